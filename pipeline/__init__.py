@@ -1,0 +1,63 @@
+"""Calibration of inertial measurement units: the conventions of the whole package.
+
+Units
+    Specific force in g (standard, 9.80665 m/s^2), angular rate in deg/s, angles in deg, time in s since power-on
+    (stored as integer ns), temperature in degC. Conversion happens at ingest and at export only.
+
+Frames
+    *body*: the right-handed axes x, y, z that the unit's readings are calibrated to, fixed to the table's turn axes.
+    *level*: z up (against gravity), x and y level; where Earth's rotation matters, ``table.azimuth_deg`` is the azimuth
+    of level x, clockwise from north seen from above. Attitudes are unit quaternions (w, x, y, z) that take body
+    vectors to the level frame.
+    A turn about body axis a by the table angle: at angle 0 the axis that points up is z for turns about x and y, and x
+    for turns about z; the specific force at angle A is the up vector turned by -A about the turn axis (right-handed).
+    At angle 0 the body axes coincide with the level axes for turns about x and y; for turns about z body x is level z,
+    body y level y, body z level -x.
+
+Signs
+    At rest the upward axis reads ``+table.gravity_g``. Vectors are columns.
+
+The measurement equation
+    ``reading = bias + K @ truth + sum of effects + noise``, with ``K = matrix^-1``, so
+    ``truth = matrix @ (reading - bias - effects)``, where
+
+    reading : (3,) what the sensor says, g or deg/s
+    bias    : (3,) same unit
+    matrix  : (3, 3) the calibration matrix, scale factor, misalignment and non-orthogonality in one
+    effects : functions of the motion, the temperature and the time; see ``pipeline.model.effects``
+    noise   : white noise plus a Gauss-Markov bias wander; see ``pipeline.records.Noise``
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from pipeline.model.compensation import Compensation
+
+__version__ = "0.1.0"
+__all__ = ["__version__", "load_calibration"]
+
+
+def load_calibration(path: str | Path) -> Compensation:
+    """Load ``calibrations/<unit>.json`` as an object that compensates arrays.
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Returns
+    -------
+    Compensation
+        Call ``apply(accelerometer=..., gyroscope=..., temperature=..., time=...)`` on it.
+
+    Raises
+    ------
+    InputError
+        If the file does not exist, is no calibration, or is the record of a failed unit.
+    """
+    from pipeline.model.compensation import load  # noqa: PLC0415  (numpy is imported only where it is needed)
+
+    return load(path)

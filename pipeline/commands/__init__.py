@@ -1,0 +1,1 @@
+"""Commands for people: simulate, new, explain, config."""

@@ -1,0 +1,67 @@
+"""The tree of user errors.
+
+Each says what is wrong, where, what was expected and what to do. A user error is one line and exit code 2 on the
+command line, and a failure record of one unit in a batch; anything else that is raised is a bug and keeps its traceback.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+
+class PipelineError(Exception):
+    """A user error.
+
+    Parameters
+    ----------
+    message : str
+        What is wrong, where (line, time, axis), what was expected and what to do.
+    file : str, optional
+        The file concerned, with its line as ``path:line`` where there is one.
+    """
+
+    code: ClassVar[str] = "error"
+
+    def __init__(self, message: str, file: str | None = None) -> None:
+        super().__init__(message)
+        self.message = message
+        self.file = file
+
+    def __str__(self) -> str:
+        return f"{self.file}: {self.message}" if self.file else self.message
+
+
+class InputError(PipelineError):
+    """A recording or another input file cannot be used as it is."""
+
+    code = "bad_input"
+
+
+class MissingInputError(InputError):
+    """A file that the procedure needs does not exist."""
+
+    code = "missing_file"
+
+
+class ConfigurationError(PipelineError):
+    """A setting is unknown, of the wrong type or out of its range."""
+
+    code = "bad_configuration"
+
+
+class NotObservableError(PipelineError):
+    """The recording does not determine what was asked of it."""
+
+    code = "not_observable"
+
+
+class ConvergenceError(PipelineError):
+    """An iterative estimate did not converge."""
+
+    code = "did_not_converge"
+
+
+class CannotCalibrateError(PipelineError):
+    """The procedure or method cannot calibrate this sensor at all: it becomes ``null`` with a reason, no failure."""
+
+    code = "cannot_calibrate"

@@ -1,0 +1,1 @@
+"""Files to recordings: units and axes end here."""

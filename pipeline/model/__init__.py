@@ -1,0 +1,1 @@
+"""The physics: kinematics of the table, the measurement equation, its effects and its inversion."""

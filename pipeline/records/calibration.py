@@ -1,0 +1,159 @@
+"""The calibration of one sensor, as it grows stage by stage, and its JSON form (CONTRACT section 6).
+
+``reading = bias + matrix^-1 @ truth + effects + noise``, so ``truth = matrix @ (reading - bias - effects)``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+UNITS = {"accelerometer": "g", "gyroscope": "deg/s"}
+
+
+@dataclass(frozen=True)
+class StageResult:
+    """One stage of a fit.
+
+    Attributes
+    ----------
+    name : str
+    parameters : dict
+        Name to ``{"value", "unit", "standard_uncertainty"}``; the uncertainty may be None.
+    residual_rms : float or None
+        Of the fit's own error measure after this stage, unit of the sensor.
+    correction : dict or None
+        How readings are corrected up to and including this stage, where that is not yet (or not only) matrix and
+        bias; what it means is known to the method's module in ``pipeline.estimation``.
+    details : dict
+        Free figures for the report (condition number, samples used, iterations ...).
+    """
+
+    name: str
+    parameters: dict[str, Any]
+    residual_rms: float | None = None
+    correction: dict[str, Any] | None = None
+    details: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class FittedEffect:
+    """A fitted effect: its name and parameters.
+
+    Attributes
+    ----------
+    name : str
+    parameters : dict
+        Name to ``{"value", "unit", "expanded_uncertainty"}``.
+    """
+
+    name: str
+    parameters: dict[str, dict[str, Any]]
+
+    @property
+    def values(self) -> NDArray[np.float64]:
+        """Values of the parameters, in their order."""
+        return np.array([p["value"] for p in self.parameters.values()])
+
+
+@dataclass(frozen=True)
+class SensorCalibration:
+    """What is known of one sensor after a stage.
+
+    Attributes
+    ----------
+    sensor : str
+        ``accelerometer`` or ``gyroscope``.
+    bias : (3,) array, g or deg/s
+    matrix : (3, 3) array, dimensionless
+    stages : tuple of StageResult
+    effects : tuple of FittedEffect
+    covariance : (12, 12) array or None
+        Of (bias_x..z, matrix_xx, matrix_xy .. matrix_zz), then each effect's parameters (then larger than 12).
+    degrees_of_freedom : float
+    converged : bool
+    """
+
+    sensor: str
+    bias: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    matrix: NDArray[np.float64] = field(default_factory=lambda: np.eye(3))
+    stages: tuple[StageResult, ...] = ()
+    effects: tuple[FittedEffect, ...] = ()
+    covariance: NDArray[np.float64] | None = None
+    degrees_of_freedom: float = float("inf")
+    converged: bool = True
+
+    def parameter_names(self) -> list[str]:
+        """Return the names of the covariance's rows."""
+        names = [f"bias_{a}" for a in "xyz"] + [f"matrix_{a}{b}" for a in "xyz" for b in "xyz"]
+        return names + [f"{e.name}.{p}" for e in self.effects for p in e.parameters]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the sensor's part of ``calibrations/<unit>.json``."""
+        size = len(self.parameter_names())
+        covariance = np.zeros((size, size)) if self.covariance is None else self.covariance
+        factor = coverage_factor(self.degrees_of_freedom)
+        expanded = factor * np.sqrt(np.clip(np.diag(covariance), 0.0, None))
+        return {
+            "unit": UNITS[self.sensor],
+            "bias": self.bias.tolist(),
+            "matrix": self.matrix.tolist(),
+            "expanded_uncertainty": {
+                "bias": expanded[:3].tolist(),
+                "matrix": expanded[3:12].reshape(3, 3).tolist(),
+            },
+            "coverage_factor": {"bias": [factor] * 3, "matrix": [[factor] * 3] * 3},
+            "degrees_of_freedom": self.degrees_of_freedom if np.isfinite(self.degrees_of_freedom) else None,
+            "covariance": {"parameters": self.parameter_names(), "values": covariance.tolist()},
+            "stages": [
+                {
+                    "name": s.name,
+                    "parameters": s.parameters,
+                    "residual_rms": s.residual_rms,
+                    "correction": s.correction,
+                    "details": s.details,
+                }
+                for s in self.stages
+            ],
+            "effects": [{"name": e.name, "parameters": e.parameters} for e in self.effects],
+            "converged": self.converged,
+        }
+
+    @classmethod
+    def from_json(cls, sensor: str, data: dict[str, Any]) -> Self:
+        """Read back what ``to_json`` wrote."""
+        return cls(
+            sensor=sensor,
+            bias=np.array(data["bias"], float),
+            matrix=np.array(data["matrix"], float),
+            stages=tuple(StageResult(**s) for s in data["stages"]),
+            effects=tuple(FittedEffect(**e) for e in data["effects"]),
+            covariance=np.array(data["covariance"]["values"], float),
+            degrees_of_freedom=float("inf") if data["degrees_of_freedom"] is None else data["degrees_of_freedom"],
+            converged=data["converged"],
+        )
+
+
+def coverage_factor(degrees_of_freedom: float, probability: float = 0.95) -> float:
+    """Return the two-sided coverage factor k of Student's t.
+
+    k solves ``P(|t_nu| <= k) = probability`` (JCGM 100:2008, annex G); for infinite ``nu`` it is the normal quantile.
+
+    Parameters
+    ----------
+    degrees_of_freedom : float
+    probability : float
+
+    Returns
+    -------
+    float
+    """
+    from scipy.special import ndtri, stdtrit  # noqa: PLC0415  (0.1 s that only writers of uncertainties pay)
+
+    upper = 0.5 + probability / 2.0
+    return float(ndtri(upper) if np.isinf(degrees_of_freedom) else stdtrit(degrees_of_freedom, upper))

@@ -1,0 +1,50 @@
+"""The motion of the body as a reference knows it, at the sample times of one recording."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What the body did, from a table's log (no noise) or from a log's own calibrated signals.
+
+    Attributes
+    ----------
+    time : (n,) array, s since power-on
+    specific_force : (n, 3) array, g, body frame
+    angular_rate : (n, 3) array, deg/s, body frame
+    angular_acceleration : (n, 3) array, deg/s^2, body frame
+    specific_force_rate : (n, 3) array, g/s, body frame
+        Time derivative of ``specific_force`` as the body sees it (for gravity alone ``-omega x f``, omega in rad/s).
+    temperature : (n,) array, degC, or None
+        Smoothed over 30 s: sensor noise in a regressor would bias what is fitted to it.
+    angle, rate : (n,) array, deg and deg/s, or None
+        About the turn axis, where there is one.
+    axis : int or None
+        Index of the turn axis in the body frame.
+    still : (n,) array of bool
+        Samples at which the body rests and has settled.
+    at_offset : callable or None
+        ``at_offset(offset=tau)`` is the motion at ``time + tau`` (tau a float or (n,) array, s), from the same
+        interpolated trajectory; None where the trajectory is not known between the samples.
+    """
+
+    time: NDArray[np.float64]
+    specific_force: NDArray[np.float64]
+    angular_rate: NDArray[np.float64]
+    angular_acceleration: NDArray[np.float64]
+    specific_force_rate: NDArray[np.float64]
+    temperature: NDArray[np.float64] | None
+    angle: NDArray[np.float64] | None
+    rate: NDArray[np.float64] | None
+    axis: int | None
+    still: NDArray[np.bool_]
+    at_offset: Callable[..., Motion | None] | None = None

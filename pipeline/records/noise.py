@@ -1,0 +1,35 @@
+"""The noise of one sensor: white noise and bias wander."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Noise:
+    """White noise of a sample and a first-order Gauss-Markov bias wander, per axis.
+
+    ``noise[n] = white * w[n] + wander * m[n]``, with ``w`` independent standard normal and ``m`` stationary with unit
+    variance and autocorrelation ``exp(-|t| / correlation_time)``.
+
+    Attributes
+    ----------
+    white : (3,) array, unit of the sensor
+        Standard deviation of one raw sample, before any filter.
+    wander : (3,) array, unit of the sensor
+        Stationary standard deviation of the bias wander; 0 where none was seen.
+    correlation_time : float, s
+    source : str
+        ``static`` (a long rest), ``rests`` (rest parts of the recordings), ``residual`` (what a fit left) or
+        ``data_sheet``.
+    """
+
+    white: NDArray[np.float64]
+    wander: NDArray[np.float64]
+    correlation_time: float
+    source: str

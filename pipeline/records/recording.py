@@ -1,0 +1,148 @@
+"""A recording: one file's samples, in the units of the house.
+
+Units: time in integer nanoseconds since power-on, specific force in g (9.80665 m/s^2), angular rate in deg/s,
+angles in deg, temperature in degC. A channel that the file does not hold is ``None``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+AXES = ("x", "y", "z")
+SENSORS = ("accelerometer", "gyroscope")
+NANOSECONDS = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class Note:
+    """A machine-readable remark on an input: what was found or repaired, how often and where.
+
+    Attributes
+    ----------
+    code : str
+        ``N-...`` code, for example ``N-GAP``.
+    count : int
+        How often it was found.
+    first, last : int
+        First and last line of the file concerned, counted from 1; 0 where lines do not apply.
+    detail : str
+        One sentence.
+    """
+
+    code: str
+    count: int
+    first: int
+    last: int
+    detail: str
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """How a stored integer becomes a value: ``value = (count - offset) * scale``.
+
+    Raw counts stay integers in every intermediate file, so that nothing is lost before the fit.
+    """
+
+    scale: float
+    offset: float = 0.0
+
+
+@dataclass(frozen=True)
+class Recording:
+    """The samples of one recording.
+
+    Attributes
+    ----------
+    name : str
+        Name in the procedure, for example ``accel_x``.
+    role : str
+        ``accelerometer`` or ``gyroscope`` (turns for that sensor), ``rests`` (rests and moves without a table),
+        ``validation`` (held out from every fit) or ``static`` (pins the noise model).
+    axis : str or None
+        Body axis that the table turns about (``x``, ``y``, ``z``), None where there is no single axis.
+    time_ns : (n,) array of int64, ns since power-on
+    accelerometer : (n, 3) array, g, or None
+    gyroscope : (n, 3) array, deg/s, or None
+    temperature : (n,) array, degC, or None
+    table_angle : (n,) array, deg, or None
+        About the turn axis; not wrapped.
+    table_rate : (n,) array, deg/s, or None
+        About the turn axis; in held-out motion the magnitude of the table's rate.
+    table_attitude : (n, 4) array, or None
+        Unit quaternion (w, x, y, z), body to level with z up.
+    flags : (n,) array of uint16, or None
+        Bit 0: a gap before this sample. Bit 1: clipped. Bit 2: stuck. Bit 3: repaired.
+    source : dict
+        ``file``, ``sha256``, ``rows`` of the input.
+    notes : tuple of Note
+        What ingest found or repaired.
+    filter : dict
+        Name and settings of the filter that was applied, and ``delay_s``, the delay of its output in s
+        (0 where it is zero-phase), and ``noise_gain``, the factor on the standard deviation of white noise.
+    encodings : dict of str to Encoding
+        Columns that came as integers.
+    clock_shared : bool
+        Whether the time between this recording and the unit's others is known (their times do not overlap).
+    """
+
+    name: str
+    role: str
+    axis: str | None
+    time_ns: NDArray[np.int64]
+    accelerometer: NDArray[np.float64] | None = None
+    gyroscope: NDArray[np.float64] | None = None
+    temperature: NDArray[np.float64] | None = None
+    table_angle: NDArray[np.float64] | None = None
+    table_rate: NDArray[np.float64] | None = None
+    table_attitude: NDArray[np.float64] | None = None
+    flags: NDArray[np.uint16] | None = None
+    source: dict[str, Any] = field(default_factory=dict)
+    notes: tuple[Note, ...] = ()
+    filter: dict[str, Any] = field(default_factory=lambda: {"name": "none", "delay_s": 0.0, "noise_gain": 1.0})
+    encodings: dict[str, Encoding] = field(default_factory=dict)
+    clock_shared: bool = True
+
+    @cached_property
+    def time(self) -> NDArray[np.float64]:
+        """Time of each sample: (n,) array, s since power-on."""
+        seconds: NDArray[np.float64] = self.time_ns // NANOSECONDS + (self.time_ns % NANOSECONDS) / NANOSECONDS
+        return seconds
+
+    @property
+    def samples(self) -> int:
+        """Number of samples."""
+        return len(self.time_ns)
+
+    @cached_property
+    def interval(self) -> float:
+        """Median sampling interval, s."""
+        return float(np.median(np.diff(self.time_ns))) / NANOSECONDS if self.samples > 1 else float("nan")
+
+    def reading(self, sensor: str) -> NDArray[np.float64] | None:
+        """Return the (n, 3) readings of ``accelerometer`` (g) or ``gyroscope`` (deg/s), or None."""
+        return self.accelerometer if sensor == "accelerometer" else self.gyroscope
+
+    def select(self, index: NDArray[Any] | slice) -> Self:
+        """Return the recording with only the samples of ``index`` (slice, mask or integers)."""
+
+        def cut(values: NDArray[Any] | None) -> NDArray[Any] | None:
+            return None if values is None else values[index]
+
+        return replace(
+            self,
+            time_ns=self.time_ns[index],
+            accelerometer=cut(self.accelerometer),
+            gyroscope=cut(self.gyroscope),
+            temperature=cut(self.temperature),
+            table_angle=cut(self.table_angle),
+            table_rate=cut(self.table_rate),
+            table_attitude=cut(self.table_attitude),
+            flags=cut(self.flags),
+        )

@@ -1,0 +1,1 @@
+"""Filters, rests and turns, noise, temperature."""

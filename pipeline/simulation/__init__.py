@@ -1,0 +1,1 @@
+"""A table and a sensor, with any effect hidden in them."""

@@ -1,0 +1,1 @@
+"""Errors on held-out motion, beside the noise floor."""
