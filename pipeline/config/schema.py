@@ -1,0 +1,152 @@
+"""The schema of one unit's configuration: names, types and ranges, in one place.
+
+What each key means stands beside it in ``configs/``. Unknown keys are refused everywhere but in ``ingest`` column maps
+and effect limits, whose keys are names of channels and parameters.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Axis = Literal["x", "y", "z"]
+SignedAxis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
+
+
+class Section(BaseModel):
+    """A part of the configuration: strict types, no unknown keys."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+
+class DataSheet(Section):
+    """One sensor's data sheet."""
+
+    full_scale: Positive
+    counts_per_unit: Positive
+    noise_density: Positive
+    bias_wander: NonNegative
+    wander_time_s: Positive
+    bias: Positive
+    scale_factor: Positive
+    cross_axis: Positive
+    effects: dict[str, Positive]
+
+
+class Sensor(Section):
+    """A sensor model."""
+
+    name: str
+    axis_map: Annotated[list[SignedAxis], Field(min_length=3, max_length=3)]
+    accelerometer: DataSheet
+    gyroscope: DataSheet
+
+
+class Table(Section):
+    """A rate table, or none."""
+
+    name: str
+    motion: Literal["logged", "commanded", "none"]
+    gravity_g: Annotated[float, Field(gt=0.9, lt=1.1)]
+    latitude_deg: Annotated[float, Field(ge=-90, le=90)] | None
+    azimuth_deg: Annotated[float, Field(ge=-360, le=360)] | None
+    angle_accuracy_deg: NonNegative
+    rate_accuracy: NonNegative
+    orthogonality_deg: NonNegative
+
+
+class RecordingFile(Section):
+    """One recording of a procedure."""
+
+    file: str
+    role: Literal["accelerometer", "gyroscope", "rests", "validation", "static"]
+    axis: Axis | None
+    optional: bool
+
+
+class Procedure(Section):
+    """Which recordings a calibration consists of."""
+
+    name: str
+    table: str
+    folder: str
+    recordings: dict[str, RecordingFile]
+    holdout_every: Annotated[int, Field(ge=0)]
+
+
+class Stages(Section):
+    """The stages of a method, per sensor."""
+
+    accelerometer: list[str] | None = None
+    gyroscope: list[str] | None = None
+
+
+class Method(Section):
+    """How each sensor is fitted."""
+
+    name: str
+    accelerometer: str
+    gyroscope: str
+    as_printed: bool
+    stages: Stages
+
+
+class Filter(Section):
+    """The filter before the fit."""
+
+    name: Literal["none", "rc_low_pass", "low_pass", "high_pass", "band_pass", "band_stop"]
+    cutoff_hz: Positive | None
+    time_constant_s: Positive | None
+    low_hz: Positive | None
+    high_hz: Positive | None
+    order: Annotated[int, Field(ge=1, le=10)] | None
+    zero_phase: bool
+
+
+class Effects(Section):
+    """The effects fitted together with the base model."""
+
+    accelerometer: list[str] | Literal["auto"]
+    gyroscope: list[str] | Literal["auto"]
+
+
+class SensorLimits(Section):
+    """What a unit must keep to pass; None is not checked."""
+
+    held_out_rms_error: Positive | None
+    held_out_mean_abs_error: Positive | None
+    held_out_max_abs_error: Positive | None
+    bias: Positive | None
+    scale_factor: Positive | None
+
+
+class Limits(Section):
+    """Limits of both sensors."""
+
+    accelerometer: SensorLimits
+    gyroscope: SensorLimits
+
+
+class Ingest(Section):
+    """How files become recordings; ``pipeline.formats`` documents the keys of ``csv`` and ``mcap``."""
+
+    name: str
+    csv: dict[str, Any]
+    mcap: dict[str, Any]
+
+
+class Unit(Section):
+    """The whole configuration of one unit."""
+
+    unit: str
+    sensor: Sensor
+    table: Table
+    procedure: Procedure
+    method: Method
+    filter: Filter
+    ingest: Ingest
+    effects: Effects
+    limits: Limits
