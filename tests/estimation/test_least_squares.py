@@ -1,0 +1,105 @@
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from pipeline.errors import NotObservableError
+from pipeline.estimation.least_squares import complex_step_jacobian, refine, solve_linear, solve_nonlinear, undetermined
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+def test_a_straight_line_has_its_textbook_uncertainty() -> None:
+    x = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
+    y = np.array([1.0, 3.0, 2.0, 5.0, 4.0])
+    fit = solve_linear(np.column_stack([np.ones(5), x]), y)
+    # By hand: mean 3, slope 8/10; residual sum of squares 10 - 6.4 = 3.6, s^2 = 1.2.
+    assert fit.x == pytest.approx([3.0, 0.8], abs=1e-14)
+    assert fit.covariance == pytest.approx(np.diag([1.2 / 5, 1.2 / 10]), abs=1e-14)
+    assert (fit.degrees_of_freedom, fit.rank, fit.converged) == (3, 2, True)
+
+
+def test_a_given_sigma_replaces_the_scatter_of_the_residuals() -> None:
+    A = np.eye(4)[:, :2]
+    fit = solve_linear(A, np.array([1.0, 2.0, 0.0, 0.0]), sigma=0.5)
+    assert fit.standard_uncertainty == pytest.approx([0.5, 0.5])
+
+
+def test_columns_of_very_different_size_are_no_rank_deficiency() -> None:
+    rng = np.random.default_rng(1)
+    A = rng.normal(size=(50, 3)) * np.array([1e-12, 1.0, 1e12])
+    truth = np.array([3e12, -2.0, 5e-12])
+    assert solve_linear(A, A @ truth).x == pytest.approx(truth, rel=1e-10)
+
+
+def test_hilbert_columns_keep_the_digits_that_normal_equations_lose() -> None:
+    n = 8
+    H = 1.0 / (np.arange(n)[:, None] + np.arange(n)[None, :] + 1.0)
+    x = solve_linear(H, H.sum(axis=1), sigma=1.0).x
+    assert np.max(np.abs(x - 1.0)) < 1e-5  # condition 1.5e10; its square is beyond double precision
+
+
+def test_parameters_that_the_data_do_not_determine_are_named() -> None:
+    A = np.random.default_rng(2).normal(size=(20, 4))
+    A[:, 3] = 2.0 * A[:, 1]
+    with pytest.raises(NotObservableError, match=r"3 of 4 parameters.*: bias_y, scale_y\."):
+        solve_linear(A, A[:, 0], names=["bias_x", "bias_y", "scale_x", "scale_y"])
+    assert undetermined(A, ["a", "b", "c", "d"]) == ["b", "d"]
+
+
+def test_a_column_of_zeros_is_named() -> None:
+    A = np.array([[1.0, 0.0], [2.0, 0.0], [3.0, 0.0]])
+    with pytest.raises(NotObservableError, match="each other: lag"):
+        solve_linear(A, A[:, 0], names=["bias", "lag"])
+
+
+def test_fewer_equations_than_parameters_are_refused() -> None:
+    with pytest.raises(NotObservableError, match="2 of 3 parameters"):
+        solve_linear(np.ones((2, 3)) + np.eye(3)[:2], np.ones(2))
+
+
+def test_the_complex_step_is_exact_to_rounding() -> None:
+    jacobian = complex_step_jacobian(lambda x: np.array([np.exp(x[0]) * x[1], np.sin(x[1])]))
+    expected = np.array([[np.e * 2.0, np.e], [0.0, np.cos(2.0)]])
+    assert jacobian(np.array([1.0, 2.0])) == pytest.approx(expected, rel=1e-15)
+
+
+def _circle(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    angle = np.linspace(0.0, 2.0, 30)
+    points = np.stack([3.0 + 2.0 * np.cos(angle), -1.0 + 2.0 * np.sin(angle)])
+    return np.sqrt((points[0] - x[0]) ** 2 + (points[1] - x[1]) ** 2) - x[2]
+
+
+def test_a_circle_is_found_from_far_off_and_from_near() -> None:
+    far = solve_nonlinear(_circle, np.array([0.5, 1.0, 0.1]))
+    near = refine(_circle, np.array([2.5, -0.8, 1.7]))
+    assert far.x == pytest.approx([3.0, -1.0, 2.0], abs=1e-12)
+    assert near.x == pytest.approx([3.0, -1.0, 2.0], abs=1e-12)
+    assert far.converged
+    assert near.converged
+
+
+def test_uncertainty_covers_the_truth_in_its_share_of_repeats() -> None:
+    rng = np.random.default_rng(3)
+    t = np.linspace(0.0, 4.0, 60)
+    truth = np.array([2.0, 0.7])
+    inside = 0
+    for _ in range(400):
+        y = truth[0] * np.exp(-truth[1] * t) + 0.02 * rng.normal(size=60)
+        fit = refine(lambda b, y=y: b[0] * np.exp(-b[1] * t) - y, np.array([1.8, 0.6]))
+        inside += int(np.abs(fit.x[1] - truth[1]) < fit.standard_uncertainty[1])
+    assert 0.683 - 0.07 < inside / 400 < 0.683 + 0.07  # three standard deviations of the count
+
+
+def test_a_search_cut_short_is_not_called_converged() -> None:
+    fit = refine(lambda x: np.array([x[0] - 5.0, 1e3 * (x[1] - x[0] ** 2), 1.0]), np.array([1.0, 0.0]), iterations=1)
+    assert not fit.converged
+    assert fit.cosine > 1e-3
+
+
+def test_a_start_where_nothing_is_finite_is_refused() -> None:
+    with pytest.raises(NotObservableError, match="not finite at the start"):
+        refine(lambda x: np.log(x - 1.0), np.array([1.0]))
