@@ -1,0 +1,39 @@
+# Calibration of inertial measurement units: the stages and what they depend on.
+#
+#   snakemake --cores 2                                          runs data/demo
+#   snakemake --cores 2 --config campaign=NAME_OR_DIR            runs another campaign
+#   ... --config campaign=C 'overrides=[filter=rc_low_pass]'     Hydra overrides for every unit of the run
+#
+# ingest -> filter -> fit/{sensor}/{stage} ... -> validate, diagnose, calibration -> export, report -> gather -> verdict
+#
+# One job handles a batch of units; each writes one file per unit below results/<campaign>/batches/<batch>/<stage>/.
+
+
+include: "workflow/rules/common.smk"
+
+
+rule all:
+    input:
+        f"{RESULTS}/complete.json",
+
+
+include: "workflow/rules/ingest.smk"
+include: "workflow/rules/filter.smk"
+include: "workflow/rules/fit.smk"
+include: "workflow/rules/validate.smk"
+include: "workflow/rules/diagnose.smk"
+include: "workflow/rules/calibration.smk"
+include: "workflow/rules/export.smk"
+include: "workflow/rules/report.smk"
+include: "workflow/rules/gather.smk"
+include: "workflow/rules/verdict.smk"
+
+
+localrules:
+    all,
+    gather,
+    verdict,
+
+
+onerror:
+    repeat_verdict()

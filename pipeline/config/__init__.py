@@ -1,0 +1,10 @@
+"""From Hydra groups and ``units.csv`` to checked configurations, batches and each stage's part of them.
+
+Only this package knows Hydra; jobs read the JSON files that it writes.
+"""
+
+from pipeline.config.campaign import Campaign, UnitRow, load_campaign
+from pipeline.config.code import code_digest
+from pipeline.config.parts import write_part
+
+__all__ = ["Campaign", "UnitRow", "code_digest", "load_campaign", "write_part"]

@@ -1,0 +1,239 @@
+"""A campaign: its directory, its units with their configurations, and the batches in which they are worked on."""
+
+from __future__ import annotations
+
+import csv
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from omegaconf import OmegaConf
+
+from pipeline.config.compose import CONFIGS, GROUPS, RUN_SETTINGS, Composer, Problem, default_of_run, nearest, parse
+from pipeline.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+SHIPPED = CONFIGS.parent / "data"
+UNIT_NAME = re.compile(r"[A-Za-z0-9._-]+")
+FREE_COLUMNS = ("serial", "lot", "date")
+
+
+@dataclass(frozen=True)
+class UnitRow:
+    """One unit: its row of ``units.csv`` and its configuration."""
+
+    name: str
+    row: dict[str, str]
+    config: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """A campaign with everything resolved.
+
+    Attributes
+    ----------
+    name : str
+        Under which its results are found.
+    directory : Path
+    results : Path
+        ``<results>/<name>``.
+    units : dict of str to UnitRow
+        In the order of ``units.csv``.
+    batches : dict of str to list of str
+        Units of one chain of stages, cut in the order of ``units.csv``.
+    chains : dict of str to dict
+        Batch and sensor to the ordered stages of its fit.
+    """
+
+    name: str
+    directory: Path
+    results: Path
+    units: dict[str, UnitRow]
+    batches: dict[str, list[str]]
+    chains: dict[str, dict[str, list[str]]] = field(default_factory=dict)
+
+    def folder(self, unit: str) -> Path:
+        """Return where a unit's recordings lie."""
+        folder: str = self.units[unit].config["procedure"]["folder"]
+        return self.directory / folder
+
+
+def load_campaign(settings: Mapping[str, Any]) -> Campaign:
+    """Load and check a campaign.
+
+    Parameters
+    ----------
+    settings : mapping
+        What ``snakemake --config`` gave: ``campaign``, ``results``, ``overrides``, ``unit_overrides``.
+
+    Raises
+    ------
+    ConfigurationError
+        With one message for everything that is wrong.
+    """
+    unknown = sorted(set(settings) - {"campaign", "results", "overrides", "unit_overrides"})
+    if unknown:
+        valid = ("campaign", "results", "overrides", "unit_overrides")
+        raise ConfigurationError(f"--config {unknown[0]}: unknown setting{nearest(unknown[0], valid)}")
+    directory = find_campaign(str(settings.get("campaign", "demo")))
+    rows = read_units(directory / "units.csv")
+    of_all, of_run = campaign_overrides(directory / "campaign.yaml")
+    from_command = as_list(settings.get("overrides", []), "overrides")
+    per_unit = unit_overrides(settings.get("unit_overrides", {}), rows)
+    of_run, from_command = split_run_settings([*of_run, *from_command])
+    composer = Composer(directory)
+    units: dict[str, UnitRow] = {}
+    problems: dict[str, list[str]] = {}
+    for name, row in rows.items():
+        groups = [f"{g}={row[g]}" for g in GROUPS if row.get(g)]
+        own = [o.strip() for o in row.get("overrides", "").split(";") if o.strip()]
+        try:
+            config = composer.unit(name, [*of_all, *groups, *own, *from_command, *per_unit.get(name, [])])
+            units[name] = UnitRow(name, row, config)
+        except Problem as problem:
+            for line in str(problem).splitlines():
+                problems.setdefault(line, []).append(name)
+    if problems:
+        raise ConfigurationError(_one_message(problems), str(directory / "units.csv"))
+    batches, chains = cut_batches(units, batch_size(of_run))
+    results = Path(str(settings.get("results", "results"))) / directory.name
+    return Campaign(directory.name, directory, results, units, batches, chains)
+
+
+def find_campaign(name: str) -> Path:
+    """Return the directory of a campaign: one that ships, by name, or any directory with a ``units.csv``."""
+    for directory in (SHIPPED / name, Path(name)):
+        if (directory / "units.csv").is_file():
+            return directory.resolve()
+    shipped = [d.parent.name for d in SHIPPED.glob("*/units.csv")]
+    raise ConfigurationError(
+        f"campaign {name!r}: neither data/{name} nor {name} holds a units.csv{nearest(name, shipped)}"
+    )
+
+
+def read_units(path: Path) -> dict[str, dict[str, str]]:
+    """Read ``units.csv``: unit name to row; refuses bad names, duplicates and ragged rows, all in one message."""
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as stream:
+            reader = csv.DictReader(stream, strict=True)
+            columns = [c.strip() for c in reader.fieldnames or []]
+            reader.fieldnames = columns
+            rows = [(reader.line_num, row) for row in reader]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ConfigurationError(f"cannot be read: {error}", str(path)) from error
+    if "unit" not in columns:
+        raise ConfigurationError(f"has no column 'unit'; its columns are {', '.join(columns) or 'none'}", f"{path}:1")
+    found: dict[str, dict[str, str]] = {}
+    problems = [f"line 1: column {c!r} stands twice" for c in sorted({c for c in columns if columns.count(c) > 1})]
+    for line, raw in rows:
+        if None in raw or any(v is None for v in raw.values()):
+            problems.append(f"line {line}: {len(columns)} columns expected, as in the header")
+            continue
+        row = {k: v.strip() for k, v in raw.items()}
+        name = row["unit"]
+        if not UNIT_NAME.fullmatch(name) or name in (".", ".."):
+            problems.append(f"line {line}: unit {name!r}: use letters, digits, '.', '_', '-'")
+        elif name in found:
+            problems.append(f"line {line}: unit {name!r} stands twice")
+        else:
+            found[name] = row
+    if not found and not problems:
+        problems.append("has no units")
+    if problems:
+        raise ConfigurationError("; ".join(problems), str(path))
+    return found
+
+
+def campaign_overrides(path: Path) -> tuple[list[str], list[str]]:
+    """Read ``campaign.yaml``: the overrides of all units, and those that are settings of the run."""
+    if not path.is_file():
+        return [], []
+    try:
+        content = OmegaConf.to_container(OmegaConf.load(path)) or {}
+    except Exception as error:
+        raise ConfigurationError(f"is not YAML: {' '.join(str(error).split())}", str(path)) from error
+    if not isinstance(content, dict):
+        raise ConfigurationError("must be a mapping, for example 'overrides: [filter=rc_low_pass]'", str(path))
+    unknown = [str(k) for k in content if k not in ("overrides", "compare")]
+    if unknown:
+        raise ConfigurationError(f"{unknown[0]}: unknown key{nearest(unknown[0], ['overrides', 'compare'])}", str(path))
+    run, units = split_run_settings(as_list(content.get("overrides", []), f"{path}: overrides"))
+    return units, run
+
+
+def as_list(value: Any, where: str) -> list[str]:  # noqa: ANN401  (whatever the user wrote)
+    """Return overrides as a list: a list of strings as it is, a plain string as one."""
+    if isinstance(value, str):
+        value = [value]
+    if not isinstance(value, (list, tuple)) or not all(isinstance(v, str) for v in value):
+        raise ConfigurationError(f"{where}: a list of overrides KEY=VALUE is expected, got {value!r}")
+    return list(value)
+
+
+def unit_overrides(value: Any, rows: Mapping[str, Any]) -> dict[str, list[str]]:  # noqa: ANN401
+    """Check ``unit_overrides``: unit name to a list of overrides, of units that exist."""
+    if not isinstance(value, dict):
+        raise ConfigurationError(f"unit_overrides: {{UNIT: [KEY=VALUE]}} is expected, got {value!r}")
+    for name in value:
+        if str(name) not in rows:
+            raise ConfigurationError(f"unit_overrides: no unit {name!r} in units.csv{nearest(str(name), rows)}")
+    return {str(name): as_list(v, f"unit_overrides of {name}") for name, v in value.items()}
+
+
+def split_run_settings(overrides: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Split overrides into those of the run and those of units."""
+    run = [o for o in overrides if o.lstrip("+").split("=")[0] in RUN_SETTINGS]
+    return run, [o for o in overrides if o not in run]
+
+
+def batch_size(overrides: Sequence[str]) -> int:
+    """Return the batch size that the run's overrides ask for."""
+    size = default_of_run("batch_size")
+    for text in overrides:
+        try:
+            size = parse(text).value()
+        except Problem as problem:
+            raise ConfigurationError(str(problem)) from problem
+    if not isinstance(size, int) or isinstance(size, bool) or size < 1:
+        raise ConfigurationError(f"batch_size={size}: a whole number from 1 on is expected")
+    return size
+
+
+def cut_batches(
+    units: Mapping[str, UnitRow], size: int
+) -> tuple[dict[str, list[str]], dict[str, dict[str, list[str]]]]:
+    """Cut units of one chain of stages into batches, in the order of the sheet.
+
+    Appending units touches the last batch of their chain only. Whether effects are fitted does not cut batches anew:
+    a batch has the stage if any of its units asks for it.
+    """
+    by_chain: dict[str, list[str]] = {}
+    for name, unit in units.items():
+        method = unit.config["method"]
+        parts = dict.fromkeys([method["name"], method["accelerometer"], method["gyroscope"]])
+        by_chain.setdefault("+".join(parts), []).append(name)
+    batches: dict[str, list[str]] = {}
+    chains: dict[str, dict[str, list[str]]] = {}
+    for chain, names in by_chain.items():
+        for i in range(0, len(names), size):
+            batch = f"{chain}-{i // size + 1:04d}"
+            batches[batch] = names[i : i + size]
+            configs = [units[n].config for n in batches[batch]]
+            chains[batch] = {
+                sensor: configs[0]["method"]["stages"][sensor]
+                + (["effects"] if any(c["effects"][sensor] for c in configs) else [])
+                for sensor in ("accelerometer", "gyroscope")
+            }
+    return batches, chains
+
+
+def _one_message(problems: Mapping[str, list[str]]) -> str:
+    lines = []
+    for text, names in problems.items():
+        more = f" and {len(names) - 5} more" if len(names) > 5 else ""
+        lines.append(f"  unit {', '.join(names[:5])}{more}: {text}")
+    return "the configuration is refused:\n" + "\n".join(lines)

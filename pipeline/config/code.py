@@ -1,0 +1,72 @@
+"""A digest of the code that a stage runs.
+
+Snakemake sees the shell command of a rule, not the package that it calls; so each rule has this digest as a parameter,
+and a changed method reruns the stages that use it.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+from functools import cache
+from pathlib import Path
+
+PACKAGE = Path(__file__).resolve().parents[1]
+
+
+@cache
+def code_digest(module: str) -> str:
+    """Return a digest of a module's source and of every module of the package that it imports, at any depth.
+
+    A package counts with all that lies beside its ``__init__`` where it finds its modules on disk (effects, exports).
+
+    Parameters
+    ----------
+    module : str
+        For example ``pipeline.stages.ingest``.
+    """
+    digest = hashlib.sha256()
+    for file in sorted(_closure(module)):
+        digest.update(str(file.relative_to(PACKAGE)).encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+@cache
+def _closure(module: str) -> frozenset[Path]:
+    seen: set[Path] = set()
+    todo = [file for file in [_file_of(module)] if file]
+    while todo:
+        file = todo.pop()
+        if file not in seen:
+            seen.add(file)
+            todo.extend(_imports(file))
+    return frozenset(seen)
+
+
+@cache
+def _imports(file: Path) -> tuple[Path, ...]:
+    tree = ast.parse(file.read_bytes())
+    found: list[Path | None] = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found += [_file_of(alias.name) for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
+            found.append(_file_of(node.module))
+            found += [_file_of(f"{node.module}.{alias.name}") for alias in node.names]
+        elif (
+            file.name == "__init__.py"
+            and isinstance(node, ast.Call)
+            and getattr(node.func, "id", "") == "import_module"
+        ):
+            found += [f for f in file.parent.rglob("*") if f.is_file() and f.suffix != ".pyc"]
+    return tuple(f for f in found if f)
+
+
+def _file_of(module: str) -> Path | None:
+    if module != "pipeline" and not module.startswith("pipeline."):
+        return None
+    path = PACKAGE.joinpath(*module.split(".")[1:])
+    for file in (path / "__init__.py", path.with_suffix(".py")):
+        if file.is_file():
+            return file
+    return None

@@ -1,0 +1,275 @@
+"""Composition of one unit's configuration with Hydra.
+
+Groups are chosen first, values are merged after them; within each, what comes later in the order of precedence wins:
+group defaults, ``campaign.yaml``, ``units.csv`` groups, ``units.csv`` overrides, ``overrides=``, ``unit_overrides=``.
+Hydra composes once for each distinct selection of groups (65 ms each); value overrides are parsed and merged.
+"""
+
+from __future__ import annotations
+
+import copy
+import difflib
+import json
+from functools import cache, lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException, OverrideParseException
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from pydantic import ValidationError
+
+from pipeline.config.schema import Unit
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from hydra.core.override_parser.types import Override
+
+GROUPS = ("sensor", "table", "procedure", "method", "filter", "ingest")
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+RUN_SETTINGS = ("batch_size",)
+
+
+class Problem(Exception):  # noqa: N818  (one of many: they are collected, then raised as one ConfigurationError)
+    """One thing that is wrong with a configuration."""
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Return a hint at the nearest valid name, and all of them where there are few."""
+    known = sorted(known)
+    close = difflib.get_close_matches(name, known, 1, 0.5)
+    hint = f"; nearest: {close[0]}" if close else ""
+    return f"{hint}; valid: {', '.join(known)}" if len(known) <= 12 else hint
+
+
+class Composer:
+    """Composes configurations for the units of one campaign.
+
+    Parameters
+    ----------
+    campaign : Path
+        The campaign's directory; its ``configs/<group>/*.yaml`` are options too.
+    """
+
+    def __init__(self, campaign: Path) -> None:
+        own = campaign / "configs"
+        self.searchpath = [own.resolve()] if own.is_dir() else []
+        self.options = {
+            group: {f.stem for root in (CONFIGS, *self.searchpath) for f in (root / group).glob("*.yaml")}
+            for group in GROUPS
+        }
+        self.effects = {f.stem for f in (CONFIGS / "effect").glob("*.yaml")}
+        self.effects |= {f.stem for f in (campaign / "effects").glob("*.yaml")}
+        self._bases: dict[tuple[tuple[str, str], ...], dict[str, Any]] = {}
+        self._resolved: dict[str, dict[str, Any]] = {}
+
+    def unit(self, name: str, layers: Sequence[str]) -> dict[str, Any]:
+        """Return the checked configuration of a unit.
+
+        Parameters
+        ----------
+        name : str
+        layers : sequence of str
+            Hydra overrides, weakest first.
+
+        Raises
+        ------
+        Problem
+            One line for each thing that is wrong.
+        """
+        groups: dict[str, str] = {}
+        values: list[tuple[str, Any]] = []
+        for text in layers:
+            override = parse(text)
+            key, value = override.key_or_group, override.value()
+            if key in GROUPS and isinstance(value, str):
+                if value not in self.options[key]:
+                    raise Problem(f"{key}={value}: no such {key}{nearest(value, self.options[key])}")
+                groups[key] = value
+            elif key in RUN_SETTINGS:
+                raise Problem(
+                    f"{text}: {key} is a setting of the run, not of a unit; set it in campaign.yaml or overrides="
+                )
+            elif key.startswith("method.stages"):
+                raise Problem(f"{text}: stages are what a method is; write a method of your own in configs/method/")
+            else:
+                values.append((key, value))
+        key = json.dumps([sorted(groups.items()), values], default=str)
+        if key not in self._resolved:
+            self._resolved[key] = self._resolve(groups, values)
+        resolved = copy.deepcopy(self._resolved[key])
+        resolved["unit"] = name
+        resolved["procedure"]["folder"] = resolved["procedure"]["folder"].replace("{unit}", name)
+        return resolved
+
+    def _resolve(self, groups: dict[str, str], values: list[tuple[str, Any]]) -> dict[str, Any]:
+        merged = copy.deepcopy(self._base(self._complete(groups)))
+        for key, value in values:
+            _set(merged, key.split("."), value)
+        try:
+            resolved = OmegaConf.to_container(OmegaConf.create(merged), resolve=True)
+        except OmegaConfBaseException as error:
+            raise Problem(str(error).splitlines()[0]) from error
+        assert isinstance(resolved, dict)  # noqa: S101
+        try:
+            checked = Unit.model_validate({"unit": "?", **resolved}).model_dump()
+        except ValidationError as error:
+            raise Problem("\n".join(_explain(e, merged) for e in error.errors())) from None
+        self._choose_stages(checked)
+        self._check_meaning(checked)
+        return checked
+
+    def _complete(self, groups: dict[str, str]) -> dict[str, str]:
+        """Fill in the defaults that depend on other choices: the procedure's table, the table's method."""
+        chosen = dict(groups)
+        procedure = self._read("procedure", chosen.get("procedure", "three_axis_turns"))
+        chosen.setdefault("table", str(procedure["table"]))
+        if "method" not in chosen:
+            without = self._read("table", chosen["table"])["motion"] == "none" or procedure["table"] == "hand"
+            chosen["method"] = "nonlinear_least_squares" if without else "reference_least_squares"
+        return chosen
+
+    def _read(self, group: str, option: str) -> dict[str, Any]:
+        return _read_option(group, option, tuple(self.searchpath))
+
+    def _base(self, groups: dict[str, str]) -> dict[str, Any]:
+        key = tuple(sorted(groups.items()))
+        if key not in self._bases:
+            overrides = [f"{g}={o}" for g, o in key]
+            if self.searchpath:
+                overrides.append(f"hydra.searchpath=[{','.join(f'file://{p}' for p in self.searchpath)}]")
+            GlobalHydra.instance().clear()
+            try:
+                with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+                    composed = compose("config", overrides)
+            except (HydraException, OmegaConfBaseException) as error:
+                cause = f" ({error.__cause__})" if error.__cause__ else ""
+                raise Problem(f"{str(error).splitlines()[0]}{cause}") from error
+            base = OmegaConf.to_container(composed, resolve=False)
+            assert isinstance(base, dict)  # noqa: S101
+            plain: dict[str, Any] = {str(k): v for k, v in base.items()}
+            for run_setting in RUN_SETTINGS:
+                plain.pop(run_setting)
+            for group in GROUPS:
+                option = groups.get(group) or _default_option(group)
+                plain[group] = {"name": option, **plain[group]}
+            self._bases[key] = plain
+        return self._bases[key]
+
+    def _choose_stages(self, config: dict[str, Any]) -> None:
+        """Replace ``method.stages`` by the stages of the method chosen for each sensor."""
+        method = config["method"]
+        own = method["stages"]
+        method["stages"] = {}
+        for sensor in ("accelerometer", "gyroscope"):
+            name = method[sensor]
+            if name not in self.options["method"]:
+                raise Problem(f"method.{sensor}={name}: no such method{nearest(name, self.options['method'])}")
+            stages = own[sensor] if name == method["name"] else self._read("method", name)["stages"].get(sensor)
+            if not stages:
+                fit = [m for m in self.options["method"] if self._read("method", m)["stages"].get(sensor)]
+                raise Problem(f"method.{sensor}={name}: {name} has no stages for the {sensor}{nearest(name, fit)}")
+            method["stages"][sensor] = list(stages)
+
+    def _check_meaning(self, config: dict[str, Any]) -> None:
+        for sensor, names in config["effects"].items():
+            for name in [] if names == "auto" else names:
+                if name not in self.effects:
+                    raise Problem(f"effects.{sensor}: no effect is called {name!r}{nearest(name, self.effects)}")
+                applies = _read_option("effect", name, ()).get("sensors", [sensor])
+                if sensor not in applies:
+                    raise Problem(f"effects.{sensor}: {name} applies to the {' and '.join(applies)} only")
+        both = [config["table"][k] is None for k in ("latitude_deg", "azimuth_deg")]
+        if any(both) and not all(both):
+            raise Problem(
+                "table.latitude_deg and table.azimuth_deg: set both (Earth's rotation is modelled) or neither (null)"
+            )
+
+
+@lru_cache(maxsize=100_000)
+def parse(text: str) -> Override:
+    """Parse one Hydra override.
+
+    Raises
+    ------
+    Problem
+        If it is no override, a sweep or a deletion.
+    """
+    hint = "; write KEY=VALUE, for example filter.cutoff_hz=5"
+    if text.startswith("["):
+        raise Problem(f'{text!r} is not a list of overrides; quote each one: \'overrides=["a=1","b=[x,y]"]\'')
+    try:
+        override: Override = OverridesParser.create().parse_override(text)
+    except (OverrideParseException, HydraException) as error:
+        raise Problem(f"{text!r} is not a Hydra override ({str(error).splitlines()[0]}){hint}") from error
+    if override.is_sweep_override() or override.is_delete():
+        raise Problem(f"{text!r} is a {'sweep' if override.is_sweep_override() else 'deletion'}; give one value{hint}")
+    return override
+
+
+@cache
+def _read_option(group: str, option: str, searchpath: tuple[Path, ...]) -> dict[str, Any]:
+    for root in (*searchpath, CONFIGS):
+        file = root / group / f"{option}.yaml"
+        if file.is_file():
+            content = OmegaConf.to_container(OmegaConf.load(file), resolve=False)
+            assert isinstance(content, dict)  # noqa: S101
+            return {str(k): v for k, v in content.items()}
+    return {}
+
+
+@cache
+def _default_option(group: str) -> str:
+    for entry in OmegaConf.load(CONFIGS / "config.yaml").defaults:
+        if not isinstance(entry, str) and group in entry:
+            return str(entry[group])
+    raise KeyError(group)
+
+
+def default_of_run(name: str) -> Any:  # noqa: ANN401  (a setting's type is its own)
+    """Return the default of a setting of the run."""
+    settings = OmegaConf.to_container(OmegaConf.load(CONFIGS / "config.yaml"))
+    assert isinstance(settings, dict)  # noqa: S101
+    return settings[name]
+
+
+def _set(tree: dict[str, Any], path: list[str], value: Any) -> None:  # noqa: ANN401
+    """Set a value; a key that does not exist is set too, and found by the schema."""
+    for i, key in enumerate(path[:-1]):
+        node = tree.setdefault(key, {})
+        if not isinstance(node, dict):
+            raise Problem(f"{'.'.join(path)}: {'.'.join(path[: i + 1])} is a value ({node!r}), it has no keys")
+        tree = node
+    tree[path[-1]] = value
+
+
+def _explain(error: Any, config: dict[str, Any]) -> str:  # noqa: ANN401  (pydantic's own TypedDict)
+    """Turn one finding of the schema into a sentence with key, value and nearest valid name."""
+    path = [str(p) for p in error["loc"]]
+    key = ".".join(path)
+    if error["type"] == "extra_forbidden":
+        parent: Any = config
+        for part in path[:-1]:
+            parent = parent.get(part, {}) if isinstance(parent, dict) else {}
+        known = [k for k in _keys_of_schema(path[:-1]) or parent if k != path[-1]]
+        return f"{key}={_short(error['input'])}: unknown key{nearest(path[-1], known)}"
+    return f"{key}={_short(error['input'])}: {error['msg'][0].lower()}{error['msg'][1:]}"
+
+
+def _keys_of_schema(path: list[str]) -> list[str]:
+    model: Any = Unit
+    for part in path:
+        field = getattr(model, "model_fields", {}).get(part)
+        if field is None:
+            return []
+        model = field.annotation
+    return [k for k in getattr(model, "model_fields", {}) if k != "unit"]
+
+
+def _short(value: Any) -> str:  # noqa: ANN401
+    text = json.dumps(value, default=str)
+    return text if len(text) <= 60 else text[:57] + "..."

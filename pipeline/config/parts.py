@@ -1,0 +1,126 @@
+"""Each stage's own part of the configuration, in a file that is named after its content.
+
+A job cannot read a setting that is not in its part, and the name of the file is a parameter of its rule; so changing a
+setting reruns exactly the stages that read it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    from pipeline.config.campaign import Campaign
+
+# Dotted keys that a stage reads; {sensor} is the sensor that the stage is about.
+FIT = (
+    "table.motion",
+    "table.gravity_g",
+    "table.latitude_deg",
+    "table.azimuth_deg",
+    "procedure.holdout_every",
+    "method.{sensor}",
+    "method.as_printed",
+    "sensor.{sensor}.full_scale",
+    "sensor.{sensor}.counts_per_unit",
+    "sensor.{sensor}.noise_density",
+    "sensor.{sensor}.bias_wander",
+    "sensor.{sensor}.wander_time_s",
+)
+SENSORS_AND_TABLE = ("sensor", "table", "procedure.holdout_every")
+READS: dict[str, tuple[str, ...]] = {
+    "ingest": (
+        "ingest",
+        "procedure.folder",
+        "procedure.recordings",
+        "sensor.axis_map",
+        "sensor.accelerometer.full_scale",
+        "sensor.gyroscope.full_scale",
+    ),
+    "filter": ("filter",),
+    "fit": FIT,
+    "effects": (*FIT, "effects.{sensor}"),
+    "calibration": ("sensor.name", "table.name", "procedure.name", "method", "config_sha256"),
+    "validate": (*SENSORS_AND_TABLE, "limits"),
+    "diagnose": (*SENSORS_AND_TABLE, "effects", "method"),
+    "export": ("sensor", "table.gravity_g"),
+    "report": (
+        "sensor",
+        "table",
+        "procedure",
+        "method",
+        "filter",
+        "ingest",
+        "effects",
+        "limits",
+        "config_sha256",
+    ),
+    "gather": (),
+}
+
+
+def config_sha256(config: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of a unit's whole configuration, as canonical JSON."""
+    return hashlib.sha256(_canonical(config)).hexdigest()
+
+
+def part(config: Mapping[str, Any], stage: str, sensor: str = "") -> dict[str, Any]:
+    """Return what a stage reads of a unit's configuration.
+
+    Parameters
+    ----------
+    config : mapping
+        The unit's whole configuration.
+    stage : str
+        Key of ``READS``; other names are stages of a fit.
+    sensor : str
+        The sensor of a stage of a fit.
+    """
+    whole = {**config, "config_sha256": config_sha256(config)} if stage in ("calibration", "report") else config
+    out: dict[str, Any] = {}
+    for key in READS.get(stage, FIT):
+        path = key.format(sensor=sensor).split(".")
+        source: Any = whole
+        target = out
+        for step in path[:-1]:
+            source = source[step]
+            target = target.setdefault(step, {})
+        target[path[-1]] = source[path[-1]]
+    return out
+
+
+def write_part(campaign: Campaign, stage: str, units: Sequence[str], sensor: str = "") -> str:
+    """Write a stage's part of the configuration of some units, unless it is there; return the file's path."""
+    content: dict[str, Any] = {"units": {u: part(campaign.units[u].config, stage, sensor) for u in units}}
+    if stage in ("ingest", "report"):
+        content["campaign"] = campaign.name
+    if stage == "ingest":
+        content["directory"] = str(campaign.directory)
+    if stage == "gather":
+        content = {"campaign": campaign.name, "rows": {u: campaign.units[u].row for u in units}, "compare": []}
+    text = _canonical(content)
+    name = f"{stage}-{sensor}" if sensor else stage
+    path = campaign.results / "configs" / f"{name}-{hashlib.sha256(text).hexdigest()[:16]}.json"
+    if not path.is_file():
+        write_atomically(path, text)
+    return str(path)
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Write a file under a temporary name in the same folder, flush it, then rename it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    with temporary.open("wb") as stream:
+        stream.write(content)
+        stream.flush()
+        os.fsync(stream.fileno())
+    temporary.replace(path)
+
+
+def _canonical(value: Any) -> bytes:  # noqa: ANN401  (any JSON value)
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()

@@ -1,0 +1,123 @@
+"""What every stage has in common: a batch of units, handled one after the other, each guarded by itself.
+
+A unit that fails leaves ``<unit>.failed.json`` in the stage's folder; the stages after it pass it on, and the last rule
+turns it into the exit code. Files are written to a temporary name, flushed and renamed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import sys
+import traceback
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.errors import PipelineError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+FAILED = ".failed.json"
+
+
+@dataclass(frozen=True)
+class Job:
+    """One job: a stage on a batch.
+
+    Attributes
+    ----------
+    stage : str
+    units : dict of str to dict
+        Unit to its part of the configuration.
+    run : dict
+        What the part says beside the units.
+    inputs : dict of str to Path
+        Folders of the stages before.
+    output : Path
+    """
+
+    stage: str
+    units: dict[str, dict[str, Any]]
+    run: dict[str, Any]
+    inputs: dict[str, Path]
+    output: Path
+
+
+def parse_job(stage: str, argv: Sequence[str], inputs: Sequence[str], options: Sequence[str] = ()) -> Job:
+    """Read a stage's command line: ``--config PART.json --output DIR``, a folder for each input, and options."""
+    parser = argparse.ArgumentParser(prog=f"python -m pipeline {stage}", description=f"The stage {stage} on a batch.")
+    parser.add_argument("--config", type=Path, required=True, help="the stage's part of the configuration (JSON)")
+    parser.add_argument("--output", type=Path, required=True, help="folder or file to write")
+    for name in inputs:
+        parser.add_argument(f"--{name}", type=Path, required=True, help=f"folder of the stage {name}")
+    for name in options:
+        parser.add_argument(f"--{name}", default="", help=f"{name} of this stage")
+    arguments = vars(parser.parse_args(argv))
+    content = json.loads(arguments.pop("config").read_text())
+    run = {k: v for k, v in content.items() if k != "units"} | {name: arguments[name] for name in options}
+    folders = {name: arguments[name] for name in inputs}
+    return Job(stage, content.get("units", {}), run, folders, arguments["output"])
+
+
+def run_batch(job: Job, work: Callable[[str, dict[str, Any]], None]) -> int:
+    """Call ``work(unit, part)`` for each unit; a failure is recorded and the others go on.
+
+    Returns
+    -------
+    int
+        0: the job itself has succeeded; failures are in its output.
+    """
+    job.output.mkdir(parents=True, exist_ok=True)
+    for number, (unit, part) in enumerate(job.units.items(), 1):
+        print(f"{job.stage}: {unit} ({number} of {len(job.units)})", file=sys.stderr, flush=True)
+        earlier = [f for f in (folder / f"{unit}{FAILED}" for folder in job.inputs.values()) if f.is_file()]
+        if earlier:
+            shutil.copyfile(earlier[0], job.output / f"{unit}{FAILED}")
+            continue
+        try:
+            work(unit, part)
+        except PipelineError as error:
+            _record_failure(job, unit, error.code, error.message, error.file)
+        except OSError as error:
+            if error.filename is None or Path(str(error.filename)).is_relative_to(job.output):
+                raise  # a full disk or a folder that cannot be written is the run's trouble, not the unit's
+            _record_failure(job, unit, "bad_input", error.strerror or str(error), str(error.filename))
+        except Exception as error:  # noqa: BLE001  (one unit's bug never stops the others; its traceback is kept)
+            traceback.print_exc()
+            _record_failure(job, unit, "internal_error", f"{type(error).__name__}: {error} (a bug; see the log)", None)
+    return 0
+
+
+def _record_failure(job: Job, unit: str, code: str, message: str, file: str | None) -> None:
+    for leftover in job.output.glob(f"{unit}.*"):
+        if leftover.stem == unit and leftover.is_file():
+            leftover.unlink()
+    stage = "/".join([job.stage, *(str(job.run[k]) for k in ("sensor", "stage") if job.run.get(k))])
+    failure = {"unit": unit, "stage": stage, "code": code, "message": message, "file": file}
+    write_json(job.output / f"{unit}{FAILED}", failure)
+    print(f"{stage}: {unit} FAILED: {message}", file=sys.stderr, flush=True)
+
+
+def read_json(path: Path) -> Any:  # noqa: ANN401  (any JSON value)
+    """Read a JSON file of a run."""
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def write_json(path: Path, value: Any) -> None:  # noqa: ANN401
+    """Write a JSON file; numbers that JSON cannot hold are refused, not written."""
+    write_text(path, json.dumps(value, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file under a temporary name, flush it, then rename it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.tmp")
+    with temporary.open("w", encoding="utf-8", newline="\n") as stream:
+        stream.write(text)
+        stream.flush()
+        os.fsync(stream.fileno())
+    temporary.replace(path)

@@ -1,0 +1,66 @@
+"""Stage calibration: both sensors' fits, the inputs and the software in one document (CONTRACT section 6)."""
+
+from __future__ import annotations
+
+import platform
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
+
+from pipeline import __version__
+from pipeline.formats.parquet import load_recordings
+from pipeline.records import SENSORS
+from pipeline.stages.batch import parse_job, read_json, run_batch, write_json
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+LIBRARIES = ("numpy", "scipy", "pyarrow", "mcap")
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run the stage."""
+    job = parse_job("calibration", argv, ["ingest", "accelerometer", "gyroscope"])
+
+    def work(unit: str, part: dict[str, Any]) -> None:
+        fits = {sensor: read_json(job.inputs[sensor] / f"{unit}.json") for sensor in SENSORS}
+        reasons = {s: f["not_calibrated"] for s, f in fits.items() if "not_calibrated" in f}
+        document = header(unit, part) | {
+            "status": "ok",
+            "error": None,
+            "inputs": inputs(job.inputs["ingest"] / f"{unit}.parquet"),
+            "not_calibrated": reasons,
+        }
+        document |= {s: None if s in reasons else f for s, f in fits.items()}
+        write_json(job.output / f"{unit}.json", document)
+
+    return run_batch(job, work)
+
+
+def header(unit: str, part: dict[str, Any]) -> dict[str, Any]:
+    """Return what a calibration document says of a unit before anything of it is fitted."""
+    return {
+        "schema_version": 1,
+        "unit": unit,
+        "status": None,
+        "error": None,
+        **{group: part[group]["name"] for group in ("sensor", "table", "procedure", "method")},
+        "methods": {sensor: part["method"][sensor] for sensor in SENSORS},
+        "config_sha256": part["config_sha256"],
+        "software": {"imu-calibration": __version__, "python": platform.python_version()}
+        | {library: version(library) for library in LIBRARIES},
+    }
+
+
+def inputs(path: Path) -> list[dict[str, Any]]:
+    """Return file, hash, rows and notes of each input of a unit."""
+    return [
+        {
+            "recording": r.name,
+            "file": r.source.get("file"),
+            "sha256": r.source.get("sha256"),
+            "rows": r.source.get("rows"),
+            "notes": [vars(n) for n in r.notes],
+        }
+        for r in load_recordings(path)
+    ]

@@ -1,0 +1,29 @@
+"""Stage diagnose: which physical effect is missing, as far as the recordings can tell."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from pipeline.diagnosis.diagnose import diagnose
+from pipeline.formats.parquet import load_recordings
+from pipeline.signal.noise import estimate_noise
+from pipeline.stages.batch import parse_job, run_batch, write_json
+from pipeline.stages.fits import load_fits
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run the stage."""
+    job = parse_job("diagnose", argv, ["filter", "accelerometer", "gyroscope"])
+
+    def work(unit: str, part: dict[str, Any]) -> None:
+        recordings = load_recordings(job.inputs["filter"] / f"{unit}.parquet")
+        document: dict[str, Any] = {"schema_version": 1, "unit": unit}
+        for sensor, calibration in load_fits(job.inputs, unit).items():
+            noise = estimate_noise(sensor, recordings, part["sensor"][sensor])
+            document[sensor] = calibration and diagnose(calibration, recordings, noise, part)
+        write_json(job.output / f"{unit}.json", document)
+
+    return run_batch(job, work)

@@ -1,0 +1,73 @@
+"""Stage gather: publish every unit's files under their stable paths, and write the summary and the campaign page."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.report.campaign_page import render
+from pipeline.report.summary import summary_row, write_summary
+from pipeline.stages.batch import FAILED, parse_job, read_json, write_json, write_text
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+PUBLISHED = {"validate": "validations", "diagnose": "diagnoses"}
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run the stage; ``--output`` is the campaign's results, ``--batches`` the folder of the batches concerned."""
+    job = parse_job("gather", argv, [], ["batches"])
+    of_unit = {unit: Path(folder) for folder in job.run["batches"].split(",") for unit in _units(Path(folder))}
+    for name in ("calibrations", "validations", "diagnoses", "reports", "exports"):
+        shutil.rmtree(job.output / name, ignore_errors=True)
+        (job.output / name).mkdir(parents=True)
+    rows, failures = [], []
+    for unit, sheet_row in job.run["rows"].items():
+        batch = of_unit[unit]
+        failure = _failure(batch, unit)
+        publish(batch / "report" / f"{unit}.html", job.output / "reports" / f"{unit}.html")
+        documents: dict[str, Any] = {"validate": None, "diagnose": None}
+        if failure:
+            failures.append(failure)
+            document = batch / "report" / f"{unit}.calibration.json"
+            calibration = read_json(document)
+            publish(document, job.output / "calibrations" / f"{unit}.json")
+        else:
+            calibration = read_json(batch / "calibration" / f"{unit}.json")
+            publish(batch / "calibration" / f"{unit}.json", job.output / "calibrations" / f"{unit}.json")
+            for stage, folder in PUBLISHED.items():
+                documents[stage] = read_json(batch / stage / f"{unit}.json")
+                publish(batch / stage / f"{unit}.json", job.output / folder / f"{unit}.json")
+            for file in sorted((batch / "export" / unit).iterdir()):
+                publish(file, job.output / "exports" / unit / file.name)
+        rows.append(summary_row(unit, calibration, documents["validate"], documents["diagnose"], sheet_row))
+    write_summary(job.output / "summary.csv", rows)
+    write_json(job.output / "failures.json", failures)
+    write_text(job.output / "index.html", render(job.run["campaign"], rows, failures, job.run["compare"]))
+    return 0
+
+
+def publish(source: Path, target: Path) -> None:
+    """Give a file its stable path: a hard link, or a copy where the file system has none."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    target.unlink(missing_ok=True)
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copyfile(source, target)
+
+
+def _units(batch: Path) -> list[str]:
+    return [f.stem for f in (batch / "report").glob("*.html")]
+
+
+def _failure(batch: Path, unit: str) -> dict[str, Any] | None:
+    for stage in ("report", "export", "diagnose", "validate", "calibration"):
+        file = batch / stage / f"{unit}{FAILED}"
+        if file.is_file():
+            failure: dict[str, Any] = read_json(file)
+            return failure
+    return None

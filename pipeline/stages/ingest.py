@@ -1,0 +1,26 @@
+"""Stage ingest: a unit's files to one Parquet file with all its recordings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.formats.parquet import save_recordings
+from pipeline.formats.read import read_recordings
+from pipeline.stages.batch import parse_job, run_batch
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run the stage."""
+    job = parse_job("ingest", argv, [])
+    directory = Path(job.run["directory"])
+
+    def work(unit: str, part: dict[str, Any]) -> None:
+        folder = directory / part["procedure"]["folder"]
+        recordings = read_recordings(part["procedure"], part["ingest"], part["sensor"], folder)
+        save_recordings(job.output / f"{unit}.parquet", recordings)
+
+    return run_batch(job, work)

@@ -1,0 +1,36 @@
+"""Stage report: one page a unit, those that failed included."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from pipeline.formats.parquet import load_recordings
+from pipeline.report.unit_page import render
+from pipeline.stages.batch import FAILED, parse_job, read_json, run_batch, write_json, write_text
+from pipeline.stages.calibration import header
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+STAGES = ("calibration", "validate", "diagnose")
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run the stage."""
+    job = parse_job("report", argv, ["filter", *STAGES])
+
+    def work(unit: str, part: dict[str, Any]) -> None:
+        calibration, validation, diagnosis = (read_json(job.inputs[s] / f"{unit}.json") for s in STAGES)
+        recordings = load_recordings(job.inputs["filter"] / f"{unit}.parquet")
+        page = render(calibration, validation, diagnosis, recordings, part)
+        write_text(job.output / f"{unit}.html", page)
+
+    status = run_batch(job, work)
+    for unit, part in job.units.items():
+        failed = job.output / f"{unit}{FAILED}"
+        if failed.is_file():
+            document = header(unit, part) | {"status": "failed", "error": read_json(failed), "inputs": []}
+            document |= {"accelerometer": None, "gyroscope": None, "not_calibrated": {}}
+            write_json(job.output / f"{unit}.calibration.json", document)
+            write_text(job.output / f"{unit}.html", render(document, None, None, [], part))
+    return status

@@ -1,0 +1,16 @@
+# Both sensors' fits, the inputs and the software in one document.
+rule calibration:
+    input:
+        ingest=f"{BATCH}/ingest",
+        accelerometer=last_fit("accelerometer"),
+        gyroscope=last_fit("gyroscope"),
+    output:
+        directory(f"{BATCH}/calibration"),
+    log:
+        f"{LOG}/calibration.log",
+    params:
+        config=part("calibration"),
+        code=code_digest("pipeline.stages.calibration"),
+    shell:
+        "{RUN} calibration --config {params.config:q} --ingest {input.ingest:q} --accelerometer {input.accelerometer:q}"
+        " --gyroscope {input.gyroscope:q} --output {output:q} > {log:q} 2>&1"

@@ -1,0 +1,16 @@
+# Which physical effect is missing.
+rule diagnose:
+    input:
+        filter=f"{BATCH}/filter",
+        accelerometer=last_fit("accelerometer"),
+        gyroscope=last_fit("gyroscope"),
+    output:
+        directory(f"{BATCH}/diagnose"),
+    log:
+        f"{LOG}/diagnose.log",
+    params:
+        config=part("diagnose"),
+        code=code_digest("pipeline.stages.diagnose"),
+    shell:
+        "{RUN} diagnose --config {params.config:q} --filter {input.filter:q} --accelerometer {input.accelerometer:q}"
+        " --gyroscope {input.gyroscope:q} --output {output:q} > {log:q} 2>&1"

@@ -1,0 +1,15 @@
+# The calibration in the formats of those who use it.
+rule export:
+    input:
+        calibration=f"{BATCH}/calibration",
+        validate=f"{BATCH}/validate",
+    output:
+        directory(f"{BATCH}/export"),
+    log:
+        f"{LOG}/export.log",
+    params:
+        config=part("export"),
+        code=code_digest("pipeline.stages.export"),
+    shell:
+        "{RUN} export --config {params.config:q} --calibration {input.calibration:q} --validate {input.validate:q}"
+        " --output {output:q} > {log:q} 2>&1"

@@ -1,0 +1,36 @@
+# One stage of one sensor's method, on the result of the stage before it.
+def stage_before(wildcards):
+    chain = CAMPAIGN.chains[wildcards.batch][wildcards.sensor]
+    i = chain.index(wildcards.stage)
+    return f"{BATCH}/fit/{{sensor}}/{chain[i - 1]}".format(**wildcards) if i else []
+
+
+def part_of_fit(wildcards):
+    stage = "effects" if wildcards.stage == "effects" else f"fit-{wildcards.stage}"
+    return write_part(
+        CAMPAIGN, stage, CAMPAIGN.batches[wildcards.batch], wildcards.sensor
+    )
+
+
+def code_of_fit(wildcards):
+    modules = (
+        "pipeline.stages.fit",
+        f"pipeline.estimation.{wildcards.sensor}.{wildcards.stage}",
+    )
+    return "".join(code_digest(module) for module in modules)
+
+
+rule fit:
+    input:
+        filter=f"{BATCH}/filter",
+        previous=stage_before,
+    output:
+        directory(f"{BATCH}/fit/{{sensor}}/{{stage}}"),
+    log:
+        f"{LOG}/fit-{{sensor}}-{{stage}}.log",
+    params:
+        config=part_of_fit,
+        code=code_of_fit,
+    shell:
+        "{RUN} fit --config {params.config:q} --sensor {wildcards.sensor} --stage {wildcards.stage}"
+        " --filter {input.filter:q} --previous={input.previous:q} --output {output:q} > {log:q} 2>&1"

@@ -1,0 +1,17 @@
+# One page a unit, those that failed included.
+rule report:
+    input:
+        filter=f"{BATCH}/filter",
+        calibration=f"{BATCH}/calibration",
+        validate=f"{BATCH}/validate",
+        diagnose=f"{BATCH}/diagnose",
+    output:
+        directory(f"{BATCH}/report"),
+    log:
+        f"{LOG}/report.log",
+    params:
+        config=part("report"),
+        code=code_digest("pipeline.stages.report"),
+    shell:
+        "{RUN} report --config {params.config:q} --filter {input.filter:q} --calibration {input.calibration:q}"
+        " --validate {input.validate:q} --diagnose {input.diagnose:q} --output {output:q} > {log:q} 2>&1"

@@ -1,0 +1,16 @@
+# The error on held-out motion after each step.
+rule validate:
+    input:
+        filter=f"{BATCH}/filter",
+        accelerometer=last_fit("accelerometer"),
+        gyroscope=last_fit("gyroscope"),
+    output:
+        directory(f"{BATCH}/validate"),
+    log:
+        f"{LOG}/validate.log",
+    params:
+        config=part("validate"),
+        code=code_digest("pipeline.stages.validate"),
+    shell:
+        "{RUN} validate --config {params.config:q} --filter {input.filter:q} --accelerometer {input.accelerometer:q}"
+        " --gyroscope {input.gyroscope:q} --output {output:q} > {log:q} 2>&1"
