@@ -1,0 +1,297 @@
+"""Filters of the readings.
+
+RC low-pass (Sudsanguan 2019, eqs 3.3 to 3.14, an RC circuit discretised backwards), per axis:
+
+    a[n] = a[n-1] + k[n] (r[n] - a[n-1]),   k[n] = dt[n] / (dt[n] + RC),   f_c = 1 / (2 pi RC)
+
+where
+
+    r, a  : reading before and after
+    dt[n] : time since the sample before, s; at a lost sample it is twice as long, so the equation holds over gaps
+    RC    : time constant, s
+    f_c   : cutoff, Hz
+
+Butterworth low-pass, high-pass, band-pass and band-stop as second-order sections at the recording's median interval; at
+a gap (an interval above 1.5 medians) such a filter starts anew, because its state knows nothing of what was lost.
+
+A causal filter begins as if the first reading had lasted for ever, so a constant passes from the first sample on. Its
+output is late by the group delay,
+
+    delay = -d arg H / d omega = Re(sum n b_n z^-n / sum b_n z^-n) - Re(sum n a_n z^-n / sum a_n z^-n)
+
+with z = e^(i omega dt) (RC for the RC filter); a zero-phase filter runs forwards, then backwards, and has none, at the
+square of the attenuation. Both multiply the standard deviation of white noise by
+
+    noise_gain = sqrt(sum_n h[n]^2) = sqrt(mean over frequency of |H|^2)          (|H|^4 where zero-phase)
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from pipeline.errors import ConfigurationError, InputError
+from pipeline.records import Note
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from pipeline.records import Recording
+
+    Values = NDArray[np.float64]
+
+GAP = 1.5
+JITTER = 0.1
+BANDS: dict[str, Literal["lowpass", "highpass", "bandpass", "bandstop"]] = {
+    "low_pass": "lowpass",
+    "high_pass": "highpass",
+    "band_pass": "bandpass",
+    "band_stop": "bandstop",
+}
+
+
+def apply_filter(recording: Recording, settings: dict[str, Any]) -> Recording:
+    """Filter the accelerometer and gyroscope readings of a recording; everything else stays as it is.
+
+    Parameters
+    ----------
+    recording : Recording
+    settings : dict
+        ``name`` (``none``, ``rc_low_pass``, ``low_pass``, ``high_pass``, ``band_pass``, ``band_stop``), ``cutoff_hz``,
+        ``time_constant_s``, ``low_hz``, ``high_hz``, ``order``, ``zero_phase``.
+
+    Returns
+    -------
+    Recording
+        With ``filter`` holding the settings, ``delay_s`` (at 0 Hz; of a band-pass at the middle of its band; 0 for a
+        high-pass, which does not delay what is far above its cutoff) and ``noise_gain``.
+
+    Raises
+    ------
+    ConfigurationError
+        If a setting is missing or a cutoff is not below half the sampling rate.
+    InputError
+        If the recording is too short to have a sampling interval.
+    """
+    name = settings["name"]
+    if name == "none":
+        return recording
+    if recording.samples < 2:
+        raise InputError(
+            f"recording {recording.name} has {recording.samples} samples; a filter needs at least 2",
+            recording.source.get("file"),
+        )
+    zero_phase = bool(settings["zero_phase"])
+    interval = recording.interval
+    notes: tuple[Note, ...] = ()
+    if name == "rc_low_pass":
+        time_constant = _time_constant(settings, interval)
+        sections = _rc_section(time_constant, interval)
+        run = _rc_runner(recording.time, time_constant, zero_phase=zero_phase)
+    else:
+        sections = _butterworth_sections(settings, interval)
+        run = _section_runner(sections, _starts(recording), zero_phase=zero_phase)
+        notes = _timing_notes(recording)
+    delay = 0.0 if zero_phase else _delay(name, settings, sections, interval)
+    return replace(
+        recording,
+        accelerometer=None if recording.accelerometer is None else run(recording.accelerometer),
+        gyroscope=None if recording.gyroscope is None else run(recording.gyroscope),
+        notes=recording.notes + notes,
+        filter={**settings, "delay_s": delay, "noise_gain": noise_gain(sections, zero_phase=zero_phase)},
+        encodings={k: v for k, v in recording.encodings.items() if not k.startswith(("accel", "gyro"))},
+    )
+
+
+def rc_low_pass(time: Values, reading: Values, time_constant: float) -> Values:
+    """Filter readings by eq. 3.14, with the time since the sample before in each step.
+
+    Parameters
+    ----------
+    time : (n,) array, s
+    reading : (n, m) array
+    time_constant : float, s
+
+    Returns
+    -------
+    (n, m) array
+
+    Notes
+    -----
+    The recursion is summed in closed form over blocks: with P[n] = prod (1 - k), ``a[n] = P[n] (a[0] + sum k r / P)``.
+    A block ends before P falls to 1e-100, which keeps all digits.
+    """
+    if time_constant == 0.0:
+        return reading.copy()
+    dt = np.diff(time)
+    k = np.concatenate([[0.0], dt / (dt + time_constant)])
+    decay = np.cumsum(np.log1p(-k))
+    out = np.empty_like(reading)
+    last, start = reading[0], 0
+    while start < len(time):
+        level = decay[start - 1] if start else 0.0
+        stop = max(start + 1, int(np.searchsorted(-decay, 230.0 - level, side="right")))
+        P = np.exp(decay[start:stop] - level)[:, None]
+        out[start:stop] = P * (last + np.cumsum(k[start:stop, None] * reading[start:stop] / P, axis=0))
+        last, start = out[stop - 1], stop
+    return out
+
+
+def group_delay(sections: Values, omega: float) -> float:
+    """Return the group delay of second-order sections.
+
+    Parameters
+    ----------
+    sections : (m, 6) array
+        Rows b0 b1 b2 a0 a1 a2.
+    omega : float, rad a sample
+
+    Returns
+    -------
+    float, samples
+    """
+    n = np.arange(3)
+    turn = np.exp(-1j * omega * n)
+
+    def delay(c: Values) -> Values:
+        return np.real((c @ (n * turn)) / (c @ turn))
+
+    return float(np.sum(delay(sections[:, :3]) - delay(sections[:, 3:])))
+
+
+def noise_gain(sections: Values, *, zero_phase: bool) -> float:
+    """Return the factor on the standard deviation of white noise.
+
+    Parameters
+    ----------
+    sections : (m, 6) array
+    zero_phase : bool
+
+    Returns
+    -------
+    float
+
+    Notes
+    -----
+    The mean of |H|^2 over N frequencies differs from ``sum h^2`` by terms of size r^N, r the largest pole radius; N is
+    chosen for r^N < 1e-16.
+    """
+    radius = max(float(np.max(np.abs(np.roots(a)))) if np.any(a[1:]) else 0.0 for a in sections[:, 3:])
+    size = 2 ** int(np.clip(np.ceil(np.log2(-40.0 / np.log(np.clip(radius, 1e-6, 1.0 - 1e-9)))), 10, 20))
+    response = np.ones(size // 2 + 1)
+    for row in sections:
+        response *= np.abs(np.fft.rfft(row[:3], size) / np.fft.rfft(row[3:], size)) ** (4 if zero_phase else 2)
+    weight = np.full(len(response), 2.0)
+    weight[[0, -1]] = 1.0
+    return float(np.sqrt(weight @ response / size))
+
+
+def _time_constant(settings: dict[str, Any], interval: float) -> float:
+    """Return RC in s, from the cutoff where one is given."""
+    cutoff, time_constant = settings["cutoff_hz"], settings["time_constant_s"]
+    if cutoff is None and time_constant is None:
+        raise ConfigurationError("filter rc_low_pass needs filter.cutoff_hz (Hz) or filter.time_constant_s (s)")
+    if cutoff is None:
+        if time_constant < 0:
+            raise ConfigurationError(f"filter.time_constant_s is {time_constant:g} s; it cannot be negative")
+        return float(time_constant)
+    _require_below_nyquist("cutoff_hz", cutoff, interval)
+    return float(1.0 / (2.0 * np.pi * cutoff))
+
+
+def _require_below_nyquist(key: str, frequency: float | None, interval: float) -> None:
+    nyquist = 0.5 / interval
+    if frequency is None:
+        raise ConfigurationError(f"filter.{key} is null; this filter needs it, in Hz, below {nyquist:.4g} Hz")
+    if not 0.0 < frequency < nyquist:
+        raise ConfigurationError(
+            f"filter.{key} is {frequency:g} Hz, but the readings come every {interval:.4g} s: it must lie between 0 "
+            f"and half the sampling rate, {nyquist:.4g} Hz"
+        )
+
+
+def _rc_section(time_constant: float, interval: float) -> Values:
+    k = interval / (interval + time_constant)
+    return np.array([[k, 0.0, 0.0, 1.0, k - 1.0, 0.0]])
+
+
+def _rc_runner(time: Values, time_constant: float, *, zero_phase: bool) -> Callable[[Values], Values]:
+    def run(reading: Values) -> Values:
+        forward = rc_low_pass(time, reading, time_constant)
+        return rc_low_pass(-time[::-1], forward[::-1], time_constant)[::-1] if zero_phase else forward
+
+    return run
+
+
+def _butterworth_sections(settings: dict[str, Any], interval: float) -> Values:
+    from scipy.signal import butter  # noqa: PLC0415  (0.6 s that the default, no filter, does not pay)
+
+    name, order = settings["name"], settings["order"]
+    if name not in BANDS:
+        raise ConfigurationError(f"filter.name is {name!r}; it is one of none, rc_low_pass, {', '.join(BANDS)}")
+    if not isinstance(order, int) or not 1 <= order <= 12:
+        raise ConfigurationError(f"filter.order is {order!r}; it must be a whole number from 1 to 12")
+    keys = ("low_hz", "high_hz") if name.startswith("band") else ("cutoff_hz",)
+    for key in keys:
+        _require_below_nyquist(key, settings[key], interval)
+    edges = [float(settings[key]) for key in keys]
+    if len(edges) == 2 and edges[0] >= edges[1]:
+        raise ConfigurationError(f"filter.low_hz is {edges[0]:g} Hz; it must be below filter.high_hz, {edges[1]:g} Hz")
+    band = edges if len(edges) == 2 else edges[0]
+    return butter(order, band, BANDS[name], output="sos", fs=1.0 / interval)
+
+
+def _section_runner(sections: Values, starts: list[int], *, zero_phase: bool) -> Callable[[Values], Values]:
+    from scipy.signal import sosfilt, sosfilt_zi, sosfiltfilt  # noqa: PLC0415  (see _butterworth_sections)
+
+    at_rest = sosfilt_zi(sections)[:, :, None]
+
+    def run(reading: Values) -> Values:
+        out = np.empty_like(reading)
+        for start, stop in pairwise(starts):
+            part = reading[start:stop]
+            if zero_phase:
+                padding = min(6 * len(sections) + 3, stop - start - 1)
+                out[start:stop] = sosfiltfilt(sections, part, axis=0, padlen=padding)
+            else:
+                out[start:stop] = sosfilt(sections, part, axis=0, zi=at_rest * part[0])[0]
+        return out
+
+    return run
+
+
+def _starts(recording: Recording) -> list[int]:
+    """Return where the stretches without a gap begin, and the end."""
+    gaps = np.flatnonzero(np.diff(recording.time) > GAP * recording.interval) + 1
+    return [0, *gaps.tolist(), recording.samples]
+
+
+def _timing_notes(recording: Recording) -> tuple[Note, ...]:
+    """Say where the samples are not what a filter of evenly spaced samples expects."""
+    notes = []
+    starts = _starts(recording)
+    if len(starts) > 2:
+        detail = f"{recording.name}: the filter started anew after each of {len(starts) - 2} gaps"
+        notes.append(Note("N-FILTER-RESTART", len(starts) - 2, 0, 0, detail))
+    dt = np.diff(recording.time)
+    uneven = np.abs(dt / recording.interval - 1.0)
+    count = int(np.sum((uneven > JITTER) & (dt <= GAP * recording.interval)))
+    if count > 0.05 * len(dt):
+        detail = f"{recording.name}: {count} intervals are off the median by over 10 %; the filter takes them as even"
+        notes.append(Note("N-FILTER-JITTER", count, 0, 0, detail))
+    return tuple(notes)
+
+
+def _delay(name: str, settings: dict[str, Any], sections: Values, interval: float) -> float:
+    if name == "high_pass":
+        return 0.0
+    omega = 0.0
+    if name == "band_pass":  # the middle of the band as the bilinear transform maps it
+        edges = np.tan(np.pi * interval * np.array([settings["low_hz"], settings["high_hz"]]))
+        omega = 2.0 * float(np.arctan(np.sqrt(np.prod(edges))))
+    return group_delay(sections, omega) * interval
