@@ -1,0 +1,83 @@
+"""Lay out an empty campaign with comments."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import yaml
+
+from pipeline.errors import ConfigurationError, InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+GROUPS = ("sensor", "table", "procedure", "method", "filter", "ingest")
+HEADER = "unit,serial,lot,date,sensor,procedure,overrides"
+SETTINGS = """\
+# Hydra overrides for all units of this campaign; units.csv and the command line are stronger.
+overrides:
+  []
+  # - table.gravity_g=0.9976          # local gravity, g (9.80665 m/s^2)
+  # - filter=rc_low_pass              # a group: one of its options
+  # - filter.cutoff_hz=2.0            # a value
+  # - effects.gyroscope=[g_sensitivity]
+  # - limits.gyroscope.held_out_rms_error=0.05
+  # - batch_size=50                   # units that one job handles
+"""
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run ``python -m pipeline new DIR``."""
+    parser = argparse.ArgumentParser(prog="python -m pipeline new", description=__doc__)
+    parser.add_argument("directory", type=Path, metavar="DIR", help="the campaign's directory; made if need be")
+    parser.add_argument("--sensor", default="generic", help="sensor model of the example row (default: generic)")
+    parser.add_argument("--procedure", default="three_axis_turns", help="procedure (default: three_axis_turns)")
+    parser.add_argument("--unit", default="U1", help="name of the example unit (default: U1)")
+    arguments = parser.parse_args(argv)
+    sheet = arguments.directory / "units.csv"
+    if sheet.exists():
+        raise InputError("exists; a campaign is not laid out over another one", str(sheet))
+    _option("sensor", arguments.sensor)
+    procedure = _option("procedure", arguments.procedure)
+    folder = arguments.directory / procedure["folder"].replace("{unit}", arguments.unit)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "README.md").write_text(_recordings(arguments.procedure, procedure), encoding="utf-8")
+    (arguments.directory / "campaign.yaml").write_text(SETTINGS + _options(), encoding="utf-8")
+    row = f"{arguments.unit},,,,{arguments.sensor},{arguments.procedure},"
+    sheet.write_text(f"{HEADER}\n{row}\n", encoding="utf-8")
+    print(f"{sheet}: one row a unit; recordings go to {folder} (its README.md says which)")
+    print(f"then: snakemake --cores 2 --config campaign={arguments.directory}")
+    return 0
+
+
+def _option(group: str, name: str) -> dict[str, Any]:
+    file = CONFIGS / group / f"{name}.yaml"
+    if not file.is_file():
+        options = ", ".join(sorted(f.stem for f in (CONFIGS / group).glob("*.yaml")))
+        raise ConfigurationError(f"no {group} is called {name!r}; known: {options}")
+    content: dict[str, Any] = yaml.safe_load(file.read_text(encoding="utf-8"))
+    return content
+
+
+def _recordings(name: str, procedure: dict[str, Any]) -> str:
+    lines = [f"# Recordings of the procedure {name}", "", "`.mcap` in place of `.csv` works for each.", ""]
+    for recording in procedure["recordings"].values():
+        axis = f", turns about {recording['axis']}" if recording["axis"] else ""
+        optional = " (optional)" if recording["optional"] else ""
+        lines.append(f"- `{recording['file']}.csv`: {recording['role']}{axis}{optional}")
+    columns = "time_s, accel_x_g, accel_y_g, accel_z_g, gyro_x_dps, gyro_y_dps, gyro_z_dps"
+    optional = "temperature_degc, table_angle_deg, table_rate_dps, table_qw, table_qx, table_qy, table_qz"
+    lines += ["", f"Columns of a canonical CSV: {columns}, and where known {optional}.", ""]
+    lines += ["Other columns, units and raw counts: describe them in an ingest config.", ""]
+    return "\n".join(lines)
+
+
+def _options() -> str:
+    lines = ["", "# Groups and their options (columns of units.csv, or overrides):"]
+    for group in GROUPS:
+        options = ", ".join(sorted(f.stem for f in (CONFIGS / group).glob("*.yaml")))
+        lines.append(f"#   {group}: {options}")
+    return "\n".join(lines) + "\n"
