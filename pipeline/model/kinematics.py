@@ -116,12 +116,13 @@ def _motion_of_turn(
 
         position, velocity = CubicHermiteSpline(time, angle, rate), CubicHermiteSpline(time, rate, acceleration)
         angle, rate, acceleration = position(time + offset), velocity(time + offset), velocity(time + offset, 1)
-    force = gravity_g * turn_about_axis(UP_AT_ZERO[axis], axis, -angle)
+    level = np.stack([turn_about_axis(row, axis, -angle) for row in LEVEL_AT_ZERO[axis]], axis=1)
+    force = gravity_g * level[:, 2, :]
     omega, alpha = np.zeros_like(force), np.zeros_like(force)
     omega[:, axis], alpha[:, axis] = rate, acceleration
     force_rate = -np.cross(np.radians(omega), force)
     if earth is not None:
-        omega = omega + turn_about_axis(earth @ LEVEL_AT_ZERO[axis], axis, -angle)
+        omega = omega + np.einsum("i,nij->nj", earth, level)
     return Motion(
         time=time,
         specific_force=force,
@@ -134,6 +135,7 @@ def _motion_of_turn(
         axis=axis,
         still=still,
         at_offset=partial(reference_motion, recording, gravity_g, earth),
+        level=level,
     )
 
 
@@ -175,6 +177,7 @@ def _motion_of_attitude(
         axis=None,
         still=still_samples(time, rate),
         at_offset=partial(reference_motion, recording, gravity_g, earth),
+        level=level,
     )
 
 

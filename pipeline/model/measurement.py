@@ -24,7 +24,23 @@ def predicted_reading(calibration: SensorCalibration, motion: Motion) -> NDArray
     motion : Motion
     """
     K = np.linalg.solve(calibration.matrix, np.eye(3))
+    motion = felt_motion(calibration, motion)
     reading = calibration.bias + truth(calibration.sensor, motion) @ K.T
     for fitted in calibration.effects:
-        reading = reading + effect(fitted.name).reading(calibration.sensor, motion, K, fitted.values)
+        if not effect(fitted.name).moves:
+            reading = reading + effect(fitted.name).reading(calibration.sensor, motion, K, fitted.values)
     return reading
+
+
+def felt_motion(calibration: SensorCalibration, motion: Motion) -> Motion:
+    """Return the motion that the sensor felt at its time stamps, after the fitted effects of timing.
+
+    Parameters
+    ----------
+    calibration : SensorCalibration
+    motion : Motion
+        By the clock of the reference.
+    """
+    for fitted in calibration.effects:
+        motion = effect(fitted.name).moved(motion, fitted.values)
+    return motion

@@ -35,6 +35,11 @@ class Motion:
     at_offset : callable or None
         ``at_offset(offset=tau)`` is the motion at ``time + tau`` (tau a float or (n,) array, s), from the same
         interpolated trajectory; None where the trajectory is not known between the samples.
+    level : (n, 3, 3) array, or None
+        Rows: the level frame's axes x, y, z in the body frame; None where no reference gives the heading.
+    direction : (n, 3) array, or None
+        Unit vector in the body frame of the turn that goes on or, at rest, of the last one; zeros before the first.
+        None: not worked out yet (``pipeline.model.effects.base.turning_direction`` does it from the rates).
     """
 
     time: NDArray[np.float64]
@@ -48,3 +53,5 @@ class Motion:
     axis: int | None
     still: NDArray[np.bool_]
     at_offset: Callable[..., Motion | None] | None = None
+    level: NDArray[np.float64] | None = None
+    direction: NDArray[np.float64] | None = None

@@ -6,6 +6,9 @@ An effect adds to the reading of a sensor:
 
 where ``p`` are its parameters and ``z`` vanishes at ``p = 0``. It says its value and its derivative; both in the
 measurement direction, from a motion that has no noise, so that fitting it is linear wherever the physics is.
+
+Effects of timing move the motion instead: ``reading(t) = bias + K @ truth' + z(motion')``, where the primed motion is
+what the sensor felt at the sample's time stamp (``Effect.moved``).
 """
 
 from __future__ import annotations
@@ -17,12 +20,16 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from pipeline.errors import InputError
 from pipeline.records import SENSORS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.records import Motion
+
+REFERENCE_TEMPERATURE = 25.0
+STANDARD_GRAVITY = 9.80665
 
 
 class Owner(StrEnum):
@@ -32,6 +39,14 @@ class Owner(StrEnum):
     RECORDING = "recording"
     MOUNTING = "mounting"
     TABLE = "table"
+
+
+class Layout(StrEnum):
+    """How regressors act on the three axes."""
+
+    PER_AXIS = "per_axis"  # (n, 3, q): each axis has q regressors and q coefficients of its own
+    EVERY_AXIS = "every_axis"  # (n, q): the same q regressors for each axis, with coefficients of its own
+    SHARED = "shared"  # (n, 3, p): p coefficients that the axes share
 
 
 @dataclass(frozen=True)
@@ -52,19 +67,36 @@ class Effect(abc.ABC):
     owner : Owner
     sensors : tuple of str
         The sensors to which it applies.
+    layout : Layout
     needs : tuple of str
-        What the recording must hold beside a motion: ``temperature``, ``angle``.
+        What the recording must hold beside a motion: ``temperature``, ``angle``, ``level``.
+    needs_clock : bool
+        Whether the time between the recordings must be known.
+    nonlinear : tuple of str
+        Parameters in which the reading is not linear.
+    unseen : dict of str to str
+        Sensor to the reason why the effect never changes its readings.
+    meaning : str
+        One sentence for the reader of a report.
     excitation : str
         What a recording must do for this effect to show, as advice to the user.
+    experiment : str
+        What separates it from its look-alikes, as advice to the user.
     source : str
         Where the equation comes from.
     """
 
     name: ClassVar[str]
     owner: ClassVar[Owner]
+    layout: ClassVar[Layout]
     sensors: ClassVar[tuple[str, ...]] = SENSORS
     needs: ClassVar[tuple[str, ...]] = ()
+    needs_clock: ClassVar[bool] = False
+    nonlinear: ClassVar[tuple[str, ...]] = ()
+    unseen: ClassVar[dict[str, str]] = {}
+    meaning: ClassVar[str]
     excitation: ClassVar[str]
+    experiment: ClassVar[str]
     source: ClassVar[str]
 
     @abc.abstractmethod
@@ -72,10 +104,10 @@ class Effect(abc.ABC):
         """Return the parameters for ``sensor``; units in g or deg/s and their products."""
 
     @abc.abstractmethod
-    def columns(
+    def regressors(
         self, sensor: str, motion: Motion, K: NDArray[np.float64], values: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the derivative of the reading with respect to each parameter, at ``values``: (n, 3, p) array.
+        """Return the derivatives of the reading in the shape that ``layout`` says.
 
         Parameters
         ----------
@@ -86,6 +118,15 @@ class Effect(abc.ABC):
         values : (p,) array
         """
 
+    def columns(
+        self, sensor: str, motion: Motion, K: NDArray[np.float64], values: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the derivative of the reading with respect to each parameter, at ``values``: (n, 3, p) array."""
+        regressors = self.regressors(sensor, motion, K, values)
+        if self.layout == Layout.SHARED:
+            return regressors
+        return per_axis(regressors) if self.layout == Layout.PER_AXIS else every_axis(regressors)
+
     def reading(
         self, sensor: str, motion: Motion, K: NDArray[np.float64], values: NDArray[np.float64]
     ) -> NDArray[np.float64]:
@@ -95,6 +136,20 @@ class Effect(abc.ABC):
         """
         added: NDArray[np.float64] = self.columns(sensor, motion, K, values) @ values
         return added
+
+    def moved(self, motion: Motion, values: NDArray[np.float64]) -> Motion:
+        """Return the motion that the sensor felt at the time stamps; effects that are not of timing leave it."""
+        del values
+        return motion
+
+    @property
+    def moves(self) -> bool:
+        """Whether the effect moves the motion in time."""
+        return type(self).moved is not Effect.moved
+
+    def starts(self, sensor: str) -> list[NDArray[np.float64]]:
+        """Return the values from which a fit starts, several where the reading is not linear in them."""
+        return [np.zeros(len(self.parameters(sensor)))]
 
     def available(self, motion: Motion) -> bool:
         """Return whether the motion holds what the effect needs."""
@@ -111,11 +166,56 @@ def truth_rate(sensor: str, motion: Motion) -> NDArray[np.float64]:
     return motion.specific_force_rate if sensor == "accelerometer" else motion.angular_acceleration
 
 
+def temperature_difference(motion: Motion) -> NDArray[np.float64]:
+    """Return the temperature above the reference of 25 degC: (n,) array, degC.
+
+    Raises
+    ------
+    InputError
+        If the recording holds no temperature.
+    """
+    if motion.temperature is None:
+        raise InputError(
+            "an effect of temperature is asked for, but the recording holds no temperature; "
+            "record one, or take the effect out of the configuration"
+        )
+    return motion.temperature - REFERENCE_TEMPERATURE
+
+
+def turning_direction(motion: Motion) -> NDArray[np.float64]:
+    """Return the unit vector of the turn that goes on or, at rest, of the last one: (n, 3) array, body frame.
+
+    A turn about a table's axis is seen in its rate and in its angle (a step may lie between two samples); any other
+    is one faster than 0.25 deg/s.
+    """
+    if motion.direction is not None:
+        return motion.direction
+    if motion.axis is not None and motion.rate is not None and motion.angle is not None:
+        step = np.diff(motion.angle, prepend=motion.angle[0])
+        sign = np.where(
+            np.abs(motion.rate) > 0.02, np.sign(motion.rate), np.where(np.abs(step) > 5e-3, np.sign(step), 0)
+        )
+        now = np.zeros_like(motion.angular_rate)
+        now[:, motion.axis] = sign
+        turning = sign != 0
+    else:
+        magnitude = np.linalg.norm(motion.angular_rate, axis=1)
+        turning = magnitude > 0.25
+        now = motion.angular_rate / np.where(turning, magnitude, 1.0)[:, None]
+    last = np.maximum.accumulate(np.where(turning, np.arange(len(turning)), -1))
+    held: NDArray[np.float64] = np.where(last[:, None] >= 0, now[last], 0.0)
+    return held
+
+
 def per_axis(regressors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Spread (n, 3) regressors, one coefficient an axis, to (n, 3, 3) columns."""
-    out = np.zeros((len(regressors), 3, 3))
-    out[:, [0, 1, 2], [0, 1, 2]] = regressors
-    return out
+    """Spread (n, 3, q) regressors, q coefficients an axis, to (n, 3, 3 q) columns.
+
+    Parameter order: all of x, then y, then z.
+    """
+    n, _, q = regressors.shape
+    out = np.zeros((n, 3, 3, q))
+    out[:, [0, 1, 2], [0, 1, 2], :] = regressors
+    return out.reshape(n, 3, 3 * q)
 
 
 def every_axis(regressors: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -123,17 +223,25 @@ def every_axis(regressors: NDArray[np.float64]) -> NDArray[np.float64]:
 
     Parameter order: all of x, then y, then z, so that ``values.reshape(3, q) @ regressors[i]`` is what is added.
     """
-    n, q = regressors.shape
-    out = np.zeros((n, 3, 3, q))
-    out[:, [0, 1, 2], [0, 1, 2], :] = regressors[:, None, :]
-    return out.reshape(n, 3, 3 * q)
+    return per_axis(np.broadcast_to(regressors[:, None, :], (len(regressors), 3, regressors.shape[1])))
 
 
 def axis_parameters(symbol: str, unit: str, meaning: str) -> tuple[Parameter, ...]:
     """Return one parameter an axis, ``<symbol>_x .. <symbol>_z``."""
-    return tuple(Parameter(f"{symbol}_{a}", unit, meaning) for a in "xyz")
+    return tuple(Parameter(f"{symbol}_{a}", unit, f"{meaning}, {a} axis") for a in "xyz")
+
+
+def matrix_parameters(symbol: str, unit: str, meaning: str) -> tuple[Parameter, ...]:
+    """Return nine parameters ``<symbol>_xx, <symbol>_xy .. <symbol>_zz``: of the first axis, along the second."""
+    return tuple(Parameter(f"{symbol}_{a}{b}", unit, f"{meaning}, {a} axis, along {b}") for a in "xyz" for b in "xyz")
 
 
 def unit_of(sensor: str) -> str:
     """Return the unit of a sensor's readings."""
     return "g" if sensor == "accelerometer" else "deg/s"
+
+
+def per_unit_of(sensor: str, power: int = 1) -> str:
+    """Return the unit of one over a power of a sensor's readings: ``1/g``, ``1/(deg/s)^2``."""
+    unit = "g" if sensor == "accelerometer" else "(deg/s)"
+    return f"1/{unit}" if power == 1 else f"1/{unit}^{power}"

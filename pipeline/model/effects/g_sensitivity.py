@@ -2,14 +2,14 @@
 
     z = G f
 
-where G is (3, 3), deg/s/g, and f the specific force in g (IEEE Std 528-2019, "g-sensitive drift").
+where G is (3, 3), deg/s/g, and f the specific force in g.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.model.effects.base import Effect, Owner, Parameter, every_axis
+from pipeline.model.effects.base import Effect, Layout, Owner, Parameter, matrix_parameters
 
 if TYPE_CHECKING:
     import numpy as np
@@ -23,22 +23,28 @@ class GSensitivity(Effect):
 
     name = "g_sensitivity"
     owner = Owner.SENSOR
+    layout = Layout.EVERY_AXIS
     sensors = ("gyroscope",)
-    excitation = "turns about all three axes in which gravity moves through the body"
-    source = "IEEE Std 528-2019; MPU-6000/6050 product specification 3.4, linear acceleration sensitivity"
+    meaning = "A gyroscope reads a part of the specific force."
+    excitation = "turns about all three axes in which gravity moves through the body, or rests in several attitudes"
+    experiment = (
+        "turn the table's home about the vertical: Earth's rotation stays with Earth, the sensitivity with the unit"
+    )
+    source = (
+        "IEEE Std 528-2019, g-sensitive drift; MPU-6000/6050 product specification 6.1, linear acceleration sensitivity"
+    )
 
     def parameters(self, sensor: str) -> tuple[Parameter, ...]:
         """Return G, row by row."""
         del sensor
-        meaning = "rate read per g"
-        return tuple(Parameter(f"G_{a}{b}", "deg/s/g", f"{a} {meaning} along {b}") for a in "xyz" for b in "xyz")
+        return matrix_parameters("G", "deg/s/g", "rate read per specific force")
 
-    def columns(
+    def regressors(
         self, sensor: str, motion: Motion, K: NDArray[np.float64], values: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return f for each axis."""
+        """Return f."""
         del sensor, K, values
-        return every_axis(motion.specific_force)
+        return motion.specific_force
 
 
 EFFECT = GSensitivity()

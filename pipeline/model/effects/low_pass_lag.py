@@ -1,0 +1,82 @@
+"""A low-pass filter inside the sensor.
+
+    reading(t) = model(u'),    u'(t) = integral_0^inf exp(-s / tau) / tau u(t - s) ds,    z = K [u'(t) - u(t)]
+
+where tau is the time constant of the filter, s (0 and more), u the truth, g or deg/s, and K the inverse of the
+calibration matrix. The integral is a Gauss-Laguerre sum, exact where u is a polynomial of degree 7 in time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.model.effects.base import Effect, Layout, Owner, Parameter, truth, truth_rate
+from pipeline.model.effects.time_offset import shifted
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pipeline.records import Motion
+
+NODES, WEIGHTS = np.polynomial.laguerre.laggauss(4)
+
+
+class LowPassLag(Effect):
+    """A first-order lag: one coefficient."""
+
+    name = "low_pass_lag"
+    owner = Owner.TABLE
+    layout = Layout.SHARED
+    nonlinear = ("tau",)
+    meaning = "A low-pass filter inside the sensor makes it lag behind the motion."
+    excitation = "readings while the table turns at 10 deg/s and more, or while it speeds up and slows down"
+    experiment = "turn in both directions with fast ramps (30 deg/s and more): a delay and a lag differ only there"
+    source = "MPU-6000/6050 register map, DLPF_CFG, delay of 1 to 19 ms; first-order lag"
+
+    def parameters(self, sensor: str) -> tuple[Parameter, ...]:
+        """Return tau."""
+        del sensor
+        return (Parameter("tau", "s", "time constant of the filter"),)
+
+    def regressors(
+        self, sensor: str, motion: Motion, K: NDArray[np.float64], values: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return ``K du'/dtau``."""
+        slope = np.zeros_like(motion.specific_force)
+        for node, weight in zip(NODES, WEIGHTS, strict=True):
+            slope -= weight * node * truth_rate(sensor, shifted(motion, -max(values[0], 0.0) * node))
+        return (slope @ K.T)[:, :, None]
+
+    def reading(
+        self, sensor: str, motion: Motion, K: NDArray[np.float64], values: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return ``K [u'(t) - u(t)]``."""
+        change = truth(sensor, self.moved(motion, values)) - truth(sensor, motion)
+        added: NDArray[np.float64] = change @ K.T
+        return added
+
+    def moved(self, motion: Motion, values: NDArray[np.float64]) -> Motion:
+        """Return the motion that a sensor with this lag feels."""
+        if values[0] <= 0.0:
+            return motion
+        nodes = [shifted(motion, -values[0] * node) for node in NODES]
+
+        def mean(name: str) -> NDArray[np.float64]:
+            total = np.zeros_like(motion.specific_force)
+            for weight, node in zip(WEIGHTS, nodes, strict=True):
+                total += weight * getattr(node, name)
+            return total
+
+        return replace(
+            motion,
+            specific_force=mean("specific_force"),
+            angular_rate=mean("angular_rate"),
+            angular_acceleration=mean("angular_acceleration"),
+            specific_force_rate=mean("specific_force_rate"),
+        )
+
+
+EFFECT = LowPassLag()

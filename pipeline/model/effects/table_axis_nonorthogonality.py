@@ -1,0 +1,75 @@
+"""Turn axes of the table that are not at right angles.
+
+    accelerometer:  z = K [theta x f - R_a(-A) (theta x f_0)] (pi/180),    theta = e_a x d_a
+    gyroscope:      z = K (pi/180) d_a dA/dt
+
+for turns about axis a, where d_a is how far that axis leans, deg, along the other two body axes at angle 0, e_a its
+unit vector, A the table angle, R_a the rotation about it, f the specific force, f_0 that at angle 0, and K the inverse
+of the calibration matrix.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.model.effects.base import Effect, Layout, Owner, Parameter
+from pipeline.model.kinematics import UP_AT_ZERO
+from pipeline.model.rotation import turn_about_axis
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pipeline.records import Motion
+
+LEANS = (
+    ("x", "y"),
+    ("x", "z"),
+    ("y", "z"),
+    ("y", "x"),
+    ("z", "x"),
+    ("z", "y"),
+)  # the axis, and the other two in cyclic order
+
+
+class TableAxisNonorthogonality(Effect):
+    """Non-orthogonality of the table's axes: six coefficients."""
+
+    name = "table_axis_nonorthogonality"
+    owner = Owner.TABLE
+    layout = Layout.SHARED
+    needs = ("level",)
+    meaning = "The axes that the table turns about are not at right angles."
+    excitation = "turns about all three axes"
+    experiment = "turn the unit on its mount by 90 deg and repeat, or take the axes in another order"
+    source = "Acutronic AC33xx specification, orthogonality; first-order geometry of a turn"
+
+    def parameters(self, sensor: str) -> tuple[Parameter, ...]:
+        """Return d, axis by axis."""
+        del sensor
+        return tuple(Parameter(f"d_{a}{b}", "deg", f"lean of table axis {a} toward {b}") for a, b in LEANS)
+
+    def regressors(
+        self, sensor: str, motion: Motion, K: NDArray[np.float64], values: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the columns of the axis turned about, zeros for the others."""
+        del values
+        out = np.zeros((len(motion.time), 3, 6))
+        if motion.axis is None or motion.angle is None or motion.rate is None:
+            return out
+        axis, f = motion.axis, motion.specific_force
+        gravity = np.linalg.norm(f, axis=1)[:, None]
+        for step in (1, 2):
+            lean = np.zeros(3)
+            lean[(axis + step) % 3] = np.radians(1.0)
+            theta = np.cross(np.eye(3)[axis], lean)
+            home = turn_about_axis(np.cross(theta, UP_AT_ZERO[axis]), axis, -motion.angle)
+            change = np.cross(theta, f) - gravity * home
+            if sensor == "gyroscope":
+                change = lean * motion.rate[:, None]
+            out[:, :, 2 * axis + step - 1] = change @ K.T
+        return out
+
+
+EFFECT = TableAxisNonorthogonality()
