@@ -23,7 +23,7 @@ def predicted_reading(calibration: SensorCalibration, motion: Motion) -> NDArray
     calibration : SensorCalibration
     motion : Motion
     """
-    K: NDArray[np.float64] = np.linalg.solve(calibration.matrix, np.eye(3))
+    K = np.asarray(np.linalg.solve(calibration.matrix, np.eye(3)), np.float64)
     motion = felt_motion(calibration, motion)
     reading = calibration.bias + truth(calibration.sensor, motion) @ K.T
     for fitted in calibration.effects:

@@ -1,8 +1,8 @@
 """A clock of the sensor that runs fast or slow against the reference.
 
-    reading(t) = model(t + e t),    z = K [u(t + e t) - u(t)]
+    reading(t) = model(t + 1e-6 e t),    z = K [u(t + 1e-6 e t) - u(t)]
 
-where e is the relative error of the clock, dimensionless, t the time since power-on, s, u the truth, g or deg/s, and K
+where e is the error of the clock, ppm, t the time since power-on, s, u the truth, g or deg/s, and K
 the inverse of the calibration matrix.
 """
 
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.records import Motion
+
+PPM = 1e-6
 
 
 class ClockRate(Effect):
@@ -36,27 +38,27 @@ class ClockRate(Effect):
     def parameters(self, sensor: str) -> tuple[Parameter, ...]:
         """Return e."""
         del sensor
-        return (Parameter("e", "1", "relative error of the clock"),)
+        return (Parameter("e", "ppm", "error of the clock"),)
 
     def regressors(
         self, sensor: str, motion: Motion, K: NDArray[np.float64], values: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return ``K t du/dt`` at ``t + e t``."""
-        there = shifted(motion, values[0] * motion.time)
-        slope: NDArray[np.float64] = (motion.time[:, None] * truth_rate(sensor, there)) @ K.T
+        """Return ``K 1e-6 t du/dt`` there."""
+        there = shifted(motion, PPM * values[0] * motion.time)
+        slope: NDArray[np.float64] = (PPM * motion.time[:, None] * truth_rate(sensor, there)) @ K.T
         return slope[:, :, None]
 
     def reading(
         self, sensor: str, motion: Motion, K: NDArray[np.float64], values: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return ``K [u(t + e t) - u(t)]``."""
-        change = truth(sensor, shifted(motion, values[0] * motion.time)) - truth(sensor, motion)
+        """Return the change of the truth, times K."""
+        change = truth(sensor, shifted(motion, PPM * values[0] * motion.time)) - truth(sensor, motion)
         added: NDArray[np.float64] = change @ K.T
         return added
 
     def moved(self, motion: Motion, values: NDArray[np.float64]) -> Motion:
-        """Return the motion at ``t + e t``."""
-        return shifted(motion, values[0] * motion.time)
+        """Return the motion at ``t + 1e-6 e t``."""
+        return shifted(motion, PPM * values[0] * motion.time)
 
 
 EFFECT = ClockRate()

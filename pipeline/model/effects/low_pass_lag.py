@@ -9,6 +9,7 @@ calibration matrix. The integral is a Gauss-Laguerre sum, exact where u is a pol
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -76,7 +77,14 @@ class LowPassLag(Effect):
             angular_rate=mean("angular_rate"),
             angular_acceleration=mean("angular_acceleration"),
             specific_force_rate=mean("specific_force_rate"),
+            at_offset=partial(self._moved_at, motion, values),
         )
+
+    def _moved_at(
+        self, motion: Motion, values: NDArray[np.float64], offset: float | NDArray[np.float64] = 0.0
+    ) -> Motion:
+        """Return what the sensor feels at ``time + offset``."""
+        return self.moved(shifted(motion, offset), values)
 
 
 EFFECT = LowPassLag()

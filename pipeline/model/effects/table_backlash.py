@@ -1,6 +1,6 @@
 """Play of the table: the angle is behind in the direction of the turn.
 
-    z = -K (e_a x f) (pi/180) B_a s
+    z = K (e_a x f) (pi/180) B_a s
 
 for turns about axis a, where B_a is deg, s = +1 or -1 the direction of the turn (at rest of the last one), e_a the unit
 vector of the axis, f the specific force, g, and K the inverse of the calibration matrix.
@@ -47,7 +47,7 @@ class TableBacklash(Effect):
         del values
         out = np.zeros((len(motion.time), 3, 3))
         if sensor == "accelerometer" and motion.axis is not None:
-            slope = -np.radians(1.0) * np.cross(np.eye(3)[motion.axis], motion.specific_force) @ K.T
+            slope = np.radians(1.0) * np.cross(np.eye(3)[motion.axis], motion.specific_force) @ K.T
             out[:, :, motion.axis] = slope * turning_direction(motion)[:, motion.axis, None]
         return out
 

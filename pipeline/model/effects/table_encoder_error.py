@@ -1,14 +1,15 @@
 """Angle error of the table with one period a turn, as of an encoder that sits off centre.
 
-    z = -K (e_a x f) (pi/180) (A_a cos A + B_a sin A)
+    accelerometer:  z = -K (e_a x f) (pi/180) (A_a cos A + B_a sin A)
+    gyroscope:      z = K e_a dA/dt (pi/180) (B_a cos A - A_a sin A)
 
 for turns about axis a, where A_a and B_a are deg, A the table angle, e_a the unit vector of the axis, f the specific
-force, g, and K the inverse of the calibration matrix.
+force, g, and K the inverse of the calibration matrix. The gyroscope sees it as a ripple of the rate.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -29,9 +30,6 @@ class TableEncoderError(Effect):
     owner = Owner.TABLE
     layout = Layout.SHARED
     needs = ("angle",)
-    unseen: ClassVar[dict[str, str]] = {
-        "gyroscope": "the rate is logged by itself; an error of the angle does not enter it",
-    }
     meaning = "The table's angle is wrong by some arcminutes, once around in a turn."
     excitation = "a full turn about each axis"
     experiment = "turn a second time with the unit remounted at another angle: the error stays with the table"
@@ -50,11 +48,16 @@ class TableEncoderError(Effect):
         """Return the columns of the axis turned about, zeros for the others."""
         del values
         out = np.zeros((len(motion.time), 3, 6))
-        if sensor == "accelerometer" and motion.axis is not None and motion.angle is not None:
+        if motion.axis is None or motion.angle is None or motion.rate is None:
+            return out
+        cosine, sine = np.cos(np.radians(motion.angle))[:, None], np.sin(np.radians(motion.angle))[:, None]
+        columns = out[:, :, 2 * motion.axis : 2 * motion.axis + 2]
+        if sensor == "gyroscope":
+            slope = np.radians(motion.rate)[:, None] * K[:, motion.axis]
+            columns[:, :, 0], columns[:, :, 1] = -slope * sine, slope * cosine
+        else:
             slope = -np.radians(1.0) * np.cross(np.eye(3)[motion.axis], motion.specific_force) @ K.T
-            angle = np.radians(motion.angle)[:, None]
-            out[:, :, 2 * motion.axis] = slope * np.cos(angle)
-            out[:, :, 2 * motion.axis + 1] = slope * np.sin(angle)
+            columns[:, :, 0], columns[:, :, 1] = slope * cosine, slope * sine
         return out
 
 

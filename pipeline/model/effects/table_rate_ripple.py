@@ -1,14 +1,16 @@
 """Rate error of the table with one period a turn.
 
-    z = K e_a dA/dt (A_a cos A + B_a sin A)
+    gyroscope:      z = K e_a dA/dt (A_a cos A + B_a sin A)
+    accelerometer:  z = -K (e_a x f) [A_a sin A + B_a (1 - cos A)]
 
-for turns about axis a, where A_a and B_a are dimensionless, A the table angle, e_a the unit vector of the axis, and K
-the inverse of the calibration matrix.
+for turns about axis a, where A_a and B_a are dimensionless, A the table angle, e_a the unit vector of the axis, f the
+specific force, g, and K the inverse of the calibration matrix. The accelerometer sees the angle that the ripple sums
+up to, where the log shows the commanded one.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -29,9 +31,6 @@ class TableRateRipple(Effect):
     owner = Owner.TABLE
     layout = Layout.SHARED
     needs = ("angle",)
-    unseen: ClassVar[dict[str, str]] = {
-        "accelerometer": "the angle is logged by itself; a ripple of the rate does not enter it",
-    }
     meaning = "The table's rate is wrong in proportion, once around in a turn."
     excitation = "a full turn about each axis"
     experiment = "turn a second time with the unit remounted at another angle: the ripple stays with the table"
@@ -48,11 +47,16 @@ class TableRateRipple(Effect):
         """Return the columns of the axis turned about, zeros for the others."""
         del values
         out = np.zeros((len(motion.time), 3, 6))
-        if sensor == "gyroscope" and motion.axis is not None and motion.angle is not None and motion.rate is not None:
+        if motion.axis is None or motion.angle is None or motion.rate is None:
+            return out
+        cosine, sine = np.cos(np.radians(motion.angle))[:, None], np.sin(np.radians(motion.angle))[:, None]
+        columns = out[:, :, 2 * motion.axis : 2 * motion.axis + 2]
+        if sensor == "gyroscope":
             slope = motion.rate[:, None] * K[:, motion.axis]
-            angle = np.radians(motion.angle)[:, None]
-            out[:, :, 2 * motion.axis] = slope * np.cos(angle)
-            out[:, :, 2 * motion.axis + 1] = slope * np.sin(angle)
+            columns[:, :, 0], columns[:, :, 1] = slope * cosine, slope * sine
+        else:
+            slope = -np.cross(np.eye(3)[motion.axis], motion.specific_force) @ K.T
+            columns[:, :, 0], columns[:, :, 1] = slope * sine, slope * (1.0 - cosine)
         return out
 
 

@@ -1,8 +1,8 @@
 """A table that is not level.
 
-    z = K R^T g (pi/180) (d_x, d_y, 0)
+    z = K R^T g (pi/180) (-d_y, d_x, 0)
 
-where d is how far the vertical leans toward level x and y, deg, R the rotation from body to level, g the local gravity,
+where d_x and d_y are small turns of the table about level x and y, deg, R the rotation from body to level, g the local gravity,
 g, and K the inverse of the calibration matrix.
 """
 
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.records import Motion
+
+SIGNS = np.array([[1.0], [-1.0]])
 
 
 class TableTilt(Effect):
@@ -38,18 +40,20 @@ class TableTilt(Effect):
     def parameters(self, sensor: str) -> tuple[Parameter, ...]:
         """Return d_x and d_y."""
         del sensor
-        return tuple(Parameter(f"d_{a}", "deg", f"lean of the vertical toward level {a}") for a in "xy")
+        return tuple(Parameter(f"d_{a}", "deg", f"tilt of the table about level {a}") for a in "xy")
 
     def regressors(
         self, sensor: str, motion: Motion, K: NDArray[np.float64], values: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return K times the level axes x and y in the body frame, times gravity; zeros for the gyroscope."""
+        """Return K times level y and minus level x in the body frame, times gravity; zeros for the gyroscope."""
         del values
         assert motion.level is not None  # noqa: S101
         if sensor == "gyroscope":
             return np.zeros((len(motion.time), 3, 2))
         gravity = np.linalg.norm(motion.specific_force, axis=1)[:, None, None]
-        columns: NDArray[np.float64] = np.radians(1.0) * gravity * (K @ motion.level[:, :2, :].transpose(0, 2, 1))
+        columns: NDArray[np.float64] = (
+            np.radians(1.0) * gravity * (K @ (motion.level[:, [1, 0], :] * SIGNS).transpose(0, 2, 1))
+        )
         return columns
 
 
