@@ -1,0 +1,164 @@
+"""All recordings of one unit: files found, read, checked, turned into body axes, their clocks compared.
+
+Times of a unit count from power-on. Where the times of two files overlap they cannot be one clock (each file starts at
+0), and the time between the recordings is unknown. Times since 1970 are counted from the unit's first sample instead: a
+double holds 1.7*10^9 s to 2*10^-7 s only, too coarse to differentiate.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.errors import InputError, MissingInputError
+from pipeline.formats.axes import to_body_axes
+from pipeline.formats.files import candidate_files, recording_files
+from pipeline.formats.plausibility import examine
+from pipeline.formats.units import ATTITUDE, TRIADS
+from pipeline.records import Note, Recording
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from pipeline.formats.channel_table import ChannelTable
+
+EPOCH_AFTER_NS = 100_000_000 * 1_000_000_000  # 3 years: no sensor has been on for longer
+
+
+def read_recordings(
+    procedure: Mapping[str, Any], ingest: Mapping[str, Any], sensor: Mapping[str, Any], folder: Path
+) -> list[Recording]:
+    """Read all recordings of a unit.
+
+    Parameters
+    ----------
+    procedure, ingest, sensor : mapping
+        Sections of the unit's configuration.
+    folder : Path
+        Where the unit's recordings lie.
+
+    Returns
+    -------
+    list of Recording
+        In the order of the procedure; optional ones that do not exist are left out.
+
+    Raises
+    ------
+    MissingInputError
+        If files that are not optional do not exist; one error names all.
+    InputError
+        If a file cannot be used; ``file`` holds its path, and line where there is one.
+    ConfigurationError
+        If the ingest profile or the axis map is no such thing.
+    """
+    files = recording_files(procedure, ingest, folder)
+    wanted = candidate_files(procedure, ingest)
+    _check_complete(procedure, files, wanted, folder)
+    recordings = []
+    for name, paths in files.items():
+        table = read_table(paths, ingest)
+        other = [f for c in wanted[name] for f in c if folder / f not in paths and (folder / f).exists()]
+        recording = _to_recording(name, procedure["recordings"][name], table, sensor)
+        if other:
+            detail = f"{', '.join(other)} exists too and was not read"
+            recording = replace(recording, notes=(*recording.notes, Note("N-NOTREAD", len(other), 0, 0, detail)))
+        recordings.append(recording)
+    _check_different(recordings)
+    return _compare_clocks(recordings)
+
+
+def read_table(paths: Sequence[Path], ingest: Mapping[str, Any]) -> ChannelTable:
+    """Read the file or files of one recording, by their suffix."""
+    if paths[0].suffix == ".mcap":
+        from pipeline.formats.mcap import read_mcap  # noqa: PLC0415  (the decoder costs what a text log need not pay)
+        from pipeline.formats.settings import mcap_format  # noqa: PLC0415
+
+        return read_mcap(paths[0], mcap_format(ingest))
+    from pipeline.formats.csv_read import read_csv  # noqa: PLC0415
+    from pipeline.formats.settings import csv_formats  # noqa: PLC0415
+
+    return read_csv(paths, csv_formats(ingest))
+
+
+def _check_complete(
+    procedure: Mapping[str, Any],
+    files: Mapping[str, list[Path]],
+    wanted: Mapping[str, list[list[str]]],
+    folder: Path,
+) -> None:
+    """Raise one error that names all missing files."""
+    missing = []
+    for name, candidates in wanted.items():
+        if name not in files:
+            if not procedure["recordings"][name].get("optional", False):
+                missing.append(f"{name} (tried {', or '.join(' with '.join(c) for c in candidates)})")
+            continue
+        taken = next(c for c in candidates if any(folder / f in files[name] for f in c))
+        missing += [f"{name} ({f})" for f in taken if folder / f not in files[name]]
+    if missing:
+        reason = "" if folder.is_dir() else "; the folder does not exist"
+        raise MissingInputError(f"missing recordings: {'; '.join(missing)}{reason}", str(folder))
+
+
+def _to_recording(name: str, entry: Mapping[str, Any], table: ChannelTable, sensor: Mapping[str, Any]) -> Recording:
+    flags, notes = examine(table, sensor)
+    table = to_body_axes(table, sensor.get("axis_map") or ("+x", "+y", "+z"))
+    values = table.values
+    return Recording(
+        name=name,
+        role=entry["role"],
+        axis=entry.get("axis"),
+        time_ns=table.time_ns,
+        accelerometer=_stack(values, TRIADS["accelerometer"]),
+        gyroscope=_stack(values, TRIADS["gyroscope"]),
+        temperature=values.get("temperature"),
+        table_angle=values.get("table_angle"),
+        table_rate=values.get("table_rate"),
+        table_attitude=_stack(values, ATTITUDE, table.path),
+        flags=flags,
+        source=table.source,
+        notes=(*table.notes, *notes),
+        encodings=table.encodings,
+    )
+
+
+def _stack(
+    values: Mapping[str, NDArray[np.float64]], channels: Sequence[str], path: str = ""
+) -> NDArray[np.float64] | None:
+    missing = [c for c in channels if c not in values]
+    if len(missing) == len(channels):
+        return None
+    if missing:
+        raise InputError(f"{', '.join(missing)} missing; {', '.join(channels)} come together or not at all", path)
+    return np.column_stack([values[c] for c in channels])
+
+
+def _check_different(recordings: Sequence[Recording]) -> None:
+    """Refuse one file under two names: held-out data would not be held out, or one axis would stand for another."""
+    seen: dict[str, Recording] = {}
+    for recording in recordings:
+        twin = seen.setdefault(recording.source["sha256"], recording)
+        if twin is not recording:
+            raise InputError(
+                f"recordings {twin.name} and {recording.name} are the same file, byte for byte "
+                f"({twin.source['file']}); each needs its own",
+                recording.source["file"],
+            )
+
+
+def _compare_clocks(recordings: list[Recording]) -> list[Recording]:
+    """Count times from power-on where they count from 1970, and say whether the recordings share a clock."""
+    if recordings and all(r.time_ns[0] > EPOCH_AFTER_NS for r in recordings):
+        origin = min(int(r.time_ns[0]) for r in recordings)
+        detail = f"times count from the unit's first sample, {origin} ns in the clock of the files"
+        note = Note("N-EPOCH", len(recordings), 0, 0, detail)
+        recordings = [replace(r, time_ns=r.time_ns - origin, notes=(*r.notes, note)) for r in recordings]
+    spans = sorted((int(r.time_ns[0]), int(r.time_ns[-1])) for r in recordings)
+    overlap = any(start <= end for (_, end), (start, _) in itertools.pairwise(spans))
+    return [replace(r, clock_shared=False) for r in recordings] if overlap else recordings

@@ -1,0 +1,69 @@
+"""Channels of a recording and the units that they may come in.
+
+    value in house unit = value * multiplier / divisor,   value = (count - offset) / counts_per_unit
+
+House units are g, deg/s, deg, degC and integer ns. Nothing is guessed: a column's unit stands in the ingest profile.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pipeline.records import Encoding
+
+STANDARD_GRAVITY = 9.80665  # m/s^2
+DEGREES = 180.0 / math.pi
+COUNTS = "counts"
+
+ACCELEROMETER = ("accel_x", "accel_y", "accel_z")
+GYROSCOPE = ("gyro_x", "gyro_y", "gyro_z")
+ATTITUDE = ("table_qw", "table_qx", "table_qy", "table_qz")
+SCALARS = ("temperature", "table_angle", "table_rate")
+CHANNELS = (*ACCELEROMETER, *GYROSCOPE, *SCALARS, *ATTITUDE)
+TRIADS = {"accelerometer": ACCELEROMETER, "gyroscope": GYROSCOPE}
+
+# Per quantity: unit to (multiplier, divisor); two numbers, because 1001.5 mg / 1000 is exact and times 0.001 is not.
+_FORCE = {"g": (1.0, 1.0), "mg": (1.0, 1000.0), "m/s^2": (1.0, STANDARD_GRAVITY), COUNTS: (1.0, 1.0)}
+_RATE = {"deg/s": (1.0, 1.0), "rad/s": (DEGREES, 1.0), COUNTS: (1.0, 1.0)}
+_ANGLE = {"deg": (1.0, 1.0), "rad": (DEGREES, 1.0), COUNTS: (1.0, 1.0)}
+_TEMPERATURE = {"degC": (1.0, 1.0), COUNTS: (1.0, 1.0)}
+_RATIO = {"1": (1.0, 1.0)}
+_TIME = {"s": (1e9, 1.0), "ms": (1e6, 1.0), "us": (1e3, 1.0), "ns": (1.0, 1.0)}
+
+UNITS: dict[str, dict[str, tuple[float, float]]] = {
+    "time": _TIME,
+    **dict.fromkeys(ACCELEROMETER, _FORCE),
+    **dict.fromkeys(GYROSCOPE, _RATE),
+    "temperature": _TEMPERATURE,
+    "table_angle": _ANGLE,
+    "table_rate": _RATE,
+    **dict.fromkeys(ATTITUDE, _RATIO),
+}
+
+
+def to_house_unit(channel: str, values: NDArray[np.float64], unit: str) -> NDArray[np.float64]:
+    """Convert values of a channel to its house unit (g, deg/s, deg, degC); counts are none of its business."""
+    multiplier, divisor = UNITS[channel][unit]
+    if multiplier != 1.0:
+        values = values * multiplier
+    return values / divisor if divisor != 1.0 else values
+
+
+def decode(counts: NDArray[np.float64], encoding: Encoding) -> NDArray[np.float64]:
+    """Return ``(count - offset) * scale``: the one formula by which counts become values, to the last bit."""
+    values: NDArray[np.float64] = (counts - encoding.offset) * encoding.scale
+    return values
+
+
+def encode(values: NDArray[np.float64], encoding: Encoding) -> NDArray[np.int64] | None:
+    """Return the counts that decode to exactly these values, or None where there are none."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        counts = np.rint(values / encoding.scale + encoding.offset)
+        exact = np.array_equal(decode(counts, encoding), values) and bool(np.all(np.abs(counts) < 2**53))
+    return counts.astype(np.int64) if exact else None
