@@ -1,0 +1,50 @@
+"""Allan deviation of a rest, overlapping.
+
+    sigma^2(tau) = sum_i (theta[i + 2m] - 2 theta[i + m] + theta[i])^2 / (2 tau^2 (N - 2m + 1)),   tau = m dt
+
+where theta is the integral of the N values, dt the sampling interval, and m runs over logarithmically spaced lengths.
+White noise of density D shows as ``D / sqrt(tau)``, a Gauss-Markov wander as a hump near 1.89 times its correlation
+time. Source: IEEE Std 952-1997, annex C; Riley, NIST SP 1065, section 5.2.4.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+def allan_deviation(
+    values: NDArray[np.float64], interval: float, points_per_decade: int = 10
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the overlapping Allan deviation.
+
+    Parameters
+    ----------
+    values : (n,) or (n, k) array
+        Readings at rest, evenly sampled.
+    interval : float, s
+    points_per_decade : int
+        Averaging times per decade.
+
+    Returns
+    -------
+    tau : (m,) array, s
+    deviation : (m,) or (m, k) array, unit of the values
+        Both empty where there are fewer than 3 values.
+    """
+    n = len(values)
+    longest = (n - 1) // 2
+    if longest < 1:
+        return np.empty(0), np.empty((0, *values.shape[1:]))
+    count = 1 + int(points_per_decade * np.log10(longest))
+    lengths = np.unique(np.geomspace(1, longest, count).astype(np.int64))
+    theta = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values - values.mean(axis=0), axis=0)])
+    deviation = np.empty((len(lengths), *values.shape[1:]))
+    for row, m in enumerate(lengths):
+        second = theta[2 * m :] - 2.0 * theta[m:-m] + theta[: -2 * m]
+        deviation[row] = np.sqrt(np.mean(second * second, axis=0) / 2.0) / m
+    return lengths.astype(np.float64) * interval, deviation

@@ -1,0 +1,241 @@
+"""The noise of a sensor, from what its recordings hold.
+
+    noise[n] = white * w[n] + wander * m[n]        (``pipeline.records.Noise``)
+
+It is pinned by the first of these that there is:
+
+1. ``static``: a long rest. Temperature and warm-up, which would pass for wander, are regressed out.
+2. ``rests``: the rests of the other recordings, each with a mean of its own.
+3. ``residual``: short windows of turns, less a local polynomial: white noise alone. With P the projection that removes
+   the polynomial and R the autocovariance of the filter, ``median(|P y|^2) = white^2 tr(P R) (1 - 2/(9 nu))^3``, where
+   ``nu = tr(P R)^2 / tr(P R P R)`` (Satterthwaite 1946; the median, so that windows over a ramp do not count).
+4. ``data_sheet``: ``white = noise_density sqrt(1 / (2 dt))``.
+
+``white`` is that of a raw sample: a filter is undone by its exact autocovariance, taken from its impulse response.
+Wander that the recordings cannot tell from none is the data sheet's, unless they exclude that; then it is 0.
+A recording held out for validation is not looked at.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.errors import ConfigurationError
+from pipeline.records import Noise, Recording
+from pipeline.signal.allan import allan_deviation
+from pipeline.signal.filters import apply_filter
+from pipeline.signal.rests import runs, still_samples
+from pipeline.signal.temperature import smooth_temperature
+from pipeline.signal.wander import RATIOS, Blocks, Likelihood, blocks_of, likelihood
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Rest = tuple[NDArray[np.float64], NDArray[np.float64]]
+
+__all__ = ["allan_deviation", "estimate_noise", "filter_autocovariance"]
+
+UNUSABLE = 0b110  # clipped or stuck
+GAP = 1.5
+WANDER_TIME_S = 100.0  # where the data sheet gives none
+TIMES = np.exp2(np.arange(-4.0, 4.0))  # correlation times tried, in those of the data sheet
+IMPULSE_SAMPLES = 4096
+SHORTEST_BLOCK = 8
+FEWEST_SAMPLES = 60
+WINDOW, WINDOW_DEGREE, WINDOW_ARC_DEG = 16, 4, 60.0
+WARM_UP_S = (60.0, 180.0, 500.0)
+SMALLEST_WHITE = 1e-9  # keeps the weights of a noise-free recording finite
+SEEN, AGREES = 6.0, 4.0  # twice the gain in log-likelihood
+
+
+def estimate_noise(sensor: str, recordings: list[Recording], data_sheet: dict[str, Any]) -> Noise:
+    """Return white noise and bias wander of a sensor.
+
+    Parameters
+    ----------
+    sensor : str
+        ``accelerometer`` or ``gyroscope``.
+    recordings : list of Recording
+    data_sheet : dict
+        ``noise_density`` (g/sqrt(Hz) or deg/s/sqrt(Hz)), ``bias_wander`` (g or deg/s), ``wander_time_s``.
+
+    Raises
+    ------
+    ConfigurationError
+        If neither the recordings nor the data sheet tell the noise.
+    """
+    usable = [r for r in recordings if r.role != "validation" and r.reading(sensor) is not None and r.samples > 1]
+    static = [r for r in usable if r.role == "static"]
+    for source, chosen in (("static", static), ("rests", [r for r in usable if r.role != "static"])):
+        rests = [rest for r in chosen for rest in _rests(r, sensor, everything=source == "static")]
+        if sum(len(time) for time, _ in rests) >= FEWEST_SAMPLES:
+            return _noise_of_rests(rests, chosen, data_sheet, source)
+    white = _white_of_turns(usable, sensor)
+    return _with_sheet_wander(white, data_sheet, "residual") if white is not None else _of_sheet(usable, data_sheet)
+
+
+def filter_autocovariance(recording: Recording) -> NDArray[np.float64]:
+    """Return the autocovariance of a recording's filter output for white noise of variance 1: (l,) array from lag 0."""
+    if recording.filter["name"] == "none" or recording.samples < 2:
+        return np.ones(1)
+    impulse = np.zeros((IMPULSE_SAMPLES, 3))
+    impulse[IMPULSE_SAMPLES // 2] = 1.0
+    time_ns = np.arange(IMPULSE_SAMPLES) * round(recording.interval * 1e9)
+    settings = {k: v for k, v in recording.filter.items() if k not in ("delay_s", "noise_gain")}
+    response = apply_filter(Recording("impulse", "static", None, time_ns, impulse), settings).accelerometer
+    assert response is not None  # noqa: S101
+    spectrum = np.fft.rfft(response[:, 0], 2 * IMPULSE_SAMPLES)
+    covariance: NDArray[np.float64] = np.fft.irfft(np.abs(spectrum) ** 2)[:IMPULSE_SAMPLES]
+    far = np.flatnonzero(np.abs(covariance) > 1e-9 * covariance[0])[-1]
+    return covariance[: far + 1]
+
+
+def _stretches(recording: Recording, mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return the runs of a mask, cut at gaps in time."""
+    cuts = np.flatnonzero(np.diff(recording.time_ns) > GAP * recording.interval * 1e9) + 1
+    pieces: list[tuple[int, int]] = []
+    for start, stop in runs(mask):
+        edges = [start, *cuts[(cuts > start) & (cuts < stop)].tolist(), stop]
+        pieces += pairwise(edges)
+    return pieces
+
+
+def _usable(recording: Recording, values: NDArray[np.float64]) -> NDArray[np.bool_]:
+    mask = np.asarray(np.isfinite(values).all(axis=1))
+    if recording.flags is not None:
+        mask[(recording.flags & UNUSABLE) != 0] = False
+    return mask
+
+
+def _rests(recording: Recording, sensor: str, *, everything: bool) -> list[Rest]:
+    """Return the times and readings of each rest of a recording."""
+    values = recording.reading(sensor)
+    assert values is not None  # noqa: S101
+    still = _usable(recording, values)
+    if not everything:
+        if recording.table_rate is not None:
+            rate = recording.table_rate
+        elif recording.table_angle is not None:
+            rate = np.gradient(recording.table_angle, recording.time)
+        else:
+            return []
+        still &= still_samples(recording.time, rate)
+    if everything:  # a gap does not end a static rest: the likelihood knows the times
+        return [(recording.time[still], values[still])] if still.any() else []
+    return [(recording.time[a:b], values[a:b]) for a, b in _stretches(recording, still) if b - a > 2]
+
+
+def _noise_of_rests(rests: list[Rest], chosen: list[Recording], sheet: dict[str, Any], source: str) -> Noise:
+    covariance = filter_autocovariance(chosen[0])
+    memory = int(np.searchsorted(-np.abs(covariance), -0.01 * covariance[0]))
+    blocks = blocks_of(rests, max(SHORTEST_BLOCK, 4 * memory))
+    passed = (2.0 * covariance.sum() - covariance[0]) > 0.5  # at 0 Hz; a high-pass lets no wander through
+    if blocks.cut.sum() - len(np.unique(blocks.rest[blocks.cut])) < 3 or not passed:
+        counts = blocks.count
+        from_scatter = blocks.scatter / max(float(np.sum(counts - 1)) * covariance[0], 1e-300)
+        return _with_sheet_wander(np.sqrt(from_scatter), sheet, source)
+    found = likelihood(blocks, _nuisance(blocks, chosen, source), covariance, TIMES * _wander_time(sheet))
+    return _best(found, sheet, source)
+
+
+def _nuisance(blocks: Blocks, chosen: list[Recording], source: str) -> NDArray[np.float64]:
+    """Return a constant for each rest and, in a static recording, temperature and warm-up."""
+    rest, centre = blocks.rest[blocks.cut], (blocks.start + blocks.length / 2.0)[blocks.cut]
+    columns = [(rest == r).astype(float) for r in np.unique(rest)]
+    if source != "static":
+        return np.stack(columns, axis=1)
+    columns += [np.exp(-(centre - centre.min()) / tau) for tau in WARM_UP_S if centre.min() < 4.0 * tau]
+    for recording in chosen:
+        if recording.temperature is not None and np.isfinite(recording.temperature).all():
+            smooth = np.interp(centre, recording.time, smooth_temperature(recording.time, recording.temperature))
+            if np.ptp(smooth) > 0.1:
+                columns.append(smooth - smooth.mean())
+    return np.stack(columns, axis=1)
+
+
+def _best(found: Likelihood, sheet: dict[str, Any], source: str) -> Noise:
+    """Return the most likely noise; one ratio of wander to white noise for all axes unless they differ."""
+    gain = 2.0 * (found.log_likelihood - found.log_likelihood[:, :1])
+    pooled = gain.sum(axis=2).max(axis=1)
+    row = int(np.argmax(pooled))
+    sheet_row = int(np.argmin(np.abs(TIMES - 1.0)))
+    if pooled[row] - pooled[sheet_row] < AGREES:
+        row = sheet_row
+    if pooled[row] < SEEN:
+        return _unseen(found, sheet_row, sheet, source)
+    apart = gain[row].max(axis=0).sum() - pooled[row] > SEEN
+    axes = [slice(c, c + 1) for c in range(3)] if apart else [slice(0, 3)] * 3
+    ratio = np.array([_peak(gain[row][:, axis].sum(axis=1)) for axis in axes])
+    white = np.array([np.interp(ratio[c], RATIOS, found.white[row, :, c]) for c in range(3)])
+    white = np.maximum(white, SMALLEST_WHITE)
+    return Noise(white, white * ratio, float(TIMES[row] * _wander_time(sheet)), source)
+
+
+def _peak(gain: NDArray[np.float64]) -> float:
+    """Return the ratio at the maximum, by a parabola through the three points about it."""
+    k = int(np.argmax(gain))
+    if k < 2 or k == len(gain) - 1:
+        return float(RATIOS[k])
+    x, (a, b, c) = np.log(RATIOS[k - 1 : k + 2]), gain[k - 1 : k + 2]
+    bend = a - 2.0 * b + c
+    return float(np.exp(x[1] + (0.5 * (a - c) / bend * (x[1] - x[0]) if bend < 0 else 0.0)))
+
+
+def _unseen(found: Likelihood, row: int, sheet: dict[str, Any], source: str) -> Noise:
+    """Return the data sheet's wander where the likelihood allows it, else none."""
+    white = np.maximum(found.white[row, 0], SMALLEST_WHITE)
+    noise = _with_sheet_wander(white, sheet, source)
+    column = np.argmin(np.abs(RATIOS[:, None] - noise.wander / white), axis=0)
+    loss = 2.0 * np.sum(found.log_likelihood[row, 0] - found.log_likelihood[row, column, np.arange(3)])
+    return noise if loss < AGREES else Noise(white, np.zeros(3), noise.correlation_time, source)
+
+
+def _wander_time(sheet: dict[str, Any]) -> float:
+    return float(sheet.get("wander_time_s") or WANDER_TIME_S)
+
+
+def _with_sheet_wander(white: NDArray[np.float64], sheet: dict[str, Any], source: str) -> Noise:
+    wander = np.full(3, float(sheet.get("bias_wander") or 0.0))
+    return Noise(np.maximum(white, SMALLEST_WHITE), wander, _wander_time(sheet), source)
+
+
+def _white_of_turns(recordings: list[Recording], sensor: str) -> NDArray[np.float64] | None:
+    """Return the white noise of short windows less a local polynomial, or None where there are too few."""
+    squares, trace, nu = [], 0.0, 1.0
+    x = np.linspace(-1.0, 1.0, WINDOW)
+    basis, _ = np.linalg.qr(np.vander(x, WINDOW_DEGREE + 1))
+    P = np.eye(WINDOW) - basis @ basis.T
+    for recording in recordings:
+        values = recording.reading(sensor)
+        assert values is not None  # noqa: S101
+        slow = _usable(recording, values)
+        if recording.table_rate is not None:
+            slow &= np.abs(recording.table_rate) * recording.interval * WINDOW < WINDOW_ARC_DEG
+        covariance = np.zeros(WINDOW)
+        known = filter_autocovariance(recording)[:WINDOW]
+        covariance[: len(known)] = known
+        PR = P @ covariance[np.abs(np.subtract.outer(np.arange(WINDOW), np.arange(WINDOW)))]
+        trace = float(np.trace(PR))
+        nu = trace**2 / float(np.sum(PR * PR.T))
+        for start, stop in _stretches(recording, slow):
+            count = (stop - start) // WINDOW
+            windows = values[start : start + count * WINDOW].reshape(count, WINDOW, 3)
+            squares.append(np.sum(np.einsum("ij,njc->nic", P, windows) ** 2, axis=1) / trace)
+    found = np.concatenate(squares) if squares else np.empty((0, 3))
+    if len(found) < 5:
+        return None
+    return np.sqrt(np.median(found, axis=0) / (1.0 - 2.0 / (9.0 * nu)) ** 3)
+
+
+def _of_sheet(recordings: list[Recording], sheet: dict[str, Any]) -> Noise:
+    density = sheet.get("noise_density")
+    if not density or not recordings:
+        raise ConfigurationError(
+            "the recordings hold no rest and too few even stretches to tell the noise; "
+            "give the sensor's noise_density, or record static (a rest of some minutes)"
+        )
+    white = float(density) * np.sqrt(0.5 / recordings[0].interval)
+    return _with_sheet_wander(np.full(3, white), sheet, "data_sheet")

@@ -1,0 +1,201 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from pipeline.errors import ConfigurationError
+from pipeline.records import Recording
+from pipeline.signal.filters import apply_filter
+from pipeline.signal.noise import allan_deviation, estimate_noise, filter_autocovariance
+from pipeline.signal.wander import block_covariance, variance_of_average
+
+SHEET = {"noise_density": 4e-4, "bias_wander": 1e-4, "wander_time_s": 100.0}
+NO_WANDER = {"noise_density": 4e-4, "bias_wander": 0.0, "wander_time_s": 100.0}
+DT = 0.12
+WHITE = 8e-4
+OFF = {"cutoff_hz": None, "time_constant_s": None, "low_hz": None, "high_hz": None, "order": 2, "zero_phase": False}
+FILTERS = {
+    "none": {**OFF, "name": "none"},
+    "rc": {**OFF, "name": "rc_low_pass", "cutoff_hz": 1.0},
+    "butterworth": {**OFF, "name": "low_pass", "cutoff_hz": 1.5, "order": 4, "zero_phase": True},
+}
+
+
+def gauss_markov(n: int, tau: float, rng: np.random.Generator) -> np.ndarray:
+    phi = np.exp(-DT / tau)
+    steps = rng.standard_normal((n, 3)) * np.sqrt(1.0 - phi**2)
+    steps[0] = rng.standard_normal(3)
+    return lfilter([1.0], [1.0, -phi], steps, axis=0)
+
+
+def rest(n: int, wander: float, seed: int, *, role: str = "static", start: float = 3000.0) -> Recording:
+    rng = np.random.default_rng(seed)
+    values = np.array([0.0, 0.0, 1.0]) + WHITE * rng.standard_normal((n, 3)) + wander * gauss_markov(n, 100.0, rng)
+    time_ns = ((start + np.arange(n) * DT) * 1e9).astype(np.int64)
+    return Recording("static", role, None, time_ns, accelerometer=values)
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_white_noise_of_a_raw_sample_is_recovered_through_a_filter(name: str) -> None:
+    found = [
+        estimate_noise("accelerometer", [apply_filter(rest(5000, 1e-4, s), FILTERS[name])], SHEET).white
+        for s in range(20)
+    ]
+    assert np.mean(found) == pytest.approx(WHITE, rel=0.006)
+    assert np.std(found) / WHITE < 0.03
+
+
+@pytest.mark.parametrize("name", ["none", "rc"])
+@pytest.mark.parametrize("wander", [1e-4, 5e-4])
+def test_wander_is_recovered_from_a_static_recording(name: str, wander: float) -> None:
+    noises = [
+        estimate_noise("accelerometer", [apply_filter(rest(10000, wander, s), FILTERS[name])], SHEET) for s in range(24)
+    ]
+    rms = [np.sqrt(np.mean(n.wander**2)) for n in noises]
+    assert np.mean(rms) == pytest.approx(wander, rel=0.08)
+    assert np.std(rms) < 0.25 * wander
+    assert 50.0 <= np.median([n.correlation_time for n in noises]) <= 200.0
+    assert {n.source for n in noises} == {"static"}
+
+
+def test_no_wander_is_invented_in_white_noise() -> None:
+    found = [estimate_noise("accelerometer", [rest(10000, 0.0, s)], SHEET).wander.max() for s in range(24)]
+    assert np.mean(np.array(found) == 0.0) > 0.85
+    assert max(found) < 1e-4
+
+
+def test_wander_that_a_short_rest_cannot_show_is_the_data_sheets() -> None:
+    noise = estimate_noise("accelerometer", [rest(100, 0.0, 0)], SHEET)
+    assert noise.wander.tolist() == [1e-4] * 3
+    assert noise.correlation_time == 100.0
+
+
+def test_warm_up_of_a_static_recording_does_not_pass_for_wander() -> None:
+    found = []
+    for seed in range(12):
+        cold = rest(8000, 0.0, seed, start=5.0)
+        settling = 5e-3 * np.exp(-cold.time / 180.0)[:, None]
+        warming = replace(cold, accelerometer=cold.accelerometer + settling)
+        found.append(estimate_noise("accelerometer", [warming], NO_WANDER).wander.max())
+    assert np.median(found) == 0.0
+    assert max(found) < 3e-4
+
+
+def test_temperature_of_a_static_recording_does_not_pass_for_wander() -> None:
+    cold = rest(8000, 0.0, 3)
+    temperature = 25.0 + 2.0 * np.sin(cold.time / 150.0)
+    values = cold.accelerometer + 1e-3 * (temperature - 25.0)[:, None]
+    noise = estimate_noise("accelerometer", [replace(cold, accelerometer=values, temperature=temperature)], NO_WANDER)
+    assert noise.wander.max() < 1e-4
+
+
+def stop_and_go(seed: int, steps: int = 150) -> Recording:
+    """Rests of 1 s, 1 deg apart, as the table logs them."""
+    rng = np.random.default_rng(seed)
+    per_rest, per_move = 9, 3
+    rate = np.tile(np.concatenate([np.zeros(per_rest), np.full(per_move, 1.0 / (per_move * DT))]), steps)
+    angle = np.cumsum(rate) * DT
+    n = len(rate)
+    truth = np.stack([np.zeros(n), np.sin(np.radians(angle)), np.cos(np.radians(angle))], 1)
+    values = truth + WHITE * rng.standard_normal((n, 3))
+    values[rate > 0] += 0.05 * rng.standard_normal((int(np.sum(rate > 0)), 3))
+    time_ns = np.arange(n) * round(DT * 1e9)
+    return Recording("accel_x", "accelerometer", "x", time_ns, values, table_angle=angle, table_rate=rate)
+
+
+def test_rests_of_stop_and_go_give_white_noise_without_the_shaking_of_the_moves() -> None:
+    noises = [estimate_noise("accelerometer", [stop_and_go(s)], SHEET) for s in range(20)]
+    assert {n.source for n in noises} == {"rests"}
+    assert np.mean([n.white for n in noises]) == pytest.approx(WHITE, rel=0.02)
+
+
+@pytest.mark.parametrize("name", ["none", "rc"])
+@pytest.mark.parametrize("rate", [1.0, 10.0, 30.0])
+def test_continuous_turns_without_a_rest_give_white_noise_from_their_high_frequencies(name: str, rate: float) -> None:
+    found = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        n = 1200
+        angle = rate * DT * np.arange(n)
+        truth = np.stack([np.zeros(n), np.sin(np.radians(angle)), np.cos(np.radians(angle))], 1)
+        turn = Recording(
+            "accel_x", "accelerometer", "x", np.arange(n) * round(DT * 1e9),
+            truth + WHITE * rng.standard_normal((n, 3)),
+            table_angle=angle, table_rate=np.full(n, rate),
+        )  # fmt: skip
+        noise = estimate_noise("accelerometer", [apply_filter(turn, FILTERS[name])], SHEET)
+        assert noise.source == "residual"
+        found.append(noise.white)
+    assert np.mean(found) == pytest.approx(WHITE, rel=0.02)
+
+
+def test_data_sheet_is_the_last_resort() -> None:
+    fast = replace(stop_and_go(0, 20), table_rate=np.full(240, 200.0))
+    noise = estimate_noise("accelerometer", [fast], SHEET)
+    assert noise.source == "data_sheet"
+    assert noise.white == pytest.approx(np.full(3, 4e-4 / np.sqrt(2 * DT)), rel=1e-6)
+
+
+def test_without_rest_turns_and_data_sheet_the_user_is_told_what_to_give() -> None:
+    fast = replace(stop_and_go(0, 20), table_rate=np.full(240, 200.0))
+    with pytest.raises(ConfigurationError, match="noise_density"):
+        estimate_noise("accelerometer", [fast], {})
+
+
+def test_held_out_recording_is_not_looked_at() -> None:
+    loud = rest(2000, 0.0, 1, role="validation")
+    loud = replace(loud, accelerometer=loud.accelerometer * 50.0, table_rate=np.zeros(2000))
+    assert estimate_noise("accelerometer", [loud, stop_and_go(1)], SHEET).white == pytest.approx(WHITE, rel=0.1)
+
+
+def test_clipped_and_stuck_samples_do_not_count() -> None:
+    good = rest(3000, 0.0, 2)
+    values, flags = good.accelerometer.copy(), np.zeros(3000, np.uint16)
+    values[100:110], flags[100:105], flags[105:110] = 2.0, 0b010, 0b100
+    noise = estimate_noise("accelerometer", [replace(good, accelerometer=values, flags=flags)], SHEET)
+    assert noise.white == pytest.approx(WHITE, rel=0.06)
+
+
+def test_autocovariance_of_the_rc_filter_is_that_of_its_equation() -> None:
+    filtered = apply_filter(rest(500, 0.0, 0), FILTERS["rc"])
+    k = DT / (DT + 1.0 / (2.0 * np.pi))
+    expected = k / (2.0 - k) * (1.0 - k) ** np.arange(20)
+    assert filter_autocovariance(filtered)[:20] == pytest.approx(expected, rel=1e-9)
+    assert np.sqrt(filter_autocovariance(filtered)[0]) == pytest.approx(filtered.filter["noise_gain"], rel=1e-9)
+
+
+def test_covariance_of_block_averages_is_that_of_the_averaged_process() -> None:
+    fine = 0.05
+    t = np.arange(0.0, 60.0, fine) + fine / 2
+    R = np.exp(-np.abs(t[:, None] - t) / 20.0)
+    average = np.kron(np.eye(4), np.full((1, 300), 1 / 300.0))
+    start = np.array([0.0, 15.0, 30.0, 45.0])
+    B = block_covariance(start, np.full(4, 15.0), 20.0)
+    assert pytest.approx(average @ R @ average.T, rel=1e-5) == B
+    assert variance_of_average(np.array([15.0]), 20.0)[0] == pytest.approx(B[0, 0])
+
+
+def test_allan_deviation_of_white_noise_falls_with_the_root_of_time() -> None:
+    values = np.random.default_rng(0).standard_normal((40000, 3))
+    tau, deviation = allan_deviation(values, 0.1)
+    early = tau < 20.0
+    expected = 1.0 / np.sqrt(tau[early] / 0.1)
+    assert deviation[early] == pytest.approx(np.repeat(expected[:, None], 3, 1), rel=0.1)
+
+
+def test_allan_deviation_is_the_literal_sum() -> None:
+    values = np.random.default_rng(1).standard_normal(50)
+    tau, deviation = allan_deviation(values, 0.5)
+    for t, found in zip(tau, deviation, strict=True):
+        m = round(t / 0.5)
+        means = np.array([values[i : i + m].mean() for i in range(50 - m + 1)])
+        assert found == pytest.approx(np.sqrt(0.5 * np.mean((means[m:] - means[:-m]) ** 2)), rel=1e-12)
+
+
+def test_allan_deviation_of_two_values_is_empty() -> None:
+    tau, deviation = allan_deviation(np.zeros((2, 3)), 1.0)
+    assert len(tau) == 0
+    assert deviation.shape == (0, 3)
