@@ -109,7 +109,8 @@ def _check_attitude(table: ChannelTable) -> None:
     if wrong.size:
         row = int(wrong[0])
         raise InputError(
-            f"the table's quaternion has the length {norm[row]:.4g} ({wrong.size} such samples); 1 is expected",
+            f"the table's quaternion has the length {norm[row]:.4g} at {table.time_ns[row] / 1e9:.9g} s "
+            f"({wrong.size} such samples); 1 is expected",
             table.place(row),
         )
 
@@ -139,8 +140,9 @@ def _mark_clipped(table: ChannelTable, sensor: str, full_scale: float, flags: ND
         if size.max() > FULL_SCALE_MARGIN * full_scale:
             row = int(np.argmax(size > FULL_SCALE_MARGIN * full_scale))
             raise InputError(
-                f"{channel} is {table.values[channel][row]:.6g} {UNIT_NAMES[sensor]}, beyond {FULL_SCALE_MARGIN} times "
-                f"the full scale of {full_scale:g}; correct the column's unit or sensor.{sensor}.full_scale",
+                f"{channel} is {table.values[channel][row]:.6g} {UNIT_NAMES[sensor]} at {table.time_ns[row] / 1e9:.9g} "
+                f"s, beyond {FULL_SCALE_MARGIN} times the full scale of {full_scale:g}; correct the column's unit or "
+                f"sensor.{sensor}.full_scale",
                 table.place(row),
             )
         count = abs(table.encodings[channel].scale) if channel in table.encodings else 0.0
