@@ -1,0 +1,48 @@
+"""Numbers as people read them.
+
+A measured value is written to two digits of its expanded uncertainty, as the GUM asks (JCGM 100:2008, 7.2.6).
+"""
+
+from __future__ import annotations
+
+import math
+
+NOTHING = "\N{EN DASH}"
+MINUS = "\N{MINUS SIGN}"
+
+
+def number(value: object, digits: int = 3) -> str:
+    """Return a value to so many significant digits, without an exponent from 1e-4 to 1e5; a dash where it is none."""
+    if not isinstance(value, int | float) or not math.isfinite(value):
+        return NOTHING
+    if value == 0:
+        return "0"
+    if 1e-4 <= abs(value) < 1e5:
+        decimals = max(0, digits - 1 - math.floor(math.log10(abs(value))))
+        return f"{value:.{decimals}f}".replace("-", MINUS)
+    return f"{value:.{digits - 1}e}".replace("-", MINUS).replace("e+", "e")
+
+
+def measured(value: float | None, expanded: float | None) -> str:
+    """Return ``value ± expanded uncertainty``, both to the decimals that two digits of the uncertainty need."""
+    if value is None or not math.isfinite(value):
+        return NOTHING
+    if expanded is None or not math.isfinite(expanded) or expanded <= 0:
+        return number(value, 5)
+    decimals = 1 - math.floor(math.log10(expanded))
+    if decimals > 9:
+        return f"{number(value, 7)} ± {number(expanded, 2)}"
+    decimals = max(0, decimals)
+    return f"{value:.{decimals}f} ± {expanded:.{decimals}f}".replace("-", MINUS)
+
+
+def percent(share: object) -> str:
+    """Return a share as percent."""
+    return f"{number(100.0 * share, 2)} %" if isinstance(share, int | float) else NOTHING
+
+
+def probability(value: object) -> str:
+    """Return a p-value; tiny ones as a bound."""
+    if not isinstance(value, int | float):
+        return NOTHING
+    return "< 1e\N{MINUS SIGN}12" if value < 1e-12 else number(value, 2)

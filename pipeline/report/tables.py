@@ -1,0 +1,166 @@
+"""Rows of the tables of a unit's page: parameters beside data-sheet limits, stages, steps of the held-out error.
+
+Scale factor errors and cross-axis terms are those of ``K = matrix^-1``, which the data sheet speaks of:
+
+    dK = -K dM K,    cov(K) = J cov(M) J^T,    J = K (x) K^T    (rows of M one after the other)
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from pipeline.report.numbers import NOTHING, measured, number, percent
+
+JSON = dict[str, Any]
+AXES = "xyz"
+
+
+def parameter_rows(part: JSON, sheet: JSON) -> list[JSON]:
+    """Return bias, scale factor errors and cross-axis terms with expanded uncertainty beside their limits.
+
+    Parameters
+    ----------
+    part : dict
+        The sensor's part of the calibration.
+    sheet : dict
+        The sensor's section of the configuration, with the data-sheet limits.
+    """
+    unit, factor = part["unit"], part.get("coverage_factor", {}).get("bias", [None])[0]
+    matrix = np.array(part["matrix"], float)
+    K = np.linalg.solve(matrix, np.eye(3))
+    bias_U = part.get("expanded_uncertainty", {}).get("bias", [None] * 3)
+    K_U = _uncertainty_of_inverse(K, part)
+    rows = [
+        _row(f"Bias {a}", unit, part["bias"][i], expanded=bias_U[i], factor=factor, limit=sheet.get("bias"))
+        for i, a in enumerate(AXES)
+    ]
+    rows += [
+        _row(
+            f"Scale factor error {a}",
+            "",
+            K[i, i] - 1.0,
+            expanded=K_U[i][i],
+            factor=factor,
+            limit=sheet.get("scale_factor"),
+        )
+        for i, a in enumerate(AXES)
+    ]
+    return rows + [
+        _row(f"{a} reads of {b}", "", K[i, j], expanded=K_U[i][j], factor=factor, limit=sheet.get("cross_axis"))
+        for i, a in enumerate(AXES)
+        for j, b in enumerate(AXES)
+        if i != j
+    ]
+
+
+def effect_rows(part: JSON, sheet: JSON) -> list[JSON]:
+    """Return the parameters of the fitted effects beside their limits."""
+    limits = sheet.get("effects") or {}
+    factor = part.get("coverage_factor", {}).get("bias", [None])[0]
+    return [
+        _row(
+            f"{e['name'].replace('_', ' ')}: {name}",
+            p.get("unit") or "",
+            p["value"],
+            expanded=p.get("expanded_uncertainty"),
+            factor=factor,
+            limit=limit,
+        )
+        for e in part.get("effects", [])
+        for limit in [limits.get(e["name"])]
+        for name, p in e["parameters"].items()
+    ]
+
+
+def matrix_rows(part: JSON) -> list[list[str]]:
+    """Return the elements of the calibration matrix with their expanded uncertainties."""
+    expanded = part.get("expanded_uncertainty", {}).get("matrix", [[None] * 3] * 3)
+    return [[measured(part["matrix"][i][j], expanded[i][j]) for j in range(3)] for i in range(3)]
+
+
+def stage_rows(part: JSON) -> list[JSON]:
+    """Return each stage of the fit: its name, parameters and the residual after it."""
+    return [
+        {
+            "name": str(stage.get("name", "")).replace("_", " "),
+            "parameters": parameter_texts(stage.get("parameters")),
+            "residual": number(stage.get("residual_rms")),
+            "details": [
+                f"{key.replace('_', ' ')}: {_detail(value)}"
+                for key, value in (stage.get("details") or {}).items()
+                if isinstance(value, int | float | str | bool)
+            ],
+        }
+        for stage in part.get("stages", [])
+    ]
+
+
+def parameter_texts(parameters: JSON | None) -> list[str]:
+    """Return ``name = value ± uncertainty unit`` for each parameter."""
+    texts = []
+    for name, given in (parameters or {}).items():
+        p = given if isinstance(given, dict) else {"value": given}
+        value, unit = p.get("value"), p.get("unit") or ""
+        if "expanded_uncertainty" in p:
+            shown = measured(value, p["expanded_uncertainty"])
+        else:
+            standard = p.get("standard_uncertainty")
+            shown = number(value, 5) + (f" (u = {number(standard, 2)})" if standard else "")
+        texts.append(f"{name} = {shown} {unit}".rstrip())
+    return texts
+
+
+def step_rows(held_out: JSON) -> list[JSON]:
+    """Return the steps of the held-out error, each with its figures."""
+    return [
+        {
+            "name": step_label(step["name"]),
+            "mean_abs": number(step.get("mean_abs_error")),
+            "sum_abs": number(step.get("sum_abs_error")),
+            "rms": number(step.get("rms_error")),
+            "max": number(step.get("max_error")),
+            "min": number(step.get("min_error")),
+            "vector": number(step.get("vector_rms_error")),
+            "change": NOTHING if step.get("change_percent") is None else number(step["change_percent"], 3) + " %",
+        }
+        for step in held_out.get("steps", [])
+    ]
+
+
+def step_label(name: str) -> str:
+    """Return a step's name for people."""
+    if name.startswith("stage:"):
+        return "after " + name.removeprefix("stage:").strip().replace("_", " ")
+    return name.replace("_", " ")
+
+
+def _row(
+    name: str, unit: str, value: float, *, expanded: float | None, factor: float | None, limit: float | None
+) -> JSON:
+    bound = limit if isinstance(limit, int | float) and limit > 0 else None
+    return {
+        "name": name,
+        "value": measured(value, expanded),
+        "unit": unit,
+        "factor": number(factor, 3),
+        "limit": NOTHING if bound is None else f"± {number(bound)}",
+        "share": None if bound is None else percent(abs(value) / bound),
+        "beyond": bound is not None and abs(value) > bound,
+    }
+
+
+def _uncertainty_of_inverse(K: np.ndarray, part: JSON) -> list[list[float | None]]:
+    values = part.get("covariance", {}).get("values")
+    factor = part.get("coverage_factor", {}).get("bias", [None])[0]
+    if values is None or factor is None:
+        return [[None] * 3] * 3
+    J = np.kron(K, K.T)
+    variance = np.diag(J @ np.array(values, float)[3:12, 3:12] @ J.T)
+    expanded: list[list[float | None]] = (factor * np.sqrt(np.clip(variance, 0.0, None))).reshape(3, 3).tolist()
+    return expanded
+
+
+def _detail(value: object) -> str:
+    return number(float(value), 4) if isinstance(value, float) else str(value)

@@ -1,0 +1,35 @@
+"""The templates of the pages: HTML, CSS and JavaScript beside this file, every value escaped."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+from jinja2 import Environment, FileSystemLoader, Template
+from markupsafe import Markup
+
+from pipeline.report.numbers import measured, number, percent, probability
+
+FOLDER = Path(__file__).parent / "templates"
+
+
+@cache
+def template(name: str) -> Template:
+    """Return a template by its file name."""
+    environment = Environment(
+        loader=FileSystemLoader(FOLDER),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters.update(
+        number=number, measured=measured, percent=percent, probability=probability, words=lambda s: s.replace("_", " ")
+    )
+    environment.globals["asset"] = asset
+    return environment.get_template(name)
+
+
+@cache
+def asset(name: str) -> Markup:
+    """Return a style sheet or script of our own as it is."""
+    return Markup((FOLDER / name).read_text(encoding="utf-8"))  # noqa: S704  (our own file)

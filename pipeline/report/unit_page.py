@@ -1,0 +1,146 @@
+"""The page of one unit: verdict and held-out error first, then what they rest on.
+
+One file that opens offline: style, script and charts are inline, and its content security policy forbids every request.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.records import SENSORS
+from pipeline.report import figures, tables
+from pipeline.report.limits import check_limits, final_step, verdict
+from pipeline.report.residuals import Residual, residuals
+from pipeline.report.templating import template
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pipeline.records import Recording
+
+JSON = dict[str, Any]
+VERDICTS = {
+    "nothing_missing": "Nothing significant is missing from the model.",
+    "missing_effect": "A physical effect is missing from the model.",
+    "unexplained": "Something is missing that no known effect explains.",
+    "not_enough_data": "The recording is too short to say what is missing.",
+}
+
+
+def render(
+    calibration: JSON,
+    validation: JSON | None,
+    diagnosis: JSON | None,
+    recordings: list[Recording],
+    settings: JSON,
+    *,
+    words: dict[str, list[str]] | None = None,
+) -> str:
+    """Return the page of one unit as HTML.
+
+    Parameters
+    ----------
+    calibration, validation, diagnosis : dict
+        As in their files; the last two may be None where their stage failed.
+    recordings : list of Recording
+        After the filter; may be empty.
+    settings : dict
+        The unit's part of the resolved configuration.
+    words : dict of str to list of str, optional
+        The diagnosis of each sensor in sentences.
+
+    Returns
+    -------
+    str
+    """
+    checks = check_limits(calibration, validation, settings.get("limits"))
+    ok = calibration.get("status") == "ok"
+    page: str = template("unit.html").render(
+        calibration=calibration,
+        ok=ok,
+        passed=verdict(calibration, checks),
+        checks=checks,
+        sensors=[
+            _sensor(sensor, calibration, validation, diagnosis, recordings, settings, words or {}) for sensor in SENSORS
+        ]
+        if ok
+        else [],
+        notes=[{"file": i.get("file"), "notes": i.get("notes") or []} for i in calibration.get("inputs") or []],
+        settings_text=json.dumps(settings, indent=1, ensure_ascii=False, default=str),
+    )
+    return page
+
+
+def _sensor(  # noqa: PLR0917  (the inputs of the page, passed on)
+    sensor: str,
+    calibration: JSON,
+    validation: JSON | None,
+    diagnosis: JSON | None,
+    recordings: list[Recording],
+    settings: JSON,
+    words: dict[str, list[str]],
+) -> JSON:
+    part, unit = calibration.get(sensor), figures.UNITS[sensor]
+    if part is None:
+        reason = (calibration.get("not_calibrated") or {}).get(sensor) or "the procedure does not calibrate it"
+        return {"name": sensor, "unit": unit, "part": None, "reason": reason}
+    held_out, found = (validation or {}).get(sensor) or {}, (diagnosis or {}).get(sensor) or {}
+    sheet = (settings.get("sensor") or {}).get(sensor) or {}
+    table = settings.get("table") or {}
+    traces = residuals(sensor, part, recordings, table)
+    sigma = _sigma(held_out, found, traces)
+    steps = held_out.get("steps") or [{}]
+    return {
+        "name": sensor,
+        "unit": unit,
+        "part": part,
+        "held_out": held_out,
+        "before": steps[0].get("rms_error"),
+        "after": final_step(held_out).get("rms_error"),
+        "floor": held_out.get("noise_floor"),
+        "steps": tables.step_rows(held_out),
+        "staircases": [f for v in (False, True) if (f := figures.staircase(sensor, held_out, vector=v))],
+        "model_figures": [figures.measurement_and_model(sensor, r, sigma) for r in traces],
+        "held_out_figures": _held_out(sensor, part, held_out, recordings, table),
+        "residual_figures": figures.residual_figures(sensor, traces),
+        "matrix": tables.matrix_rows(part),
+        "parameters": tables.parameter_rows(part, sheet) + tables.effect_rows(part, sheet),
+        "stages": tables.stage_rows(part),
+        "diagnosis": found,
+        "ranking": [
+            {**r, "parameter_texts": tables.parameter_texts(r.get("parameters"))} for r in found.get("ranking") or []
+        ],
+        "ranking_figure": figures.ranking(sensor, found),
+        "verdict": VERDICTS.get(found.get("verdict", ""), "There is no diagnosis."),
+        "words": words.get(sensor) or found.get("words") or [],
+    }
+
+
+def _sigma(held_out: JSON, found: JSON, traces: list[Residual]) -> NDArray[np.float64] | None:
+    noise = found.get("noise") or held_out.get("noise")
+    if not isinstance(noise, dict) or not noise.get("white") or not traces:
+        return None
+    gain = float(traces[0].recording.filter.get("noise_gain", 1.0))
+    wander = np.array(noise.get("wander") or [0.0] * 3, float)
+    sigma: NDArray[np.float64] = np.hypot(gain * np.array(noise["white"], float), wander)
+    return sigma
+
+
+def _held_out(
+    sensor: str, part: JSON, held_out: JSON, recordings: list[Recording], table: JSON
+) -> list[figures.Figure]:
+    out = []
+    matrix, bias = np.array(part["matrix"], float), np.array(part["bias"], float)
+    for recording in recordings:
+        reading = recording.reading(sensor)
+        rate = recording.table_rate
+        if recording.role != "validation" or reading is None or (sensor == "gyroscope" and rate is None):
+            continue
+        reference = table.get("gravity_g") or 1.0 if rate is None or sensor == "accelerometer" else np.abs(rate)
+        raw = np.linalg.norm(reading, axis=1) - reference
+        calibrated = np.linalg.norm((reading - bias) @ matrix.T, axis=1) - reference
+        out.append(figures.held_out_over_time(sensor, recording, raw, calibrated, held_out.get("noise_floor")))
+    return out
