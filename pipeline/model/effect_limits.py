@@ -1,0 +1,36 @@
+"""The largest plausible size of an effect's parameters, from the sensor's configuration.
+
+``effects`` of a sensor's configuration names a limit for each effect. Where the parameters of an effect differ in unit,
+``<effect>_<parameter>`` (the parameter's name or its part before the axis) goes before it: ``warm_up_time_constant``.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from pipeline.model.effects.base import Effect
+
+
+def parameter_limits(effect: Effect, sensor: str, limits: Mapping[str, float]) -> NDArray[np.float64]:
+    """Return the limit of each parameter's absolute value: (p,) array, infinite where the configuration has none.
+
+    Parameters
+    ----------
+    effect : Effect
+    sensor : str
+    limits : mapping of str to float
+        ``effects`` of the sensor's configuration.
+    """
+    found = []
+    for parameter in effect.parameters(sensor):
+        symbol = parameter.name.rpartition("_")[0]
+        names = (f"{effect.name}_{parameter.name}", f"{effect.name}_{symbol}", effect.name)
+        found.append(next((float(limits[name]) for name in names if name in limits), np.inf))
+    return np.array(found)
