@@ -1,16 +1,70 @@
-"""Rests in a recording: from a table's log, or from the sensor's own readings."""
+"""Rests in a recording: from a table's log, or from the sensor's own readings.
+
+By the readings (after Tedaldi, Pretto & Menegatti, ICRA 2014, section IV): a sample rests where the variance of the
+specific force in a short window, summed over the axes, stays under a multiple of the sensor's own,
+
+    v[n] = sum_axes var(f[n .. n+W-1]) < m v_0
+
+where
+
+    W   : window, 0.5 s and at least 5 samples
+    v_0 : the noise: the 5th percentile of v, so that no part of the recording has to be known to rest
+    m   : the multiple, from the widest range over which the number of rests stays the same
+
+A rest is trimmed by W at both ends. One in which the sensor still turned or shook would spoil a mean, and is refused:
+its angular rate stands off that of the neighbouring rests, its direction moves, or it scatters beyond the noise. A turn
+by an angle theta shortens the mean of a vector by theta^2 / 24, for 2 deg by 5e-5: 0.05 mg.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
+
+    from pipeline.records import Recording
 
 RATE_AT_REST_DPS = 0.02
 SETTLING_S = 0.3
+
+WINDOW_S = 0.5
+SHORTEST_REST_S = 1.0
+MULTIPLES = np.geomspace(4.0, 1000.0, 25)
+SMALLEST_VARIANCE = 1e-12  # g^2, keeps the multiple of a noise-free recording above rounding
+CLIPPED_OR_STUCK = 0b110
+NEIGHBOURS = 5
+# Limits of a rest that is averaged. Beside the data: a hand-held rest of a consumer gyroscope differs by its
+# g-sensitivity (0.1 deg/s/g) and tremor (0.3 deg/s over some seconds) from its neighbours.
+RATE_LIMIT_DPS = 0.7
+TURN_LIMIT_DEG = 2.0
+SCATTER_LIMIT = 3.0
+SIGNIFICANT = 6.0  # standard deviations
+
+
+@dataclass(frozen=True)
+class Rest:
+    """One rest of a recording.
+
+    Attributes
+    ----------
+    start, stop : int
+        Its samples are ``start <= n < stop``.
+    accepted : bool
+        Whether its mean may be used.
+    reason : str
+        Why it is refused; empty where it is accepted.
+    """
+
+    start: int
+    stop: int
+    accepted: bool = True
+    reason: str = ""
 
 
 def runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
@@ -42,3 +96,163 @@ def still_samples(
         if start > 0:
             still[start:stop] &= time[start:stop] >= time[start] + settling
     return still
+
+
+def rests_from_table(recording: Recording) -> list[Rest]:
+    """Return the rests by the table's rate, or by the derivative of its angle; none without such a log.
+
+    Parameters
+    ----------
+    recording : Recording
+
+    Returns
+    -------
+    list of Rest
+        Their first 0.3 s, and the delay of the recording's filter, are left out.
+    """
+    if recording.table_rate is not None:
+        rate = recording.table_rate
+    elif recording.table_angle is not None and recording.samples > 1:
+        rate = np.gradient(recording.table_angle, recording.time)
+    else:
+        return []
+    still = still_samples(recording.time, rate, SETTLING_S + float(recording.filter.get("delay_s", 0.0)))
+    return [Rest(start, stop) for start, stop in runs(still)]
+
+
+def find_rests(recording: Recording) -> list[Rest]:
+    """Find the rests of a hand-held recording from its readings.
+
+    Parameters
+    ----------
+    recording : Recording
+        With accelerometer readings; those of the gyroscope, where it holds them, show rests that still turned.
+
+    Returns
+    -------
+    list of Rest
+        In order of time, at least 1 s long; those that moved are refused, with the reason.
+    """
+    force = recording.accelerometer
+    size = max(5, round(WINDOW_S / recording.interval)) if recording.samples > 1 else 5
+    if force is None or recording.samples < 2 * size:
+        return []
+    variance = _windowed_variance(force, size)
+    noise = max(float(np.percentile(variance, 5.0)), SMALLEST_VARIANCE)
+    variance[_spoilt(recording, size)] = np.inf
+    found = [_below(variance, multiple * noise, recording, size) for multiple in MULTIPLES]
+    return assess_rests(recording, found[_plateau([len(rests) for rests in found])], noise)
+
+
+def assess_rests(recording: Recording, intervals: Sequence[tuple[int, int]], noise_variance: float) -> list[Rest]:
+    """Refuse those rests in which the sensor moved.
+
+    Parameters
+    ----------
+    recording : Recording
+    intervals : sequence of (int, int)
+        Start and stop of each rest.
+    noise_variance : float, g^2
+        Variance of the specific force at rest, summed over the axes.
+
+    Returns
+    -------
+    list of Rest
+    """
+    rests = [Rest(start, stop) for start, stop in intervals]
+    reasons = [_scatter(recording, r, noise_variance) or _turn(recording, r) for r in rests]
+    rates = _rate_reasons(recording, rests)
+    return [
+        replace(rest, accepted=not reason, reason=reason)
+        for rest, reason in zip(rests, (a or b for a, b in zip(reasons, rates, strict=True)), strict=True)
+    ]
+
+
+def _windowed_variance(values: NDArray[np.float64], size: int) -> NDArray[np.float64]:
+    """Return the variance in each window of ``size`` samples, summed over the columns: (n - size + 1,) array."""
+    centred = values - values.mean(axis=0)
+
+    def sums(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        total = np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(x, axis=0)])
+        window: NDArray[np.float64] = total[size:] - total[:-size]
+        return window
+
+    squares = sums(centred**2) - sums(centred) ** 2 / size
+    variance: NDArray[np.float64] = np.maximum(squares.sum(axis=1), 0.0) / (size - 1)
+    return variance
+
+
+def _spoilt(recording: Recording, size: int) -> NDArray[np.bool_]:
+    """Return the windows with a clipped, stuck or missing reading, or over a gap as long as a window."""
+    assert recording.accelerometer is not None  # noqa: S101
+    bad = np.logical_not(np.all(np.isfinite(recording.accelerometer), axis=1))
+    if recording.flags is not None:
+        bad |= (recording.flags & CLIPPED_OR_STUCK) != 0
+    bad[1:] |= np.diff(recording.time_ns) > size * recording.interval * 1e9
+    total = np.concatenate([[0], np.cumsum(bad)])
+    return total[size:] > total[:-size]
+
+
+def _below(variance: NDArray[np.float64], threshold: float, recording: Recording, size: int) -> list[tuple[int, int]]:
+    """Return the trimmed stretches whose windows stay under a threshold, if long enough."""
+    lag = int(np.ceil(5.0 * float(recording.filter.get("delay_s", 0.0)) / recording.interval))
+    shortest = max(size, round(SHORTEST_REST_S / recording.interval))
+    trimmed = ((start + size + lag, stop - 1) for start, stop in runs(variance < threshold))
+    return [(start, stop) for start, stop in trimmed if stop - start >= shortest]
+
+
+def _plateau(counts: Sequence[int]) -> int:
+    """Return an index in the lower third of the longest run of equal counts above zero."""
+    steps = np.flatnonzero(np.diff(counts)) + 1
+    edges = [0, *steps.tolist(), len(counts)]
+    best = max(range(len(edges) - 1), key=lambda i: (counts[edges[i]] > 0, edges[i + 1] - edges[i]))
+    return int(edges[best] + (edges[best + 1] - edges[best]) // 3)
+
+
+def _scatter(recording: Recording, rest: Rest, noise_variance: float) -> str:
+    assert recording.accelerometer is not None  # noqa: S101
+    variance = float(np.var(recording.accelerometer[rest.start : rest.stop], axis=0).sum())
+    ratio = np.sqrt(variance / noise_variance)
+    if ratio <= SCATTER_LIMIT:
+        return ""
+    return f"specific force scatters {ratio:.1f} times the noise (limit {SCATTER_LIMIT:g})"
+
+
+def _turn(recording: Recording, rest: Rest) -> str:
+    """Compare the directions of the rest's four quarters."""
+    assert recording.accelerometer is not None  # noqa: S101
+    force = recording.accelerometer[rest.start : rest.stop]
+    quarter = len(force) // 4
+    if quarter == 0:
+        return ""
+    blocks = force[: 4 * quarter].reshape(4, quarter, 3)
+    means, length = blocks.mean(axis=1), float(np.linalg.norm(force.mean(axis=0)))
+    moved = float(np.max(np.linalg.norm(means[:, None] - means[None], axis=2)))
+    noise = float(np.sqrt(blocks.var(axis=1).sum(axis=1).mean() / quarter))
+    angle = np.degrees(moved / length) if length > 0 else 0.0
+    if angle <= TURN_LIMIT_DEG or moved <= SIGNIFICANT * noise:
+        return ""
+    return f"direction of the specific force moves by {angle:.1f} deg (limit {TURN_LIMIT_DEG:g} deg)"
+
+
+def _rate_reasons(recording: Recording, rests: Sequence[Rest]) -> list[str]:
+    """Compare each rest's mean angular rate with the median of the rests around it.
+
+    The bias itself wanders with the temperature, so that neighbours in time are compared, not all rests.
+    """
+    rate = recording.gyroscope
+    if rate is None or len(rests) < 3:
+        return [""] * len(rests)
+    parts = [rate[r.start : r.stop] for r in rests]
+    means = np.array([part.mean(axis=0) for part in parts])
+    reasons = []
+    for i, part in enumerate(parts):
+        first = int(np.clip(i - NEIGHBOURS // 2, 0, max(len(rests) - NEIGHBOURS, 0)))
+        off = float(np.max(np.abs(means[i] - np.median(means[first : first + NEIGHBOURS], axis=0))))
+        noise = float(np.max(part.std(axis=0))) / np.sqrt(len(part))
+        reasons.append(
+            f"angular rate is {off:.2f} deg/s off that of its neighbours (limit {RATE_LIMIT_DPS:g} deg/s)"
+            if off > max(RATE_LIMIT_DPS, SIGNIFICANT * noise)
+            else ""
+        )
+    return reasons
