@@ -107,7 +107,7 @@ def _single_blanks(body: bytes) -> bytes:
 
 
 def _fields(line: str, delimiter: str) -> list[str]:
-    return [name.strip() for name in next(csv.reader([line], delimiter=delimiter), [])]
+    return [name.strip() for name in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])]
 
 
 def _find_columns(names: list[str], settings: CsvFormat, where: str) -> list[tuple[Column, int]]:

@@ -52,6 +52,7 @@ def examine(table: ChannelTable, sensor: Mapping[str, Any]) -> tuple[NDArray[np.
     ------
     InputError
     """
+    _check_whole(table)
     _check_times(table)
     _check_force(table)
     _check_attitude(table)
@@ -62,6 +63,15 @@ def examine(table: ChannelTable, sensor: Mapping[str, Any]) -> tuple[NDArray[np.
         if full_scale is not None:
             notes += _mark_clipped(table, name, float(full_scale), flags)
     return (flags if flags.any() else None), notes
+
+
+def _check_whole(table: ChannelTable) -> None:
+    for channels in (*TRIADS.values(), ATTITUDE):
+        missing = [c for c in channels if c not in table.values]
+        if 0 < len(missing) < len(channels):
+            raise InputError(
+                f"{', '.join(missing)} missing; {', '.join(channels)} come together or not at all", table.path
+            )
 
 
 def _check_times(table: ChannelTable) -> None:

@@ -120,7 +120,7 @@ def _to_recording(name: str, entry: Mapping[str, Any], table: ChannelTable, sens
         temperature=values.get("temperature"),
         table_angle=values.get("table_angle"),
         table_rate=values.get("table_rate"),
-        table_attitude=_stack(values, ATTITUDE, table.path),
+        table_attitude=_stack(values, ATTITUDE),
         flags=flags,
         source=table.source,
         notes=(*table.notes, *notes),
@@ -128,15 +128,8 @@ def _to_recording(name: str, entry: Mapping[str, Any], table: ChannelTable, sens
     )
 
 
-def _stack(
-    values: Mapping[str, NDArray[np.float64]], channels: Sequence[str], path: str = ""
-) -> NDArray[np.float64] | None:
-    missing = [c for c in channels if c not in values]
-    if len(missing) == len(channels):
-        return None
-    if missing:
-        raise InputError(f"{', '.join(missing)} missing; {', '.join(channels)} come together or not at all", path)
-    return np.column_stack([values[c] for c in channels])
+def _stack(values: Mapping[str, NDArray[np.float64]], channels: Sequence[str]) -> NDArray[np.float64] | None:
+    return np.column_stack([values[c] for c in channels]) if channels[0] in values else None
 
 
 def _check_different(recordings: Sequence[Recording]) -> None:
