@@ -26,6 +26,7 @@ import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.model.rotation import attitude_matrix, conjugate_product, turn_about_axis
+from pipeline.model.turn_log import TurnLog
 from pipeline.records import AXES, Motion
 from pipeline.signal.rests import still_samples
 from pipeline.signal.temperature import smooth_temperature
@@ -106,16 +107,25 @@ def _motion_of_turn(
 ) -> Motion:
     assert recording.axis is not None  # noqa: S101
     assert recording.table_angle is not None  # noqa: S101
-    axis = AXES.index(recording.axis)
     time, angle = recording.time, recording.table_angle
     rate = recording.table_rate if recording.table_rate is not None else _derivative(time, angle)
-    acceleration = np.gradient(rate, time, edge_order=2)
+    log = TurnLog(time, angle, rate)
     still = still_samples(time, rate)
-    if np.any(offset):
-        from scipy.interpolate import CubicHermiteSpline  # noqa: PLC0415  (0.3 s, needed by delays alone)
+    return _turn(log, AXES.index(recording.axis), gravity_g, earth, still, temperature, offset)
 
-        position, velocity = CubicHermiteSpline(time, angle, rate), CubicHermiteSpline(time, rate, acceleration)
-        angle, rate, acceleration = position(time + offset), velocity(time + offset), velocity(time + offset, 1)
+
+def _turn(  # noqa: PLR0917  (bound one by one for the motion at an offset)
+    log: TurnLog,
+    axis: int,
+    gravity_g: float,
+    earth: NDArray[np.float64] | None,
+    still: NDArray[np.bool_],
+    temperature: NDArray[np.float64] | None,
+    offset: float | NDArray[np.float64] = 0.0,
+) -> Motion:
+    angle, rate, acceleration = log.angle, log.rate, log.acceleration
+    if np.any(offset):
+        angle, rate, acceleration = log.at(log.time + offset)
     level = np.stack([turn_about_axis(row, axis, -angle) for row in LEVEL_AT_ZERO[axis]], axis=1)
     force = gravity_g * level[:, 2, :]
     omega, alpha = np.zeros_like(force), np.zeros_like(force)
@@ -124,7 +134,7 @@ def _motion_of_turn(
     if earth is not None:
         omega = omega + np.einsum("i,nij->nj", earth, level)
     return Motion(
-        time=time,
+        time=log.time,
         specific_force=force,
         angular_rate=omega,
         angular_acceleration=alpha,
@@ -134,8 +144,9 @@ def _motion_of_turn(
         rate=rate,
         axis=axis,
         still=still,
-        at_offset=partial(reference_motion, recording, gravity_g, earth),
+        at_offset=partial(_turn, log, axis, gravity_g, earth, still, temperature),
         level=level,
+        followed=log.followed_samples,
     )
 
 

@@ -40,6 +40,8 @@ class Motion:
     direction : (n, 3) array, or None
         Unit vector in the body frame of the turn that goes on or, at rest, of the last one; zeros before the first.
         None: not worked out yet (``pipeline.model.effects.base.turning_direction`` does it from the rates).
+    followed : (n,) array of bool, or None
+        Samples beside which the log is fine enough to know the trajectory between the samples.
     """
 
     time: NDArray[np.float64]
@@ -55,3 +57,4 @@ class Motion:
     at_offset: Callable[..., Motion | None] | None = None
     level: NDArray[np.float64] | None = None
     direction: NDArray[np.float64] | None = None
+    followed: NDArray[np.bool_] | None = None

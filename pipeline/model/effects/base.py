@@ -151,6 +151,10 @@ class Effect(abc.ABC):
         """Return the values from which a fit starts, several where the reading is not linear in them."""
         return [np.zeros(len(self.parameters(sensor)))]
 
+    def stepped(self, values: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return ``values + step``, as far as the parameters may go in one round of a nonlinear fit."""
+        return values + step
+
     def available(self, motion: Motion) -> bool:
         """Return whether the motion holds what the effect needs."""
         return all(getattr(motion, need) is not None for need in self.needs)

@@ -42,6 +42,15 @@ class LowPassLag(Effect):
         del sensor
         return (Parameter("tau", "s", "time constant of the filter"),)
 
+    def starts(self, sensor: str) -> list[NDArray[np.float64]]:
+        """Return a short lag: at none, it looks exactly like a time offset."""
+        del sensor
+        return [np.array([0.005])]
+
+    def stepped(self, values: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return ``values + step``, not below zero."""
+        return np.maximum(values + step, 0.0)
+
     def regressors(
         self, sensor: str, motion: Motion, K: NDArray[np.float64], values: NDArray[np.float64]
     ) -> NDArray[np.float64]:

@@ -2,8 +2,8 @@
 
     z = K R^T g (pi/180) (-d_y, d_x, 0)
 
-where d_x and d_y are small turns of the table about level x and y, deg, R the rotation from body to level, g the local gravity,
-g, and K the inverse of the calibration matrix.
+where d_x and d_y are small turns of the table about level x and y, deg, R the rotation from body to level, g the local
+gravity, g, and K the inverse of the calibration matrix.
 """
 
 from __future__ import annotations

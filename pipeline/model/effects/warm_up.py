@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from pipeline.records import Motion
 
 STARTS_S = (60.0, 180.0, 500.0)
+SHORTEST_S, LONGEST_S = 1.0, 1e5
 
 
 class WarmUp(Effect):
@@ -43,6 +44,12 @@ class WarmUp(Effect):
         """Return a small grid of time constants."""
         del sensor
         return [np.array([0.0, 0.0, 0.0, tau]) for tau in STARTS_S]
+
+    def stepped(self, values: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return ``values + step`` with the time constant at most halved or doubled."""
+        new = values + step
+        new[3] = np.clip(new[3], max(values[3] / 2.0, SHORTEST_S), min(values[3] * 2.0, LONGEST_S))
+        return new
 
     def regressors(
         self, sensor: str, motion: Motion, K: NDArray[np.float64], values: NDArray[np.float64]

@@ -1,0 +1,251 @@
+"""Base and effects as columns of a linear problem in the measurement direction.
+
+    y_c = b_c + K_c . u + sum over effects z_c(p) + noise,    c = x, y, z
+
+where b is the bias, K_c row c of the inverse of the calibration matrix, u the truth by the table. The columns of one
+axis and those that the axes share differ by effect (``Layout``); each is built once:
+
+    A = [1, u, every-axis regressors | y_x, its own and shared | y_y, ... | y_z, ...]
+
+so that all products of the 3 n rows are found in ``A^T A``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.errors import NotObservableError
+from pipeline.estimation.wandering import Whitened, cells_of
+from pipeline.model.effects.base import Layout, truth
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.estimation.observations import Observations, Part
+    from pipeline.estimation.wandering import Setting
+    from pipeline.model.effects.base import Effect
+    from pipeline.records import Motion, Noise
+
+BASE = 12
+BASE_NAMES = [f"bias_{a}" for a in "xyz"] + [f"matrix_{a}{b}" for a in "xyz" for b in "xyz"]
+
+
+@dataclass(frozen=True)
+class Term:
+    """An effect at given values of its parameters, as columns.
+
+    Attributes
+    ----------
+    effect : Effect
+    values : (p,) array
+        Where its derivative is taken.
+    full : bool
+        Whether the columns of its nonlinear parameters are among them.
+    """
+
+    effect: Effect
+    values: NDArray[np.float64]
+    full: bool = False
+
+    def layout(self) -> Layout:
+        """Return how its columns act on the axes."""
+        return Layout.SHARED if self.full else self.effect.layout
+
+    def regressors(self, sensor: str, motion: Motion, K: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return its columns in the shape of its layout."""
+        of = self.effect.columns if self.full else self.effect.regressors
+        return of(sensor, motion, K, self.values)
+
+
+def felt(part: Part, terms: Sequence[Term], but: Effect | None = None) -> Motion:
+    """Return the motion that the sensor felt, after all effects of timing but one."""
+    motion = part.motion
+    for term in terms:
+        if term.effect is not but:
+            motion = term.effect.moved(motion, term.values)
+    return motion
+
+
+def motions_of(part: Part, terms: Sequence[Term]) -> list[Motion]:
+    """Return the motion that each term acts on, and last that of the base."""
+    everything = felt(part, terms)
+    moves = [term.effect.moves and bool(np.any(term.values)) for term in terms]
+    acted = [felt(part, terms, term.effect) if move else everything for term, move in zip(terms, moves, strict=True)]
+    return [*acted, everything]
+
+
+@dataclass(frozen=True)
+class Start:
+    """The base by ordinary least squares.
+
+    Attributes
+    ----------
+    bias : (3,) array
+    K : (3, 3) array
+    scale : (3,) array
+        White noise of each axis, for the weights between the axes.
+    """
+
+    bias: NDArray[np.float64]
+    K: NDArray[np.float64]
+    scale: NDArray[np.float64]
+
+
+def ordinary_base(observations: Observations, noise: Noise | None) -> Start:
+    """Fit bias and matrix by ordinary least squares.
+
+    Raises
+    ------
+    NotObservableError
+        If the motion does not determine them.
+    """
+    names = [f"column {b} of the matrix" for b in "xyz"]
+    if not observations.parts:
+        raise NotObservableError(
+            f"no recording holds the {observations.sensor} together with the motion of a table; "
+            "effects are fitted against a reference: record table_angle_deg or the table's attitude"
+        )
+    u = np.concatenate([truth(observations.sensor, part.motion) for part in observations.parts])
+    root = np.sqrt(observations.weight)[:, None]
+    X = root * np.column_stack([np.ones(len(u)), u])
+    size = np.linalg.norm(X, axis=0)
+    if len(u) < 4 or np.any(size == 0):
+        idle = [name for name, s in zip(names, size[1:], strict=True) if s == 0]
+        raise NotObservableError(_undetermined(observations.sensor, idle or names))
+    U, s, Vt = np.linalg.svd(X / size, full_matrices=False)
+    if s[-1] < 1e-3 * s[0]:
+        weak = [name for name, part in zip(names, Vt[-1, 1:], strict=True) if abs(part) > 0.1]
+        raise NotObservableError(_undetermined(observations.sensor, weak or ["bias"]))
+    y = root * observations.reading
+    beta = (Vt.T / s) @ (U.T @ y) / size[:, None]
+    residual = y - X @ beta
+    scale = np.sqrt((np.sum(residual**2, axis=0) + observations.scatter) / max(observations.samples - 4.0, 1.0))
+    if noise is not None and np.all(np.isfinite(noise.white)) and np.all(noise.white > 0):
+        scale = noise.white
+    largest = max(float(scale.max()), float(np.abs(observations.reading).max()) * 1e-12, 1e-300)
+    return Start(beta[0], beta[1:].T, np.maximum(scale, 1e-6 * largest))
+
+
+def _undetermined(sensor: str, names: Sequence[str]) -> str:
+    return (
+        f"the recordings of the {sensor} do not determine {', '.join(names)}: "
+        "the table's motion must excite all three axes; record turns about each of them"
+    )
+
+
+class Design:
+    """Products of base, terms and readings under noise settings.
+
+    Parameters
+    ----------
+    observations : Observations
+    terms : sequence of Term
+    K : (3, 3) array
+    scale : (3,) array
+    target : (n, 3) array, optional
+        What is to be explained; None: the readings.
+    project : bool
+        Take the base out of the other columns first, so that products keep their digits.
+    base : (n, 3) array, optional
+        Regressors of K in place of the truth.
+    """
+
+    def __init__(
+        self,
+        observations: Observations,
+        terms: Sequence[Term],
+        K: NDArray[np.float64],
+        scale: NDArray[np.float64],
+        *,
+        target: NDArray[np.float64] | None = None,
+        base: NDArray[np.float64] | None = None,
+        project: bool = False,
+    ) -> None:
+        self.scale = scale
+        self._place(observations.sensor, terms)
+        weight = observations.weight
+        A = np.zeros((len(weight), self._width))
+        A[:, self._readings] = observations.reading if target is None else target
+        row = 0
+        for part in observations.parts:
+            rows = slice(row, row + len(part.weight))
+            self._fill(A[rows], observations.sensor, part, terms, K)
+            row = rows.stop
+        if base is not None:
+            A[:, 1:4] = base
+        self.size = np.sqrt(np.einsum("i,ij,ij->j", weight, A, A))
+        if project:
+            root = np.sqrt(weight)[:, None]
+            Q, R = np.linalg.qr(root * A[:, :4])
+            inner = Q.T @ (root * A[:, 4:])
+            A[:, 4:] -= A[:, :4] @ np.linalg.solve(R, inner)
+        self.whitened = Whitened(cells_of(observations), weight, A)
+
+    def _place(self, sensor: str, terms: Sequence[Term]) -> None:
+        """Lay out the columns: where each lies in A, and which of all parameters it belongs to, for each axis."""
+        local: list[list[int]] = [[0, 1, 2, 3] for _ in range(3)]
+        total: list[list[int]] = [[c, 3 + 3 * c, 4 + 3 * c, 5 + 3 * c] for c in range(3)]
+        self.slices: list[slice] = []
+        self._columns: list[list[slice]] = []
+        width, parameters = 4, BASE
+        for term in terms:
+            layout = term.layout()
+            count = len(term.effect.parameters(sensor))
+            if layout != Layout.SHARED:
+                count -= len(term.effect.nonlinear)
+            each = count if layout == Layout.SHARED else count // 3
+            places = []
+            for c in range(3):
+                places.append(slice(width, width + each))
+                local[c] += range(width, width + each)
+                offset = parameters if layout == Layout.SHARED else parameters + c * each
+                total[c] += range(offset, offset + each)
+                if layout != Layout.EVERY_AXIS or c == 2:
+                    width += each
+            self._columns.append(places)
+            self.slices.append(slice(parameters, parameters + count))
+            parameters += count
+        self._readings = [width, width + 1, width + 2]
+        for c in range(3):
+            local[c].append(width + c)
+            total[c].append(parameters)
+        self.count = parameters
+        self._width = width + 3
+        self._local = [np.array(index) for index in local]
+        self._total = [np.array(index) for index in total]
+
+    def _fill(
+        self, A: NDArray[np.float64], sensor: str, part: Part, terms: Sequence[Term], K: NDArray[np.float64]
+    ) -> None:
+        *motions, everything = motions_of(part, terms)
+        A[:, 0] = 1.0
+        A[:, 1:4] = truth(sensor, everything)
+        for term, motion, places in zip(terms, motions, self._columns, strict=True):
+            regressors = term.regressors(sensor, motion, K)
+            if term.layout() == Layout.EVERY_AXIS:
+                A[:, places[0]] = regressors
+            else:
+                for c in range(3):
+                    A[:, places[c]] = regressors[:, c]
+
+    def products(self, setting: Setting) -> tuple[NDArray[np.float64], float]:
+        """Return all products of parameters' columns and, last, the readings; and log det C, up to a constant."""
+        local, logarithm = self.whitened.products(setting)
+        total = np.zeros((self.count + 1, self.count + 1))
+        for c in range(3):
+            total[np.ix_(self._total[c], self._total[c])] += (
+                local[np.ix_(self._local[c], self._local[c])] / self.scale[c] ** 2
+            )
+        return total, 3.0 * logarithm
+
+    def sizes(self) -> NDArray[np.float64]:
+        """Return the norm of each parameter's column before the base was taken out: (p + 1,) array."""
+        squares = np.zeros(self.count + 1)
+        for c in range(3):
+            np.add.at(squares, self._total[c], (self.size[self._local[c]] / self.scale[c]) ** 2)
+        return np.sqrt(squares)

@@ -1,0 +1,425 @@
+"""Base and effects fitted together, by generalised least squares in the measurement direction.
+
+    y = b + K u(t') + sum over effects z(t'; p) + noise,    beta = (b, K, p)
+    step = (J^T C^-1 J)^-1 J^T C^-1 r,    covariance = s^2 (J^T C^-1 J)^-1
+
+where
+
+    u  : truth by the table, at the time t' that effects of timing lead to
+    J  : derivative of the model with respect to beta; r: readings less the model
+    C  : white noise plus a bias wander, ``pipeline.estimation.wandering``
+    s  : standard deviation of one sample, from the residual
+
+Nearly everything is linear; time offsets, lags and time constants take a few Gauss-Newton rounds. The noise is the one
+under which the readings are most likely, and the covariance is averaged over the noises by their likelihood.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.errors import ConfigurationError, NotObservableError
+from pipeline.estimation.design import BASE, BASE_NAMES, Design, Start, Term, motions_of, ordinary_base
+from pipeline.estimation.observations import observe
+from pipeline.estimation.wandering import Setting, settings_for
+from pipeline.model.effects import effect
+from pipeline.model.effects.base import Layout, truth
+from pipeline.records import FittedEffect, SensorCalibration, StageResult
+from pipeline.records.calibration import coverage_factor
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.estimation.observations import Observations
+    from pipeline.model.effects.base import Effect
+    from pipeline.records import Noise, Recording
+
+ROUNDS = 25
+SMALL_STEP = 1e-3  # of a standard uncertainty
+RATIOS = (0.01, 0.03, 0.1, 0.2, 0.3, 0.5, 1.0, 3.0)
+TIMES = (30.0, 100.0, 300.0, 1000.0)
+WHITE = Setting(0.0, 1.0)
+LEAST_EIGENVALUE = 1e-7  # of the products of columns of unit norm: a column is 3e-4 new
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Base and effects that explain the readings best.
+
+    Attributes
+    ----------
+    bias : (3,) array
+    K : (3, 3) array
+    terms : tuple of Term
+        The effects at their values.
+    covariance : (12 + p, 12 + p) array
+        Of bias, K (row by row) and the effects' parameters.
+    log_likelihood : float
+        Under the best noise setting, up to a constant of the readings.
+    setting : Setting
+        That noise setting.
+    degrees_of_freedom : float
+    residual_rms : float
+        Of single samples, unit of the sensor.
+    rounds : int
+    converged : bool
+    condition : float
+        Of the scaled products of columns.
+    """
+
+    bias: NDArray[np.float64]
+    K: NDArray[np.float64]
+    terms: tuple[Term, ...]
+    covariance: NDArray[np.float64]
+    log_likelihood: float
+    setting: Setting
+    degrees_of_freedom: float
+    residual_rms: float
+    rounds: int
+    converged: bool
+    condition: float
+
+
+@dataclass(frozen=True)
+class _Point:
+    """The model at some parameters: its residual and derivative, as products under each noise."""
+
+    design: Design
+    residual: NDArray[np.float64]
+
+
+def fit_terms(observations: Observations, terms: Sequence[Term], start: Start, settings: Sequence[Setting]) -> Fit:
+    """Fit base and effects from given values.
+
+    Parameters
+    ----------
+    observations : Observations
+    terms : sequence of Term
+        Effects and where their nonlinear parameters start.
+    start : Start
+    settings : sequence of Setting
+        Noises over which the likelihood is maximised.
+
+    Returns
+    -------
+    Fit
+    """
+    terms = [Term(term.effect, np.array(term.values, float), full=True) for term in terms]
+    bias, K = start.bias.copy(), start.K.copy()
+    converged, rounds = False, 0
+    for rounds in range(1, ROUNDS + 1):
+        point = _at(observations, terms, bias, K, start.scale)
+        solved = _solve(point, observations, settings)
+        step, uncertainty = solved.step, np.sqrt(np.diag(solved.covariance))
+        bias, K = bias + step[:3], K + step[3:BASE].reshape(3, 3)
+        moved, at = [], BASE
+        for term in terms:
+            size = len(term.values)
+            moved.append(Term(term.effect, term.effect.stepped(term.values, step[at : at + size]), full=True))
+            at += size
+        taken = np.concatenate([step[:BASE], *[m.values - t.values for m, t in zip(moved, terms, strict=True)]])
+        terms = moved
+        small = np.maximum(
+            SMALL_STEP * uncertainty, 1e-12 * np.concatenate([np.ones(BASE), np.zeros(len(step) - BASE)])
+        )
+        if np.all(np.abs(taken) <= small) or (rounds > 1 and not any(t.effect.nonlinear or _bends(t) for t in terms)):
+            converged = True
+            break
+    point = _at(observations, terms, bias, K, start.scale)
+    solved = _solve(point, observations, settings)
+    return Fit(
+        bias,
+        K,
+        tuple(terms),
+        solved.covariance,
+        solved.log_likelihood,
+        solved.setting,
+        solved.degrees_of_freedom,
+        _residual_rms(point, observations),
+        rounds,
+        converged,
+        solved.condition,
+    )
+
+
+def _bends(term: Term) -> bool:
+    return term.effect.layout == Layout.SHARED
+
+
+def _at(
+    observations: Observations,
+    terms: Sequence[Term],
+    bias: NDArray[np.float64],
+    K: NDArray[np.float64],
+    scale: NDArray[np.float64],
+) -> _Point:
+    """Return the model at some parameters. Effects that the axes share pass through K, so K acts on them too."""
+    sensor = observations.sensor
+    predicted, base = [], []
+    for part in observations.parts:
+        *motions, everything = motions_of(part, terms)
+        u = truth(sensor, everything)
+        reading = bias + u @ K.T
+        for term, motion in zip(terms, motions, strict=True):
+            if term.effect.moves:
+                continue
+            z = term.effect.reading(sensor, motion, K, term.values)
+            reading = reading + z
+            if term.effect.layout == Layout.SHARED:
+                u = u + np.linalg.solve(K, z.T).T
+        predicted.append(reading)
+        base.append(u)
+    residual = observations.reading - np.concatenate(predicted)
+    design = Design(observations, terms, K, scale, target=residual, base=np.concatenate(base))
+    return _Point(design, residual)
+
+
+@dataclass(frozen=True)
+class _Solved:
+    step: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    log_likelihood: float
+    setting: Setting
+    degrees_of_freedom: float
+    condition: float
+
+
+def _solve(point: _Point, observations: Observations, settings: Sequence[Setting]) -> _Solved:
+    """Solve for the step under each noise setting; take the most likely one, and average the covariance."""
+    design = point.design
+    n = 3.0 * observations.samples
+    within = float(np.sum(observations.scatter / design.scale**2))
+    size = design.sizes()[:-1]
+    size = np.where(size > 0, size, 1.0)
+    spare = max(n - design.count, 1.0)
+    scores, steps, covariances, conditions = [], [], [], []
+    for setting in settings:
+        products, logarithm = design.products(setting)
+        gram, rhs = products[:-1, :-1] / np.outer(size, size), products[:-1, -1] / size
+        unit = np.sqrt(np.maximum(np.diag(gram), 1e-30))
+        values, vectors = np.linalg.eigh(gram / np.outer(unit, unit))
+        kept = values > 1e-12 * values[-1]
+        half = vectors[:, kept] / np.sqrt(values[kept]) / unit[:, None]
+        step = half @ (half.T @ rhs)
+        rss = max(products[-1, -1] - float(step @ rhs), 0.0) + within
+        rss = max(rss, 1e-300)
+        scores.append(-0.5 * n * np.log(rss / n) - 0.5 * logarithm + setting.prior)
+        steps.append(step / size)
+        covariances.append(half @ half.T / np.outer(size, size) * rss / spare)
+        conditions.append(float(np.sqrt(values[-1] / max(values[0], 1e-300))))
+    best = int(np.argmax(scores))
+    weight = np.exp(np.array(scores) - scores[best])
+    covariance, freedom = _averaged(np.array(covariances), weight / weight.sum(), spare)
+    return _Solved(steps[best], covariance, float(scores[best]), settings[best], freedom, conditions[best])
+
+
+def _averaged(
+    covariances: NDArray[np.float64], weight: NDArray[np.float64], spare: float
+) -> tuple[NDArray[np.float64], float]:
+    """Average covariances over the noises; their spread says how many degrees of freedom the average has.
+
+    A variance with a scaled inverse chi-square distribution of nu degrees has ``var / mean^2 = 2 / (nu - 4)``.
+    """
+    mean: NDArray[np.float64] = np.tensordot(weight, covariances, 1)
+    diagonal = np.diagonal(covariances, axis1=1, axis2=2)
+    average = np.maximum(np.diag(mean), 1e-300)
+    spread = float(np.max(weight @ (diagonal / average - 1.0) ** 2))
+    freedom = 4.0 + 2.0 / spread if spread > 1e-12 else np.inf
+    shrink = (freedom - 2.0) / freedom if np.isfinite(freedom) else 1.0
+    return mean * shrink, float(1.0 / (1.0 / spare + 1.0 / freedom))
+
+
+def _residual_rms(point: _Point, observations: Observations) -> float:
+    squares = np.sum(observations.weight[:, None] * point.residual**2) + np.sum(observations.scatter)
+    return float(np.sqrt(squares / (3.0 * observations.samples)))
+
+
+def starts_of(names: Sequence[str], sensor: str, known: SensorCalibration | None = None) -> list[list[Term]]:
+    """Return the terms from which a fit starts, every combination of the effects' starts.
+
+    Parameters
+    ----------
+    names : sequence of str
+    sensor : str
+    known : SensorCalibration, optional
+        Its fitted effects start where they are.
+
+    Raises
+    ------
+    ConfigurationError
+        If an effect is unknown, named twice, or not one of this sensor.
+    """
+    if len(set(names)) != len(names):
+        raise ConfigurationError(f"effects.{sensor} names an effect twice: {', '.join(names)}")
+    fitted = {} if known is None else {e.name: e.values for e in known.effects}
+    combinations: list[list[Term]] = [[]]
+    for name in names:
+        this = effect(name)
+        if sensor not in this.sensors:
+            raise ConfigurationError(
+                f"effects.{sensor} names {name}, which is an effect of the {this.sensors[0]} alone"
+            )
+        values = [fitted[name]] if name in fitted else this.starts(sensor)
+        combinations = [[*before, Term(this, v)] for before in combinations for v in values]
+    return combinations
+
+
+def fit_best(
+    observations: Observations, combinations: Sequence[Sequence[Term]], start: Start, settings: Sequence[Setting]
+) -> Fit:
+    """Fit from the combination of starts under which the readings are most likely after one linear step."""
+    chosen = combinations[0]
+    if len(combinations) > 1:
+        scores = []
+        for terms in combinations:
+            full = [Term(t.effect, np.array(t.values, float), full=True) for t in terms]
+            point = _at(observations, full, start.bias, start.K, start.scale)
+            scores.append(_solve(point, observations, settings).log_likelihood)
+        chosen = combinations[int(np.argmax(scores))]
+    return fit_terms(observations, chosen, start, settings)
+
+
+def require_observable(observations: Observations, fit: Fit, scale: NDArray[np.float64]) -> None:
+    """Refuse a fit that the recordings do not determine.
+
+    Raises
+    ------
+    NotObservableError
+        Naming the parameters.
+    """
+    point = _at(observations, fit.terms, fit.bias, fit.K, scale)
+    names = [*BASE_NAMES, *parameter_names(observations.sensor, [t.effect for t in fit.terms])]
+    size = point.design.sizes()[:-1]
+    products = point.design.products(WHITE)[0][:-1, :-1] / np.outer(*[np.where(size > 0, size, 1.0)] * 2)
+    values, vectors = np.linalg.eigh(products)
+    weak = [name for name, s in zip(names, size, strict=True) if s == 0]
+    for value, vector in zip(values, vectors.T, strict=True):
+        if value < LEAST_EIGENVALUE:
+            weak += [
+                name for name, share in zip(names, np.abs(vector), strict=True) if share > 0.2 and name not in weak
+            ]
+    if weak:
+        involved = {name.split(".")[0] for name in weak if "." in name}
+        advice = "; ".join(
+            f"{t.effect.name} needs {t.effect.excitation}" for t in fit.terms if t.effect.name in involved
+        )
+        raise NotObservableError(
+            f"the recordings of the {observations.sensor} do not determine {', '.join(weak)}: "
+            f"{advice or 'record turns about all three axes'}; or take the effect out of effects.{observations.sensor}"
+        )
+
+
+def parameter_names(sensor: str, effects: Sequence[Effect]) -> list[str]:
+    """Return ``<effect>.<parameter>`` for each parameter."""
+    return [f"{e.name}.{p.name}" for e in effects for p in e.parameters(sensor)]
+
+
+def _require_available(observations: Observations, names: Sequence[str]) -> None:
+    for name in names:
+        this = effect(name)
+        lacking = [need for need in this.needs if all(getattr(p.motion, need) is None for p in observations.parts)]
+        without = [p.name for p in observations.parts for need in this.needs if getattr(p.motion, need) is None]
+        if lacking or ("temperature" in this.needs and without):
+            raise NotObservableError(
+                f"{name} needs {', '.join(lacking or ['temperature'])}, which "
+                f"{'no recording holds' if lacking else 'is missing in ' + ', '.join(without)}; "
+                f"record it, or take {name} out of effects.{observations.sensor}"
+            )
+        if this.needs_clock and not observations.clock_shared:
+            raise NotObservableError(
+                f"{name} needs the time between the recordings, but their times overlap (each starts at 0?): "
+                f"record them on one clock, or take {name} out of effects.{observations.sensor}"
+            )
+
+
+def fit_joint(  # noqa: PLR0917  (the interface that the stages and the diagnosis share)
+    sensor: str,
+    recordings: Sequence[Recording],
+    effects: Sequence[str],
+    noise: Noise | None,
+    settings: Mapping[str, Any],
+    start: SensorCalibration | None = None,
+) -> SensorCalibration:
+    """Fit bias, matrix and effects together.
+
+    Parameters
+    ----------
+    sensor : str
+    recordings : sequence of Recording
+        All of a unit; those held out are left aside.
+    effects : sequence of str
+        In the order in which they are reported.
+    noise : Noise or None
+        Pins the bias wander where it comes from a static recording.
+    settings : mapping
+        The unit's part of the configuration; its section ``table`` is read.
+    start : SensorCalibration, optional
+        The calibration so far: its stages are kept, its effects are starts.
+
+    Returns
+    -------
+    SensorCalibration
+        With ``effects`` and a stage ``effects``.
+
+    Raises
+    ------
+    NotObservableError
+        If the recordings do not determine a parameter.
+    ConfigurationError
+        If an effect is unknown or not one of this sensor.
+    """
+    combinations = starts_of(effects, sensor, start)
+    observations = observe(sensor, recordings, settings["table"])
+    base = ordinary_base(observations, noise)
+    _require_available(observations, effects)
+    grid = settings_for(noise, RATIOS, TIMES)
+    fit = fit_best(observations, combinations, base, grid)
+    require_observable(observations, fit, base.scale)
+    return calibration_of(sensor, fit, observations, start)
+
+
+def calibration_of(
+    sensor: str, fit: Fit, observations: Observations, before: SensorCalibration | None
+) -> SensorCalibration:
+    """Return a fit as a calibration: ``matrix = K^-1``, with ``d matrix = -matrix dK matrix``."""
+    matrix = np.asarray(np.linalg.solve(fit.K, np.eye(3)), np.float64)
+    change = np.eye(len(fit.covariance))
+    change[3:BASE, 3:BASE] = -np.kron(matrix, matrix.T)
+    covariance = change @ fit.covariance @ change.T
+    uncertainty = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
+    factor = coverage_factor(fit.degrees_of_freedom)
+    effects, parameters, at = [], {}, BASE
+    for term in fit.terms:
+        described: dict[str, dict[str, Any]] = {}
+        for parameter, value in zip(term.effect.parameters(sensor), term.values, strict=True):
+            shared = {"value": float(value), "unit": parameter.unit}
+            described[parameter.name] = {**shared, "expanded_uncertainty": float(factor * uncertainty[at])}
+            parameters[f"{term.effect.name}.{parameter.name}"] = {
+                **shared,
+                "standard_uncertainty": float(uncertainty[at]),
+            }
+            at += 1
+        effects.append(FittedEffect(term.effect.name, described))
+    details = {
+        "samples": round(observations.samples),
+        "rounds": fit.rounds,
+        "condition": fit.condition,
+        "wander_ratio": fit.setting.ratio,
+        "wander_time_s": fit.setting.time,
+    }
+    stage = StageResult("effects", parameters, fit.residual_rms, None, details)
+    return replace(
+        before or SensorCalibration(sensor),
+        bias=fit.bias,
+        matrix=matrix,
+        stages=(*(before.stages if before else ()), stage),
+        effects=tuple(effects),
+        covariance=covariance,
+        degrees_of_freedom=fit.degrees_of_freedom,
+        converged=fit.converged,
+    )

@@ -1,0 +1,273 @@
+"""The samples that a fit against a table's motion uses, of every recording of a unit.
+
+Kept are, where readings and log are sound,
+
+* rests that have settled, as means over at most 1 s: within one the motion does not change, so nothing but white noise
+  is lost, and its sum of squares is kept;
+* samples at which the log follows the motion. Where it is too coarse for a ramp or a step, the angular acceleration,
+  and with it a lever arm or a delay, would be the log's and not the table's; those samples are left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.model.effects.base import turning_direction
+from pipeline.model.effects.time_offset import shifted
+from pipeline.model.kinematics import earth_rate, reference_motion
+from pipeline.signal.rests import RATE_AT_REST_DPS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.records import Motion, Recording
+
+ROLES = ("accelerometer", "gyroscope", "static")
+UNSOUND = 0b0110  # flags of clipped and stuck samples
+MEAN_S = 1.0
+BEND_DPS, BEND_SHARE = 0.05, 1e-3
+ARRAYS = (
+    "time",
+    "specific_force",
+    "angular_rate",
+    "angular_acceleration",
+    "specific_force_rate",
+    "temperature",
+    "angle",
+    "rate",
+    "level",
+    "direction",
+)
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Groups of a recording's samples whose means are the rows of a fit.
+
+    Attributes
+    ----------
+    kept : (k,) array of int
+        Indices of the samples.
+    first : (m,) array of int
+        Where in ``kept`` each group starts.
+    count : (m,) array
+        Samples of each group.
+    total : int
+        Samples of the recording.
+    """
+
+    kept: NDArray[np.intp]
+    first: NDArray[np.intp]
+    count: NDArray[np.float64]
+    total: int
+
+    def means(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the group means of (n, ...) values: (m, ...) array."""
+        kept = values[self.kept]
+        if len(self.first) == len(kept):
+            return kept
+        shape = (-1,) + (1,) * (values.ndim - 1)
+        means: NDArray[np.float64] = np.add.reduceat(kept, self.first, axis=0) / self.count.reshape(shape)
+        return means
+
+    def motion(self, motion: Motion) -> Motion:
+        """Return the motion at the rows."""
+        means: dict[str, Any] = {name: self.means(v) for name in ARRAYS if (v := getattr(motion, name)) is not None}
+        trajectory = motion.at_offset
+        return replace(
+            motion,
+            **means,
+            still=motion.still[self.kept[self.first]],
+            followed=None,
+            at_offset=None if trajectory is None else partial(self._at, trajectory),
+        )
+
+    def _at(self, trajectory: Callable[..., Motion | None], offset: float | NDArray[np.float64] = 0.0) -> Motion:
+        """Return the motion at the rows' samples shifted in time; ``offset`` is that of the rows."""
+        if isinstance(offset, np.ndarray):
+            samples = np.zeros(self.total)
+            samples[self.kept] = np.repeat(offset, self.count.astype(int))
+            offset = samples
+        motion = trajectory(offset=offset)
+        assert motion is not None  # noqa: S101
+        return self.motion(motion)
+
+
+@dataclass(frozen=True)
+class Part:
+    """The rows of one recording.
+
+    Attributes
+    ----------
+    name, role : str
+    motion : Motion
+    reading : (m, 3) array, g or deg/s
+    weight : (m,) array
+        Samples of each row, less what a filter's correlation takes from their information.
+    scatter : (3,) array
+        Sum of squares about the means, weighted.
+    clock_shared : bool
+    """
+
+    name: str
+    role: str
+    motion: Motion
+    reading: NDArray[np.float64]
+    weight: NDArray[np.float64]
+    scatter: NDArray[np.float64]
+    clock_shared: bool
+
+
+@dataclass(frozen=True)
+class Observations:
+    """What a fit sees of one sensor.
+
+    Attributes
+    ----------
+    sensor : str
+    parts : tuple of Part
+        In the order of time where the clock is shared.
+    earth : bool
+        Whether Earth's rotation is in the motion.
+    """
+
+    sensor: str
+    parts: tuple[Part, ...]
+    earth: bool
+
+    @property
+    def reading(self) -> NDArray[np.float64]:
+        """All readings: (n, 3) array."""
+        return np.concatenate([part.reading for part in self.parts])
+
+    @property
+    def weight(self) -> NDArray[np.float64]:
+        """All weights: (n,) array."""
+        return np.concatenate([part.weight for part in self.parts])
+
+    @property
+    def scatter(self) -> NDArray[np.float64]:
+        """Sum of squares within the rows: (3,) array."""
+        total = np.zeros(3)
+        for part in self.parts:
+            total += part.scatter
+        return total
+
+    @property
+    def samples(self) -> float:
+        """Number of samples, as far as they are independent."""
+        return float(sum(part.weight.sum() for part in self.parts))
+
+    @property
+    def clock_shared(self) -> bool:
+        """Whether the time between the recordings is known."""
+        return all(part.clock_shared for part in self.parts) or len(self.parts) == 1
+
+
+def observe(sensor: str, recordings: Sequence[Recording], table: Mapping[str, Any]) -> Observations:
+    """Return what a fit sees of one sensor: every recording with its readings and a table's motion.
+
+    Parameters
+    ----------
+    sensor : str
+    recordings : sequence of Recording
+        Those held out are left aside.
+    table : mapping
+        ``gravity_g``, ``latitude_deg``, ``azimuth_deg``.
+    """
+    latitude, azimuth = table.get("latitude_deg"), table.get("azimuth_deg")
+    earth = None if latitude is None or azimuth is None else earth_rate(float(latitude), float(azimuth))
+    parts = []
+    for recording in recordings:
+        if recording.role in ROLES and recording.samples >= 6:
+            part = _part(sensor, recording, float(table.get("gravity_g") or 1.0), earth)
+            if part is not None:
+                parts.append(part)
+    parts.sort(key=lambda part: (not part.clock_shared, part.motion.time[0] if part.clock_shared else 0.0))
+    return Observations(sensor, tuple(parts), earth is not None)
+
+
+def _part(sensor: str, recording: Recording, gravity: float, earth: NDArray[np.float64] | None) -> Part | None:
+    reading = recording.reading(sensor)
+    if reading is None:
+        return None
+    motion = reference_motion(recording, gravity, earth)
+    if motion is None:
+        return None
+    motion = replace(motion, direction=turning_direction(motion))
+    delay = float(recording.filter.get("delay_s", 0.0))
+    motion = shifted(motion, -delay)
+    sound: NDArray[np.bool_] = np.all(np.isfinite(reading), axis=1)
+    if recording.flags is not None:
+        sound = np.logical_and(sound, (recording.flags & UNSOUND) == 0)
+    rows = rows_of(motion, sound)
+    if len(rows.first) == 0:
+        return None
+    information = min(float(recording.filter.get("noise_gain", 1.0)) ** 2, 1.0)
+    means = rows.means(reading)
+    kept = reading[rows.kept]
+    within = np.sum((kept - np.repeat(means, rows.count.astype(int), axis=0)) ** 2, axis=0)
+    return Part(
+        recording.name,
+        recording.role,
+        rows.motion(motion),
+        means,
+        rows.count * information,
+        within * information,
+        recording.clock_shared,
+    )
+
+
+def rows_of(motion: Motion, sound: NDArray[np.bool_]) -> Rows:
+    """Choose the samples of a fit and group those of a rest.
+
+    Parameters
+    ----------
+    motion : Motion
+    sound : (n,) array of bool
+        Samples whose readings can be used.
+    """
+    moving = np.linalg.norm(motion.angular_rate, axis=1) > RATE_AT_REST_DPS
+    if motion.rate is not None:
+        moving = np.abs(motion.rate) > RATE_AT_REST_DPS
+    kept = np.flatnonzero(sound & (motion.still | moving) & followed(motion))
+    if len(kept) == 0:
+        return Rows(kept, kept, np.zeros(0), len(sound))
+    still, time = motion.still[kept], motion.time[kept]
+    together = still[1:] & still[:-1] & (np.diff(kept) == 1)
+    rest = np.concatenate([[0], np.cumsum(~together)])
+    begin = time[np.concatenate([[True], ~together])]
+    piece = np.floor((time - begin[rest]) / MEAN_S + 1e-9)
+    new = np.concatenate([[True], ~together | (np.diff(piece) != 0)])
+    first = np.flatnonzero(new)
+    return Rows(kept, first, np.diff(np.append(first, len(kept))).astype(float), len(sound))
+
+
+def followed(motion: Motion) -> NDArray[np.bool_]:
+    """Return at which samples the log follows the table: (n,) array of bool.
+
+    Both intervals beside a sample of a turn must be explained; with an attitude log, the rate must be the cubic through
+    its four neighbours, and theirs too, to 0.05 deg/s and 0.1 %.
+    """
+    if motion.followed is not None:
+        return motion.followed
+    rate, time = motion.angular_rate, motion.time
+    bend = np.full(len(time), np.inf)
+    if len(time) >= 5:
+        t = [time[k : len(time) - 4 + k] for k in range(5)]
+        guess = np.zeros((len(t[0]), rate.shape[1]))
+        for j in (0, 1, 3, 4):  # Lagrange's cubic through the four neighbours, at the middle sample
+            others = [k for k in (0, 1, 3, 4) if k != j]
+            weight = np.prod([(t[2] - t[k]) / (t[j] - t[k]) for k in others], axis=0)
+            guess += weight[:, None] * rate[j : len(time) - 4 + j]
+        bend[2:-2] = np.abs(guess - rate[2:-2]).max(axis=1)
+    bends = bend > np.maximum(BEND_DPS, BEND_SHARE * np.abs(rate).max(axis=1))
+    near = np.convolve(bends, np.ones(3), "same") > 0.5
+    sure: NDArray[np.bool_] = np.logical_not(near)
+    return sure

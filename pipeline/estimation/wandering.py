@@ -1,0 +1,159 @@
+"""Likelihood of readings whose noise is white plus a bias wander.
+
+The noise of a channel is
+
+    C = s^2 (diag(1/w) + q W R W^T),   R_jk = exp(-|t_j - t_k| / tau)
+
+where
+
+    w   : (n,) weights, samples of each row
+    s   : standard deviation of one sample's white noise
+    q   : variance of the wander over s^2
+    tau : correlation time of the wander, s
+    W   : (n, m) marks which of m short cells of time a row lies in; within a cell the wander does not change
+
+The matrix inversion lemma turns every product with ``C^-1`` into one over the rows, formed once, and one over cells,
+
+    A^T C^-1 B s^2 = A^T w B - S_A^T (R^-1/q + W^T w W)^-1 S_B,     S_A = W^T w A
+
+in which ``R^-1`` is tridiagonal, as the wander is a Markov process. So any noise setting costs as little as its cells.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.estimation.observations import Observations
+    from pipeline.records import Noise
+
+CELLS = 600
+SHORTEST_CELL_S = 2.0
+STATIC_WIDTH = 0.35  # of the logarithm of the ratio that a static rest of some minutes gives
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One noise: ratio of wander to white noise, its correlation time in s, and a prior log weight."""
+
+    ratio: float
+    time: float
+    prior: float = 0.0
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Short stretches of time in which the wander is taken as constant.
+
+    Attributes
+    ----------
+    first : (m,) array of int
+        First row of each; rows are in order.
+    time : (m,) array, s
+        Mean time of each.
+    joined : (m - 1,) array of bool
+        Whether the time from each to the next is known.
+    weight : (m,) array
+        Sum of the weights of its rows.
+    """
+
+    first: NDArray[np.intp]
+    time: NDArray[np.float64]
+    joined: NDArray[np.bool_]
+    weight: NDArray[np.float64]
+
+    def factor(self, setting: Setting) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+        """Return the tridiagonal factor of ``R^-1/q + W^T w W`` and log det C, up to that of the weights."""
+        from scipy.linalg.lapack import dpttrf  # noqa: PLC0415  (0.1 s that only fits pay)
+
+        q = setting.ratio**2
+        step = np.where(self.joined, np.exp(-np.abs(np.diff(self.time)) / setting.time), 0.0)
+        gain = 1.0 / -np.expm1(2.0 * np.log(np.clip(step, 1e-300, 1.0 - 1e-9)))
+        diagonal = np.ones(len(self.time))
+        diagonal[1:] += step**2 * gain
+        diagonal[:-1] += step**2 * gain
+        d, e, info = dpttrf(diagonal / q + self.weight, -step * gain / q)
+        assert info == 0  # noqa: S101
+        logarithm = float(np.sum(np.log(d)) + len(d) * np.log(q) - np.sum(np.log(gain)))
+        return d, e, logarithm
+
+
+def cells_of(observations: Observations) -> Cells:
+    """Cut the rows into cells, a new one for each recording."""
+    span = sum(float(np.ptp(part.motion.time)) for part in observations.parts)
+    length = max(SHORTEST_CELL_S, span / CELLS)
+    first, times, weights, joined, row = [], [], [], [], 0
+    known = False
+    for part in observations.parts:
+        cell = np.floor((part.motion.time - part.motion.time[0]) / length)
+        start = np.flatnonzero(np.concatenate([[True], np.diff(cell) != 0]))
+        weight = np.add.reduceat(part.weight, start)
+        first.append(start + row)
+        times.append(np.add.reduceat(part.weight * part.motion.time, start) / weight)
+        weights.append(weight)
+        joined.append(np.concatenate([[known and part.clock_shared], np.ones(len(start) - 1, bool)]))
+        row += len(part.motion.time)
+        known = part.clock_shared
+    return Cells(np.concatenate(first), np.concatenate(times), np.concatenate(joined)[1:], np.concatenate(weights))
+
+
+def settings_for(
+    noise: Noise | None,
+    ratios: Sequence[float] = (0.03, 0.1, 0.3, 1.0),
+    times: Sequence[float] = (60.0, 600.0),
+) -> list[Setting]:
+    """Return the noise settings over which the likelihood is maximised.
+
+    A static recording pins them: its ratio, halves and doubles of it, by a log-normal weight. Without one they span
+    what sensors of the field show, and no wander at all.
+
+    Parameters
+    ----------
+    noise : Noise or None
+    ratios, times : sequence of float
+        The free grid; times in s.
+    """
+    if noise is not None and noise.source == "static" and np.any(noise.wander > 0) and np.all(noise.white > 0):
+        known = float(np.sqrt(np.mean((noise.wander / noise.white) ** 2)))
+        factors = np.array([0.25, 0.5, 1.0, 2.0, 4.0])
+        priors = -0.5 * (np.log(factors) / STATIC_WIDTH) ** 2
+        pairs = zip(factors, priors, strict=True)
+        return [Setting(known * f, noise.correlation_time * t, p) for f, p in pairs for t in (0.5, 2.0)]
+    return [Setting(0.0, 1.0)] + [Setting(ratio, time) for ratio in ratios for time in times]
+
+
+class Whitened:
+    """Products of columns under every noise setting.
+
+    Parameters
+    ----------
+    cells : Cells
+    weight : (n,) array
+    columns : (n, p) array
+        Each row is multiplied by the root of its weight in place.
+    """
+
+    def __init__(self, cells: Cells, weight: NDArray[np.float64], columns: NDArray[np.float64]) -> None:
+        self.cells = cells
+        columns *= np.sqrt(weight)[:, None]
+        self.white: NDArray[np.float64] = columns.T @ columns
+        columns *= np.sqrt(weight)[:, None]
+        self.sums: NDArray[np.float64] = np.add.reduceat(columns, cells.first, axis=0)
+
+    def products(self, setting: Setting) -> tuple[NDArray[np.float64], float]:
+        """Return ``A^T C^-1 A s^2``, (p, p), and log det C of one channel for s = 1, up to a constant."""
+        if setting.ratio == 0.0:
+            return self.white, 0.0
+        from scipy.linalg.lapack import dpttrs  # noqa: PLC0415  (as in Cells.factor)
+
+        d, e, logarithm = self.cells.factor(setting)
+        solved, info = dpttrs(d, e, self.sums)
+        assert info == 0  # noqa: S101
+        return self.white - self.sums.T @ solved, logarithm

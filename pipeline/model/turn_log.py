@@ -1,0 +1,156 @@
+"""The trajectory of a turn between the samples of its log.
+
+A table's program is made of stretches of constant angular acceleration, and its log holds angle A and rate r at times
+that know nothing of where one stretch ends. Between two samples, dt apart,
+
+    no bend inside:   dA = (r_0 + r_1) dt / 2
+    a bend at s:      dr = a s + b (dt - s),   dA = r_0 dt + a s (dt - s / 2) + b (dt - s)^2 / 2
+
+where a and b are the accelerations before and after it. An interval without a bend has ``a = dr / dt``; one with a bend
+takes a, b or both from its neighbours, which gives s, and where both are known the second equation is a check. So ramps
+of a few samples are followed exactly. Elsewhere, in smooth motion, the angle is the quintic through angle, rate and
+acceleration at both ends, with the acceleration from the five nearest rates; one curve gives all three.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Values = NDArray[np.float64]
+
+TIGHTEST_DEG, LOOSEST_DEG = 1e-5, 1e-3
+MOVING_DPS = 0.02
+
+
+class TurnLog:
+    """Angle, rate and acceleration at any time, by a log.
+
+    Parameters
+    ----------
+    time : (n,) array, s
+        At least 6, increasing.
+    angle : (n,) array, deg
+    rate : (n,) array, deg/s
+
+    Attributes
+    ----------
+    explained : (n - 1,) array of bool
+        Intervals that one or two stretches of constant acceleration reproduce.
+    followed : (n - 1,) array of bool
+        Those, and intervals of smooth motion: ``dA = (r_0 + r_1) dt / 2 - (r'_1 - r'_0) dt^2 / 12`` to 1e-3 deg, or to
+        what the log's own noise allows. In the others the trajectory is a guess.
+    followed_samples : (n,) array of bool
+        Samples that lie between two such intervals.
+    acceleration : (n,) array, deg/s^2
+        At the samples.
+    """
+
+    def __init__(self, time: Values, angle: Values, rate: Values) -> None:
+        self.time, self.angle, self.rate = time, angle, rate
+        self._step = np.diff(time)
+        self._mean = np.diff(rate) / self._step
+        excess = np.diff(angle) - 0.5 * (rate[1:] + rate[:-1]) * self._step
+        self._tolerance = float(np.clip(10.0 * np.median(np.abs(excess)), TIGHTEST_DEG, LOOSEST_DEG))
+        even = np.abs(excess) <= self._tolerance
+        self._bend, self._before, self._after, bent = self._bends(even)
+        self.explained: NDArray[np.bool_] = even | bent
+        self.acceleration = self._at_samples()
+        self.followed: NDArray[np.bool_] = self.explained | self._smooth(excess)
+        beside = np.concatenate([[True], self.followed, [True]])
+        self.followed_samples: NDArray[np.bool_] = np.logical_and(beside[1:], beside[:-1])
+
+    def _bends(self, even: NDArray[np.bool_]) -> tuple[Values, Values, Values, NDArray[np.bool_]]:
+        """Return for each interval where it bends, the acceleration before and after, and whether that holds."""
+        step, mean = self._step, self._mean
+        left, right = np.concatenate([[False], even[:-1]]), np.concatenate([even[1:], [False]])
+        a, b = np.concatenate([mean[:1], mean[:-1]]), np.concatenate([mean[1:], mean[-1:]])
+        r0, r1 = self.rate[:-1], self.rate[1:]
+        dr, dA = np.diff(self.rate), np.diff(self.angle)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            both = (dr - b * step) / (a - b)
+            rest = 2.0 * (dA - r0 * step - 0.5 * a * step**2) / (dr - a * step)
+            lead = 2.0 * (r1 * step - 0.5 * b * step**2 - dA) / (dr - b * step)
+            s = np.where(left & right, both, np.where(left, step - rest, lead))
+            b = np.where(left & ~right, (dr - a * s) / (step - s), b)
+            a = np.where(right & ~left, (dr - b * (step - s)) / s, a)
+            miss = np.abs(dA - r0 * step - a * s * (step - 0.5 * s) - 0.5 * b * (step - s) ** 2)
+            bent = ~even & (left | right) & (s >= 0) & (s <= step) & (miss <= 3.0 * self._tolerance)
+        whole = ~bent
+        return np.where(whole, step, s), np.where(whole, mean, a), np.where(whole, mean, b), bent
+
+    def _at_samples(self) -> Values:
+        """Return the acceleration at the samples: of an explained interval beside it, else of the nearest rates."""
+        known = np.zeros((2, len(self.time)))
+        weight = np.zeros((2, len(self.time)))
+        known[0, :-1], weight[0, :-1] = self._before, self.explained
+        known[1, 1:], weight[1, 1:] = self._after, self.explained
+        total = weight.sum(0)
+        mean = (known * weight).sum(0) / np.where(total > 0, total, 1.0)
+        return mean if np.all(total > 0) else np.where(total > 0, mean, nearest_slope(self.time, self.rate))
+
+    def _smooth(self, excess: Values) -> NDArray[np.bool_]:
+        if self.explained.all():
+            return self.explained
+        slope = nearest_slope(self.time, self.rate)
+        miss = np.abs(excess + np.diff(slope) * self._step**2 / 12.0)
+        moving = np.abs(self._mean) + np.abs(self.rate[1:]) + np.abs(self.rate[:-1]) > MOVING_DPS
+        inside = np.convolve(moving, np.ones(7), "same") > 6.5
+        noise = 4.0 * float(np.median(miss[inside])) if inside.sum() > 20 else 0.0
+        smooth: NDArray[np.bool_] = miss <= max(LOOSEST_DEG, noise)
+        return smooth
+
+    def at(self, time: Values) -> tuple[Values, Values, Values]:
+        """Return angle (deg), rate (deg/s) and acceleration (deg/s^2) at any times; (n,) arrays."""
+        k = np.clip(np.searchsorted(self.time, time, side="right") - 1, 0, len(self._step) - 1)
+        x = time - self.time[k]
+        angle, rate, acceleration = self._piecewise(k, x)
+        smooth = ~self.explained[k]
+        if smooth.any():
+            angle[smooth], rate[smooth], acceleration[smooth] = self._quintic(k[smooth], x[smooth])
+        return angle, rate, acceleration
+
+    def _piecewise(self, k: NDArray[np.intp], x: Values) -> tuple[Values, Values, Values]:
+        a, b, s = self._before[k], self._after[k], self._bend[k]
+        past = np.maximum(x - s, 0.0)
+        rate = self.rate[k] + a * x + (b - a) * past
+        angle = self.angle[k] + self.rate[k] * x + 0.5 * a * x**2 + 0.5 * (b - a) * past**2
+        return angle, rate, np.where(x > s, b, a)
+
+    def _quintic(self, k: NDArray[np.intp], x: Values) -> tuple[Values, Values, Values]:
+        h = self._step[k]
+        r0, a0 = self.rate[k], self.acceleration[k]
+        dA = self.angle[k + 1] - self.angle[k] - r0 * h - 0.5 * a0 * h**2
+        dr = (self.rate[k + 1] - r0 - a0 * h) * h
+        da = (self.acceleration[k + 1] - a0) * h**2
+        c3, c4, c5 = 10 * dA - 4 * dr + 0.5 * da, -15 * dA + 7 * dr - da, 6 * dA - 3 * dr + 0.5 * da
+        q = x / h
+        angle = self.angle[k] + r0 * x + 0.5 * a0 * x**2 + q**3 * (c3 + q * (c4 + q * c5))
+        rate = r0 + a0 * x + q**2 * (3 * c3 + q * (4 * c4 + q * 5 * c5)) / h
+        return angle, rate, a0 + q * (6 * c3 + q * (12 * c4 + q * 20 * c5)) / h**2
+
+
+def nearest_slope(time: Values, values: Values) -> Values:
+    """Return the derivative at each sample of the quartic through it and its four neighbours: (n,) array.
+
+    Parameters
+    ----------
+    time : (n,) array, s
+        n at least 5.
+    values : (n,) array
+    """
+    n = len(time)
+    window = np.clip(np.arange(n)[:, None] - 2, 0, n - 5) + np.arange(5)
+    t, v = time[window] - time[:, None], values[window]
+    slope = np.zeros(n)
+    for j in range(5):
+        others = [m for m in range(5) if m != j]
+        spread = np.prod([t[:, j] - t[:, m] for m in others], axis=0)
+        # derivative at 0 of prod (x - t_m): the sum of its products that leave one factor out
+        terms = sum(np.prod([-t[:, m] for m in others if m != skip], axis=0) for skip in others)
+        slope += v[:, j] * terms / spread
+    return slope

@@ -1,0 +1,1 @@
+"""Modules beside this file, such as ``bench_session``, can be imported by tests of any folder."""
