@@ -92,7 +92,9 @@ def load_recordings(path: Path) -> list[Recording]:
             metadata = file.schema_arrow.metadata or {}
             data = _checked_metadata(metadata, str(path))
             table = file.read(use_threads=False)
-    except (OSError, pa.ArrowException) as error:
+    except InputError:
+        raise
+    except Exception as error:  # damaged lengths and names surface as errors of many kinds
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(
             f"cannot be read, it is missing or damaged ({reason}); delete it and run again", str(path)
