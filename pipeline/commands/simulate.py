@@ -1,0 +1,137 @@
+"""Write a campaign of simulated units, with any physical effect hidden in them."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import yaml
+
+from pipeline.errors import ConfigurationError
+from pipeline.simulation.campaign import write_campaign
+from pipeline.simulation.description import FORMATS, description_from, read_description
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+FILE = "simulation.yaml"
+EPILOG = """\
+A campaign is simulated from a description, DIR/simulation.yaml or --from FILE; where there is none (or options are
+given), from the options, and the description is written to DIR/simulation.yaml.
+
+examples:
+  python -m pipeline simulate data/fleet --units 100 --samples 10000 --seed 1
+  python -m pipeline simulate /tmp/hidden --effect gyroscope.g_sensitivity --effect accelerometer.lever_arm=0.05,0,0.02
+  python -m pipeline simulate /tmp/table --effect table_tilt=0.2 --both-directions --rate 20 60 100
+  python -m pipeline simulate data/demo
+
+An effect is hidden in one sensor (accelerometer.NAME) or in both (NAME); without a size it has the typical one of the
+sensor's configuration with random signs, with one number that size, with several its parameters' values.
+The truth is written to DIR/truth/<unit>.json.
+"""
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run ``python -m pipeline simulate DIR``."""
+    arguments = vars(_parser().parse_args(argv))
+    directory: Path = arguments.pop("directory")
+    source: Path | None = arguments.pop("source")
+    quiet: bool = arguments.pop("quiet")
+    if source is None and not arguments and (directory / FILE).is_file():
+        source = directory / FILE
+    if source is not None and arguments:
+        given = ", ".join(f"--{name.replace('_', '-')}" for name in arguments)
+        raise ConfigurationError(f"--from takes everything from the description; leave out {given} or --from")
+    if source is not None:
+        description = read_description(source)
+    else:
+        data = _described(arguments)
+        description = description_from(data, "the options")
+        directory.mkdir(parents=True, exist_ok=True)
+        text = "# Read by: python -m pipeline simulate\n" + yaml.safe_dump(data, sort_keys=False)
+        (directory / FILE).write_text(text, encoding="utf-8")
+    directory.mkdir(parents=True, exist_ok=True)
+    write_campaign(description, directory, (lambda _: None) if quiet else print)
+    print(f"then: snakemake --cores 2 --config campaign={directory}")
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m pipeline simulate",
+        description=__doc__,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        argument_default=argparse.SUPPRESS,
+    )
+    add = parser.add_argument
+    add("directory", type=Path, metavar="DIR", help="the campaign's directory; made if need be")
+    add("--from", dest="source", type=Path, default=None, metavar="FILE", help="description of what to simulate (YAML)")
+    add("--quiet", action="store_true", default=False, help="do not name every unit")
+    add("--units", type=int, metavar="N", help="number of units (1)")
+    add("--prefix", metavar="NAME", help="their names: NAME001, NAME002 ... (U)")
+    add("--seed", type=int, help="every random number follows from it (0)")
+    add("--sensor", metavar="NAME", help="configs/sensor (mpu6050)")
+    add("--table", metavar="NAME", help="configs/table (acutronic; hand for procedures without a table)")
+    add("--procedure", metavar="NAME", help="configs/procedure (three_axis_turns)")
+    add("--samples", type=int, metavar="N", help="about so many rows a unit: dwells, rests, held-out motion follow")
+    add("--interval", dest="interval_s", type=float, metavar="S", help="sampling interval in s (0.12)")
+    add("--lost", type=float, metavar="SHARE", help="share of the samples that the radio link loses (0)")
+    add("--format", choices=FORMATS, help="of the recordings (csv)")
+    add("--effect", action="append", metavar="[SENSOR.]NAME[=SIZE]", help="hide an effect; may be repeated")
+    course = parser.add_argument_group("how the procedure is run")
+    add = course.add_argument
+    add("--dwell", dest="dwell_s", type=float, metavar="S", help="rest at each stop (1; without a table 4)")
+    add("--step", dest="step_deg", type=float, metavar="DEG", help="of stop-and-go (5)")
+    add("--accelerometer-rate", dest="accelerometer_rates_dps", type=float, nargs="+", metavar="DPS",
+        help="continuous turns for the accelerometer in place of stop-and-go")  # fmt: skip
+    add("--rate", "--rates", dest="rates_dps", type=float, nargs="+", metavar="DPS", help="gyroscope turns (60)")
+    add("--both-directions", action="store_true", help="make each turn backwards too")
+    add("--turns", type=int, metavar="N", help="whole turns at each rate (1)")
+    add("--positions", type=int, metavar="N", help="rests of multi_position (40)")
+    add(
+        "--validation",
+        dest="validation_s",
+        type=float,
+        metavar="S",
+        help="length of held-out motion (120; 0: none)",
+    )
+    add("--validation-rate", dest="validation_rate_dps", type=float, metavar="DPS", help="largest rate in it (40)")
+    add("--static", dest="static_s", type=float, metavar="S", help="length of the long rest (120; 0: none)")
+    add("--pause", dest="pause_s", type=float, metavar="S", help="between recordings (30)")
+    return parser
+
+
+COURSE = (
+    "dwell_s", "step_deg", "accelerometer_rates_dps", "rates_dps", "both_directions", "turns", "positions",
+    "validation_s", "validation_rate_dps", "static_s", "pause_s",
+)  # fmt: skip
+
+
+def _described(arguments: dict[str, Any]) -> dict[str, Any]:
+    """Return the description that the options give."""
+    seed, count = arguments.pop("seed", 0), arguments.pop("units", 1)
+    effects = dict(_effect(text) for text in arguments.pop("effect", ()))
+    course = {name: arguments.pop(name) for name in COURSE if name in arguments}
+    prefix = arguments.pop("prefix", "U")
+    procedure = arguments.get("procedure", "three_axis_turns")
+    table = "acutronic" if procedure in ("three_axis_turns", "thermal_ramp") else "hand"
+    unit = {"unit": prefix if count > 1 else f"{prefix}001", "count": count, "table": table, **arguments}
+    if course:
+        unit["course"] = course
+    if effects:
+        unit["effects"] = effects
+    return {"seed": seed, "units": [unit]}
+
+
+def _effect(text: str) -> tuple[str, Any]:
+    """Return name and size of an effect: ``name``, ``name=0.1`` or ``name=0.1,0.2,0.3``."""
+    name, given, size = text.partition("=")
+    if not given:
+        return name, None
+    try:
+        values = [float(v) for v in size.split(",")]
+    except ValueError:
+        raise ConfigurationError(f"--effect {text}: after = a number, or several with commas, is expected") from None
+    return name, values[0] if len(values) == 1 else values

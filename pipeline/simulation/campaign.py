@@ -1,0 +1,212 @@
+"""Write a simulated campaign: units.csv, campaign.yaml, the recordings, and the truth behind them.
+
+    <directory>/units.csv, campaign.yaml, simulation.yaml
+    <directory>/raw/<unit>/<recording>.csv (or .mcap)
+    <directory>/truth/<unit>.json     bias, matrix, effects and noise of each sensor
+
+The truth is for tests and for the reader; no stage reads it.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.errors import ConfigurationError
+from pipeline.formats.csv_write import write_canonical_csv
+from pipeline.model.effects import effect
+from pipeline.records import AXES, SENSORS
+from pipeline.simulation.description import read_config
+from pipeline.simulation.draw import drawn_effects, drawn_sensors
+from pipeline.simulation.environment import random_environment
+from pipeline.simulation.procedures import TABLE_PROCEDURES, Course, fit_to_samples, plan
+from pipeline.simulation.session import (
+    ANGLE_DECIMALS,
+    QUATERNION_DECIMALS,
+    TEMPERATURE_DECIMALS,
+    Bench,
+    Session,
+    Streams,
+    hidden,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from pipeline.records import Recording
+    from pipeline.simulation.description import Description, UnitDescription
+    from pipeline.simulation.sensor import SimulatedSensor
+
+COLUMNS = ("unit", "serial", "lot", "date", "sensor", "table", "procedure", "method", "ingest", "filter", "overrides")
+CAMPAIGN = "# Hydra overrides for all units of this campaign.\noverrides: []\n"
+# By hand, rests are longer and moves faster than on a table, and there is no held-out motion with a reference.
+BY_HAND = Course(dwell_s=4.0, step_rate_dps=60.0, acceleration_dps2=200.0, validation_s=0.0)
+
+
+def write_campaign(description: Description, directory: Path, progress: Callable[[str], None] = lambda _: None) -> None:
+    """Simulate every unit of a description and write the campaign.
+
+    Parameters
+    ----------
+    description : Description
+    directory : Path
+        Made if it does not exist; files of the same names are replaced.
+    progress : callable
+        Told of each unit that is done.
+    """
+    rows = []
+    for number, unit in enumerate(description.units):
+        origin = _origin(description, unit, number)
+        recordings, truth = simulate_unit(description.units[origin], description.seed, origin)
+        sheet = read_config("sensor", unit.sensor)
+        folder = directory / "raw" / unit.unit
+        folder.mkdir(parents=True, exist_ok=True)
+        for recording in recordings:
+            write_recording(folder, recording, unit.format, sheet)
+        _write_json(directory / "truth" / f"{unit.unit}.json", {**truth, "unit": unit.unit})
+        rows.append(
+            {"unit": unit.unit, "sensor": unit.sensor, "table": unit.table, "procedure": unit.procedure, **unit.columns}
+        )
+        progress(f"{unit.unit}: {sum(r.samples for r in recordings)} samples in {len(recordings)} recordings")
+    rows += [{str(k): v for k, v in row.items()} for row in description.rows]
+    (directory / "units.csv").write_text(_table(rows), encoding="utf-8")
+    if not (directory / "campaign.yaml").exists():
+        (directory / "campaign.yaml").write_text(CAMPAIGN, encoding="utf-8")
+
+
+def simulate_unit(unit: UnitDescription, seed: int, number: int) -> tuple[list[Recording], dict[str, Any]]:
+    """Return the recordings of one unit and the truth behind them.
+
+    Parameters
+    ----------
+    unit : UnitDescription
+    seed : int
+    number : int
+        Of the unit in its campaign; with the seed it determines every random number.
+    """
+    streams = Streams(seed, number)
+    sheets = read_config("sensor", unit.sensor)
+    table = read_config("table", unit.table)
+    course = _course(unit)
+    effects = drawn_effects(unit.effects, sheets, streams["effects"])
+    given = {s: getattr(unit, s) for s in SENSORS}
+    sensors = drawn_sensors(sheets, given, effects, streams["unit"])
+    bench = Bench(table, _imperfections(table, unit.imperfections, streams["bench"]), sensors)
+    benches = {"": bench}
+    if unit.held_out:
+        benches |= dict.fromkeys(("validation", "static"), _held_out_bench(unit, sheets, effects, streams))
+    by_hand = table["angle_accuracy_deg"] if table["motion"] == "none" else 0.0
+    planned = plan(unit.procedure, course, streams["motion"], by_hand)
+    total = sum(p.trajectory.duration + course.pause_s for p in planned)
+    ramp = course.thermal_ramp_degc if unit.procedure == "thermal_ramp" else 0.0
+    environment = random_environment(streams["room"], ramp=ramp, ramp_period=total / 1.5)
+    environment = replace(environment, **unit.temperature)
+    session = Session(planned, benches, hidden(effects), environment, unit.interval_s, course.pause_s, unit.lost)
+    truth = {
+        "seed": [seed, number],
+        **{name: getattr(unit, name) for name in ("sensor", "table", "procedure", "interval_s", "lost")},
+        **{s: _truth(sensors[s], effects[s], unit.interval_s) for s in SENSORS},
+        "imperfections": {k: np.asarray(v).tolist() for k, v in bench.imperfections.items()},
+    }
+    return session.recordings(streams), truth
+
+
+def write_recording(folder: Path, recording: Recording, kind: str, sheets: dict[str, Any]) -> None:
+    """Write one recording as ``<name>.csv`` or ``<name>.mcap``, in the axes of the unit's body."""
+    if kind == "mcap":
+        from pipeline.formats.mcap_write import write_mcap  # noqa: PLC0415  (needs the mcap library)
+
+        write_mcap(folder / f"{recording.name}.mcap", recording)
+        return
+    wanted = {f"accel_{a}_g": _digits(sheets["accelerometer"]) for a in AXES}
+    wanted |= {f"gyro_{a}_dps": _digits(sheets["gyroscope"]) for a in AXES}
+    wanted |= {"temperature_degc": TEMPERATURE_DECIMALS}
+    wanted |= dict.fromkeys(("table_angle_deg", "table_rate_dps"), ANGLE_DECIMALS)
+    wanted |= {f"table_q{c}": QUATERNION_DECIMALS for c in "wxyz"}
+    write_canonical_csv(folder / f"{recording.name}.csv", recording, wanted)
+
+
+def _digits(sheet: dict[str, Any]) -> int:
+    return int(np.ceil(np.log10(sheet["counts_per_unit"]))) + 1
+
+
+def _course(unit: UnitDescription) -> Course:
+    base = Course() if unit.procedure in TABLE_PROCEDURES else BY_HAND
+    wanted: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in unit.course.items()}
+    course = replace(base, **wanted)
+    if unit.samples is None:
+        return course
+    return fit_to_samples(unit.procedure, course, unit.samples, unit.interval_s, keep_step="step_deg" in unit.course)
+
+
+def _imperfections(table: dict[str, Any], given: dict[str, Any], rng: np.random.Generator) -> dict[str, Any]:
+    """Return what the table does otherwise than commanded: as described, else by its accuracies."""
+    return {
+        "angle_accuracy_deg": table["angle_accuracy_deg"],
+        "rate_error": table["rate_accuracy"] * rng.standard_normal(3),
+        "direction_deg": table["orthogonality_deg"] * rng.standard_normal((3, 2)),
+        **given,
+    }
+
+
+def _held_out_bench(
+    unit: UnitDescription,
+    sheets: dict[str, Any],
+    effects: dict[str, dict[str, NDArray[np.float64]]],
+    streams: Streams,
+) -> Bench:
+    """Return the bench of the held-out motion; the sensors there are the same, mounted anew."""
+    given = {s: {**getattr(unit, s), **unit.held_out.get(s, {})} for s in SENSORS}
+    table = read_config("table", unit.held_out.get("table", unit.table))
+    imperfections = _imperfections(table, unit.held_out.get("imperfections", {}), streams["bench"])
+    return Bench(table, imperfections, drawn_sensors(sheets, given, effects, streams["unit"]))
+
+
+def _truth(sensor: SimulatedSensor, effects: dict[str, NDArray[np.float64]], interval: float) -> dict[str, Any]:
+    return {
+        "bias": sensor.bias.tolist(),
+        "matrix": sensor.matrix.tolist(),
+        "effects": {
+            name: {p.name: float(v) for p, v in zip(effect(name).parameters(sensor.sensor), values, strict=True)}
+            for name, values in effects.items()
+        },
+        "noise": {
+            "white": sensor.white(interval),
+            "wander": sensor.sheet["bias_wander"],
+            "correlation_time": sensor.sheet["wander_time_s"],
+        },
+    }
+
+
+def _origin(description: Description, unit: UnitDescription, number: int) -> int:
+    """Return the number of the unit that makes the recordings."""
+    if unit.copy_of is None:
+        return number
+    names = [u.unit for u in description.units]
+    if unit.copy_of not in names:
+        raise ConfigurationError(f"unit {unit.unit}: copy_of names {unit.copy_of}, which is not among the units")
+    return names.index(unit.copy_of)
+
+
+def _table(rows: list[dict[str, Any]]) -> str:
+    """Return units.csv: the known columns that any row has, then the others."""
+    found = dict.fromkeys(key for row in rows for key in row)
+    columns = [c for c in COLUMNS if c in found] + [c for c in found if c not in COLUMNS]
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")

@@ -1,0 +1,163 @@
+"""Sensors and effects of a unit: as described, and where nothing is described at random from the data sheet.
+
+    matrix = R_m^T T diag(S),   T = [[1, 0, 0], [n_yx, 1, 0], [n_zx, n_zy, 1]]
+
+where
+
+S   : (3,) scale factors of the correction (body = matrix @ (reading - bias))
+n   : non-orthogonality, rad
+R_m : mounting, which takes body vectors to the sensor's axes: turns about x, then y, then z
+
+Data-sheet limits are taken for three standard deviations; the mounting lies within 1 deg (Sudsanguan 2019, chapter 3).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.errors import ConfigurationError
+from pipeline.model.effect_limits import parameter_limits
+from pipeline.model.effects import effect
+from pipeline.records import SENSORS
+from pipeline.simulation.alterations import ALTERATIONS
+from pipeline.simulation.sensor import SimulatedSensor
+from pipeline.simulation.trajectory import rotation_about
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+KEYS = {"bias", "matrix", "scale_factor", "non_orthogonality_deg", "mounting_deg"}
+POSITIVE = {"time_constant", "tau"}
+# A typical size as a share of the largest plausible one, where that is not a half.
+TYPICAL_SHARE = {
+    "inner_lever_arms": 0.05,
+    "clock_rate": 0.02,
+    "table_tilt": 0.2,
+    "table_axis_nonorthogonality": 0.1,
+    "table_encoder_error": 0.1,
+    "table_rate_ripple": 0.1,
+    "table_backlash": 0.1,
+}
+
+
+def drawn_sensors(
+    sheets: Mapping[str, Mapping[str, Any]],
+    given: Mapping[str, Mapping[str, Any]],
+    effects: Mapping[str, dict[str, NDArray[np.float64]]],
+    rng: np.random.Generator,
+) -> dict[str, SimulatedSensor]:
+    """Return accelerometer and gyroscope of a unit.
+
+    Parameters
+    ----------
+    sheets, given : mapping
+        Sensor to its section of the configuration, and to what is described of it.
+    effects : mapping
+        Sensor to its effects' values.
+    rng : Generator
+    """
+    mounting = rng.uniform(-1.0, 1.0, 3)
+    out = {}
+    for sensor in SENSORS:
+        unknown = sorted(set(given[sensor]) - KEYS)
+        if unknown:
+            raise ConfigurationError(f"{sensor}: {', '.join(unknown)} is not known; known: {', '.join(sorted(KEYS))}")
+        sheet = sheets[sensor]
+        own = {name: values for name, values in effects[sensor].items() if name not in ALTERATIONS}
+        bias = _limited(sheet["bias"], 3, rng)
+        matrix = _matrix(sheet, given[sensor], mounting, rng)
+        out[sensor] = SimulatedSensor(sensor, sheet, np.array(given[sensor].get("bias", bias), float), matrix, own)
+    return out
+
+
+def drawn_effects(
+    specification: Mapping[str, Any], sheets: Mapping[str, Mapping[str, Any]], rng: np.random.Generator
+) -> dict[str, dict[str, NDArray[np.float64]]]:
+    """Return the values of the parameters of each effect, per sensor.
+
+    Parameters
+    ----------
+    specification : mapping
+        ``sensor.effect``, or ``effect`` for both sensors, to None (typical, at random), a size or the values.
+    sheets : mapping
+    rng : Generator
+
+    Raises
+    ------
+    ConfigurationError
+        If there is no such effect, it does not apply, or the number of values is wrong.
+    """
+    out: dict[str, dict[str, NDArray[np.float64]]] = {sensor: {} for sensor in SENSORS}
+    for key, value in specification.items():
+        sensor, _, name = str(key).rpartition(".")
+        kind = effect(name)
+        if sensor not in (*kind.sensors, ""):
+            raise ConfigurationError(f"effect {key}: {name} applies to the {' and '.join(kind.sensors)}")
+        for each in kind.sensors if sensor == "" else (sensor,):
+            if name in ALTERATIONS and each != kind.sensors[0] and sensor == "":
+                out[each][name] = out[kind.sensors[0]][name]  # one table, one clock: the same for both sensors
+            else:
+                out[each][name] = _values(name, each, value, sheets[each]["effects"], rng)
+    return out
+
+
+def rotation(mounting_deg: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return ``R_m = R_z R_y R_x``: (3, 3) array."""
+    x, y, z = (rotation_about(axis, np.array([a]))[0] for axis, a in zip(np.eye(3), mounting_deg, strict=True))
+    product: NDArray[np.float64] = z @ y @ x
+    return product
+
+
+def _matrix(
+    sheet: Mapping[str, Any], given: Mapping[str, Any], mounting: NDArray[np.float64], rng: np.random.Generator
+) -> NDArray[np.float64]:
+    scale = 1.0 + _limited(sheet["scale_factor"], 3, rng)
+    skew = np.degrees(_limited(sheet["cross_axis"], 3, rng))
+    if "matrix" in given:
+        return np.array(given["matrix"], float)
+    if KEYS & set(given) - {"bias"}:
+        scale, skew, mounting = np.ones(3), np.zeros(3), np.zeros(3)
+    scale = np.array(given.get("scale_factor", scale), float)
+    lower = np.eye(3)
+    lower[[1, 2, 2], [0, 0, 1]] = np.radians(np.array(given.get("non_orthogonality_deg", skew), float))
+    turned = rotation(np.array(given.get("mounting_deg", mounting), float))
+    matrix: NDArray[np.float64] = turned.T @ lower @ np.diag(scale)
+    return matrix
+
+
+def _limited(limit: float, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Return normal numbers with the limit at three standard deviations, cut there."""
+    return np.clip(rng.standard_normal(count) * limit / 3.0, -limit, limit)
+
+
+def _values(
+    name: str,
+    sensor: str,
+    value: Any,  # noqa: ANN401  (None, a number or a list, as YAML gives it)
+    limits: Mapping[str, float],
+    rng: np.random.Generator,
+) -> NDArray[np.float64]:
+    parameters = effect(name).parameters(sensor)
+    positive = np.array([p.name in POSITIVE for p in parameters])
+    sign = np.where(positive, 1.0, rng.choice([-1.0, 1.0], len(parameters)))
+    typical = TYPICAL_SHARE.get(name, 0.5) * parameter_limits(effect(name), sensor, limits)
+    drawn = sign * rng.uniform(0.7, 1.3, len(parameters)) * typical
+    given = np.array([]) if value is None else np.atleast_1d(np.asarray(value, float))
+    if len(given) == len(parameters):
+        return given
+    if len(given) == 1:
+        return np.where(positive, typical, sign * given[0])
+    if value is not None:
+        names = ", ".join(p.name for p in parameters)
+        raise ConfigurationError(
+            f"{sensor}.{name} takes one size or {len(parameters)} values ({names}), not {len(given)}"
+        )
+    if not np.all(np.isfinite(drawn)):
+        raise ConfigurationError(
+            f"{sensor}.{name}: the sensor's configuration has no limit of this effect, so no typical size; give one"
+        )
+    return np.asarray(drawn)

@@ -1,0 +1,261 @@
+"""What is recorded: the table's program of every recording of a procedure.
+
+``three_axis_turns`` and ``thermal_ramp`` (Sudsanguan 2019, chapter 4): about each axis, stop-and-go or continuous turns
+for the accelerometer, turns at one or several rates between rests for the gyroscope; then held-out random motion and a
+long rest. ``orientations_24`` (Sudsanguan 2018): eight rests 45 deg apart about each axis. ``six_positions``: each axis
+up and down. ``multi_position``: rests in random attitudes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.errors import ConfigurationError
+from pipeline.records import AXES
+from pipeline.simulation.program import ProgramBuilder
+from pipeline.simulation.trajectory import Gimbals, Moves, Turn, random_gimbals, rotation_about
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+TABLE_PROCEDURES = ("three_axis_turns", "thermal_ramp")
+STEPS_DEG = (1.0, 2.0, 3.0, 5.0, 10.0, 15.0, 30.0, 45.0, 90.0)
+
+
+@dataclass(frozen=True)
+class Course:
+    """How a procedure is run.
+
+    Attributes
+    ----------
+    step_deg : float
+        Of stop-and-go.
+    dwell_s : float
+        Rest at each stop, orientation or position.
+    accelerometer_rates_dps : tuple of float
+        Continuous turns in place of stop-and-go; empty for stop-and-go.
+    rates_dps : tuple of float
+        Of the gyroscope's turns.
+    both_directions : bool
+        Each turn of the gyroscope (and each continuous one of the accelerometer) is also made backwards.
+    turns : int
+        Whole turns at each rate.
+    warm_up_rest_s, rest_s : float
+        Rest before the first turn of a recording for the gyroscope, and after each.
+    acceleration_dps2, step_rate_dps : float
+        Of the table; its rate between stops.
+    validation_s, validation_rate_dps : float
+        Length of the held-out motion (0: none), and the largest |rate| in it.
+    static_s : float
+        Length of the long rest; 0 for none.
+    pause_s : float
+        Between recordings, and before the first.
+    positions : int
+        Rests of ``multi_position``.
+    thermal_ramp_degc : float
+        Amplitude of the chamber's ramp in ``thermal_ramp``.
+    """
+
+    step_deg: float = 5.0
+    dwell_s: float = 1.0
+    accelerometer_rates_dps: tuple[float, ...] = ()
+    rates_dps: tuple[float, ...] = (60.0,)
+    both_directions: bool = False
+    turns: int = 1
+    warm_up_rest_s: float = 30.0
+    rest_s: float = 3.0
+    acceleration_dps2: float = 100.0
+    step_rate_dps: float = 20.0
+    validation_s: float = 120.0
+    validation_rate_dps: float = 40.0
+    static_s: float = 120.0
+    pause_s: float = 30.0
+    positions: int = 40
+    thermal_ramp_degc: float = 15.0
+
+
+@dataclass(frozen=True)
+class Planned:
+    """One recording to be made: its name, role, turn axis (index or None) and trajectory."""
+
+    name: str
+    role: str
+    axis: int | None
+    trajectory: Turn | Moves | Gimbals
+
+
+def plan(procedure: str, course: Course, rng: np.random.Generator, hand_accuracy: float = 0.0) -> list[Planned]:
+    """Return the recordings of a procedure, in the order in which they are made.
+
+    Parameters
+    ----------
+    procedure : str
+    course : Course
+    rng : Generator
+    hand_accuracy : float, deg
+        Standard deviation with which an attitude is set where there is no table.
+
+    Raises
+    ------
+    ConfigurationError
+        If there is no such procedure.
+    """
+    if procedure in TABLE_PROCEDURES:
+        return _turns(course) + _heldout(course, rng)
+    attitudes: dict[str, Callable[[], NDArray[np.float64]]] = {
+        "orientations_24": _orientations_24,
+        "six_positions": _six_positions,
+        "multi_position": lambda: _random_attitudes(course.positions, rng),
+    }
+    if procedure not in attitudes:
+        known = ", ".join((*TABLE_PROCEDURES, *attitudes))
+        raise ConfigurationError(f"no procedure is called {procedure!r}; known: {known}")
+    planned = [Planned("recording", "rests", None, _rests(attitudes[procedure](), course, rng, hand_accuracy))]
+    if course.validation_s > 0.0:
+        count = max(2, int(course.validation_s / (course.dwell_s + 2.0)))
+        held_out = _rests(_random_attitudes(count, rng), replace(course, warm_up_rest_s=0.0), rng, 0.0)
+        planned.append(Planned("validation", "validation", None, held_out))
+    return planned + _static(course)
+
+
+@cache
+def fit_to_samples(procedure: str, course: Course, samples: int, interval: float, *, keep_step: bool) -> Course:
+    """Return the course with dwells, rests and held-out motion of a length that gives about ``samples`` rows a unit.
+
+    Parameters
+    ----------
+    procedure : str
+    course : Course
+    samples : int
+    interval : float, s
+    keep_step : bool
+        Whether the step of stop-and-go was asked for; else a larger one may be taken for a short recording.
+
+    Raises
+    ------
+    ConfigurationError
+        If the procedure cannot be run in so few samples.
+    """
+    target = samples * interval
+
+    def stretched(step: float, factor: float) -> Course:
+        stretch = {
+            name: factor * getattr(course, name)
+            for name in ("dwell_s", "rest_s", "warm_up_rest_s", "validation_s", "static_s")
+        }
+        return replace(course, step_deg=step, **stretch)
+
+    def length(candidate: Course) -> float:
+        return sum(p.trajectory.duration for p in plan(procedure, candidate, np.random.default_rng(0)))
+
+    least = float("inf")
+    for step in (course.step_deg,) if keep_step else [s for s in STEPS_DEG if s >= course.step_deg]:
+        low, high = (length(stretched(step, f)) for f in (0.5, 1.0))
+        factor = 1.0 + (target - high) / (2.0 * (high - low))
+        least = min(least, low)
+        if factor >= 0.5:
+            return stretched(step, factor)
+    raise ConfigurationError(
+        f"{procedure} cannot be recorded in {samples} samples at {interval} s; "
+        f"ask for at least {int(np.ceil(least / interval))}, or for larger steps or higher rates"
+    )
+
+
+def _turns(course: Course) -> list[Planned]:
+    accelerometer = [Planned(f"accel_{a}", "accelerometer", i, _accelerometer(i, course)) for i, a in enumerate(AXES)]
+    gyroscope = [Planned(f"gyro_{a}", "gyroscope", i, _gyroscope(i, course)) for i, a in enumerate(AXES)]
+    return accelerometer + gyroscope
+
+
+def _accelerometer(axis: int, course: Course) -> Turn:
+    builder = ProgramBuilder(course.acceleration_dps2)
+    if course.accelerometer_rates_dps:
+        builder.rest(course.rest_s)
+        for rate in course.accelerometer_rates_dps:
+            for sign in (1.0, -1.0)[: 1 + course.both_directions]:
+                builder.turn_with_plateau(sign * 360.0 * course.turns, rate).rest(course.rest_s)
+    else:
+        builder.rest(course.dwell_s)
+        for _ in range(round(360.0 / course.step_deg)):
+            builder.turn(course.step_deg, course.step_rate_dps).rest(course.dwell_s)
+    return Turn(axis, builder.build())
+
+
+def _gyroscope(axis: int, course: Course) -> Turn:
+    builder = ProgramBuilder(course.acceleration_dps2).rest(course.warm_up_rest_s)
+    for rate in course.rates_dps:
+        for sign in (1.0, -1.0)[: 1 + course.both_directions]:
+            builder.turn_with_plateau(sign * 360.0 * course.turns, rate).rest(course.rest_s)
+    return Turn(axis, builder.build())
+
+
+def _heldout(course: Course, rng: np.random.Generator) -> list[Planned]:
+    if course.validation_s <= 0.0:
+        return _static(course)
+    motion = random_gimbals(course.validation_s, course.validation_rate_dps, rng)
+    return [Planned("validation", "validation", None, motion), *_static(course)]
+
+
+def _static(course: Course) -> list[Planned]:
+    if course.static_s <= 0.0:
+        return []
+    program = ProgramBuilder(course.acceleration_dps2).rest(course.static_s).build()
+    return [Planned("static", "static", None, Moves(program, np.eye(3)[:1]))]
+
+
+def _rests(attitudes: NDArray[np.float64], course: Course, rng: np.random.Generator, accuracy: float) -> Moves:
+    """Return rests in the attitudes, set within ``accuracy`` deg, and the shortest move from each to the next."""
+    tilt = accuracy * rng.standard_normal((len(attitudes), 3))
+    size = np.linalg.norm(tilt, axis=1)
+    attitudes = attitudes @ rotation_about(tilt / np.where(size > 0.0, size, 1.0)[:, None], size)
+    builder = ProgramBuilder(course.acceleration_dps2).rest(max(course.warm_up_rest_s, course.dwell_s))
+    axes = []
+    for before, after in pairwise(attitudes):
+        axis, angle = axis_and_angle(before.T @ after)
+        builder.turn(angle, course.step_rate_dps).rest(course.dwell_s)
+        axes.append(axis)
+    return Moves(builder.build(), np.array(axes), attitudes[0])
+
+
+def axis_and_angle(rotation: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Return the unit axis and the angle in deg, 0 to 180, of a rotation matrix.
+
+    The quaternion is the eigenvector of Bar-Itzhack's matrix for its largest eigenvalue; it is good at 180 deg too.
+    """
+    d, off = rotation, np.array([rotation[2, 1], rotation[0, 2], rotation[1, 0]])
+    skew = off - np.array([d[1, 2], d[2, 0], d[0, 1]])
+    matrix = np.empty((4, 4))
+    matrix[0, 0] = np.trace(d)
+    matrix[0, 1:] = matrix[1:, 0] = skew
+    matrix[1:, 1:] = d + d.T - np.trace(d) * np.eye(3)
+    q = np.linalg.eigh(matrix)[1][:, -1]
+    q = q if q[0] >= 0.0 else -q
+    size = float(np.linalg.norm(q[1:]))
+    return q[1:] / size, float(np.degrees(2.0 * np.arctan2(size, q[0])))
+
+
+def _orientations_24() -> NDArray[np.float64]:
+    angles = np.linspace(0.0, 315.0, 8)
+    x, y, z = np.eye(3)
+    upright = rotation_about(y, np.array([-90.0]))[0]  # body x up
+    turns = [rotation_about(x, angles), rotation_about(y, angles), upright @ rotation_about(z, angles)]
+    return np.concatenate(turns)
+
+
+def _six_positions() -> NDArray[np.float64]:
+    x, y, _ = np.eye(3)
+    return np.concatenate([rotation_about(x, np.linspace(0.0, 270.0, 4)), rotation_about(y, np.array([-90.0, 90.0]))])
+
+
+def _random_attitudes(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    from pipeline.model.rotation import attitude_matrix  # noqa: PLC0415  (hand-held procedures alone)
+
+    q = rng.standard_normal((count, 4))
+    return attitude_matrix(q / np.linalg.norm(q, axis=1, keepdims=True))

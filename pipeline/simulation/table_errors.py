@@ -1,0 +1,160 @@
+"""What a table does otherwise than commanded, in exact geometry.
+
+A turn is commanded to the angle ``phi(t)`` and really reaches
+
+    theta = D_k + (phi - C_k) (D_k+1 - D_k) / (C_k+1 - C_k) + h(phi) + v(t)
+    h(phi) = A cos phi + B sin phi + (180/pi) (a sin phi + b (1 - cos phi))
+
+about the axis ``u = (e + d) / |e + d|``, where
+
+C_k, D_k : commanded and true angle of stop k, deg: step quantisation, angle errors, lost steps (rate errors), backlash
+A, B     : encoder error (eccentricity), deg
+a, b     : rate ripple once a revolution: ``dtheta/dt = (1 + a cos phi + b sin phi) dphi/dt``, relative
+v(t)     : vibration while the table moves, ``V sin(2 pi f t)``, deg
+d        : error of the axis direction, rad, across the nominal axis e
+
+The true rate and acceleration are the derivatives of theta(t), by the chain rule. The Mark 2 table (Sudsanguan 2019,
+sections 3.3 and 5.2.3) has all of them: acrylic parts, stepper motors, friction and an unbalanced load.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pipeline.simulation.program import Program
+
+
+@dataclass(frozen=True)
+class TurnErrors:
+    """Errors of turns about one axis; none by default.
+
+    Attributes
+    ----------
+    encoder : (2,) array, deg
+        A and B above.
+    ripple : (2,) array, relative
+        a and b above.
+    stops : (moves + 1,) array or None, deg
+        Angle error ``D_k - C_k`` of each stop of the program.
+    backlash : float, deg
+        The table lags behind by it, in the direction of the last move.
+    direction : (2,) array, rad
+        Components of d along the two axes that follow the turn axis cyclically.
+    vibration : float, deg
+        Amplitude V.
+    vibration_frequency : float, Hz
+    """
+
+    encoder: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
+    ripple: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
+    stops: NDArray[np.float64] | None = None
+    backlash: float = 0.0
+    direction: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
+    vibration: float = 0.0
+    vibration_frequency: float = 0.0
+
+    def turn_axis(self, axis: int) -> NDArray[np.float64]:
+        """Return the true turn axis: (3,) unit vector, body frame."""
+        u = np.zeros(3)
+        u[[axis, (axis + 1) % 3, (axis + 2) % 3]] = 1.0, *self.direction
+        unit: NDArray[np.float64] = u / np.linalg.norm(u)
+        return unit
+
+    def motion(
+        self, program: Program, time: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return the true angle (deg), rate (deg/s) and acceleration (deg/s^2): (n,) arrays."""
+        phi, rate, acceleration, move = program.at(time)
+        base, slope = self._stops(program, phi, move)
+        theta, first, second = self._harmonics(phi)
+        theta, first = theta + base, first + slope
+        angle, true_rate, true_acceleration = theta, first * rate, first * acceleration + second * rate**2
+        if self.vibration:
+            w = 2.0 * np.pi * self.vibration_frequency
+            swing = np.where(rate != 0.0, self.vibration, 0.0)
+            angle = angle + swing * np.sin(w * time)
+            true_rate = true_rate + swing * w * np.cos(w * time)
+            true_acceleration = true_acceleration - swing * w**2 * np.sin(w * time)
+        return angle, true_rate, true_acceleration
+
+    def _stops(
+        self, program: Program, phi: NDArray[np.float64], move: NDArray[np.int64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the angle between its stops, and its slope in the commanded angle."""
+        if (self.stops is None and not self.backlash) or len(program.stops) < 2:
+            return phi, np.ones_like(phi)
+        error = np.zeros_like(program.stops) if self.stops is None else self.stops
+        commanded = np.diff(program.stops)
+        k = np.clip(move, 0, None)
+        slope = 1.0 + np.diff(error)[k] / commanded[k]
+        lag = -self.backlash * np.sign(commanded[k])
+        return program.stops[k] + error[k] + (phi - program.stops[k]) * slope + lag, slope
+
+    def _harmonics(
+        self, phi: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return h (deg) and its first (deg/deg) and second (1/deg) derivative."""
+        sine, cosine = np.sin(np.radians(phi)), np.cos(np.radians(phi))
+        (A, B), (a, b) = self.encoder, self.ripple
+        value = A * cosine + B * sine + np.degrees(a * sine + b * (1.0 - cosine))
+        first = np.radians(B * cosine - A * sine) + a * cosine + b * sine
+        second = np.radians(np.radians(-A * cosine - B * sine) + b * cosine - a * sine)
+        return value, first, second
+
+
+def stop_errors(
+    program: Program,
+    rng: np.random.Generator,
+    angle_accuracy: float = 0.0,
+    rate_error: float = 0.0,
+    step: float = 0.0,
+) -> NDArray[np.float64]:
+    """Return the angle errors of the stops of a program: (moves + 1,) array, deg.
+
+    Parameters
+    ----------
+    program : Program
+    rng : Generator
+    angle_accuracy : float, deg
+        Standard deviation of each stop, independent.
+    rate_error : float, relative
+        Every move falls short (negative) or goes too far by this share of it.
+    step : float, deg
+        Step of the motor; 0 for none.
+    """
+    travelled = np.concatenate([[0.0], np.cumsum(np.diff(program.stops) * rate_error)])
+    error: NDArray[np.float64] = travelled + angle_accuracy * rng.standard_normal(len(program.stops))
+    if step > 0.0:
+        error = np.round((program.stops + error) / step) * step - program.stops
+    return error
+
+
+def random_errors(program: Program, rng: np.random.Generator, settings: dict[str, Any], axis: int) -> TurnErrors:
+    """Return the errors of one recording on a table.
+
+    Parameters
+    ----------
+    program : Program
+    rng : Generator
+    settings : dict
+        ``angle_accuracy_deg``, ``rate_error`` (3,), ``step_deg``, ``ripple`` (relative amplitude),
+        ``direction_deg`` (3, 2), ``vibration_deg``, ``vibration_hz``; what is missing is 0.
+    axis : int
+    """
+    phase = rng.uniform(0.0, 2.0 * np.pi)
+    rate_error = settings.get("rate_error", (0.0, 0.0, 0.0))[axis]
+    return TurnErrors(
+        ripple=settings.get("ripple", 0.0) * np.array([np.cos(phase), np.sin(phase)]),
+        stops=stop_errors(
+            program, rng, settings.get("angle_accuracy_deg", 0.0), rate_error, settings.get("step_deg", 0.0)
+        ),
+        direction=np.radians(np.asarray(settings.get("direction_deg", np.zeros((3, 2))), float)[axis]),
+        vibration=settings.get("vibration_deg", 0.0),
+        vibration_frequency=settings.get("vibration_hz", 0.0),
+    )
