@@ -76,7 +76,7 @@ def find_layout(text: TextFile, settings: CsvFormat) -> Layout:
         first = body.lstrip(b"\n").partition(b"\n")[0].decode("utf-8")
         names = [f"column {i}" for i in range(len(_fields(first, delimiter)))]
     where = f"{text.path}:{line - 1 if settings.header else line}"
-    if not body.strip():
+    if not body or body.isspace():
         found = f"header on line {line - 1}, " if settings.header else ""
         raise InputError(f"{found}0 data rows; at least 2 are needed", text.path)
     columns = _find_columns(names, settings, where)

@@ -72,7 +72,7 @@ def candidate_files(procedure: Mapping[str, Any], ingest: Mapping[str, Any]) -> 
         elif not parts:
             out[name] = [[file + suffix] for suffix in SUFFIXES]
         elif owner in (None, name):
-            out[name] = [[part["file"].replace(FILE, file) for part in parts], [file + ".mcap"]]
+            out[name] = [[str(part["file"]).replace(FILE, file) for part in parts], [file + ".mcap"]]
         else:
             out[name] = [[file + ".mcap"]]
     return out

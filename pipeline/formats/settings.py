@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import ConfigurationError
+from pipeline.formats.files import candidate_files
 from pipeline.formats.units import CHANNELS, COUNTS, TRIADS, UNITS
 
 if TYPE_CHECKING:
@@ -70,8 +71,15 @@ class McapFormat:
     joint: str | None = None
 
 
-def check_ingest(ingest: Mapping[str, Any]) -> None:
+def check_ingest(ingest: Mapping[str, Any], procedure: Mapping[str, Any] | None = None) -> None:
     """Refuse an ingest profile that no file could be read with.
+
+    Parameters
+    ----------
+    ingest : mapping
+        Section of a unit's configuration.
+    procedure : mapping, optional
+        Where it is given, the profile's parts have to suit its recordings.
 
     Raises
     ------
@@ -81,6 +89,8 @@ def check_ingest(ingest: Mapping[str, Any]) -> None:
     mcap_format(ingest)
     if ingest.get("csv"):
         csv_formats(ingest)
+    if procedure is not None:
+        candidate_files(procedure, ingest)
 
 
 def csv_formats(ingest: Mapping[str, Any]) -> list[CsvFormat]:
@@ -103,6 +113,8 @@ def csv_formats(ingest: Mapping[str, Any]) -> list[CsvFormat]:
         where = f"ingest.csv.parts[{index}]" if csv.get("parts") else "ingest.csv"
         if csv.get("parts"):
             _refuse_unknown(where, part, ("file", "columns"))
+            if not (isinstance(part.get("file"), str) and part["file"]):
+                raise ConfigurationError(f"{where}.file is {part.get('file')!r}; it is the name of a file")
         columns = _columns(f"{where}.columns", part.get("columns") or {}, header=header)
         formats.append(CsvFormat(delimiter, header, skip_lines, rate_hz, columns))
     _check_channels(formats, rate_hz)
