@@ -27,7 +27,7 @@ from pipeline.errors import ConfigurationError
 from pipeline.records import Noise, Recording
 from pipeline.signal.allan import allan_deviation
 from pipeline.signal.filters import apply_filter
-from pipeline.signal.rests import runs, still_samples
+from pipeline.signal.rests import CLIPPED_OR_STUCK, find_rests, rests_from_table, runs
 from pipeline.signal.temperature import smooth_temperature
 from pipeline.signal.wander import RATIOS, Blocks, Likelihood, blocks_of, likelihood
 
@@ -38,7 +38,6 @@ if TYPE_CHECKING:
 
 __all__ = ["allan_deviation", "estimate_noise", "filter_autocovariance"]
 
-UNUSABLE = 0b110  # clipped or stuck
 GAP = 1.5
 WANDER_TIME_S = 100.0  # where the data sheet gives none
 TIMES = np.exp2(np.arange(-4.0, 4.0))  # correlation times tried, in those of the data sheet
@@ -106,7 +105,7 @@ def _stretches(recording: Recording, mask: NDArray[np.bool_]) -> list[tuple[int,
 def _usable(recording: Recording, values: NDArray[np.float64]) -> NDArray[np.bool_]:
     mask = np.asarray(np.isfinite(values).all(axis=1))
     if recording.flags is not None:
-        mask[(recording.flags & UNUSABLE) != 0] = False
+        mask[(recording.flags & CLIPPED_OR_STUCK) != 0] = False
     return mask
 
 
@@ -116,13 +115,13 @@ def _rests(recording: Recording, sensor: str, *, everything: bool) -> list[Rest]
     assert values is not None  # noqa: S101
     still = _usable(recording, values)
     if not everything:
-        if recording.table_rate is not None:
-            rate = recording.table_rate
-        elif recording.table_angle is not None:
-            rate = np.gradient(recording.table_angle, recording.time)
-        else:
-            return []
-        still &= still_samples(recording.time, rate)
+        found = rests_from_table(recording)
+        if not found and recording.role == "rests":
+            found = find_rests(recording)
+        resting = np.zeros(recording.samples, bool)
+        for rest in found:
+            resting[rest.start : rest.stop] = rest.accepted
+        still &= resting
     if everything:  # a gap does not end a static rest: the likelihood knows the times
         return [(recording.time[still], values[still])] if still.any() else []
     return [(recording.time[a:b], values[a:b]) for a, b in _stretches(recording, still) if b - a > 2]

@@ -1,0 +1,201 @@
+"""The motion that a log's own calibrated signals tell, causally: a sample knows nothing of those after it.
+
+    domega/dt[n] = (omega[n] - omega[n-1]) / (t[n] - t[n-1]),    df/dt likewise; 0 at the first sample
+
+and the temperature is that of a straight line through the past, with exponentially fading weights:
+
+    T(t) = a,  (a, b) = argmin sum_i exp((t_i - t) / h) (T_i - a - b (t_i - t))^2,    t_i <= t
+
+so that a ramp passes without lag and the thermometer's noise does not reach the readings. What a block leaves to the
+next is a ``LogState``; a log cut into blocks of any size gives what it gives in one piece.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.errors import ConfigurationError, InputError
+from pipeline.model.effects import effect
+from pipeline.model.effects.base import turning_direction
+from pipeline.records import Motion
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from numpy.typing import NDArray
+
+    from pipeline.records import FittedEffect
+
+    Known = tuple[float, NDArray[np.float64]]  # the last sample that is not missing: time in s, value
+
+SIGNALS = {
+    "time": {"time"},
+    "temperature": {"temperature"},
+    "specific_force": {"accelerometer"},
+    "specific_force_rate": {"accelerometer", "time"},
+    "angular_rate": {"gyroscope"},
+    "angular_acceleration": {"gyroscope", "time"},
+    "direction": {"gyroscope"},
+}
+FIELDS = tuple(f.name for f in fields(Motion))
+
+
+@dataclass
+class LineThroughThePast:
+    """The fading line of a temperature log, as weighted sums about the last sample."""
+
+    bandwidth: float
+    last: float = float("nan")
+    sums: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+    def follow(self, time: NDArray[np.float64], temperature: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the smoothed temperature; a row without one (NaN) is given the line's."""
+        out = np.empty(len(time))
+        s0, s1, s2, r0, r1 = self.sums
+        last = self.last
+        for row, (t, value) in enumerate(zip(time.tolist(), temperature.tolist(), strict=True)):
+            step = t - last if s0 else 0.0
+            fade = np.exp(-step / self.bandwidth) if step else 1.0
+            s2 = fade * (s2 - 2.0 * step * s1 + step * step * s0)
+            r1 = fade * (r1 - step * r0)
+            s1 = fade * (s1 - step * s0)
+            s0, r0, last = fade * s0, fade * r0, t
+            if value == value:  # noqa: PLR0124  (not NaN)
+                s0, r0 = s0 + 1.0, r0 + value
+            determinant = s0 * s2 - s1 * s1
+            if determinant > 1e-15 * s0 * s0 * self.bandwidth**2:
+                out[row] = (s2 * r0 - s1 * r1) / determinant
+            else:
+                out[row] = r0 / s0 if s0 else float("nan")
+        self.sums, self.last = (s0, s1, s2, r0, r1), last
+        return out
+
+
+@dataclass
+class LogState:
+    """What a block of a log leaves to the next: its last samples, the last turn and the line of the temperature."""
+
+    smoothing: LineThroughThePast
+    force: Known | None = None
+    rate: Known | None = None
+    direction: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+
+    def keep(self, motion: Motion) -> None:
+        """Remember the end of a block."""
+        self.force = _last_known(motion.time, motion.specific_force) or self.force
+        self.rate = _last_known(motion.time, motion.angular_rate) or self.rate
+        if motion.direction is not None:
+            self.direction = motion.direction[-1]
+
+
+def _last_known(time: NDArray[np.float64], values: NDArray[np.float64]) -> Known | None:
+    known = np.flatnonzero(np.isfinite(values).all(axis=1))
+    return (float(time[known[-1]]), values[known[-1]]) if len(known) else None
+
+
+def log_motion(
+    time: NDArray[np.float64],
+    *,
+    specific_force: NDArray[np.float64],
+    angular_rate: NDArray[np.float64],
+    temperature: NDArray[np.float64] | None,
+    used: set[str],
+    state: LogState,
+) -> Motion:
+    """Return the motion of a block.
+
+    Parameters
+    ----------
+    time : (n,) array, s
+    specific_force : (n, 3) array, g
+    angular_rate : (n, 3) array, deg/s
+    temperature : (n,) array, degC, or None
+        Smoothed.
+    used : set of str
+        Fields of ``Motion`` that are needed; of the others only those that cost nothing are filled.
+    state : LogState
+        Of the block before.
+    """
+    zeros = np.zeros_like(specific_force)
+    rate = _difference(time, specific_force, state.force) if "specific_force_rate" in used else zeros
+    turn = _difference(time, angular_rate, state.rate) if "angular_acceleration" in used else zeros
+    motion = Motion(
+        time=time,
+        specific_force=specific_force,
+        angular_rate=angular_rate,
+        angular_acceleration=turn,
+        specific_force_rate=rate,
+        temperature=temperature,
+        angle=None,
+        rate=None,
+        axis=None,
+        still=np.zeros(len(time), bool),
+    )
+    if "direction" not in used:
+        return motion
+    direction = turning_direction(motion)
+    turned = np.any(direction != 0.0, axis=1, keepdims=True)
+    direction = np.where(turned, direction, state.direction)
+    return replace(motion, direction=direction)
+
+
+def fields_used(sensor: str, effects: Iterable[FittedEffect]) -> set[str]:
+    """Return the fields of a motion that effects look at.
+
+    Raises
+    ------
+    ConfigurationError
+        If one needs what no log of a sensor holds, such as a table's angle.
+    """
+    seen: set[str] = set()
+    for fitted in effects:
+        looked_at: set[str] = set()
+        found = effect(fitted.name)
+        found.reading(sensor, _watched(looked_at), np.eye(3), fitted.values)
+        seen |= looked_at | set(found.needs)
+        strange = sorted((looked_at | set(found.needs)) - set(SIGNALS))
+        if strange:
+            raise ConfigurationError(
+                f"effect {fitted.name} needs {', '.join(strange)}, which a field log does not hold"
+            )
+    return seen
+
+
+def _watched(seen: set[str]) -> Motion:
+    """Return a motion that notes which of its fields are read."""
+
+    class Watched(Motion):
+        def __getattribute__(self, name: str) -> Any:  # noqa: ANN401
+            if name in FIELDS:
+                seen.add(name)
+            return super().__getattribute__(name)
+
+    time, vector = np.arange(2.0), np.ones((2, 3))
+    return Watched(
+        time, vector, vector, vector, vector, np.full(2, 25.0), time, time, 0, np.ones(2, bool), None, None, vector
+    )
+
+
+def _difference(time: NDArray[np.float64], values: NDArray[np.float64], before: Known | None) -> NDArray[np.float64]:
+    """Return the backward difference quotient: (n, 3) array; 0 at a first sample."""
+    first = before is None
+    t_before, v_before = (time[0], values[0]) if before is None else before
+    t = np.concatenate([[t_before], time])
+    v = np.concatenate([v_before[None], values])
+    known = np.where(np.isfinite(v).all(axis=1), np.arange(len(v)), 0)
+    last = np.maximum.accumulate(known)[:-1]  # a missing sample is stepped over
+    step = t[1:] - t[last]
+    back = np.flatnonzero(step[1 if first else 0 :] <= 0) + (1 if first else 0)
+    if len(back):
+        raise InputError(
+            f"time does not increase at {time[back[0]]:.6f} s; an effect of this calibration needs rates of change: "
+            "sort the log and drop repeated samples"
+        )
+    if first:
+        step[0] = 1.0
+    quotient: NDArray[np.float64] = (v[1:] - v[last]) / step[:, None]
+    quotient[np.isnan(v[last]).any(axis=1)] = 0.0  # nothing is known before
+    return quotient

@@ -1,0 +1,265 @@
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+import pipeline
+from pipeline.errors import ConfigurationError, ConvergenceError, InputError, MissingInputError
+from pipeline.model.compensation import Compensation, compensate, load
+from pipeline.model.effects import catalogue
+from pipeline.model.effects.base import Owner
+from pipeline.model.log_motion import LineThroughThePast
+from pipeline.model.measurement import predicted_reading
+from pipeline.records import SENSORS, FittedEffect, Motion, SensorCalibration
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+SIZE = {"accelerometer": 2e-3, "gyroscope": 1e-5}
+EFFECTS = [(s, e.name) for s in SENSORS for e in catalogue().values() if e.owner == Owner.SENSOR and s in e.sensors]
+
+
+def motion(n: int = 400, seed: int = 0, dt: float = 0.01) -> Motion:
+    """A smooth random motion whose fields are consistent with backward differences of its signals."""
+    rng = np.random.default_rng(seed)
+    time = 5.0 + dt * np.arange(n)
+    phase, speed = rng.uniform(0, 6, (2, 3)), rng.uniform(0.5, 3.0, (2, 3))
+    force = np.sin(time[:, None] * speed[0] + phase[0])
+    rate = 80.0 * np.sin(time[:, None] * speed[1] + phase[1])
+    zero = np.zeros((1, 3))
+    return Motion(
+        time=time,
+        specific_force=force,
+        angular_rate=rate,
+        angular_acceleration=np.concatenate([zero, np.diff(rate, axis=0) / np.diff(time)[:, None]]),
+        specific_force_rate=np.concatenate([zero, np.diff(force, axis=0) / np.diff(time)[:, None]]),
+        temperature=25.0 + 0.05 * (time - 5.0),
+        angle=None,
+        rate=None,
+        axis=None,
+        still=np.zeros(n, bool),
+    )
+
+
+def fitted(name: str, sensor: str, seed: int = 1) -> FittedEffect:
+    rng = np.random.default_rng(seed)
+    parameters = {}
+    for p in catalogue()[name].parameters(sensor):
+        value = 120.0 if p.unit == "s" else rng.uniform(-1, 1) * SIZE[sensor]
+        parameters[p.name] = {"value": value, "unit": p.unit, "expanded_uncertainty": 0.0}
+    return FittedEffect(name, parameters)
+
+
+def calibration(sensor: str, effects: tuple[FittedEffect, ...] = ()) -> SensorCalibration:
+    rng = np.random.default_rng(7)
+    return SensorCalibration(
+        sensor, bias=rng.uniform(-0.1, 0.1, 3), matrix=np.eye(3) + rng.uniform(-0.03, 0.03, (3, 3)), effects=effects
+    )
+
+
+def truth(sensor: str, m: Motion) -> np.ndarray:
+    return m.specific_force if sensor == "accelerometer" else m.angular_rate
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_linear_compensation_inverts_the_measurement_equation(sensor: str) -> None:
+    m, c = motion(), calibration(sensor)
+    found = compensate(c, predicted_reading(c, m), m)
+    assert np.max(np.abs(found - truth(sensor, m))) < 1e-12 * max(1.0, np.max(np.abs(truth(sensor, m))))
+
+
+@pytest.mark.parametrize(("sensor", "name"), EFFECTS)
+def test_every_effect_of_a_sensor_is_inverted(sensor: str, name: str) -> None:
+    m, c = motion(), calibration(sensor, (fitted(name, sensor),))
+    reading = predicted_reading(c, m)
+    assert np.max(np.abs(reading - predicted_reading(calibration(sensor), m))) > 1e-6
+    assert np.max(np.abs(compensate(c, reading, m) - truth(sensor, m))) < 1e-9
+
+
+@pytest.mark.parametrize(("sensor", "name"), EFFECTS)
+def test_every_effect_is_inverted_from_the_logs_own_signals(sensor: str, name: str) -> None:
+    m = motion()
+    unit = {s: calibration(s, (fitted(name, s),) if s == sensor else ()) for s in SENSORS}
+    found = Compensation(**unit).apply(
+        predicted_reading(unit["accelerometer"], m), predicted_reading(unit["gyroscope"], m), m.temperature, m.time
+    )
+    assert np.max(np.abs(found.accelerometer - m.specific_force)) < 1e-9
+    assert np.max(np.abs(found.gyroscope - m.angular_rate)) < 1e-9
+
+
+def everything() -> dict[str, SensorCalibration]:
+    return {s: calibration(s, tuple(fitted(n, t, 3) for t, n in EFFECTS if t == s)) for s in SENSORS}
+
+
+def test_all_effects_of_both_sensors_are_inverted_together() -> None:
+    m, unit = motion(), everything()
+    readings = [predicted_reading(unit[s], m) for s in SENSORS]
+    accelerometer, gyroscope = Compensation(**unit).apply(*readings, m.temperature, m.time)
+    assert np.max(np.abs(accelerometer - m.specific_force)) < 1e-9
+    assert np.max(np.abs(gyroscope - m.angular_rate)) < 1e-9
+
+
+@pytest.mark.parametrize("size", [1, 7, 150])
+def test_a_log_in_blocks_gives_what_it_gives_in_one_piece(size: int) -> None:
+    m, unit = motion(300), everything()
+    rng = np.random.default_rng(2)
+    a, g = (predicted_reading(unit[s], m) + 1e-3 * rng.standard_normal((300, 3)) for s in SENSORS)
+    temperature = m.temperature + 0.05 * rng.standard_normal(300)
+    whole = Compensation(**unit).apply(a, g, temperature, m.time)
+    stream = Compensation(**unit).stream()
+    parts = [
+        stream.apply(a[i : i + size], g[i : i + size], temperature[i : i + size], m.time[i : i + size])
+        for i in range(0, 300, size)
+    ]
+    assert np.max(np.abs(np.concatenate([p.accelerometer for p in parts]) - whole.accelerometer)) < 1e-12
+    assert np.max(np.abs(np.concatenate([p.gyroscope for p in parts]) - whole.gyroscope)) < 1e-10
+
+
+def test_effects_of_the_bench_are_not_applied_to_a_field_log() -> None:
+    tilt = fitted("lever_arm", "accelerometer")
+    m, c = motion(), calibration("accelerometer", (tilt,))
+    reading = predicted_reading(calibration("accelerometer"), m)
+    found = Compensation(c, None).apply(reading, m.angular_rate, m.temperature, m.time).accelerometer
+    assert found == pytest.approx(m.specific_force, abs=1e-12)
+
+
+def test_a_single_sample_is_compensated() -> None:
+    c = calibration("accelerometer")
+    reading = c.bias + np.linalg.solve(c.matrix, [0.0, 0.0, 1.0])
+    accelerometer, gyroscope = Compensation(c, None).apply(accelerometer=list(reading))
+    assert accelerometer == pytest.approx(np.array([0.0, 0.0, 1.0]), abs=1e-12)
+    assert gyroscope is None
+
+
+def test_a_sensor_that_is_not_calibrated_passes_through_unchanged() -> None:
+    readings = motion().angular_rate
+    _, gyroscope = Compensation(calibration("accelerometer"), None).apply(gyroscope=readings)
+    assert np.array_equal(gyroscope, readings)
+
+
+def test_a_missing_reading_stays_missing_and_alone() -> None:
+    m, unit = motion(), everything()
+    a, g = (predicted_reading(unit[s], m) for s in SENSORS)
+    a[100, 1] = np.nan
+    found = Compensation(**unit).apply(a, g, m.temperature, m.time)
+    assert np.isnan(found.accelerometer[100]).all()
+    assert np.isfinite(np.delete(found.accelerometer, 100, 0)).all()
+
+
+def test_temperature_noise_does_not_reach_the_reading() -> None:
+    m = motion(3000, dt=0.12)
+    effect = FittedEffect("bias_temperature", fitted("bias_temperature", "gyroscope").parameters)
+    for p in effect.parameters.values():
+        p["value"] = 0.16
+    c = calibration("gyroscope", (effect,))
+    noisy = m.temperature + 0.05 * np.random.default_rng(0).standard_normal(3000)
+    reading = predicted_reading(c, m)
+    smooth = Compensation(None, c).apply(gyroscope=reading, temperature=noisy, time=m.time)
+    plain = Compensation(None, c).apply(gyroscope=reading, temperature=noisy, time=m.time, smoothing=0)
+    after = [np.std(found.gyroscope[500:] - m.angular_rate[500:]) for found in (smooth, plain)]
+    assert after[1] == pytest.approx(0.16 * 0.05, rel=0.05)
+    assert after[0] < 0.3 * after[1]
+
+
+def test_the_line_through_the_past_is_the_literal_weighted_fit() -> None:
+    rng = np.random.default_rng(4)
+    time = np.cumsum(rng.uniform(0.05, 0.4, 80))
+    temperature = 20.0 + rng.standard_normal(80)
+    found = LineThroughThePast(3.0).follow(time, temperature)
+    for n in (1, 2, 10, 79):
+        root = np.exp(0.5 * (time[: n + 1] - time[n]) / 3.0)
+        design = np.stack([root, root * (time[: n + 1] - time[n])], 1)
+        expected = np.linalg.lstsq(design, root * temperature[: n + 1], rcond=None)[0][0]
+        assert found[n] == pytest.approx(expected, abs=1e-8)
+
+
+def test_a_ramp_of_temperature_passes_without_lag_and_a_gap_is_bridged() -> None:
+    time = 0.1 * np.arange(200)
+    ramp = 20.0 + 0.3 * time
+    broken = ramp.copy()
+    broken[100:110] = np.nan
+    assert LineThroughThePast(3.0).follow(time, broken) == pytest.approx(ramp, abs=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("name", "missing"),
+    [("g_sensitivity", "accelerometer"), ("bias_temperature", "temperature"), ("warm_up", "time")],
+)
+def test_a_missing_signal_is_named(name: str, missing: str) -> None:
+    c = calibration("gyroscope", (fitted(name, "gyroscope"),))
+    with pytest.raises(InputError, match=f"{name}, which needs {missing}"):
+        Compensation(None, c).apply(gyroscope=np.zeros((4, 3)))
+
+
+def test_time_that_does_not_increase_is_refused_where_rates_are_needed() -> None:
+    c = calibration("accelerometer", (fitted("inner_lever_arms", "accelerometer"),))
+    with pytest.raises(InputError, match="does not increase"):
+        Compensation(c, None).apply(np.ones((3, 3)), np.ones((3, 3)), time=[0.0, 0.1, 0.1])
+
+
+def test_nothing_to_compensate_is_refused() -> None:
+    with pytest.raises(InputError, match="nothing to compensate"):
+        Compensation(None, None).apply(temperature=[25.0])
+
+
+def test_shapes_that_do_not_match_are_refused() -> None:
+    with pytest.raises(InputError, match="shape"):
+        Compensation(None, None).apply(np.zeros((4, 3)), np.zeros((5, 3)))
+
+
+def test_a_reading_far_out_of_range_is_named() -> None:
+    effect = fitted("cubic_nonlinearity", "accelerometer")
+    for p in effect.parameters.values():
+        p["value"] = 5e-3
+    reading = np.zeros((5, 3))
+    reading[3, 1] = 400.0
+    with pytest.raises(ConvergenceError, match=r"reading of 400 \(sample 4"):
+        Compensation(calibration("accelerometer", (effect,)), None).apply(reading)
+
+
+def test_an_effect_without_an_implementation_is_named() -> None:
+    strange = FittedEffect("phase_of_the_moon", {"a": {"value": 1.0, "unit": "1", "expanded_uncertainty": 0.0}})
+    with pytest.raises(ConfigurationError, match="phase_of_the_moon"):
+        Compensation(calibration("accelerometer", (strange,)), None).apply(np.zeros((1, 3)))
+
+
+def write(path: Path, **changes: object) -> Path:
+    unit = everything()
+    document = {"unit": "U1", "status": "ok", "error": None, **{s: unit[s].to_json() for s in SENSORS}, **changes}
+    path.write_text(json.dumps(document), encoding="utf-8")
+    return path
+
+
+def test_a_calibration_file_compensates_as_the_fit_does(tmp_path: Path) -> None:
+    m, unit = motion(), everything()
+    readings = [predicted_reading(unit[s], m) for s in SENSORS]
+    found = pipeline.load_calibration(write(tmp_path / "U1.json")).apply(*readings, m.temperature, m.time)
+    assert np.max(np.abs(found.gyroscope - m.angular_rate)) < 1e-9
+
+
+def test_a_missing_calibration_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(MissingInputError, match=r"U9\.json"):
+        load(tmp_path / "U9.json")
+
+
+def test_a_failed_unit_is_refused_with_its_cause(tmp_path: Path) -> None:
+    failed = {"status": "failed", "error": {"code": "bad_input", "message": "no rest was found", "file": None}}
+    with pytest.raises(InputError, match="no rest was found"):
+        load(write(tmp_path / "U1.json", **failed))
+
+
+@pytest.mark.parametrize("text", ["{", "[]", "{}", '{"status": "ok", "gyroscope": {"bias": [0, 0, 0]}}'])
+def test_a_file_that_is_no_calibration_is_refused(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "U1.json"
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match="no calibration"):
+        load(file)
+
+
+def test_a_calibration_of_the_wrong_shape_is_refused(tmp_path: Path) -> None:
+    part = {**calibration("gyroscope").to_json(), "bias": [0.0, 1.0]}
+    with pytest.raises(InputError, match="bias is not 3"):
+        load(write(tmp_path / "U1.json", gyroscope=part))
