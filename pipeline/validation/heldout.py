@@ -1,0 +1,174 @@
+"""Held-out errors: what a calibration leaves on samples that no fit has seen, beside what noise alone would leave.
+
+See ``pipeline.validation.ladder`` for the errors, ``pipeline.validation.floor`` for the floor. Held out are the
+recordings of role ``validation``; without one, every third rest (``procedure.holdout_every``) of a recording of rests.
+Where nothing is held out, the samples of the fit are judged, and the result says so.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.estimation.rest_means import held_out_rests, split_rests
+from pipeline.model.effects.base import truth, unit_of
+from pipeline.model.inversion import linear_truth
+from pipeline.validation.floor import squared_norm_errors, squared_vector_errors
+from pipeline.validation.ladder import ladder
+from pipeline.validation.limits import check_limits
+from pipeline.validation.samples import samples_of_motion, samples_of_rests
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.records import Noise, Recording, SensorCalibration
+    from pipeline.signal.rests import Rest
+    from pipeline.validation.samples import Samples
+
+FIGURES = ("mean_abs_error", "sum_abs_error", "max_error", "min_error", "rms_error", "change_percent")
+
+
+def validate(
+    calibration: SensorCalibration,
+    recordings: Sequence[Recording],
+    noise: Noise,
+    settings: Mapping[str, Any],
+    *,
+    other: SensorCalibration | None = None,
+) -> dict[str, Any]:
+    """Return a sensor's part of ``validations/<unit>.json``.
+
+    Parameters
+    ----------
+    calibration : SensorCalibration
+    recordings : sequence of Recording
+        All of the unit, filtered as for the fit.
+    noise : Noise
+    settings : mapping
+        Sections ``table``, ``procedure`` and ``limits``.
+    other : SensorCalibration, optional
+        Of the unit's other sensor. Only where no attitude is logged: effects that look at the other sensor's signal
+        then take it calibrated; without it, as it was read.
+
+    Returns
+    -------
+    dict
+        ``unit, samples, noise_floor, vector_noise_floor, steps`` of the published file, and ``held_out`` (false: judged
+        on the samples of the fit), ``reason`` (why), ``noise``, ``notes``, ``limits`` and ``pass``.
+        ``vector_rms_error`` is the root of the mean squared length of the difference to the reference.
+    """
+    samples, reason = _choose(calibration.sensor, recordings, noise, settings)
+    part: dict[str, Any] = {
+        "unit": unit_of(calibration.sensor),
+        "held_out": reason is None,
+        "reason": reason,
+        "samples": int(sum(np.isfinite(s.reading).all(axis=1).sum() for s in samples)),
+        "noise": {
+            "white": noise.white.tolist(),
+            "wander": noise.wander.tolist(),
+            "correlation_time_s": noise.correlation_time,
+            "source": noise.source,
+        },
+    }
+    if part["samples"] == 0:
+        nothing: dict[str, Any] = dict.fromkeys((*FIGURES, "vector_rms_error"))
+        part |= {"noise_floor": None, "vector_noise_floor": None, "notes": []}
+        part["steps"] = [{"name": name, **nothing} for name in ("raw", "calibrated")]
+    else:
+        part["noise_floor"], part["vector_noise_floor"] = noise_floors(calibration, samples)
+        part["steps"], part["notes"] = ladder(calibration, samples, other)
+    part["limits"], part["pass"] = check_limits(
+        calibration, part, (settings.get("limits") or {}).get(calibration.sensor)
+    )
+    return part
+
+
+def final_error(part: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the figures of a summary: of the first step and of the last.
+
+    Parameters
+    ----------
+    part : mapping
+        What ``validate`` returned.
+
+    Returns
+    -------
+    dict
+        ``before`` and ``after`` (``rms_error`` of the first and last step), ``mean_abs_error_before`` and ``_after``,
+        ``change_percent``, ``noise_floor``, ``step`` (name of the last).
+    """
+    first, last = part["steps"][0], part["steps"][-1]
+    return {
+        "before": first["rms_error"],
+        "after": last["rms_error"],
+        "mean_abs_error_before": first["mean_abs_error"],
+        "mean_abs_error_after": last["mean_abs_error"],
+        "change_percent": last["change_percent"],
+        "noise_floor": part["noise_floor"],
+        "step": last["name"],
+    }
+
+
+def noise_floors(calibration: SensorCalibration, samples: Sequence[Samples]) -> tuple[float, float | None]:
+    """Return the rms error, and where an attitude is known the vector rms error, that noise alone would give.
+
+    Parameters
+    ----------
+    calibration : SensorCalibration
+    samples : sequence of Samples
+    """
+    squares = [squared_norm_errors(_truth(calibration, s), calibration.matrix, s.variance) for s in samples]
+    floor = float(np.sqrt(np.nanmean(np.concatenate(squares))))
+    if any(s.motion is None for s in samples):
+        return floor, None
+    vectors = np.concatenate([squared_vector_errors(calibration.matrix, s.variance) for s in samples])
+    return floor, float(np.sqrt(np.mean(vectors)))
+
+
+def _truth(calibration: SensorCalibration, samples: Samples) -> NDArray[np.float64]:
+    """Return the reference's magnitude along its direction, or along that of the calibrated reading: (n, 3) array."""
+    reading = linear_truth(calibration, samples.reading)
+    direction = reading if samples.motion is None else truth(samples.sensor, samples.motion)
+    size = np.linalg.norm(direction, axis=1, keepdims=True)
+    unit = np.where(size > 0, direction / np.where(size > 0, size, 1.0), [1.0, 0.0, 0.0])
+    along: NDArray[np.float64] = samples.magnitude[:, None] * unit
+    return along
+
+
+def _choose(
+    sensor: str, recordings: Sequence[Recording], noise: Noise, settings: Mapping[str, Any]
+) -> tuple[list[Samples], str | None]:
+    """Return the samples to judge on, and why they are not held out where they are not."""
+    table = settings["table"]
+    by_rests = any(r.role == "rests" for r in recordings)
+
+    def moving(role: str) -> list[Samples]:
+        chosen = [r for r in recordings if r.role == role]
+        if by_rests:  # hand-held: between its rests nobody knows the specific force
+            chosen = [r for r in chosen if _logs_table(r)]
+        found = [samples_of_motion(sensor, r, noise, table) for r in chosen]
+        return [s for s in found if s is not None and np.isfinite(s.reading).all(axis=1).any()]
+
+    def resting(rests: Mapping[str, Sequence[Rest]]) -> list[Samples]:
+        chosen = [(r, rests[r.name]) for r in recordings if rests.get(r.name)]
+        return [s for s in (samples_of_rests(sensor, r, rs, noise, table) for r, rs in chosen) if s is not None]
+
+    def rests_of(role: str) -> dict[str, Sequence[Rest]]:
+        return {r.name: split_rests(r, 0).used for r in recordings if r.role == role}
+
+    held_out = moving("validation")
+    if not held_out and by_rests:
+        held_out = resting(held_out_rests(recordings, settings)) or resting(rests_of("validation"))
+    if held_out:
+        return held_out, None
+    lack = f"no held-out recording holds readings of the {sensor} and a reference for them"
+    fitted = moving(sensor) or resting(rests_of("rests")) or resting(rests_of(sensor))
+    return fitted, lack + ("; judged on the samples of the fit" if fitted else "")
+
+
+def _logs_table(recording: Recording) -> bool:
+    logs = (recording.table_attitude, recording.table_rate, recording.table_angle)
+    return any(log is not None for log in logs)

@@ -1,0 +1,166 @@
+"""Held-out errors after each step of a calibration.
+
+    accelerometer: e_n = |a_n| - gravity_g,    gyroscope: e_n = |g_n| - I_n        (Sudsanguan 2019, eqs 5.1 to 5.4)
+
+before anything (``raw``), after each stage of the fit, with matrix and bias, and with each fitted effect added:
+
+    corrected = matrix @ (reading - bias - sum of effects)
+
+where the effects are those of the reference motion, if the attitude is known. Then effects of timing move the reference
+to what the sensor felt, and the vector error is ``sqrt(mean |corrected - truth|^2)``; it contains a misalignment
+between unit and table, unless the fit was against the same table. Without a known attitude, effects are
+those of the log's own calibrated signals, by fixed point.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.errors import ConfigurationError
+from pipeline.estimation.correction import apply_correction
+from pipeline.model.effects import effect
+from pipeline.model.effects.base import truth
+from pipeline.model.inversion import inverse_of, linear_truth, solve
+from pipeline.model.log_motion import LineThroughThePast, LogState, fields_used, log_motion
+from pipeline.validation.samples import OTHER
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.records import FittedEffect, Motion, SensorCalibration
+    from pipeline.validation.samples import Samples
+
+    Corrected = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64] | None]
+    Step = Callable[[Samples], Corrected]
+
+
+def ladder(
+    calibration: SensorCalibration, samples: Sequence[Samples], other: SensorCalibration | None
+) -> tuple[list[dict[str, Any]], list[str]]:
+    """Return the figures of every step, and notes on effects that the samples cannot show.
+
+    Parameters
+    ----------
+    calibration : SensorCalibration
+    samples : sequence of Samples
+    other : SensorCalibration or None
+        Of the other sensor, for effects that look at it.
+    """
+    steps: list[tuple[str, Step]] = [("raw", partial(_with, partial(apply_correction, None)))]
+    steps += [
+        (f"stage:{stage.name}", partial(_with, partial(apply_correction, stage.correction)))
+        for stage in calibration.stages
+        if stage.correction is not None
+    ]
+    steps.append(("calibrated", partial(_with, partial(linear_truth, calibration))))
+    shown: list[FittedEffect] = []
+    notes = []
+    for fitted in calibration.effects:
+        lack = next(filter(None, (_lack(calibration, fitted, s) for s in samples)), None)
+        if lack:
+            notes.append(f"{fitted.name} is left out: {lack}")
+        else:
+            shown = [*shown, fitted]
+        steps.append((f"+ {fitted.name}", partial(_with_effects, calibration, tuple(shown), other)))
+    figures = [_figures(name, [step(s) for s in samples]) for name, step in steps]
+    raw = figures[0]["mean_abs_error"]
+    for row in figures:
+        row["change_percent"] = 100.0 * (raw - row["mean_abs_error"]) / raw if raw else None
+    return figures, notes
+
+
+def _with(correct: Callable[[NDArray[np.float64]], NDArray[np.float64]], samples: Samples) -> Corrected:
+    known = None if samples.motion is None else truth(samples.sensor, samples.motion)
+    return correct(samples.reading), samples.magnitude, known
+
+
+def _figures(name: str, corrected: Sequence[Corrected]) -> dict[str, Any]:
+    error = np.concatenate([np.linalg.norm(vector, axis=1) - magnitude for vector, magnitude, _ in corrected])
+    squares = None
+    differences = [vector - known for vector, _, known in corrected if known is not None]
+    if len(differences) == len(corrected):
+        squares = np.sum(np.concatenate(differences) ** 2, axis=1)[np.isfinite(error)]
+    error = error[np.isfinite(error)]
+    return {
+        "name": name,
+        "mean_abs_error": float(np.mean(np.abs(error))),
+        "sum_abs_error": float(np.sum(np.abs(error))),
+        "max_error": float(np.max(error)),
+        "min_error": float(np.min(error)),
+        "rms_error": float(np.sqrt(np.mean(error**2))),
+        "change_percent": None,
+        "vector_rms_error": None if squares is None else float(np.sqrt(np.mean(squares))),
+    }
+
+
+def _lack(calibration: SensorCalibration, fitted: FittedEffect, samples: Samples) -> str | None:
+    """Say what the held-out recording lacks for an effect to be taken off, or None."""
+    found = effect(fitted.name)
+    if samples.motion is not None:
+        missing = [need for need in found.needs if getattr(samples.motion, need) is None]
+        return f"the held-out recording holds no {' and no '.join(missing)}" if missing else None
+    if found.moves:
+        return "the held-out recording logs no attitude, and without it the reference cannot be moved in time"
+    try:
+        used = fields_used(calibration.sensor, [fitted])
+    except ConfigurationError as error:
+        return f"the held-out recording logs no attitude ({error})"
+    if "temperature" in used and samples.temperature is None:
+        return "the held-out recording holds no temperature"
+    across = "angular_rate" if calibration.sensor == "accelerometer" else "specific_force"
+    if across in used and samples.other is None and not samples.resting:
+        return f"the held-out recording holds no {OTHER[calibration.sensor]}"
+    return None
+
+
+def _with_effects(
+    calibration: SensorCalibration, effects: Sequence[FittedEffect], other: SensorCalibration | None, samples: Samples
+) -> Corrected:
+    if samples.motion is None:
+        return _from_own_signals(calibration, effects, samples, other), samples.magnitude, None
+    sensor, motion, K = calibration.sensor, samples.motion, inverse_of(calibration)
+    for fitted in effects:
+        motion = effect(fitted.name).moved(motion, fitted.values)
+    rest = samples.reading
+    for fitted in effects:
+        if not effect(fitted.name).moves:
+            rest = rest - effect(fitted.name).reading(sensor, motion, K, fitted.values)
+    felt, stamped = truth(sensor, motion), truth(sensor, samples.motion)
+    change = np.linalg.norm(felt, axis=1) - np.linalg.norm(stamped, axis=1)
+    return linear_truth(calibration, rest), samples.magnitude + change, felt
+
+
+def _from_own_signals(
+    calibration: SensorCalibration, effects: Sequence[FittedEffect], samples: Samples, other: SensorCalibration | None
+) -> NDArray[np.float64]:
+    """Take effects off by the log's own calibrated signals."""
+    sensor = calibration.sensor
+    readings = {sensor: samples.reading}
+    parts: dict[str, tuple[SensorCalibration | None, Sequence[FittedEffect]]] = {sensor: (calibration, effects)}
+    if samples.other is not None:
+        readings[OTHER[sensor]] = samples.other
+        parts[OTHER[sensor]] = (other, ())
+    used = fields_used(sensor, effects)
+    nothing = np.zeros_like(samples.reading)
+
+    def felt(truths: dict[str, NDArray[np.float64]]) -> Motion:
+        force, rate = truths.get("accelerometer", nothing), truths.get("gyroscope", nothing)
+        if samples.resting:
+            rate = nothing
+        found = log_motion(
+            samples.time,
+            specific_force=force,
+            angular_rate=rate,
+            temperature=samples.temperature,
+            used=used,
+            state=LogState(LineThroughThePast(1.0)),
+        )
+        return replace(found, specific_force_rate=nothing, angular_acceleration=nothing) if samples.resting else found
+
+    return solve(parts, readings, felt)[sensor]

@@ -1,0 +1,179 @@
+"""Held-out samples of a sensor, what is known of the truth there, and the noise that is in them.
+
+The reference of a filtered recording is taken at ``time - delay``. Its magnitude is
+
+    accelerometer: gravity_g,      gyroscope: |table rate|
+
+where the table rate is that of the log, else that of the attitude's derivative; with Earth's rotation configured, it is
+changed by ``|omega + Omega| - |omega|``, which the gyroscope sees too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.estimation.rest_means import rest_means
+from pipeline.model.effects.base import truth
+from pipeline.model.effects.time_offset import shifted
+from pipeline.model.kinematics import earth_rate, reference_motion
+from pipeline.signal.noise import filter_autocovariance
+from pipeline.signal.wander import variance_of_average, variance_of_mean
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.records import Motion, Noise, Recording
+    from pipeline.signal.rests import Rest
+
+OTHER = {"accelerometer": "gyroscope", "gyroscope": "accelerometer"}
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Samples of one recording on which a calibration is judged.
+
+    Attributes
+    ----------
+    sensor : str
+    time : (n,) array, s
+    reading : (n, 3) array, g or deg/s
+    magnitude : (n,) array, same unit
+        What the norm should be.
+    variance : (n, 3) array, unit squared
+        Of white noise and wander, per reading axis.
+    motion : Motion or None
+        By the reference, where the attitude is known.
+    other : (n, 3) array or None
+        Readings of the other sensor.
+    temperature : (n,) array, degC, or None
+    resting : bool
+        Whether each sample is the mean of a rest.
+    """
+
+    sensor: str
+    time: NDArray[np.float64]
+    reading: NDArray[np.float64]
+    magnitude: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    motion: Motion | None
+    other: NDArray[np.float64] | None
+    temperature: NDArray[np.float64] | None
+    resting: bool = False
+
+
+def samples_of_motion(sensor: str, recording: Recording, noise: Noise, table: Mapping[str, Any]) -> Samples | None:
+    """Return a recording's samples, or None where it holds no readings of the sensor or no reference for them.
+
+    Parameters
+    ----------
+    sensor : str
+    recording : Recording
+    noise : Noise
+    table : mapping
+        ``gravity_g``, ``latitude_deg``, ``azimuth_deg``.
+    """
+    reading = recording.reading(sensor)
+    if reading is None or recording.samples == 0:
+        return None
+    gravity = float(table.get("gravity_g") or 1.0)
+    latitude, azimuth = table.get("latitude_deg"), table.get("azimuth_deg")
+    earth = None if latitude is None or azimuth is None else earth_rate(latitude, azimuth)
+    delay = float(recording.filter.get("delay_s", 0.0))
+    motion = reference_motion(recording, gravity, earth)
+    if motion is not None:
+        motion = shifted(motion, -delay)
+    magnitude = np.full(recording.samples, gravity)
+    if sensor == "gyroscope":
+        known = _rate(recording, motion, earth, delay)
+        if known is None:
+            return None
+        magnitude = known
+    variance = white_variance(recording, noise) + wander_share(recording) * noise.wander**2
+    temperature = recording.temperature if motion is None else motion.temperature
+    n = recording.samples
+    return Samples(
+        sensor,
+        recording.time,
+        reading,
+        magnitude,
+        np.broadcast_to(variance, (n, 3)),
+        motion,
+        recording.reading(OTHER[sensor]),
+        temperature,
+    )
+
+
+def samples_of_rests(
+    sensor: str, recording: Recording, rests: Sequence[Rest], noise: Noise, table: Mapping[str, Any]
+) -> Samples | None:
+    """Return the mean readings of rests, or None where there are none.
+
+    Parameters
+    ----------
+    sensor : str
+    recording : Recording
+    rests : sequence of Rest
+    noise : Noise
+    table : mapping
+    """
+    reading, counts = rest_means(recording, rests, sensor)
+    rests = [rest for rest, count in zip(rests, counts, strict=False) if count]
+    if not rests:
+        return None
+    reading, counts = reading[counts > 0], counts[counts > 0]
+
+    def means(values: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+        return None if values is None else np.array([np.mean(values[r.start : r.stop]) for r in rests])
+
+    other, _ = rest_means(recording, rests, OTHER[sensor])
+    share = variance_of_mean(filter_autocovariance(recording), counts)
+    averaged = variance_of_average(counts.astype(np.float64) * recording.interval, noise.correlation_time)
+    wander = wander_share(recording) * noise.wander**2
+    gravity = float(table.get("gravity_g") or 1.0) if sensor == "accelerometer" else 0.0
+    time = means(recording.time)
+    assert time is not None  # noqa: S101
+    return Samples(
+        sensor,
+        time,
+        reading,
+        np.full(len(rests), gravity),
+        share[:, None] * noise.white**2 + averaged[:, None] * wander,
+        None,
+        other if len(other) else None,
+        means(recording.temperature),
+        resting=True,
+    )
+
+
+def white_variance(recording: Recording, noise: Noise) -> NDArray[np.float64]:
+    """Return the variance of white noise behind the recording's filter: (3,) array."""
+    variance: NDArray[np.float64] = (float(recording.filter.get("noise_gain", 1.0)) * noise.white) ** 2
+    return variance
+
+
+def wander_share(recording: Recording) -> float:
+    """Return how much of the variance of a slow wander passes the filter: 1, or 0 of a high-pass."""
+    covariance = filter_autocovariance(recording)
+    return float(np.clip(2.0 * covariance.sum() - covariance[0], 0.0, 1.0))
+
+
+def _rate(
+    recording: Recording, motion: Motion | None, earth: NDArray[np.float64] | None, delay: float
+) -> NDArray[np.float64] | None:
+    """Return the magnitude of the rate that the gyroscope should see: (n,) array, deg/s."""
+    seen = None if motion is None else np.linalg.norm(truth("gyroscope", motion), axis=1)
+    turned = seen
+    if motion is not None and earth is not None and motion.level is not None:
+        of_table = motion.angular_rate - np.einsum("i,nij->nj", earth, motion.level)
+        turned = np.linalg.norm(of_table, axis=1)
+    if recording.table_rate is None:
+        return seen
+    logged = np.abs(recording.table_rate)
+    if delay:
+        logged = np.abs(np.interp(recording.time - delay, recording.time, recording.table_rate))
+    return logged if seen is None or turned is None else logged + (seen - turned)
