@@ -1,0 +1,4 @@
+"""Calibration of the accelerometer: each module is one stage of a fit.
+
+Importing one does not import the others, so that a job pays only for its own stage.
+"""

@@ -1,0 +1,199 @@
+"""The extremes that the staged method works with (Sudsanguan 2019, eqs 3.15-3.25).
+
+In a turn about body axis i the axes j = i + 1 and k = i + 2 (cyclic: *first* and *second*) each point up and down once.
+The method uses, for each turn, the table angles of these four extremes, and for each axis its largest and smallest
+readings, its readings where it is level, and what it reads while the table turns about it:
+
+    a_max = mean of the largest, a_min = mean of the smallest, a_zero = mean of the level readings  (3.23-3.25)
+
+By default they are those of sinusoids fitted to the turns (``pipeline.estimation.turns``): the opposite extreme is then
+180 deg away, and all samples count. ``as_printed`` takes the largest and the smallest sample and their angles.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+
+from pipeline.errors import NotObservableError
+from pipeline.estimation.correction import apply_step
+from pipeline.estimation.turns import fit_sinusoid, settled, wrap
+from pipeline.records import AXES
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.estimation.turns import Part, Sinusoid
+    from pipeline.records import Recording
+
+OTHERS = ((1, 2), (2, 0), (0, 1))  # first and second axis of a turn about x, y, z
+
+
+@dataclass(frozen=True)
+class Extremes:
+    """What the staged method knows of the turns.
+
+    Attributes
+    ----------
+    angle_high, angle_low : (3, 2) array, deg
+        Table angle where the first and the second axis of the turn about x, y, z read most and least.
+    high, low : (3, 2) array, g
+        Largest and smallest readings of each axis, one from each of the two turns in which it goes up and down.
+    level : (3, m) array, g
+        Readings of each axis where it is level.
+    height : (3,) array, g
+        What each axis reads while the table turns about it: by default the amplitude of its swing, as printed its mean.
+    """
+
+    angle_high: NDArray[np.float64]
+    angle_low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    low: NDArray[np.float64]
+    level: NDArray[np.float64]
+    height: NDArray[np.float64]
+
+    @property
+    def a_max(self) -> NDArray[np.float64]:
+        """Largest reading of each axis, g."""
+        mean: NDArray[np.float64] = self.high.mean(axis=1)
+        return mean
+
+    @property
+    def a_min(self) -> NDArray[np.float64]:
+        """Smallest reading of each axis, g."""
+        mean: NDArray[np.float64] = self.low.mean(axis=1)
+        return mean
+
+    @property
+    def a_zero(self) -> NDArray[np.float64]:
+        """Level reading of each axis, g."""
+        mean: NDArray[np.float64] = self.level.mean(axis=1)
+        return mean
+
+    @property
+    def excess_high(self) -> NDArray[np.float64]:
+        """alpha_P, beta_P, gamma_P: by how much the upper extremes of a turn are not 90 deg apart."""
+        return wrap(self.angle_high[:, 0] - self.angle_high[:, 1] - 90.0)
+
+    @property
+    def excess_low(self) -> NDArray[np.float64]:
+        """alpha_N, beta_N, gamma_N: the same of the lower extremes."""
+        return wrap(self.angle_low[:, 0] - self.angle_low[:, 1] - 90.0)
+
+    def corrected(self, step: Mapping[str, Any], *, as_printed: bool) -> Self:
+        """Return the extremes of readings after a step of a correction."""
+
+        def apply(values: NDArray[np.float64]) -> NDArray[np.float64]:
+            return apply_step(step, values.T).T
+
+        height = self.height
+        if as_printed:
+            height = apply(height[:, None])[:, 0]
+        elif "two_sided" in step:
+            sides = step["two_sided"]
+            height = height * (np.array(sides["positive"]) + np.array(sides["negative"])) / 2.0
+        return replace(self, high=apply(self.high), low=apply(self.low), level=apply(self.level), height=height)
+
+
+@dataclass(frozen=True)
+class Turn:
+    """The samples that are used of all recordings of turns about one axis.
+
+    Attributes
+    ----------
+    angle : (n,) array, deg
+    reading : (n, 3) array, g
+    used : list of (Recording, array of bool)
+        Where they come from, in order.
+    """
+
+    angle: NDArray[np.float64]
+    reading: NDArray[np.float64]
+    used: list[tuple[Recording, NDArray[np.bool_]]]
+
+
+def turns_of(parts: Sequence[Part]) -> list[Turn]:
+    """Return the turns about x, y and z.
+
+    Raises
+    ------
+    NotObservableError
+        If there is none about one of the axes.
+    """
+    turns = []
+    for axis in range(3):
+        used = [(part, settled(part)) for part in parts if part.motion.axis == axis]
+        if not any(np.any(keep) for _, keep in used):
+            raise NotObservableError(
+                f"no usable sample of a turn about body axis {AXES[axis]}: the staged method needs a turn about each "
+                "of x, y and z; record it, or choose reference_least_squares"
+            )
+        angle = np.concatenate([np.asarray(part.motion.angle)[keep] for part, keep in used])
+        reading = np.concatenate([np.asarray(part.recording.accelerometer)[keep] for part, keep in used])
+        turns.append(Turn(angle, reading, [(part.recording, keep) for part, keep in used]))
+    return turns
+
+
+def sinusoids_of(turns: Sequence[Turn]) -> list[list[Sinusoid]]:
+    """Fit a sinusoid to each channel in each turn: ``[turn][channel]``."""
+    return [
+        [
+            fit_sinusoid(
+                turn.angle,
+                turn.reading[:, channel],
+                sides=channel != axis,
+                where=f"accelerometer {AXES[channel]} in the turn about {AXES[axis]}",
+            )
+            for channel in range(3)
+        ]
+        for axis, turn in enumerate(turns)
+    ]
+
+
+def extremes_of_sinusoids(coefficients: Sequence[Sequence[NDArray[np.float64]]]) -> Extremes:
+    """Return the extremes of fitted sinusoids.
+
+    Parameters
+    ----------
+    coefficients : [turn][channel] of (3,) or (4,) arrays
+        ``Sinusoid.coefficients``.
+    """
+    angle = np.empty((3, 2))
+    high, low, level = np.empty((3, 2)), np.empty((3, 2)), np.empty((3, 3))
+    height = np.empty(3)
+    for axis in range(3):
+        zero, cosine, sine = coefficients[axis][axis]
+        level[axis, 2], height[axis] = zero, np.hypot(cosine, sine)
+        for pose, channel in enumerate(OTHERS[axis]):
+            zero, cosine, sine, asymmetry = coefficients[axis][channel]
+            amplitude = np.hypot(cosine, sine)
+            angle[axis, pose] = np.degrees(np.arctan2(sine, cosine))
+            high[channel, pose], low[channel, pose] = zero + asymmetry + amplitude, zero + asymmetry - amplitude
+            level[channel, pose] = zero
+    return Extremes(angle, angle + 180.0, high, low, level, height)
+
+
+def extremes_of_samples(turns: Sequence[Turn]) -> Extremes:
+    """Return the extremes as the largest and smallest samples of the turns, the readings of each pose from one sample.
+
+    An axis is level in two poses of either turn in which it goes up and down and in all four of its own turn.
+    """
+    angle_high, angle_low = np.empty((3, 2)), np.empty((3, 2))
+    high, low, level = np.empty((3, 2)), np.empty((3, 2)), np.empty((3, 8))
+    height = np.empty(3)
+    for axis, turn in enumerate(turns):
+        pair = list(OTHERS[axis])
+        top, bottom = np.argmax(turn.reading[:, pair], axis=0), np.argmin(turn.reading[:, pair], axis=0)
+        angle_high[axis], angle_low[axis] = turn.angle[top], turn.angle[bottom]
+        for pose, channel in enumerate(pair):
+            other = 1 - pose
+            high[channel, pose] = turn.reading[top[pose], channel]
+            low[channel, pose] = turn.reading[bottom[pose], channel]
+            level[channel, 2 * pose : 2 * pose + 2] = turn.reading[[top[other], bottom[other]], channel]
+        level[axis, 4:] = turn.reading[np.concatenate([top, bottom]), axis]
+        height[axis] = turn.reading[:, axis].mean()
+    return Extremes(angle_high, angle_low, high, low, level, height)

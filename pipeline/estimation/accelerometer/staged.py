@@ -1,0 +1,216 @@
+"""The staged method of the accelerometer: what its stages have in common (Sudsanguan 2019, eqs 3.15-3.43).
+
+The stages are followed one after the other (``pipeline.estimation.accelerometer.chain``), so the whole method is a
+function of a few coefficients, those of the sinusoids fitted to the turns. The covariance of all that comes out follows
+from theirs by the derivative of the whole chain (JCGM 100:2008, 5.2.2), taken by differences. As printed, the extremes
+are single samples, order statistics of the noise: the covariance is then that of synthetic turns, the fitted sinusoids
+with new noise of the size that the residuals have.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.errors import ConfigurationError
+from pipeline.estimation.accelerometer.chain import follow
+from pipeline.estimation.accelerometer.extremes import (
+    OTHERS,
+    Extremes,
+    extremes_of_samples,
+    extremes_of_sinusoids,
+    sinusoids_of,
+    turns_of,
+)
+from pipeline.estimation.correction import apply_correction
+from pipeline.estimation.sample_blocks import make_blocks
+from pipeline.estimation.serial_noise import assess_noise, combine, prior_of
+from pipeline.estimation.turns import parts_of
+from pipeline.model.effects.scale_factor_asymmetry import EFFECT
+from pipeline.records import FittedEffect, SensorCalibration, StageResult
+from pipeline.records.calibration import coverage_factor
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.estimation.accelerometer.chain import Chain
+    from pipeline.estimation.accelerometer.extremes import Turn
+    from pipeline.estimation.serial_noise import Prior, SerialNoise
+    from pipeline.estimation.turns import Sinusoid
+    from pipeline.records import Recording
+
+STAGES = ("orthogonality", "misalignment", "bias", "scale_factor")
+REPLICATES = 100
+SEED = 20190508
+STEP = 1e-7  # g, of the differences: truncation and rounding are then both about 1e-8 of the derivative
+
+
+def fit_stage(
+    name: str, recordings: Sequence[Recording], previous: SensorCalibration | None, settings: Mapping[str, Any]
+) -> SensorCalibration:
+    """Run one stage of the staged method.
+
+    Parameters
+    ----------
+    name : str
+        The stage.
+    recordings : sequence of Recording
+        Those of role ``accelerometer`` are used.
+    previous : SensorCalibration or None
+        The result of the stage before.
+    settings : mapping
+        Sections ``table``, ``method`` and ``sensor``.
+
+    Returns
+    -------
+    SensorCalibration
+    """
+    names = [*_stages_before(previous), name]
+    as_printed = bool(settings["method"].get("as_printed", False))
+    gravity_g = float(settings["table"].get("gravity_g", 1.0))
+    turns = turns_of(parts_of(recordings, "accelerometer", settings["table"], "the staged method"))
+    sinusoids = sinusoids_of(turns)
+    noise = _noise(turns, sinusoids, prior_of("accelerometer", recordings, settings))
+
+    def run(extremes: Extremes) -> Chain:
+        return follow(extremes, names, gravity_g, as_printed=as_printed)
+
+    chain = run(extremes_of_samples(turns) if as_printed else extremes_of_sinusoids(_coefficients(sinusoids)))
+    if as_printed:
+        covariance, freedom = _resampled(turns, sinusoids, noise, run)
+    else:
+        covariance, freedom = _propagated(sinusoids, noise, run)
+    after = apply_correction({"steps": chain.steps}, np.concatenate([turn.reading for turn in turns]))
+    result = StageResult(
+        name=name,
+        parameters=_parameters(chain, covariance),
+        residual_rms=float(np.sqrt(np.mean((np.linalg.norm(after, axis=1) - gravity_g) ** 2))),
+        correction={"steps": chain.steps},
+        details=_details(turns, noise, freedom),
+    )
+    effects: tuple[FittedEffect, ...] = ()
+    known = 12
+    if name == "scale_factor":
+        effects, known = (_asymmetry(chain, covariance, freedom),), 15
+    return SensorCalibration(
+        sensor="accelerometer",
+        bias=chain.bias,
+        matrix=np.diag(1.0 / chain.k),
+        stages=(*(previous.stages if previous else ()), result),
+        effects=effects,
+        covariance=covariance[:known, :known],
+        degrees_of_freedom=freedom,
+    )
+
+
+def _parameters(chain: Chain, covariance: NDArray[np.float64]) -> dict[str, dict[str, Any]]:
+    own = np.sqrt(np.clip(np.diag(covariance)[15:], 0.0, None))
+    return {
+        name: {"value": value, "unit": unit, "standard_uncertainty": float(u)}
+        for (name, (value, unit)), u in zip(chain.outcome.values.items(), own, strict=True)
+    }
+
+
+def _details(turns: Sequence[Turn], noise: SerialNoise, freedom: float) -> dict[str, Any]:
+    used = sum(len(turn.angle) for turn in turns)
+    total = sum(recording.samples for turn in turns for recording, _ in turn.used)
+    return {
+        "samples_used": used,
+        "samples_left_out": total - used,
+        "white_noise": noise.white.tolist(),
+        "bias_wander": noise.wander.tolist(),
+        "degrees_of_freedom": freedom,
+    }
+
+
+def _asymmetry(chain: Chain, covariance: NDArray[np.float64], freedom: float) -> FittedEffect:
+    factor = coverage_factor(freedom)
+    expanded = factor * np.sqrt(np.diag(covariance)[12:15])
+    names = EFFECT.parameters("accelerometer")
+    return FittedEffect(
+        EFFECT.name,
+        {
+            parameter.name: {"value": float(value), "unit": parameter.unit, "expanded_uncertainty": float(u)}
+            for parameter, value, u in zip(names, chain.c, expanded, strict=True)
+        },
+    )
+
+
+def _stages_before(previous: SensorCalibration | None) -> list[str]:
+    names = [] if previous is None else [stage.name for stage in previous.stages]
+    unknown = [name for name in names if name not in STAGES]
+    if unknown:
+        raise ConfigurationError(
+            f"a stage of the staged method cannot follow {unknown[0]!r}, which leaves no corrected readings for it; "
+            f"the stages of the accelerometer are {', '.join(STAGES)}"
+        )
+    return names
+
+
+def _coefficients(sinusoids: Sequence[Sequence[Sinusoid]]) -> list[list[NDArray[np.float64]]]:
+    return [[sinusoid.coefficients for sinusoid in turn] for turn in sinusoids]
+
+
+def _noise(turns: Sequence[Turn], sinusoids: Sequence[Sequence[Sinusoid]], prior: Prior) -> SerialNoise:
+    residuals = np.concatenate([np.column_stack([s.residuals for s in turn]) for turn in sinusoids])
+    design = _side_by_side([_columns(turn, axis) for axis, turn in enumerate(sinusoids)])
+    blocks = make_blocks([used for turn in turns for used in turn.used])
+    return assess_noise(residuals, design, blocks, prior)
+
+
+def _columns(fits: Sequence[Sinusoid], axis: int) -> NDArray[np.float64]:
+    """Return the columns of all channels in a turn, each once."""
+    first, second = OTHERS[axis]
+    return np.column_stack([fits[first].columns, fits[second].columns[:, 3]])
+
+
+def _side_by_side(matrices: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Return a block-diagonal matrix."""
+    rows, columns = np.sum([m.shape for m in matrices], axis=0)
+    out = np.zeros((rows, columns))
+    i = j = 0
+    for m in matrices:
+        out[i : i + m.shape[0], j : j + m.shape[1]] = m
+        i, j = i + m.shape[0], j + m.shape[1]
+    return out
+
+
+def _propagated(
+    sinusoids: Sequence[Sequence[Sinusoid]], noise: SerialNoise, run: Callable[[Extremes], Chain]
+) -> tuple[NDArray[np.float64], float]:
+    """Return the covariance of ``Chain.vector`` by the derivative of the chain, and its degrees of freedom."""
+    coefficients = _coefficients(sinusoids)
+    here = run(extremes_of_sinusoids(coefficients)).vector()
+    candidates: NDArray[np.float64] | float = 0.0
+    for channel in range(3):
+        columns = []
+        for turn in range(3):
+            for j in range(len(coefficients[turn][channel])):
+                moved = [[c.copy() for c in channels] for channels in coefficients]
+                moved[turn][channel][j] += STEP
+                columns.append((run(extremes_of_sinusoids(moved)).vector() - here) / STEP)
+        J = np.column_stack(columns)
+        A = _side_by_side([turn[channel].weights for turn in sinusoids])
+        candidates = candidates + J @ noise.covariances(A, channel) @ J.T
+    return combine(noise, np.asarray(candidates))
+
+
+def _resampled(
+    turns: Sequence[Turn], sinusoids: Sequence[Sequence[Sinusoid]], noise: SerialNoise, run: Callable[[Extremes], Chain]
+) -> tuple[NDArray[np.float64], float]:
+    """Return the covariance of ``Chain.vector`` over synthetic turns, and its degrees of freedom."""
+    rng = np.random.default_rng(SEED)
+    means = [
+        turn.reading - np.column_stack([s.residuals for s in fits]) for turn, fits in zip(turns, sinusoids, strict=True)
+    ]
+    cuts = np.cumsum([len(turn.angle) for turn in turns])[:-1]
+    vectors = []
+    for _ in range(REPLICATES):
+        added = np.split(noise.draw(rng), cuts)
+        synthetic = [replace(turn, reading=mean + new) for turn, mean, new in zip(turns, means, added, strict=True)]
+        vectors.append(run(extremes_of_samples(synthetic)).vector())
+    return np.cov(np.array(vectors).T), float(REPLICATES - 1)

@@ -1,0 +1,160 @@
+"""What rests and steady turns say of a gyroscope, for the staged method (Sudsanguan 2019, eqs 3.47-3.49).
+
+By the table's log, the samples of the recordings made for the gyroscope are at rest, in the steady part of a turn about
+one axis, or neither. The first two give, for each channel c,
+
+    b_c = mean of y_c at rest
+    R_ic = sum rate (y_c - b_c) / sum rate^2   over the steady parts of the turns about axis i
+
+where y is the reading, deg/s, and the rate is signed, so that turns at several rates and in both directions count as
+one regression; Earth's rotation is taken off y first where the table's place and azimuth are set. Without a rest in
+these recordings the bias is that of the static recording. As printed, row i is the mean reading over the mean rate.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.errors import NotObservableError
+from pipeline.estimation.sample_blocks import make_blocks
+from pipeline.estimation.turns import usable
+from pipeline.records import AXES
+from pipeline.signal.rests import runs
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.estimation.sample_blocks import Blocks
+    from pipeline.estimation.turns import Part
+    from pipeline.records import Recording
+
+SLOWEST_SHARE = 0.02  # of the largest rate, below which a turn is not called one
+CHANGE_PER_SECOND = 0.25  # of the rate, above which a turn is not steady
+EDGE_S = 0.15
+DELAYS_TO_SETTLE = 5.0
+
+
+@dataclass(frozen=True)
+class Response:
+    """What the readings of rests and steady turns say.
+
+    Attributes
+    ----------
+    rest : (3,) array, deg/s
+        Mean reading at rest.
+    slope : (3, 3) array
+        Row i: reading of x, y, z per deg/s about axis i.
+    rate : (3,) array, deg/s
+        I: mean magnitude of the rate about each axis; 0 where none was recorded.
+    """
+
+    rest: NDArray[np.float64]
+    slope: NDArray[np.float64]
+    rate: NDArray[np.float64]
+
+    def corrected(self, step: Mapping[str, Any]) -> Response:
+        """Return the response of readings after a step of a correction."""
+        if "subtract" in step:
+            return Response(self.rest - np.asarray(step["subtract"]), self.slope, self.rate)
+        matrix = np.asarray(step["matrix"])
+        return Response(matrix @ self.rest, self.slope @ matrix.T, self.rate)
+
+    def require_turns(self) -> None:
+        """Raise ``NotObservableError`` where there is no turn about one of the axes."""
+        missing = [axis for axis, rate in zip(AXES, self.rate, strict=True) if rate == 0.0]
+        if missing:
+            raise NotObservableError(
+                f"the gyroscope was not turned steadily about {' and '.join(missing)}: record a turn at a constant "
+                "rate about each of x, y and z"
+            )
+
+
+@dataclass(frozen=True)
+class Samples:
+    """The samples that are used, stacked.
+
+    Attributes
+    ----------
+    reading : (n, 3) array, deg/s
+        Less Earth's rotation where it is known.
+    rate : (n, 3) array, deg/s
+        Signed rate of the table about its turn axis, in that axis's column; 0 at rest.
+    blocks : Blocks
+    total : int
+        Samples of the recordings.
+    """
+
+    reading: NDArray[np.float64]
+    rate: NDArray[np.float64]
+    blocks: Blocks
+    total: int
+
+    @property
+    def speed(self) -> NDArray[np.float64]:
+        """I: mean magnitude of the rate about each axis, 0 where there is no steady turn: (3,) array, deg/s."""
+        moving = np.count_nonzero(self.rate, axis=0)
+        mean: NDArray[np.float64] = np.abs(self.rate).sum(axis=0) / np.maximum(moving, 1)
+        return mean
+
+
+def samples_of(parts: Sequence[Part], recordings: Sequence[Recording]) -> Samples:
+    """Return the samples at rest and in steady turns, and a static recording's where there is no other rest."""
+    chosen, readings, rates = [], [], []
+    for part in parts:
+        steady = _steady(part)
+        rate = np.zeros((part.recording.samples, 3))
+        if part.motion.axis is not None:
+            rate[steady, part.motion.axis] = np.asarray(part.motion.rate)[steady]
+        keep = (part.motion.still | steady) & part.keep
+        earth = part.motion.angular_rate[keep] - rate[keep]
+        readings.append(np.asarray(part.recording.gyroscope)[keep] - earth)
+        rates.append(rate[keep])
+        chosen.append((part.recording, keep))
+    if all(np.any(rate, axis=1).all() for rate in rates):
+        for recording in recordings:
+            if recording.role == "static" and recording.gyroscope is not None:
+                keep = usable(recording)
+                readings.append(recording.gyroscope[keep])
+                rates.append(np.zeros((int(keep.sum()), 3)))
+                chosen.append((recording, keep))
+    total = sum(recording.samples for recording, _ in chosen)
+    return Samples(np.concatenate(readings), np.concatenate(rates), make_blocks(chosen), total)
+
+
+def _steady(part: Part) -> NDArray[np.bool_]:
+    """Return the samples in the steady parts of a turn about one axis."""
+    motion = part.motion
+    if motion.axis is None or motion.rate is None:
+        return np.zeros(len(motion.time), bool)
+    rate, change = np.abs(motion.rate), np.abs(motion.angular_acceleration[:, motion.axis])
+    steady: NDArray[np.bool_] = (
+        (rate > SLOWEST_SHARE * np.max(rate)) & (change <= CHANGE_PER_SECOND * rate) & ~motion.still
+    )
+    edge = EDGE_S + DELAYS_TO_SETTLE * float(part.recording.filter.get("delay_s", 0.0))
+    for start, stop in runs(steady):
+        time = motion.time[start:stop]
+        steady[start:stop] = (time >= time[0] + (edge if start else 0.0)) & (time <= time[-1] - EDGE_S)
+    return steady
+
+
+def weights_of(rate: NDArray[np.float64], *, as_printed: bool) -> NDArray[np.float64]:
+    """Return the weights of the samples in (b, R_x, R_y, R_z): (4, n) array."""
+    rest = np.all(rate == 0, axis=1)
+    if not np.any(rest):
+        raise NotObservableError(
+            "the gyroscope's recordings hold no rest, and there is no static recording: let the table rest for some "
+            "seconds before a turn"
+        )
+    weights = np.zeros((4, len(rate)))
+    weights[0] = rest / rest.sum()
+    for axis in range(3):
+        by = np.sign(rate[:, axis]) if as_printed else rate[:, axis]
+        if np.any(by):
+            own = by / (by @ rate[:, axis])
+            weights[axis + 1] = own - own.sum() * weights[0]
+    return weights

@@ -1,0 +1,196 @@
+"""Bias and full 3x3 matrix of a sensor by least squares against the table's motion.
+
+In the measurement direction, with regressors that have no noise,
+
+    y = b + K u + noise,   matrix = K^-1
+
+where
+
+    y : (3,) reading, g or deg/s
+    u : (3,) specific force or angular rate by the table's log, same unit
+    b : (3,) bias
+    K : (3, 3)
+
+each channel is a linear problem with the same columns (1, u_x, u_y, u_z). A reading that was filtered is compared with
+``b + K F u``, F the same filter: exact for any linear filter, where shifting u by the filter's delay would be wrong by
+its attenuation and in every ramp. A filter that this cannot rebuild leaves the shift, ``u(t - delay)``.
+
+The accelerometer of a table that stops and goes is fitted to its settled rests, otherwise to all samples; the gyroscope
+to all samples, but where the table's rate is only the derivative of its logged angle the ramps are left out.
+
+The covariance allows for a bias wander (``pipeline.estimation.serial_noise``); that of the matrix follows from
+``dM = -M dK M``. It holds what the noise does, not the accuracy of the table.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.errors import ConfigurationError, NotObservableError
+from pipeline.estimation.sample_blocks import make_blocks
+from pipeline.estimation.serial_noise import assess_noise, combine, prior_of
+from pipeline.estimation.turns import Factors, parts_of, settled
+from pipeline.model.effects.base import truth
+from pipeline.records import AXES, SensorCalibration, StageResult
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.estimation.serial_noise import SerialNoise
+    from pipeline.estimation.turns import Part
+    from pipeline.records import Recording
+
+NAME = "reference_least_squares"
+COLUMNS = ("bias", *(f"matrix column {axis}" for axis in AXES))
+WEAKEST_DIRECTION = 1e-3
+SHARP_CHANGE = 1e-3  # of the largest rate between two samples, where the rate is not logged
+ADVICE = {
+    "accelerometer": "turns about at least two axes bring gravity along all three",
+    "gyroscope": "record a turn about each of x, y and z, and rests or turns in both directions",
+}
+
+
+def fit_reference(
+    sensor: str, recordings: Sequence[Recording], previous: SensorCalibration | None, settings: Mapping[str, Any]
+) -> SensorCalibration:
+    """Fit bias and matrix of a sensor against the table's motion.
+
+    Parameters
+    ----------
+    sensor : str
+        ``accelerometer`` or ``gyroscope``; recordings of that role are used.
+    recordings : sequence of Recording
+    previous : SensorCalibration or None
+        Only its stages are kept.
+    settings : mapping
+        Sections ``table`` and ``sensor``.
+
+    Returns
+    -------
+    SensorCalibration
+
+    Raises
+    ------
+    CannotCalibrateError
+        If no recording of the sensor's own logs the table's motion.
+    NotObservableError
+        If the recordings do not determine all columns.
+    """
+    parts = [_select(sensor, part) for part in parts_of(recordings, sensor, settings["table"], NAME)]
+    y = np.concatenate([part.reading(sensor) for part in parts])
+    u = np.concatenate([_reference(sensor, part)[part.keep] for part in parts])
+    X = np.column_stack([np.ones(len(u)), u])
+    condition = _require_observable(sensor, X)
+    factors = Factors.of(X)
+    beta = factors.solve(y)
+    residuals = y - X @ beta
+    blocks = make_blocks([(part.recording, part.keep) for part in parts])
+    noise = assess_noise(residuals, X, blocks, prior_of(sensor, recordings, settings))
+    bias, K = beta[0], beta[1:].T
+    matrix = np.asarray(np.linalg.solve(K, np.eye(3)), float)
+    covariance, freedom = _covariance(factors.weights(), noise, matrix)
+    result = StageResult(
+        name=NAME,
+        parameters=_parameters(sensor, bias, matrix, covariance),
+        residual_rms=float(np.sqrt(np.mean(residuals**2))),
+        details={
+            "condition": condition,
+            "samples_used": len(y),
+            "samples_left_out": sum(part.recording.samples for part in parts) - len(y),
+            "residual_rms": np.sqrt(np.mean(residuals**2, axis=0)).tolist(),
+            "white_noise": noise.white.tolist(),
+            "bias_wander": noise.wander.tolist(),
+            "degrees_of_freedom": freedom,
+        },
+    )
+    return SensorCalibration(
+        sensor=sensor,
+        bias=bias,
+        matrix=matrix,
+        stages=(*(previous.stages if previous else ()), result),
+        covariance=covariance,
+        degrees_of_freedom=freedom,
+    )
+
+
+def _select(sensor: str, part: Part) -> Part:
+    """Return a part with the samples that the fit uses."""
+    if sensor == "accelerometer":
+        return replace(part, keep=settled(part))
+    if part.recording.table_rate is not None:
+        return part
+    rate = np.linalg.norm(part.motion.angular_acceleration, axis=1) * part.recording.interval
+    sharp = rate > SHARP_CHANGE * np.max(np.abs(part.motion.angular_rate))
+    sharp = np.convolve(sharp, np.ones(5), mode="same") > 0  # a spline rings about a corner
+    return replace(part, keep=part.keep & ~sharp)
+
+
+def _reference(sensor: str, part: Part) -> NDArray[np.float64]:
+    """Return what an ideal sensor would read behind the recording's filter: (n, 3) array."""
+    recording, motion = part.recording, part.motion
+    applied = recording.filter
+    if applied["name"] == "none":
+        return truth(sensor, motion)
+    from pipeline.signal.filters import apply_filter  # noqa: PLC0415  (only filtered recordings pay for it)
+
+    settings = {key: value for key, value in applied.items() if key not in ("delay_s", "noise_gain")}
+    ideal = replace(
+        recording, accelerometer=truth(sensor, motion), gyroscope=None, filter={"name": "none"}, encodings={}
+    )
+    try:
+        filtered = apply_filter(ideal, settings).accelerometer
+        assert filtered is not None  # noqa: S101
+    except (ConfigurationError, KeyError):
+        late = motion.at_offset(offset=-applied["delay_s"]) if motion.at_offset else None
+        return truth(sensor, late or motion)
+    return filtered
+
+
+def _require_observable(sensor: str, X: NDArray[np.float64]) -> float:
+    """Return the condition of the columns, all in units of the largest motion."""
+    size = float(np.max(np.linalg.norm(X[:, 1:], axis=1), initial=0.0))
+    if size == 0.0:
+        raise NotObservableError(f"{sensor}: the table never moved in these recordings; {ADVICE[sensor]}")
+    scaled = X / np.array([1.0, size, size, size]) / np.sqrt(len(X))
+    _, s, Vt = np.linalg.svd(np.linalg.qr(scaled, mode="r"))
+    singular = np.zeros(4)
+    singular[: len(s)] = s
+    null = Vt[singular < WEAKEST_DIRECTION * singular[0]]
+    if len(null):
+        share = np.linalg.norm(null, axis=0)
+        lost = [name for name, part in zip(COLUMNS, share, strict=True) if part > 0.1]
+        raise NotObservableError(
+            f"{sensor}: the recordings do not determine {', '.join(lost)}"
+            f"{' independently of each other' if len(lost) > 1 else ''}: {ADVICE[sensor]}"
+        )
+    return float(singular[0] / singular[-1])
+
+
+def _covariance(
+    weights: NDArray[np.float64], noise: SerialNoise, matrix: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], float]:
+    """Return the covariance of bias and matrix, and its degrees of freedom."""
+    candidates: NDArray[np.float64] | float = 0.0
+    for channel in range(3):
+        J = np.zeros((12, 4))
+        J[channel, 0] = 1.0
+        J[3:, 1:] = -np.einsum("i,bj->ijb", matrix[:, channel], matrix).reshape(9, 3)
+        candidates = candidates + J @ noise.covariances(weights, channel) @ J.T
+    return combine(noise, np.asarray(candidates))
+
+
+def _parameters(
+    sensor: str, bias: NDArray[np.float64], matrix: NDArray[np.float64], covariance: NDArray[np.float64]
+) -> dict[str, dict[str, Any]]:
+    unit = "g" if sensor == "accelerometer" else "deg/s"
+    names = [f"bias_{a}" for a in AXES] + [f"matrix_{a}{b}" for a in AXES for b in AXES]
+    values, u = np.concatenate([bias, matrix.ravel()]), np.sqrt(np.diag(covariance))
+    return {
+        name: {"value": float(v), "unit": unit if j < 3 else "1", "standard_uncertainty": float(s)}
+        for j, (name, v, s) in enumerate(zip(names, values, u, strict=True))
+    }

@@ -1,0 +1,235 @@
+"""The turns of a table: which samples a fit uses, and the sinusoid that a channel draws while the table turns.
+
+While the table turns about body axis i by the angle A, gravity G draws in a channel whose axis lies across
+
+    y = z + a cos(A - phi) + c |cos(A - phi)|
+
+where
+
+    z    : reading where the axis is level, g
+    phi  : angle at which the axis points up, deg
+    a, c : half sum and half difference of the two sides, g: the largest reading is ``z + a + c``, the smallest
+           ``z - a + c``; c is zero where a sensor has one scale factor for both sides
+
+and in the channel whose axis is turned about ``y = z + h cos(A - phi)`` with a small h, the misalignment. Given phi the
+rest is linear; phi is the phase of the linear fit's own first harmonic, found by a few rounds since |cos| has even
+harmonics only. So all samples of a turn say where its extremes are, not the few at its flat peaks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+
+from pipeline.errors import CannotCalibrateError, NotObservableError
+from pipeline.model.kinematics import earth_rate, reference_motion
+from pipeline.signal.rests import runs
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.records import Motion, Recording
+
+CLIPPED_OR_STUCK = 0b110
+DISTINCT_DIRECTION_G = 0.01
+ROUNDS = 12
+SAME_PHASE = 1e-12  # rad
+WEAKEST_DIRECTION = 1e-3  # smallest singular value of unit columns that still counts as determined
+
+
+@dataclass(frozen=True)
+class Part:
+    """The samples of one recording that a fit uses.
+
+    Attributes
+    ----------
+    recording : Recording
+    motion : Motion
+    keep : (n,) array of bool
+    """
+
+    recording: Recording
+    motion: Motion
+    keep: NDArray[np.bool_]
+
+    def reading(self, sensor: str) -> NDArray[np.float64]:
+        """Return the readings that are used: (k, 3) array."""
+        reading = self.recording.reading(sensor)
+        assert reading is not None  # noqa: S101
+        return reading[self.keep]
+
+
+def table_motion(recording: Recording, table: Mapping[str, Any]) -> Motion | None:
+    """Return the motion by the table's log, with Earth's rotation where the table's place and azimuth are set.
+
+    Parameters
+    ----------
+    recording : Recording
+    table : mapping
+        ``gravity_g``, ``latitude_deg``, ``azimuth_deg``.
+    """
+    latitude, azimuth = table.get("latitude_deg"), table.get("azimuth_deg")
+    earth = None if latitude is None or azimuth is None else earth_rate(latitude, azimuth)
+    return reference_motion(recording, float(table.get("gravity_g", 1.0)), earth)
+
+
+def usable(recording: Recording) -> NDArray[np.bool_]:
+    """Return which samples ingest did not flag as clipped or stuck; one after a gap is as good as any other."""
+    if recording.flags is None:
+        return np.ones(recording.samples, bool)
+    good: NDArray[np.bool_] = (recording.flags & CLIPPED_OR_STUCK) == 0
+    return good
+
+
+def parts_of(recordings: Sequence[Recording], sensor: str, table: Mapping[str, Any], method: str) -> list[Part]:
+    """Return the recordings made for a sensor that hold its readings and the table's motion, without bad samples.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+    sensor : str
+    table : mapping
+    method : str
+        Name of the method, for the message.
+
+    Returns
+    -------
+    list of Part
+
+    Raises
+    ------
+    CannotCalibrateError
+        If there is none.
+    """
+    own = [r for r in recordings if r.role == sensor and r.reading(sensor) is not None]
+    parts = []
+    for recording in own:
+        motion = table_motion(recording, table)
+        if motion is not None:
+            parts.append(Part(recording, motion, usable(recording)))
+    if not parts:
+        lack = "none of them logs the table's angle" if own else f"no recording of role {sensor} holds its readings"
+        raise CannotCalibrateError(
+            f"{method} needs the table's motion for the {sensor}, and {lack}: record turns about x, y and z with "
+            "table_angle_deg, or choose a method that needs no table"
+        )
+    return parts
+
+
+def stop_and_go(motion: Motion) -> bool:
+    """Return whether a motion rests at four or more attitudes, so that its rests say it all."""
+    rests = runs(motion.still)
+    if len(rests) < 4:
+        return False
+    total = np.concatenate([np.zeros((1, 3)), np.cumsum(motion.specific_force, axis=0)])
+    start, stop = np.array(rests).T
+    means = (total[stop] - total[start]) / (stop - start)[:, None]
+    return len(np.unique(np.round(means / DISTINCT_DIRECTION_G), axis=0)) >= 4
+
+
+def settled(part: Part) -> NDArray[np.bool_]:
+    """Return the samples of a part that an accelerometer's fit uses: its rests if it stops and goes, else all."""
+    return part.keep & part.motion.still if stop_and_go(part.motion) else part.keep
+
+
+@dataclass(frozen=True)
+class Sinusoid:
+    """The sinusoid of one channel in one turn.
+
+    Attributes
+    ----------
+    coefficients : (3,) or (4,) array, g
+        z, then the cosine's and the sine's coefficient, then c where both sides were fitted.
+    columns : (n, p) array
+    weights : (p, n) array
+        ``coefficients = weights @ readings``.
+    residuals : (n,) array, g
+    """
+
+    coefficients: NDArray[np.float64]
+    columns: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    residuals: NDArray[np.float64]
+
+
+def fit_sinusoid(angle_deg: NDArray[np.float64], reading: NDArray[np.float64], *, sides: bool, where: str) -> Sinusoid:
+    """Fit a sinusoid of the table angle.
+
+    Parameters
+    ----------
+    angle_deg : (n,) array, deg
+    reading : (n,) array, g
+    sides : bool
+        Whether the two sides may differ.
+    where : str
+        Channel and turn, for the message.
+
+    Returns
+    -------
+    Sinusoid
+
+    Raises
+    ------
+    NotObservableError
+        If the angles do not determine it.
+    """
+    angle = np.radians(angle_deg)
+    columns = harmonic = np.column_stack([np.ones_like(angle), np.cos(angle), np.sin(angle)])
+    factors = _factors(columns, where)
+    coefficients = factors.solve(reading)
+    for _ in range(ROUNDS if sides else 0):
+        phase = np.arctan2(coefficients[2], coefficients[1])
+        columns = np.column_stack([harmonic, np.abs(np.cos(angle - phase))])
+        factors = _factors(columns, where)
+        coefficients = factors.solve(reading)
+        if abs(np.arctan2(coefficients[2], coefficients[1]) - phase) < SAME_PHASE:
+            break
+    return Sinusoid(coefficients, columns, factors.weights(), reading - columns @ coefficients)
+
+
+def wrap(angle_deg: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return angles in [-180, 180) deg."""
+    return (angle_deg + 180.0) % 360.0 - 180.0
+
+
+@dataclass(frozen=True)
+class Factors:
+    """Columns scaled to unit norm, in factors: ``columns = Q R diag(scale)``."""
+
+    Q: NDArray[np.float64]
+    R: NDArray[np.float64]
+    scale: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, columns: NDArray[np.float64]) -> Self:
+        """Factorise (n, p) columns."""
+        scale = np.linalg.norm(columns, axis=0)
+        scale[scale == 0] = 1.0
+        Q, R = np.linalg.qr(columns / scale)
+        return cls(Q, R, scale)
+
+    def solve(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the least-squares coefficients of (n,) or (n, m) readings."""
+        found: NDArray[np.float64] = (np.linalg.solve(self.R, self.Q.T @ y).T / self.scale).T
+        return found
+
+    def weights(self) -> NDArray[np.float64]:
+        """Return the pseudo-inverse: (p, n) array, with ``solve(y) = weights @ y``."""
+        inverse: NDArray[np.float64] = np.linalg.solve(self.R, self.Q.T) / self.scale[:, None]
+        return inverse
+
+
+def _factors(columns: NDArray[np.float64], where: str) -> Factors:
+    n, p = columns.shape
+    if n >= p:
+        factors = Factors.of(columns)
+        if np.linalg.svd(factors.R, compute_uv=False)[-1] > WEAKEST_DIRECTION:
+            return factors
+    raise NotObservableError(
+        f"{where} does not show a sinusoid: {n} samples over too few angles; turn the table once around, stopping at "
+        "four angles or more, so that the axis points up and down and is level in between"
+    )
