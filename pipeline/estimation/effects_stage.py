@@ -1,0 +1,62 @@
+"""The last stage of a fit, for both sensors: base and effects together, the list configured or selected."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from pipeline.errors import ConfigurationError, InputError
+from pipeline.estimation.joint import fit_joint
+from pipeline.estimation.observations import observe
+from pipeline.estimation.selection import select
+from pipeline.records import SensorCalibration
+from pipeline.signal.noise import estimate_noise
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.records import Noise, Recording
+
+AUTO = "auto"
+
+
+def fit_effects(
+    sensor: str, recordings: Sequence[Recording], previous: SensorCalibration | None, settings: Mapping[str, Any]
+) -> SensorCalibration:
+    """Fit the effects of ``settings["effects"][sensor]`` together with bias and matrix, whatever the method was.
+
+    Parameters
+    ----------
+    sensor : str
+    recordings : sequence of Recording
+    previous : SensorCalibration or None
+        The stage before.
+    settings : mapping
+        Sections ``effects``, ``sensor`` and ``table``.
+
+    Returns
+    -------
+    SensorCalibration
+        ``previous`` unchanged where there is nothing to add.
+    """
+    wanted = settings["effects"][sensor]
+    before = previous or SensorCalibration(sensor)
+    if not wanted:
+        return before
+    noise = noise_of(sensor, recordings, settings["sensor"][sensor])
+    names = list(wanted)
+    if wanted == AUTO:
+        observations = observe(sensor, recordings, settings["table"])
+        if not observations.parts:
+            return before
+        names = select(observations, [], noise, settings["sensor"][sensor]).names
+    if not names:
+        return before
+    return fit_joint(sensor, recordings, names, noise, settings, before)
+
+
+def noise_of(sensor: str, recordings: Sequence[Recording], sheet: Mapping[str, Any]) -> Noise | None:
+    """Return the noise that the recordings and the data sheet tell, or None where they tell nothing."""
+    try:
+        return estimate_noise(sensor, list(recordings), dict(sheet))
+    except (ConfigurationError, InputError):
+        return None

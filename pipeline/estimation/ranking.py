@@ -1,0 +1,283 @@
+"""How much each effect would improve a fit: the whitened profile likelihood of every candidate.
+
+    log L(theta) = -N/2 log RSS(theta) - 1/2 log det C(theta),    delta BIC = 2 (max log L' - max log L) - k log N
+
+where theta is the noise setting, over which each candidate is maximised by itself, RSS the whitened residual sum of
+squares, N the number of readings and k the parameters that are added. Base and chosen effects are taken out of the
+candidates' columns first, so that a candidate is a small linear problem of its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.estimation.design import BASE, Design, Term
+from pipeline.estimation.wandering import Setting
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.estimation.observations import Observations
+
+WHITE = Setting(0.0, 1.0)
+EXCITED = 1e-3  # share of a column's norm that the base leaves
+NEW = 1e-4  # share of the variance of a candidate's weakest direction that the chosen effects leave
+RIDGE = 1e-11
+
+
+@dataclass(frozen=True)
+class Score:
+    """What one candidate would bring.
+
+    Attributes
+    ----------
+    name : str
+    delta_bic, p_value : float
+        Against the model without it; p of the likelihood ratio.
+    parameters : int
+        k above.
+    values, uncertainty : (p,) array
+        Estimates and standard uncertainties, nonlinear parameters at their start.
+    log_likelihood : float
+    setting : int
+        Index of its best noise setting.
+    admissible : bool
+        Whether it adds anything that the chosen effects cannot do.
+    plausible : bool
+        Whether the estimates are within the sensor's limits.
+    """
+
+    name: str
+    delta_bic: float
+    p_value: float
+    parameters: int
+    values: NDArray[np.float64]
+    uncertainty: NDArray[np.float64]
+    log_likelihood: float
+    setting: int
+    admissible: bool = True
+    plausible: bool = True
+
+
+class Ranking:
+    """Every candidate as a small linear problem beside base and configured effects.
+
+    Parameters
+    ----------
+    observations : Observations
+    configured : sequence of Term
+        Effects that belong to the base.
+    candidates : sequence of Term
+        One effect may be there several times, at several values of its nonlinear parameters.
+    K : (3, 3) array
+    scale : (3,) array
+    settings : sequence of Setting
+    """
+
+    def __init__(  # noqa: PLR0917  (they are the problem)
+        self,
+        observations: Observations,
+        configured: Sequence[Term],
+        candidates: Sequence[Term],
+        K: NDArray[np.float64],
+        scale: NDArray[np.float64],
+        settings: Sequence[Setting],
+    ) -> None:
+        self.sensor = observations.sensor
+        self.candidates = list(candidates)
+        self.settings = [WHITE, *settings]
+        self.samples = 3.0 * observations.samples
+        self.within = float(np.sum(observations.scatter / scale**2))
+        design = Design(observations, [*configured, *candidates], K, scale, project=True)
+        stacked, logarithms = zip(*(design.products(setting) for setting in self.settings), strict=True)
+        self.penalty = np.array(
+            [0.5 * log - setting.prior for log, setting in zip(logarithms, self.settings, strict=True)]
+        )
+        known = BASE + sum(s.stop - s.start for s in design.slices[: len(configured)])
+        products = without(np.array(stacked), np.arange(known))[:, known:, known:]
+        self._reduce(products, design.sizes()[known:], [s.start - known for s in design.slices[len(configured) :]])
+
+    def _reduce(self, products: NDArray[np.float64], sizes: NDArray[np.float64], starts: Sequence[int]) -> None:
+        """Keep of each candidate the directions that the motion excites, scaled to unit norm under white noise."""
+        ends = [*starts[1:], len(sizes) - 1]
+        size = np.where(sizes > 0, sizes, 1.0)
+        blocks, self.excited, self.places = [], [], []
+        width = 0
+        for start, end in zip(starts, ends, strict=True):
+            block = slice(start, end)
+            values, vectors = np.linalg.eigh(products[0, block, block] / np.outer(size[block], size[block]))
+            kept = values > EXCITED**2
+            self.excited.append(float(np.sqrt(max(values[-1], 0.0))))
+            blocks.append(vectors[:, kept] / np.sqrt(values[kept]) / size[block, None])
+            self.places.append(np.arange(width, width + int(kept.sum())))
+            width += int(kept.sum())
+        reduction = np.zeros((len(sizes), width + 1))
+        for start, end, block, place in zip(starts, ends, blocks, self.places, strict=True):
+            reduction[start:end, place] = block
+        reduction[-1, -1] = 1.0
+        self.blocks = blocks
+        self.products: NDArray[np.float64] = reduction.T @ products @ reduction
+        self.unreduced = products[:, :-1, :-1], starts, ends
+
+    def indices(self, name: str) -> list[int]:
+        """Return the candidates that are this effect and that the motion excites."""
+        return [j for j, term in enumerate(self.candidates) if term.effect.name == name and len(self.places[j]) > 0]
+
+    def chosen(self, selected: Sequence[int]) -> NDArray[np.float64]:
+        """Return the products without what base and selected candidates explain: (t, q + 1, q + 1) array."""
+        return without(self.products, np.concatenate([np.zeros(0, int), *[self.places[j] for j in selected]]))
+
+    def log_likelihood(self, rss: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return log L at each noise setting."""
+        total = np.maximum(rss + self.within, 1e-300)
+        found: NDArray[np.float64] = -0.5 * self.samples * np.log(total / self.samples) - self.penalty
+        return found
+
+    def of_model(self, selected: Sequence[int]) -> tuple[float, int]:
+        """Return the log likelihood of base and selected candidates, and its best noise setting."""
+        found = self.log_likelihood(self.chosen(selected)[:, -1, -1])
+        return float(found[1:].max()), int(np.argmax(found[1:])) + 1
+
+    def scores(self, selected: Sequence[int], limits: dict[str, NDArray[np.float64]]) -> list[Score]:
+        """Return what each candidate brings beside the selected ones, best first.
+
+        Parameters
+        ----------
+        selected : sequence of int
+            Indices of candidates.
+        limits : dict
+            Effect to (p,) array, limits of plausibility of the parameters' absolute values.
+        """
+        products = self.chosen(selected)
+        before = float(self.log_likelihood(products[:, -1, -1])[1:].max())
+        names = {self.candidates[j].effect.name for j in selected}
+        best: dict[str, Score] = {}
+        for j, term in enumerate(self.candidates):
+            if len(self.places[j]) == 0 or term.effect.name in names:
+                continue
+            score = self._score(j, products, before, limits.get(term.effect.name))
+            held = best.get(score.name)
+            if held is None or score.delta_bic > held.delta_bic:
+                best[score.name] = score
+        return sorted(best.values(), key=lambda s: -s.delta_bic)
+
+    def _score(self, j: int, products: NDArray[np.float64], before: float, limits: NDArray[np.float64] | None) -> Score:
+        from scipy.special import chdtrc  # noqa: PLC0415  (0.1 s that only rankings pay)
+
+        place, term = self.places[j], self.candidates[j]
+        inner, cross = products[:, place[:, None], place], products[:, place, -1]
+        ridge = RIDGE * np.einsum("tii->ti", self.products[:, place[:, None], place])
+        solved = np.linalg.solve(inner + ridge[:, :, None] * np.eye(len(place)), cross[:, :, None])[:, :, 0]
+        rss = products[:, -1, -1] - np.sum(cross * solved, axis=1)
+        found = self.log_likelihood(rss)[1:]
+        at = int(np.argmax(found)) + 1
+        nonlinear = 0 if term.effect.moves else len(term.effect.nonlinear)
+        k = len(place) + nonlinear
+        gain = max(2.0 * (float(found[at - 1]) - before), 0.0)
+        admissible = bool(np.linalg.eigvalsh(inner[0])[0] > NEW)
+        values, uncertainty = self._estimate(j, solved[at], inner[at] + np.diag(ridge[at]), rss[at])
+        plausible = limits is None or bool(np.all(np.abs(values) - 2.0 * uncertainty <= limits))
+        return Score(
+            term.effect.name,
+            gain - k * float(np.log(self.samples)),
+            float(chdtrc(k, gain)),
+            k,
+            values,
+            uncertainty,
+            float(found[at - 1]),
+            at,
+            admissible,
+            plausible,
+        )
+
+    def _estimate(
+        self, j: int, solved: NDArray[np.float64], inner: NDArray[np.float64], rss: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the parameters and their standard uncertainties from the reduced coefficients."""
+        term, block = self.candidates[j], self.blocks[j]
+        variance = (max(rss, 0.0) + self.within) / self.samples
+        covariance = block @ np.linalg.solve(inner, block.T) * variance
+        values, uncertainty = term.values.copy(), np.zeros(len(term.values))
+        linear = slice(0, len(block))
+        values[linear] = block @ solved + (term.values[linear] if term.effect.moves else 0.0)
+        uncertainty[linear] = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
+        return values, uncertainty
+
+    def pair(self, j: int, k: int) -> tuple[float, int]:
+        """Return log L of base and two candidates, and how many parameters they have."""
+        place = np.concatenate([self.places[j], self.places[k]])
+        inner, cross = self.products[:, place[:, None], place], self.products[:, place, -1]
+        ridge = RIDGE * np.einsum("tii->ti", inner)
+        solved = np.linalg.solve(inner + ridge[:, :, None] * np.eye(len(place)), cross[:, :, None])[:, :, 0]
+        found = self.log_likelihood(self.products[:, -1, -1] - np.sum(cross * solved, axis=1))
+        return float(found[1:].max()), len(place)
+
+    def shares(self, j: int, selected: Sequence[int], setting: int) -> dict[str, float]:
+        """Return which share of a candidate's fitted signal each other effect reproduces.
+
+        Parameters
+        ----------
+        j : int
+            The candidate.
+        selected : sequence of int
+            Other candidates that the model holds.
+        setting : int
+            Index of the noise setting.
+        """
+        others = [i for i in selected if i != j]
+        products = self.chosen(others)[setting]
+        place = self.places[j]
+        inner = products[np.ix_(place, place)]
+        ridge = RIDGE * np.diag(np.diag(self.products[setting][np.ix_(place, place)]))
+        signal = np.linalg.solve(inner + ridge, products[place, -1])
+        power = float(signal @ inner @ signal)
+        found: dict[str, float] = {}
+        for i, term in enumerate(self.candidates):
+            if term.effect.name == self.candidates[j].effect.name or i in others or len(self.places[i]) == 0:
+                continue
+            at = self.places[i]
+            own = products[np.ix_(at, at)] + RIDGE * np.diag(np.diag(self.products[setting][np.ix_(at, at)]))
+            cross = products[np.ix_(at, place)] @ signal
+            share = float(cross @ np.linalg.solve(own, cross)) / power if power > 0 else 0.0
+            found[term.effect.name] = max(found.get(term.effect.name, 0.0), min(share, 1.0))
+        return found
+
+    def explained(self, selected: Sequence[int]) -> NDArray[np.float64]:
+        """Return the whitened sum of squares that each candidate takes from base and selected, white noise: (c,)."""
+        products = self.chosen(selected)[0]
+        out = np.zeros(len(self.candidates))
+        for j, place in enumerate(self.places):
+            if len(place):
+                inner = products[np.ix_(place, place)] + RIDGE * np.eye(len(place))
+                out[j] = float(products[place, -1] @ np.linalg.solve(inner, products[place, -1]))
+        return out
+
+    def visibility(self, j: int, limits: NDArray[np.float64], setting: int) -> float:
+        """Return the expected gain in 2 log L of an effect whose parameters are all at their limits."""
+        products, starts, ends = self.unreduced
+        block = slice(starts[j], ends[j])
+        count = ends[j] - starts[j]
+        return float(np.sum(limits[:count] ** 2 * np.diag(products[setting, block, block])))
+
+
+def without(products: NDArray[np.float64], index: NDArray[np.intp]) -> NDArray[np.float64]:
+    """Return products of columns after some of them are projected out of all: (t, p, p) array, zeros in theirs.
+
+    Parameters
+    ----------
+    products : (t, p, p) array
+    index : (q,) array of int
+    """
+    if len(index) == 0:
+        return products
+    inner, cross = products[:, index[:, None], index], products[:, index, :]
+    size = np.sqrt(np.maximum(np.einsum("tii->ti", inner), 1e-300))
+    scaled = inner / (size[:, :, None] * size[:, None, :]) + RIDGE * np.eye(len(index))
+    solved = np.linalg.solve(scaled, cross / size[:, :, None]) / size[:, :, None]
+    rest: NDArray[np.float64] = products - cross.transpose(0, 2, 1) @ solved
+    return rest

@@ -1,0 +1,369 @@
+"""Which effects the recordings ask for: forward selection with backward drop.
+
+In each round every candidate competes at its own best noise setting. The best one is accepted if
+
+    delta BIC > 10   and   m p < 0.01
+
+where p is that of the likelihood ratio and m the number of candidates (Bonferroni). After an effect of timing or with
+a time constant the model is fitted anew and all columns are rebuilt there. Selected effects whose own delta BIC has
+become negative are dropped, and one that a rival replaces with delta BIC > 10 is exchanged. If nothing passes although
+the wander seems three times that of a static recording or of the data sheet, two effects may hide each other: then all
+pairs are tried once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from itertools import combinations
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.estimation.design import Start, Term, ordinary_base
+from pipeline.estimation.joint import Fit, fit_best, fit_terms, starts_of
+from pipeline.estimation.ranking import Ranking, Score
+from pipeline.estimation.wandering import settings_for
+from pipeline.model.effects import catalogue, effect
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.estimation.observations import Observations
+    from pipeline.estimation.wandering import Setting
+    from pipeline.model.effects.base import Effect
+    from pipeline.records import Noise, SensorCalibration
+
+GATE_BIC = 10.0
+GATE_P = 0.01
+MOST = 5
+INFLATED = 3.0
+MOVER_SHARE = 0.1  # of the best candidate's delta BIC above which an effect of timing is fitted to its own optimum
+PREFERRED = ("time_offset", "low_pass_lag")  # of look-alikes the first is taken unless the second is clearly better
+CLEARLY = 6.0
+
+
+@dataclass
+class Selection:
+    """What was selected, and how every candidate did.
+
+    Attributes
+    ----------
+    names : list of str
+        Selected effects, in order.
+    steps : dict of str to Score
+        Of each selected effect when it was accepted.
+    alone : dict of str to Score
+        Of each candidate against the base.
+    fit : Fit
+        Base, configured and selected effects.
+    base : Fit
+        Base and configured effects.
+    ranking : Ranking
+        The linear problem with the selected effects at their values.
+    observations : Observations
+    start : Start
+    settings : list of Setting
+    limits : dict of str to array
+    """
+
+    names: list[str]
+    steps: dict[str, Score]
+    alone: dict[str, Score]
+    fit: Fit
+    base: Fit
+    ranking: Ranking
+    observations: Observations
+    start: Start
+    settings: list[Setting]
+    limits: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+
+    def chosen(self) -> list[int]:
+        """Return the indices of the selected effects among the ranking's candidates."""
+        return [self.ranking.indices(name)[0] for name in self.names]
+
+
+def limits_of(sensor: str, sheet: Mapping[str, Any]) -> dict[str, NDArray[np.float64]]:
+    """Return the limits of plausibility of every effect's parameters, absolute values.
+
+    Parameters
+    ----------
+    sensor : str
+    sheet : mapping
+        ``effects`` of the sensor's data sheet: ``<effect>`` for all its parameters, ``<effect>_<parameter>`` for one
+        or, without the axis, for some of them.
+    """
+    given = sheet.get("effects") or {}
+    found = {}
+    for name, this in catalogue().items():
+        if sensor in this.sensors and name in given:
+            limits = []
+            for parameter in this.parameters(sensor):
+                keys = (f"{name}_{parameter.name}", f"{name}_{parameter.name.rsplit('_', 1)[0]}", name)
+                limits.append(next(float(given[key]) for key in keys if key in given))
+            found[name] = np.array(limits)
+    return found
+
+
+def candidates_for(observations: Observations, configured: Sequence[str]) -> list[Effect]:
+    """Return the effects that could be missing and whose needs the recordings meet."""
+    found = []
+    for name, this in catalogue().items():
+        if name in configured or observations.sensor not in this.sensors or observations.sensor in this.unseen:
+            continue
+        if name == "earth_rotation" and observations.earth:
+            continue
+        if this.needs_clock and not observations.clock_shared:
+            continue
+        complete = all(part.motion.temperature is not None for part in observations.parts)
+        if "temperature" in this.needs and not complete:
+            continue
+        if any(this.available(part.motion) for part in observations.parts):
+            found.append(this)
+    return sorted(found, key=lambda e: (e.name in PREFERRED[1:], e.name))
+
+
+def select(
+    observations: Observations,
+    configured: Sequence[str],
+    noise: Noise | None,
+    sheet: Mapping[str, Any],
+    known: SensorCalibration | None = None,
+) -> Selection:
+    """Select effects.
+
+    Parameters
+    ----------
+    observations : Observations
+    configured : sequence of str
+        Effects that are in the model already.
+    noise : Noise or None
+    sheet : mapping
+        The sensor's section of the configuration.
+    known : SensorCalibration, optional
+        Its effects are starts for the configured ones.
+
+    Returns
+    -------
+    Selection
+    """
+    return _Search(observations, configured, noise, sheet, known).run()
+
+
+class _Search:
+    """The state of a selection."""
+
+    def __init__(
+        self,
+        observations: Observations,
+        configured: Sequence[str],
+        noise: Noise | None,
+        sheet: Mapping[str, Any],
+        known: SensorCalibration | None,
+    ) -> None:
+        self.observations = observations
+        self.start = ordinary_base(observations, noise)
+        self.settings = settings_for(noise)
+        self.noise, self.sheet = noise, sheet
+        self.limits = limits_of(observations.sensor, sheet)
+        combinations_ = starts_of(configured, observations.sensor, known)
+        self.base = fit_best(observations, combinations_, self.start, self.settings)
+        self.effects = candidates_for(observations, configured)
+        self.names: list[str] = []
+        self.steps: dict[str, Score] = {}
+        self.fit = self.base
+        self.ranking = self._ranking()
+
+    def run(self) -> Selection:
+        alone = {score.name: score for score in self._scores()}
+        self._forward(alone)
+        if not self.names and self._inflated():
+            self._pairs()
+        if self.names:
+            self._refit(self.names)
+        return Selection(
+            self.names,
+            self.steps,
+            alone,
+            self.fit,
+            self.base,
+            self.ranking,
+            self.observations,
+            self.start,
+            self.settings,
+            self.limits,
+        )
+
+    def _forward(self, alone: dict[str, Score]) -> None:
+        for _ in range(3 * MOST):
+            if len(self.names) == MOST:
+                return
+            best = self._best(self._scores() if self.names else list(alone.values()))
+            if best is None:
+                if not self._exchange():
+                    return
+                continue
+            if not self.names:
+                alone[best.name] = best
+            self.names.append(best.name)
+            self.steps[best.name] = best
+            if effect(best.name).nonlinear:
+                self._refit(self.names)
+            self._drop()
+
+    def _ranking(self) -> Ranking:
+        """Build the linear problem: configured effects in the base, the others as candidates."""
+        fitted = {term.effect.name: Term(term.effect, term.values) for term in self.fit.terms}
+        configured = [replace(fitted[term.effect.name], full=True) for term in self.base.terms]
+        candidates = []
+        for this in self.effects:
+            if this.name in fitted:
+                candidates.append(fitted[this.name])
+            elif this.moves:
+                candidates.append(Term(this, np.zeros(len(this.parameters(self.observations.sensor)))))
+            else:
+                candidates += [Term(this, values) for values in this.starts(self.observations.sensor)]
+        return Ranking(self.observations, configured, candidates, self.fit.K, self.start.scale, self.settings)
+
+    def _selected(self, names: Sequence[str]) -> list[int]:
+        return [self.ranking.indices(name)[0] for name in names]
+
+    def _scores(self) -> list[Score]:
+        """Score all candidates; those of timing that compete are fitted to their own optimum."""
+        scores = self.ranking.scores(self._selected(self.names), self.limits)
+        top = max((s.delta_bic for s in scores if s.admissible), default=0.0)
+        return [self._refined(s) if self._competes(s, top) else s for s in scores]
+
+    def _competes(self, score: Score, top: float) -> bool:
+        return effect(score.name).moves and score.delta_bic > max(GATE_BIC, MOVER_SHARE * top)
+
+    def _refined(self, score: Score) -> Score:
+        """Return the score of a candidate of timing at its own optimum."""
+        this = effect(score.name)
+        start = (
+            np.maximum(score.values, this.starts(self.observations.sensor)[0]) if this.name in PREFERRED[1:] else None
+        )
+        term = Term(this, score.values if start is None else start)
+        fit = fit_terms(self.observations, [*self.fit.terms, term], self.start, self.settings)
+        before, _ = self.ranking.of_model(self._selected(self.names))
+        from scipy.special import chdtrc  # noqa: PLC0415  (as in Ranking)
+
+        gain = max(2.0 * (fit.log_likelihood - before), 0.0)
+        values = fit.terms[-1].values
+        uncertainty = np.sqrt(np.diag(fit.covariance))[-len(values) :]
+        return replace(
+            score,
+            delta_bic=gain - score.parameters * float(np.log(self.ranking.samples)),
+            p_value=float(chdtrc(score.parameters, gain)),
+            values=values,
+            uncertainty=uncertainty,
+            log_likelihood=fit.log_likelihood,
+            plausible=self._plausible(score.name, values, uncertainty),
+        )
+
+    def _plausible(self, name: str, values: NDArray[np.float64], uncertainty: NDArray[np.float64]) -> bool:
+        limits = self.limits.get(name)
+        return limits is None or bool(np.all(np.abs(values) - 2.0 * uncertainty <= limits))
+
+    def _best(self, scores: Sequence[Score]) -> Score | None:
+        """Return the candidate to accept; of two within the gate of each other a plausible one goes first."""
+        passing = [
+            s
+            for s in scores
+            if s.admissible and s.delta_bic > GATE_BIC and s.p_value * len(self.effects) < GATE_P and _real(s)
+        ]
+        if not passing:
+            return None
+        best = max(passing, key=lambda s: s.delta_bic - (0.0 if s.plausible else GATE_BIC))
+        if best.name == PREFERRED[1]:
+            first = next((s for s in passing if s.name == PREFERRED[0]), None)
+            if first is not None and first.delta_bic > best.delta_bic - CLEARLY:
+                return first
+        return best
+
+    def _refit(self, names: Sequence[str]) -> None:
+        """Fit configured and selected effects together and rebuild the candidates there."""
+        held = {term.effect.name: term for term in self.fit.terms}
+        terms = []
+        for name in names:
+            if name in held:
+                terms.append(held[name])
+            else:
+                score = self.steps[name]
+                terms.append(Term(effect(name), score.values))
+        start = Start(self.fit.bias, self.fit.K, self.start.scale)
+        self.fit = fit_terms(self.observations, [*self.base.terms, *terms], start, self.settings)
+        self.ranking = self._ranking()
+
+    def _own(self, name: str) -> float:
+        """Return the delta BIC that a selected effect brings beside the others."""
+        others = self._selected([n for n in self.names if n != name])
+        scores = {s.name: s for s in self.ranking.scores(others, self.limits)}
+        return scores[name].delta_bic if name in scores else float("-inf")
+
+    def _drop(self) -> None:
+        for name in list(self.names[:-1]):
+            if self._own(name) < 0.0:
+                self.names.remove(name)
+                del self.steps[name]
+                self.fit = replace(self.fit, terms=tuple(t for t in self.fit.terms if t.effect.name != name))
+                if effect(name).nonlinear:
+                    self._refit(self.names)
+
+    def _exchange(self) -> bool:
+        """Replace a selected effect by one that explains clearly more in its place."""
+        for name in self.names:
+            if effect(name).moves:
+                continue
+            others = [n for n in self.names if n != name]
+            scores = self.ranking.scores(self._selected(others), self.limits)
+            own = next((s.delta_bic for s in scores if s.name == name), float("-inf"))
+            rivals = [s for s in scores if s.name != name and s.admissible and not effect(s.name).moves]
+            if rivals and rivals[0].delta_bic > own + GATE_BIC:
+                rival = rivals[0]
+                self.names[self.names.index(name)] = rival.name
+                self.steps[rival.name] = rival
+                del self.steps[name]
+                self.fit = replace(self.fit, terms=tuple(t for t in self.fit.terms if t.effect.name != name))
+                if effect(name).nonlinear or effect(rival.name).nonlinear:
+                    self._refit(self.names)
+                return True
+        return False
+
+    def _inflated(self) -> bool:
+        """Return whether the residual's wander is far above that of a static recording or of the data sheet."""
+        _, at = self.ranking.of_model([])
+        white = float(np.sqrt(np.mean(self.start.scale**2)))
+        if self.noise is not None and self.noise.source == "static":
+            expected = float(np.sqrt(np.mean(self.noise.wander**2)))
+        else:
+            expected = float(self.sheet.get("bias_wander") or 0.0)
+        return expected > 0 and self.ranking.settings[at].ratio * white > INFLATED * expected
+
+    def _pairs(self) -> None:
+        """Score all pairs once and accept the best if each of the two is needed."""
+        before, _ = self.ranking.of_model([])
+        able = [j for j, place in enumerate(self.ranking.places) if len(place)]
+        logarithm = float(np.log(self.ranking.samples))
+        best: tuple[float, int, int] = (2.0 * GATE_BIC, -1, -1)
+        for j, k in combinations(able, 2):
+            if self.ranking.candidates[j].effect.name == self.ranking.candidates[k].effect.name:
+                continue
+            found, count = self.ranking.pair(j, k)
+            best = max(best, (2.0 * (found - before) - count * logarithm, j, k))
+        if best[1] < 0:
+            return
+        names = [self.ranking.candidates[j].effect.name for j in best[1:]]
+        first = self.ranking.scores([best[2]], self.limits)
+        second = self.ranking.scores([best[1]], self.limits)
+        scores = [next(s for s in found if s.name == n) for found, n in zip((first, second), names, strict=True)]
+        tried = len(able) * (len(able) - 1) / 2
+        if all(s.admissible and s.delta_bic > GATE_BIC and s.p_value * tried < GATE_P for s in scores):
+            self.names = names
+            self.steps = dict(zip(names, scores, strict=True))
+
+
+def _real(score: Score) -> bool:
+    """Return whether a lag is not negative, which would be a reading ahead of the motion."""
+    return score.name != PREFERRED[1] or bool(score.values[0] > 0)
