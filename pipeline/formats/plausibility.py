@@ -29,6 +29,7 @@ GAP_INTERVALS = 1.5
 FORCE_RANGE_G = (0.3, 3.0)
 FULL_SCALE_MARGIN = 1.2
 RAIL = 1e-4  # relative; the top code of 16 bits lies 3e-5 below full scale
+BEYOND = 1e-3  # relative; with nominal counts per unit the top code lies up to so far above
 QUATERNION_TOLERANCE = 0.01
 UNIT_NAMES = {"accelerometer": "g", "gyroscope": "deg/s"}
 
@@ -156,12 +157,26 @@ def _mark_clipped(table: ChannelTable, sensor: str, full_scale: float, flags: ND
                 table.place(row),
             )
         count = abs(table.encodings[channel].scale) if channel in table.encodings else 0.0
-        rows = np.flatnonzero(size >= full_scale - max(1.5 * count, RAIL * full_scale))
+        rows = np.flatnonzero(_at_rail(size, full_scale, count))
         if rows.size:
             flags[rows] |= CLIPPED
             detail = f"{channel} reaches the full scale of {full_scale:g} {UNIT_NAMES[sensor]} and may be clipped"
             notes.append(_note("N-CLIP", table, rows, detail))
     return notes
+
+
+def _at_rail(size: NDArray[np.float64], full_scale: float, count: float) -> NDArray[np.bool_]:
+    """Return which sizes lie at full scale, or at a largest value beyond it that occurs more than once.
+
+    Many sensors read on past their nominal range (131 counts per deg/s reach 250.1 deg/s), some by a fifth.
+    """
+    clipped = (size >= full_scale - max(1.5 * count, RAIL * full_scale)) & (size <= (1.0 + BEYOND) * full_scale)
+    largest = size.max()
+    if largest > full_scale:
+        at_largest = size >= largest - 1.5 * count
+        if at_largest.sum() > 1:
+            clipped |= at_largest
+    return np.asarray(clipped)
 
 
 def _note(code: str, table: ChannelTable, rows: NDArray[np.intp], detail: str) -> Note:

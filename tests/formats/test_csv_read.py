@@ -194,6 +194,20 @@ def test_clipped_readings_are_marked(tmp_path: Path, canonical: dict[str, Any]) 
     assert [(n.code, n.count, n.first, n.last) for n in read.notes] == [("N-CLIP", 2, 9, 10)]
 
 
+def test_readings_past_the_nominal_range_are_clipped_only_where_they_stay(
+    tmp_path: Path, canonical: dict[str, Any]
+) -> None:
+    """A sensor of 250 deg/s that saturates at 290: a passing peak is none, a plateau is clipped."""
+    recording = make_recording(50)
+    assert recording.gyroscope is not None
+    recording.gyroscope[10:14, 1] = [260.0, 270.0, 280.0, 265.0]
+    recording.gyroscope[20:25, 2] = [-280.0, -290.0, -290.0, -290.0, -270.0]
+    write_canonical_csv(tmp_path / "accel_x.csv", recording)
+    read = read_back(tmp_path, canonical)
+    assert read.flags is not None
+    assert np.flatnonzero(read.flags == 2).tolist() == [21, 22, 23]
+
+
 def test_files_that_overlap_in_time_share_no_clock(tmp_path: Path, canonical: dict[str, Any]) -> None:
     for index, start in enumerate((0, 2, 4)):
         written = make_recording(100, start_ns=start * 10**9, seed=index)
