@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from pipeline.records import Recording
 
-FLIPS = 150
+FLIPS = 100
 
 
 def read(folder: Path, **mcap: Any) -> Recording:

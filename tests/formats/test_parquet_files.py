@@ -24,7 +24,7 @@ from pipeline.records import Encoding, Note, Recording
 if TYPE_CHECKING:
     from pathlib import Path
 
-FLIPS = 400
+FLIPS = 250
 
 
 def unit() -> list[Recording]:
