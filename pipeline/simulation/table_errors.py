@@ -93,7 +93,7 @@ class TurnErrors:
         commanded = np.diff(program.stops)
         k = np.clip(move, 0, None)
         slope = 1.0 + np.diff(error)[k] / commanded[k]
-        lag = -self.backlash * np.sign(commanded[k])
+        lag = np.where(move >= 0, -self.backlash * np.sign(commanded[k]), 0.0)
         return program.stops[k] + error[k] + (phi - program.stops[k]) * slope + lag, slope
 
     def _harmonics(

@@ -10,7 +10,7 @@ A turn by A about the unit axis u (the same in body and level, since R_u u = u):
 
     level = level_0 R_u(A),   omega = u dA/dt,   alpha = u d2A/dt2
 
-Gimbals ``level = R_z(psi) R_y(theta) R_x(phi)``, each angle a sum of sinusoids:
+Gimbals ``level = R_z(psi) R_y(theta) R_x(phi)``, each angle a steady turn plus a sum of sinusoids:
 
     omega = (phi' - psi' sin theta,  theta' cos phi + psi' cos theta sin phi,  -theta' sin phi + psi' cos theta cos phi)
 """
@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.simulation.program import Program
+
+SWING_RMS_DEG = np.array([60.0, 42.0, 60.0])
 
 
 @dataclass(frozen=True)
@@ -164,15 +166,18 @@ class Moves:
 
 @dataclass(frozen=True)
 class Gimbals:
-    """Random motion of a three-axis table: each gimbal angle a sum of sinusoids.
+    """Random motion of a three-axis table: each gimbal angle a steady turn plus a sum of sinusoids.
 
     Attributes
     ----------
+    drift : (3,) array, deg/s
+        Steady rates of the gimbals about x (inner), y, z (outer).
     amplitude, frequency, phase : (3, m) array, deg, Hz, rad
-        Of the gimbals about x (inner), y, z (outer).
+        Of their sinusoids.
     duration : float, s
     """
 
+    drift: NDArray[np.float64]
     amplitude: NDArray[np.float64]
     frequency: NDArray[np.float64]
     phase: NDArray[np.float64]
@@ -184,7 +189,8 @@ class Gimbals:
         argument = w * time + self.phase[:, :, None]
         sine, cosine = np.sin(argument), np.cos(argument)
         a = self.amplitude[:, :, None]
-        return (a * sine).sum(1), (a * w * cosine).sum(1), (-a * w * w * sine).sum(1)
+        drift = self.drift[:, None]
+        return drift * time + (a * sine).sum(1), drift + (a * w * cosine).sum(1), (-a * w * w * sine).sum(1)
 
     def quaternion(self, time: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the attitude, body to level: (n, 4) array, continuous in sign."""
@@ -225,8 +231,9 @@ class Gimbals:
 def random_gimbals(duration: float, peak_rate: float, rng: np.random.Generator, sinusoids: int = 4) -> Gimbals:
     """Return a random motion whose |angular rate| peaks at ``peak_rate``.
 
-    The periods lie between 12 and 60 s, and the slow ones have the large amplitudes, so that the attitudes cover the
-    sphere although the motion is slow.
+    The inner gimbal turns on and the middle one swings by 42 deg rms, which is what makes the mean squares of the three
+    components of the vertical equal: the attitudes cover the sphere evenly. How fast that path is run through is chosen
+    so that the rate peaks where it should.
 
     Parameters
     ----------
@@ -234,15 +241,22 @@ def random_gimbals(duration: float, peak_rate: float, rng: np.random.Generator, 
     peak_rate : float, deg/s
     rng : Generator
     sinusoids : int
-        For each gimbal.
+        For each gimbal; their frequencies lie within a factor of three.
     """
-    frequency = np.exp(rng.uniform(np.log(1.0 / 60.0), np.log(1.0 / 12.0), (3, sinusoids)))
-    amplitude = rng.uniform(0.5, 1.0, (3, sinusoids)) / frequency
+    frequency = np.exp(rng.uniform(0.0, np.log(3.0), (3, sinusoids))) / 40.0
+    weight = rng.uniform(0.5, 1.0, (3, sinusoids))
+    swing = np.sqrt(2.0) * SWING_RMS_DEG[:, None]
+    amplitude = swing * weight / np.linalg.norm(weight, axis=1, keepdims=True)
     phase = rng.uniform(0.0, 2.0 * np.pi, (3, sinusoids))
-    gimbals = Gimbals(amplitude, frequency, phase, duration)
-    time = np.arange(0.0, duration, 0.5)
-    # The rates of the angles scale with the amplitudes, |omega| not quite: it depends on the angles too.
-    for _ in range(8):
-        rate = np.linalg.norm(gimbals.true(time).omega, axis=1).max()
-        gimbals = Gimbals(gimbals.amplitude * peak_rate / rate, frequency, phase, duration)
-    return gimbals
+    drift = np.array([0.6 * 360.0 / 40.0, 0.0, 0.0]) * rng.choice([-1.0, 1.0])
+
+    def at_speed(speed: float) -> Gimbals:
+        return Gimbals(drift * speed, amplitude, frequency * speed, phase, duration)
+
+    time = np.linspace(0.0, duration, max(50, int(2.0 * duration)))
+    low, high = 1e-3, 1e3  # a faster run shows more of the path, so its peak grows with the speed, if not in proportion
+    for _ in range(24):
+        middle = float(np.sqrt(low * high))
+        peak = np.linalg.norm(at_speed(middle).true(time).omega, axis=1).max()
+        low, high = (middle, high) if peak < peak_rate else (low, middle)
+    return at_speed(low)
