@@ -60,6 +60,8 @@ class Selection:
         Base, configured and selected effects.
     base : Fit
         Base and configured effects.
+    first : Ranking
+        The linear problem of the base.
     ranking : Ranking
         The linear problem with the selected effects at their values.
     observations : Observations
@@ -73,6 +75,7 @@ class Selection:
     alone: dict[str, Score]
     fit: Fit
     base: Fit
+    first: Ranking
     ranking: Ranking
     observations: Observations
     start: Start
@@ -173,7 +176,7 @@ class _Search:
         self.names: list[str] = []
         self.steps: dict[str, Score] = {}
         self.fit = self.base
-        self.ranking = self._ranking()
+        self.first = self.ranking = self._ranking()
 
     def run(self) -> Selection:
         alone = {score.name: score for score in self._scores()}
@@ -188,6 +191,7 @@ class _Search:
             alone,
             self.fit,
             self.base,
+            self.first,
             self.ranking,
             self.observations,
             self.start,

@@ -1,0 +1,237 @@
+"""Which physical effect is missing: a sensor's part of ``diagnoses/<unit>.json``.
+
+The selection itself is ``pipeline.estimation.selection``; here it becomes a document: the ranking of every candidate
+with what else would look alike, what cannot be seen in these recordings, what remains unexplained, and what to do next.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.diagnosis.advice import next_experiment
+from pipeline.diagnosis.held_out import held_out_error
+from pipeline.diagnosis.observability import facts_of, not_observable
+from pipeline.diagnosis.unknown import unexplained
+from pipeline.errors import NotObservableError
+from pipeline.estimation.design import Start, Term
+from pipeline.estimation.effects_stage import AUTO
+from pipeline.estimation.joint import fit_terms
+from pipeline.estimation.observations import observe
+from pipeline.estimation.selection import GATE_BIC, select
+from pipeline.model.effects import catalogue
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.estimation.joint import Fit
+    from pipeline.estimation.ranking import Score
+    from pipeline.estimation.selection import Selection
+    from pipeline.records import Noise, Recording, SensorCalibration
+
+ALIKE = 0.8
+
+
+def diagnose(
+    calibration: SensorCalibration, recordings: Sequence[Recording], noise: Noise | None, settings: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return a sensor's part of ``diagnoses/<unit>.json``.
+
+    Parameters
+    ----------
+    calibration : SensorCalibration
+        Its effects are starts for those that are configured.
+    recordings : sequence of Recording
+        All of the unit; those of role ``validation`` judge, and take no part in the selection.
+    noise : Noise or None
+    settings : mapping
+        Sections ``sensor``, ``table`` and ``effects``.
+
+    Returns
+    -------
+    dict
+        ``verdict, residual_over_noise, selected, ranking, not_observable, unexplained, next_experiment, override``;
+        beside these ``configured``, and ``wander`` (ratio to white noise and correlation time that fit best).
+    """
+    sensor = calibration.sensor
+    wanted = settings["effects"][sensor]
+    configured = [] if wanted == AUTO else list(wanted)
+    observations = observe(sensor, recordings, settings["table"])
+    try:
+        selection = select(observations, configured, noise, settings["sensor"][sensor], calibration)
+    except NotObservableError as reason:
+        return _nothing(sensor, configured, reason.message)
+    return _document(selection, configured, recordings, noise, settings["table"])
+
+
+def _nothing(sensor: str, configured: list[str], reason: str) -> dict[str, Any]:
+    names = [n for n, this in catalogue().items() if sensor in this.sensors and n not in configured]
+    return {
+        "verdict": "not_enough_data",
+        "residual_over_noise": None,
+        "selected": [],
+        "ranking": [],
+        "not_observable": [{"effect": name, "reason": reason} for name in names],
+        "unexplained": [],
+        "next_experiment": "record turns about all three axes on a table whose angle and rate are logged",
+        "override": "",
+        "configured": configured,
+        "wander": None,
+    }
+
+
+def _document(
+    selection: Selection,
+    configured: list[str],
+    recordings: Sequence[Recording],
+    noise: Noise | None,
+    table: Mapping[str, Any],
+) -> dict[str, Any]:
+    sensor, selected = selection.observations.sensor, selection.names
+    hidden = not_observable(selection, configured)
+    unknown = unexplained(selection)
+    ladder = _ladder(selection, recordings, table)
+    ranking = [_entry(selection, name, ladder, noise) for name in _order(selection, hidden)]
+    verdict = "missing_effect" if selected else "unexplained" if unknown else "nothing_missing"
+    if not ranking and verdict == "nothing_missing" and len(hidden) > 0:
+        verdict = "not_enough_data"
+    adds = ",".join([*configured, *selected])
+    _, at = selection.ranking.of_model(selection.chosen())
+    wander = selection.ranking.settings[at]
+    return {
+        "verdict": verdict,
+        "residual_over_noise": _over_noise(selection, recordings, noise),
+        "selected": selected,
+        "ranking": ranking,
+        "not_observable": [{"effect": name, "reason": reason} for name, reason in hidden.items()],
+        "unexplained": unknown,
+        "next_experiment": next_experiment(ranking, selected, hidden, unknown, facts_of(selection.observations)),
+        "override": f"effects.{sensor}=[{adds}]" if selected else "",
+        "configured": configured,
+        "wander": {"ratio": wander.ratio, "time_s": wander.time if wander.ratio else None},
+    }
+
+
+def _order(selection: Selection, hidden: Mapping[str, str]) -> list[str]:
+    """Return the observable candidates: the selected ones in their order, then the others by what they bring alone."""
+    others = sorted(selection.alone.values(), key=lambda s: -s.delta_bic)
+    return [*selection.names, *(s.name for s in others if s.name not in selection.names and s.name not in hidden)]
+
+
+def _ladder(
+    selection: Selection, recordings: Sequence[Recording], table: Mapping[str, Any]
+) -> list[tuple[Fit, float | None]]:
+    """Return the fits and held-out errors of the base and with each further selected effect."""
+    fits = [selection.base]
+    held = {term.effect.name: term for term in selection.fit.terms}
+    for count in range(1, len(selection.names)):
+        terms = [*selection.base.terms, *(held[name] for name in selection.names[:count])]
+        start = Start(selection.fit.bias, selection.fit.K, selection.start.scale)
+        fits.append(fit_terms(selection.observations, terms, start, selection.settings))
+    if selection.names:
+        fits.append(selection.fit)
+    return [
+        (fit, held_out_error(fit, selection.observations, recordings, table) if selection.names else None)
+        for fit in fits
+    ]
+
+
+def _entry(
+    selection: Selection, name: str, ladder: Sequence[tuple[Fit, float | None]], noise: Noise | None
+) -> dict[str, Any]:
+    """Return one line of the ranking."""
+    score = selection.steps.get(name) or selection.alone[name]
+    before = after = None
+    if name in selection.names:
+        step = selection.names.index(name)
+        (without, before), (within, after) = ladder[step], ladder[step + 1]
+        drop = without.residual_rms**2 - within.residual_rms**2
+    else:
+        drop = _drop(selection, name)
+    return {
+        "effect": name,
+        "delta_bic": score.delta_bic,
+        "p_value": score.p_value,
+        "parameters": _parameters(selection, score),
+        "explained_share": _share(drop, selection, noise),
+        "held_out_error_before": before,
+        "held_out_error_after": after,
+        "look_alikes": _look_alikes(selection, score),
+        "plausible": _plausible(selection, score),
+    }
+
+
+def _drop(selection: Selection, name: str) -> float:
+    """Return by how much an effect alone would lower the mean square of the residual."""
+    first = selection.first
+    explained = first.explained([])
+    best = max(explained[j] for j in first.indices(name))
+    return float(best / first.samples * np.mean(selection.start.scale**2))
+
+
+def _share(drop: float, selection: Selection, noise: Noise | None) -> float:
+    """Return the share of the residual's excess over the noise that a drop of its mean square is."""
+    base, final = selection.base.residual_rms**2, selection.fit.residual_rms**2
+    floor = final if noise is None else float(np.mean(noise.white**2 + noise.wander**2))
+    excess = max(base - floor, base - final, drop)
+    return float(np.clip(drop / excess, 0.0, 1.0)) if excess > 0 else 0.0
+
+
+def _final(selection: Selection, name: str) -> tuple[Term, int] | None:
+    at = 12
+    for term in selection.fit.terms:
+        if term.effect.name == name and name in selection.names:
+            return term, at
+        at += len(term.values)
+    return None
+
+
+def _parameters(selection: Selection, score: Score) -> dict[str, dict[str, Any]]:
+    """Return the estimates: of the fit of all selected effects, or of the effect alone."""
+    sensor = selection.observations.sensor
+    values, uncertainty = score.values, score.uncertainty
+    final = _final(selection, score.name)
+    if final is not None:
+        term, at = final
+        values = term.values
+        uncertainty = np.sqrt(np.clip(np.diag(selection.fit.covariance)[at : at + len(values)], 0.0, None))
+    described = catalogue()[score.name].parameters(sensor)
+    return {
+        p.name: {"value": float(v), "unit": p.unit, "standard_uncertainty": float(u) if u > 0 else None}
+        for p, v, u in zip(described, values, uncertainty, strict=True)
+    }
+
+
+def _plausible(selection: Selection, score: Score) -> bool:
+    limits, final = selection.limits.get(score.name), _final(selection, score.name)
+    if limits is None or final is None:
+        return score.plausible
+    term, at = final
+    uncertainty = np.sqrt(np.clip(np.diag(selection.fit.covariance)[at : at + len(term.values)], 0.0, None))
+    return bool(np.all(np.abs(term.values) - 2.0 * uncertainty <= limits))
+
+
+def _look_alikes(selection: Selection, score: Score) -> list[dict[str, Any]]:
+    """Return the effects that reproduce most of an effect's fitted signal; of a signal in the noise, none."""
+    if score.delta_bic <= GATE_BIC:
+        return []
+    if score.name in selection.names:
+        ranking, held = selection.ranking, selection.chosen()
+        place = ranking.indices(score.name)[0]
+        _, at = ranking.of_model(held)
+    else:
+        ranking, held = selection.first, []
+        place, at = ranking.indices(score.name)[0], score.setting
+    shares = ranking.shares(place, held, at)
+    alike = sorted(((share, name) for name, share in shares.items() if share > ALIKE), reverse=True)
+    return [{"effect": name, "share": share} for share, name in alike]
+
+
+def _over_noise(selection: Selection, recordings: Sequence[Recording], noise: Noise | None) -> float | None:
+    """Return the rms residual of base and configured effects over that of noise alone."""
+    if noise is None:
+        return None
+    gain = max(float(r.filter.get("noise_gain", 1.0)) for r in recordings)
+    floor = float(np.sqrt(np.mean((gain * noise.white) ** 2 + noise.wander**2)))
+    return float(selection.base.residual_rms / floor) if floor > 0 else None

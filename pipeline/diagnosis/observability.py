@@ -1,0 +1,152 @@
+"""Which effects the recordings cannot show, and why.
+
+An effect is not observable where it needs what the recordings do not hold, where base and configured effects add up to
+all that it would add (less than 1e-3 of its columns is left), or where it would hide in the noise even with all its
+parameters at the sensor's limits,
+
+    lambda = sum_j limit_j^2 H_jj < k log N + 10
+
+with H the whitened products of its columns: the gain in 2 log L that it could reach on average, against the gate.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.estimation.selection import GATE_BIC
+from pipeline.model.effects import catalogue
+
+if TYPE_CHECKING:
+    from pipeline.estimation.observations import Observations
+    from pipeline.estimation.selection import Selection
+    from pipeline.model.effects.base import Effect
+
+LEAST_SPAN_DEGC = 1.0
+MOVING = {
+    "lever_arm",
+    "inner_lever_arms",
+    "vibration_rectification",
+    "rate_dependence",
+    "time_offset",
+    "low_pass_lag",
+    "clock_rate",
+    "table_rate_ripple",
+}
+BOTH_WAYS = {"scale_factor_asymmetry", "vibration_rectification", "table_backlash", "rate_dependence"}
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What the recordings did.
+
+    Attributes
+    ----------
+    temperature : bool
+        Whether every recording holds one.
+    span : float, degC
+        Of the temperature.
+    moving : bool
+        Whether any used sample moves.
+    fastest : float, deg/s
+    one_way : bool
+        Whether the turns about no axis go in both directions.
+    clock_shared : bool
+    """
+
+    temperature: bool
+    span: float
+    moving: bool
+    fastest: float
+    one_way: bool
+    clock_shared: bool
+
+
+def facts_of(observations: Observations) -> Facts:
+    """Return what the recordings did."""
+    warmth = [part.motion.temperature for part in observations.parts]
+    known = [t for t in warmth if t is not None]
+    span = float(np.ptp(np.concatenate(known))) if known else 0.0
+    rates = [np.abs(part.motion.angular_rate).max(axis=1) for part in observations.parts]
+    moving = any(np.any(~part.motion.still) for part in observations.parts)
+    ways: dict[int, set[int]] = {}
+    for part in observations.parts:
+        if part.motion.axis is not None and part.motion.rate is not None:
+            seen = np.unique(np.sign(part.motion.rate[~part.motion.still]))
+            ways.setdefault(part.motion.axis, set()).update(int(s) for s in seen if s)
+    return Facts(
+        temperature=len(known) == len(warmth),
+        span=span,
+        moving=moving,
+        fastest=float(max(r.max() for r in rates)),
+        one_way=moving and not any(len(w) == 2 for w in ways.values()),
+        clock_shared=observations.clock_shared,
+    )
+
+
+def not_observable(selection: Selection, configured: list[str]) -> dict[str, str]:
+    """Return the effects that these recordings cannot show, each with the reason and what would show it.
+
+    Parameters
+    ----------
+    selection : Selection
+    configured : list of str
+        Effects of the model, which are not asked for.
+    """
+    observations, facts = selection.observations, facts_of(selection.observations)
+    found = {}
+    for name, this in catalogue().items():
+        if observations.sensor not in this.sensors or name in configured or name in selection.names:
+            continue
+        if name == "earth_rotation" and observations.earth:
+            continue
+        reason = _reason(this, selection, facts)
+        if reason:
+            advice = "" if observations.sensor in this.unseen else f"; it needs {this.excitation}"
+            found[name] = reason + advice
+    return found
+
+
+def _reason(this: Effect, selection: Selection, facts: Facts) -> str | None:
+    places = selection.first.indices(this.name)
+    hidden = _hidden(this, selection, places)
+    checks = [
+        (selection.observations.sensor in this.unseen, this.unseen.get(selection.observations.sensor, "")),
+        ("temperature" in this.needs and not facts.temperature, "the recordings hold no temperature"),
+        (this.needs_clock and not facts.clock_shared, "the time between the recordings is not known"),
+        (not places, _unexcited(this, facts)),
+        ("temperature" in this.needs and facts.span < LEAST_SPAN_DEGC, _steady(facts)),
+        (hidden, _faint(this, selection) if hidden else ""),
+    ]
+    return next((reason for applies, reason in checks if applies), None)
+
+
+def _steady(facts: Facts) -> str:
+    return f"the temperature changes by no more than {facts.span:.2g} degC"
+
+
+def _faint(this: Effect, selection: Selection) -> str:
+    unit = this.parameters(selection.observations.sensor)[0].unit
+    limit = selection.limits[this.name][0]
+    return f"even at its limit of {limit:.2g}{'' if unit == '1' else ' ' + unit} it would hide in the noise"
+
+
+def _unexcited(this: Effect, facts: Facts) -> str:
+    if this.name in MOVING and not facts.moving:
+        return "the table never moved while it was sampled"
+    if "temperature" in this.needs:
+        return _steady(facts)
+    if this.name in BOTH_WAYS and facts.one_way:
+        return "every turn goes in one direction, in which it looks exactly like a part of bias and matrix"
+    return "bias and matrix explain all that it would add in this motion"
+
+
+def _hidden(this: Effect, selection: Selection, places: list[int]) -> bool:
+    limits = selection.limits.get(this.name)
+    score = selection.alone.get(this.name)
+    if limits is None or score is None or not places or score.delta_bic > GATE_BIC:
+        return False
+    gate = score.parameters * float(np.log(selection.first.samples)) + GATE_BIC
+    return max(selection.first.visibility(j, limits, score.setting) for j in places) < gate

@@ -1,0 +1,100 @@
+"""A diagnosis in plain words."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from pipeline.model.effects import catalogue
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+UNITS = {"accelerometer": "g", "gyroscope": "deg/s"}
+
+
+def in_words(part: Mapping[str, Any] | None, sensor: str) -> list[str]:
+    """Return a sensor's diagnosis as sentences.
+
+    Parameters
+    ----------
+    part : mapping or None
+        The sensor's part of ``diagnoses/<unit>.json``; None where the sensor was not calibrated.
+    sensor : str
+
+    Returns
+    -------
+    list of str
+    """
+    if part is None:
+        return [f"The {sensor} was not calibrated, so there is nothing to diagnose."]
+    lines = [_verdict(part, sensor)]
+    entries = {entry["effect"]: entry for entry in part["ranking"]}
+    for name in part["selected"]:
+        lines += _selected(entries[name], sensor)
+    for found in part["unexplained"]:
+        lines.append(f"The residual depends on {plain(found['covariate'])} (p = {found['p_value']:.1g}) beyond that.")
+    if part["not_observable"]:
+        lines.append(_hidden(part))
+    if part["next_experiment"]:
+        lines.append(f"Next experiment: {part['next_experiment']}.")
+    if part["override"]:
+        lines.append(f"To add it, run with overrides='{part['override']}'.")
+    return lines
+
+
+def plain(name: str) -> str:
+    """Return the name of an effect or covariate in words: ``bias temperature`` for ``bias_temperature``."""
+    return name.replace("_", " ")
+
+
+def _verdict(part: Mapping[str, Any], sensor: str) -> str:
+    text = {
+        "nothing_missing": f"Nothing that these recordings can show is missing in the model of the {sensor}.",
+        "missing_effect": f"The model of the {sensor} misses {_names(part['selected'])}.",
+        "unexplained": f"The {sensor} does something that no effect of the catalogue explains.",
+        "not_enough_data": f"The recordings cannot tell whether an effect of the {sensor} is missing.",
+    }[part["verdict"]]
+    ratio = part["residual_over_noise"]
+    if ratio is None:
+        return text
+    subject = "Without it, the residual" if part["selected"] else "The residual"
+    return f"{text} {subject} is {ratio:.3g} times the noise."
+
+
+def _names(names: list[str]) -> str:
+    words = [plain(name) for name in names]
+    return " and ".join(filter(None, [", ".join(words[:-1]), *words[-1:]]))
+
+
+def _selected(entry: Mapping[str, Any], sensor: str) -> list[str]:
+    meaning = catalogue()[entry["effect"]].meaning if entry["effect"] in catalogue() else ""
+    values = ", ".join(_value(name, p) for name, p in entry["parameters"].items())
+    share = 100 * entry["explained_share"]
+    head = f"{plain(entry['effect']).capitalize()}: {meaning} {values}."
+    bic = f"(delta BIC {entry['delta_bic']:.0f})"
+    lines = [f"{head} It explains {share:.0f} % of the excess over the noise {bic}."]
+    if not entry["plausible"]:
+        lines.append("That is beyond the sensor's data sheet: take it as a sign of something else.")
+    if entry["look_alikes"]:
+        alike = ", ".join(f"{plain(a['effect'])} ({100 * a['share']:.0f} %)" for a in entry["look_alikes"])
+        lines.append(f"It looks much like {alike} of the same signal.")
+    before, after = entry["held_out_error_before"], entry["held_out_error_after"]
+    if before is not None and after is not None:
+        lines.append(f"On held-out motion the rms error goes from {before:.4g} to {after:.4g} {UNITS[sensor]}.")
+    return lines
+
+
+def _value(name: str, parameter: Mapping[str, Any]) -> str:
+    unit = "" if parameter["unit"] == "1" else f" {parameter['unit']}"
+    uncertainty = parameter["standard_uncertainty"]
+    spread = f" +- {2 * uncertainty:.2g}" if uncertainty else ""
+    return f"{name} = {parameter['value']:.4g}{spread}{unit}"
+
+
+def _hidden(part: Mapping[str, Any]) -> str:
+    hidden = part["not_observable"]
+    reasons = {entry["reason"] for entry in hidden}
+    if not part["ranking"] and len(reasons) == 1:
+        return f"No effect can be seen: {hidden[0]['reason']}."
+    listed = "; ".join(f"{plain(e['effect'])} ({e['reason'].split('; it needs ')[0]})" for e in hidden)
+    return f"Not observable: {listed}."
