@@ -17,8 +17,10 @@ import numpy as np
 
 from pipeline.errors import ConfigurationError
 from pipeline.records import AXES
+from pipeline.simulation.attitudes import axis_and_angle, orientations_24, random_attitudes, six_positions
+from pipeline.simulation.gimbals import Gimbals, random_gimbals
 from pipeline.simulation.program import ProgramBuilder
-from pipeline.simulation.trajectory import Gimbals, Moves, Turn, random_gimbals, rotation_about
+from pipeline.simulation.trajectory import Moves, Turn, rotation_about
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -110,9 +112,9 @@ def plan(procedure: str, course: Course, rng: np.random.Generator, hand_accuracy
     if procedure in TABLE_PROCEDURES:
         return _turns(course) + _heldout(course, rng)
     attitudes: dict[str, Callable[[], NDArray[np.float64]]] = {
-        "orientations_24": _orientations_24,
-        "six_positions": _six_positions,
-        "multi_position": lambda: _random_attitudes(course.positions, rng),
+        "orientations_24": orientations_24,
+        "six_positions": six_positions,
+        "multi_position": lambda: random_attitudes(course.positions, rng),
     }
     if procedure not in attitudes:
         known = ", ".join((*TABLE_PROCEDURES, *attitudes))
@@ -120,7 +122,7 @@ def plan(procedure: str, course: Course, rng: np.random.Generator, hand_accuracy
     planned = [Planned("recording", "rests", None, _rests(attitudes[procedure](), course, rng, hand_accuracy))]
     if course.validation_s > 0.0:
         count = max(2, int(course.validation_s / (course.dwell_s + 2.0)))
-        held_out = _rests(_random_attitudes(count, rng), replace(course, warm_up_rest_s=0.0), rng, 0.0)
+        held_out = _rests(random_attitudes(count, rng), replace(course, warm_up_rest_s=0.0), rng, 0.0)
         planned.append(Planned("validation", "validation", None, held_out))
     return planned + _static(course)
 
@@ -222,40 +224,3 @@ def _rests(attitudes: NDArray[np.float64], course: Course, rng: np.random.Genera
         builder.turn(angle, course.step_rate_dps).rest(course.dwell_s)
         axes.append(axis)
     return Moves(builder.build(), np.array(axes), attitudes[0])
-
-
-def axis_and_angle(rotation: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Return the unit axis and the angle in deg, 0 to 180, of a rotation matrix.
-
-    The quaternion is the eigenvector of Bar-Itzhack's matrix for its largest eigenvalue; it is good at 180 deg too.
-    """
-    d, off = rotation, np.array([rotation[2, 1], rotation[0, 2], rotation[1, 0]])
-    skew = off - np.array([d[1, 2], d[2, 0], d[0, 1]])
-    matrix = np.empty((4, 4))
-    matrix[0, 0] = np.trace(d)
-    matrix[0, 1:] = matrix[1:, 0] = skew
-    matrix[1:, 1:] = d + d.T - np.trace(d) * np.eye(3)
-    q = np.linalg.eigh(matrix)[1][:, -1]
-    q = q if q[0] >= 0.0 else -q
-    size = float(np.linalg.norm(q[1:]))
-    return q[1:] / size, float(np.degrees(2.0 * np.arctan2(size, q[0])))
-
-
-def _orientations_24() -> NDArray[np.float64]:
-    angles = np.linspace(0.0, 315.0, 8)
-    x, y, z = np.eye(3)
-    upright = rotation_about(y, np.array([-90.0]))[0]  # body x up
-    turns = [rotation_about(x, angles), rotation_about(y, angles), upright @ rotation_about(z, angles)]
-    return np.concatenate(turns)
-
-
-def _six_positions() -> NDArray[np.float64]:
-    x, y, _ = np.eye(3)
-    return np.concatenate([rotation_about(x, np.linspace(0.0, 270.0, 4)), rotation_about(y, np.array([-90.0, 90.0]))])
-
-
-def _random_attitudes(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    from pipeline.model.rotation import attitude_matrix  # noqa: PLC0415  (hand-held procedures alone)
-
-    q = rng.standard_normal((count, 4))
-    return attitude_matrix(q / np.linalg.norm(q, axis=1, keepdims=True))

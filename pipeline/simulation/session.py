@@ -14,10 +14,11 @@ import numpy as np
 from pipeline.model.kinematics import earth_rate
 from pipeline.records import AXES, SENSORS, Recording
 from pipeline.simulation.alterations import ALTERATIONS, alter
+from pipeline.simulation.gimbals import Gimbals
 from pipeline.simulation.scene import Scene
 from pipeline.simulation.sensor import bias_wander
 from pipeline.simulation.table_errors import random_errors
-from pipeline.simulation.trajectory import Gimbals, Moves, Turn, rotation_about
+from pipeline.simulation.trajectory import Moves, Turn, rotation_about
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -8,10 +8,12 @@ import pytest
 
 from pipeline.model.kinematics import UP_AT_ZERO
 from pipeline.model.rotation import attitude_matrix, turn_about_axis
-from pipeline.simulation.procedures import Course, axis_and_angle, plan
+from pipeline.simulation.attitudes import axis_and_angle
+from pipeline.simulation.gimbals import random_gimbals
+from pipeline.simulation.procedures import Course, plan
 from pipeline.simulation.program import Program, ProgramBuilder
 from pipeline.simulation.table_errors import TurnErrors
-from pipeline.simulation.trajectory import Moves, Turn, random_gimbals, rotation_about
+from pipeline.simulation.trajectory import Moves, Turn, rotation_about
 
 STEP = 1e-5
 
