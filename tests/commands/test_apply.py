@@ -1,0 +1,216 @@
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from pipeline.commands.apply import compensate_csv, main
+from pipeline.errors import ConvergenceError, InputError, MissingInputError
+from pipeline.model.compensation import load
+from pipeline.records import FittedEffect, SensorCalibration
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+HEADER = (
+    "time_s,accel_x_g,accel_y_g,accel_z_g,remark,gyro_x_dps,gyro_y_dps,gyro_z_dps,temperature_degc,table_rate_dps,count"
+)
+
+
+def effect(name: str, **values: float) -> FittedEffect:
+    return FittedEffect(name, {k: {"value": v, "unit": "", "expanded_uncertainty": 0.0} for k, v in values.items()})
+
+
+def nine(symbol: str, value: float) -> dict[str, float]:
+    return {f"{symbol}_{a}{b}": value for a in "xyz" for b in "xyz"}
+
+
+@pytest.fixture
+def calibration(tmp_path: Path) -> Path:
+    accelerometer = SensorCalibration(
+        "accelerometer", np.array([0.02, -0.01, 0.03]), np.diag([1.01, 0.99, 1.02]),
+        effects=(effect("inner_lever_arms", **nine("r", 3e-3)),),
+    )  # fmt: skip
+    gyroscope = SensorCalibration(
+        "gyroscope", np.array([1.0, -2.0, 0.5]), np.eye(3) + 0.01,
+        effects=(
+            effect("bias_temperature", beta_x=0.1, beta_y=0.2, beta_z=-0.1),
+            effect("g_sensitivity", **nine("G", 0.05)),
+            effect("warm_up", A_x=0.3, A_y=0.2, A_z=0.1, time_constant=60.0),
+        ),
+    )  # fmt: skip
+    file = tmp_path / "U1.json"
+    parts = {"accelerometer": accelerometer.to_json(), "gyroscope": gyroscope.to_json()}
+    file.write_text(json.dumps({"unit": "U1", "status": "ok", "error": None, **parts}), encoding="utf-8")
+    return file
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    rng = np.random.default_rng(0)
+    n = 500
+    lines = [HEADER]
+    for i in range(n):
+        a, g = rng.standard_normal(3), 50.0 * rng.standard_normal(3)
+        remark = '"a, ""b"""' if i % 100 == 7 else "ok"
+        temperature = 25.0 + 0.01 * i + 0.05 * rng.standard_normal()
+        values = [f"{0.12 * i:.2f}", *(f"{v:.6f}" for v in a), remark, *(f"{v:.5f}" for v in g)]
+        lines.append(",".join([*values, f"{temperature:.3f}", "007.500", f"{i:04d}"]))
+    file = tmp_path / "log.csv"
+    file.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return file
+
+
+def columns(file: Path) -> dict[str, list[str]]:
+    with file.open(encoding="utf-8", newline="") as stream:
+        rows = list(csv.reader(stream))
+    return {name: [row[i] for row in rows[1:]] for i, name in enumerate(rows[0])}
+
+
+def vectors(table: dict[str, list[str]], sensor: str) -> np.ndarray:
+    names = [f"accel_{a}_g" for a in "xyz"] if sensor == "accelerometer" else [f"gyro_{a}_dps" for a in "xyz"]
+    return np.array([table[name] for name in names], float).T
+
+
+def test_a_log_is_compensated_as_its_arrays_are(calibration: Path, log: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.csv"
+    assert main(["--calibration", str(calibration), str(log), "-o", str(out)]) == 0
+    before, after = columns(log), columns(out)
+    temperature, time = np.array(before["temperature_degc"], float), np.array(before["time_s"], float)
+    expected = load(calibration).apply(
+        vectors(before, "accelerometer"), vectors(before, "gyroscope"), temperature, time
+    )
+    assert vectors(after, "accelerometer") == pytest.approx(expected.accelerometer, abs=2e-12)
+    assert vectors(after, "gyroscope") == pytest.approx(expected.gyroscope, abs=1e-10)
+
+
+def test_other_columns_are_kept_to_the_letter(calibration: Path, log: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.csv"
+    main(["--calibration", str(calibration), str(log), "-o", str(out)])
+    before, after = columns(log), columns(out)
+    assert list(before) == list(after)
+    for name in ("time_s", "remark", "temperature_degc", "table_rate_dps", "count"):
+        assert before[name] == after[name]
+    assert out.read_text(encoding="utf-8").count('"a, ""b"""') == 5
+
+
+@pytest.mark.parametrize("block_bytes", [150, 1000, 20_000])
+def test_small_blocks_give_what_one_block_gives(calibration: Path, log: Path, tmp_path: Path, block_bytes: int) -> None:
+    compensation = load(calibration)
+    whole, cut = tmp_path / "whole.csv", tmp_path / "cut.csv"
+    assert compensate_csv(compensation, log, whole) == (500, ["accelerometer", "gyroscope"])
+    seen = []
+    compensate_csv(compensation, log, cut, block_bytes=block_bytes, progress=lambda rows, _: seen.append(rows))
+    assert len(seen) > 500 * 60 // block_bytes / 2
+    for sensor in ("accelerometer", "gyroscope"):
+        assert vectors(columns(cut), sensor) == pytest.approx(vectors(columns(whole), sensor), abs=1e-10)
+
+
+def test_cells_that_are_empty_stay_empty(calibration: Path, log: Path, tmp_path: Path) -> None:
+    lines = log.read_text(encoding="utf-8").splitlines()
+    cells = lines[20].split(",")
+    lines[20] = ",".join([cells[0], "", *cells[2:]])
+    log.write_text("\n".join(lines), encoding="utf-8")
+    compensate_csv(load(calibration), log, tmp_path / "out.csv")
+    table = columns(tmp_path / "out.csv")
+    assert table["accel_x_g"][19] == ""
+    assert all(table["accel_x_g"][:19] + table["accel_x_g"][20:])
+
+
+def test_a_sensor_without_calibration_is_left_unchanged_and_said(
+    calibration: Path, log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = json.loads(calibration.read_text(encoding="utf-8"))
+    calibration.write_text(json.dumps({**data, "accelerometer": None}), encoding="utf-8")
+    out = tmp_path / "out.csv"
+    main(["--calibration", str(calibration), str(log), "-o", str(out)])
+    assert "holds no accelerometer" in capsys.readouterr().err
+    assert vectors(columns(out), "accelerometer") == pytest.approx(vectors(columns(log), "accelerometer"))
+
+
+def test_a_byte_order_mark_and_windows_lines_are_read(calibration: Path, log: Path, tmp_path: Path) -> None:
+    text = log.read_text(encoding="utf-8")
+    plain, windows = tmp_path / "plain.csv", tmp_path / "windows.csv"
+    compensate_csv(load(calibration), log, plain)
+    log.write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
+    compensate_csv(load(calibration), log, windows)
+    assert windows.read_bytes() == plain.read_bytes()
+
+
+def test_the_log_is_never_overwritten(calibration: Path, log: Path, tmp_path: Path) -> None:
+    (tmp_path / "link.csv").symlink_to(log)
+    for target in (log, tmp_path / "link.csv"):
+        with pytest.raises(InputError, match="overwrite"):
+            main(["--calibration", str(calibration), str(log), "-o", str(target)])
+
+
+def test_a_failed_run_leaves_no_output(calibration: Path, log: Path, tmp_path: Path) -> None:
+    log.write_text(log.read_text(encoding="utf-8") + "60.0,1,2,x,ok,1,1,1,25,0,1\n", encoding="utf-8")
+    with pytest.raises(InputError, match=r"log\.csv:502: accel_z_g is 'x'; expected a number"):
+        main(["--calibration", str(calibration), str(log), "-o", str(tmp_path / "out.csv")])
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["U1.json", "log.csv"]
+
+
+def test_a_row_with_a_missing_cell_is_refused(calibration: Path, log: Path, tmp_path: Path) -> None:
+    log.write_text(log.read_text(encoding="utf-8") + "60.0,1,2\n", encoding="utf-8")
+    with pytest.raises(InputError, match="11 columns"):
+        main(["--calibration", str(calibration), str(log), "-o", str(tmp_path / "out.csv")])
+
+
+@pytest.mark.parametrize(
+    ("header", "message"),
+    [
+        ("t,ax,ay,az", "expected accel_x_g"),
+        ("time_s,accel_x_g,accel_y_g,gyro_x_dps", "but not accel_z_g"),
+        ("accel_x_g,accel_x_g,accel_y_g,accel_z_g", "more than once"),
+        ("", "empty"),
+    ],
+)
+def test_a_header_without_the_sensors_is_refused(calibration: Path, tmp_path: Path, header: str, message: str) -> None:
+    bad = tmp_path / "bad.csv"
+    bad.write_text(f"{header}\n1,2,3,4\n", encoding="utf-8")
+    with pytest.raises(InputError, match=message):
+        main(["--calibration", str(calibration), str(bad), "-o", str(tmp_path / "out.csv")])
+
+
+def test_a_signal_that_an_effect_needs_is_named(calibration: Path, tmp_path: Path) -> None:
+    bare = tmp_path / "bare.csv"
+    bare.write_text("gyro_x_dps,gyro_y_dps,gyro_z_dps\n1,2,3\n", encoding="utf-8")
+    with pytest.raises(InputError, match="bias_temperature, which needs temperature"):
+        main(["--calibration", str(calibration), str(bare), "-o", str(tmp_path / "out.csv")])
+
+
+def test_a_log_without_rows_gives_a_header(calibration: Path, log: Path, tmp_path: Path) -> None:
+    log.write_text(HEADER + "\n", encoding="utf-8")
+    assert compensate_csv(load(calibration), log, tmp_path / "out.csv")[0] == 0
+    assert (tmp_path / "out.csv").read_text(encoding="utf-8") == HEADER + "\n"
+
+
+def test_a_missing_log_and_mcap_are_refused(calibration: Path, tmp_path: Path) -> None:
+    arguments = ["--calibration", str(calibration), "-o", str(tmp_path / "out.csv")]
+    with pytest.raises(MissingInputError, match="no such log"):
+        main([*arguments, str(tmp_path / "none.csv")])
+    with pytest.raises(InputError, match=r"supported: canonical CSV"):
+        main([*arguments, str(tmp_path / "log.mcap")])
+
+
+def test_a_reading_out_of_reach_is_refused_with_its_line(log: Path, tmp_path: Path) -> None:
+    cubic = SensorCalibration("accelerometer", effects=(effect("cubic_nonlinearity", a=5e-3, b=5e-3, c=5e-3),))
+    file = tmp_path / "U2.json"
+    part = {"accelerometer": cubic.to_json(), "gyroscope": None}
+    file.write_text(json.dumps({"unit": "U2", "status": "ok", "error": None, **part}), encoding="utf-8")
+    log.write_text("accel_x_g,accel_y_g,accel_z_g\n0,0,1\n0,0,900\n", encoding="utf-8")
+    with pytest.raises(ConvergenceError, match=r"log\.csv:2: .*reading of 900"):
+        main(["--calibration", str(file), str(log), "-o", str(tmp_path / "out.csv")])
+
+
+def test_a_user_error_is_one_line_and_exit_code_2(calibration: Path, log: Path) -> None:
+    command = [sys.executable, "-m", "pipeline", "apply", "--calibration", str(calibration), str(log), "-o", str(log)]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert run.returncode == 2
+    assert len(run.stderr.splitlines()) == 1
