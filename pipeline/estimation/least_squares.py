@@ -10,10 +10,9 @@ where
     J     : (n, p) derivative of r with respect to x
     sigma : standard deviation of one residual: given, or sqrt(|r|^2 / (n - p))
 
-Each step is solved by QR of the columns scaled to unit norm, followed by the singular values of R: ``J^T J`` is never
-formed, so that no digits are lost by squaring the condition number, and the singular values say which parameters the
-data do not determine. The nonlinear problem is approached by a trust region (Branch, Coleman & Li, SIAM J. Sci.
-Comput. 21, 1999) and finished by Gauss-Newton steps, halved while they do not help.
+Each step is solved by QR of the columns scaled to unit norm (``pipeline.estimation.scaled_columns``). The nonlinear
+problem is approached by a trust region (Branch, Coleman & Li, SIAM J. Sci. Comput. 21, 1999) and finished by
+Gauss-Newton steps, halved while they do not help.
 
 A success flag proves nothing; the largest cosine between the residual and a column of the Jacobian does: at a minimum
 the residual is orthogonal to all of them (Bates & Watts, Nonlinear Regression Analysis, 1988, section 2.2.3).
@@ -27,19 +26,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.errors import NotObservableError
+from pipeline.estimation.complex_step import complex_step_jacobian
+from pipeline.estimation.scaled_columns import factorise
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
+    from pipeline.estimation.scaled_columns import ScaledColumns
+
     Function = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
-COMPLEX_STEP = 1e-30
-# A singular value of the scaled columns below this share of the largest says that the data do not determine something.
-RANK_TOLERANCE = 1e-11
 COSINE_AT_MINIMUM = 1e-7
 STEP_AT_MINIMUM = 1e-10
+ROUNDING = 1e-10  # relative, of a sum of squares of small differences of large values
 
 
 @dataclass(frozen=True)
@@ -89,33 +90,6 @@ class LeastSquaresResult:
         return float(np.sqrt(np.mean(self.residual**2)))
 
 
-@dataclass(frozen=True)
-class _Factors:
-    """Scaled columns in factors: J = Q U diag(s) Vt diag(scale)."""
-
-    basis: NDArray[np.float64]
-    singular: NDArray[np.float64]
-    Vt: NDArray[np.float64]
-    scale: NDArray[np.float64]
-
-    @property
-    def rank(self) -> int:
-        return int(np.sum(self.singular > RANK_TOLERANCE * self.singular[0]))
-
-    @property
-    def condition(self) -> float:
-        return float(self.singular[0] / self.singular[-1]) if self.singular[-1] > 0 else float("inf")
-
-    def solve(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        keep = slice(self.rank)
-        x: NDArray[np.float64] = self.Vt[keep].T @ ((self.basis.T @ y)[keep] / self.singular[keep]) / self.scale
-        return x
-
-    def covariance(self) -> NDArray[np.float64]:
-        half = self.Vt.T / self.singular / self.scale[:, None]
-        return half @ half.T
-
-
 def solve_linear(
     A: NDArray[np.float64],
     y: NDArray[np.float64],
@@ -142,8 +116,8 @@ def solve_linear(
     NotObservableError
         If the columns are linearly dependent or fewer equations than parameters are given.
     """
-    factors = _factorise(A)
-    _require_full_rank(factors, names)
+    factors = factorise(A)
+    factors.require_full_rank(names)
     x = factors.solve(y)
     residual = y - A @ x
     x += factors.solve(residual)  # one refinement recovers the digits that ill-conditioned columns cost
@@ -234,76 +208,38 @@ def refine(
         r = residuals(x)
         J = jacobian(x)
         _require_finite(r, J)
-        factors = _factorise(J)
+        factors = factorise(J)
+        size = np.inf
         for _ in range(iterations):
             step = -factors.solve(r)
             x_new, r_new, tried = _halved(residuals, x, r, step)
             spent += tried
             if x_new is None or r_new is None:
                 break
-            small = np.all(np.abs(x_new - x) <= STEP_AT_MINIMUM * np.abs(x_new))
+            small = bool(np.all(np.abs(x_new - x) <= STEP_AT_MINIMUM * np.abs(x_new)))
+            size, before = float(np.linalg.norm(step * factors.scale)), size
+            stalled = size > 0.5 * before and r_new @ r_new >= (1.0 - ROUNDING) * (r @ r)
             x, r = x_new, r_new
             J = jacobian(x)
-            factors = _factorise(J)
-            if small:
+            factors = factorise(J)
+            if small or stalled:
                 break
-    _require_full_rank(factors, names)
+    factors.require_full_rank(names)
     return _result(x, r, J, factors, sigma=sigma, evaluations=spent)
-
-
-def complex_step_jacobian(function: Function) -> Function:
-    """Return the derivative of an analytic function, exact to rounding.
-
-    ``df/dx_j = Im f(x + i h e_j) / h`` with h = 1e-30; there is no difference, so nothing cancels
-    (Squire & Trapp, SIAM Review 40, 1998).
-
-    Parameters
-    ----------
-    function : callable
-        (p,) to (n,), analytic: no abs, no comparison of its argument.
-
-    Returns
-    -------
-    callable
-        (p,) to (n, p).
-    """
-
-    def jacobian(x: NDArray[np.float64]) -> NDArray[np.float64]:
-        columns = []
-        for j in range(len(x)):
-            moved = x.astype(complex)
-            moved[j] += 1j * COMPLEX_STEP
-            columns.append(np.imag(function(moved)) / COMPLEX_STEP)
-        return np.stack(columns, axis=1)
-
-    return jacobian
-
-
-def undetermined(J: NDArray[np.float64], names: Sequence[str]) -> list[str]:
-    """Return the names of the parameters that the columns of a Jacobian do not determine.
-
-    Parameters
-    ----------
-    J : (n, p) array
-    names : sequence of str
-
-    Returns
-    -------
-    list of str
-        Those with a part in the null space of the scaled columns.
-    """
-    return _undetermined(_factorise(J), names)
 
 
 def _halved(
     residuals: Function, x: NDArray[np.float64], r: NDArray[np.float64], step: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None, int]:
-    """Return the first of step, step/2, ... that lowers |r|, or None where none does."""
+    """Return the first of step, step/2, ... that lowers |r|, or None where none does.
+
+    Near the minimum the sum of squares is flat to rounding while the step still has digits: there it may stay the same.
+    """
     before = r @ r
     for tried in range(1, 31):
         x_new = x + step * 0.5 ** (tried - 1)
         r_new = residuals(x_new)
-        if r_new @ r_new < before:
+        if r_new @ r_new < before * (1.0 + (ROUNDING if tried == 1 else 0.0)):
             return x_new, r_new, tried
     return None, None, 30
 
@@ -316,39 +252,11 @@ def _require_finite(r: NDArray[np.float64], J: NDArray[np.float64]) -> None:
         )
 
 
-def _factorise(J: NDArray[np.float64]) -> _Factors:
-    scale = np.linalg.norm(J, axis=0)
-    scale[scale == 0] = 1.0
-    Q, R = np.linalg.qr(J / scale)
-    U, s, Vt = np.linalg.svd(R, full_matrices=J.shape[0] < J.shape[1])
-    singular = np.zeros(J.shape[1])
-    singular[: len(s)] = s
-    basis = np.zeros((J.shape[0], J.shape[1]))
-    basis[:, : len(s)] = Q @ U
-    return _Factors(basis, singular, Vt, scale)
-
-
-def _undetermined(factors: _Factors, names: Sequence[str]) -> list[str]:
-    null = factors.Vt[factors.rank :]
-    share = np.linalg.norm(null, axis=0) if len(null) else np.zeros(len(factors.scale))
-    return [name for name, part in zip(names, share, strict=True) if part > 1e-3]
-
-
-def _require_full_rank(factors: _Factors, names: Sequence[str] | None) -> None:
-    p = len(factors.scale)
-    if factors.rank < p:
-        missing = _undetermined(factors, names or [f"x[{j}]" for j in range(p)])
-        raise NotObservableError(
-            f"the data determine {factors.rank} of {p} parameters; not determined, or only in combination with each "
-            f"other: {', '.join(missing)}. Record motion that changes these independently, or fix some of them"
-        )
-
-
 def _result(
     x: NDArray[np.float64],
     r: NDArray[np.float64],
     J: NDArray[np.float64],
-    factors: _Factors,
+    factors: ScaledColumns,
     *,
     sigma: float | None,
     evaluations: int,

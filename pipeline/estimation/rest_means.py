@@ -51,6 +51,8 @@ def holdout_interval(recordings: Sequence[Recording], settings: Mapping[str, Any
 def split_rests(recording: Recording, every: int) -> RestSplit:
     """Find the rests of a recording and hold out every ``every``-th of those that are sound; 0 holds out none.
 
+    The middle one of each group of ``every`` is held out: the first and the last rest stay in the fit.
+
     Parameters
     ----------
     recording : Recording
@@ -63,7 +65,7 @@ def split_rests(recording: Recording, every: int) -> RestSplit:
     """
     rests = rests_from_table(recording) or find_rests(recording)
     sound = [rest for rest in rests if rest.accepted]
-    held = set(range(every - 1, len(sound), every)) if every else set()
+    held = set(range(every // 2, len(sound), every)) if every else set()
     return RestSplit(
         used=tuple(rest for i, rest in enumerate(sound) if i not in held),
         held_out=tuple(sound[i] for i in sorted(held)),

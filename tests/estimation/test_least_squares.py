@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.least_squares import complex_step_jacobian, refine, solve_linear, solve_nonlinear, undetermined
+from pipeline.estimation.complex_step import complex_step_jacobian
+from pipeline.estimation.least_squares import refine, solve_linear, solve_nonlinear
+from pipeline.estimation.scaled_columns import estimate_weights, factorise
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -47,7 +49,7 @@ def test_parameters_that_the_data_do_not_determine_are_named() -> None:
     A[:, 3] = 2.0 * A[:, 1]
     with pytest.raises(NotObservableError, match=r"3 of 4 parameters.*: bias_y, scale_y\."):
         solve_linear(A, A[:, 0], names=["bias_x", "bias_y", "scale_x", "scale_y"])
-    assert undetermined(A, ["a", "b", "c", "d"]) == ["b", "d"]
+    assert factorise(A).undetermined(["a", "b", "c", "d"]) == ["b", "d"]
 
 
 def test_a_column_of_zeros_is_named() -> None:
@@ -103,3 +105,10 @@ def test_a_search_cut_short_is_not_called_converged() -> None:
 def test_a_start_where_nothing_is_finite_is_refused() -> None:
     with pytest.raises(NotObservableError, match="not finite at the start"):
         refine(lambda x: np.log(x - 1.0), np.array([1.0]))
+
+
+def test_estimate_weights_are_those_of_the_weighted_normal_equations() -> None:
+    rng = np.random.default_rng(4)
+    A, weight = rng.normal(size=(12, 3)), rng.uniform(0.5, 2.0, 12)
+    W = np.diag(weight**2)
+    assert estimate_weights(A, weight) == pytest.approx(np.linalg.solve(A.T @ W @ A, A.T @ W), rel=1e-12)

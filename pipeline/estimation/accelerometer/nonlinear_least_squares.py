@@ -1,0 +1,242 @@
+"""Nine parameters of the accelerometer from the length of gravity (paper eqs 1 and 4; Sudsanguan 2019, 5.5-5.6).
+
+    u = T S (y - b),   minimise  sum_i w_i (|u_i| - G)^2
+
+with the bias b, the scale factors S and the unit lower triangular misalignment T: x of the sensor is x of the body, and
+its y lies in the plane of x and y, since the length of gravity says nothing of how the sensor is mounted. The
+orientations need not be known. See ``pipeline.estimation.accelerometer.magnitude`` for the equations.
+
+A misalignment that the orientations do not determine, as in six positions, is left at zero, and the result says so. On
+a table the errors of the rows are correlated by the bias wander, whose covariance is that of
+``pipeline.estimation.serial_noise``; by hand each rest is independent, its scatter beyond the noise included.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.errors import NotObservableError
+from pipeline.estimation.accelerometer.magnitude import (
+    COLUMNS,
+    MISALIGNMENT,
+    NAMES,
+    ROWS,
+    derivative_of,
+    fit_ellipsoid,
+)
+from pipeline.estimation.accelerometer.orientations import orientations_of, without
+from pipeline.estimation.sample_blocks import make_blocks
+from pipeline.estimation.scaled_columns import estimate_weights
+from pipeline.estimation.serial_noise import assess_noise, combine, prior_of
+from pipeline.records import SensorCalibration, StageResult
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.estimation.accelerometer.magnitude import Ellipsoid
+    from pipeline.estimation.accelerometer.orientations import Orientations
+    from pipeline.estimation.serial_noise import Prior, SerialNoise
+    from pipeline.records import Recording
+    from pipeline.signal.rests import Rest
+
+    Values = NDArray[np.float64]
+
+NAME = "nonlinear_least_squares"
+MISALIGNMENT_UNKNOWN = 0.05  # rad, standard uncertainty above which the rests do not determine a misalignment
+OUTLIER = 6.0  # robust standard deviations
+FEWEST_TO_JUDGE = 18  # rests, two a parameter
+OUTLIER_SHARE = 0.2
+
+
+def fit(
+    recordings: Sequence[Recording], previous: SensorCalibration | None, settings: Mapping[str, Any]
+) -> SensorCalibration:
+    """Fit bias, scale factors and misalignment of the accelerometer.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+        Rests in many orientations (role ``rests``), or a table's turns (role ``accelerometer``).
+    previous : SensorCalibration or None
+        The result of the stage before; only its stages are kept.
+    settings : mapping
+        Sections ``table`` (``gravity_g``), ``procedure`` (``holdout_every``) and ``sensor``.
+
+    Returns
+    -------
+    SensorCalibration
+
+    Raises
+    ------
+    CannotCalibrateError
+        If there is no recording for it.
+    NotObservableError
+        If the orientations are too few or too much alike.
+    """
+    gravity_g = float(settings["table"].get("gravity_g", 1.0))
+    orientations = orientations_of(recordings, settings)
+    found = _fit_determined(orientations, gravity_g)
+    while refused := _outlier(orientations, found):
+        orientations = without(orientations, refused)
+        found = _fit_determined(orientations, gravity_g)
+    covariance, freedom = _covariance(orientations, found, prior_of("accelerometer", recordings, settings))
+    result = StageResult(
+        name=NAME,
+        parameters=_parameters(found, covariance),
+        residual_rms=float(np.sqrt(np.mean(found.error**2))),
+        correction={"steps": [{"subtract": found.bias.tolist()}, {"matrix": found.matrix.tolist()}]},
+        details=_details(orientations, found, freedom),
+    )
+    place = np.zeros((12, 9))
+    place[[0, 1, 2, *(3 + 3 * ROWS + COLUMNS).tolist()], np.arange(9)] = 1.0
+    return SensorCalibration(
+        sensor="accelerometer",
+        bias=found.bias,
+        matrix=found.matrix,
+        stages=(*(previous.stages if previous else ()), result),
+        covariance=place @ covariance @ place.T,
+        degrees_of_freedom=freedom,
+        converged=found.fit.converged,
+    )
+
+
+def _fit_determined(orientations: Orientations, gravity_g: float) -> Ellipsoid:
+    """Fit bias, scale factors and those misalignments that the orientations determine."""
+    rows = len(orientations.mean)
+    if rows < 6:
+        raise NotObservableError(
+            f"{rows} orientations determine neither bias nor scale factors: {_left(orientations)}. Record rests in at "
+            "least 6 orientations, each axis up and down, or better in 24 that are spread evenly"
+        )
+    free = np.full(9, fill_value=True) if rows >= 9 else ~MISALIGNMENT
+    while True:
+        try:
+            found = fit_ellipsoid(orientations, gravity_g, free)
+        except NotObservableError as lack:
+            if not np.any(free & MISALIGNMENT):
+                raise NotObservableError(
+                    f"the {rows} orientations are too much alike: {lack.message} ({_left(orientations)}). Record rests "
+                    "with each axis up, down and level, spread evenly"
+                ) from lack
+            free = ~MISALIGNMENT
+            continue
+        uncertainty = np.where(MISALIGNMENT, found.standard_uncertainty, 0.0)
+        if np.max(uncertainty) <= MISALIGNMENT_UNKNOWN:
+            return found
+        free = free & (np.arange(9) != np.argmax(uncertainty))
+
+
+def _left(orientations: Orientations) -> str:
+    left_out, held_out = len(orientations.left_out), len(orientations.held_out)
+    return f"{left_out} rests were left out because the sensor moved, {held_out} are held out for validation"
+
+
+def _outlier(orientations: Orientations, found: Ellipsoid) -> dict[int, str]:
+    """Return the hand-held rest that contradicts the others most, if it does, with the reason."""
+    m, left_out = len(found.error), len(orientations.left_out)
+    if not orientations.by_hand or m < FEWEST_TO_JUDGE:
+        return {}
+    scaled = np.abs(found.weight * found.error)
+    limit = OUTLIER * 1.4826 * float(np.median(scaled)) * np.sqrt(m / (m - found.free.sum()))
+    worst = int(np.argmax(scaled))
+    if scaled[worst] <= limit or left_out >= OUTLIER_SHARE * (m + left_out):
+        return {}
+    off = 1e3 * found.error[worst]
+    return {worst: f"length of the specific force is off by {off:.2f} mg, over {OUTLIER:g} times the others' scatter"}
+
+
+def _covariance(orientations: Orientations, found: Ellipsoid, prior: Prior) -> tuple[Values, float]:
+    """Return the covariance of b and L (9, 9) and its degrees of freedom."""
+    covariance = np.zeros((9, 9))
+    free = np.ix_(found.free, found.free)
+    spare = found.fit.degrees_of_freedom
+    if orientations.by_hand or spare < 2:
+        covariance[free] = found.fit.covariance
+        known = found.between == 0.0  # then the noise within the rests says it all
+        return covariance, float(3 * np.sum(orientations.count - 1)) if known else float(spare)
+    covariance[free], freedom = _serial_covariance(orientations, found, prior)
+    return covariance, freedom
+
+
+def _serial_covariance(orientations: Orientations, found: Ellipsoid, prior: Prior) -> tuple[Values, float]:
+    """Return the covariance under white noise and bias wander, as the samples' own errors tell them.
+
+    The error of a sample is its noise along the direction of gravity, ``n^T L noise``, so that the estimate is linear
+    in the readings of each channel c with the weights ``J^+ (n^T L)_c``.
+    """
+    row, y, L = orientations.row, orientations.mean, found.matrix
+    u = (y - found.bias) @ L.T
+    along = (u / np.linalg.norm(u, axis=1, keepdims=True)) @ L
+    J = derivative_of(y, found.values)[:, found.free]
+    error = found.error[row] + np.einsum("ij,ij->i", along[row], orientations.reading() - y[row])
+    noise = assess_noise(np.repeat(error[:, None], 3, axis=1), J[row], make_blocks(orientations.parts), prior)
+    noise = _counted_once(noise, prior, float(np.sqrt(np.mean(error**2))))
+    per_sample = (estimate_weights(J, found.weight) / orientations.count)[:, row]
+    candidates = [noise.covariances(per_sample * along[row, c], c) for c in range(3)]
+    return combine(noise, np.sum(candidates, axis=0))
+
+
+def _counted_once(noise: SerialNoise, prior: Prior, white: float) -> SerialNoise:
+    """Return the noise with the likelihood of one channel, where three channels were the same error.
+
+    The weight of a candidate is ``likelihood^3 x prior x spacing of the grid``.
+    """
+    ratio = np.sqrt(noise.ratio)
+    other = np.array([prior.log_density(r * white) for r in ratio])
+    for time in np.unique(noise.time):
+        group = noise.time == time
+        if group.sum() > 1:
+            other[group] += np.log(np.gradient(np.log(ratio[group])))
+    once = (np.log(noise.weight) - other) / 3.0 + other
+    weight = np.exp(once - once.max())
+    return replace(noise, weight=weight / weight.sum())
+
+
+def _parameters(found: Ellipsoid, covariance: Values) -> dict[str, dict[str, Any]]:
+    """Return b, S and T with their uncertainties; ``L_ij = T_ij S_j``."""
+    S = np.diag(found.matrix)[COLUMNS]
+    diagonal = {int(i): 3 + k for k, (i, j) in enumerate(zip(ROWS, COLUMNS, strict=True)) if i == j}
+    J, values = np.eye(9), found.values.copy()
+    for k in np.flatnonzero(ROWS != COLUMNS):
+        values[3 + k] /= S[k]
+        J[3 + k, 3 + k], J[3 + k, diagonal[int(COLUMNS[k])]] = 1.0 / S[k], -values[3 + k] / S[k]
+    own = np.sqrt(np.clip(np.diag(J @ covariance @ J.T), 0.0, None))
+    units = ["g"] * 3 + ["1" if i == j else "rad" for i, j in zip(ROWS, COLUMNS, strict=True)]
+    return {
+        name: {"value": float(value), "unit": unit, "standard_uncertainty": float(u) if is_free else None}
+        for name, value, unit, u, is_free in zip(NAMES, values, units, own, found.free, strict=True)
+    }
+
+
+def _details(orientations: Orientations, found: Ellipsoid, freedom: float) -> dict[str, Any]:
+    return {
+        "orientations_used": len(orientations.mean),
+        "samples_used": int(orientations.count.sum()),
+        "rests_left_out": _described(orientations.left_out),
+        "rests_held_out": _described(orientations.held_out),
+        "fixed": [name for name, is_free in zip(NAMES, found.free, strict=True) if not is_free],
+        "white_noise": orientations.white,
+        "scatter_between_rests": found.between,
+        "largest_error": float(np.max(np.abs(found.error))),
+        "condition": found.fit.condition,
+        "cosine": found.fit.cosine,
+        "evaluations": found.fit.evaluations,
+        "degrees_of_freedom": freedom,
+    }
+
+
+def _described(pairs: Sequence[tuple[Recording, Rest]]) -> list[dict[str, Any]]:
+    return [
+        {
+            "recording": recording.name,
+            "time_s": float(recording.time[rest.start]),
+            "duration_s": float(recording.time[rest.stop - 1] - recording.time[rest.start]),
+            "reason": rest.reason,
+        }
+        for recording, rest in pairs
+    ]

@@ -1,0 +1,189 @@
+"""What recordings say of the length of gravity: mean readings of rests, and single readings of slow turns.
+
+A row is a mean reading ``y`` of ``n`` samples in one orientation:
+
+* hand-held rests, found by themselves; each is an orientation of its own, with an error of its own;
+* the dwells of a table's stop-and-go turns;
+* the single samples of a table's continuous turns (n = 1).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.errors import CannotCalibrateError
+from pipeline.estimation.rest_means import holdout_interval, rest_means, sound_samples, split_rests
+from pipeline.estimation.turns import stop_and_go, table_motion
+from pipeline.signal.rests import Rest, rests_from_table
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.records import Recording
+
+SMALLEST_NOISE = 1e-9  # g, keeps the weights of a noise-free recording finite
+
+
+@dataclass(frozen=True)
+class Orientations:
+    """Rows of mean readings.
+
+    Attributes
+    ----------
+    mean : (m, 3) array, g
+    count : (m,) array
+        Samples of each row.
+    white : float, g
+        Standard deviation of a raw sample about the mean of its row, averaged over the axes; 0 where no row has two.
+    parts : tuple of (Recording, (n,) array of bool)
+        The samples behind the rows, in order.
+    row : (k,) array of int
+        Row of each of these samples.
+    by_hand : bool
+        Whether every row is a hand-held rest.
+    rests : tuple of (Recording, Rest)
+        The rest behind each row, where all are rests of a hand-held recording.
+    held_out, left_out : tuple of (Recording, Rest)
+    """
+
+    mean: NDArray[np.float64]
+    count: NDArray[np.int64]
+    white: float
+    parts: tuple[tuple[Recording, NDArray[np.bool_]], ...]
+    row: NDArray[np.intp]
+    by_hand: bool
+    rests: tuple[tuple[Recording, Rest], ...]
+    held_out: tuple[tuple[Recording, Rest], ...]
+    left_out: tuple[tuple[Recording, Rest], ...]
+
+    @property
+    def variance(self) -> NDArray[np.float64]:
+        """Variance of each row's mean by white noise, an axis: (m,) array, g^2."""
+        return np.asarray(max(self.white, SMALLEST_NOISE) ** 2 / self.count)
+
+    def reading(self) -> NDArray[np.float64]:
+        """Return the samples behind the rows: (k, 3) array, g."""
+        readings = [np.asarray(recording.accelerometer)[keep] for recording, keep in self.parts]
+        return np.concatenate(readings)
+
+
+def orientations_of(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> Orientations:
+    """Collect the rows of all recordings made for the accelerometer.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+        Those of role ``rests`` and ``accelerometer`` are used.
+    settings : mapping
+        Sections ``table`` and ``procedure``.
+
+    Returns
+    -------
+    Orientations
+
+    Raises
+    ------
+    CannotCalibrateError
+        If no such recording holds readings of the accelerometer.
+    """
+    every = holdout_interval(recordings, settings)
+    chosen = [r for r in recordings if r.role in {"rests", "accelerometer"} and r.accelerometer is not None]
+    if not chosen:
+        raise CannotCalibrateError(
+            "nonlinear least squares needs the accelerometer at rest in many orientations, and no recording of role "
+            "rests or accelerometer holds its readings: record some 24 rests, each in another orientation"
+        )
+    used: list[tuple[Recording, Rest]] = []
+    held_out: list[tuple[Recording, Rest]] = []
+    left_out: list[tuple[Recording, Rest]] = []
+    by_hand = True
+    for recording in chosen:
+        on_table = _rests_on_table(recording, settings["table"])
+        if on_table is None:
+            split = split_rests(recording, every if recording.role == "rests" else 0)
+            used += [(recording, rest) for rest in split.used]
+            held_out += [(recording, rest) for rest in split.held_out]
+            left_out += [(recording, rest) for rest in split.left_out]
+        else:
+            by_hand = False
+            used += [(recording, rest) for rest in on_table]
+    return _rows(used, held_out, left_out, by_hand=by_hand)
+
+
+def without(orientations: Orientations, refused: Mapping[int, str]) -> Orientations:
+    """Return the rows of hand-held rests without some of them, which count as left out, each with its reason."""
+    keep = [pair for i, pair in enumerate(orientations.rests) if i not in refused]
+    gone = [
+        (recording, Rest(rest.start, rest.stop, accepted=False, reason=refused[i]))
+        for i, (recording, rest) in enumerate(orientations.rests)
+        if i in refused
+    ]
+    left_out = sorted([*orientations.left_out, *gone], key=lambda pair: (pair[0].name, pair[1].start))
+    return _rows(keep, orientations.held_out, left_out, by_hand=orientations.by_hand)
+
+
+def _rests_on_table(recording: Recording, table: Mapping[str, Any]) -> list[Rest] | None:
+    """Return the dwells of a recording on a table, single samples of a continuous one, or None without a table."""
+    motion = table_motion(recording, table) if recording.role == "accelerometer" else None
+    if motion is None:
+        return None
+    if stop_and_go(motion):
+        return rests_from_table(recording)
+    return [Rest(i, i + 1) for i in np.flatnonzero(sound_samples(recording, "accelerometer")).tolist()]
+
+
+def _rows(
+    used: Sequence[tuple[Recording, Rest]],
+    held_out: Sequence[tuple[Recording, Rest]],
+    left_out: Sequence[tuple[Recording, Rest]],
+    *,
+    by_hand: bool,
+) -> Orientations:
+    means, counts, parts, rows = [np.empty((0, 3))], [np.empty(0, np.int64)], [], [np.empty(0, np.intp)]
+    scatter, spare, first = 0.0, 0, 0
+    for recording in dict.fromkeys(id(r) for r, _ in used):
+        own = [(r, rest) for r, rest in used if id(r) == recording]
+        source, rests = own[0][0], [rest for _, rest in own]
+        mean, count = rest_means(source, rests)
+        keep, row = _samples(source, rests)
+        deviation = np.asarray(source.accelerometer)[keep] - mean[row]
+        gain = float(source.filter.get("noise_gain", 1.0)) or 1.0
+        scatter += float(np.sum(deviation**2)) / (3.0 * gain**2)
+        spare += int(np.sum(np.maximum(count - 1, 0)))
+        means.append(mean)
+        counts.append(count)
+        parts.append((source, keep))
+        rows.append(row + first)
+        first += len(rests)
+    mean, count, row = np.concatenate(means), np.concatenate(counts), np.concatenate(rows)
+    filled = count > 0
+    return Orientations(
+        mean=mean[filled],
+        count=count[filled],
+        white=float(np.sqrt(scatter / spare)) if spare else 0.0,
+        parts=tuple(parts),
+        row=(np.cumsum(filled) - 1)[row],
+        by_hand=by_hand,
+        rests=tuple(pair for pair, some in zip(used, filled, strict=True) if some) if by_hand else (),
+        held_out=tuple(held_out),
+        left_out=tuple(left_out),
+    )
+
+
+def _samples(recording: Recording, rests: Sequence[Rest]) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
+    """Return which samples of a recording belong to its rests, and the row of each of these."""
+    label = np.full(recording.samples, -1, np.intp)
+    edges = np.array([[rest.start, rest.stop] for rest in rests])
+    inside = np.zeros(recording.samples + 1, np.intp)
+    np.add.at(inside, edges[:, 0], 1)
+    np.add.at(inside, edges[:, 1], -1)
+    began = np.zeros(recording.samples, np.intp)
+    began[edges[:, 0]] = 1
+    label = np.cumsum(began) - 1
+    keep = (np.cumsum(inside[:-1]) > 0) & sound_samples(recording, "accelerometer")
+    return keep, label[keep]

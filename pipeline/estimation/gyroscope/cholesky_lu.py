@@ -1,0 +1,221 @@
+"""The gyroscope's matrix by the Cholesky and LU factors of integrated turns (paper eqs 2 and 5-12).
+
+    y - b = A u,   A = S T M
+
+where
+
+    y, b : reading and bias, deg/s; the bias comes from the stage before
+    u    : angular rate by the table, deg/s
+    S    : diagonal scale factors
+    T    : unit lower triangular, the non-orthogonality of the sensor's axes
+    M    : orthonormal, how the sensor is mounted
+
+Readings and reference are integrated over each turn (``pipeline.estimation.gyroscope.integrated_turns``); the angles
+are the columns of Y and U (deg), and
+
+    A = Y U^T (U U^T)^-1,   S T = chol(A A^T),   M = (S T)^-1 A
+
+Several turns about an axis, at several rates and in both directions, make A a least-squares estimate. The calibration
+matrix is ``A^-1``. As printed it is A: in Sudsanguan 2019, tables 5.25 and 5.26, the forward matrix is applied as if it
+were the correction.
+
+Y is linear in the readings, so the covariance of A under white noise and bias wander follows from that of
+``pipeline.estimation.serial_noise``, and that of S, T, M and ``A^-1`` from their derivatives with respect to A.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.errors import ConfigurationError
+from pipeline.estimation.gyroscope.integrated_turns import require_turns, turns_of
+from pipeline.estimation.least_squares import solve_linear
+from pipeline.estimation.sample_blocks import make_blocks
+from pipeline.estimation.serial_noise import assess_noise, combine, prior_of
+from pipeline.estimation.turns import parts_of
+from pipeline.records import AXES, SensorCalibration, StageResult
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.estimation.gyroscope.integrated_turns import Turns
+    from pipeline.estimation.serial_noise import SerialNoise
+    from pipeline.records import Recording
+
+    Values = NDArray[np.float64]
+
+NAME = "cholesky_lu"
+STEP = 1e-6
+
+
+@dataclass(frozen=True)
+class Factors:
+    """S, T and M of a forward matrix ``A = S T M``: (3,), (3, 3) and (3, 3) arrays."""
+
+    S: Values
+    T: Values
+    M: Values
+
+
+def fit(
+    recordings: Sequence[Recording], previous: SensorCalibration | None, settings: Mapping[str, Any]
+) -> SensorCalibration:
+    """Fit the matrix of the gyroscope to integrated turns.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+        Those of role ``gyroscope`` are used; each must log the table's motion.
+    previous : SensorCalibration
+        The result of the stage ``bias``.
+    settings : mapping
+        Sections ``table``, ``method`` (``as_printed``) and ``sensor``.
+
+    Returns
+    -------
+    SensorCalibration
+
+    Raises
+    ------
+    CannotCalibrateError
+        If no recording of the gyroscope logs the table's motion.
+    NotObservableError
+        If there is no turn about one of the axes.
+    ConfigurationError
+        If no stage before it estimated the bias.
+    """
+    if previous is None:
+        raise ConfigurationError(
+            "the stage cholesky_lu needs the bias: let the stage bias run before it (method.stages)"
+        )
+    turns = turns_of(parts_of(recordings, "gyroscope", settings["table"], "the Cholesky and LU method"))
+    Y, U = turns.integral(turns.reading - previous.bias), turns.integral(turns.rate)
+    require_turns(U)
+    A = np.array([solve_linear(U, Y[:, channel], sigma=1.0).x for channel in range(3)])
+    as_printed = bool(settings["method"].get("as_printed", False))
+    factors = factorise(A)
+    residuals = turns.reading - previous.bias - turns.rate @ A.T
+    design = np.column_stack([np.ones(len(turns.rate)), turns.rate])
+    prior = prior_of("gyroscope", recordings, settings)
+    noise = assess_noise(residuals, design, make_blocks(turns.parts), prior)
+    covariance, freedom = _covariance(turns, A, previous, noise, as_printed=as_printed)
+    matrix = _matrix(A, as_printed=as_printed)
+    result = StageResult(
+        name=NAME,
+        parameters=_parameters(factors, covariance),
+        residual_rms=_residual_rms(turns, previous.bias, matrix),
+        correction={"steps": [{"subtract": previous.bias.tolist()}, {"matrix": matrix.tolist()}]},
+        details={
+            "turns": len(U),
+            "turns_left_out": turns.left_out,
+            "samples_used": len(turns.reading),
+            "angle_error_rms_deg": _angle_errors(Y, U, matrix),
+            "orthonormality_error": float(np.max(np.abs(factors.M @ factors.M.T - np.eye(3)))),
+            "determinant_of_M": float(np.linalg.det(factors.M)),
+            "condition": float(np.linalg.cond(U / np.linalg.norm(U, axis=0))),
+            "degrees_of_freedom": freedom,
+        },
+    )
+    return SensorCalibration(
+        sensor="gyroscope",
+        bias=previous.bias,
+        matrix=matrix,
+        stages=(*previous.stages, result),
+        covariance=covariance[:12, :12],
+        degrees_of_freedom=freedom,
+    )
+
+
+def factorise(A: Values) -> Factors:
+    """Return S (positive), T (unit lower triangular) and M (orthonormal) with ``A = S T M``.
+
+    Parameters
+    ----------
+    A : (3, 3) array, not singular
+
+    Returns
+    -------
+    Factors
+    """
+    L = np.linalg.cholesky(A @ A.T)
+    S = np.diag(L).copy()
+    return Factors(S, L / S[:, None], np.linalg.solve(L, A))
+
+
+def _matrix(A: Values, *, as_printed: bool) -> Values:
+    return A if as_printed else np.asarray(np.linalg.solve(A, np.eye(3)))
+
+
+def _covariance(
+    turns: Turns, A: Values, previous: SensorCalibration, noise: SerialNoise, *, as_printed: bool
+) -> tuple[Values, float]:
+    """Return the covariance of bias, matrix, S, T and M (12 + 15) and its degrees of freedom."""
+    U = turns.integral(turns.rate)
+    scale = np.linalg.norm(U, axis=0)
+    inverse = np.linalg.pinv(U / scale) / scale[:, None]
+    inside = turns.turn >= 0
+    weights = np.zeros((4, len(turns.reading)))
+    weights[1:, inside] = inverse[:, turns.turn[inside]] * turns.weight[inside]
+    from_rests = bool(turns.rest.any())  # else the bias is that of another recording
+    lever = np.array([1.0, *(-weights[1:].sum(axis=1))])
+    if from_rests:
+        weights += lever[:, None] * np.where(turns.rest, 1.0 / turns.rest.sum(), 0.0)
+    total = np.zeros((len(noise.weight), 27, 27))
+    theta = np.column_stack([previous.bias, A])
+    for channel in range(3):
+        own = noise.covariances(weights, channel)
+        if not from_rests and previous.covariance is not None:
+            own = own + previous.covariance[channel, channel] * np.outer(lever, lever)
+        J = _derivative(theta, channel, as_printed=as_printed)
+        total += J @ own @ J.T
+    return combine(noise, total)
+
+
+def _derivative(theta: Values, channel: int, *, as_printed: bool) -> Values:
+    """Return the derivative of all results with respect to bias and row of A of one channel: (27, 4) array."""
+
+    def results(values: Values) -> Values:
+        A = values[:, 1:]
+        factors = factorise(A)
+        matrix = _matrix(A, as_printed=as_printed)
+        T = factors.T[np.tril_indices(3, -1)]
+        return np.concatenate([values[:, 0], matrix.ravel(), factors.S, T, factors.M.ravel()])
+
+    columns = []
+    for k in range(4):
+        up, down = theta.copy(), theta.copy()
+        up[channel, k] += STEP
+        down[channel, k] -= STEP
+        columns.append((results(up) - results(down)) / (2.0 * STEP))
+    return np.column_stack(columns)
+
+
+def _parameters(factors: Factors, covariance: Values) -> dict[str, dict[str, Any]]:
+    values = {f"S_{axis}": float(s) for axis, s in zip(AXES, factors.S, strict=True)}
+    values |= {f"T_{AXES[i]}{AXES[j]}": float(factors.T[i, j]) for i, j in zip(*np.tril_indices(3, -1), strict=True)}
+    values |= {f"M_{AXES[i]}{AXES[j]}": float(factors.M[i, j]) for i in range(3) for j in range(3)}
+    own = np.sqrt(np.clip(np.diag(covariance)[12:], 0.0, None))
+    return {
+        name: {"value": value, "unit": "1", "standard_uncertainty": float(u)}
+        for (name, value), u in zip(values.items(), own, strict=True)
+    }
+
+
+def _residual_rms(turns: Turns, bias: Values, matrix: Values) -> float:
+    rate = (turns.reading - bias) @ matrix.T
+    error = np.linalg.norm(rate, axis=1) - np.linalg.norm(turns.rate, axis=1)
+    return float(np.sqrt(np.mean(error**2)))
+
+
+def _angle_errors(Y: Values, U: Values, matrix: Values) -> list[list[float | None]]:
+    """Return the rms error of the integrated angles, deg: a row a turn axis, a column a sensor axis."""
+    error, about = Y @ matrix.T - U, np.argmax(np.abs(U), axis=1)
+    return [
+        [float(np.sqrt(np.mean(error[about == i, j] ** 2))) if np.any(about == i) else None for j in range(3)]
+        for i in range(3)
+    ]
