@@ -1,6 +1,6 @@
 """The true motion that a sensor feels in one recording: trajectory, place, mounting and timing.
 
-    f = g * up + [omega x (omega x r) + alpha x r] / 9.80665,   omega_sensed = omega + level^T Omega_earth
+    f = g up + [omega x (omega x r) + alpha x r] / 9.80665 + shaking,   omega_sensed = omega + level^T Omega_earth
 
 at the time that the sensor's clock really shows,
 
@@ -103,7 +103,9 @@ class Scene:
         gravity = self.gravity * (self.up @ pose.level)
         force = gravity
         if np.any(self.lever_arm):
-            force = gravity + lever_arm_force(pose, self.lever_arm)
+            force = force + lever_arm_force(pose, self.lever_arm)
+        if pose.force is not None:
+            force = force + pose.force
         omega = pose.omega if self.earth is None else pose.omega + self.earth @ pose.level
         rate = np.linalg.norm(pose.omega, axis=1)
         return Motion(

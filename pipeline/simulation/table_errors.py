@@ -10,7 +10,7 @@ about the axis ``u = (e + d) / |e + d|``, where
 C_k, D_k : commanded and true angle of stop k, deg: step quantisation, angle errors, lost steps (rate errors), backlash
 A, B     : encoder error (eccentricity), deg
 a, b     : rate ripple once a revolution: ``dtheta/dt = (1 + a cos phi + b sin phi) dphi/dt``, relative
-v(t)     : vibration while the table moves, ``V sin(2 pi f t)``, deg
+v(t)     : vibration while the table moves, ``V sin(2 pi f t)``, deg; with it goes a shaking of the plate, in g
 d        : error of the axis direction, rad, across the nominal axis e
 
 The true rate and acceleration are the derivatives of theta(t), by the chain rule. The Mark 2 table (Sudsanguan 2019,
@@ -48,6 +48,8 @@ class TurnErrors:
         Components of d along the two axes that follow the turn axis cyclically.
     vibration : float, deg
         Amplitude V.
+    shaking : float, g
+        Amplitude of the specific force that the vibration adds along each body axis, 120 deg apart in phase.
     vibration_frequency : float, Hz
     """
 
@@ -57,6 +59,7 @@ class TurnErrors:
     backlash: float = 0.0
     direction: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
     vibration: float = 0.0
+    shaking: float = 0.0
     vibration_frequency: float = 0.0
 
     def turn_axis(self, axis: int) -> NDArray[np.float64]:
@@ -65,6 +68,15 @@ class TurnErrors:
         u[[axis, (axis + 1) % 3, (axis + 2) % 3]] = 1.0, *self.direction
         unit: NDArray[np.float64] = u / np.linalg.norm(u)
         return unit
+
+    def force(self, program: Program, time: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """Return the specific force of the shaking plate: (n, 3) array, g, or None where it is quiet."""
+        if not self.shaking:
+            return None
+        phase = 2.0 * np.pi * (self.vibration_frequency * time[:, None] + np.arange(3) / 3.0)
+        moving = program.at(time)[1] != 0.0
+        shaken: NDArray[np.float64] = self.shaking * moving[:, None] * np.sin(phase)
+        return shaken
 
     def motion(
         self, program: Program, time: NDArray[np.float64]
@@ -144,7 +156,7 @@ def random_errors(program: Program, rng: np.random.Generator, settings: dict[str
     rng : Generator
     settings : dict
         ``angle_accuracy_deg``, ``rate_error`` (3,), ``step_deg``, ``ripple`` (relative amplitude),
-        ``direction_deg`` (3, 2), ``vibration_deg``, ``vibration_hz``; what is missing is 0.
+        ``direction_deg`` (3, 2), ``vibration_deg``, ``shaking_g``, ``vibration_hz``; what is missing is 0.
     axis : int
     """
     phase = rng.uniform(0.0, 2.0 * np.pi)
@@ -156,5 +168,6 @@ def random_errors(program: Program, rng: np.random.Generator, settings: dict[str
         ),
         direction=np.radians(np.asarray(settings.get("direction_deg", np.zeros((3, 2))), float)[axis]),
         vibration=settings.get("vibration_deg", 0.0),
+        shaking=settings.get("shaking_g", 0.0),
         vibration_frequency=settings.get("vibration_hz", 0.0),
     )

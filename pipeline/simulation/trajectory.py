@@ -13,7 +13,7 @@ A turn by A about the unit axis u (the same in body and level, since R_u u = u):
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -40,6 +40,8 @@ class Pose:
         About the turn axis.
     direction : (n, 3) array or None
         Unit vector of the turn that goes on or, at rest, of the last one; zeros before the first.
+    force : (n, 3) array or None, g, body frame
+        Specific force of a shaking plate, beside gravity.
     """
 
     level: NDArray[np.float64]
@@ -48,6 +50,7 @@ class Pose:
     angle: NDArray[np.float64] | None = None
     rate: NDArray[np.float64] | None = None
     direction: NDArray[np.float64] | None = None
+    force: NDArray[np.float64] | None = None
 
 
 def rotation_about(axis: NDArray[np.float64], angle_deg: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -96,7 +99,8 @@ class Turn:
         """Return the pose that the table really takes."""
         angle, rate, acceleration = self.errors.motion(self.program, time)
         move = self.program.at(time)[3]
-        return self._pose(self.errors.turn_axis(self.axis), angle, rate, acceleration, move)
+        pose = self._pose(self.errors.turn_axis(self.axis), angle, rate, acceleration, move)
+        return replace(pose, force=self.errors.force(self.program, time))
 
     def _pose(
         self,

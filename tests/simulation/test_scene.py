@@ -1,5 +1,7 @@
 """Exact geometry against physics worked out by hand, and against the linear columns of the catalogue at small sizes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from pipeline.simulation.alterations import ALTERATIONS, alter
 from pipeline.simulation.gimbals import random_gimbals
 from pipeline.simulation.program import ProgramBuilder
 from pipeline.simulation.scene import STANDARD_GRAVITY, Scene
+from pipeline.simulation.table_errors import TurnErrors
 from pipeline.simulation.trajectory import Turn
 
 SIZES = {
@@ -104,3 +107,17 @@ def test_exact_geometry_agrees_with_the_columns_of_the_catalogue_at_small_sizes(
 def test_errors_of_a_turn_leave_other_motions_alone() -> None:
     scene = Scene(random_gimbals(60.0, 40.0, np.random.default_rng(2)))
     assert alter(scene, {"table_encoder_error": np.ones(6), "table_backlash": np.ones(3)}) is scene
+
+
+def test_a_shaking_plate_is_felt_while_it_turns_only() -> None:
+    scene = turn_scene()
+    shaken = replace(
+        scene, trajectory=replace(scene.trajectory, errors=TurnErrors(shaking=0.05, vibration_frequency=7.3))
+    )
+    time = np.arange(0.0, 12.0, 0.01)
+    plain, motion = scene.motion(time), shaken.motion(time)
+    added = motion.specific_force - plain.specific_force
+    moving = plain.rate != 0.0
+    assert np.all(added[~moving] == 0.0)
+    np.testing.assert_allclose(np.std(added[moving], axis=0), 0.05 / np.sqrt(2.0), rtol=0.02)
+    np.testing.assert_array_equal(motion.angular_rate, plain.angular_rate)
