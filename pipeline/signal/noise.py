@@ -4,7 +4,8 @@
 
 It is pinned by the first of these that there is:
 
-1. ``static``: a long rest. Temperature and warm-up, which would pass for wander, are regressed out.
+1. ``static``: a long rest. Temperature and warm-up, which would pass for wander, are regressed out. The scatter within
+   the rests of the other recordings joins in for the white noise, where it agrees.
 2. ``rests``: the rests of the other recordings, each with a mean of its own.
 3. ``residual``: short windows of turns, less a local polynomial: white noise alone. With P the projection that removes
    the polynomial and R the autocovariance of the filter, ``median(|P y|^2) = white^2 tr(P R) (1 - 2/(9 nu))^3``, where
@@ -29,7 +30,7 @@ from pipeline.signal.allan import allan_deviation
 from pipeline.signal.filters import apply_filter
 from pipeline.signal.rests import CLIPPED_OR_STUCK, find_rests, rests_from_table, runs
 from pipeline.signal.temperature import smooth_temperature
-from pipeline.signal.wander import RATIOS, Blocks, Likelihood, blocks_of, likelihood
+from pipeline.signal.wander import RATIOS, Blocks, Likelihood, blocks_of, likelihood, variance_of_mean, with_scatter
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -68,10 +69,12 @@ def estimate_noise(sensor: str, recordings: list[Recording], data_sheet: dict[st
     """
     usable = [r for r in recordings if r.role != "validation" and r.reading(sensor) is not None and r.samples > 1]
     static = [r for r in usable if r.role == "static"]
-    for source, chosen in (("static", static), ("rests", [r for r in usable if r.role != "static"])):
-        rests = [rest for r in chosen for rest in _rests(r, sensor, everything=source == "static")]
-        if sum(len(time) for time, _ in rests) >= FEWEST_SAMPLES:
-            return _noise_of_rests(rests, chosen, data_sheet, source)
+    rests = [rest for r in usable if r.role != "static" for rest in _rests(r, sensor, everything=False)]
+    long_rests = [rest for r in static for rest in _rests(r, sensor, everything=True)]
+    for source, found, more in (("static", long_rests, rests), ("rests", rests, [])):
+        if sum(len(time) for time, _ in found) >= FEWEST_SAMPLES:
+            chosen = static if source == "static" else usable
+            return _noise_of_rests(found, more, chosen, data_sheet, source)
     white = _white_of_turns(usable, sensor)
     return _with_sheet_wander(white, data_sheet, "residual") if white is not None else _of_sheet(usable, data_sheet)
 
@@ -127,15 +130,19 @@ def _rests(recording: Recording, sensor: str, *, everything: bool) -> list[Rest]
     return [(recording.time[a:b], values[a:b]) for a, b in _stretches(recording, still) if b - a > 2]
 
 
-def _noise_of_rests(rests: list[Rest], chosen: list[Recording], sheet: dict[str, Any], source: str) -> Noise:
+def _noise_of_rests(
+    rests: list[Rest], more: list[Rest], chosen: list[Recording], sheet: dict[str, Any], source: str
+) -> Noise:
     covariance = filter_autocovariance(chosen[0])
     memory = int(np.searchsorted(-np.abs(covariance), -0.01 * covariance[0]))
-    blocks = blocks_of(rests, max(SHORTEST_BLOCK, 4 * memory))
+    shortest = max(SHORTEST_BLOCK, 4 * memory)
+    blocks = blocks_of(rests, shortest)
+    if more and len(covariance) == 1:  # a filter still settles in a short rest after a move
+        blocks = with_scatter(blocks, blocks_of(more, shortest))
     passed = (2.0 * covariance.sum() - covariance[0]) > 0.5  # at 0 Hz; a high-pass lets no wander through
     if blocks.cut.sum() - len(np.unique(blocks.rest[blocks.cut])) < 3 or not passed:
-        counts = blocks.count
-        from_scatter = blocks.scatter / max(float(np.sum(counts - 1)) * covariance[0], 1e-300)
-        return _with_sheet_wander(np.sqrt(from_scatter), sheet, source)
+        expected = np.sum(blocks.count * (covariance[0] - variance_of_mean(covariance, blocks.count)))
+        return _with_sheet_wander(np.sqrt(blocks.scatter / max(float(expected), 1e-300)), sheet, source)
     found = likelihood(blocks, _nuisance(blocks, chosen, source), covariance, TIMES * _wander_time(sheet))
     return _best(found, sheet, source)
 

@@ -23,7 +23,7 @@ Sources: Patterson & Thompson, Biometrika 58, 1971; for the block averages, IEEE
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -102,6 +102,32 @@ def blocks_of(rests: list[tuple[NDArray[np.float64], NDArray[np.float64]]], shor
     scatter = np.maximum(np.sum(values * values, axis=0) - np.sum(counts[:, None] * mean * mean, axis=0), 0.0)
     length = (time[first + counts - 1] - time[first]) * counts / np.maximum(counts - 1, 1)
     return Blocks(time[first], length, counts, mean, rest, pieces[rest] > 1, scatter)
+
+
+def with_scatter(blocks: Blocks, more: Blocks) -> Blocks:
+    """Return the blocks with the scatter of others added where it agrees with theirs; nothing else of them counts.
+
+    Scatters agree where the estimates of white noise differ by less than 3 standard deviations on every axis.
+    """
+    nu = np.array([np.sum(b.count - 1) for b in (blocks, more)], float)
+    if np.any(nu < 1) or np.any(blocks.scatter == 0) or np.any(more.scatter == 0):
+        return blocks
+    log_ratio = np.log(blocks.scatter / nu[0]) - np.log(more.scatter / nu[1])
+    if np.any(np.abs(log_ratio) > 3.0 * np.sqrt(2.0 / nu[0] + 2.0 / nu[1])):
+        return blocks
+
+    def joined(name: str) -> NDArray[Any]:
+        return np.concatenate([getattr(blocks, name), getattr(more, name)])
+
+    return Blocks(
+        start=joined("start"),
+        length=joined("length"),
+        count=joined("count"),
+        mean=joined("mean"),
+        rest=np.concatenate([blocks.rest, blocks.rest.max() + 1 + more.rest]),
+        cut=np.concatenate([blocks.cut, np.zeros(len(more.cut), bool)]),
+        scatter=blocks.scatter + more.scatter,
+    )
 
 
 def variance_of_mean(covariance: NDArray[np.float64], count: NDArray[np.int64]) -> NDArray[np.float64]:

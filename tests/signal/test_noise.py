@@ -112,6 +112,25 @@ def test_rests_of_stop_and_go_give_white_noise_without_the_shaking_of_the_moves(
     assert np.mean([n.white for n in noises]) == pytest.approx(WHITE, rel=0.02)
 
 
+def test_rests_of_other_recordings_sharpen_the_white_noise_of_a_short_static_one() -> None:
+    alone, together = [], []
+    for seed in range(40):
+        static = rest(200, 0.0, 1000 + seed)
+        alone.append(estimate_noise("accelerometer", [static], NO_WANDER).white)
+        both = estimate_noise("accelerometer", [static, stop_and_go(seed)], NO_WANDER)
+        together.append(both.white)
+        assert both.source == "static"
+    assert np.std(together) < 0.6 * np.std(alone)
+    assert np.mean(together) == pytest.approx(WHITE, rel=0.01)
+
+
+def test_rests_that_shake_do_not_join_the_static_recording() -> None:
+    shaken = stop_and_go(0)
+    shaken = replace(shaken, accelerometer=3.0 * shaken.accelerometer)
+    white = estimate_noise("accelerometer", [rest(3000, 0.0, 0), shaken], NO_WANDER).white
+    assert white == pytest.approx(estimate_noise("accelerometer", [rest(3000, 0.0, 0)], NO_WANDER).white)
+
+
 @pytest.mark.parametrize("name", ["none", "rc"])
 @pytest.mark.parametrize("rate", [1.0, 10.0, 30.0])
 def test_continuous_turns_without_a_rest_give_white_noise_from_their_high_frequencies(name: str, rate: float) -> None:
