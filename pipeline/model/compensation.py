@@ -107,12 +107,18 @@ class CompensationStream:
     _state: LogState = field(init=False)
     _effects: dict[str, list[FittedEffect]] = field(init=False)
     _used: dict[str, set[str]] = field(init=False)
+    _signals: dict[str, dict[str, set[str]]] = field(init=False)
 
     def __post_init__(self) -> None:
         """Find out once what the effects need."""
         known = {s: self.compensation.calibration(s) for s in SENSORS}
         self._effects = {s: [] if c is None else sensor_effects(c) for s, c in known.items()}
-        self._used = {s: fields_used(s, effects) for s, effects in self._effects.items()}
+        looked_at = {s: {e.name: fields_used(s, [e]) for e in effects} for s, effects in self._effects.items()}
+        self._used = {s: set().union(*of.values()) for s, of in looked_at.items()}
+        self._signals = {
+            s: {name: set().union(*(SIGNALS[f] for f in used)) for name, used in of.items()}
+            for s, of in looked_at.items()
+        }
         self._state = LogState(LineThroughThePast(self.smoothing))
 
     def apply(
@@ -153,12 +159,11 @@ class CompensationStream:
         for sensor in SENSORS:
             if sensor not in arrays:
                 continue
-            for fitted in self._effects[sensor]:
-                signals = set().union(*(SIGNALS[f] for f in fields_used(sensor, [fitted])))
+            for name, signals in self._signals[sensor].items():
                 missing = sorted(signals - set(arrays))
                 if missing:
                     raise InputError(
-                        f"the {sensor} of unit {self.compensation.unit} was calibrated with the effect {fitted.name}, "
+                        f"the {sensor} of unit {self.compensation.unit} was calibrated with the effect {name}, "
                         f"which needs {' and '.join(missing)}: give that too, or calibrate without the effect"
                     )
 
