@@ -44,6 +44,7 @@ NEIGHBOURS = 5
 RATE_LIMIT_DPS = 0.7
 TURN_LIMIT_DEG = 2.0
 SCATTER_LIMIT = 3.0
+SMALLEST_SCATTER_G2 = 3e-6  # 1 mg on each axis, so that a quiet sensor may settle by 0.1 deg
 SIGNIFICANT = 6.0  # standard deviations
 
 
@@ -160,7 +161,7 @@ def assess_rests(recording: Recording, intervals: Sequence[tuple[int, int]], noi
     list of Rest
     """
     rests = [Rest(start, stop) for start, stop in intervals]
-    reasons = [_scatter(recording, r, noise_variance) or _turn(recording, r) for r in rests]
+    reasons = [_turn(recording, r) or _scatter(recording, r, noise_variance) for r in rests]
     rates = _rate_reasons(recording, rests)
     return [
         replace(rest, accepted=not reason, reason=reason)
@@ -212,7 +213,7 @@ def _plateau(counts: Sequence[int]) -> int:
 def _scatter(recording: Recording, rest: Rest, noise_variance: float) -> str:
     assert recording.accelerometer is not None  # noqa: S101
     variance = float(np.var(recording.accelerometer[rest.start : rest.stop], axis=0).sum())
-    ratio = np.sqrt(variance / noise_variance)
+    ratio = np.sqrt(variance / max(noise_variance, SMALLEST_SCATTER_G2))
     if ratio <= SCATTER_LIMIT:
         return ""
     return f"specific force scatters {ratio:.1f} times the noise (limit {SCATTER_LIMIT:g})"

@@ -155,11 +155,15 @@ def _covariance(orientations: Orientations, found: Ellipsoid, prior: Prior) -> t
     covariance = np.zeros((9, 9))
     free = np.ix_(found.free, found.free)
     spare = found.fit.degrees_of_freedom
-    if orientations.by_hand or spare < 2:
-        covariance[free] = found.fit.covariance
-        known = found.between == 0.0  # then the noise within the rests says it all
-        return covariance, float(3 * np.sum(orientations.count - 1)) if known else float(spare)
-    covariance[free], freedom = _serial_covariance(orientations, found, prior)
+    if not orientations.by_hand and spare > 1:
+        covariance[free], freedom = _serial_covariance(orientations, found, prior)
+    elif found.between > 0.0:
+        covariance[free], freedom = found.fit.covariance, float(spare)
+    else:  # the rests show no scatter of their own, or are too few to: what is believed of the bias wander stands in
+        J = derivative_of(orientations.mean, found.values)[:, found.free]
+        gain = estimate_weights(J, found.weight)
+        covariance[free] = gain * (orientations.variance + prior.wander**2) @ gain.T
+        freedom = float(3 * np.sum(orientations.count - 1))
     return covariance, freedom
 
 
