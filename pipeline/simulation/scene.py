@@ -13,8 +13,8 @@ r      : (3,) position of the accelerometer from the turn axes, m, body frame
 tau    : time offset, s: the reading at t shows the motion at t + tau
 epsilon : relative error of the sensor's clock
 
-A lag is a first-order low pass of what the sensor feels, ``y(t) = integral_0^inf exp(-s) u(t - lag s) ds``, by
-Gauss-Laguerre quadrature, which needs no state since the trajectory is known at any time.
+A lag is a first-order low pass of what the sensor feels, ``y(t) = integral_0^inf exp(-s) u(t - lag s) ds``, by Gauss'
+rule on short panels: the corners of a ramp lie anywhere in the past, and no smooth rule would follow them.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ if TYPE_CHECKING:
     from pipeline.simulation.trajectory import Pose
 
 STANDARD_GRAVITY = 9.80665
-QUADRATURE_NODES = 24
+# Edges of the panels in s: beyond 20 time constants nothing is left.
+PANELS = np.concatenate([np.linspace(0.0, 2.0, 21), np.linspace(2.25, 6.0, 16), np.linspace(7.0, 20.0, 14)])
 
 
 class Trajectory(Protocol):
@@ -89,7 +90,7 @@ class Scene:
         shown = time + self.offset + self.clock * time
         felt = self._felt(shown, temperature)
         if self.lag > 0.0:
-            nodes, weights = np.polynomial.laguerre.laggauss(QUADRATURE_NODES)
+            nodes, weights = lag_rule()
             past = [self._felt(shown - self.lag * node, None) for node in nodes]
             names = ("specific_force", "angular_rate", "angular_acceleration", "specific_force_rate")
             felt = replace(
@@ -122,6 +123,14 @@ class Scene:
             level=pose.level,
             direction=pose.direction,
         )
+
+
+def lag_rule() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return nodes s and weights of the integral of ``exp(-s) u(s)``, two a panel: (m,) arrays; weights sum to 1."""
+    middle, half = (PANELS[1:] + PANELS[:-1]) / 2.0, np.diff(PANELS) / 2.0
+    nodes = np.concatenate([middle - half / np.sqrt(3.0), middle + half / np.sqrt(3.0)])
+    weights = np.tile(half, 2) * np.exp(-nodes)
+    return nodes, weights / weights.sum()
 
 
 def lever_arm_force(pose: Pose, r: NDArray[np.float64]) -> NDArray[np.float64]:
