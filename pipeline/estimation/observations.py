@@ -86,15 +86,18 @@ class Rows:
             still=motion.still[self.kept[self.first]],
             followed=None,
             at_offset=None if trajectory is None else partial(self._at, trajectory),
+            at_lag=None if motion.at_lag is None else partial(self._at, motion.at_lag),
         )
 
-    def _at(self, trajectory: Callable[..., Motion | None], offset: float | NDArray[np.float64] = 0.0) -> Motion:
+    def _at(
+        self, trajectory: Callable[..., Motion | None], offset: float | NDArray[np.float64] = 0.0, **lag: float
+    ) -> Motion:
         """Return the motion at the rows' samples shifted in time; ``offset`` is that of the rows."""
         if isinstance(offset, np.ndarray):
             samples = np.zeros(self.total)
             samples[self.kept] = np.repeat(offset, self.count.astype(int))
             offset = samples
-        motion = trajectory(offset=offset)
+        motion = trajectory(offset=offset, **lag)
         assert motion is not None  # noqa: S101
         return self.motion(motion)
 

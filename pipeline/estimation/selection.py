@@ -40,8 +40,10 @@ GATE_P = 0.01
 MOST = 5
 INFLATED = 3.0
 MOVER_SHARE = 0.1  # of the best candidate's delta BIC above which an effect of timing is fitted to its own optimum
-PREFERRED = ("time_offset", "low_pass_lag")  # of look-alikes the first is taken unless the second is clearly better
+DELAYS = ("time_offset", "low_pass_lag")  # of the two the first is taken unless the second is clearly better
 CLEARLY = 6.0
+TIE = 0.5
+SECOND = {"accelerometer": (), "gyroscope": ("table_encoder_error",)}  # exact look-alikes of a likelier effect
 
 
 @dataclass
@@ -124,7 +126,8 @@ def candidates_for(observations: Observations, configured: Sequence[str]) -> lis
             continue
         if any(this.available(part.motion) for part in observations.parts):
             found.append(this)
-    return sorted(found, key=lambda e: (e.name in PREFERRED[1:], e.name))
+    second = SECOND[observations.sensor]
+    return sorted(found, key=lambda e: (e.name in second, e.name))
 
 
 def select(
@@ -245,9 +248,7 @@ class _Search:
     def _refined(self, score: Score) -> Score:
         """Return the score of a candidate of timing at its own optimum."""
         this = effect(score.name)
-        start = (
-            np.maximum(score.values, this.starts(self.observations.sensor)[0]) if this.name in PREFERRED[1:] else None
-        )
+        start = np.maximum(score.values, this.starts(self.observations.sensor)[0]) if this.name == DELAYS[1] else None
         term = Term(this, score.values if start is None else start)
         fit = fit_terms(self.observations, [*self.fit.terms, term], self.start, self.settings)
         before, _ = self.ranking.of_model(self._selected(self.names))
@@ -272,19 +273,23 @@ class _Search:
 
     def _best(self, scores: Sequence[Score]) -> Score | None:
         """Return the candidate to accept; of two within the gate of each other a plausible one goes first."""
-        passing = [
-            s
-            for s in scores
-            if s.admissible and s.delta_bic > GATE_BIC and s.p_value * len(self.effects) < GATE_P and _real(s)
-        ]
-        if not passing:
+        worth = {s.name: s.delta_bic - (0.0 if s.plausible else GATE_BIC) for s in scores if self._passes(s)}
+        if not worth:
             return None
-        best = max(passing, key=lambda s: s.delta_bic - (0.0 if s.plausible else GATE_BIC))
-        if best.name == PREFERRED[1]:
-            first = next((s for s in passing if s.name == PREFERRED[0]), None)
-            if first is not None and first.delta_bic > best.delta_bic - CLEARLY:
-                return first
-        return best
+        best = max(worth, key=lambda name: worth[name])
+        if best == DELAYS[1] and worth.get(DELAYS[0], 0.0) > worth[best] - CLEARLY:
+            best = DELAYS[0]
+        tied = [e.name for e in self.effects if worth.get(e.name, 0.0) > worth[best] - TIE]
+        name = best if best in DELAYS else tied[0]
+        return next(s for s in scores if s.name == name)
+
+    def _passes(self, score: Score) -> bool:
+        """Return whether a candidate passes the gate; a lag cannot be negative, nor be told beside a delay."""
+        if score.name in DELAYS and any(name in DELAYS for name in self.names):
+            return False
+        real = score.name != DELAYS[1] or score.values[0] > 0
+        significant = score.delta_bic > GATE_BIC and score.p_value * len(self.effects) < GATE_P
+        return bool(score.admissible and significant and real)
 
     def _refit(self, names: Sequence[str]) -> None:
         """Fit configured and selected effects together and rebuild the candidates there."""
@@ -308,7 +313,7 @@ class _Search:
 
     def _drop(self) -> None:
         for name in list(self.names[:-1]):
-            if self._own(name) < 0.0:
+            if not effect(name).moves and self._own(name) < 0.0:
                 self.names.remove(name)
                 del self.steps[name]
                 self.fit = replace(self.fit, terms=tuple(t for t in self.fit.terms if t.effect.name != name))
@@ -366,8 +371,3 @@ class _Search:
         if all(s.admissible and s.delta_bic > GATE_BIC and s.p_value * tried < GATE_P for s in scores):
             self.names = names
             self.steps = dict(zip(names, scores, strict=True))
-
-
-def _real(score: Score) -> bool:
-    """Return whether a lag is not negative, which would be a reading ahead of the motion."""
-    return score.name != PREFERRED[1] or bool(score.values[0] > 0)

@@ -106,7 +106,7 @@ def cells_of(observations: Observations) -> Cells:
 
 def settings_for(
     noise: Noise | None,
-    ratios: Sequence[float] = (0.03, 0.1, 0.3, 1.0),
+    ratios: Sequence[float] = (0.03, 0.1, 0.3, 1.0, 3.0),
     times: Sequence[float] = (60.0, 600.0),
 ) -> list[Setting]:
     """Return the noise settings over which the likelihood is maximised.

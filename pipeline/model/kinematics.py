@@ -40,6 +40,7 @@ EARTH_RATE_DPS = 360.0 / 86164.0905
 UP_AT_ZERO = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
 # Rows: level x, y, z axes in the body frame at table angle 0, for turns about x, y, z.
 LEVEL_AT_ZERO = np.array([np.eye(3), np.eye(3), [[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]])
+NODES, WEIGHTS = np.polynomial.laguerre.laggauss(4)  # of integrals of exp(-x) u(x), for the lag of smooth signals
 
 
 def earth_rate(latitude_deg: float, azimuth_deg: float) -> NDArray[np.float64]:
@@ -122,11 +123,16 @@ def _turn(  # noqa: PLR0917  (bound one by one for the motion at an offset)
     still: NDArray[np.bool_],
     temperature: NDArray[np.float64] | None,
     offset: float | NDArray[np.float64] = 0.0,
+    lag: float = 0.0,
 ) -> Motion:
     angle, rate, acceleration = log.angle, log.rate, log.acceleration
     if np.any(offset):
         angle, rate, acceleration = log.at(log.time + offset)
-    level = np.stack([turn_about_axis(row, axis, -angle) for row in LEVEL_AT_ZERO[axis]], axis=1)
+    level = _level(axis, angle)
+    if lag > 0.0:
+        rate, acceleration = log.lagged(log.time + offset, lag)
+        past = [_level(axis, log.at(log.time + offset - lag * node)[0]) for node in NODES]
+        level = np.tensordot(WEIGHTS, np.array(past), 1)
     force = gravity_g * level[:, 2, :]
     omega, alpha = np.zeros_like(force), np.zeros_like(force)
     omega[:, axis], alpha[:, axis] = rate, acceleration
@@ -145,9 +151,15 @@ def _turn(  # noqa: PLR0917  (bound one by one for the motion at an offset)
         axis=axis,
         still=still,
         at_offset=partial(_turn, log, axis, gravity_g, earth, still, temperature),
+        at_lag=partial(_turn, log, axis, gravity_g, earth, still, temperature),
         level=level,
         followed=log.followed_samples,
     )
+
+
+def _level(axis: int, angle: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the level axes in the body frame, as rows: (n, 3, 3) array."""
+    return np.stack([turn_about_axis(row, axis, -angle) for row in LEVEL_AT_ZERO[axis]], axis=1)
 
 
 def _motion_of_attitude(

@@ -114,6 +114,44 @@ class TurnLog:
             angle[smooth], rate[smooth], acceleration[smooth] = self._quintic(k[smooth], x[smooth])
         return angle, rate, acceleration
 
+    def lagged(self, time: Values, lag: float) -> tuple[Values, Values]:
+        """Return the rate (deg/s) that a first-order lag shows, and its derivative (deg/s^2), at any times.
+
+        A stretch ``r + a x`` leaves ``r + a (x - lag) + (L - r + a lag) exp(-x / lag)`` of what was shown before, L.
+
+        Parameters
+        ----------
+        time : (n,) array, s
+        lag : float, s
+            Time constant, above 0.
+        """
+        through = np.zeros(len(self.time))
+        gain = np.zeros(len(self.time))
+        through[0] = self.rate[0]
+        everything = np.arange(len(self._step))
+        through[1:], gain[1:] = self._lag_step(everything, self._step, lag)
+        shown = through.copy()
+        for _ in range(len(shown)):  # each pass hands on what was shown one sample further; its weight dies out
+            following = through + gain * np.concatenate([[0.0], shown[:-1]])
+            settled = np.array_equal(following, shown)
+            shown = following
+            if settled:
+                break
+        k = np.clip(np.searchsorted(self.time, time, side="right") - 1, 0, len(self._step) - 1)
+        x = np.maximum(time - self.time[k], 0.0)
+        through, gain = self._lag_step(k, x, lag)
+        value = through + gain * shown[k]
+        return value, (self._piecewise(k, x)[1] - value) / lag
+
+    def _lag_step(self, k: NDArray[np.intp], x: Values, lag: float) -> tuple[Values, Values]:
+        """Return what a lag shows at x into intervals: a part of its own, and the factor on what it showed before."""
+        a, b, s = self._before[k], self._after[k], self._bend[k]
+        first, second = np.minimum(x, s), np.maximum(x - s, 0.0)
+        fade, fade_after = np.exp(-first / lag), np.exp(-second / lag)
+        middle = self.rate[k] + a * first
+        own = middle - a * lag + (a * lag - self.rate[k]) * fade
+        return middle + b * (second - lag) + (own - middle + b * lag) * fade_after, fade * fade_after
+
     def _piecewise(self, k: NDArray[np.intp], x: Values) -> tuple[Values, Values, Values]:
         a, b, s = self._before[k], self._after[k], self._bend[k]
         past = np.maximum(x - s, 0.0)

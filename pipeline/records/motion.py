@@ -35,6 +35,8 @@ class Motion:
     at_offset : callable or None
         ``at_offset(offset=tau)`` is the motion at ``time + tau`` (tau a float or (n,) array, s), from the same
         interpolated trajectory; None where the trajectory is not known between the samples.
+    at_lag : callable or None
+        ``at_lag(lag=tau, offset=0.0)`` is what a first-order lag of time constant tau, s, leaves of that motion.
     level : (n, 3, 3) array, or None
         Rows: the level frame's axes x, y, z in the body frame; None where no reference gives the heading.
     direction : (n, 3) array, or None
@@ -55,6 +57,7 @@ class Motion:
     axis: int | None
     still: NDArray[np.bool_]
     at_offset: Callable[..., Motion | None] | None = None
+    at_lag: Callable[..., Motion | None] | None = None
     level: NDArray[np.float64] | None = None
     direction: NDArray[np.float64] | None = None
     followed: NDArray[np.bool_] | None = None

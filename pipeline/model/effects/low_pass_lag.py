@@ -3,7 +3,8 @@
     reading(t) = model(u'),    u'(t) = integral_0^inf exp(-s / tau) / tau u(t - s) ds,    z = K [u'(t) - u(t)]
 
 where tau is the time constant of the filter, s (0 and more), u the truth, g or deg/s, and K the inverse of the
-calibration matrix. The integral is a Gauss-Laguerre sum, exact where u is a polynomial of degree 7 in time.
+calibration matrix. A turn's rate is taken through the lag exactly; other signals by a Gauss-Laguerre sum, which is
+exact where they are polynomials of degree 7 in time.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from pipeline.records import Motion
 
 NODES, WEIGHTS = np.polynomial.laguerre.laggauss(4)
+STEP_S = 1e-5
 
 
 class LowPassLag(Effect):
@@ -54,10 +56,12 @@ class LowPassLag(Effect):
     def regressors(
         self, sensor: str, motion: Motion, K: NDArray[np.float64], values: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return ``K du'/dtau``."""
-        slope = np.zeros_like(motion.specific_force)
-        for node, weight in zip(NODES, WEIGHTS, strict=True):
-            slope -= weight * node * truth_rate(sensor, shifted(motion, -max(values[0], 0.0) * node))
+        """Return ``K du'/dtau``: minus the rate of u where there is no lag yet, else a central difference."""
+        if values[0] <= STEP_S:
+            slope = -truth_rate(sensor, motion)
+        else:
+            later, sooner = (truth(sensor, self.moved(motion, values + d)) for d in (STEP_S, -STEP_S))
+            slope = (later - sooner) / (2.0 * STEP_S)
         return (slope @ K.T)[:, :, None]
 
     def reading(
@@ -72,6 +76,15 @@ class LowPassLag(Effect):
         """Return the motion that a sensor with this lag feels."""
         if values[0] <= 0.0:
             return motion
+        if motion.at_lag is not None:
+            shown = motion.at_lag(lag=float(values[0]))
+            assert shown is not None  # noqa: S101
+            return replace(
+                shown,
+                still=motion.still,
+                direction=motion.direction,
+                at_offset=partial(self._moved_at, motion, values),
+            )
         nodes = [shifted(motion, -values[0] * node) for node in NODES]
 
         def mean(name: str) -> NDArray[np.float64]:

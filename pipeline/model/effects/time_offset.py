@@ -61,7 +61,21 @@ def _at(
         still=still_of.still,
         direction=still_of.direction,
         at_offset=partial(_at, trajectory, total, still_of),
+        at_lag=None if there.at_lag is None else partial(_lagged_at, there.at_lag, total, still_of),
     )
+
+
+def _lagged_at(
+    lagged: Callable[..., Motion | None],
+    before: float | NDArray[np.float64],
+    still_of: Motion,
+    lag: float,
+    offset: float | NDArray[np.float64] = 0.0,
+) -> Motion:
+    """Return what a lag shows of a trajectory at the sum of two offsets."""
+    there = lagged(lag=lag, offset=before + offset)
+    assert there is not None  # noqa: S101
+    return replace(there, still=still_of.still, direction=still_of.direction)
 
 
 class TimeOffset(Effect):
