@@ -29,9 +29,10 @@ from pipeline.estimation.accelerometer.magnitude import (
 )
 from pipeline.estimation.accelerometer.orientations import orientations_of, without
 from pipeline.estimation.sample_blocks import make_blocks
-from pipeline.estimation.scaled_columns import estimate_weights
+from pipeline.estimation.scaled_columns import estimate_weights, factorise
 from pipeline.estimation.serial_noise import assess_noise, combine, prior_of
 from pipeline.records import SensorCalibration, StageResult
+from pipeline.records.calibration import coverage_factor
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -48,7 +49,8 @@ if TYPE_CHECKING:
 
 NAME = "nonlinear_least_squares"
 MISALIGNMENT_UNKNOWN = 0.05  # rad, standard uncertainty above which the rests do not determine a misalignment
-OUTLIER = 6.0  # robust standard deviations
+FALSE_ALARM = 1e-3  # probability of calling one of the rests of a sound recording an outlier
+SMALLEST_OUTLIER_G = 1e-6
 FEWEST_TO_JUDGE = 18  # rests, two a parameter
 OUTLIER_SHARE = 0.2
 
@@ -137,17 +139,27 @@ def _left(orientations: Orientations) -> str:
 
 
 def _outlier(orientations: Orientations, found: Ellipsoid) -> dict[int, str]:
-    """Return the hand-held rest that contradicts the others most, if it does, with the reason."""
+    """Return the hand-held rest that contradicts the others most, if it does, with the reason.
+
+    A rest is compared with what the others alone say: with its leverage h, its weighted error r and p parameters,
+    ``t = r / (s sqrt(1 - h))`` follows Student's t with m - p - 1 degrees of freedom, where s is the scatter of the
+    others, ``s^2 = (sum r^2 - r^2 / (1 - h)) / (m - p - 1)`` (Belsley, Kuh & Welsch 1980, section 2.1).
+    """
     m, left_out = len(found.error), len(orientations.left_out)
-    if not orientations.by_hand or m < FEWEST_TO_JUDGE:
+    if not orientations.by_hand or m < FEWEST_TO_JUDGE or left_out >= OUTLIER_SHARE * (m + left_out):
         return {}
-    scaled = np.abs(found.weight * found.error)
-    limit = OUTLIER * 1.4826 * float(np.median(scaled)) * np.sqrt(m / (m - found.free.sum()))
-    worst = int(np.argmax(scaled))
-    if scaled[worst] <= limit or left_out >= OUTLIER_SHARE * (m + left_out):
+    J = derivative_of(orientations.mean, found.values)[:, found.free]
+    rest = 1.0 - np.sum(factorise(found.weight[:, None] * J).basis ** 2, axis=1)
+    r, spare = found.weight * found.error, m - int(found.free.sum()) - 1
+    others = np.maximum(np.sum(r**2) - r**2 / np.maximum(rest, 1e-9), 1e-12 * np.sum(r**2)) / spare
+    t = np.abs(r) / np.sqrt(others * np.maximum(rest, 1e-9))
+    worst = int(np.argmax(t))
+    off = float(found.error[worst] / rest[worst])
+    if t[worst] <= coverage_factor(spare, 1.0 - FALSE_ALARM / m) or abs(off) < SMALLEST_OUTLIER_G:
         return {}
-    off = 1e3 * found.error[worst]
-    return {worst: f"length of the specific force is off by {off:.2f} mg, over {OUTLIER:g} times the others' scatter"}
+    return {
+        worst: f"length of the specific force is {1e3 * off:.2f} mg off what the other rests say, t = {t[worst]:.0f}"
+    }
 
 
 def _covariance(orientations: Orientations, found: Ellipsoid, prior: Prior) -> tuple[Values, float]:
