@@ -68,7 +68,7 @@ def measurement_and_model(sensor: str, residual: Residual, sigma: NDArray[np.flo
     name = residual.recording.name
     outside = float(np.mean(np.abs(residual.error) > 2 * sigma))
     caption = (
-        f"{name}: readings and model (black); below, reading minus model, its mean over short stretches, and the band "
+        f"{name}: readings and model (thin line); below, reading minus model, its mean over short stretches, and the band "
         f"of ±2 σ {source}. "
         f"{100 * outside:.1f} % of the residuals lie outside of it; white noise alone puts 4.6 % there."
     )
@@ -172,9 +172,7 @@ def ranking(sensor: str, diagnosis: JSON) -> Figure | None:
         "ΔBIC (logarithmic): larger is stronger evidence",
         levels={"strong evidence": 10.0},
     )
-    return Figure(
-        svg, "Evidence for each effect beyond the configured model; above 10 is strong. ~ names a look-alike."
-    )
+    return Figure(svg, "Evidence for each effect beyond the configured model; above 10 is strong.")
 
 
 def residual_figures(sensor: str, found: list[Residual]) -> list[Figure]:

@@ -1,0 +1,137 @@
+"""The page of a campaign: failures first, then the fleet in figures, methods side by side, and every unit.
+
+Units with the same serial are the same device calibrated in several ways (or several times): they are put side by side.
+"""
+
+from __future__ import annotations
+
+from statistics import median
+from typing import TYPE_CHECKING, Any
+
+from pipeline.records import SENSORS
+from pipeline.report.numbers import number
+from pipeline.report.templating import template
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+JSON = dict[str, Any]
+UNITS = {"accelerometer": "g", "gyroscope": "deg/s"}
+VERDICTS = {
+    "nothing_missing": ("nothing missing", "good"),
+    "missing_effect": ("missing effect", "warn"),
+    "unexplained": ("unexplained", "warn"),
+    "not_enough_data": ("not enough data", ""),
+}
+
+
+def render(
+    campaign: str, rows: list[JSON], failures: list[JSON], comparisons: Sequence[JSON | Sequence[str]] = ()
+) -> str:
+    """Return ``index.html``.
+
+    Parameters
+    ----------
+    campaign : str
+    rows : list of dict
+        One a unit, as of ``summary.summary_row``.
+    failures : list of dict
+        ``unit``, ``stage``, ``code``, ``message``, ``file`` of each failed unit.
+    comparisons : sequence, optional
+        Groups of units to put side by side beyond those that share a serial: lists of units, or
+        ``{"title", "units"}``.
+
+    Returns
+    -------
+    str
+    """
+    shown = [_cells(row) for row in rows]
+    by_unit = {row["unit"]: cells for row, cells in zip(rows, shown, strict=True)}
+    page: str = template("campaign.html").render(
+        campaign=campaign,
+        rows=shown,
+        failures=failures,
+        ok=sum(row["status"] == "ok" for row in rows),
+        passed=sum(row.get("pass") is True for row in rows),
+        not_passed=sum(row.get("pass") is False for row in rows),
+        judged=any(row.get("pass") is not None for row in rows if row["status"] == "ok"),
+        fleet=[f for s in SENSORS if (f := _fleet(s, "all units", rows))] + _lots(rows),
+        groups=[
+            {"title": title, "rows": [by_unit[u] for u in units if u in by_unit]}
+            for title, units in [*_same_serial(rows), *_asked_for(comparisons)]
+        ],
+        verdicts=VERDICTS,
+    )
+    return page
+
+
+def _cells(row: JSON) -> JSON:
+    """Return a row with its figures as text, so that the template only places them."""
+    cells: JSON = {k: row.get(k) or "" for k in ("unit", "serial", "lot", "date", "status", "sensor", "method")}
+    cells["pass"] = row.get("pass")
+    cells["sensors"] = []
+    for sensor in SENSORS:
+        after, floor = row.get(f"{sensor}_error_after"), row.get(f"{sensor}_noise_floor")
+        cells["sensors"].append(
+            (
+                _figure(row.get(f"{sensor}_error_before")),
+                _figure(after),
+                _figure(floor),
+                _figure(after / floor if after is not None and floor else None),
+                row.get(f"{sensor}_verdict") or "",
+                (row.get(f"{sensor}_selected") or "").replace("_", " ").replace(";", ", "),
+            )
+        )
+    return cells
+
+
+def _figure(value: float | None) -> str:
+    return "" if value is None else number(value)
+
+
+def _fleet(sensor: str, name: str, rows: list[JSON]) -> JSON | None:
+    """Return medians over units of what was reached."""
+    known = [r for r in rows if r.get(f"{sensor}_error_after") is not None]
+    if not known:
+        return None
+
+    def middle(column: str) -> float | None:
+        values = [v for r in known if (v := r.get(f"{sensor}_{column}")) is not None]
+        return median(values) if values else None
+
+    verdicts = [r.get(f"{sensor}_verdict") for r in known]
+    return {
+        "sensor": sensor,
+        "name": name,
+        "unit": UNITS[sensor],
+        "count": len(known),
+        "before": number(middle("error_before")),
+        "after": number(middle("error_after")),
+        "floor": number(middle("noise_floor")),
+        "verdicts": {VERDICTS[v][0]: verdicts.count(v) for v in VERDICTS if v in verdicts},
+    }
+
+
+def _lots(rows: list[JSON]) -> list[JSON]:
+    lots = list(dict.fromkeys(r["lot"] for r in rows if r.get("lot")))
+    if not 1 < len(lots) <= 60:
+        return []
+    return [
+        f for s in SENSORS for lot in lots if (f := _fleet(s, f"lot {lot}", [r for r in rows if r.get("lot") == lot]))
+    ]
+
+
+def _same_serial(rows: list[JSON]) -> Iterable[tuple[str, list[str]]]:
+    groups: dict[str, list[str]] = {}
+    for row in rows:
+        if row.get("serial"):
+            groups.setdefault(row["serial"], []).append(row["unit"])
+    return [(f"Serial {serial}", units) for serial, units in groups.items() if len(units) > 1]
+
+
+def _asked_for(comparisons: Sequence[JSON | Sequence[str]]) -> Iterable[tuple[str, list[str]]]:
+    for group in comparisons:
+        if isinstance(group, dict):
+            yield str(group.get("title") or "Side by side"), list(group.get("units") or [])
+        else:
+            yield "Side by side", list(group)

@@ -1,0 +1,120 @@
+"""One row a unit: ``summary.csv`` and the table of the campaign's page.
+
+Columns: those of every campaign in the order of ``COLUMNS``, then the user's own columns of ``units.csv``. A column of
+the user's whose name is taken gets ``sheet_`` before it.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+from pathlib import Path
+from typing import Any
+
+from pipeline.records import SENSORS
+from pipeline.report.limits import check_limits, final_step, verdict
+
+JSON = dict[str, Any]
+UNIT_COLUMNS = ("unit", "serial", "lot", "date", "status", "error", "sensor", "method")
+SENSOR_COLUMNS = (
+    "error_before",
+    "error_after",
+    "mean_abs_before",
+    "mean_abs_after",
+    "noise_floor",
+    "verdict",
+    "selected",
+)
+COLUMNS = (*UNIT_COLUMNS, *(f"{s}_{c}" for s in SENSORS for c in SENSOR_COLUMNS), "pass")
+SHEET_COLUMNS = ("table", "procedure", "ingest", "filter", "overrides")  # of units.csv, said elsewhere
+
+
+def summary_row(
+    unit: str,
+    calibration: JSON,
+    validation: JSON | None,
+    diagnosis: JSON | None,
+    sheet_row: dict[str, str],
+    *,
+    limits: JSON | None = None,
+) -> JSON:
+    """Return a unit's row: a dict from column to value, None where there is none.
+
+    Parameters
+    ----------
+    unit : str
+    calibration, validation, diagnosis : dict
+        As in their files; the last two may be None.
+    sheet_row : dict of str to str
+        The unit's row of ``units.csv``.
+    limits : dict, optional
+        The section ``limits`` of the unit's configuration; without it the validation's own ``pass`` counts.
+    """
+    error = calibration.get("error")
+    row: JSON = dict.fromkeys(COLUMNS)
+    row |= {
+        "unit": unit,
+        **{key: sheet_row.get(key) or None for key in ("serial", "lot", "date")},
+        "status": calibration.get("status"),
+        "error": f"{error['file']}: {error['message']}"
+        if error and error.get("file")
+        else (error or {}).get("message"),
+        "sensor": calibration.get("sensor"),
+        "method": calibration.get("method"),
+        "pass": _pass(calibration, validation, limits),
+    }
+    for sensor in SENSORS:
+        held_out, found = (validation or {}).get(sensor) or {}, (diagnosis or {}).get(sensor) or {}
+        raw, final = (held_out.get("steps") or [{}])[0], final_step(held_out)
+        selected = found.get("selected")
+        values = (
+            raw.get("rms_error"),
+            final.get("rms_error"),
+            raw.get("mean_abs_error"),
+            final.get("mean_abs_error"),
+            held_out.get("noise_floor"),
+            found.get("verdict"),
+            ";".join(selected) if selected else None,
+        )
+        row |= {f"{sensor}_{column}": value for column, value in zip(SENSOR_COLUMNS, values, strict=True)}
+    for key, value in sheet_row.items():
+        if key not in SHEET_COLUMNS and key not in UNIT_COLUMNS:
+            row[f"sheet_{key}" if key in COLUMNS else key] = value
+    return row
+
+
+def write_summary(path: Path | str, rows: list[JSON]) -> None:
+    """Write ``summary.csv`` under a temporary name, then rename it.
+
+    Parameters
+    ----------
+    path : Path or str
+    rows : list of dict
+        As of ``summary_row``; own columns may differ from unit to unit.
+    """
+    path = Path(path)
+    columns = list(dict.fromkeys([*COLUMNS, *(key for row in rows for key in row)]))
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows([_cell(row.get(column)) for column in columns] for row in rows)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary.write_text(buffer.getvalue(), encoding="utf-8", newline="")
+    temporary.replace(path)
+
+
+def _pass(calibration: JSON, validation: JSON | None, limits: JSON | None) -> bool | None:
+    if limits is not None or calibration.get("status") != "ok":
+        return verdict(calibration, check_limits(calibration, validation, limits))
+    given = [((validation or {}).get(s) or {}).get("pass") for s in SENSORS]
+    judged = [bool(g) for g in given if g is not None]
+    return all(judged) if judged else None
+
+
+def _cell(value: object) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"{value:.9g}" if isinstance(value, float) else str(value)
