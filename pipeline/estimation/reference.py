@@ -175,12 +175,13 @@ def _covariance(
     weights: NDArray[np.float64], noise: SerialNoise, matrix: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], float]:
     """Return the covariance of bias and matrix, and its degrees of freedom."""
+    unit = noise.covariances(weights)
     candidates: NDArray[np.float64] | float = 0.0
     for channel in range(3):
         J = np.zeros((12, 4))
         J[channel, 0] = 1.0
         J[3:, 1:] = -np.einsum("i,bj->ijb", matrix[:, channel], matrix).reshape(9, 3)
-        candidates = candidates + J @ noise.covariances(weights, channel) @ J.T
+        candidates = candidates + J @ (noise.white_variance[:, channel, None, None] * unit) @ J.T
     return combine(noise, np.asarray(candidates))
 
 

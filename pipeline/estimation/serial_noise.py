@@ -3,7 +3,7 @@
 The noise of a channel is white noise plus a bias wander; residuals of a fit that ignores the wander are correlated, and
 ``sigma^2 (X^T X)^-1`` would claim far too little. In means over short blocks of samples,
 
-    r_b = w_b + e_b,   var e_b = s^2 / n_b,   cov(w_b, w_c) = s^2 q R_bc,   R_bc = exp(-|t_b - t_c| / tau)
+    r_b = w_b + e_b,   var e_b = s^2 / n_b,   cov(w_b, w_c) = s^2 q R_bc,   R_bc ~ exp(-|t_b - t_c| / tau)
 
 where
 
@@ -22,7 +22,7 @@ they are not picked: each point of a grid is weighted by its restricted likeliho
 varies over the grid gives its degrees of freedom: a variance with a scaled inverse chi-square distribution of nu
 degrees has ``var / mean^2 = 2 / (nu - 4)`` and ``mean = scale nu / (nu - 2)``.
 
-R^-1 is tridiagonal (``pipeline.estimation.sample_blocks``), so everything is linear in the number of blocks.
+One eigendecomposition of R, projected on what the fit cannot reach, gives the likelihood of a tau at every q.
 """
 
 from __future__ import annotations
@@ -33,10 +33,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.sample_blocks import cholesky, solve
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -46,14 +45,12 @@ if TYPE_CHECKING:
 DEFAULT_TIME_S = 100.0
 TIMES = (0.25, 0.5, 1.0, 2.0, 4.0)  # of the correlation time that is believed
 TIME_PRIOR = (0.1, 0.2, 0.4, 0.2, 0.1)
-# Exponents of ten of the ratio of the standard deviations of wander and white noise: first all, then about the best.
-COARSE = np.arange(-2.4, 0.9, 0.4)
-FINE = np.array([-0.3, -0.2, -0.1, 0.1, 0.2, 0.3])
+RATIOS = 10.0 ** np.arange(-2.4, 0.85, 0.1)  # standard deviation of the wander over that of a white sample
 NEGLIGIBLE = 1e-6
+AVERAGED_OUT = 1e-3
 SHEET_WIDTH = float(np.log(3.0))
 SHARPEST_WIDTH = 0.15
 FARTHEST = 3.0  # widths; beyond, the residuals alone decide
-NO_NOISE = 1e-13  # a residual below this share of the readings is rounding
 
 
 @dataclass(frozen=True)
@@ -125,6 +122,8 @@ class SerialNoise:
         s^2 of each candidate and channel.
     spare : int
         Blocks less parameters.
+    correlation : dict of float to (b, b) array
+        R of each tau.
     """
 
     blocks: Blocks
@@ -133,6 +132,7 @@ class SerialNoise:
     time: NDArray[np.float64]
     white_variance: NDArray[np.float64]
     spare: int
+    correlation: dict[float, NDArray[np.float64]]
 
     @property
     def white(self) -> NDArray[np.float64]:
@@ -144,36 +144,31 @@ class SerialNoise:
         """Standard deviation of the bias wander: (3,) array."""
         return np.sqrt((self.weight * self.ratio) @ self.white_variance)
 
-    def draw(self, rng: np.random.Generator) -> NDArray[np.float64]:
-        """Return noise of the likeliest candidate at each sample: (n, 3) array; wander is even over a block."""
+    def draws(self, rng: np.random.Generator, number: int) -> Iterator[NDArray[np.float64]]:
+        """Yield noise of the likeliest candidate at each sample, (n, 3) arrays; wander is even over a block."""
         best = int(np.argmax(self.weight))
-        step = np.exp(-np.diff(self.blocks.time) / self.time[best]) * self.blocks.joined
-        wander = rng.standard_normal((len(self.blocks.count), 3))
-        for b, keep in enumerate(step, start=1):
-            wander[b] = keep * wander[b - 1] + np.sqrt(1.0 - keep**2) * wander[b]
-        samples = (
-            rng.standard_normal((len(self.blocks.label), 3)) + np.sqrt(self.ratio[best]) * wander[self.blocks.label]
-        )
-        noise: NDArray[np.float64] = np.sqrt(self.white_variance[best]) * samples
-        return noise
+        e, U = np.linalg.eigh(self.correlation[float(self.time[best])])
+        root = np.sqrt(self.ratio[best]) * U * np.sqrt(np.clip(e, 0.0, None))
+        for _ in range(number):
+            wander = root @ rng.standard_normal((len(e), 3))
+            samples = rng.standard_normal((len(self.blocks.label), 3))
+            yield np.sqrt(self.white_variance[best]) * (samples + wander[self.blocks.label])
 
-    def covariances(self, A: NDArray[np.float64], channel: int) -> NDArray[np.float64]:
-        """Return the covariance of ``A y`` under each candidate: (m, p, p) array.
+    def covariances(self, A: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the covariance of ``A y`` under each candidate, for white noise of variance 1: (m, p, p) array.
+
+        That of a channel is ``white_variance[:, channel, None, None]`` times this.
 
         Parameters
         ----------
         A : (p, n) array
             The estimate's weights of the samples.
-        channel : int
         """
-        white = A @ A.T
         a = self.blocks.sums(A.T)
-        wander = {tau: a.T @ solve(cholesky(self.blocks.precision(tau)), a) for tau in np.unique(self.time)}
-        stacked: NDArray[np.float64] = np.stack(
-            [white + q * wander[tau] for q, tau in zip(self.ratio, self.time, strict=True)]
-        )
-        stacked *= self.white_variance[:, channel, None, None]
-        return stacked
+        kinds, which = np.unique(self.time, return_inverse=True)
+        wander = np.stack([a.T @ self.correlation[tau] @ a for tau in kinds.tolist()])
+        covariances: NDArray[np.float64] = A @ A.T + self.ratio[:, None, None] * wander[which]
+        return covariances
 
 
 def assess_noise(
@@ -204,25 +199,27 @@ def assess_noise(
             f"{len(blocks.count)} samples determine {design.shape[1]} parameters and leave none to tell the noise by: "
             "record more samples"
         )
-    likelihood = _Likelihood(blocks.sums(residuals) / blocks.count[:, None], _basis(blocks, design), blocks)
+    root = np.sqrt(blocks.count)[:, None]
+    Q = _complement(root * (blocks.sums(design) / blocks.count[:, None]), design)
+    z = Q.T @ (blocks.sums(residuals) / root)
     white = float(np.sqrt(np.mean(residuals**2)))
-    weights, ratios, times, variances = [], [], [], []
-    for factor, belief in zip(TIMES, TIME_PRIOR, strict=True):
-        ratio, score, variance = likelihood.along(factor * prior.time, lambda r: prior.log_density(r * white))
-        weights.append(score + np.log(belief * np.gradient(np.log(ratio))))
-        ratios.append(ratio**2)
-        times.append(np.full(len(ratio), factor * prior.time))
+    belief = np.array([prior.log_density(ratio * white) for ratio in RATIOS])
+    correlation = {factor * prior.time: blocks.correlation(factor * prior.time) for factor in TIMES}
+    scores, variances = [], []
+    for R, believed in zip(correlation.values(), TIME_PRIOR, strict=True):
+        score, variance = _restricted_likelihood(z, Q.T @ (root * R * root.T) @ Q)
+        scores.append(score + belief + np.log(believed))
         variances.append(variance)
-    weight = np.concatenate(weights)
-    weight = np.exp(weight - weight.max())
+    weight = np.exp(np.concatenate(scores) - np.max(scores))
     kept = weight > NEGLIGIBLE
     return SerialNoise(
         blocks,
         weight[kept] / weight[kept].sum(),
-        np.concatenate(ratios)[kept],
-        np.concatenate(times)[kept],
+        np.tile(RATIOS**2, len(TIMES))[kept],
+        np.repeat(list(correlation), len(RATIOS))[kept],
         np.concatenate(variances)[kept],
         spare,
+        correlation,
     )
 
 
@@ -254,60 +251,25 @@ def combine(noise: SerialNoise, covariances: NDArray[np.float64]) -> tuple[NDArr
     return mean * shrink, 1.0 / (1.0 / noise.spare + 1.0 / grid)
 
 
-def _basis(blocks: Blocks, design: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the block means of fitted columns, without what averages out: (b, q) array."""
-    means = blocks.sums(design) / blocks.count[:, None]
+def _complement(means: NDArray[np.float64], design: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return an orthonormal basis of what fitted columns do not reach in block means: (b, b - q) array.
+
+    Columns that average out within the blocks reach nothing there.
+    """
     size = np.sqrt(np.mean(design**2, axis=0))
-    U, s, _ = np.linalg.svd(means / np.where(size > 0, size, 1.0), full_matrices=False)
-    return U[:, s > 1e-3 * s[0]]
+    U, s, _ = np.linalg.svd(means / np.where(size > 0, size, 1.0), full_matrices=True)
+    return U[:, int(np.sum(s > AVERAGED_OUT * s[0])) :]
 
 
-@dataclass(frozen=True)
-class _Likelihood:
-    """The restricted likelihood of block means (b, 3), after the fit of the columns of a basis (b, q)."""
+def _restricted_likelihood(
+    z: NDArray[np.float64], E: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the log likelihood at each ratio, maximised over s^2 of each channel, and these s^2.
 
-    means: NDArray[np.float64]
-    basis: NDArray[np.float64]
-    blocks: Blocks
-
-    def along(
-        self, correlation_time: float, belief: Callable[[float], float]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return ratios, the log likelihood plus belief of each, and s^2: coarsely over all, finely about the best."""
-        precision = self.blocks.precision(correlation_time)
-        half = float(np.sum(np.log(cholesky(precision)[1])))
-        found: dict[float, tuple[float, NDArray[np.float64]]] = {}
-        for offsets in (COARSE, FINE):
-            centre = max(found, key=lambda r: found[r][0]) if found else 0.0
-            for exponent in np.round(centre + offsets, 6).tolist():
-                if exponent not in found:
-                    score, variance = self.at(precision, 2.0 * half, 10.0 ** (2.0 * exponent))
-                    found[exponent] = score + belief(10.0**exponent), variance
-        order = sorted(found)
-        return (
-            10.0 ** np.array(order),
-            np.array([found[r][0] for r in order]),
-            np.array([found[r][1] for r in order]),
-        )
-
-    def at(self, precision: NDArray[np.float64], determinant: float, q: float) -> tuple[float, NDArray[np.float64]]:
-        """Return the log likelihood, maximised over s^2 of each channel, and these s^2.
-
-        ``determinant`` is the logarithm of that of R^-1. By Woodbury's identity, with D = diag(n),
-        ``(D^-1 + q R)^-1 = D - D (D + R^-1 / q)^-1 D``.
-        """
-        count = self.blocks.count
-        bands = precision / q
-        bands[1] += count
-        factor = cholesky(bands)
-        logarithm = len(count) * np.log(q) - determinant - float(np.sum(np.log(count)))
-        logarithm += 2.0 * float(np.sum(np.log(factor[1])))
-        together = np.concatenate([self.means, self.basis], axis=1)
-        weighted = count[:, None] * together
-        gram = together.T @ weighted - weighted.T @ solve(factor, weighted)
-        inner, outer = gram[3:, 3:], gram[3:, :3]
-        explained = np.sum(outer * np.linalg.solve(inner, outer), axis=0)
-        left = len(count) - len(inner)
-        variance = np.maximum(np.diag(gram)[:3] - explained, np.finfo(float).tiny) / left
-        score = -0.5 * (3.0 * (logarithm + np.linalg.slogdet(inner)[1]) + left * np.sum(np.log(variance)))
-        return float(score), variance
+    ``z ~ N(0, s^2 (I + q E))``.
+    """
+    e, U = np.linalg.eigh(E)
+    spectrum = 1.0 + np.outer(RATIOS**2, np.clip(e, 0.0, None))
+    variance = np.maximum((1.0 / spectrum) @ (U.T @ z) ** 2 / len(e), np.finfo(float).tiny)
+    score = -0.5 * (z.shape[1] * np.log(spectrum).sum(axis=1) + len(e) * np.log(variance).sum(axis=1))
+    return score, variance

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from pipeline.records import Recording
 
 STAGES = ("orthogonality", "misalignment", "bias", "scale_factor")
-REPLICATES = 100
+REPLICATES = 60
 SEED = 20190508
 STEP = 1e-7  # g, of the differences: truncation and rounding are then both about 1e-8 of the derivative
 
@@ -195,7 +195,7 @@ def _propagated(
                 columns.append((run(extremes_of_sinusoids(moved)).vector() - here) / STEP)
         J = np.column_stack(columns)
         A = _side_by_side([turn[channel].weights for turn in sinusoids])
-        candidates = candidates + J @ noise.covariances(A, channel) @ J.T
+        candidates = candidates + J @ (noise.white_variance[:, channel, None, None] * noise.covariances(A)) @ J.T
     return combine(noise, np.asarray(candidates))
 
 
@@ -209,8 +209,8 @@ def _resampled(
     ]
     cuts = np.cumsum([len(turn.angle) for turn in turns])[:-1]
     vectors = []
-    for _ in range(REPLICATES):
-        added = np.split(noise.draw(rng), cuts)
+    for noisy in noise.draws(rng, REPLICATES):
+        added = np.split(noisy, cuts)
         synthetic = [replace(turn, reading=mean + new) for turn, mean, new in zip(turns, means, added, strict=True)]
         vectors.append(run(extremes_of_samples(synthetic)).vector())
     return np.cov(np.array(vectors).T), float(REPLICATES - 1)

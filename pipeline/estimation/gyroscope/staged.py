@@ -175,6 +175,7 @@ def _propagated(
     run: Callable[[NDArray[np.float64]], Chain],
 ) -> tuple[NDArray[np.float64], float]:
     """Return the covariance of ``Chain.vector``, and its degrees of freedom."""
+    unit = noise.covariances(weights)
     candidates: NDArray[np.float64] | float = 0.0
     for channel in range(3):
         columns = []
@@ -184,7 +185,7 @@ def _propagated(
             down[row, channel] -= STEP
             columns.append((run(up).vector() - run(down).vector()) / (2.0 * STEP))
         J = np.column_stack(columns)
-        candidates = candidates + J @ noise.covariances(weights, channel) @ J.T
+        candidates = candidates + J @ (noise.white_variance[:, channel, None, None] * unit) @ J.T
     return combine(noise, np.asarray(candidates))
 
 
