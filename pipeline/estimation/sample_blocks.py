@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from pipeline.records import Recording
 
-BLOCKS = 150
+BLOCKS = 100
 
 
 @dataclass(frozen=True)
