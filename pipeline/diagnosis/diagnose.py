@@ -25,6 +25,8 @@ from pipeline.model.effects import catalogue
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from numpy.typing import NDArray
+
     from pipeline.estimation.joint import Fit
     from pipeline.estimation.ranking import Score
     from pipeline.estimation.selection import Selection
@@ -92,7 +94,8 @@ def _document(
     hidden = not_observable(selection, configured)
     unknown = unexplained(selection)
     ladder = _ladder(selection, recordings, table)
-    ranking = [_entry(selection, name, ladder, noise) for name in _order(selection, hidden)]
+    explained = selection.first.explained([])
+    ranking = [_entry(selection, name, ladder, explained, noise) for name in _order(selection, hidden)]
     verdict = "missing_effect" if selected else "unexplained" if unknown else "nothing_missing"
     if not ranking and verdict == "nothing_missing" and len(hidden) > 0:
         verdict = "not_enough_data"
@@ -138,7 +141,11 @@ def _ladder(
 
 
 def _entry(
-    selection: Selection, name: str, ladder: Sequence[tuple[Fit, float | None]], noise: Noise | None
+    selection: Selection,
+    name: str,
+    ladder: Sequence[tuple[Fit, float | None]],
+    explained: NDArray[np.float64],
+    noise: Noise | None,
 ) -> dict[str, Any]:
     """Return one line of the ranking."""
     score = selection.steps.get(name) or selection.alone[name]
@@ -148,7 +155,7 @@ def _entry(
         (without, before), (within, after) = ladder[step], ladder[step + 1]
         drop = without.residual_rms**2 - within.residual_rms**2
     else:
-        drop = _drop(selection, name)
+        drop = _drop(selection, name, explained)
     return {
         "effect": name,
         "delta_bic": score.delta_bic,
@@ -162,10 +169,9 @@ def _entry(
     }
 
 
-def _drop(selection: Selection, name: str) -> float:
+def _drop(selection: Selection, name: str, explained: NDArray[np.float64]) -> float:
     """Return by how much an effect alone would lower the mean square of the residual."""
     first = selection.first
-    explained = first.explained([])
     best = max(explained[j] for j in first.indices(name))
     return float(best / first.samples * np.mean(selection.start.scale**2))
 

@@ -108,9 +108,9 @@ def _chebyshev(
     def curves(motion: Motion) -> NDArray[np.float64]:
         value = of(motion)
         assert value is not None  # noqa: S101
-        return np.polynomial.chebyshev.chebvander(2.0 * (value - low) / width - 1.0, degrees.stop - 1)[
-            :, degrees.start :
-        ]
+        scaled = np.asarray(2.0 * (value - low) / width - 1.0, np.float64)
+        powers = np.polynomial.chebyshev.chebvander(scaled, degrees.stop - 1)
+        return np.asarray(powers[:, degrees.start :], np.float64)
 
     return curves
 

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from pipeline.records import Motion, Noise
 
 BASE = 12
+REMEMBERED = 4
 BASE_NAMES = [f"bias_{a}" for a in "xyz"] + [f"matrix_{a}{b}" for a in "xyz" for b in "xyz"]
 
 
@@ -56,19 +57,32 @@ class Term:
         """Return how its columns act on the axes."""
         return Layout.SHARED if self.full else self.effect.layout
 
-    def regressors(self, sensor: str, motion: Motion, K: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return its columns in the shape of its layout."""
+    def regressors(
+        self, sensor: str, motion: Motion, K: NDArray[np.float64], everything: Motion | None = None
+    ) -> NDArray[np.float64]:
+        """Return its columns in the shape of its layout; ``everything`` is the motion after all effects of timing."""
+        if everything is not None and self.effect.moves and np.any(self.values):
+            slope = self.effect.slope(sensor, everything)
+            if slope is not None:
+                return (slope @ K.T)[:, :, None]
         of = self.effect.columns if self.full else self.effect.regressors
         return of(sensor, motion, K, self.values)
 
 
 def felt(part: Part, terms: Sequence[Term], but: Effect | None = None) -> Motion:
     """Return the motion that the sensor felt, after all effects of timing but one."""
-    motion = part.motion
-    for term in terms:
-        if term.effect is not but:
+    movers = [term for term in terms if term.effect.moves and term.effect is not but and np.any(term.values)]
+    if not movers:
+        return part.motion
+    key = tuple((term.effect.name, term.values.tobytes()) for term in movers)
+    if key not in part.moved:
+        motion = part.motion
+        for term in movers:
             motion = term.effect.moved(motion, term.values)
-    return motion
+        while len(part.moved) >= REMEMBERED:
+            part.moved.pop(next(iter(part.moved)))
+        part.moved[key] = motion
+    return part.moved[key]
 
 
 def motions_of(part: Part, terms: Sequence[Term]) -> list[Motion]:
@@ -218,6 +232,8 @@ class Design:
         self._width = width + 3
         self._local = [np.array(index) for index in local]
         self._total = [np.array(index) for index in total]
+        self._from = [np.add.outer(index * self._width, index).ravel() for index in self._local]
+        self._to = [np.add.outer(index * (parameters + 1), index).ravel() for index in self._total]
 
     def _fill(
         self, A: NDArray[np.float64], sensor: str, part: Part, terms: Sequence[Term], K: NDArray[np.float64]
@@ -226,7 +242,7 @@ class Design:
         A[:, 0] = 1.0
         A[:, 1:4] = truth(sensor, everything)
         for term, motion, places in zip(terms, motions, self._columns, strict=True):
-            regressors = term.regressors(sensor, motion, K)
+            regressors = term.regressors(sensor, motion, K, everything)
             if term.layout() == Layout.EVERY_AXIS:
                 A[:, places[0]] = regressors
             else:
@@ -236,12 +252,10 @@ class Design:
     def products(self, setting: Setting) -> tuple[NDArray[np.float64], float]:
         """Return all products of parameters' columns and, last, the readings; and log det C, up to a constant."""
         local, logarithm = self.whitened.products(setting)
-        total = np.zeros((self.count + 1, self.count + 1))
+        total = np.zeros((self.count + 1) ** 2)
         for c in range(3):
-            total[np.ix_(self._total[c], self._total[c])] += (
-                local[np.ix_(self._local[c], self._local[c])] / self.scale[c] ** 2
-            )
-        return total, 3.0 * logarithm
+            total[self._to[c]] += local.ravel()[self._from[c]] / self.scale[c] ** 2
+        return total.reshape(self.count + 1, self.count + 1), 3.0 * logarithm
 
     def sizes(self) -> NDArray[np.float64]:
         """Return the norm of each parameter's column before the base was taken out: (p + 1,) array."""

@@ -85,14 +85,6 @@ class Fit:
     condition: float
 
 
-@dataclass(frozen=True)
-class _Point:
-    """The model at some parameters: its residual and derivative, as products under each noise."""
-
-    design: Design
-    residual: NDArray[np.float64]
-
-
 def fit_terms(observations: Observations, terms: Sequence[Term], start: Start, settings: Sequence[Setting]) -> Fit:
     """Fit base and effects from given values.
 
@@ -111,27 +103,17 @@ def fit_terms(observations: Observations, terms: Sequence[Term], start: Start, s
     """
     terms = [Term(term.effect, np.array(term.values, float), full=True) for term in terms]
     bias, K = start.bias.copy(), start.K.copy()
-    converged, rounds = False, 0
-    for rounds in range(1, ROUNDS + 1):
-        point = _at(observations, terms, bias, K, start.scale)
-        solved = _solve(point, observations, settings)
-        step, uncertainty = solved.step, np.sqrt(np.diag(solved.covariance))
-        bias, K = bias + step[:3], K + step[3:BASE].reshape(3, 3)
-        moved, at = [], BASE
-        for term in terms:
-            size = len(term.values)
-            moved.append(Term(term.effect, term.effect.stepped(term.values, step[at : at + size]), full=True))
-            at += size
-        taken = np.concatenate([step[:BASE], *[m.values - t.values for m, t in zip(moved, terms, strict=True)]])
-        terms = moved
-        small = np.maximum(
-            SMALL_STEP * uncertainty, 1e-12 * np.concatenate([np.ones(BASE), np.zeros(len(step) - BASE)])
-        )
-        if np.all(np.abs(taken) <= small) or (rounds > 1 and not any(t.effect.nonlinear or _bends(t) for t in terms)):
-            converged = True
-            break
-    point = _at(observations, terms, bias, K, start.scale)
-    solved = _solve(point, observations, settings)
+    linear = not any(term.effect.nonlinear or term.effect.layout == Layout.SHARED for term in terms)
+    rounds, converged = 0, False
+    solved = _solve(_at(observations, terms, bias, K, start.scale), observations, settings)
+    while rounds < ROUNDS and not converged:
+        rounds += 1
+        bias, K, terms, taken = _stepped(bias, K, terms, solved.step)
+        converged = linear or bool(np.all(np.abs(taken) <= _small(solved.covariance)))
+        if not linear:
+            solved = _solve(_at(observations, terms, bias, K, start.scale), observations, settings)
+    residual, _ = _residual(observations, terms, bias, K)
+    squares = np.sum(observations.weight[:, None] * residual**2) + np.sum(observations.scatter)
     return Fit(
         bias,
         K,
@@ -140,15 +122,32 @@ def fit_terms(observations: Observations, terms: Sequence[Term], start: Start, s
         solved.log_likelihood,
         solved.setting,
         solved.degrees_of_freedom,
-        _residual_rms(point, observations),
+        float(np.sqrt(squares / (3.0 * observations.samples))),
         rounds,
         converged,
         solved.condition,
     )
 
 
-def _bends(term: Term) -> bool:
-    return term.effect.layout == Layout.SHARED
+def _stepped(
+    bias: NDArray[np.float64], K: NDArray[np.float64], terms: Sequence[Term], step: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], list[Term], NDArray[np.float64]]:
+    """Return bias, K and terms after a step, and what of the step was taken."""
+    moved, taken, at = [], [step[:BASE]], BASE
+    for term in terms:
+        size = len(term.values)
+        values = term.effect.stepped(term.values, step[at : at + size])
+        moved.append(Term(term.effect, values, full=True))
+        taken.append(values - term.values)
+        at += size
+    return bias + step[:3], K + step[3:BASE].reshape(3, 3), moved, np.concatenate(taken)
+
+
+def _small(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the steps that no longer matter: (p,) array."""
+    rounding = np.zeros(len(covariance))
+    rounding[:BASE] = 1e-12
+    return np.asarray(np.maximum(SMALL_STEP * np.sqrt(np.diag(covariance)), rounding), np.float64)
 
 
 def _at(
@@ -157,8 +156,16 @@ def _at(
     bias: NDArray[np.float64],
     K: NDArray[np.float64],
     scale: NDArray[np.float64],
-) -> _Point:
-    """Return the model at some parameters. Effects that the axes share pass through K, so K acts on them too."""
+) -> Design:
+    """Return the derivative of the model at some parameters, and its residual, as products."""
+    residual, base = _residual(observations, terms, bias, K)
+    return Design(observations, terms, K, scale, target=residual, base=base)
+
+
+def _residual(
+    observations: Observations, terms: Sequence[Term], bias: NDArray[np.float64], K: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the readings less the model, and what K acts on: the truth and the effects that the axes share."""
     sensor = observations.sensor
     predicted, base = [], []
     for part in observations.parts:
@@ -174,9 +181,7 @@ def _at(
                 u = u + np.linalg.solve(K, z.T).T
         predicted.append(reading)
         base.append(u)
-    residual = observations.reading - np.concatenate(predicted)
-    design = Design(observations, terms, K, scale, target=residual, base=np.concatenate(base))
-    return _Point(design, residual)
+    return observations.reading - np.concatenate(predicted), np.concatenate(base)
 
 
 @dataclass(frozen=True)
@@ -189,9 +194,8 @@ class _Solved:
     condition: float
 
 
-def _solve(point: _Point, observations: Observations, settings: Sequence[Setting]) -> _Solved:
+def _solve(design: Design, observations: Observations, settings: Sequence[Setting]) -> _Solved:
     """Solve for the step under each noise setting; take the most likely one, and average the covariance."""
-    design = point.design
     n = 3.0 * observations.samples
     within = float(np.sum(observations.scatter / design.scale**2))
     size = design.sizes()[:-1]
@@ -234,11 +238,6 @@ def _averaged(
     return mean * shrink, float(1.0 / (1.0 / spare + 1.0 / freedom))
 
 
-def _residual_rms(point: _Point, observations: Observations) -> float:
-    squares = np.sum(observations.weight[:, None] * point.residual**2) + np.sum(observations.scatter)
-    return float(np.sqrt(squares / (3.0 * observations.samples)))
-
-
 def starts_of(names: Sequence[str], sensor: str, known: SensorCalibration | None = None) -> list[list[Term]]:
     """Return the terms from which a fit starts, every combination of the effects' starts.
 
@@ -278,8 +277,8 @@ def fit_best(
         scores = []
         for terms in combinations:
             full = [Term(t.effect, np.array(t.values, float), full=True) for t in terms]
-            point = _at(observations, full, start.bias, start.K, start.scale)
-            scores.append(_solve(point, observations, settings).log_likelihood)
+            design = _at(observations, full, start.bias, start.K, start.scale)
+            scores.append(_solve(design, observations, settings).log_likelihood)
         chosen = combinations[int(np.argmax(scores))]
     return fit_terms(observations, chosen, start, settings)
 
@@ -292,10 +291,10 @@ def require_observable(observations: Observations, fit: Fit, scale: NDArray[np.f
     NotObservableError
         Naming the parameters.
     """
-    point = _at(observations, fit.terms, fit.bias, fit.K, scale)
+    design = _at(observations, fit.terms, fit.bias, fit.K, scale)
     names = [*BASE_NAMES, *parameter_names(observations.sensor, [t.effect for t in fit.terms])]
-    size = point.design.sizes()[:-1]
-    products = point.design.products(WHITE)[0][:-1, :-1] / np.outer(*[np.where(size > 0, size, 1.0)] * 2)
+    size = design.sizes()[:-1]
+    products = design.products(WHITE)[0][:-1, :-1] / np.outer(*[np.where(size > 0, size, 1.0)] * 2)
     values, vectors = np.linalg.eigh(products)
     weak = [name for name, s in zip(names, size, strict=True) if s == 0]
     for value, vector in zip(values, vectors.T, strict=True):

@@ -10,7 +10,7 @@ Kept are, where readings and log are sound,
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -125,6 +125,7 @@ class Part:
     weight: NDArray[np.float64]
     scatter: NDArray[np.float64]
     clock_shared: bool
+    moved: dict[tuple[tuple[str, bytes], ...], Motion] = field(default_factory=dict, compare=False, repr=False)
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.estimation.design import Start, Term, ordinary_base
+from pipeline.estimation.design import BASE, Start, Term, ordinary_base
 from pipeline.estimation.joint import Fit, fit_best, fit_terms, starts_of
 from pipeline.estimation.ranking import Ranking, Score
 from pipeline.estimation.wandering import settings_for
@@ -179,6 +179,7 @@ class _Search:
         self.names: list[str] = []
         self.steps: dict[str, Score] = {}
         self.fit = self.base
+        self.fits: dict[tuple[str, ...], Fit] = {}
         self.first = self.ranking = self._ranking()
 
     def run(self) -> Selection:
@@ -187,7 +188,10 @@ class _Search:
         if not self.names and self._inflated():
             self._pairs()
         if self.names:
-            self._refit(self.names)
+            self._fit_selected()
+            if self._other_delay():
+                self._forward(alone)
+                self._fit_selected()
         return Selection(
             self.names,
             self.steps,
@@ -216,7 +220,7 @@ class _Search:
             self.names.append(best.name)
             self.steps[best.name] = best
             if effect(best.name).nonlinear:
-                self._refit(self.names)
+                self._refit()
             self._drop()
 
     def _ranking(self) -> Ranking:
@@ -250,7 +254,9 @@ class _Search:
         this = effect(score.name)
         start = np.maximum(score.values, this.starts(self.observations.sensor)[0]) if this.name == DELAYS[1] else None
         term = Term(this, score.values if start is None else start)
-        fit = fit_terms(self.observations, [*self.fit.terms, term], self.start, self.settings)
+        terms = [*self.base.terms, *self._terms(), term]
+        fit = fit_terms(self.observations, terms, self.start, self.settings)
+        self.fits[(*self.names, score.name)] = fit
         before, _ = self.ranking.of_model(self._selected(self.names))
         from scipy.special import chdtrc  # noqa: PLC0415  (as in Ranking)
 
@@ -291,19 +297,23 @@ class _Search:
         significant = score.delta_bic > GATE_BIC and score.p_value * len(self.effects) < GATE_P
         return bool(score.admissible and significant and real)
 
-    def _refit(self, names: Sequence[str]) -> None:
+    def _refit(self) -> None:
         """Fit configured and selected effects together and rebuild the candidates there."""
-        held = {term.effect.name: term for term in self.fit.terms}
-        terms = []
-        for name in names:
-            if name in held:
-                terms.append(held[name])
-            else:
-                score = self.steps[name]
-                terms.append(Term(effect(name), score.values))
-        start = Start(self.fit.bias, self.fit.K, self.start.scale)
-        self.fit = fit_terms(self.observations, [*self.base.terms, *terms], start, self.settings)
+        self._fit_selected()
         self.ranking = self._ranking()
+
+    def _fit_selected(self) -> None:
+        if tuple(self.names) in self.fits:
+            self.fit = self.fits[tuple(self.names)]
+            return
+        start = Start(self.fit.bias, self.fit.K, self.start.scale)
+        self.fit = fit_terms(self.observations, [*self.base.terms, *self._terms()], start, self.settings)
+        self.fits[tuple(self.names)] = self.fit
+
+    def _terms(self) -> list[Term]:
+        """Return the selected effects at their fitted values, or at those of the step that accepted them."""
+        held = {term.effect.name: term for term in self.fit.terms}
+        return [held.get(name, Term(effect(name), self.steps[name].values)) for name in self.names]
 
     def _own(self, name: str) -> float:
         """Return the delta BIC that a selected effect brings beside the others."""
@@ -312,13 +322,13 @@ class _Search:
         return scores[name].delta_bic if name in scores else float("-inf")
 
     def _drop(self) -> None:
-        for name in list(self.names[:-1]):
+        for name in list(self.names):
             if not effect(name).moves and self._own(name) < 0.0:
                 self.names.remove(name)
                 del self.steps[name]
                 self.fit = replace(self.fit, terms=tuple(t for t in self.fit.terms if t.effect.name != name))
                 if effect(name).nonlinear:
-                    self._refit(self.names)
+                    self._refit()
 
     def _exchange(self) -> bool:
         """Replace a selected effect by one that explains clearly more in its place."""
@@ -336,9 +346,40 @@ class _Search:
                 del self.steps[name]
                 self.fit = replace(self.fit, terms=tuple(t for t in self.fit.terms if t.effect.name != name))
                 if effect(name).nonlinear or effect(rival.name).nonlinear:
-                    self._refit(self.names)
+                    self._refit()
                 return True
         return False
+
+    def _other_delay(self) -> bool:
+        """Take a lag for a delay, or the reverse, if it is clearly better beside all that was selected."""
+        name = next((n for n in self.names if n in DELAYS), None)
+        other = next((n for n in DELAYS if n != name), "")
+        if name is None or len(self.names) == 1 or other not in [e.name for e in self.effects]:
+            return False
+        place = self.names.index(name)
+        terms = self._terms()
+        value = np.maximum(-terms[place].values, effect(other).starts(self.observations.sensor)[0])
+        terms[place] = Term(effect(other), value)
+        start = Start(self.fit.bias, self.fit.K, self.start.scale)
+        fit = fit_terms(self.observations, [*self.base.terms, *terms], start, self.settings)
+        gain = 2.0 * (fit.log_likelihood - self.fit.log_likelihood)
+        if gain <= (CLEARLY if other == DELAYS[1] else 0.0):
+            return False
+        step = self.steps.pop(name)
+        found = fit.terms[len(self.base.terms) + place]
+        at = BASE + sum(len(t.values) for t in fit.terms[: len(self.base.terms) + place])
+        self.names[place] = other
+        self.steps[other] = replace(
+            step,
+            name=other,
+            delta_bic=step.delta_bic + gain,
+            values=found.values,
+            uncertainty=np.sqrt(np.diag(fit.covariance)[at : at + len(found.values)]),
+        )
+        self.fits[tuple(self.names)] = fit
+        self._refit()
+        self._drop()
+        return True
 
     def _inflated(self) -> bool:
         """Return whether the residual's wander is far above that of a static recording or of the data sheet."""

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 TIGHTEST_DEG, LOOSEST_DEG = 1e-5, 1e-3
 MOVING_DPS = 0.02
+LAG_ROUNDING_DPS = 1e-11
 
 
 class TurnLog:
@@ -133,7 +134,7 @@ class TurnLog:
         shown = through.copy()
         for _ in range(len(shown)):  # each pass hands on what was shown one sample further; its weight dies out
             following = through + gain * np.concatenate([[0.0], shown[:-1]])
-            settled = np.array_equal(following, shown)
+            settled = float(np.abs(following - shown).max()) <= LAG_ROUNDING_DPS
             shown = following
             if settled:
                 break

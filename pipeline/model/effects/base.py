@@ -142,6 +142,14 @@ class Effect(abc.ABC):
         del values
         return motion
 
+    def slope(self, sensor: str, moved: Motion) -> NDArray[np.float64] | None:
+        """Return the derivative of the truth with respect to the only parameter of an effect of timing: (n, 3) array.
+
+        At the motion that it has led to; None where that does not tell it.
+        """
+        del sensor, moved
+        return None
+
     @property
     def moves(self) -> bool:
         """Whether the effect moves the motion in time."""

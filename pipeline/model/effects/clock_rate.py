@@ -56,6 +56,10 @@ class ClockRate(Effect):
         added: NDArray[np.float64] = change @ K.T
         return added
 
+    def slope(self, sensor: str, moved: Motion) -> NDArray[np.float64]:
+        """Return ``1e-6 t du/dt``."""
+        return PPM * moved.time[:, None] * truth_rate(sensor, moved)
+
     def moved(self, motion: Motion, values: NDArray[np.float64]) -> Motion:
         """Return the motion at ``t + 1e-6 e t``."""
         return shifted(motion, PPM * values[0] * motion.time)

@@ -110,6 +110,10 @@ class TimeOffset(Effect):
         added: NDArray[np.float64] = change @ K.T
         return added
 
+    def slope(self, sensor: str, moved: Motion) -> NDArray[np.float64]:
+        """Return ``du/dt``."""
+        return truth_rate(sensor, moved)
+
     def moved(self, motion: Motion, values: NDArray[np.float64]) -> Motion:
         """Return the motion at ``t + tau``."""
         return shifted(motion, values[0])
