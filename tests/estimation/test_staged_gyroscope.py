@@ -12,6 +12,7 @@ from pipeline.estimation.gyroscope.scale_factor import fit as fit_scale_factor
 from pipeline.model.kinematics import earth_rate
 from pipeline.records import SensorCalibration, StageResult
 from pipeline.records.calibration import coverage_factor
+from pipeline.signal.filters import apply_filter
 
 STAGES = ["bias", "orthogonality_and_misalignment", "scale_factor"]
 BIAS = [-3.837, 0.003, 0.255]  # MPU6050 (1), Sudsanguan 2019, table 5.15
@@ -137,6 +138,15 @@ def test_stated_uncertainty_covers_the_truth() -> None:
         hits.append(np.abs(error) <= coverage_factor(found.degrees_of_freedom) * u)
     assert 0.92 < np.mean(hits) < 0.985
     assert np.all(np.mean(hits, axis=0) > 0.86)
+
+
+@pytest.mark.parametrize("zero_phase", [False, True])
+def test_what_a_filter_still_holds_of_a_turn_is_no_rest(zero_phase: bool) -> None:  # noqa: FBT001
+    applied = {"name": "rc_low_pass", "cutoff_hz": 1.0, "time_constant_s": None, "zero_phase": zero_phase}
+    recordings = [apply_filter(r, applied) for r in Bench("gyroscope", BIAS, K).turns_at([200.0])]
+    found = calibrate(recordings)
+    assert np.allclose(found.bias, BIAS, atol=1e-4)
+    assert np.allclose(found.matrix, M.T, atol=1e-5)
 
 
 def test_without_a_table_log_the_gyroscope_cannot_be_calibrated_and_the_message_says_what_to_record() -> None:

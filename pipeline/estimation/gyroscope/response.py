@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.errors import NotObservableError
+from pipeline.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.sample_blocks import make_blocks
 from pipeline.estimation.turns import usable
 from pipeline.records import AXES
@@ -36,7 +36,9 @@ if TYPE_CHECKING:
 SLOWEST_SHARE = 0.02  # of the largest rate, below which a turn is not called one
 CHANGE_PER_SECOND = 0.25  # of the rate, above which a turn is not steady
 EDGE_S = 0.15
-DELAYS_TO_SETTLE = 5.0
+LONGEST_TAIL = 0.4  # of a steady turn
+FORGOTTEN = 1e-5  # of a change of rate, that a filter's output may still hold where a rest or a steady turn begins
+DELAYS_TO_SETTLE = 12.0  # the same for a filter that is known by its delay alone
 
 
 @dataclass(frozen=True)
@@ -106,11 +108,12 @@ def samples_of(parts: Sequence[Part], recordings: Sequence[Recording]) -> Sample
     """Return the samples at rest and in steady turns, and a static recording's where there is no other rest."""
     chosen, readings, rates = [], [], []
     for part in parts:
-        steady = _steady(part)
+        memory = _memory(part.recording)
+        steady, still = _steady(part, memory), _without_tails(part, memory)
         rate = np.zeros((part.recording.samples, 3))
         if part.motion.axis is not None:
             rate[steady, part.motion.axis] = np.asarray(part.motion.rate)[steady]
-        keep = (part.motion.still | steady) & part.keep
+        keep = (still | steady) & part.keep
         earth = part.motion.angular_rate[keep] - rate[keep]
         readings.append(np.asarray(part.recording.gyroscope)[keep] - earth)
         rates.append(rate[keep])
@@ -126,19 +129,50 @@ def samples_of(parts: Sequence[Part], recordings: Sequence[Recording]) -> Sample
     return Samples(np.concatenate(readings), np.concatenate(rates), make_blocks(chosen), total)
 
 
-def _steady(part: Part) -> NDArray[np.bool_]:
-    """Return the samples in the steady parts of a turn about one axis."""
+def _memory(recording: Recording) -> float:
+    """Return for how long the recording's filter remembers a change, s."""
+    applied = recording.filter
+    if applied["name"] == "none":
+        return 0.0
+    try:
+        from pipeline.signal.noise import filter_autocovariance  # noqa: PLC0415  (only filtered recordings pay for it)
+
+        covariance = np.abs(filter_autocovariance(recording))
+    except (ConfigurationError, KeyError):
+        return DELAYS_TO_SETTLE * float(applied["delay_s"])
+    return float(np.flatnonzero(covariance > FORGOTTEN * covariance[0])[-1] + 1) * recording.interval
+
+
+def _without_tails(part: Part, memory: float) -> NDArray[np.bool_]:
+    """Return the settled samples of the rests, without what a filter still holds of the turns before or after."""
+    still, time = part.motion.still.copy(), part.motion.time
+    before = memory if part.recording.filter.get("zero_phase") else 0.0
+    for start, stop in runs(part.motion.still) if memory > 0 else []:
+        if start > 0:
+            still[start:stop] &= time[start:stop] >= time[start] + memory
+        if stop < len(time):
+            still[start:stop] &= time[start:stop] <= time[stop - 1] - before
+    return still
+
+
+def _steady(part: Part, memory: float) -> NDArray[np.bool_]:
+    """Return the samples in the steady parts of a turn about one axis.
+
+    A turn that is shorter than the filter's memory keeps its middle: what the filter still lacks there is a small share
+    of the rate, where the bias of a rest would take all of it.
+    """
     motion = part.motion
     if motion.axis is None or motion.rate is None:
         return np.zeros(len(motion.time), bool)
     rate, change = np.abs(motion.rate), np.abs(motion.angular_acceleration[:, motion.axis])
-    steady: NDArray[np.bool_] = (
-        (rate > SLOWEST_SHARE * np.max(rate)) & (change <= CHANGE_PER_SECOND * rate) & ~motion.still
-    )
-    edge = EDGE_S + DELAYS_TO_SETTLE * float(part.recording.filter.get("delay_s", 0.0))
+    steady: NDArray[np.bool_] = (rate > SLOWEST_SHARE * np.max(rate)) & (change <= CHANGE_PER_SECOND * rate)
+    steady &= ~motion.still
+    both_ways = bool(part.recording.filter.get("zero_phase"))
     for start, stop in runs(steady):
         time = motion.time[start:stop]
-        steady[start:stop] = (time >= time[0] + (edge if start else 0.0)) & (time <= time[-1] - EDGE_S)
+        tail = min(memory, LONGEST_TAIL * (time[-1] - time[0]))
+        since, until = (EDGE_S + tail if start else 0.0), EDGE_S + both_ways * tail
+        steady[start:stop] = (time >= time[0] + since) & (time <= time[-1] - until)
     return steady
 
 
@@ -147,8 +181,8 @@ def weights_of(rate: NDArray[np.float64], *, as_printed: bool) -> NDArray[np.flo
     rest = np.all(rate == 0, axis=1)
     if not np.any(rest):
         raise NotObservableError(
-            "the gyroscope's recordings hold no rest, and there is no static recording: let the table rest for some "
-            "seconds before a turn"
+            "the gyroscope's recordings hold no rest, or none longer than the filter's memory, and there is no static "
+            "recording: let the table rest for some seconds before a turn"
         )
     weights = np.zeros((4, len(rate)))
     weights[0] = rest / rest.sum()
