@@ -5,16 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.signal import lfilter
 
 from pipeline.model.effects import effect
 from pipeline.model.effects.base import truth
 from pipeline.records import AXES, Recording
 from pipeline.simulation.alterations import ALTERATIONS, alter
 from pipeline.simulation.environment import Environment
-from pipeline.simulation.procedures import Course, plan
+from pipeline.simulation.procedures import Course, Planned, plan
 from pipeline.simulation.scene import Scene
 
 STOP_AND_GO = Course(step_deg=5.0, dwell_s=2.0, rates_dps=(30.0, 100.0), both_directions=True, turns=1, rest_s=5.0)
+THESIS = replace(STOP_AND_GO, step_deg=1.0, dwell_s=1.0)
 ONE_WAY = replace(STOP_AND_GO, both_directions=False)
 CONTINUOUS = replace(STOP_AND_GO, accelerometer_rates_dps=(5.0, 30.0), both_directions=True)
 
@@ -103,14 +105,20 @@ class Session:
     clock_shared: bool = True
     static: bool = False
     ramp: float = 0.0
-    commanded_log: bool = True
 
 
 def record(session: Session) -> list[Recording]:
     """Return the recordings of both sensors."""
     rng = np.random.default_rng(session.seed)
     air = Environment(
-        25.0 + rng.uniform(-1, 1), 4.5, 300.0, 0.3, np.array([2100.0, 4700.0]), rng.uniform(0, 6, 2), session.ramp, 2000.0
+        25.0 + rng.uniform(-1, 1),
+        4.5,
+        300.0,
+        0.3,
+        np.array([2100.0, 4700.0]),
+        rng.uniform(0, 6, 2),
+        session.ramp,
+        2000.0,
     )
     course = replace(session.course, static_s=session.course.static_s if session.static else 0.0)
     planned, start, plans = plan("three_axis_turns", course, rng), 30.0, []
@@ -119,16 +127,27 @@ def record(session: Session) -> list[Recording]:
         plans.append((item, start, start + session.interval * np.arange(n)))
         start += item.trajectory.duration + course.pause_s
     noise = {s: _noise(s, [t for _, _, t in plans], session, rng) for s in WHITE}
-    return [_recording(session, k, *entry, air, noise, rng) for k, entry in enumerate(plans)]
+    return [
+        _recording(session, item, clock, air, {s: noise[s][k] for s in noise}, rng)
+        for k, (item, *clock) in enumerate(plans)
+    ]
 
 
-def _recording(session, index, item, start, time, air, noise, rng) -> Recording:
+def _recording(  # noqa: PLR0917  (one of everything that a recording is made of)
+    session: Session,
+    item: Planned,
+    clock: tuple[float, np.ndarray],
+    air: Environment,
+    noise: dict[str, np.ndarray],
+    rng: np.random.Generator,
+) -> Recording:
     readings = {}
+    start, time = clock
     for sensor in WHITE:
         hidden = session.effects.get(sensor, {})
         scene = alter(Scene(item.trajectory, start, item.axis), hidden)
         motion = scene.motion(time, air.temperature(time))
-        readings[sensor] = BIAS[sensor] + truth(sensor, motion) @ K[sensor].T + noise[sensor][index]
+        readings[sensor] = BIAS[sensor] + truth(sensor, motion) @ K[sensor].T + noise[sensor]
         for name, values in hidden.items():
             if name not in ALTERATIONS:
                 readings[sensor] += effect(name).reading(sensor, motion, K[sensor], values)
@@ -152,10 +171,8 @@ def _recording(session, index, item, start, time, air, noise, rng) -> Recording:
     )
 
 
-def _noise(sensor, times, session, rng) -> list[np.ndarray]:
+def _noise(sensor: str, times: list[np.ndarray], session: Session, rng: np.random.Generator) -> list[np.ndarray]:
     time = np.concatenate(times)
-    from scipy.signal import lfilter
-
     grid = np.arange(time[0], time[-1] + session.interval, session.interval)
     r = np.exp(-session.interval / session.wander_time)
     drive = rng.standard_normal((len(grid), 3)) * np.sqrt(1 - r * r)

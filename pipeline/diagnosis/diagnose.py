@@ -6,6 +6,7 @@ with what else would look alike, what cannot be seen in these recordings, what r
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from pipeline.records import Noise, Recording, SensorCalibration
 
 ALIKE = 0.8
+MOSTLY = 0.5
 
 
 def diagnose(
@@ -90,9 +92,11 @@ def _document(
     noise: Noise | None,
     table: Mapping[str, Any],
 ) -> dict[str, Any]:
+    unknown = unexplained(selection)
+    if unknown and selection.names and _explained_share(selection, noise) < MOSTLY:
+        selection = withdrawn(selection)
     sensor, selected = selection.observations.sensor, selection.names
     hidden = not_observable(selection, configured)
-    unknown = unexplained(selection)
     ladder = _ladder(selection, recordings, table)
     explained = selection.first.explained([])
     ranking = [_entry(selection, name, ladder, explained, noise) for name in _order(selection, hidden)]
@@ -114,6 +118,16 @@ def _document(
         "configured": configured,
         "wander": {"ratio": wander.ratio, "time_s": wander.time if wander.ratio else None},
     }
+
+
+def withdrawn(selection: Selection) -> Selection:
+    """Return the selection without its effects: what they explain is little beside what none explains."""
+    return replace(selection, names=[], steps={}, fit=selection.base, ranking=selection.first)
+
+
+def _explained_share(selection: Selection, noise: Noise | None) -> float:
+    """Return the share of the excess over the noise that all selected effects explain."""
+    return _share(selection.base.residual_rms**2 - selection.fit.residual_rms**2, selection, noise)
 
 
 def _order(selection: Selection, hidden: Mapping[str, str]) -> list[str]:

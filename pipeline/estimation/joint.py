@@ -251,10 +251,16 @@ def starts_of(names: Sequence[str], sensor: str, known: SensorCalibration | None
     Raises
     ------
     ConfigurationError
-        If an effect is unknown, named twice, or not one of this sensor.
+        If an effect is unknown, named twice, contained in another, or not one of this sensor.
     """
     if len(set(names)) != len(names):
         raise ConfigurationError(f"effects.{sensor} names an effect twice: {', '.join(names)}")
+    for name in names:
+        within = [n for n in effect(name).contains if n in names]
+        if within:
+            raise ConfigurationError(
+                f"effects.{sensor} names {name} and {within[0]}, which it contains: name one of them"
+            )
     fitted = {} if known is None else {e.name: e.values for e in known.effects}
     combinations: list[list[Term]] = [[]]
     for name in names:

@@ -43,6 +43,7 @@ MOVER_SHARE = 0.1  # of the best candidate's delta BIC above which an effect of 
 DELAYS = ("time_offset", "low_pass_lag")  # of the two the first is taken unless the second is clearly better
 CLEARLY = 6.0
 TIE = 0.5
+ANOTHER_K = 2e-3  # change of K that changes the columns of effects that the axes share
 SECOND = {"accelerometer": (), "gyroscope": ("table_encoder_error",)}  # exact look-alikes of a likelier effect
 
 
@@ -219,9 +220,15 @@ class _Search:
                 alone[best.name] = best
             self.names.append(best.name)
             self.steps[best.name] = best
-            if effect(best.name).nonlinear:
-                self._refit()
+            self._accept(best.name)
             self._drop()
+
+    def _accept(self, name: str) -> None:
+        """Fit with the new effect; rebuild the candidates if their columns depend on what has changed."""
+        K = self.fit.K
+        self._fit_selected()
+        if effect(name).nonlinear or np.abs(self.fit.K - K).max() > ANOTHER_K:
+            self.ranking = self._ranking()
 
     def _ranking(self) -> Ranking:
         """Build the linear problem: configured effects in the base, the others as candidates."""
@@ -292,6 +299,9 @@ class _Search:
     def _passes(self, score: Score) -> bool:
         """Return whether a candidate passes the gate; a lag cannot be negative, nor be told beside a delay."""
         if score.name in DELAYS and any(name in DELAYS for name in self.names):
+            return False
+        held = [*self.names, *(term.effect.name for term in self.base.terms)]
+        if any(score.name in effect(name).contains or name in effect(score.name).contains for name in held):
             return False
         real = score.name != DELAYS[1] or score.values[0] > 0
         significant = score.delta_bic > GATE_BIC and score.p_value * len(self.effects) < GATE_P

@@ -7,9 +7,10 @@ that know nothing of where one stretch ends. Between two samples, dt apart,
     a bend at s:      dr = a s + b (dt - s),   dA = r_0 dt + a s (dt - s / 2) + b (dt - s)^2 / 2
 
 where a and b are the accelerations before and after it. An interval without a bend has ``a = dr / dt``; one with a bend
-takes a, b or both from its neighbours, which gives s, and where both are known the second equation is a check. So ramps
-of a few samples are followed exactly. Elsewhere, in smooth motion, the angle is the quintic through angle, rate and
-acceleration at both ends, with the acceleration from the five nearest rates; one curve gives all three.
+takes a, b or both from its neighbours, which gives s; where both are known the second equation is a check, else the
+next interval must go on as this one ends. So ramps of a few samples are followed exactly. Elsewhere, in smooth motion,
+the angle is the quintic through angle, rate and acceleration at both ends, with the acceleration from the five nearest
+rates; one curve gives all three.
 """
 
 from __future__ import annotations
@@ -24,7 +25,9 @@ if TYPE_CHECKING:
     Values = NDArray[np.float64]
 
 TIGHTEST_DEG, LOOSEST_DEG = 1e-5, 1e-3
+GENTLE_DEG, EXACT_DEG = 1e-4, 1e-6  # smooth motion, where no bend is looked for; and an interval without any
 MOVING_DPS = 0.02
+SAME_SHARE, SAME_DPS2 = 0.01, 0.1
 LAG_ROUNDING_DPS = 1e-11
 
 
@@ -59,9 +62,13 @@ class TurnLog:
         self._tolerance = float(np.clip(10.0 * np.median(np.abs(excess)), TIGHTEST_DEG, LOOSEST_DEG))
         even = np.abs(excess) <= self._tolerance
         self._bend, self._before, self._after, bent = self._bends(even)
-        self.explained: NDArray[np.bool_] = even | bent
-        self.acceleration = self._at_samples()
-        self.followed: NDArray[np.bool_] = self.explained | self._smooth(excess)
+        slope = nearest_slope(time, rate)
+        miss = np.abs(excess + np.diff(slope) * self._step**2 / 12.0)
+        gentle = np.convolve(miss > GENTLE_DEG, np.ones(3), "same") < 0.5
+        gentle &= np.abs(excess) > EXACT_DEG
+        self.explained: NDArray[np.bool_] = np.logical_and(even | bent, np.logical_not(gentle))
+        self.acceleration = self._at_samples(slope)
+        self.followed: NDArray[np.bool_] = self.explained | self._smooth(miss)
         beside = np.concatenate([[True], self.followed, [True]])
         self.followed_samples: NDArray[np.bool_] = np.logical_and(beside[1:], beside[:-1])
 
@@ -81,10 +88,14 @@ class TurnLog:
             a = np.where(right & ~left, (dr - b * (step - s)) / s, a)
             miss = np.abs(dA - r0 * step - a * s * (step - 0.5 * s) - 0.5 * b * (step - s) ** 2)
             bent = ~even & (left | right) & (s >= 0) & (s <= step) & (miss <= 3.0 * self._tolerance)
+            # With one neighbour known there is nothing left to check by, but the next interval must go on as this ends.
+            same = np.abs(b[:-1] - a[1:]) <= SAME_SHARE * np.abs(b[:-1]) + SAME_DPS2
+            checked = (left & right) | np.append(same & bent[1:], False) | np.append(False, same & bent[:-1])
+            bent &= checked
         whole = ~bent
         return np.where(whole, step, s), np.where(whole, mean, a), np.where(whole, mean, b), bent
 
-    def _at_samples(self) -> Values:
+    def _at_samples(self, slope: Values) -> Values:
         """Return the acceleration at the samples: of an explained interval beside it, else of the nearest rates."""
         known = np.zeros((2, len(self.time)))
         weight = np.zeros((2, len(self.time)))
@@ -92,13 +103,9 @@ class TurnLog:
         known[1, 1:], weight[1, 1:] = self._after, self.explained
         total = weight.sum(0)
         mean = (known * weight).sum(0) / np.where(total > 0, total, 1.0)
-        return mean if np.all(total > 0) else np.where(total > 0, mean, nearest_slope(self.time, self.rate))
+        return np.where(total > 0, mean, slope)
 
-    def _smooth(self, excess: Values) -> NDArray[np.bool_]:
-        if self.explained.all():
-            return self.explained
-        slope = nearest_slope(self.time, self.rate)
-        miss = np.abs(excess + np.diff(slope) * self._step**2 / 12.0)
+    def _smooth(self, miss: Values) -> NDArray[np.bool_]:
         moving = np.abs(self._mean) + np.abs(self.rate[1:]) + np.abs(self.rate[:-1]) > MOVING_DPS
         inside = np.convolve(moving, np.ones(7), "same") > 6.5
         noise = 4.0 * float(np.median(miss[inside])) if inside.sum() > 20 else 0.0

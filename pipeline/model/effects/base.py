@@ -74,6 +74,8 @@ class Effect(abc.ABC):
         Whether the time between the recordings must be known.
     nonlinear : tuple of str
         Parameters in which the reading is not linear.
+    contains : tuple of str
+        Effects of which this is a generalisation; the two are never fitted together.
     unseen : dict of str to str
         Sensor to the reason why the effect never changes its readings.
     meaning : str
@@ -93,6 +95,7 @@ class Effect(abc.ABC):
     needs: ClassVar[tuple[str, ...]] = ()
     needs_clock: ClassVar[bool] = False
     nonlinear: ClassVar[tuple[str, ...]] = ()
+    contains: ClassVar[tuple[str, ...]] = ()
     unseen: ClassVar[dict[str, str]] = {}
     meaning: ClassVar[str]
     excitation: ClassVar[str]

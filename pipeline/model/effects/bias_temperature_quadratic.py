@@ -26,6 +26,7 @@ class BiasTemperatureQuadratic(Effect):
     owner = Owner.SENSOR
     layout = Layout.EVERY_AXIS
     needs = ("temperature",)
+    contains = ("bias_temperature",)
     meaning = "The bias changes with the temperature along a parabola."
     excitation = "a temperature that changes by ten degrees and more while it is recorded"
     experiment = "heat and cool over a wider span, and so that the temperature does not simply rise with time"

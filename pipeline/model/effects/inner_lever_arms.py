@@ -28,6 +28,7 @@ class InnerLeverArms(Effect):
     owner = Owner.SENSOR
     layout = Layout.PER_AXIS
     sensors = ("accelerometer",)
+    contains = ("lever_arm",)
     meaning = "The accelerometers of the three axes are not at one point."
     excitation = "turns about all three axes at 100 deg/s and more"
     experiment = "turn about all three axes at 100 to 200 deg/s while the accelerometer is recorded"

@@ -1,0 +1,258 @@
+"""The diagnosis names what is hidden, invents nothing, and says what it cannot see."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from bench_session import CONTINUOUS, ONE_WAY, SIZE, STOP_AND_GO, THESIS, Course, Session, record, values_of
+
+from pipeline.diagnosis.diagnose import diagnose
+from pipeline.diagnosis.words import in_words
+from pipeline.estimation.gyroscope import effects as gyroscope_stage
+from pipeline.records import Recording, SensorCalibration
+from pipeline.signal.noise import estimate_noise
+
+SHEET = yaml.safe_load((Path(__file__).parents[2] / "configs/sensor/mpu6050.yaml").read_text(encoding="utf-8"))
+TABLE = {"gravity_g": 1.0, "latitude_deg": None, "azimuth_deg": None}
+FIRST = [
+    ("accelerometer", "bias_temperature"),
+    ("accelerometer", "scale_factor_asymmetry"),
+    ("accelerometer", "quadratic_nonlinearity"),
+    ("accelerometer", "lever_arm"),
+    ("accelerometer", "time_offset"),
+    ("gyroscope", "bias_temperature"),
+    ("gyroscope", "scale_factor_asymmetry"),
+    ("gyroscope", "quadratic_nonlinearity"),
+    ("gyroscope", "time_offset"),
+    ("gyroscope", "g_sensitivity"),
+]
+KEYS = {
+    "verdict",
+    "residual_over_noise",
+    "selected",
+    "ranking",
+    "not_observable",
+    "unexplained",
+    "next_experiment",
+    "override",
+}
+ENTRY = {
+    "effect",
+    "delta_bic",
+    "p_value",
+    "parameters",
+    "explained_share",
+    "held_out_error_before",
+    "held_out_error_after",
+    "look_alikes",
+    "plausible",
+}
+
+
+def settings(sensor: str, configured: Any = ()) -> dict[str, Any]:
+    names = configured if isinstance(configured, str) else list(configured)
+    return {"sensor": SHEET, "table": TABLE, "effects": {sensor: names}}
+
+
+def diagnosed(sensor: str, recordings: list[Recording], configured: Any = ()) -> dict[str, Any]:
+    noise = estimate_noise(sensor, recordings, SHEET[sensor])
+    return diagnose(SensorCalibration(sensor), recordings, noise, settings(sensor, configured))
+
+
+def hidden(sensor: str, *names: str, seed: int = 1, course: Course = STOP_AND_GO) -> list[Recording]:
+    rng = np.random.default_rng(seed)
+    effects = {name: values_of(sensor, name, rng) for name in names}
+    return record(Session(seed, course, {sensor: effects}))
+
+
+def reason_of(part: dict[str, Any], name: str) -> str:
+    return next((e["reason"] for e in part["not_observable"] if e["effect"] == name), "observable")
+
+
+@pytest.mark.parametrize(("sensor", "name"), FIRST)
+def test_an_effect_of_data_sheet_size_is_named_alone_and_mended(sensor: str, name: str) -> None:
+    part = diagnosed(sensor, hidden(sensor, name))
+    assert part["selected"] == [name]
+    assert part["verdict"] == "missing_effect"
+    best = part["ranking"][0]
+    assert best["effect"] == name
+    assert best["plausible"]
+    assert best["held_out_error_after"] < best["held_out_error_before"]
+    mended = diagnosed(sensor, hidden(sensor, name), [name])
+    assert mended["verdict"] == "nothing_missing"
+    assert 0.85 < mended["residual_over_noise"] < 1.05 < part["residual_over_noise"]
+
+
+@pytest.mark.parametrize("sensor", SIZE)
+@pytest.mark.parametrize("wander", [1.0, 5.0])
+def test_nothing_is_selected_where_nothing_is_hidden(sensor: str, wander: float) -> None:
+    for seed in range(10):
+        part = diagnosed(sensor, record(Session(seed + 500, wander=wander)))
+        assert part["selected"] == [], (seed, part["ranking"][0])
+        assert part["unexplained"] == []
+        assert part["verdict"] == "nothing_missing"
+
+
+def test_two_effects_are_named_together_each_with_its_share_and_held_out_error() -> None:
+    part = diagnosed("accelerometer", hidden("accelerometer", "lever_arm", "cross_axis_nonlinearity"))
+    assert part["selected"] == ["lever_arm", "cross_axis_nonlinearity"]
+    assert part["override"] == "effects.accelerometer=[lever_arm,cross_axis_nonlinearity]"
+    first, second = part["ranking"][:2]
+    assert first["held_out_error_after"] == second["held_out_error_before"]
+    assert second["held_out_error_after"] < second["held_out_error_before"] < first["held_out_error_before"]
+    assert first["explained_share"] + second["explained_share"] == pytest.approx(1.0, abs=0.02)
+
+
+def test_the_second_of_two_effects_is_named_beside_a_configured_one() -> None:
+    recordings = hidden("gyroscope", "g_sensitivity", "scale_factor_asymmetry")
+    part = diagnosed("gyroscope", recordings, ["g_sensitivity"])
+    assert part["selected"] == ["scale_factor_asymmetry"]
+    assert part["override"] == "effects.gyroscope=[g_sensitivity,scale_factor_asymmetry]"
+    assert "g_sensitivity" not in {entry["effect"] for entry in part["ranking"]}
+
+
+def test_a_part_holds_every_field_and_is_json() -> None:
+    part = json.loads(json.dumps(diagnosed("accelerometer", hidden("accelerometer", "quadratic_nonlinearity"))))
+    assert set(part) >= KEYS
+    assert all(set(entry) == ENTRY for entry in part["ranking"])
+    listed = {e["effect"] for e in part["ranking"]} | {e["effect"] for e in part["not_observable"]}
+    assert {"warm_up", "table_tilt", "lever_arm", "low_pass_lag", "bias_drift"} <= listed
+
+
+def test_squares_and_magnitudes_on_a_one_g_circle_are_printed_as_look_alikes() -> None:
+    part = diagnosed("accelerometer", hidden("accelerometer", "quadratic_nonlinearity"))
+    alike = {a["effect"]: a["share"] for a in part["ranking"][0]["look_alikes"]}
+    assert 0.9 < alike["scale_factor_asymmetry"] < 0.97
+    assert "more than 1 g" in part["next_experiment"]
+
+
+def test_asymmetry_of_a_gyroscope_that_turns_one_way_is_not_observable() -> None:
+    part = diagnosed("gyroscope", hidden("gyroscope", "scale_factor_asymmetry", course=ONE_WAY))
+    assert part["selected"] == []
+    assert "one direction" in reason_of(part, "scale_factor_asymmetry")
+    assert "other direction" in part["next_experiment"]
+
+
+def test_lever_arm_delay_and_rate_effects_are_not_observable_in_stop_and_go_alone() -> None:
+    stops = [r for r in hidden("accelerometer", course=THESIS) if r.role == "accelerometer"]
+    part = diagnosed("accelerometer", stops)
+    for name in ("lever_arm", "inner_lever_arms", "time_offset", "low_pass_lag", "rate_dependence"):
+        assert "never moved" in reason_of(part, name), name
+    assert reason_of(part, "table_tilt") == "observable"
+
+
+def test_effects_of_temperature_are_not_observable_without_one_or_at_a_steady_one() -> None:
+    without = [replace(r, temperature=None) for r in hidden("gyroscope")]
+    assert "hold no temperature" in reason_of(diagnosed("gyroscope", without), "bias_temperature")
+    steady = [replace(r, temperature=np.full(r.samples, 31.0)) for r in hidden("gyroscope")]
+    assert "changes by no more than" in reason_of(diagnosed("gyroscope", steady), "bias_temperature")
+
+
+def test_effects_of_time_are_not_observable_where_each_recording_starts_at_zero() -> None:
+    part = diagnosed("accelerometer", record(Session(2, clock_shared=False)))
+    for name in ("warm_up", "bias_drift", "clock_rate"):
+        assert "time between the recordings is not known" in reason_of(part, name)
+
+
+def test_tilt_of_the_table_never_changes_a_rate() -> None:
+    assert "does not change a rate" in reason_of(diagnosed("gyroscope", hidden("gyroscope")), "table_tilt")
+
+
+def test_an_effect_outside_the_data_sheet_is_called_implausible() -> None:
+    recordings = record(Session(1, effects={"accelerometer": {"lever_arm": np.array([2.0, 0.0, 0.0])}}))
+    part = diagnosed("accelerometer", recordings)
+    assert part["selected"] == ["lever_arm"]
+    assert not part["ranking"][0]["plausible"]
+    assert any("data sheet" in line for line in in_words(part, "accelerometer"))
+
+
+def test_earth_rotation_is_no_candidate_where_the_place_is_configured() -> None:
+    recordings = hidden("gyroscope")
+    configured = settings("gyroscope") | {"table": TABLE | {"latitude_deg": 13.7, "azimuth_deg": 0.0}}
+    part = diagnose(SensorCalibration("gyroscope"), recordings, None, configured)
+    named = {e["effect"] for e in part["ranking"]} | {e["effect"] for e in part["not_observable"]}
+    assert "earth_rotation" not in named
+
+
+def test_a_dependence_that_no_effect_has_is_reported_as_unexplained() -> None:
+    recordings = [
+        r
+        if r.table_angle is None or r.accelerometer is None
+        else replace(r, accelerometer=r.accelerometer + 0.004 * np.cos(np.radians(5.0 * r.table_angle))[:, None])
+        for r in hidden("accelerometer")
+    ]
+    part = diagnosed("accelerometer", recordings)
+    assert "angle" in {entry["covariate"] for entry in part["unexplained"]}
+    assert part["verdict"] == "unexplained"
+    assert part["selected"] == []
+
+
+def test_recordings_without_a_table_cannot_be_diagnosed_and_say_so() -> None:
+    rests = [replace(r, role="rests", axis=None, table_angle=None) for r in hidden("accelerometer")]
+    part = diagnosed("accelerometer", rests)
+    assert part["verdict"] == "not_enough_data"
+    assert "motion of a table" in reason_of(part, "bias_temperature")
+    assert "motion of a table" in in_words(part, "accelerometer")[1]
+
+
+def test_automatic_effects_are_fitted_and_the_diagnosis_tells_what_was_added() -> None:
+    recordings = hidden("gyroscope", "g_sensitivity")
+    calibration = gyroscope_stage.fit(recordings, None, settings("gyroscope", "auto"))
+    assert [e.name for e in calibration.effects] == ["g_sensitivity"]
+    noise = estimate_noise("gyroscope", recordings, SHEET["gyroscope"])
+    part = diagnose(calibration, recordings, noise, settings("gyroscope", "auto"))
+    assert part["selected"] == ["g_sensitivity"]
+
+
+def test_units_do_not_change_what_is_selected() -> None:
+    recordings = hidden("accelerometer", "quadratic_nonlinearity", "table_tilt")
+    scaled = [
+        replace(r, accelerometer=None if r.accelerometer is None else 9.80665 * r.accelerometer) for r in recordings
+    ]
+    here = diagnose(SensorCalibration("accelerometer"), recordings, None, settings("accelerometer"))
+    there = diagnose(SensorCalibration("accelerometer"), scaled, None, settings("accelerometer"))
+    assert there["selected"] == here["selected"] == ["quadratic_nonlinearity", "table_tilt"] or there[
+        "selected"
+    ] == here["selected"] == ["table_tilt", "quadratic_nonlinearity"]
+
+
+def test_words_say_verdict_size_and_what_to_do() -> None:
+    part = diagnosed("accelerometer", hidden("accelerometer", "quadratic_nonlinearity"))
+    text = "\n".join(in_words(part, "accelerometer"))
+    assert "misses quadratic nonlinearity" in text
+    assert "K2_x = " in text
+    assert "held-out" in text
+    assert "effects.accelerometer=[quadratic_nonlinearity]" in text
+    assert in_words(None, "gyroscope") == ["The gyroscope was not calibrated, so there is nothing to diagnose."]
+
+
+@pytest.mark.study
+@pytest.mark.parametrize("sensor", SIZE)
+@pytest.mark.parametrize("course", [STOP_AND_GO, CONTINUOUS, ONE_WAY])
+def test_at_most_two_of_a_hundred_sessions_without_an_effect_invent_one(sensor: str, course: Course) -> None:
+    invented = [
+        (seed, part["selected"])
+        for seed in range(100)
+        if (part := diagnosed(sensor, record(Session(seed + 5000, course, wander=1.0 + 4.0 * (seed % 2)))))["selected"]
+    ]
+    assert len(invented) <= 2, invented
+
+
+@pytest.mark.study
+@pytest.mark.parametrize(("sensor", "name"), [(s, n) for s in SIZE for n in SIZE[s]])
+def test_each_effect_is_named_or_called_invisible_or_a_look_alike_of_what_is_named(sensor: str, name: str) -> None:
+    for seed in range(3):
+        part = diagnosed(sensor, hidden(sensor, name, seed=seed + 40, course=CONTINUOUS))
+        alike = {a["effect"] for entry in part["ranking"][:1] for a in entry["look_alikes"]}
+        assert (
+            part["selected"] == [name]
+            or reason_of(part, name) != "observable"
+            or name in alike
+            or (part["selected"] == [] and next(e for e in part["ranking"] if e["effect"] == name)["delta_bic"] < 10)
+        )

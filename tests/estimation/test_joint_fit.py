@@ -1,0 +1,146 @@
+"""Base and effects fitted together find what was hidden, and say what they cannot find."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from bench_session import BIAS, CONTINUOUS, ONE_WAY, SIZE, STOP_AND_GO, THESIS, K, Session, record, values_of
+from scipy.special import stdtrit
+
+from pipeline.errors import ConfigurationError, NotObservableError
+from pipeline.estimation.accelerometer import effects as accelerometer_stage
+from pipeline.estimation.joint import fit_joint
+from pipeline.estimation.observations import observe
+from pipeline.estimation.wandering import Setting, Whitened, cells_of
+from pipeline.records import SensorCalibration
+from pipeline.signal.filters import apply_filter
+
+TABLE = {"gravity_g": 1.0, "latitude_deg": None, "azimuth_deg": None}
+SETTINGS: dict[str, Any] = {"table": TABLE}
+# A leaning turn axis adds to a rate what the matrix does: that is a test of its own.
+CASES = [(s, name) for s in SIZE for name in SIZE[s] if (s, name) != ("gyroscope", "table_axis_nonorthogonality")]
+
+
+@pytest.mark.parametrize(("sensor", "name"), CASES)
+def test_every_effect_is_recovered_within_its_uncertainty(sensor: str, name: str) -> None:
+    hidden = values_of(sensor, name, np.random.default_rng(5))
+    # scale factors at several temperatures need a chamber; the others are seen as they are
+    session = Session(11, CONTINUOUS, {sensor: {name: hidden}}, ramp=10.0 if "temperature" in name else 0.0)
+    calibration = fit_joint(sensor, record(session), [name], None, SETTINGS)
+    found = np.concatenate([calibration.bias, calibration.matrix.ravel(), calibration.effects[0].values])
+    truth = np.concatenate([BIAS[sensor], np.linalg.inv(K[sensor]).ravel(), hidden])
+    assert calibration.covariance is not None
+    uncertainty = np.sqrt(np.diag(calibration.covariance))
+    factor = stdtrit(calibration.degrees_of_freedom, 1 - 0.5e-3 / len(found))  # one false alarm in 1000 such fits
+    assert calibration.converged
+    assert np.max(np.abs(found - truth) / uncertainty) < factor
+    size = np.abs(hidden).max() if name != "warm_up" else np.abs(hidden[:3]).max()
+    assert np.abs(found[12 : 12 + min(3, len(hidden))] - hidden[:3]).max() < 0.5 * size
+
+
+def test_the_order_of_the_effects_is_kept_with_units_and_expanded_uncertainties() -> None:
+    hidden = {"lever_arm": np.array([0.05, 0.0, 0.02]), "quadratic_nonlinearity": np.full(3, 5e-3)}
+    names = ["quadratic_nonlinearity", "lever_arm"]
+    calibration = fit_joint(
+        "accelerometer", record(Session(2, effects={"accelerometer": hidden})), names, None, SETTINGS
+    )
+    assert [e.name for e in calibration.effects] == names
+    assert calibration.parameter_names()[-1] == "lever_arm.r_z"
+    r_x = calibration.effects[1].parameters["r_x"]
+    assert r_x["unit"] == "m"
+    assert 0 < r_x["expanded_uncertainty"] < 0.002
+    assert calibration.stages[-1].name == "effects"
+    assert SensorCalibration.from_json("accelerometer", calibration.to_json()).effects == calibration.effects
+
+
+def test_the_stage_passes_on_what_was_there_where_no_effect_is_asked_for() -> None:
+    before = SensorCalibration("accelerometer", bias=np.ones(3))
+    assert accelerometer_stage.fit([], before, {"effects": {"accelerometer": []}}) is before
+
+
+def test_known_delay_of_a_filter_is_taken_off_the_reference() -> None:
+    settings = {"name": "low_pass", "cutoff_hz": 1.5, "order": 2, "zero_phase": False, "time_constant_s": None}
+    settings |= {"low_hz": None, "high_hz": None}
+    filtered = [apply_filter(r, settings) for r in record(Session(4, CONTINUOUS))]
+    delay = filtered[0].filter["delay_s"]
+    assert delay > 0.1
+    calibration = fit_joint("accelerometer", filtered, ["time_offset"], None, SETTINGS)
+    assert abs(calibration.effects[0].values[0]) < 0.02 * delay
+    unaware = [replace(r, filter={**r.filter, "delay_s": 0.0}) for r in filtered]
+    assert fit_joint("accelerometer", unaware, ["time_offset"], None, SETTINGS).effects[0].values[0] == pytest.approx(
+        -delay, rel=0.02
+    )
+
+
+def test_every_recording_serves_both_sensors() -> None:
+    names = {part.name for part in observe("accelerometer", record(Session(1)), TABLE).parts}
+    assert names == {f"{sensor}_{axis}" for sensor in ("accel", "gyro") for axis in "xyz"}
+
+
+@pytest.mark.parametrize(
+    ("sensor", "course", "session", "names", "message"),
+    [
+        ("gyroscope", ONE_WAY, {}, ["scale_factor_asymmetry"], r"scale_factor_asymmetry\.c_x.*both directions"),
+        ("gyroscope", STOP_AND_GO, {}, ["table_axis_nonorthogonality"], "do not determine"),
+        ("accelerometer", STOP_AND_GO, {"temperature": False}, ["bias_temperature"], "no recording holds"),
+        ("accelerometer", STOP_AND_GO, {"clock_shared": False}, ["bias_drift"], "time between the recordings"),
+    ],
+)
+def test_what_the_recordings_do_not_determine_is_refused_by_name(
+    sensor: str, course: Any, session: dict[str, Any], names: list[str], message: str
+) -> None:
+    with pytest.raises(NotObservableError, match=message):
+        fit_joint(sensor, record(Session(1, course, **session)), names, None, SETTINGS)
+
+
+def test_a_lever_arm_is_refused_where_the_table_only_stops_and_goes() -> None:
+    stops = [r for r in record(Session(1, THESIS)) if r.role == "accelerometer"]
+    with pytest.raises(NotObservableError, match=r"lever_arm\.r_x.*lever_arm needs turns at 30 deg/s"):
+        fit_joint("accelerometer", stops, ["lever_arm"], None, SETTINGS)
+
+
+def test_turns_about_one_axis_do_not_determine_the_matrix() -> None:
+    one = [r for r in record(Session(1)) if r.axis == "x"]
+    with pytest.raises(NotObservableError, match="do not determine column x of the matrix"):
+        fit_joint("accelerometer", one, [], None, SETTINGS)
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (["g_sensitivity"], "is an effect of the gyroscope alone"),
+        (["lever_arm", "lever_arm"], "names an effect twice"),
+        (["lever_arm", "inner_lever_arms"], "which it contains"),
+    ],
+)
+def test_a_list_that_makes_no_sense_is_refused(names: list[str], message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message):
+        fit_joint("accelerometer", record(Session(1)), names, None, SETTINGS)
+
+
+def test_products_under_wander_are_those_of_the_whole_covariance() -> None:
+    observations = observe("gyroscope", record(Session(6)), TABLE)
+    cells, weight = cells_of(observations), observations.weight
+    rng, setting = np.random.default_rng(0), Setting(0.4, 80.0)
+    columns = rng.standard_normal((len(weight), 4))
+    ends = np.append(cells.first[1:], len(weight))
+    member = np.repeat(np.arange(len(ends)), ends - cells.first)
+    wander = setting.ratio**2 * np.exp(-np.abs(cells.time[:, None] - cells.time) / setting.time)
+    covariance = np.diag(1.0 / weight) + wander[np.ix_(member, member)]
+    expected = columns.T @ np.linalg.solve(covariance, columns)
+    found, logarithm = Whitened(cells, weight, columns.copy()).products(setting)
+    np.testing.assert_allclose(found, expected, rtol=1e-8)
+    assert logarithm == pytest.approx(np.linalg.slogdet(covariance)[1] + np.log(weight).sum(), rel=1e-9)
+
+
+def test_uncertainty_covers_the_truth_in_nineteen_fits_of_twenty() -> None:
+    inside = []
+    for seed in range(12):
+        calibration = fit_joint("gyroscope", record(Session(seed + 300)), [], None, SETTINGS)
+        bounds = calibration.to_json()["expanded_uncertainty"]
+        inside += (np.abs(calibration.bias - BIAS["gyroscope"]) < bounds["bias"]).tolist()
+        inside += (np.abs(calibration.matrix - np.linalg.inv(K["gyroscope"])) < bounds["matrix"]).ravel().tolist()
+    assert 0.90 < np.mean(inside) <= 1.0

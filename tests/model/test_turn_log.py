@@ -1,0 +1,71 @@
+"""The trajectory between the samples of a log is that of the table's program."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline.model.turn_log import TurnLog, nearest_slope
+from pipeline.simulation.program import Program, ProgramBuilder
+
+
+@pytest.fixture(scope="module")
+def program() -> Program:
+    builder = ProgramBuilder(100.0).rest(3.0)
+    for rate in (30.0, 60.0, -100.0):
+        builder.turn_with_plateau(360.0 * np.sign(rate), abs(rate)).rest(2.0)
+    return builder.build()
+
+
+def log_of(program: Program, interval: float = 0.12) -> TurnLog:
+    time = np.arange(0.0, program.duration, interval)
+    angle, rate, _, _ = program.at(time)
+    return TurnLog(time, angle, rate)
+
+
+def test_ramps_of_a_few_samples_are_followed_exactly_between_them(program: Program) -> None:
+    log = log_of(program)
+    between = log.time[:-1] + np.random.default_rng(0).uniform(0.0, 0.12, len(log.time) - 1)
+    angle, rate, acceleration = log.at(between[log.explained])
+    truth = program.at(between[log.explained])
+    assert np.mean(log.explained) > 0.99
+    np.testing.assert_allclose(angle, truth[0], atol=1e-6)
+    np.testing.assert_allclose(rate, truth[1], atol=1e-5)
+    assert np.mean(np.abs(acceleration - truth[2]) > 1e-3) < 0.01
+
+
+def test_a_step_between_two_samples_is_not_claimed_to_be_followed() -> None:
+    time = np.arange(0.0, 6.0, 0.12)
+    angle = np.where(time < 3.0, 0.0, 1.0)
+    log = TurnLog(time, angle, np.zeros_like(time))
+    assert np.flatnonzero(~log.followed).tolist() == [int(np.searchsorted(time, 3.0)) - 1]
+
+
+def test_smooth_motion_is_interpolated_to_a_hundred_thousandth_of_its_amplitude() -> None:
+    time = np.arange(0.0, 20.0, 0.12)
+    w = 2 * np.pi * 0.3
+    log = TurnLog(time, 40 * np.sin(w * time), 40 * w * np.cos(w * time))
+    at = time[3:-4] + 0.05
+    angle, rate, _ = log.at(at)
+    np.testing.assert_allclose(angle, 40 * np.sin(w * at), atol=40 * 1e-5)
+    np.testing.assert_allclose(rate, 40 * w * np.cos(w * at), atol=40 * w * 1e-4)
+    assert log.followed.all()
+
+
+def test_slope_of_a_quartic_is_exact_at_uneven_times() -> None:
+    time = np.cumsum(np.random.default_rng(1).uniform(0.1, 0.3, 30))
+    values = np.polynomial.polynomial.polyval(time, [1.0, -2.0, 0.5, 0.3, -0.05])
+    expected = np.polynomial.polynomial.polyval(time, [-2.0, 1.0, 0.9, -0.2])
+    np.testing.assert_allclose(nearest_slope(time, values), expected, rtol=1e-9, atol=1e-8)
+
+
+def test_lagged_rate_is_the_convolution_with_an_exponential(program: Program) -> None:
+    log, lag = log_of(program), 0.02
+    fine = np.arange(0.0, 25 * lag, lag / 400)
+    for t in np.arange(4.0, program.duration, 0.7317):
+        kernel = np.exp(-fine / lag) / lag
+        expected = np.trapezoid(kernel * program.at(np.maximum(t - fine, 0.0))[1], fine)
+        value, slope = log.lagged(np.array([t]), lag)
+        assert value[0] == pytest.approx(expected, abs=1e-3)
+        later = log.lagged(np.array([t + 1e-6]), lag)[0] - log.lagged(np.array([t - 1e-6]), lag)[0]
+        assert slope[0] == pytest.approx(later[0] / 2e-6, abs=1e-2)
