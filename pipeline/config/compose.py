@@ -111,12 +111,11 @@ class Composer:
         for key, value in values:
             _set(merged, key.split("."), value)
         try:
-            resolved = OmegaConf.to_container(OmegaConf.create(merged), resolve=True)
+            resolve_references(merged, merged)
         except OmegaConfBaseException as error:
             raise Problem(str(error).splitlines()[0]) from error
-        assert isinstance(resolved, dict)  # noqa: S101
         try:
-            checked = Unit.model_validate({"unit": "?", **resolved}).model_dump()
+            checked = Unit.model_validate({"unit": "?", **merged}).model_dump()
         except ValidationError as error:
             raise Problem("\n".join(_explain(e, merged) for e in error.errors())) from None
         self._choose_stages(checked)
@@ -235,6 +234,19 @@ def default_of_run(name: str) -> Any:  # noqa: ANN401  (a setting's type is its 
     settings = OmegaConf.to_container(OmegaConf.load(CONFIGS / "config.yaml"))
     assert isinstance(settings, dict)  # noqa: S101
     return settings[name]
+
+
+def resolve_references(node: Any, root: dict[str, Any]) -> None:  # noqa: ANN401  (dict or list)
+    """Replace each ``${...}`` below a node, in place, by what it refers to.
+
+    OmegaConf resolves it, on the few branches that it names: building the whole tree in OmegaConf costs 18 ms a unit.
+    """
+    for key, value in node.items() if isinstance(node, dict) else enumerate(node):
+        if isinstance(value, (dict, list)):
+            resolve_references(value, root)
+        elif isinstance(value, str) and "${" in value:
+            branches = {name: root[name] for name in GROUPS if f"{name}." in value}
+            node[key] = OmegaConf.create({**branches, "reference": value})["reference"]
 
 
 def _set(tree: dict[str, Any], path: list[str], value: Any) -> None:  # noqa: ANN401

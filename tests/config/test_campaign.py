@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.config import load_campaign
+from pipeline.config import Campaign, load_campaign
 from pipeline.config.parts import part
 from pipeline.errors import ConfigurationError
 
@@ -18,7 +18,7 @@ def campaign(tmp_path: Path, sheet: str, settings: str = "") -> Path:
     return directory
 
 
-def load(directory: Path, **settings: object):
+def load(directory: Path, **settings: object) -> Campaign:
     return load_campaign({"campaign": str(directory), **settings})
 
 
@@ -91,7 +91,7 @@ def test_unknown_units_and_settings_are_refused_with_the_nearest_name(tmp_path: 
         load(directory, unit_overrides={"Unit-2": ["filter=none"]})
     with pytest.raises(ConfigurationError, match="overides: unknown setting; nearest: overrides"):
         load(directory, overides="filter=none")
-    with pytest.raises(ConfigurationError, match="campaign 'demmo': neither data/demmo nor demmo holds a units.csv"):
+    with pytest.raises(ConfigurationError, match="campaign 'demmo': neither data/demmo nor demmo holds"):
         load_campaign({"campaign": "demmo"})
     with pytest.raises(ConfigurationError, match="is not a list of overrides; quote each one"):
         load(directory, overrides="[filter=none, table=hand")

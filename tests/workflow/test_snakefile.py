@@ -3,6 +3,7 @@
 import csv
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -150,7 +151,9 @@ def keep_the_first_rest(file: Path) -> None:
     ],
     ids=["missing file", "unobservable fit"],
 )
-def test_other_failures_are_named_too(tmp_path: Path, simulated: Path, harm, code: str, cause: str) -> None:
+def test_other_failures_are_named_too(
+    tmp_path: Path, simulated: Path, harm: Callable[[Path], object], code: str, cause: str
+) -> None:
     bench = lay_out(tmp_path, "unit\nG1\nG2\n", simulated, ["G1", "G2"])
     harm(bench.campaign / "raw" / "G2")
     run = bench.snakemake()
