@@ -6,7 +6,6 @@ with what else would look alike, what cannot be seen in these recordings, what r
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from pipeline.estimation.design import Start, Term
 from pipeline.estimation.effects_stage import AUTO
 from pipeline.estimation.joint import fit_terms
 from pipeline.estimation.observations import observe
-from pipeline.estimation.selection import GATE_BIC, select
+from pipeline.estimation.selection import FAR_ABOVE, GATE_BIC, select
 from pipeline.model.effects import catalogue
 
 if TYPE_CHECKING:
@@ -35,6 +34,7 @@ if TYPE_CHECKING:
 
 ALIKE = 0.8
 MOSTLY = 0.5
+CLOSE = 1.1  # mean square of a residual over that of noise, under which there is no excess to share
 
 
 def diagnose(
@@ -93,14 +93,12 @@ def _document(
     table: Mapping[str, Any],
 ) -> dict[str, Any]:
     unknown = unexplained(selection)
-    if unknown and selection.names and _explained_share(selection, noise) < MOSTLY:
-        selection = withdrawn(selection)
     sensor, selected = selection.observations.sensor, selection.names
     hidden = not_observable(selection, configured)
     ladder = _ladder(selection, recordings, table)
     explained = selection.first.explained([])
     ranking = [_entry(selection, name, ladder, explained, noise) for name in _order(selection, hidden)]
-    verdict = "missing_effect" if selected else "unexplained" if unknown else "nothing_missing"
+    verdict = _verdict(selection, unknown, noise)
     if not ranking and verdict == "nothing_missing" and len(hidden) > 0:
         verdict = "not_enough_data"
     adds = ",".join([*configured, *selected])
@@ -120,14 +118,16 @@ def _document(
     }
 
 
-def withdrawn(selection: Selection) -> Selection:
-    """Return the selection without its effects: what they explain is little beside what none explains."""
-    return replace(selection, names=[], steps={}, fit=selection.base, ranking=selection.first)
-
-
-def _explained_share(selection: Selection, noise: Noise | None) -> float:
-    """Return the share of the excess over the noise that all selected effects explain."""
-    return _share(selection.base.residual_rms**2 - selection.fit.residual_rms**2, selection, noise)
+def _verdict(selection: Selection, unknown: Sequence[Any], noise: Noise | None) -> str:
+    """Return the verdict: what is selected must explain most of the excess, unless nothing else is left."""
+    left = False
+    if noise is not None:
+        floor = float(np.mean(noise.white**2 + noise.wander**2))
+        left = selection.fit.residual_rms**2 > FAR_ABOVE**2 * floor
+    share = _share(selection.base.residual_rms**2 - selection.fit.residual_rms**2, selection, noise)
+    if (unknown or left) and (not selection.names or share < MOSTLY):
+        return "unexplained"
+    return "missing_effect" if selection.names else "nothing_missing"
 
 
 def _order(selection: Selection, hidden: Mapping[str, str]) -> list[str]:
@@ -194,6 +194,8 @@ def _share(drop: float, selection: Selection, noise: Noise | None) -> float:
     """Return the share of the residual's excess over the noise that a drop of its mean square is."""
     base, final = selection.base.residual_rms**2, selection.fit.residual_rms**2
     floor = final if noise is None else float(np.mean(noise.white**2 + noise.wander**2))
+    if not selection.names and base < CLOSE * floor:
+        return float(np.clip(drop / base, 0.0, 1.0))
     excess = max(base - floor, base - final, drop)
     return float(np.clip(drop / excess, 0.0, 1.0)) if excess > 0 else 0.0
 

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.estimation.joint import calibration_of
+from pipeline.estimation.observations import through_filter
 from pipeline.model.compensation import Compensation
-from pipeline.model.effects.time_offset import shifted
 from pipeline.model.kinematics import earth_rate, reference_motion
 from pipeline.model.measurement import predicted_reading
 
@@ -78,7 +78,7 @@ def _motion(recording: Recording, table: Mapping[str, Any]) -> Motion | None:
     latitude, azimuth = table.get("latitude_deg"), table.get("azimuth_deg")
     earth = None if latitude is None or azimuth is None else earth_rate(float(latitude), float(azimuth))
     motion = reference_motion(recording, float(table.get("gravity_g") or 1.0), earth)
-    return None if motion is None else shifted(motion, -float(recording.filter.get("delay_s", 0.0)))
+    return motion if motion is None or recording.filter["name"] == "none" else through_filter(motion, recording)
 
 
 def _compensated(calibration: SensorCalibration, recording: Recording) -> NDArray[np.float64]:

@@ -6,6 +6,8 @@ Kept are, where readings and log are sound,
   is lost, and its sum of squares is kept;
 * samples at which the log follows the motion. Where it is too coarse for a ramp or a step, the angular acceleration,
   and with it a lever arm or a delay, would be the log's and not the table's; those samples are left out.
+
+Where the readings went through a filter, the motion goes through it too.
 """
 
 from __future__ import annotations
@@ -17,8 +19,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.model.effects.base import turning_direction
-from pipeline.model.effects.time_offset import shifted
 from pipeline.model.kinematics import earth_rate, reference_motion
+from pipeline.signal.filters import apply_filter
 from pipeline.signal.rests import RATE_AT_REST_DPS
 
 if TYPE_CHECKING:
@@ -205,12 +207,13 @@ def _part(sensor: str, recording: Recording, gravity: float, earth: NDArray[np.f
     if motion is None:
         return None
     motion = replace(motion, direction=turning_direction(motion))
-    delay = float(recording.filter.get("delay_s", 0.0))
-    motion = shifted(motion, -delay)
+    filtered = recording.filter["name"] != "none"
+    if filtered:
+        motion = through_filter(motion, recording)
     sound: NDArray[np.bool_] = np.all(np.isfinite(reading), axis=1)
     if recording.flags is not None:
         sound = np.logical_and(sound, (recording.flags & UNSOUND) == 0)
-    rows = rows_of(motion, sound)
+    rows = rows_of(motion, sound, together=not filtered)
     if len(rows.first) == 0:
         return None
     information = min(float(recording.filter.get("noise_gain", 1.0)) ** 2, 1.0)
@@ -228,7 +231,42 @@ def _part(sensor: str, recording: Recording, gravity: float, earth: NDArray[np.f
     )
 
 
-def rows_of(motion: Motion, sound: NDArray[np.bool_]) -> Rows:
+def through_filter(motion: Motion, recording: Recording) -> Motion:
+    """Return the motion after the filter that the readings went through.
+
+    The filter is linear, so that filtered readings are the model of filtered truth; in effects that are not linear in
+    the truth the order matters, but only while the filter's output changes.
+
+    Parameters
+    ----------
+    motion : Motion
+        At all samples of the recording.
+    recording : Recording
+        With the filter's settings.
+    """
+    signals = ("specific_force", "angular_rate"), ("specific_force_rate", "angular_acceleration")
+    found: dict[str, Any] = {}
+    for first, second in signals:
+        carrier = replace(
+            recording, accelerometer=getattr(motion, first), gyroscope=getattr(motion, second), notes=(), encodings={}
+        )
+        passed = apply_filter(carrier, recording.filter)
+        found |= {first: passed.accelerometer, second: passed.gyroscope}
+
+    def at(trajectory: Callable[..., Motion | None], **to: Any) -> Motion:  # noqa: ANN401  (an offset or a lag)
+        there = trajectory(**to)
+        assert there is not None  # noqa: S101
+        return through_filter(there, recording)
+
+    return replace(
+        motion,
+        **found,
+        at_offset=None if motion.at_offset is None else partial(at, motion.at_offset),
+        at_lag=None if motion.at_lag is None else partial(at, motion.at_lag),
+    )
+
+
+def rows_of(motion: Motion, sound: NDArray[np.bool_], *, together: bool = True) -> Rows:
     """Choose the samples of a fit and group those of a rest.
 
     Parameters
@@ -236,6 +274,8 @@ def rows_of(motion: Motion, sound: NDArray[np.bool_]) -> Rows:
     motion : Motion
     sound : (n,) array of bool
         Samples whose readings can be used.
+    together : bool
+        Whether the samples of a rest are alike; after a filter they are not.
     """
     moving = np.linalg.norm(motion.angular_rate, axis=1) > RATE_AT_REST_DPS
     if motion.rate is not None:
@@ -244,11 +284,11 @@ def rows_of(motion: Motion, sound: NDArray[np.bool_]) -> Rows:
     if len(kept) == 0:
         return Rows(kept, kept, np.zeros(0), len(sound))
     still, time = motion.still[kept], motion.time[kept]
-    together = still[1:] & still[:-1] & (np.diff(kept) == 1)
-    rest = np.concatenate([[0], np.cumsum(~together)])
-    begin = time[np.concatenate([[True], ~together])]
+    alike = still[1:] & still[:-1] & (np.diff(kept) == 1) & together
+    rest = np.concatenate([[0], np.cumsum(~alike)])
+    begin = time[np.concatenate([[True], ~alike])]
     piece = np.floor((time - begin[rest]) / MEAN_S + 1e-9)
-    new = np.concatenate([[True], ~together | (np.diff(piece) != 0)])
+    new = np.concatenate([[True], ~alike | (np.diff(piece) != 0)])
     first = np.flatnonzero(new)
     return Rows(kept, first, np.diff(np.append(first, len(kept))).astype(float), len(sound))
 

@@ -4,7 +4,8 @@ In each round every candidate competes at its own best noise setting. The best o
 
     delta BIC > 10   and   m p < 0.01
 
-where p is that of the likelihood ratio and m the number of candidates (Bonferroni). After an effect of timing or with
+where p is that of the likelihood ratio and m the number of candidates (Bonferroni). Where the residual stays above twice
+the noise, an effect must also explain 5 % of the excess: a model that misses something large fits with anything small. After an effect of timing or with
 a time constant the model is fitted anew and all columns are rebuilt there. Selected effects whose own delta BIC has
 become negative are dropped, and one that a rival replaces with delta BIC > 10 is exchanged. If nothing passes although
 the wander seems three times that of a static recording or of the data sheet, two effects may hide each other: then all
@@ -43,6 +44,8 @@ MOVER_SHARE = 0.1  # of the best candidate's delta BIC above which an effect of 
 DELAYS = ("time_offset", "low_pass_lag")  # of the two the first is taken unless the second is clearly better
 CLEARLY = 6.0
 TIE = 0.5
+FAR_ABOVE = 2.0  # times the noise: the residual of a model that misses more than the catalogue holds
+WORTH_NAMING = 0.05  # share of such a residual's excess that an effect must explain
 ANOTHER_K = 2e-3  # change of K that changes the columns of effects that the axes share
 SECOND = {"accelerometer": (), "gyroscope": ("table_encoder_error",)}  # exact look-alikes of a likelier effect
 
@@ -305,7 +308,19 @@ class _Search:
             return False
         real = score.name != DELAYS[1] or score.values[0] > 0
         significant = score.delta_bic > GATE_BIC and score.p_value * len(self.effects) < GATE_P
-        return bool(score.admissible and significant and real)
+        return bool(score.admissible and significant and real and self._matters(score.name))
+
+    def _matters(self, name: str) -> bool:
+        """Return whether an effect explains a part worth naming of an excess that is far above the noise."""
+        if self.noise is None:
+            return True
+        selected = self._selected(self.names)
+        floor = np.sum((self.noise.white**2 + self.noise.wander**2) / self.start.scale**2) / 3.0
+        residual = (self.ranking.chosen(selected)[0, -1, -1] + self.ranking.within) / self.ranking.samples
+        explained = self.ranking.explained(selected)
+        drop = max(explained[j] for j in self.ranking.indices(name)) / self.ranking.samples
+        left = residual - drop
+        return bool(left < FAR_ABOVE**2 * floor or drop > WORTH_NAMING * (residual - floor))
 
     def _refit(self) -> None:
         """Fit configured and selected effects together and rebuild the candidates there."""

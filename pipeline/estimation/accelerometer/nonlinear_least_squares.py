@@ -193,7 +193,9 @@ def _serial_covariance(orientations: Orientations, found: Ellipsoid, prior: Prio
     noise = assess_noise(np.repeat(error[:, None], 3, axis=1), J[row], make_blocks(orientations.parts), prior)
     noise = _counted_once(noise, prior, float(np.sqrt(np.mean(error**2))))
     per_sample = (estimate_weights(J, found.weight) / orientations.count)[:, row]
-    candidates = [noise.covariances(per_sample * along[row, c], c) for c in range(3)]
+    candidates = [
+        noise.white_variance[:, c, None, None] * noise.covariances(per_sample * along[row, c]) for c in range(3)
+    ]
     return combine(noise, np.sum(candidates, axis=0))
 
 

@@ -168,7 +168,7 @@ def _covariance(
     total = np.zeros((len(noise.weight), 27, 27))
     theta = np.column_stack([previous.bias, A])
     for channel in range(3):
-        own = noise.covariances(weights, channel)
+        own = noise.white_variance[:, channel, None, None] * noise.covariances(weights)
         if not from_rests and previous.covariance is not None:
             own = own + previous.covariance[channel, channel] * np.outer(lever, lever)
         J = _derivative(theta, channel, as_printed=as_printed)
