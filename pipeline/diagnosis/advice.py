@@ -18,9 +18,14 @@ UNKNOWN = {
     "angle": "turn a second time with the unit remounted at another angle: an error of the table stays with the table",
     "specific_force": "record rests in which all three axes are inclined, and more than 1 g if you can",
 }
+FAR_OFF = (
+    "check the table against its log first (steps, play, rate, vibration) and the mounting: the residual is far above "
+    "the noise and follows nothing that is recorded"
+)
 
 
 def next_experiment(
+    verdict: str,
     ranking: Sequence[Mapping[str, Any]],
     selected: Sequence[str],
     hidden: Mapping[str, str],
@@ -31,6 +36,7 @@ def next_experiment(
 
     Parameters
     ----------
+    verdict : str
     ranking : sequence of mapping
         Entries of the diagnosis.
     selected : sequence of str
@@ -41,7 +47,12 @@ def next_experiment(
     facts : Facts
         What the recordings did.
     """
+    if verdict == "unexplained" and not unknown:
+        return FAR_OFF
     entries = {entry["effect"]: entry for entry in ranking}
+    if verdict == "unexplained":
+        covariate = str(unknown[0]["covariate"])
+        return f"to find out on what the residual depends beside {_plain(covariate)}: {UNKNOWN[covariate]}"
     for name in selected:
         alike = entries[name]["look_alikes"]
         if alike:
@@ -49,9 +60,6 @@ def next_experiment(
             return f"to tell {_plain(name)} from {others}: {catalogue()[name].experiment}"
     if selected:
         return f"to confirm {_plain(selected[0])}: {catalogue()[selected[0]].experiment}"
-    if unknown:
-        covariate = str(unknown[0]["covariate"])
-        return f"to find out on what the residual depends beside {_plain(covariate)}: {UNKNOWN[covariate]}"
     if facts.one_way:
         return "make every turn in the other direction too: it shows five effects that one direction hides"
     for name in ("bias_temperature", "lever_arm", "time_offset"):

@@ -111,7 +111,9 @@ def _document(
         "ranking": ranking,
         "not_observable": [{"effect": name, "reason": reason} for name, reason in hidden.items()],
         "unexplained": unknown,
-        "next_experiment": next_experiment(ranking, selected, hidden, unknown, facts_of(selection.observations)),
+        "next_experiment": next_experiment(
+            verdict, ranking, selected, hidden, unknown, facts_of(selection.observations)
+        ),
         "override": f"effects.{sensor}=[{adds}]" if selected else "",
         "configured": configured,
         "wander": {"ratio": wander.ratio, "time_s": wander.time if wander.ratio else None},

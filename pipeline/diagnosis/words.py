@@ -57,7 +57,7 @@ def _verdict(part: Mapping[str, Any], sensor: str) -> str:
     ratio = part["residual_over_noise"]
     if ratio is None:
         return text
-    subject = "Without it, the residual" if part["selected"] else "The residual"
+    subject = "Without it, the residual" if part["verdict"] == "missing_effect" else "The residual"
     return f"{text} {subject} is {ratio:.3g} times the noise."
 
 

@@ -50,6 +50,8 @@ class Score:
         Whether it adds anything that the chosen effects cannot do.
     plausible : bool
         Whether the estimates are within the sensor's limits.
+    drop : float
+        By how much the estimates lower the unwhitened sum of squares.
     """
 
     name: str
@@ -62,6 +64,7 @@ class Score:
     setting: int
     admissible: bool = True
     plausible: bool = True
+    drop: float = 0.0
 
 
 class Ranking:
@@ -193,6 +196,7 @@ class Ranking:
             at,
             admissible,
             plausible,
+            float(2.0 * solved[at] @ cross[0] - solved[at] @ inner[0] @ solved[at]),
         )
 
     def _estimate(

@@ -4,8 +4,10 @@ In each round every candidate competes at its own best noise setting. The best o
 
     delta BIC > 10   and   m p < 0.01
 
-where p is that of the likelihood ratio and m the number of candidates (Bonferroni). Where the residual stays above twice
-the noise, an effect must also explain 5 % of the excess: a model that misses something large fits with anything small. After an effect of timing or with
+where p is that of the likelihood ratio and m the number of candidates (Bonferroni). Where the residual stays above
+twice the noise, an effect must also explain 5 % of the excess: a model that misses something large is mended a little
+by anything small.
+After an effect of timing or with
 a time constant the model is fitted anew and all columns are rebuilt there. Selected effects whose own delta BIC has
 become negative are dropped, and one that a rival replaces with delta BIC > 10 is exchanged. If nothing passes although
 the wander seems three times that of a static recording or of the data sheet, two effects may hide each other: then all
@@ -308,17 +310,16 @@ class _Search:
             return False
         real = score.name != DELAYS[1] or score.values[0] > 0
         significant = score.delta_bic > GATE_BIC and score.p_value * len(self.effects) < GATE_P
-        return bool(score.admissible and significant and real and self._matters(score.name))
+        return bool(score.admissible and significant and real and self._matters(score))
 
-    def _matters(self, name: str) -> bool:
+    def _matters(self, score: Score) -> bool:
         """Return whether an effect explains a part worth naming of an excess that is far above the noise."""
         if self.noise is None:
             return True
         selected = self._selected(self.names)
         floor = np.sum((self.noise.white**2 + self.noise.wander**2) / self.start.scale**2) / 3.0
         residual = (self.ranking.chosen(selected)[0, -1, -1] + self.ranking.within) / self.ranking.samples
-        explained = self.ranking.explained(selected)
-        drop = max(explained[j] for j in self.ranking.indices(name)) / self.ranking.samples
+        drop = score.drop / self.ranking.samples
         left = residual - drop
         return bool(left < FAR_ABOVE**2 * floor or drop > WORTH_NAMING * (residual - floor))
 
@@ -434,6 +435,6 @@ class _Search:
         second = self.ranking.scores([best[1]], self.limits)
         scores = [next(s for s in found if s.name == n) for found, n in zip((first, second), names, strict=True)]
         tried = len(able) * (len(able) - 1) / 2
-        if all(s.admissible and s.delta_bic > GATE_BIC and s.p_value * tried < GATE_P for s in scores):
+        if all(self._passes(s) and s.p_value * tried < GATE_P for s in scores):
             self.names = names
             self.steps = dict(zip(names, scores, strict=True))

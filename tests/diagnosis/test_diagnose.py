@@ -16,6 +16,7 @@ from pipeline.diagnosis.diagnose import diagnose
 from pipeline.diagnosis.words import in_words
 from pipeline.estimation.gyroscope import effects as gyroscope_stage
 from pipeline.records import Recording, SensorCalibration
+from pipeline.signal.filters import apply_filter
 from pipeline.signal.noise import estimate_noise
 
 SHEET = yaml.safe_load((Path(__file__).parents[2] / "configs/sensor/mpu6050.yaml").read_text(encoding="utf-8"))
@@ -92,7 +93,7 @@ def test_an_effect_of_data_sheet_size_is_named_alone_and_mended(sensor: str, nam
 @pytest.mark.parametrize("sensor", SIZE)
 @pytest.mark.parametrize("wander", [1.0, 5.0])
 def test_nothing_is_selected_where_nothing_is_hidden(sensor: str, wander: float) -> None:
-    for seed in range(10):
+    for seed in range(8):
         part = diagnosed(sensor, record(Session(seed + 500, wander=wander)))
         assert part["selected"] == [], (seed, part["ranking"][0])
         assert part["unexplained"] == []
@@ -191,6 +192,30 @@ def test_a_dependence_that_no_effect_has_is_reported_as_unexplained() -> None:
     assert "angle" in {entry["covariate"] for entry in part["unexplained"]}
     assert part["verdict"] == "unexplained"
     assert part["selected"] == []
+
+
+def test_a_table_far_off_its_log_is_unexplained_and_not_mended_with_whatever_fits_a_little() -> None:
+    rng = np.random.default_rng(8)
+    recordings = [
+        replace(r, table_angle=r.table_angle + np.cumsum(rng.choice([0.0, 0.3, -0.3], r.samples, p=[0.9, 0.05, 0.05])))
+        if r.role == "accelerometer" and r.table_angle is not None
+        else r
+        for r in hidden("accelerometer")
+    ]
+    part = diagnosed("accelerometer", recordings)
+    assert part["residual_over_noise"] > 3
+    assert part["verdict"] == "unexplained"
+    assert "none is needed" not in part["next_experiment"]
+    assert all(entry["explained_share"] > 0.02 for entry in part["ranking"][: len(part["selected"])])
+
+
+def test_a_filter_of_the_thesis_leaves_nothing_to_explain() -> None:
+    settings_of_filter = {"name": "rc_low_pass", "cutoff_hz": 1.0, "time_constant_s": None, "zero_phase": False}
+    for sensor in SIZE:
+        filtered = [apply_filter(r, settings_of_filter) for r in record(Session(1, static=True))]
+        part = diagnosed(sensor, filtered)
+        assert part["verdict"] == "nothing_missing"
+        assert 0.8 < part["residual_over_noise"] < 1.1
 
 
 def test_recordings_without_a_table_cannot_be_diagnosed_and_say_so() -> None:
