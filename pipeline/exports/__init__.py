@@ -1,1 +1,57 @@
-"""One module per format that consumes a calibration."""
+"""One module per format that consumes a calibration; every module of this package that has one is used.
+
+Each has ``FILE_NAME`` and ``export(calibration, settings, validation) -> str``. There is no list to extend.
+"""
+
+from __future__ import annotations
+
+import os
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+
+@cache
+def exporters() -> tuple[ModuleType, ...]:
+    """Return the modules of all formats, in alphabetical order."""
+    names = sorted(f.stem for f in Path(__file__).parent.glob("*.py") if f.stem not in ("__init__", "sensors"))
+    return tuple(import_module(f"{__name__}.{name}") for name in names)
+
+
+def export_all(
+    calibration: dict[str, Any], settings: dict[str, Any], folder: Path, validation: dict[str, Any] | None = None
+) -> list[Path]:
+    """Write a calibration in every format.
+
+    Parameters
+    ----------
+    calibration : dict
+        ``calibrations/<unit>.json``.
+    settings : dict
+        The sections ``sensor`` and ``table`` of the unit's configuration.
+    folder : Path
+        Made if need be.
+    validation : dict, optional
+        ``validations/<unit>.json``.
+
+    Returns
+    -------
+    list of Path
+        What was written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    written = []
+    for module in exporters():
+        path = folder / module.FILE_NAME
+        temporary = path.with_name(f".{path.name}.tmp")
+        with temporary.open("w", encoding="utf-8", newline="\n") as stream:
+            stream.write(module.export(calibration, settings, validation))
+            stream.flush()
+            os.fsync(stream.fileno())
+        temporary.replace(path)
+        written.append(path)
+    return written

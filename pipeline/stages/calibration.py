@@ -60,6 +60,7 @@ def inputs(path: Path) -> list[dict[str, Any]]:
             "file": r.source.get("file"),
             "sha256": r.source.get("sha256"),
             "rows": r.source.get("rows"),
+            "rate_hz": round(1.0 / r.interval, 6) if r.interval > 0 else None,
             "notes": [vars(n) for n in r.notes],
         }
         for r in load_recordings(path)
