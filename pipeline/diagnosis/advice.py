@@ -26,6 +26,7 @@ FAR_OFF = (
 
 def next_experiment(
     verdict: str,
+    *,
     ranking: Sequence[Mapping[str, Any]],
     selected: Sequence[str],
     hidden: Mapping[str, str],
@@ -47,25 +48,32 @@ def next_experiment(
     facts : Facts
         What the recordings did.
     """
-    if verdict == "unexplained" and not unknown:
-        return FAR_OFF
-    entries = {entry["effect"]: entry for entry in ranking}
     if verdict == "unexplained":
-        covariate = str(unknown[0]["covariate"])
-        return f"to find out on what the residual depends beside {_plain(covariate)}: {UNKNOWN[covariate]}"
+        return _of_unknown(unknown)
+    if selected:
+        return _of_selected({entry["effect"]: entry for entry in ranking}, selected)
+    if facts.one_way:
+        return "make every turn in the other direction too: it shows five effects that one direction hides"
+    shown = next((name for name in ("bias_temperature", "lever_arm", "time_offset") if name in hidden), None)
+    if shown:
+        return f"to see {_plain(shown)}: record {catalogue()[shown].excitation}"
+    return "none is needed: nothing that these recordings can show is missing"
+
+
+def _of_unknown(unknown: Sequence[Mapping[str, Any]]) -> str:
+    if not unknown:
+        return FAR_OFF
+    covariate = str(unknown[0]["covariate"])
+    return f"to find out on what the residual depends beside {_plain(covariate)}: {UNKNOWN[covariate]}"
+
+
+def _of_selected(entries: Mapping[str, Mapping[str, Any]], selected: Sequence[str]) -> str:
     for name in selected:
         alike = entries[name]["look_alikes"]
         if alike:
             others = " or ".join(_plain(a["effect"]) for a in alike[:2])
             return f"to tell {_plain(name)} from {others}: {catalogue()[name].experiment}"
-    if selected:
-        return f"to confirm {_plain(selected[0])}: {catalogue()[selected[0]].experiment}"
-    if facts.one_way:
-        return "make every turn in the other direction too: it shows five effects that one direction hides"
-    for name in ("bias_temperature", "lever_arm", "time_offset"):
-        if name in hidden:
-            return f"to see {_plain(name)}: record {catalogue()[name].excitation}"
-    return "none is needed: nothing that these recordings can show is missing"
+    return f"to confirm {_plain(selected[0])}: {catalogue()[selected[0]].experiment}"
 
 
 def _plain(name: str) -> str:

@@ -112,7 +112,12 @@ def _document(
         "not_observable": [{"effect": name, "reason": reason} for name, reason in hidden.items()],
         "unexplained": unknown,
         "next_experiment": next_experiment(
-            verdict, ranking, selected, hidden, unknown, facts_of(selection.observations)
+            verdict,
+            ranking=ranking,
+            selected=selected,
+            hidden=hidden,
+            unknown=unknown,
+            facts=facts_of(selection.observations),
         ),
         "override": f"effects.{sensor}=[{adds}]" if selected else "",
         "configured": configured,
