@@ -177,7 +177,8 @@ def as_list(value: Any, where: str) -> list[str]:  # noqa: ANN401  (whatever the
 def unit_overrides(value: Any, rows: Mapping[str, Any]) -> dict[str, list[str]]:  # noqa: ANN401
     """Check ``unit_overrides``: unit name to a list of overrides, of units that exist."""
     if not isinstance(value, dict):
-        raise ConfigurationError(f"unit_overrides: {{UNIT: [KEY=VALUE]}} is expected, got {value!r}")
+        form = """'unit_overrides={U1: [filter.cutoff_hz=5, "effects.gyroscope=[g_sensitivity]"]}'"""
+        raise ConfigurationError(f"unit_overrides: {form} is the form (lists within are quoted), got {value!r}")
     for name in value:
         if str(name) not in rows:
             raise ConfigurationError(f"unit_overrides: no unit {name!r} in units.csv{nearest(str(name), rows)}")

@@ -23,6 +23,8 @@ from omegaconf.errors import OmegaConfBaseException
 from pydantic import ValidationError
 
 from pipeline.config.schema import Unit
+from pipeline.errors import ConfigurationError
+from pipeline.formats.settings import check_ingest
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -182,6 +184,10 @@ class Composer:
                 applies = _read_option("effect", name, ()).get("sensors", [sensor])
                 if sensor not in applies:
                     raise Problem(f"effects.{sensor}: {name} applies to the {' and '.join(applies)} only")
+        try:
+            check_ingest(config["ingest"], config["procedure"])
+        except ConfigurationError as error:
+            raise Problem(error.message) from error
         both = [config["table"][k] is None for k in ("latitude_deg", "azimuth_deg")]
         if any(both) and not all(both):
             raise Problem(

@@ -44,7 +44,7 @@ READS: dict[str, tuple[str, ...]] = {
     ),
     "filter": ("filter",),
     "fit": FIT,
-    "effects": (*FIT, "effects.{sensor}"),
+    "effects": (*FIT, "effects.{sensor}", "sensor.{sensor}.effects"),
     "calibration": ("sensor.name", "table.name", "procedure.name", "method", "config_sha256"),
     "validate": (*SENSORS_AND_TABLE, "limits"),
     "diagnose": (*SENSORS_AND_TABLE, "effects", "method"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,13 @@ def main(argv: Sequence[str]) -> int:
     def work(unit: str, part: dict[str, Any]) -> None:
         folder = directory / part["procedure"]["folder"]
         recordings = read_recordings(part["procedure"], part["ingest"], part["sensor"], folder)
-        save_recordings(job.output / f"{unit}.parquet", recordings)
+        named = [replace(r, source=r.source | {"file": below(directory, r.source["file"])}) for r in recordings]
+        save_recordings(job.output / f"{unit}.parquet", named)
 
     return run_batch(job, work)
+
+
+def below(directory: Path, file: str) -> str:
+    """Return a file's path below the campaign's directory; one that lies elsewhere keeps its path."""
+    path = Path(file)
+    return str(path.relative_to(directory)) if path.is_relative_to(directory) else file

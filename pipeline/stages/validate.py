@@ -21,9 +21,11 @@ def main(argv: Sequence[str]) -> int:
     def work(unit: str, part: dict[str, Any]) -> None:
         recordings = load_recordings(job.inputs["filter"] / f"{unit}.parquet")
         document: dict[str, Any] = {"schema_version": 1, "unit": unit}
-        for sensor, calibration in load_fits(job.inputs, unit).items():
+        fits = load_fits(job.inputs, unit)
+        for sensor, calibration in fits.items():
             noise = estimate_noise(sensor, recordings, part["sensor"][sensor])
-            document[sensor] = calibration and validate(calibration, recordings, noise, part)
+            other = next(fit for s, fit in fits.items() if s != sensor)
+            document[sensor] = calibration and validate(calibration, recordings, noise, part, other=other)
         write_json(job.output / f"{unit}.json", document)
 
     return run_batch(job, work)

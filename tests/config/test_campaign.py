@@ -89,6 +89,8 @@ def test_unknown_units_and_settings_are_refused_with_the_nearest_name(tmp_path: 
     directory = campaign(tmp_path, "unit\nUnit-1\n")
     with pytest.raises(ConfigurationError, match=r"no unit 'Unit-2' in units.csv; nearest: Unit-1"):
         load(directory, unit_overrides={"Unit-2": ["filter=none"]})
+    with pytest.raises(ConfigurationError, match="lists within are quoted"):
+        load(directory, unit_overrides="{Unit-1: [effects.gyroscope=[g_sensitivity]]}")
     with pytest.raises(ConfigurationError, match="overides: unknown setting; nearest: overrides"):
         load(directory, overides="filter=none")
     with pytest.raises(ConfigurationError, match="campaign 'demmo': neither data/demmo nor demmo holds"):

@@ -1,4 +1,5 @@
 # The campaign, resolved and checked before any job; and what every rule has in common.
+import atexit
 import os
 import sys
 import time
@@ -53,8 +54,8 @@ def of_batches(stage):
 
 
 def repeat_verdict():
-    """Say at the end of the terminal output which units have failed, and why."""
+    """Say at the very end of the terminal output, after Snakemake's own last words, which units have failed and why."""
     log = f"{RESULTS}/logs/verdict.log"
     if os.path.exists(log) and os.path.getmtime(log) >= STARTED - 1:
         with open(log) as stream:
-            print(f"\n{stream.read()}", file=sys.stderr)
+            atexit.register(print, f"\n{stream.read()}", file=sys.stderr, end="")

@@ -235,6 +235,7 @@ def _details(orientations: Orientations, found: Ellipsoid, freedom: float) -> di
     return {
         "orientations_used": len(orientations.mean),
         "samples_used": int(orientations.count.sum()),
+        "rests_used": _described(orientations.rests),
         "rests_left_out": _described(orientations.left_out),
         "rests_held_out": _described(orientations.held_out),
         "fixed": [name for name, is_free in zip(NAMES, found.free, strict=True) if not is_free],
