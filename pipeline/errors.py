@@ -1,7 +1,7 @@
 """The tree of user errors.
 
 Each says what is wrong, where, what was expected and what to do. A user error is one line and exit code 2 on the
-command line, and a failure record of one unit in a batch; anything else that is raised is a bug and keeps its traceback.
+command line, and a failure record of one unit in a batch; all else that is raised is a bug and keeps its traceback.
 """
 
 from __future__ import annotations

@@ -47,6 +47,8 @@ class Campaign:
         Units of one chain of stages, cut in the order of ``units.csv``.
     chains : dict of str to dict
         Batch and sensor to the ordered stages of its fit.
+    compare : list
+        Groups of units that the campaign's page puts side by side.
     """
 
     name: str
@@ -55,6 +57,7 @@ class Campaign:
     units: dict[str, UnitRow]
     batches: dict[str, list[str]]
     chains: dict[str, dict[str, list[str]]] = field(default_factory=dict)
+    compare: list[Any] = field(default_factory=list)
 
     def folder(self, unit: str) -> Path:
         """Return where a unit's recordings lie."""
@@ -81,7 +84,7 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
         raise ConfigurationError(f"--config {unknown[0]}: unknown setting{nearest(unknown[0], valid)}")
     directory = find_campaign(str(settings.get("campaign", "demo")))
     rows = read_units(directory / "units.csv")
-    of_all, of_run = campaign_overrides(directory / "campaign.yaml")
+    of_all, of_run, compare = campaign_settings(directory / "campaign.yaml", rows)
     from_command = as_list(settings.get("overrides", []), "overrides")
     per_unit = unit_overrides(settings.get("unit_overrides", {}), rows)
     of_run, from_command = split_run_settings([*of_run, *from_command])
@@ -101,7 +104,7 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
         raise ConfigurationError(_one_message(problems), str(directory / "units.csv"))
     batches, chains = cut_batches(units, batch_size(of_run))
     results = Path(str(settings.get("results", "results"))) / directory.name
-    return Campaign(directory.name, directory, results, units, batches, chains)
+    return Campaign(directory.name, directory, results, units, batches, chains, compare)
 
 
 def find_campaign(name: str) -> Path:
@@ -148,10 +151,10 @@ def read_units(path: Path) -> dict[str, dict[str, str]]:
     return found
 
 
-def campaign_overrides(path: Path) -> tuple[list[str], list[str]]:
-    """Read ``campaign.yaml``: the overrides of all units, and those that are settings of the run."""
+def campaign_settings(path: Path, rows: Mapping[str, Any]) -> tuple[list[str], list[str], list[Any]]:
+    """Read ``campaign.yaml``: overrides of all units, overrides that are settings of the run, units to compare."""
     if not path.is_file():
-        return [], []
+        return [], [], []
     try:
         content = OmegaConf.to_container(OmegaConf.load(path)) or {}
     except Exception as error:
@@ -162,7 +165,13 @@ def campaign_overrides(path: Path) -> tuple[list[str], list[str]]:
     if unknown:
         raise ConfigurationError(f"{unknown[0]}: unknown key{nearest(unknown[0], ['overrides', 'compare'])}", str(path))
     run, units = split_run_settings(as_list(content.get("overrides", []), f"{path}: overrides"))
-    return units, run
+    compare = content.get("compare") or []
+    for group in compare if isinstance(compare, list) else [compare]:
+        names = group.get("units") if isinstance(group, dict) else group
+        if not isinstance(names, list) or not all(str(n) in rows for n in names):
+            form = "a list of lists of units of units.csv, or of {title, units}"
+            raise ConfigurationError(f"compare: {form} is expected, got {group!r}", str(path))
+    return units, run, compare
 
 
 def as_list(value: Any, where: str) -> list[str]:  # noqa: ANN401  (whatever the user wrote)

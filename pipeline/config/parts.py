@@ -102,7 +102,8 @@ def write_part(campaign: Campaign, stage: str, units: Sequence[str], sensor: str
     if stage == "ingest":
         content["directory"] = str(campaign.directory)
     if stage == "gather":
-        content = {"campaign": campaign.name, "rows": {u: campaign.units[u].row for u in units}, "compare": []}
+        content = {"campaign": campaign.name, "rows": {u: campaign.units[u].row for u in units}}
+        content["compare"] = campaign.compare
     text = _canonical(content)
     name = f"{stage}-{sensor}" if sensor else stage
     path = campaign.results / "configs" / f"{name}-{hashlib.sha256(text).hexdigest()[:16]}.json"

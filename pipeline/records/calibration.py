@@ -1,4 +1,4 @@
-"""The calibration of one sensor, as it grows stage by stage, and its JSON form (CONTRACT section 6).
+"""The calibration of one sensor, as it grows stage by stage, and its JSON form.
 
 ``reading = bias + matrix^-1 @ truth + effects + noise``, so ``truth = matrix @ (reading - bias - effects)``.
 """

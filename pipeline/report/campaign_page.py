@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.records import SENSORS
 from pipeline.report.numbers import number
+from pipeline.report.summary import COLUMNS
 from pipeline.report.templating import template
 
 if TYPE_CHECKING:
@@ -61,6 +62,7 @@ def render(
             for title, units in [*_same_serial(rows), *_asked_for(comparisons)]
         ],
         verdicts=VERDICTS,
+        kept=sorted({key for row in rows for key in row} - set(COLUMNS)),
     )
     return page
 

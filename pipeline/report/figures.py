@@ -68,8 +68,8 @@ def measurement_and_model(sensor: str, residual: Residual, sigma: NDArray[np.flo
     name = residual.recording.name
     outside = float(np.mean(np.abs(residual.error) > 2 * sigma))
     caption = (
-        f"{name}: readings and model (thin line); below, reading minus model, its mean over short stretches, and the band "
-        f"of ±2 σ {source}. "
+        f"{name}: readings and model (thin line); below, reading minus model, its mean over short stretches, and the "
+        f"band of ±2 σ {source}. "
         f"{100 * outside:.1f} % of the residuals lie outside of it; white noise alone puts 4.6 % there."
     )
     svg = chart(

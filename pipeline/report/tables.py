@@ -164,3 +164,14 @@ def _uncertainty_of_inverse(K: np.ndarray, part: JSON) -> list[list[float | None
 
 def _detail(value: object) -> str:
     return number(float(value), 4) if isinstance(value, float) else str(value)
+
+
+def rest_rows(part: JSON) -> list[JSON]:
+    """Return the rests that a fit found by itself, in order of time: used, held out or left out, and why."""
+    rows = [
+        {**rest, "use": kind.replace("_", " ")}
+        for stage in part.get("stages") or []
+        for kind in ("used", "held_out", "left_out")
+        for rest in (stage.get("details") or {}).get(f"rests_{kind}") or []
+    ]
+    return sorted(rows, key=lambda row: (row["recording"], row["time_s"]))

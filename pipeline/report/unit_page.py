@@ -109,13 +109,14 @@ def _sensor(  # noqa: PLR0917  (the inputs of the page, passed on)
         "matrix": tables.matrix_rows(part),
         "parameters": tables.parameter_rows(part, sheet) + tables.effect_rows(part, sheet),
         "stages": tables.stage_rows(part),
+        "rests": tables.rest_rows(part),
         "diagnosis": found,
         "ranking": [
             {**r, "parameter_texts": tables.parameter_texts(r.get("parameters"))} for r in found.get("ranking") or []
         ],
         "ranking_figure": figures.ranking(sensor, found),
         "verdict": VERDICTS.get(found.get("verdict", ""), "There is no diagnosis."),
-        "words": words.get(sensor) or found.get("words") or [],
+        "words": words.get(sensor) or [],
     }
 
 

@@ -1,4 +1,4 @@
-"""Stage calibration: both sensors' fits, the inputs and the software in one document (CONTRACT section 6)."""
+"""Stage calibration: both sensors' fits, the inputs and the software in one document."""
 
 from __future__ import annotations
 

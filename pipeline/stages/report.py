@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from pipeline.diagnosis.words import in_words
 from pipeline.formats.parquet import load_recordings
+from pipeline.records import SENSORS
 from pipeline.report.unit_page import render
 from pipeline.stages.batch import FAILED, parse_job, read_json, run_batch, write_json, write_text
 from pipeline.stages.calibration import header
@@ -22,7 +24,8 @@ def main(argv: Sequence[str]) -> int:
     def work(unit: str, part: dict[str, Any]) -> None:
         calibration, validation, diagnosis = (read_json(job.inputs[s] / f"{unit}.json") for s in STAGES)
         recordings = load_recordings(job.inputs["filter"] / f"{unit}.parquet")
-        page = render(calibration, validation, diagnosis, recordings, part)
+        words = {sensor: in_words(diagnosis[sensor], sensor) for sensor in SENSORS}
+        page = render(calibration, validation, diagnosis, recordings, part, words=words)
         write_text(job.output / f"{unit}.html", page)
 
     status = run_batch(job, work)

@@ -1,4 +1,4 @@
-"""Recordings of turns with known truth, from the geometry of CONTRACT section 3 written out by hand."""
+"""Recordings of turns with known truth, from the stated geometry of the table written out by hand."""
 
 from __future__ import annotations
 

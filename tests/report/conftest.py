@@ -48,7 +48,7 @@ def sensor_truth(sensor: str) -> SensorCalibration:
     )
 
 
-def turn(name: str, role: str, axis: str, samples: int, start: float, rng: np.random.Generator) -> Recording:
+def turn(name: str, role: str, axis: str, samples: int, start: float, *, rng: np.random.Generator) -> Recording:
     time = start + 0.12 * np.arange(samples)
     angle = np.linspace(0.0, 360.0, samples)
     rate = np.full(samples, 360.0 / (0.12 * (samples - 1)))
@@ -179,8 +179,10 @@ SHEET = {
 
 def build_unit(samples: int = 1500, held_out_samples: int = 2000) -> Unit:
     rng = np.random.default_rng(20190423)
-    recordings = [turn(f"accel_{a}", "accelerometer", a, samples, 300.0 * i, rng) for i, a in enumerate("xyz")]
-    recordings += [turn(f"gyro_{a}", "gyroscope", a, samples // 4, 2000.0 + 90.0 * i, rng) for i, a in enumerate("xyz")]
+    recordings = [turn(f"accel_{a}", "accelerometer", a, samples, 300.0 * i, rng=rng) for i, a in enumerate("xyz")]
+    recordings += [
+        turn(f"gyro_{a}", "gyroscope", a, samples // 4, 2000.0 + 90.0 * i, rng=rng) for i, a in enumerate("xyz")
+    ]
     recordings.append(held_out(held_out_samples, rng))
     calibration = {
         "schema_version": 1,

@@ -1,0 +1,177 @@
+"""The pages: complete in themselves, true to the figures they are given, and safe against what users write."""
+
+import csv
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.report import campaign_page
+from pipeline.report.summary import COLUMNS, summary_row, write_summary
+from pipeline.report.svg import Panel, Samples, chart
+from pipeline.report.unit_page import render
+
+from .conftest import Unit, build_unit
+
+VOID = {
+    "meta",
+    "link",
+    "br",
+    "hr",
+    "input",
+    "img",
+    "col",
+    "path",
+    "line",
+    "rect",
+    "circle",
+    "polyline",
+    "polygon",
+    "use",
+}
+
+
+class Text(HTMLParser):
+    """Collects headings, links and the text of a page."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.links: list[str] = []
+        self.tags: list[str] = []
+        self.words: list[str] = []
+        self.feed(page)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.links += [v or "" for k, v in attrs if k in ("href", "src")]
+
+    def handle_data(self, data: str) -> None:
+        self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        return re.sub(r"\s+", " ", " ".join(self.words))
+
+
+@pytest.fixture(scope="module")
+def unit() -> Unit:
+    return build_unit()
+
+
+@pytest.fixture(scope="module")
+def page(unit: Unit) -> str:
+    return render(*unit.arguments, words={"accelerometer": ["Quadratic nonlinearity is missing."], "gyroscope": []})
+
+
+def test_the_unit_page_asks_no_other_host_for_anything(page: str) -> None:
+    assert not re.search(r"""(?:src|href)=["']?https?:|url\(["']?https?:|@import""", page)
+    assert not [link for link in Text(page).links if "//" in link]
+    assert len(page.encode()) < 1_500_000
+
+
+def test_the_unit_page_says_the_figures_it_was_given(page: str) -> None:
+    text = Text(page).text
+    for expected in (
+        "0.0689 → 0.00310 g rms, held out",
+        "Quadratic nonlinearity is missing.",
+        "effects.accelerometer=[quadratic_nonlinearity]",
+        "the table turned too slowly",
+        "temperature (p = ",
+        "N-GAP",
+        "cdcdcd",
+    ):
+        assert expected in text
+
+
+def test_every_picture_has_a_text_alternative(page: str) -> None:
+    pictures = re.findall(r"<svg.*?</svg>", page, re.DOTALL)
+    assert len(pictures) >= 10
+    assert all(re.search(r"<title[ >]", p) and re.search(r"<desc[ >]", p) for p in pictures)
+
+
+def test_what_users_write_is_escaped(unit: Unit) -> None:
+    hostile = "<script>alert(1)</script>"
+    calibration = unit.calibration | {"unit": hostile, "software": {hostile: "1"}}
+    page = render(calibration, unit.validation, unit.diagnosis, unit.recordings, unit.settings | {"note": hostile})
+    assert hostile not in page
+    failed = calibration | {"status": "failed", "error": {"code": "bad_input", "message": hostile, "file": hostile}}
+    assert hostile not in render(failed, None, None, [], {})
+    assert hostile not in campaign_page.render(hostile, [], [{"unit": hostile, "message": hostile, "code": "x"}])
+
+
+def test_a_failed_unit_gets_a_page_that_says_what_and_where(unit: Unit) -> None:
+    error = {"code": "bad_input", "message": "'x' is no number", "file": "raw/U1/gyro_y.csv:41", "stage": "ingest"}
+    failed = unit.calibration | {"status": "failed", "error": error, "accelerometer": None, "gyroscope": None}
+    text = Text(render(failed, None, None, [], unit.settings)).text
+    assert "This unit could not be calibrated" in text
+    assert "gyro_y.csv:41" in text
+    assert "'x' is no number" in text
+
+
+def test_a_sensor_that_was_not_calibrated_is_named_with_the_reason(unit: Unit) -> None:
+    calibration = unit.calibration | {"gyroscope": None, "not_calibrated": {"gyroscope": "no turns were recorded"}}
+    page = render(calibration, unit.validation | {"gyroscope": None}, None, unit.recordings, unit.settings)
+    assert "Not calibrated: no turns were recorded" in Text(page).text
+
+
+def test_rests_that_were_left_out_are_listed_with_the_reason(unit: Unit) -> None:
+    part = dict(unit.calibration["accelerometer"])
+    rest = {"recording": "recording", "time_s": 47.52, "duration_s": 3.08, "reason": "it turned by 2.1 deg"}
+    stages = [{**part["stages"][0], "details": {"rests_used": [rest | {"reason": ""}], "rests_left_out": [rest]}}]
+    calibration = unit.calibration | {"accelerometer": part | {"stages": stages}}
+    page = render(calibration, unit.validation, unit.diagnosis, [], unit.settings)
+    assert "47.52 3.08 left out it turned by 2.1 deg" in Text(page).text
+
+
+def rows(unit: Unit, n: int) -> list[dict[str, Any]]:
+    sheet = {"serial": "S1", "lot": "L", "date": "2026-01-01", "colour": "red"}
+    made = summary_row("U", unit.calibration, unit.validation, unit.diagnosis, sheet)
+    return [made | {"unit": f"U{i}", "serial": f"S{i // 2}"} for i in range(n)]
+
+
+def test_the_summary_has_the_columns_that_scripts_rely_on(unit: Unit, tmp_path: Path) -> None:
+    write_summary(tmp_path / "summary.csv", rows(unit, 2))
+    read = list(csv.DictReader((tmp_path / "summary.csv").read_text().splitlines()))
+    assert tuple(read[0])[:8] == ("unit", "serial", "lot", "date", "status", "error", "sensor", "method")
+    assert tuple(read[0]) == (*COLUMNS, "colour")
+    assert float(read[1]["accelerometer_error_after"]) == 0.0031
+    assert read[1]["gyroscope_verdict"] == unit.diagnosis["gyroscope"]["verdict"]
+    assert read[1]["colour"] == "red"
+
+
+def test_the_campaign_page_names_failures_and_compares_units_of_one_serial(unit: Unit) -> None:
+    failure = {"unit": "U9", "stage": "ingest", "code": "bad_input", "message": "no number", "file": "a.csv:3"}
+    page = campaign_page.render("bench", rows(unit, 4), [failure], [{"title": "Mine", "units": ["U0", "U3"]}])
+    text = Text(page).text
+    for expected in ("1 unit failed", "no number", "a.csv:3", "Serial S0", "Mine", "kept in summary.csv: colour"):
+        assert expected in text
+    assert not [link for link in Text(page).links if "//" in link]
+
+
+def test_a_row_of_a_large_campaign_is_small(unit: Unit) -> None:
+    size = {n: len(campaign_page.render("bench", rows(unit, n), [])) for n in (100, 200)}
+    assert (size[200] - size[100]) / 100 < 1500
+
+
+def test_a_chart_keeps_the_extremes_of_what_it_thins_out() -> None:
+    x = np.arange(100_000.0)
+    y = np.sin(x / 50)
+    with_spike = np.where(x == 54_321, 7.0, y)
+    drawn = [
+        chart("n", "title", "words", [Panel([Samples(x, v, 0)], "y", height=100, limits=(-8, 8))], "x")
+        for v in (y, with_spike)
+    ]
+    assert max(map(len, drawn)) < 30_000
+    stroke = re.compile(r"M[-\d.]+ ([-\d.]+)V([-\d.]+)")
+    plain, spiked = ([min(map(float, ends)) for ends in stroke.findall(svg)] for svg in drawn)
+    assert sum(a != b for a, b in zip(plain, spiked, strict=True)) == 1
+    assert min(plain) - min(spiked) == pytest.approx(6.0 / 16.0 * 1000.0, rel=0.01)  # tenths of a pixel
+
+
+def test_a_page_is_the_same_each_time(unit: Unit) -> None:
+    assert render(*unit.arguments) == render(*unit.arguments)
+    assert replace(unit).arguments == unit.arguments
