@@ -175,7 +175,17 @@ def _watched(seen: set[str]) -> Motion:
 
     time, vector = np.arange(2.0), np.ones((2, 3))
     return Watched(
-        time, vector, vector, vector, vector, np.full(2, 25.0), time, time, 0, np.ones(2, bool), None, None, vector
+        time=time,
+        specific_force=vector,
+        angular_rate=vector,
+        angular_acceleration=vector,
+        specific_force_rate=vector,
+        temperature=np.full(2, 25.0),
+        angle=time,
+        rate=time,
+        axis=0,
+        still=np.ones(2, bool),
+        direction=vector,
     )
 
 
