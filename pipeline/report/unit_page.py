@@ -10,7 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.records import SENSORS
+from pipeline.model.effects import effect
+from pipeline.model.inversion import compensate, linear_truth, sensor_effects
+from pipeline.model.kinematics import reference_motion
+from pipeline.records import SENSORS, SensorCalibration
 from pipeline.report import figures, tables
 from pipeline.report.limits import check_limits, final_step, verdict
 from pipeline.report.residuals import Residual, residuals
@@ -134,7 +137,7 @@ def _held_out(
     sensor: str, part: JSON, held_out: JSON, recordings: list[Recording], table: JSON
 ) -> list[figures.Figure]:
     out = []
-    matrix, bias = np.array(part["matrix"], float), np.array(part["bias"], float)
+    calibration = SensorCalibration.from_json(sensor, part)
     for recording in recordings:
         reading = recording.reading(sensor)
         rate = recording.table_rate
@@ -142,6 +145,17 @@ def _held_out(
             continue
         reference = table.get("gravity_g") or 1.0 if rate is None or sensor == "accelerometer" else np.abs(rate)
         raw = np.linalg.norm(reading, axis=1) - reference
-        calibrated = np.linalg.norm((reading - bias) @ matrix.T, axis=1) - reference
+        calibrated = np.linalg.norm(_calibrated(calibration, reading, recording, table), axis=1) - reference
         out.append(figures.held_out_over_time(sensor, recording, raw, calibrated, held_out.get("noise_floor")))
     return out
+
+
+def _calibrated(
+    calibration: SensorCalibration, reading: NDArray[np.float64], recording: Recording, table: JSON
+) -> NDArray[np.float64]:
+    """Return calibrated held-out readings, without the sensor's own effects where the reference tells the motion."""
+    motion = reference_motion(recording, table.get("gravity_g") or 1.0)
+    own = [e for e in sensor_effects(calibration) if motion is not None and effect(e.name).available(motion)]
+    if motion is None or not own:
+        return linear_truth(calibration, reading)
+    return compensate(calibration, reading, motion, own)
