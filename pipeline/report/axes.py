@@ -53,8 +53,9 @@ def tick_label(value: float, step: float) -> str:
     """Return a tick's text, with the decimals that ``step`` needs."""
     if value == 0:
         return "0"
-    if step < 1e-5 or abs(value) >= 1e6:
-        text = f"{value:.2g}"
+    if step < 2e-4 or abs(value) >= 1e6:
+        mantissa, exponent = f"{value:.1e}".split("e")
+        text = f"{mantissa.removesuffix('.0')}e{int(exponent)}"
     else:
         decimals = max(0, -math.floor(math.log10(step) + 1e-9))
         if not math.isclose(round(step, decimals), step, rel_tol=1e-6):

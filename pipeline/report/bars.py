@@ -66,7 +66,9 @@ def bars(
     for label, value in levels.items():
         x = scale.pixels(value)
         out.append(f'<path class="level" d="M{x:.1f} {top}V{bottom}"/>')
-        out.append(text(min(max(x, LEFT + 40), WIDTH - RIGHT), top - 4, f"{label} {number(value)}", "m"))
+        words = f"{label} {number(value)}"
+        half = 3.0 * len(words)  # a letter of this size is about 6 px wide
+        out.append(text(min(max(x, LEFT + half), WIDTH - half), top - 4, words, "m"))
     out += [text(scale.pixels(v), bottom + 13, tick_label(v, v), "m") for v in at]
     out.append(text((LEFT + WIDTH - RIGHT) / 2, bottom + 27, unit, "m"))
     return frame(name, title, description, bottom + 32, "".join(out))

@@ -11,7 +11,8 @@ from pipeline.report.axes import span
 from pipeline.report.bars import Bar, bars, columns
 from pipeline.report.numbers import number
 from pipeline.report.residuals import BinnedMean, Residual, covariates, harmonics, white_noise
-from pipeline.report.svg import Band, Line, Panel, Samples, chart
+from pipeline.report.shapes import Band, Layer, Line, Means, Samples
+from pipeline.report.svg import Panel, chart
 from pipeline.report.tables import step_label
 
 if TYPE_CHECKING:
@@ -50,7 +51,7 @@ def measurement_and_model(sensor: str, residual: Residual, sigma: NDArray[np.flo
     x = motion.angle if angle and motion.angle is not None else motion.time
     source = "of the noise model" if sigma is not None else "from its own sample-to-sample scatter"
     sigma = white_noise(residual.error) if sigma is None else sigma
-    layers: list[Line | Samples | Band] = [Samples(x, residual.reading[:, i], i) for i in range(3)]
+    layers: list[Layer] = [Samples(x, residual.reading[:, i], i) for i in range(3)]
     layers += [Line(x, residual.predicted[:, i], 5, "model") for i in range(3)]
     ends = np.array([x.min(), x.max()])
     top = max(float(np.abs(residual.error).max()), 2.2 * float(sigma.max()))
@@ -104,7 +105,7 @@ def held_out_over_time(
         What noise alone would leave.
     """
     unit, x = UNITS[sensor], recording.time - recording.time[0]
-    zoom: list[Line | Samples | Band] = [Samples(x, calibrated, 2, mean=True)]
+    zoom: list[Layer] = [Samples(x, calibrated, 2, mean=True)]
     if floor:
         ends = np.array([x.min(), x.max()])
         zoom.insert(0, Band(ends, np.full(2, -2 * floor), np.full(2, 2 * floor), 5))
@@ -190,10 +191,7 @@ def _covariate(sensor: str, label: str, mean: BinnedMean) -> Figure:
     top = 1.05 * float(np.nanmax(np.abs(mean.mean) + 2 * mean.error))
     panels = [
         Panel(
-            [
-                Band(mean.centre, mean.mean[:, i] - 2 * mean.error[:, i], mean.mean[:, i] + 2 * mean.error[:, i], i),
-                Line(mean.centre, mean.mean[:, i], i),
-            ],
+            [Means(mean.centre, mean.mean[:, i], 2 * mean.error[:, i], i)],
             f"{AXES[i]}, {unit}",
             height=64,
             levels={"": 0.0},

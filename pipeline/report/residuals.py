@@ -2,6 +2,8 @@
 
     e[n] = reading[n] - predicted reading[n],    predicted = bias + matrix^-1 truth + effects
 
+The prediction passes the filter that the readings passed, so that its lag is no residual.
+
 Binned means: e is averaged in bins of a covariate (angle, rate, temperature ...), with the standard error of white
 noise, ``s / sqrt(n)``. A covariate that matters pulls the means out of that band; ``excess`` is the mean of
 ``(mean / standard error)^2``, which is 1 where nothing is there (wander makes it larger), and orders the charts.
@@ -12,7 +14,7 @@ misalignment, tilt or encoder, 2 and 4 quadratic nonlinearity or asymmetry, 3 cu
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -86,8 +88,20 @@ def residuals(sensor: str, part: dict[str, Any], recordings: list[Recording], ta
             continue
         motion = reference_motion(recording, table.get("gravity_g") or 1.0, earth)
         if motion is not None:
-            out.append(Residual(recording, motion, reading, predicted_reading(calibration, motion)))
+            predicted = _filtered(recording, predicted_reading(calibration, motion))
+            out.append(Residual(recording, motion, reading, predicted))
     return out
+
+
+def _filtered(recording: Recording, predicted: NDArray[np.float64]) -> NDArray[np.float64]:
+    settings = {k: v for k, v in recording.filter.items() if k not in ("delay_s", "noise_gain")}
+    if settings.get("name", "none") == "none":
+        return predicted
+    from pipeline.signal.filters import apply_filter  # noqa: PLC0415  (only filtered recordings pay for it)
+
+    ideal = replace(recording, accelerometer=predicted, gyroscope=None, filter={"name": "none"}, encodings={})
+    passed = apply_filter(ideal, settings).accelerometer
+    return predicted if passed is None else passed
 
 
 def white_noise(error: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.records import SENSORS
-from pipeline.report.limits import check_limits, final_step, verdict
+from pipeline.report.limits import final_step, verdict
 
 JSON = dict[str, Any]
 UNIT_COLUMNS = ("unit", "serial", "lot", "date", "status", "error", "sensor", "method")
@@ -36,8 +36,6 @@ def summary_row(
     validation: JSON | None,
     diagnosis: JSON | None,
     sheet_row: dict[str, str],
-    *,
-    limits: JSON | None = None,
 ) -> JSON:
     """Return a unit's row: a dict from column to value, None where there is none.
 
@@ -48,8 +46,6 @@ def summary_row(
         As in their files; the last two may be None.
     sheet_row : dict of str to str
         The unit's row of ``units.csv``.
-    limits : dict, optional
-        The section ``limits`` of the unit's configuration; without it the validation's own ``pass`` counts.
     """
     error = calibration.get("error")
     row: JSON = dict.fromkeys(COLUMNS)
@@ -62,7 +58,7 @@ def summary_row(
         else (error or {}).get("message"),
         "sensor": calibration.get("sensor"),
         "method": calibration.get("method"),
-        "pass": _pass(calibration, validation, limits),
+        "pass": verdict(calibration, validation),
     }
     for sensor in SENSORS:
         held_out, found = (validation or {}).get(sensor) or {}, (diagnosis or {}).get(sensor) or {}
@@ -102,14 +98,6 @@ def write_summary(path: Path | str, rows: list[JSON]) -> None:
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     temporary.write_text(buffer.getvalue(), encoding="utf-8", newline="")
     temporary.replace(path)
-
-
-def _pass(calibration: JSON, validation: JSON | None, limits: JSON | None) -> bool | None:
-    if limits is not None or calibration.get("status") != "ok":
-        return verdict(calibration, check_limits(calibration, validation, limits))
-    given = [((validation or {}).get(s) or {}).get("pass") for s in SENSORS]
-    judged = [bool(g) for g in given if g is not None]
-    return all(judged) if judged else None
 
 
 def _cell(value: object) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.report.numbers import NOTHING, measured, number, percent
+from pipeline.report.numbers import MINUS, NOTHING, measured, number, percent
 
 JSON = dict[str, Any]
 AXES = "xyz"
@@ -62,7 +62,7 @@ def effect_rows(part: JSON, sheet: JSON) -> list[JSON]:
     return [
         _row(
             f"{e['name'].replace('_', ' ')}: {name}",
-            p.get("unit") or "",
+            _unit(p),
             p["value"],
             expanded=p.get("expanded_uncertainty"),
             factor=factor,
@@ -98,18 +98,28 @@ def stage_rows(part: JSON) -> list[JSON]:
 
 
 def parameter_texts(parameters: JSON | None) -> list[str]:
-    """Return ``name = value ± uncertainty unit`` for each parameter."""
+    """Return ``name = value ± uncertainty unit`` for each parameter; the uncertainty covers about 95 %."""
     texts = []
     for name, given in (parameters or {}).items():
         p = given if isinstance(given, dict) else {"value": given}
-        value, unit = p.get("value"), p.get("unit") or ""
-        if "expanded_uncertainty" in p:
-            shown = measured(value, p["expanded_uncertainty"])
-        else:
-            standard = p.get("standard_uncertainty")
-            shown = number(value, 5) + (f" (u = {number(standard, 2)})" if standard else "")
-        texts.append(f"{name} = {shown} {unit}".rstrip())
+        standard = p.get("standard_uncertainty")
+        expanded = p.get("expanded_uncertainty", 2.0 * standard if standard else None)
+        texts.append(f"{name} = {measured(p.get('value'), expanded)} {_unit(p)}".rstrip())
     return texts
+
+
+def ranking_rows(diagnosis: JSON) -> list[JSON]:
+    """Return the ranked effects with their parameters as text; ``supported`` are those with evidence for them."""
+    selected = diagnosis.get("selected") or []
+    return [
+        {
+            **r,
+            "parameter_texts": parameter_texts(r.get("parameters")),
+            "selected": r["effect"] in selected,
+            "supported": r["effect"] in selected or (r.get("delta_bic") or 0.0) > 0.0,
+        }
+        for r in diagnosis.get("ranking") or []
+    ]
 
 
 def step_rows(held_out: JSON) -> list[JSON]:
@@ -123,7 +133,9 @@ def step_rows(held_out: JSON) -> list[JSON]:
             "max": number(step.get("max_error")),
             "min": number(step.get("min_error")),
             "vector": number(step.get("vector_rms_error")),
-            "change": NOTHING if step.get("change_percent") is None else number(step["change_percent"], 3) + " %",
+            "change": NOTHING
+            if step.get("change_percent") is None
+            else f"{step['change_percent']:.1f} %".replace("-", MINUS),
         }
         for step in held_out.get("steps", [])
     ]
@@ -160,6 +172,11 @@ def _uncertainty_of_inverse(K: np.ndarray, part: JSON) -> list[list[float | None
     variance = np.diag(J @ np.array(values, float)[3:12, 3:12] @ J.T)
     expanded: list[list[float | None]] = (factor * np.sqrt(np.clip(variance, 0.0, None))).reshape(3, 3).tolist()
     return expanded
+
+
+def _unit(parameter: JSON) -> str:
+    unit = str(parameter.get("unit") or "")
+    return "" if unit == "1" else unit
 
 
 def _detail(value: object) -> str:

@@ -15,7 +15,7 @@ from pipeline.model.inversion import compensate, linear_truth, sensor_effects
 from pipeline.model.kinematics import reference_motion
 from pipeline.records import SENSORS, SensorCalibration
 from pipeline.report import figures, tables
-from pipeline.report.limits import check_limits, final_step, verdict
+from pipeline.report.limits import checks, final_step, verdict
 from pipeline.report.residuals import Residual, residuals
 from pipeline.report.templating import template
 
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from pipeline.records import Recording
 
 JSON = dict[str, Any]
+FAR = 1.5  # of the noise floor: an error beyond it is not noise
 VERDICTS = {
     "nothing_missing": "Nothing significant is missing from the model.",
     "missing_effect": "A physical effect is missing from the model.",
@@ -59,13 +60,12 @@ def render(
     -------
     str
     """
-    checks = check_limits(calibration, validation, settings.get("limits"))
     ok = calibration.get("status") == "ok"
     page: str = template("unit.html").render(
         calibration=calibration,
         ok=ok,
-        passed=verdict(calibration, checks),
-        checks=checks,
+        passed=verdict(calibration, validation),
+        checks=checks(validation),
         sensors=[
             _sensor(sensor, calibration, validation, diagnosis, recordings, settings, words or {}) for sensor in SENSORS
         ]
@@ -114,13 +114,20 @@ def _sensor(  # noqa: PLR0917  (the inputs of the page, passed on)
         "stages": tables.stage_rows(part),
         "rests": tables.rest_rows(part),
         "diagnosis": found,
-        "ranking": [
-            {**r, "parameter_texts": tables.parameter_texts(r.get("parameters"))} for r in found.get("ranking") or []
-        ],
+        "ranking": tables.ranking_rows(found),
         "ranking_figure": figures.ranking(sensor, found),
+        "left_by_method": _left_by_method(held_out, found),
         "verdict": VERDICTS.get(found.get("verdict", ""), "There is no diagnosis."),
         "words": words.get(sensor) or [],
     }
+
+
+def _left_by_method(held_out: JSON, found: JSON) -> bool:
+    """Return whether held-out errors stand above the noise although a free matrix and bias would leave noise alone."""
+    after, floor = final_step(held_out).get("rms_error"), held_out.get("noise_floor")
+    if found.get("verdict") != "nothing_missing" or not after or not floor or not held_out.get("held_out", True):
+        return False
+    return bool(after > FAR * floor and (found.get("residual_over_noise") or FAR) < FAR)
 
 
 def _sigma(held_out: JSON, found: JSON, traces: list[Residual]) -> NDArray[np.float64] | None:
@@ -143,7 +150,11 @@ def _held_out(
         rate = recording.table_rate
         if recording.role != "validation" or reading is None or (sensor == "gyroscope" and rate is None):
             continue
-        reference = table.get("gravity_g") or 1.0 if rate is None or sensor == "accelerometer" else np.abs(rate)
+        if rate is None or sensor == "accelerometer":
+            reference = table.get("gravity_g") or 1.0
+        else:
+            late = recording.time - float(recording.filter.get("delay_s", 0.0))
+            reference = np.interp(late, recording.time, np.abs(rate))
         raw = np.linalg.norm(reading, axis=1) - reference
         calibrated = np.linalg.norm(_calibrated(calibration, reading, recording, table), axis=1) - reference
         out.append(figures.held_out_over_time(sensor, recording, raw, calibrated, held_out.get("noise_floor")))
@@ -154,8 +165,9 @@ def _calibrated(
     calibration: SensorCalibration, reading: NDArray[np.float64], recording: Recording, table: JSON
 ) -> NDArray[np.float64]:
     """Return calibrated held-out readings, without the sensor's own effects where the reference tells the motion."""
-    motion = reference_motion(recording, table.get("gravity_g") or 1.0)
-    own = [e for e in sensor_effects(calibration) if motion is not None and effect(e.name).available(motion)]
+    effects = sensor_effects(calibration)
+    motion = reference_motion(recording, table.get("gravity_g") or 1.0) if effects else None
+    own = [e for e in effects if motion is not None and effect(e.name).available(motion)]
     if motion is None or not own:
         return linear_truth(calibration, reading)
     return compensate(calibration, reading, motion, own)
