@@ -1,6 +1,7 @@
 """One module per format that consumes a calibration; every module of this package that has one is used.
 
-Each has ``FILE_NAME`` and ``export(calibration, settings, validation) -> str``. There is no list to extend.
+Each has ``FILE_NAME`` and ``export(calibration, settings, validation)``, which returns the file's text, or None where the
+format has nothing to hold of this unit. There is no list to extend.
 """
 
 from __future__ import annotations
@@ -46,10 +47,13 @@ def export_all(
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     for module in exporters():
+        text = module.export(calibration, settings, validation)
+        if text is None:
+            continue
         path = folder / module.FILE_NAME
         temporary = path.with_name(f".{path.name}.tmp")
         with temporary.open("w", encoding="utf-8", newline="\n") as stream:
-            stream.write(module.export(calibration, settings, validation))
+            stream.write(text)
             stream.flush()
             os.fsync(stream.fileno())
         temporary.replace(path)

@@ -42,6 +42,42 @@ def forward(calibration: SensorCalibration) -> NDArray[np.float64]:
     return np.asarray(np.linalg.solve(calibration.matrix, np.eye(3)))
 
 
+def left_out(found: dict[str, SensorCalibration], carried: tuple[str, ...] = ()) -> list[str]:
+    """Return a sentence a sensor on the effects that a format does not carry, and on those of the bench."""
+    lines = []
+    for sensor, c in found.items():
+        lost = [name for name in sensor_effects(c) if name not in carried]
+        lines += [f"Left out of this format, {sensor}: {', '.join(lost)}."] if lost else []
+        lines += [f"Of the bench, not of the {sensor}: {', '.join(bench_effects(c))}."] if bench_effects(c) else []
+    return lines
+
+
+def diagonal(calibration: SensorCalibration) -> tuple[NDArray[np.float64], float]:
+    """Return the scale factors that stand best for the whole matrix, and the relative error that they leave.
+
+    ``s_i = K_ii / |K_i|^2`` minimises ``E (t_i - s_i K_i t)^2`` over truths t of any direction, and leaves
+    ``sqrt(sum_i (1 - K_ii^2 / |K_i|^2) / 3)`` of |t|, K_i the rows of K.
+
+    Parameters
+    ----------
+    calibration : SensorCalibration
+
+    Returns
+    -------
+    scale : (3,) array
+    error : float
+        Root mean square of the vector's error over directions, relative to its length.
+    """
+    K = forward(calibration)
+    length = np.sum(K**2, axis=1)
+    return np.diag(K) / length, float(np.sqrt(np.sum(1.0 - np.diag(K) ** 2 / length) / 3.0))
+
+
+def comment(lines: list[str], mark: str = "# ") -> str:
+    """Return lines as comments; line ends that users wrote stay inside."""
+    return "".join(f"{mark}{' '.join(line.splitlines())}\n" for line in lines)
+
+
 def final_errors(validation: dict[str, Any] | None) -> list[str]:
     """Return a sentence a sensor on the held-out error with and without effects."""
     lines = []

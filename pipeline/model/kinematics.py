@@ -28,7 +28,7 @@ from pipeline.errors import InputError
 from pipeline.model.rotation import attitude_matrix, conjugate_product, turn_about_axis
 from pipeline.model.turn_log import TurnLog
 from pipeline.records import AXES, Motion
-from pipeline.signal.rests import still_samples
+from pipeline.signal.rests import RATE_AT_REST_DPS, still_samples
 from pipeline.signal.temperature import smooth_temperature
 
 if TYPE_CHECKING:
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
     from pipeline.records import Recording
 
+VAGUE_DPS = 0.01
 EARTH_RATE_DPS = 360.0 / 86164.0905
 UP_AT_ZERO = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
 # Rows: level x, y, z axes in the body frame at table angle 0, for turns about x, y, z.
@@ -109,8 +110,10 @@ def _motion_of_turn(
     assert recording.axis is not None  # noqa: S101
     assert recording.table_angle is not None  # noqa: S101
     time, angle = recording.time, recording.table_angle
-    rate = recording.table_rate if recording.table_rate is not None else _derivative(time, angle)
+    rate, vague = _rate_of(time, angle) if recording.table_rate is None else (recording.table_rate, None)
     log = TurnLog(time, angle, rate)
+    if vague is not None:
+        log.followed_samples &= ~vague
     still = still_samples(time, rate)
     return _turn(log, AXES.index(recording.axis), gravity_g, earth, still, temperature, offset)
 
@@ -204,8 +207,19 @@ def _motion_of_attitude(
     )
 
 
-def _derivative(time: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _rate_of(time: NDArray[np.float64], angle: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return the rate that a log of the angle alone gives, and where it is vague: (n,) arrays, deg/s and bool.
+
+    In smooth motion it is the derivative of a cubic spline. Where that differs from the central difference by more than
+    the log's own noise, the angle bends between two samples, and near it neither is the rate: a spline rings on for
+    some samples. At rest, where the angle does not change on either side, the central difference is taken.
+    """
     from scipy.interpolate import make_interp_spline  # noqa: PLC0415  (0.3 s, needed without a rate log alone)
 
-    rate: NDArray[np.float64] = make_interp_spline(time, values, k=3)(time, 1)
-    return rate
+    spline, central = make_interp_spline(time, angle, k=3)(time, 1), np.gradient(angle, time)
+    slope = np.abs(np.diff(angle) / np.diff(time))
+    resting = np.maximum(np.append(slope[0], slope), np.append(slope, slope[-1])) < RATE_AT_REST_DPS
+    miss = np.abs(spline - central)
+    bent = miss > max(VAGUE_DPS, 8.0 * float(np.percentile(miss, 10.0)))
+    vague = np.logical_and(np.convolve(bent, np.ones(9), "same") > 0.5, np.logical_not(resting))
+    return np.where(bent | resting, central, spline), vague

@@ -122,8 +122,11 @@ def _rests(recording: Recording, sensor: str, *, everything: bool) -> list[Rest]
         if not found and recording.role == "rests":
             found = find_rests(recording)
         resting = np.zeros(recording.samples, bool)
+        memory = len(filter_autocovariance(recording)) - 1  # so long a filter's output holds what was before the rest
+        ahead = memory if recording.filter.get("zero_phase") else 0
         for rest in found:
-            resting[rest.start : rest.stop] = rest.accepted
+            first = rest.start + memory * (rest.start > 0)
+            resting[first : rest.stop - ahead * (rest.stop < recording.samples)] = rest.accepted
         still &= resting
     if everything:  # a gap does not end a static rest: the likelihood knows the times
         return [(recording.time[still], values[still])] if still.any() else []

@@ -218,3 +218,16 @@ def test_allan_deviation_of_two_values_is_empty() -> None:
     tau, deviation = allan_deviation(np.zeros((2, 3)), 1.0)
     assert len(tau) == 0
     assert deviation.shape == (0, 3)
+
+
+def test_what_a_filter_still_holds_of_a_turn_is_no_noise() -> None:
+    turn = np.concatenate([np.zeros(250), np.full(50, 60.0), np.zeros(250)])
+    rng = np.random.default_rng(12)
+    readings = np.stack([turn, np.zeros(550), np.zeros(550)], 1) + rng.normal(0.0, 0.01, (550, 3))
+    time_ns = np.arange(550) * 120_000_000
+    recording = Recording("gyro_x", "gyroscope", "x", time_ns, gyroscope=readings, table_rate=turn)
+    settings = {"name": "rc_low_pass", "cutoff_hz": None, "time_constant_s": 0.24, "zero_phase": False}
+    sheet = {"noise_density": 0.005, "bias_wander": 0.003, "wander_time_s": 100.0}
+    noise = estimate_noise("gyroscope", [apply_filter(recording, settings)], sheet)
+    assert noise.source == "rests"
+    assert noise.white == pytest.approx(0.01, rel=0.1)

@@ -1,0 +1,53 @@
+"""The IMU intrinsics of DLIO (direct lidar-inertial odometry), ``dlio/imu/intrinsics``.
+
+    a = sm raw - bias',   sm = matrix,   bias' = matrix @ bias;     w = raw - bias
+
+The gyroscope has no matrix there: the remarks say what that leaves. Source: DLIO, ``odom.cc``, ``callbackImu``.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import yaml
+
+from pipeline.exports.sensors import (
+    STANDARD_GRAVITY,
+    calibrations,
+    comment,
+    final_errors,
+    forward,
+    left_out,
+    missing,
+)
+
+FILE_NAME = "dlio.yaml"
+
+
+def export(calibration: dict[str, Any], settings: dict[str, Any], validation: dict[str, Any] | None) -> str:
+    """Return the YAML text."""
+    del settings
+    found = calibrations(calibration)
+    remarks = [
+        f"Unit {calibration['unit']}: a = sm raw - bias in m/s^2, sm row by row, the bias after the matrix; "
+        "w = raw - bias in rad/s.",
+        "Body frame x y z, to which DLIO's extrinsics must refer; at rest the upward axis reads + local gravity.",
+        *(f"Left out: {line}." for line in missing(calibration)),
+        *left_out(found),
+    ]
+    intrinsics: dict[str, Any] = {}
+    if "accelerometer" in found:
+        c = found["accelerometer"]
+        intrinsics["accel"] = {
+            "bias": (c.matrix @ c.bias * STANDARD_GRAVITY).tolist(),
+            "sm": c.matrix.ravel().tolist(),
+        }
+    if "gyroscope" in found:
+        c = found["gyroscope"]
+        error = np.linalg.norm(np.eye(3) - forward(c)) / np.sqrt(3.0)
+        remarks.append(f"The matrix of the gyroscope is left out: that leaves about {100 * error:.2g} % of the rate.")
+        intrinsics["gyro"] = {"bias": np.radians(c.bias).tolist()}
+    remarks += [f"With all of the calibration: {line}." for line in final_errors(validation)]
+    content = {"dlio": {"imu": {"intrinsics": intrinsics}}}
+    return comment(remarks) + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120)

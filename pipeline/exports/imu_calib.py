@@ -1,0 +1,36 @@
+"""The parameters of ``dpkoch/imu_calib`` (ROS), which corrects the accelerometer.
+
+    a = SM raw - bias',    SM = matrix,   bias' = matrix @ bias
+
+with the bias after the matrix, in m/s^2. Source: imu_calib, ``accel_calib.cpp``.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import yaml
+
+from pipeline.exports.sensors import STANDARD_GRAVITY, calibrations, comment, final_errors, left_out
+
+FILE_NAME = "imu_calib.yaml"
+
+
+def export(calibration: dict[str, Any], settings: dict[str, Any], validation: dict[str, Any] | None) -> str | None:
+    """Return the YAML text, None where the accelerometer is not calibrated."""
+    del settings
+    found = calibrations(calibration).get("accelerometer")
+    if found is None:
+        return None
+    remarks = [
+        f"Unit {calibration['unit']}: a = SM raw - bias, both in m/s^2, SM row by row; the bias comes after the matrix.",
+        "Body frame x y z; at rest the upward axis reads + local gravity.",
+        "The gyroscope is not in this format: imu_calib takes its mean at start for its bias.",
+        *left_out({"accelerometer": found}),
+        *(f"The {line}." for line in final_errors(validation) if "accelerometer" in line),
+    ]
+    content = {
+        "SM": found.matrix.ravel().tolist(),
+        "bias": (found.matrix @ found.bias * STANDARD_GRAVITY).tolist(),
+    }
+    return comment(remarks) + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120)

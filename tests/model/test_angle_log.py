@@ -1,0 +1,58 @@
+"""A table that logs its angle alone: the rate is known where the angle tells it, and said to be vague where not."""
+
+import numpy as np
+import pytest
+
+from pipeline.model.kinematics import reference_motion
+from pipeline.records import Motion, Recording
+from pipeline.simulation.program import Program, ProgramBuilder
+
+INTERVAL = 0.12
+
+
+def motion(program: Program, *, decimals: int = 4) -> tuple[Motion, np.ndarray]:
+    time_ns = np.arange(int(program.duration / INTERVAL)) * round(INTERVAL * 1e9)
+    angle, rate, _, _ = program.at(time_ns * 1e-9)
+    found = reference_motion(Recording("turn", "gyroscope", "x", time_ns, table_angle=angle.round(decimals)))
+    assert found is not None
+    assert found.followed is not None
+    return found, rate
+
+
+def stop_and_go() -> Program:
+    builder = ProgramBuilder(100.0).rest(2.0)
+    for _ in range(36):
+        builder.turn(10.0, 20.0).rest(1.0)
+    return builder.build()
+
+
+def turns() -> Program:
+    builder = ProgramBuilder(100.0).rest(10.0)
+    for rate in (60.0, 100.0):
+        builder.turn_with_plateau(360.0, rate).rest(5.0).turn_with_plateau(-360.0, rate).rest(5.0)
+    return builder.build()
+
+
+@pytest.mark.parametrize("program", [stop_and_go(), turns()], ids=["stop-and-go", "turns"])
+def test_the_rate_is_right_wherever_it_is_said_to_be_followed(program: Program) -> None:
+    found, rate = motion(program)
+    assert found.rate is not None
+    assert found.followed is not None
+    assert np.abs(found.rate - rate)[found.followed].max() < 0.01
+    assert found.followed[found.still].all()
+
+
+@pytest.mark.parametrize("program", [stop_and_go(), turns()], ids=["stop-and-go", "turns"])
+def test_rests_are_seen_in_the_angle_alone(program: Program) -> None:
+    found, rate = motion(program)
+    assert (rate[found.still] == 0).all()
+    assert found.still.sum() > 0.4 * (rate == 0).sum()  # 0.3 s of each 1 s settle
+
+
+def test_corners_of_ramps_are_said_to_be_vague() -> None:
+    found, rate = motion(turns())
+    assert found.rate is not None
+    assert found.followed is not None
+    wrong = np.abs(found.rate - rate) > 0.1
+    assert wrong.sum() >= 8
+    assert not found.followed[wrong].any()
