@@ -1,7 +1,7 @@
 """One module per format that consumes a calibration; every module of this package that has one is used.
 
-Each has ``FILE_NAME`` and ``export(calibration, settings, validation)``, which returns the file's text, or None where the
-format has nothing to hold of this unit. There is no list to extend.
+Each has ``FILE_NAME`` and ``export(calibration, settings, validation)``, which returns the file's text, or None where
+the format can hold nothing of this unit. There is no list to extend.
 """
 
 from __future__ import annotations

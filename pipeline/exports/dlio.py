@@ -17,9 +17,9 @@ from pipeline.exports.sensors import (
     calibrations,
     comment,
     final_errors,
-    forward,
     left_out,
     missing,
+    no_gyroscope_matrix,
 )
 
 FILE_NAME = "dlio.yaml"
@@ -30,8 +30,8 @@ def export(calibration: dict[str, Any], settings: dict[str, Any], validation: di
     del settings
     found = calibrations(calibration)
     remarks = [
-        f"Unit {calibration['unit']}: a = sm raw - bias in m/s^2, sm row by row, the bias after the matrix; "
-        "w = raw - bias in rad/s.",
+        f"Unit {calibration['unit']}: a = sm raw - bias in m/s^2, sm row by row; w = raw - bias in rad/s.",
+        "The bias of the accelerometer comes after the matrix.",
         "Body frame x y z, to which DLIO's extrinsics must refer; at rest the upward axis reads + local gravity.",
         *(f"Left out: {line}." for line in missing(calibration)),
         *left_out(found),
@@ -45,8 +45,7 @@ def export(calibration: dict[str, Any], settings: dict[str, Any], validation: di
         }
     if "gyroscope" in found:
         c = found["gyroscope"]
-        error = np.linalg.norm(np.eye(3) - forward(c)) / np.sqrt(3.0)
-        remarks.append(f"The matrix of the gyroscope is left out: that leaves about {100 * error:.2g} % of the rate.")
+        remarks.append(no_gyroscope_matrix(c))
         intrinsics["gyro"] = {"bias": np.radians(c.bias).tolist()}
     remarks += [f"With all of the calibration: {line}." for line in final_errors(validation)]
     content = {"dlio": {"imu": {"intrinsics": intrinsics}}}

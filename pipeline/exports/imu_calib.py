@@ -23,7 +23,7 @@ def export(calibration: dict[str, Any], settings: dict[str, Any], validation: di
     if found is None:
         return None
     remarks = [
-        f"Unit {calibration['unit']}: a = SM raw - bias, both in m/s^2, SM row by row; the bias comes after the matrix.",
+        f"Unit {calibration['unit']}: a = SM raw - bias in m/s^2, SM row by row; the bias comes after the matrix.",
         "Body frame x y z; at rest the upward axis reads + local gravity.",
         "The gyroscope is not in this format: imu_calib takes its mean at start for its bias.",
         *left_out({"accelerometer": found}),

@@ -2,8 +2,8 @@
 
     x = T K (raw - B),    T K = matrix,   T_ii = 1,   K diagonal
 
-The file is T, K and B as plain numbers, row by row; what follows them is not read, so remarks stand there. imu_tk itself
-fits an upper triangular T, for its frame is bound to the sensor; here T is full, for the frame is the table's.
+The file is T, K and B as plain numbers, row by row; what follows them is not read, so remarks stand there. imu_tk
+itself fits an upper triangular T, for its frame is bound to the sensor; here T is full, for the frame is the table's.
 Source: imu_tk, ``calibration.h``, ``CalibratedTriad_::load``.
 """
 
@@ -36,8 +36,7 @@ def triad(unit: str, calibration: SensorCalibration, factor: float, validation: 
     scale = np.diag(calibration.matrix)
     remarks = [
         f"Unit {unit}, {sensor}: T (misalignment), K (scale factors), B (bias); x = T K (raw - B).",
-        f"raw and x in {'m/s^2' if sensor == 'accelerometer' else 'rad/s'}, body frame x y z; T K is the matrix of the "
-        "calibration, so T is full, not triangular.",
+        f"raw and x in {'m/s^2' if sensor == 'accelerometer' else 'rad/s'}, body frame x y z; T is not triangular.",
         "At rest the upward axis of the accelerometer reads + local gravity.",
         *left_out({sensor: calibration}),
         *(f"The {line}." for line in final_errors(validation) if sensor in line),

@@ -20,10 +20,11 @@ import yaml
 
 from pipeline.exports.sensors import (
     STANDARD_GRAVITY,
-    bench_effects,
     calibrations,
+    comment,
     final_errors,
     forward,
+    left_out,
     missing,
     sensor_effects,
 )
@@ -61,12 +62,8 @@ def export(calibration: dict[str, Any], settings: dict[str, Any], validation: di
         entry["gyroscopes"] = _gyroscope(found["gyroscope"], rotation)
     entry["T_i_b"] = np.block([[rotation, np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]]).tolist()
     entry["time_offset"] = 0.0
-    for sensor, c in found.items():
-        left = [e for e in sensor_effects(c) if e != "g_sensitivity"]
-        remarks += [f"Left out of this format, {sensor}: {', '.join(left)}."] if left else []
-        remarks += [f"Of the bench, not of the {sensor}: {', '.join(bench_effects(c))}."] if bench_effects(c) else []
-    comment = "".join(f"# {line}\n" for line in remarks + final_errors(validation))
-    return comment + yaml.safe_dump({"imu0": entry}, sort_keys=False, default_flow_style=None, width=120)
+    remarks += [*left_out(found, ("g_sensitivity",)), *final_errors(validation)]
+    return comment(remarks) + yaml.safe_dump({"imu0": entry}, sort_keys=False, default_flow_style=None, width=120)
 
 
 def lower_times_rotation(K: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

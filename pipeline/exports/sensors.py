@@ -73,6 +73,36 @@ def diagonal(calibration: SensorCalibration) -> tuple[NDArray[np.float64], float
     return np.diag(K) / length, float(np.sqrt(np.sum(1.0 - np.diag(K) ** 2 / length) / 3.0))
 
 
+def axis_by_axis(document: dict[str, Any]) -> tuple[dict[str, NDArray[np.float64]], list[str]]:
+    """Return what ``(raw - offset) * scale`` on each axis can hold, and remarks on what it cannot.
+
+    Returns
+    -------
+    values : dict of str to (3,) array
+        ``accelerometer_offset``, m/s^2, ``accelerometer_scale``, ``gyroscope_offset``, rad/s; of calibrated sensors.
+    remarks : list of str
+    """
+    found = calibrations(document)
+    values: dict[str, NDArray[np.float64]] = {}
+    remarks = [*(f"Left out: {line}." for line in missing(document)), *left_out(found)]
+    if "accelerometer" in found:
+        c = found["accelerometer"]
+        scale, error = diagonal(c)
+        values |= {"accelerometer_offset": c.bias * STANDARD_GRAVITY, "accelerometer_scale": scale}
+        remarks.append(f"Cross-axis terms of the accelerometer are left out: that leaves about {error:.2g} g at 1 g.")
+    if "gyroscope" in found:
+        c = found["gyroscope"]
+        values["gyroscope_offset"] = np.radians(c.bias)
+        remarks.append(no_gyroscope_matrix(c))
+    return values, remarks
+
+
+def no_gyroscope_matrix(calibration: SensorCalibration) -> str:
+    """Return a sentence on the error that taking off the bias alone leaves, over directions: ``|1 - K| / sqrt(3)``."""
+    share = float(np.linalg.norm(np.eye(3) - forward(calibration))) / np.sqrt(3.0)
+    return f"The matrix of the gyroscope is left out: that leaves about {100 * share:.2g} % of the rate."
+
+
 def comment(lines: list[str], mark: str = "# ") -> str:
     """Return lines as comments; line ends that users wrote stay inside."""
     return "".join(f"{mark}{' '.join(line.splitlines())}\n" for line in lines)
