@@ -10,7 +10,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import yaml
 
 from pipeline.exports.sensors import (
     STANDARD_GRAVITY,
@@ -20,6 +19,7 @@ from pipeline.exports.sensors import (
     left_out,
     missing,
     no_gyroscope_matrix,
+    yaml_text,
 )
 
 FILE_NAME = "dlio.yaml"
@@ -49,4 +49,4 @@ def export(calibration: dict[str, Any], settings: dict[str, Any], validation: di
         intrinsics["gyro"] = {"bias": np.radians(c.bias).tolist()}
     remarks += [f"With all of the calibration: {line}." for line in final_errors(validation)]
     content = {"dlio": {"imu": {"intrinsics": intrinsics}}}
-    return comment(remarks) + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120)
+    return comment(remarks) + yaml_text(content)

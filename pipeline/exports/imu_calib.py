@@ -9,9 +9,7 @@ from __future__ import annotations
 
 from typing import Any
 
-import yaml
-
-from pipeline.exports.sensors import STANDARD_GRAVITY, calibrations, comment, final_errors, left_out
+from pipeline.exports.sensors import STANDARD_GRAVITY, calibrations, comment, final_errors, left_out, yaml_text
 
 FILE_NAME = "imu_calib.yaml"
 
@@ -33,4 +31,4 @@ def export(calibration: dict[str, Any], settings: dict[str, Any], validation: di
         "SM": found.matrix.ravel().tolist(),
         "bias": (found.matrix @ found.bias * STANDARD_GRAVITY).tolist(),
     }
-    return comment(remarks) + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120)
+    return comment(remarks) + yaml_text(content)

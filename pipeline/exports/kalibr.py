@@ -16,7 +16,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import yaml
 
 from pipeline.exports.sensors import (
     STANDARD_GRAVITY,
@@ -27,6 +26,7 @@ from pipeline.exports.sensors import (
     left_out,
     missing,
     sensor_effects,
+    yaml_text,
 )
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def export(calibration: dict[str, Any], settings: dict[str, Any], validation: di
     entry["T_i_b"] = np.block([[rotation, np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]]).tolist()
     entry["time_offset"] = 0.0
     remarks += [*left_out(found, ("g_sensitivity",)), *final_errors(validation)]
-    return comment(remarks) + yaml.safe_dump({"imu0": entry}, sort_keys=False, default_flow_style=None, width=120)
+    return comment(remarks) + yaml_text({"imu0": entry})
 
 
 def lower_times_rotation(K: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
