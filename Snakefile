@@ -35,5 +35,11 @@ localrules:
     verdict,
 
 
+onsuccess:
+    say_at_the_end(
+        f"{len(CAMPAIGN.units)} units are calibrated; look at {RESULTS}/index.html\n"
+    )
+
+
 onerror:
     repeat_verdict()

@@ -53,9 +53,14 @@ def of_batches(stage):
     return [f"{RESULTS}/batches/{batch}/{stage}" for batch in CAMPAIGN.batches]
 
 
+def say_at_the_end(text):
+    """Print after Snakemake's own last words."""
+    atexit.register(print, f"\n{text}", file=sys.stderr, end="")
+
+
 def repeat_verdict():
-    """Say at the very end of the terminal output, after Snakemake's own last words, which units have failed and why."""
+    """Say at the very end of the terminal output which units have failed, and why."""
     log = f"{RESULTS}/logs/verdict.log"
     if os.path.exists(log) and os.path.getmtime(log) >= STARTED - 1:
         with open(log) as stream:
-            atexit.register(print, f"\n{stream.read()}", file=sys.stderr, end="")
+            say_at_the_end(stream.read())
