@@ -6,11 +6,12 @@ the format can hold nothing of this unit. There is no list to extend.
 
 from __future__ import annotations
 
-import os
 from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from pipeline.atomic import write_atomically
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -51,11 +52,6 @@ def export_all(
         if text is None:
             continue
         path = folder / module.FILE_NAME
-        temporary = path.with_name(f".{path.name}.tmp")
-        with temporary.open("w", encoding="utf-8", newline="\n") as stream:
-            stream.write(text)
-            stream.flush()
-            os.fsync(stream.fileno())
-        temporary.replace(path)
+        write_atomically(path, text)
         written.append(path)
     return written

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import csv
 import io
-import os
 from pathlib import Path
 from typing import Any
 
+from pipeline.atomic import write_atomically
 from pipeline.records import SENSORS
 from pipeline.report.limits import final_step, verdict
 
@@ -95,9 +95,7 @@ def write_summary(path: Path | str, rows: list[JSON]) -> None:
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow(columns)
     writer.writerows([_cell(row.get(column)) for column in columns] for row in rows)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    temporary.write_text(buffer.getvalue(), encoding="utf-8", newline="")
-    temporary.replace(path)
+    write_atomically(path, buffer.getvalue())
 
 
 def _cell(value: object) -> str:

@@ -7,9 +7,10 @@ import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pipeline.atomic import write_atomically
 from pipeline.report.campaign_page import render
 from pipeline.report.summary import summary_row, write_summary
-from pipeline.stages.batch import FAILED, parse_job, read_json, write_json, write_text
+from pipeline.stages.batch import FAILED, parse_job, read_json, write_json
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -46,7 +47,7 @@ def main(argv: Sequence[str]) -> int:
         rows.append(summary_row(unit, calibration, documents["validate"], documents["diagnose"], sheet_row))
     write_summary(job.output / "summary.csv", rows)
     write_json(job.output / "failures.json", failures)
-    write_text(job.output / "index.html", render(job.run["campaign"], rows, failures, job.run["compare"]))
+    write_atomically(job.output / "index.html", render(job.run["campaign"], rows, failures, job.run["compare"]))
     return 0
 
 

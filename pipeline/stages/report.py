@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from pipeline.atomic import write_atomically
 from pipeline.diagnosis.words import in_words
 from pipeline.formats.parquet import load_recordings
 from pipeline.records import SENSORS
 from pipeline.report.unit_page import render
-from pipeline.stages.batch import FAILED, parse_job, read_json, run_batch, write_json, write_text
+from pipeline.stages.batch import FAILED, parse_job, read_json, run_batch, write_json
 from pipeline.stages.calibration import header
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ def main(argv: Sequence[str]) -> int:
         recordings = load_recordings(job.inputs["filter"] / f"{unit}.parquet")
         words = {sensor: in_words(diagnosis[sensor], sensor) for sensor in SENSORS}
         page = render(calibration, validation, diagnosis, recordings, part, words=words)
-        write_text(job.output / f"{unit}.html", page)
+        write_atomically(job.output / f"{unit}.html", page)
 
     status = run_batch(job, work)
     for unit, part in job.units.items():
@@ -35,5 +36,5 @@ def main(argv: Sequence[str]) -> int:
             document = header(unit, part) | {"status": "failed", "error": read_json(failed), "inputs": []}
             document |= {"accelerometer": None, "gyroscope": None, "not_calibrated": {}}
             write_json(job.output / f"{unit}.calibration.json", document)
-            write_text(job.output / f"{unit}.html", render(document, None, None, [], part))
+            write_atomically(job.output / f"{unit}.html", render(document, None, None, [], part))
     return status
