@@ -11,9 +11,10 @@ import yaml
 from pipeline.errors import ConfigurationError
 from pipeline.simulation.campaign import write_campaign
 from pipeline.simulation.description import FORMATS, description_from, read_description
+from pipeline.simulation.options import add_recording_options, described
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
 FILE = "simulation.yaml"
 EPILOG = """\
@@ -72,57 +73,22 @@ def _parser() -> argparse.ArgumentParser:
     add("--units", type=int, metavar="N", help="number of units (1)")
     add("--prefix", metavar="NAME", help="their names: NAME001, NAME002 ... (U)")
     add("--seed", type=int, help="every random number follows from it (0)")
-    add("--sensor", metavar="NAME", help="configs/sensor (mpu6050)")
-    add("--table", metavar="NAME", help="configs/table (acutronic; hand for procedures without a table)")
-    add("--procedure", metavar="NAME", help="configs/procedure (three_axis_turns)")
-    add("--samples", type=int, metavar="N", help="about so many rows a unit: dwells, rests, held-out motion follow")
-    add("--interval", dest="interval_s", type=float, metavar="S", help="sampling interval in s (0.12)")
-    add("--lost", type=float, metavar="SHARE", help="share of the samples that the radio link loses (0)")
     add("--format", choices=FORMATS, help="of the recordings (csv)")
     add("--effect", action="append", metavar="[SENSOR.]NAME[=SIZE]", help="hide an effect; may be repeated")
-    course = parser.add_argument_group("how the procedure is run")
-    add = course.add_argument
-    add("--dwell", dest="dwell_s", type=float, metavar="S", help="rest at each stop (1; without a table 4)")
-    add("--step", dest="step_deg", type=float, metavar="DEG", help="of stop-and-go (5)")
-    add("--accelerometer-rate", dest="accelerometer_rates_dps", type=float, nargs="+", metavar="DPS",
-        help="continuous turns for the accelerometer in place of stop-and-go")  # fmt: skip
-    add("--rate", "--rates", dest="rates_dps", type=float, nargs="+", metavar="DPS", help="gyroscope turns (60)")
-    add("--both-directions", action="store_true", help="make each turn backwards too")
-    add("--turns", type=int, metavar="N", help="whole turns at each rate (1)")
-    add("--positions", type=int, metavar="N", help="rests of multi_position (40)")
-    add(
-        "--validation",
-        dest="validation_s",
-        type=float,
-        metavar="S",
-        help="length of held-out motion (120; 0: none)",
-    )
-    add("--validation-rate", dest="validation_rate_dps", type=float, metavar="DPS", help="largest rate in it (40)")
-    add("--static", dest="static_s", type=float, metavar="S", help="length of the long rest (120; 0: none)")
-    add("--pause", dest="pause_s", type=float, metavar="S", help="between recordings (30)")
+    add_recording_options(parser)
     return parser
 
 
-COURSE = (
-    "dwell_s", "step_deg", "accelerometer_rates_dps", "rates_dps", "both_directions", "turns", "positions",
-    "validation_s", "validation_rate_dps", "static_s", "pause_s",
-)  # fmt: skip
-
-
-def _described(arguments: dict[str, Any]) -> dict[str, Any]:
+def _described(arguments: Mapping[str, Any]) -> dict[str, Any]:
     """Return the description that the options give."""
-    seed, count = arguments.pop("seed", 0), arguments.pop("units", 1)
-    effects = dict(_effect(text) for text in arguments.pop("effect", ()))
-    course = {name: arguments.pop(name) for name in COURSE if name in arguments}
-    prefix = arguments.pop("prefix", "U")
-    procedure = arguments.get("procedure", "three_axis_turns")
-    table = "acutronic" if procedure in ("three_axis_turns", "thermal_ramp") else "hand"
-    unit = {"unit": prefix if count > 1 else f"{prefix}001", "count": count, "table": table, **arguments}
-    if course:
-        unit["course"] = course
+    effects = dict(_effect(text) for text in arguments.get("effect", ()))
+    count, prefix = arguments.get("units", 1), arguments.get("prefix", "U")
+    unit = {"unit": prefix if count > 1 else f"{prefix}001", "count": count, **described(arguments)}
+    if "format" in arguments:
+        unit["format"] = arguments["format"]
     if effects:
         unit["effects"] = effects
-    return {"seed": seed, "units": [unit]}
+    return {"seed": arguments.get("seed", 0), "units": [unit]}
 
 
 def _effect(text: str) -> tuple[str, Any]:
