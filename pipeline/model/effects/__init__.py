@@ -1,6 +1,7 @@
 """The catalogue of physical effects: every module of this package that defines one is part of it.
 
-There is no list to extend: ``catalogue()`` finds the modules on disk.
+There is no list to extend: ``catalogue()`` finds the modules on disk. Effects of a user's own are registered beside
+them (``pipeline.model.user_effects`` makes them from formulas); they are known to this process alone.
 """
 
 from __future__ import annotations
@@ -15,15 +16,40 @@ from pipeline.errors import ConfigurationError
 if TYPE_CHECKING:
     from pipeline.model.effects.base import Effect
 
+_registered: dict[str, Effect] = {}
+
 
 @cache
-def catalogue() -> dict[str, Effect]:
+def built_in() -> dict[str, Effect]:
     """Return every built-in effect by name, in alphabetical order."""
     found: dict[str, Effect] = {}
     for file in sorted(Path(__file__).parent.glob("*.py")):
         if file.stem not in ("__init__", "base"):
             found[file.stem] = import_module(f"{__name__}.{file.stem}").EFFECT
     return found
+
+
+def catalogue() -> dict[str, Effect]:
+    """Return every effect by name: the built-in ones in alphabetical order, then the registered ones."""
+    return {**built_in(), **_registered}
+
+
+def register(effect: Effect) -> None:
+    """Add an effect of the user's own to the catalogue of this process; one of the same name is replaced.
+
+    Raises
+    ------
+    ConfigurationError
+        If a built-in effect has that name.
+    """
+    if effect.name in built_in():
+        raise ConfigurationError(f"effect {effect.name}: a built-in effect is called so; give yours another name")
+    _registered[effect.name] = effect
+
+
+def forget_registered() -> None:
+    """Take every registered effect out of the catalogue again."""
+    _registered.clear()
 
 
 def effect(name: str) -> Effect:
@@ -34,7 +60,7 @@ def effect(name: str) -> Effect:
     ConfigurationError
         If there is none of that name.
     """
-    try:
-        return catalogue()[name]
-    except KeyError:
-        raise ConfigurationError(f"no effect is called {name!r}; known: {', '.join(catalogue())}") from None
+    found = _registered.get(name) or built_in().get(name)
+    if found is None:
+        raise ConfigurationError(f"no effect is called {name!r}; known: {', '.join(catalogue())}")
+    return found
