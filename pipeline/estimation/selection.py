@@ -163,6 +163,15 @@ def select(
     return _Search(observations, configured, noise, sheet, known).run()
 
 
+def unselected(
+    observations: Observations, configured: Sequence[str], noise: Noise | None, sheet: Mapping[str, Any]
+) -> Selection:
+    """Return a selection before its first round: the base and the candidates' products, no effect scored yet."""
+    search = _Search(observations, configured, noise, sheet, None)
+    state = search.fit, search.base, search.first, search.ranking
+    return Selection([], {}, {}, *state, observations, search.start, search.settings, search.limits)
+
+
 class _Search:
     """The state of a selection."""
 

@@ -36,13 +36,14 @@ from pipeline.simulation.session import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
 
     from pipeline.records import Recording
     from pipeline.simulation.description import Description, UnitDescription
+    from pipeline.simulation.procedures import Planned
     from pipeline.simulation.sensor import SimulatedSensor
 
 COLUMNS = ("unit", "serial", "lot", "date", "sensor", "table", "procedure", "method", "ingest", "filter", "overrides")
@@ -82,7 +83,9 @@ def write_campaign(description: Description, directory: Path, progress: Callable
         (directory / "campaign.yaml").write_text(CAMPAIGN, encoding="utf-8")
 
 
-def simulate_unit(unit: UnitDescription, seed: int, number: int) -> tuple[list[Recording], dict[str, Any]]:
+def simulate_unit(
+    unit: UnitDescription, seed: int, number: int, extra: Sequence[Planned] = ()
+) -> tuple[list[Recording], dict[str, Any]]:
     """Return the recordings of one unit and the truth behind them.
 
     Parameters
@@ -91,11 +94,13 @@ def simulate_unit(unit: UnitDescription, seed: int, number: int) -> tuple[list[R
     seed : int
     number : int
         Of the unit in its campaign; with the seed it determines every random number.
+    extra : sequence of Planned
+        Further recordings after those of the procedure.
     """
     streams = Streams(seed, number)
     sheets = read_config("sensor", unit.sensor)
     table = read_config("table", unit.table)
-    course = _course(unit)
+    course = course_of(unit)
     effects = drawn_effects(unit.effects, sheets, streams["effects"])
     given = {s: getattr(unit, s) for s in SENSORS}
     sensors = drawn_sensors(sheets, given, effects, streams["unit"])
@@ -104,7 +109,7 @@ def simulate_unit(unit: UnitDescription, seed: int, number: int) -> tuple[list[R
     if unit.held_out:
         benches |= dict.fromkeys(("validation", "static"), _held_out_bench(unit, sheets, effects, streams))
     by_hand = table["angle_accuracy_deg"] if table["motion"] == "none" else 0.0
-    planned = plan(unit.procedure, course, streams["motion"], by_hand)
+    planned = [*plan(unit.procedure, course, streams["motion"], by_hand), *extra]
     total = sum(p.trajectory.duration + course.pause_s for p in planned)
     ramp = course.thermal_ramp_degc if unit.procedure == "thermal_ramp" else 0.0
     environment = random_environment(streams["room"], ramp=ramp, ramp_period=total / 1.5)
@@ -138,7 +143,8 @@ def _digits(sheet: dict[str, Any]) -> int:
     return int(np.ceil(np.log10(sheet["counts_per_unit"]))) + 1
 
 
-def _course(unit: UnitDescription) -> Course:
+def course_of(unit: UnitDescription) -> Course:
+    """Return how the unit's procedure is run: as described, and fitted to its number of samples."""
     base = Course() if unit.procedure in TABLE_PROCEDURES else BY_HAND
     wanted: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in unit.course.items()}
     course = replace(base, **wanted)

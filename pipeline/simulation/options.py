@@ -52,7 +52,9 @@ def _add_course(course: argparse._ArgumentGroup) -> None:
     add("--validation-rate", dest="validation_rate_dps", type=float, metavar="DPS", help="largest rate in it (40)")
     add("--static", dest="static_s", type=float, metavar="S", help="length of the long rest (120; 0: none)")
     add("--pause", dest="pause_s", type=float, metavar="S", help="between recordings (30)")
-    add("--thermal-ramp", dest="thermal_ramp_degc", type=float, metavar="DEGC", help="of thermal_ramp: up and down (15)")
+    add(
+        "--thermal-ramp", dest="thermal_ramp_degc", type=float, metavar="DEGC", help="of thermal_ramp: up and down (15)"
+    )
 
 
 def described(arguments: Mapping[str, Any]) -> dict[str, Any]:
