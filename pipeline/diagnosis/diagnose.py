@@ -14,6 +14,7 @@ from pipeline.diagnosis.advice import next_experiment
 from pipeline.diagnosis.held_out import held_out_error
 from pipeline.diagnosis.observability import facts_of, not_observable
 from pipeline.diagnosis.unknown import unexplained
+from pipeline.diagnosis.wander import fitted_wander
 from pipeline.errors import NotObservableError
 from pipeline.estimation.design import Start, Term
 from pipeline.estimation.effects_stage import AUTO
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 
 ALIKE = 0.8
 MOSTLY = 0.5
+UNKNOWN_SHARE = 0.03  # of the gain in 2 log L by what was selected, above which what is left is worth naming
 CLOSE = 1.1  # mean square of a residual over that of noise, under which there is no excess to share
 
 
@@ -56,7 +58,7 @@ def diagnose(
     -------
     dict
         ``verdict, residual_over_noise, selected, ranking, not_observable, unexplained, next_experiment, override``;
-        beside these ``configured``, and ``wander`` (ratio to white noise and correlation time that fit best).
+        beside these ``configured``, and ``wander`` (``pipeline.diagnosis.wander``).
     """
     sensor = calibration.sensor
     wanted = settings["effects"][sensor]
@@ -102,8 +104,6 @@ def _document(
     if not ranking and verdict == "nothing_missing" and len(hidden) > 0:
         verdict = "not_enough_data"
     adds = ",".join([*configured, *selected])
-    _, at = selection.ranking.of_model(selection.chosen())
-    wander = selection.ranking.settings[at]
     return {
         "verdict": verdict,
         "residual_over_noise": _over_noise(selection, recordings, noise),
@@ -121,18 +121,25 @@ def _document(
         ),
         "override": f"effects.{sensor}=[{adds}]" if selected else "",
         "configured": configured,
-        "wander": {"ratio": wander.ratio, "time_s": wander.time if wander.ratio else None},
+        "wander": fitted_wander(selection, noise),
     }
 
 
 def _verdict(selection: Selection, unknown: Sequence[Any], noise: Noise | None) -> str:
-    """Return the verdict: what is selected must explain most of the excess, unless nothing else is left."""
+    """Return the verdict: what is selected must explain most of the excess, unless nothing else is left.
+
+    A residual that still depends on something beyond the catalogue is unexplained where that is worth naming beside
+    what was selected; next to a much larger effect it may be the small error of its linear equation.
+    """
     left = False
     if noise is not None:
         floor = float(np.mean(noise.white**2 + noise.wander**2))
         left = selection.fit.residual_rms**2 > FAR_ABOVE**2 * floor
     share = _share(selection.base.residual_rms**2 - selection.fit.residual_rms**2, selection, noise)
     if (unknown or left) and (not selection.names or share < MOSTLY):
+        return "unexplained"
+    gain = 2.0 * (selection.fit.log_likelihood - selection.base.log_likelihood)
+    if unknown and max(float(found["delta_bic"]) for found in unknown) > UNKNOWN_SHARE * gain:
         return "unexplained"
     return "missing_effect" if selection.names else "nothing_missing"
 

@@ -33,6 +33,12 @@ def in_words(part: Mapping[str, Any] | None, sensor: str) -> list[str]:
         lines += _selected(entries[name], sensor)
     for found in part["unexplained"]:
         lines.append(f"The residual depends on {plain(found['covariate'])} (p = {found['p_value']:.1g}) beyond that.")
+    wander = part.get("wander") or {}
+    if wander.get("inflated"):
+        lines.append(
+            f"The bias seems to wander by {wander['standard_deviation']:.2g} {UNITS[sensor]}, against "
+            f"{wander['expected']:.2g} expected: something slow may be missing that the noise model has swallowed."
+        )
     if part["not_observable"]:
         lines.append(_hidden(part))
     if part["next_experiment"]:

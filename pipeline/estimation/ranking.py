@@ -141,9 +141,13 @@ class Ranking:
         found: NDArray[np.float64] = -0.5 * self.samples * np.log(total / self.samples) - self.penalty
         return found
 
+    def log_likelihoods(self, selected: Sequence[int]) -> NDArray[np.float64]:
+        """Return log L of base and selected candidates at each noise setting, the first white noise alone."""
+        return self.log_likelihood(self.chosen(selected)[:, -1, -1])
+
     def of_model(self, selected: Sequence[int]) -> tuple[float, int]:
         """Return the log likelihood of base and selected candidates, and its best noise setting."""
-        found = self.log_likelihood(self.chosen(selected)[:, -1, -1])
+        found = self.log_likelihoods(selected)
         return float(found[1:].max()), int(np.argmax(found[1:])) + 1
 
     def scores(self, selected: Sequence[int], limits: dict[str, NDArray[np.float64]]) -> list[Score]:

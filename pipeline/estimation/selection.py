@@ -43,6 +43,7 @@ GATE_P = 0.01
 MOST = 5
 INFLATED = 3.0
 MOVER_SHARE = 0.1  # of the best candidate's delta BIC above which an effect of timing is fitted to its own optimum
+CONSTANT_SHARE = 0.6  # the same for an effect with a time constant, whose start is near its optimum
 DELAYS = ("time_offset", "low_pass_lag")  # of the two the first is taken unless the second is clearly better
 CLEARLY = 6.0
 TIE = 0.5
@@ -262,16 +263,18 @@ class _Search:
         return [self.ranking.indices(name)[0] for name in names]
 
     def _scores(self) -> list[Score]:
-        """Score all candidates; those of timing that compete are fitted to their own optimum."""
+        """Score all candidates; those of timing or with a time constant that compete are fitted to their optimum."""
         scores = self.ranking.scores(self._selected(self.names), self.limits)
         top = max((s.delta_bic for s in scores if s.admissible), default=0.0)
         return [self._refined(s) if self._competes(s, top) else s for s in scores]
 
     def _competes(self, score: Score, top: float) -> bool:
-        return effect(score.name).moves and score.delta_bic > max(GATE_BIC, MOVER_SHARE * top)
+        this = effect(score.name)
+        share = MOVER_SHARE if this.moves else CONSTANT_SHARE
+        return bool(this.nonlinear) and score.delta_bic > max(GATE_BIC, share * top)
 
     def _refined(self, score: Score) -> Score:
-        """Return the score of a candidate of timing at its own optimum."""
+        """Return the score of a nonlinear candidate at its own optimum."""
         this = effect(score.name)
         start = np.maximum(score.values, this.starts(self.observations.sensor)[0]) if this.name == DELAYS[1] else None
         term = Term(this, score.values if start is None else start)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from pipeline.records import Motion
 
-STARTS_S = (60.0, 180.0, 500.0)
+STARTS_S = (60.0, 180.0, 500.0, 1500.0)
 SHORTEST_S, LONGEST_S = 1.0, 1e5
 
 
