@@ -409,7 +409,7 @@ def calibration_of(
                 "standard_uncertainty": float(uncertainty[at]),
             }
             at += 1
-        effects.append(FittedEffect(term.effect.name, described))
+        effects.append(FittedEffect(term.effect.name, described, term.effect.definition))
     details = {
         "samples": round(observations.samples),
         "rounds": fit.rounds,

@@ -2,6 +2,7 @@
 
 ``effects`` of a sensor's configuration names a limit for each effect. Where the parameters of an effect differ in unit,
 ``<effect>_<parameter>`` (the parameter's name or its part before the axis) goes before it: ``warm_up_time_constant``.
+An effect of the user's own brings its limits itself; the sensor's configuration goes before them.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ def parameter_limits(effect: Effect, sensor: str, limits: Mapping[str, float]) -
         ``effects`` of the sensor's configuration.
     """
     found = []
+    limits = {**effect.limits(sensor), **limits}
     for parameter in effect.parameters(sensor):
         symbol = parameter.name.rpartition("_")[0]
         names = (f"{effect.name}_{parameter.name}", f"{effect.name}_{symbol}", effect.name)

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.errors import ConvergenceError
-from pipeline.model.effects import effect
 from pipeline.model.effects.base import Owner
+from pipeline.model.user_effects import effect_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -73,7 +73,7 @@ def compensate(
 
 def sensor_effects(calibration: SensorCalibration) -> list[FittedEffect]:
     """Return the fitted effects that belong to the sensor itself."""
-    return [fitted for fitted in calibration.effects if effect(fitted.name).owner == Owner.SENSOR]
+    return [fitted for fitted in calibration.effects if effect_of(fitted).owner == Owner.SENSOR]
 
 
 def solve(
@@ -114,7 +114,7 @@ def solve(
         for s, (calibration, effects, K) in busy.items():
             rest = readings[s]
             for fitted in effects:
-                rest = rest - effect(fitted.name).reading(s, motion, K, fitted.values)
+                rest = rest - effect_of(fitted).reading(s, motion, K, fitted.values)
             moved[s] = linear_truth(calibration, rest)
         change = max(_largest(moved[s] - truths[s], moved[s]) for s in busy)
         truths = moved

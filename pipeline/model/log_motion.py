@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import ConfigurationError, InputError
-from pipeline.model.effects import effect
 from pipeline.model.effects.base import turning_direction
+from pipeline.model.user_effects import FormulaEffect, effect_of
 from pipeline.records import Motion
 
 if TYPE_CHECKING:
@@ -153,8 +153,11 @@ def fields_used(sensor: str, effects: Iterable[FittedEffect]) -> set[str]:
     seen: set[str] = set()
     for fitted in effects:
         looked_at: set[str] = set()
-        found = effect(fitted.name)
-        found.reading(sensor, _watched(looked_at), np.eye(3), fitted.values)
+        found = effect_of(fitted)
+        if isinstance(found, FormulaEffect):
+            looked_at = found.fields(sensor)
+        else:
+            found.reading(sensor, _watched(looked_at), np.eye(3), fitted.values)
         seen |= looked_at | set(found.needs)
         strange = sorted((looked_at | set(found.needs)) - set(SIGNALS))
         if strange:

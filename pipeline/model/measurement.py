@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.model.effects import effect
 from pipeline.model.effects.base import truth
+from pipeline.model.user_effects import effect_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -27,8 +27,8 @@ def predicted_reading(calibration: SensorCalibration, motion: Motion) -> NDArray
     motion = felt_motion(calibration, motion)
     reading = calibration.bias + truth(calibration.sensor, motion) @ K.T
     for fitted in calibration.effects:
-        if not effect(fitted.name).moves:
-            reading = reading + effect(fitted.name).reading(calibration.sensor, motion, K, fitted.values)
+        if not effect_of(fitted).moves:
+            reading = reading + effect_of(fitted).reading(calibration.sensor, motion, K, fitted.values)
     return reading
 
 
@@ -42,5 +42,5 @@ def felt_motion(calibration: SensorCalibration, motion: Motion) -> Motion:
         By the clock of the reference.
     """
     for fitted in calibration.effects:
-        motion = effect(fitted.name).moved(motion, fitted.values)
+        motion = effect_of(fitted).moved(motion, fitted.values)
     return motion

@@ -50,10 +50,14 @@ class FittedEffect:
     name : str
     parameters : dict
         Name to ``{"value", "unit", "expanded_uncertainty"}``.
+    definition : dict or None
+        Of an effect of the user's own, what it is made from, so that the calibration says all that is needed to
+        apply it; None for a built-in one.
     """
 
     name: str
     parameters: dict[str, dict[str, Any]]
+    definition: dict[str, Any] | None = None
 
     @property
     def values(self) -> NDArray[np.float64]:
@@ -120,7 +124,10 @@ class SensorCalibration:
                 }
                 for s in self.stages
             ],
-            "effects": [{"name": e.name, "parameters": e.parameters} for e in self.effects],
+            "effects": [
+                {"name": e.name, "parameters": e.parameters} | ({"definition": e.definition} if e.definition else {})
+                for e in self.effects
+            ],
             "converged": self.converged,
         }
 

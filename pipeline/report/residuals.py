@@ -62,7 +62,7 @@ def sensor_calibration(sensor: str, part: dict[str, Any]) -> SensorCalibration:
         sensor=sensor,
         bias=np.array(part["bias"], float),
         matrix=np.array(part["matrix"], float),
-        effects=tuple(FittedEffect(e["name"], e["parameters"]) for e in part.get("effects", [])),
+        effects=tuple(FittedEffect(**e) for e in part.get("effects", [])),
     )
 
 

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.model.effects import effect
 from pipeline.model.inversion import compensate, linear_truth, sensor_effects
 from pipeline.model.kinematics import reference_motion
+from pipeline.model.user_effects import effect_of
 from pipeline.records import SENSORS, SensorCalibration
 from pipeline.report import figures, tables
 from pipeline.report.limits import checks, final_step, verdict
@@ -167,7 +167,7 @@ def _calibrated(
     """Return calibrated held-out readings, without the sensor's own effects where the reference tells the motion."""
     effects = sensor_effects(calibration)
     motion = reference_motion(recording, table.get("gravity_g") or 1.0) if effects else None
-    own = [e for e in effects if motion is not None and effect(e.name).available(motion)]
+    own = [e for e in effects if motion is not None and effect_of(e).available(motion)]
     if motion is None or not own:
         return linear_truth(calibration, reading)
     return compensate(calibration, reading, motion, own)

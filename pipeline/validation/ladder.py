@@ -22,10 +22,10 @@ import numpy as np
 
 from pipeline.errors import ConfigurationError
 from pipeline.estimation.correction import apply_correction
-from pipeline.model.effects import effect
 from pipeline.model.effects.base import truth
 from pipeline.model.inversion import inverse_of, linear_truth, solve
 from pipeline.model.log_motion import LineThroughThePast, LogState, fields_used, log_motion
+from pipeline.model.user_effects import effect_of
 from pipeline.validation.samples import OTHER
 
 if TYPE_CHECKING:
@@ -101,7 +101,7 @@ def _figures(name: str, corrected: Sequence[Corrected]) -> dict[str, Any]:
 
 def _lack(calibration: SensorCalibration, fitted: FittedEffect, samples: Samples) -> str | None:
     """Say what the held-out recording lacks for an effect to be taken off, or None."""
-    found = effect(fitted.name)
+    found = effect_of(fitted)
     if samples.motion is not None:
         missing = [need for need in found.needs if getattr(samples.motion, need) is None]
         return f"the held-out recording holds no {' and no '.join(missing)}" if missing else None
@@ -126,11 +126,11 @@ def _with_effects(
         return _from_own_signals(calibration, effects, samples, other), samples.magnitude, None
     sensor, motion, K = calibration.sensor, samples.motion, inverse_of(calibration)
     for fitted in effects:
-        motion = effect(fitted.name).moved(motion, fitted.values)
+        motion = effect_of(fitted).moved(motion, fitted.values)
     rest = samples.reading
     for fitted in effects:
-        if not effect(fitted.name).moves:
-            rest = rest - effect(fitted.name).reading(sensor, motion, K, fitted.values)
+        if not effect_of(fitted).moves:
+            rest = rest - effect_of(fitted).reading(sensor, motion, K, fitted.values)
     felt, stamped = truth(sensor, motion), truth(sensor, samples.motion)
     change = np.linalg.norm(felt, axis=1) - np.linalg.norm(stamped, axis=1)
     return linear_truth(calibration, rest), samples.magnitude + change, felt

@@ -16,7 +16,7 @@ from __future__ import annotations
 import abc
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -86,6 +86,8 @@ class Effect(abc.ABC):
         What separates it from its look-alikes, as advice to the user.
     source : str
         Where the equation comes from.
+    definition : dict or None
+        Of an effect of the user's own, what it was made from; it goes with every calibration that has the effect.
     """
 
     name: ClassVar[str]
@@ -101,6 +103,7 @@ class Effect(abc.ABC):
     excitation: ClassVar[str]
     experiment: ClassVar[str]
     source: ClassVar[str]
+    definition: dict[str, Any] | None = None
 
     @abc.abstractmethod
     def parameters(self, sensor: str) -> tuple[Parameter, ...]:
@@ -165,6 +168,11 @@ class Effect(abc.ABC):
     def stepped(self, values: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return ``values + step``, as far as the parameters may go in one round of a nonlinear fit."""
         return values + step
+
+    def limits(self, sensor: str) -> dict[str, float]:
+        """Return the largest plausible sizes that the effect brings itself, keyed as those of the data sheet."""
+        del sensor
+        return {}
 
     def available(self, motion: Motion) -> bool:
         """Return whether the motion holds what the effect needs."""
