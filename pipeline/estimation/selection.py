@@ -26,6 +26,7 @@ from pipeline.estimation.design import BASE, Start, Term, ordinary_base
 from pipeline.estimation.joint import Fit, fit_best, fit_terms, starts_of
 from pipeline.estimation.ranking import Ranking, Score
 from pipeline.estimation.wandering import settings_for
+from pipeline.model.effect_limits import parameter_limits
 from pipeline.model.effects import catalogue, effect
 
 if TYPE_CHECKING:
@@ -109,12 +110,9 @@ def limits_of(sensor: str, sheet: Mapping[str, Any]) -> dict[str, NDArray[np.flo
     given = sheet.get("effects") or {}
     found = {}
     for name, this in catalogue().items():
-        if sensor in this.sensors and name in given:
-            limits = []
-            for parameter in this.parameters(sensor):
-                keys = (f"{name}_{parameter.name}", f"{name}_{parameter.name.rsplit('_', 1)[0]}", name)
-                limits.append(next(float(given[key]) for key in keys if key in given))
-            found[name] = np.array(limits)
+        limits = parameter_limits(this, sensor, given) if sensor in this.sensors else np.array([np.inf])
+        if np.all(np.isfinite(limits)):
+            found[name] = limits
     return found
 
 
