@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.diagnosis.advice import next_experiment
+from pipeline.diagnosis.first_guess import suggested_effect, unexplained
 from pipeline.diagnosis.held_out import held_out_error
 from pipeline.diagnosis.observability import facts_of, not_observable
-from pipeline.diagnosis.unknown import unexplained
 from pipeline.diagnosis.wander import fitted_wander
 from pipeline.errors import NotObservableError
 from pipeline.estimation.design import Start, Term
@@ -80,6 +80,7 @@ def _nothing(sensor: str, configured: list[str], reason: str) -> dict[str, Any]:
         "ranking": [],
         "not_observable": [{"effect": name, "reason": reason} for name in names],
         "unexplained": [],
+        "suggested_effect": None,
         "next_experiment": "record turns about all three axes on a table whose angle and rate are logged",
         "override": "",
         "configured": configured,
@@ -111,6 +112,7 @@ def _document(
         "ranking": ranking,
         "not_observable": [{"effect": name, "reason": reason} for name, reason in hidden.items()],
         "unexplained": unknown,
+        "suggested_effect": suggested_effect(unknown, sensor, catalogue()),
         "next_experiment": next_experiment(
             verdict,
             ranking=ranking,

@@ -1,13 +1,15 @@
 """What the residual depends on beside the catalogue.
 
-Generic bases in one covariate at a time are scored like effects, beside base, configured and selected effects:
+Generic curves in one covariate at a time are tried beside base, configured and selected effects:
 
-    temperature, time : Chebyshev polynomials of degree 1 to 5 over their span
-    rate              : those of |omega|, over the moving samples
-    angle             : cos and sin of 3 to 8 periods a turn
-    specific_force    : Chebyshev polynomials of degree 3 to 5 of each component
+    temperature, time : Chebyshev polynomials of degree 1 to d over their span, d = 2 to 5
+    rate              : those of |omega|
+    angle             : cos and sin of n periods a turn, n = 3 to 8, one n and all of them
+    specific_force    : Chebyshev polynomials of degree 3 to 5 of one component, and of all
 
-They never take part in the selection: a flexible curve would win against physics in the first round.
+A covariate is named where one of its tests has delta BIC > 10 and m p < 1e-3, m the number of all tests. The curves
+never take part in the selection: a flexible curve would win against physics in the first round. Which shape the
+dependence has is looked for only then (``pipeline.diagnosis.first_guess``).
 """
 
 from __future__ import annotations
@@ -16,112 +18,122 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.estimation.design import Term
-from pipeline.estimation.ranking import Ranking
-from pipeline.model.effects.base import Effect, Layout, Owner, Parameter
+from pipeline.diagnosis.leftover import Leftover
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
-    from pipeline.estimation.observations import Observations
     from pipeline.estimation.selection import Selection
     from pipeline.records import Motion
 
+    Values = NDArray[np.float64]
+    Curves = Callable[[Motion], Values]
+    Block = tuple[Sequence[int], int]
+
 GATE_BIC = 10.0
 GATE_P = 1e-3
+DEGREE = 5
+FEWEST, MOST = 3, 8  # periods a turn: one and two look like base and catalogue
 
 
-class Basis(Effect):
-    """Curves in one covariate, each with coefficients of its own in every axis."""
-
-    owner = Owner.RECORDING
-    layout = Layout.EVERY_AXIS
-    excitation = "recordings in which the covariate changes"
-    source = "Chebyshev polynomials and harmonics"
-
-    def __init__(self, name: str, curves: Callable[[Motion], NDArray[np.float64]], count: int) -> None:
-        self._name, self._curves, self._count = name, curves, count
-
-    @property
-    def name(self) -> str:  # type: ignore[override]  # a basis is named after its covariate
-        """Name of the covariate."""
-        return self._name
-
-    def parameters(self, sensor: str) -> tuple[Parameter, ...]:
-        """Return the coefficients."""
-        del sensor
-        return tuple(Parameter(f"{a}_{j}", "1", "coefficient") for a in "xyz" for j in range(self._count))
-
-    def regressors(
-        self, sensor: str, motion: Motion, K: NDArray[np.float64], values: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Return the curves."""
-        del sensor, K, values
-        return self._curves(motion)
-
-
-def unexplained(selection: Selection) -> list[dict[str, object]]:
-    """Return the covariates on which the residual still depends, with their p-values, smallest first.
+def dependences(selection: Selection, beside: Curves | None = None) -> list[tuple[str, float]]:
+    """Return the covariates on which the residual still depends, each with its p-value, the likeliest first.
 
     Parameters
     ----------
     selection : Selection
+    beside : callable, optional
+        Motion to (n, m) further curves that count as explained.
+    """
+    from scipy.special import chdtrc  # noqa: PLC0415  (0.1 s that only a diagnosis pays)
+
+    bases = bases_of(selection)
+    leftover = Leftover(selection, lambda motion: np.concatenate([b(motion) for _, b, _ in bases], axis=1), beside)
+    names: list[str] = []
+    counts: list[int] = []
+    drops, at = [], 0
+    for covariate, _, blocks in bases:
+        for block, least in blocks:
+            kept = leftover.independent(at + np.asarray(block))
+            if len(kept) >= least:
+                drops.append(leftover.drop(kept)[:, :, least - 1 :])
+                counts += range(least, len(kept) + 1)
+                names += [covariate] * (len(kept) + 1 - least)
+        at += 1 + max(max(block) for block, _ in blocks)
+    if not names:
+        return []
+    parameters = 3 * np.array(counts)
+    delta = leftover.gains(np.concatenate(drops, axis=2), parameters)
+    p = chdtrc(parameters, np.maximum(delta + parameters * np.log(leftover.samples), 0.0))
+    found = [k for k in np.argsort(-delta) if delta[k] > GATE_BIC and p[k] * len(names) < GATE_P]
+    return list({names[k]: (names[k], float(p[k])) for k in reversed(found)}.values())[::-1]
+
+
+def bases_of(selection: Selection) -> list[tuple[str, Curves, list[Block]]]:
+    """Return covariates that the recordings hold, the curves of each, and which of these are tried together.
+
+    A block is tried with its first ``least`` curves, and with each further one.
     """
     observations = selection.observations
-    bases = bases_of(observations)
-    terms = [Term(t.effect, t.values, full=True) for t in selection.fit.terms]
-    candidates = [Term(basis, np.zeros(len(basis.parameters(observations.sensor)))) for basis in bases]
-    ranking = Ranking(observations, terms, candidates, selection.fit.K, selection.start.scale, selection.settings)
-    found = [s for s in ranking.scores([], {}) if s.delta_bic > GATE_BIC and s.p_value * len(bases) < GATE_P]
-    return [{"covariate": s.name, "p_value": s.p_value} for s in sorted(found, key=lambda s: s.p_value)]
-
-
-def bases_of(observations: Observations) -> list[Basis]:
-    """Return the bases whose covariates the recordings hold."""
     motions = [part.motion for part in observations.parts]
-    bases = [Basis("specific_force", _force, 9)]
+    degrees: list[Block] = [(range(DEGREE), 2)]
+    components: list[Block] = [(range(3 * i, 3 * i + 3), 3) for i in range(3)]
+    bases: list[tuple[str, Curves, list[Block]]] = [("specific_force", _force, [*components, (range(9), 9)])]
     if observations.clock_shared:
-        bases.append(Basis("time", _chebyshev(lambda m: m.time, motions, range(1, 6)), 5))
+        bases.append(("time", _chebyshev(lambda m: m.time, motions), degrees))
     if all(m.temperature is not None for m in motions):
-        bases.append(Basis("temperature", _chebyshev(lambda m: m.temperature, motions, range(1, 6)), 5))
+        bases.append(("temperature", _chebyshev(lambda m: m.temperature, motions), degrees))
     if any(np.any(~m.still) for m in motions):
-        bases.append(Basis("rate", _chebyshev(_speed, motions, range(1, 6)), 5))
+        bases.append(("rate", _chebyshev(speed, motions), degrees))
     if any(m.axis is not None for m in motions):
-        bases.append(Basis("angle", _harmonics, 12))
+        count = MOST - FEWEST + 1
+        single: list[Block] = [((j, count + j), 2) for j in range(count)]
+        bases.append(("angle", _harmonics, [*single, (range(2 * count), 2 * count)]))
     return bases
 
 
-def _speed(motion: Motion) -> NDArray[np.float64]:
-    speed: NDArray[np.float64] = np.linalg.norm(motion.angular_rate, axis=1)
-    return speed
+def speed(motion: Motion) -> Values:
+    """Return the magnitude of the angular rate: (n,) array, deg/s."""
+    size: Values = np.sqrt(np.einsum("ij,ij->i", motion.angular_rate, motion.angular_rate))
+    return size
 
 
-def _chebyshev(
-    of: Callable[[Motion], NDArray[np.float64] | None], motions: list[Motion], degrees: range
-) -> Callable[[Motion], NDArray[np.float64]]:
-    values = np.concatenate([v for m in motions if (v := of(m)) is not None])
-    low, high = float(values.min()), float(values.max())
+def _chebyshev(of: Callable[[Motion], Values | None], motions: list[Motion]) -> Curves:
+    values = [v for m in motions if (v := of(m)) is not None]
+    low, high = min(float(v.min()) for v in values), max(float(v.max()) for v in values)
     width = max(high - low, 1e-12)
 
-    def curves(motion: Motion) -> NDArray[np.float64]:
+    def curves(motion: Motion) -> Values:
         value = of(motion)
         assert value is not None  # noqa: S101
-        scaled = np.asarray(2.0 * (value - low) / width - 1.0, np.float64)
-        powers = np.polynomial.chebyshev.chebvander(scaled, degrees.stop - 1)
-        return np.asarray(powers[:, degrees.start :], np.float64)
+        return chebyshev(2.0 * (value - low) / width - 1.0)
 
     return curves
 
 
-def _harmonics(motion: Motion) -> NDArray[np.float64]:
+def chebyshev(x: Values) -> Values:
+    """Return the Chebyshev polynomials of degree 1 to 5 of values from -1 to 1: (n, 5) array."""
+    out = np.empty((len(x), DEGREE))
+    out[:, 0], out[:, 1] = x, 2.0 * x * x - 1.0
+    for degree in range(2, DEGREE):
+        out[:, degree] = 2.0 * x * out[:, degree - 1] - out[:, degree - 2]
+    return out
+
+
+def _harmonics(motion: Motion) -> Values:
+    count = MOST - FEWEST + 1
     if motion.angle is None:
-        return np.zeros((len(motion.time), 12))
-    argument = np.radians(motion.angle)[:, None] * np.arange(3, 9)
-    return np.concatenate([np.cos(argument), np.sin(argument)], axis=1)
+        return np.zeros((len(motion.time), 2 * count))
+    turn = np.exp(1j * np.radians(motion.angle))
+    powers = np.empty((len(turn), count), complex)
+    powers[:, 0] = turn**FEWEST
+    for j in range(1, count):
+        powers[:, j] = powers[:, j - 1] * turn
+    return np.concatenate([powers.real, powers.imag], axis=1)
 
 
-def _force(motion: Motion) -> NDArray[np.float64]:
+def _force(motion: Motion) -> Values:
     scaled = motion.specific_force / max(float(np.abs(motion.specific_force).max()), 1.0)
-    return np.asarray(np.polynomial.chebyshev.chebvander(scaled, 5)[:, :, 3:].reshape(len(scaled), 9), np.float64)
+    return np.concatenate([chebyshev(scaled[:, i])[:, 2:] for i in range(3)], axis=1)

@@ -31,8 +31,7 @@ def in_words(part: Mapping[str, Any] | None, sensor: str) -> list[str]:
     entries = {entry["effect"]: entry for entry in part["ranking"]}
     for name in part["selected"]:
         lines += _selected(entries[name], sensor)
-    for found in part["unexplained"]:
-        lines.append(f"The residual depends on {plain(found['covariate'])} (p = {found['p_value']:.1g}) beyond that.")
+    lines += _unknown(part, sensor)
     wander = part.get("wander") or {}
     if wander.get("inflated"):
         lines.append(
@@ -45,6 +44,26 @@ def in_words(part: Mapping[str, Any] | None, sensor: str) -> list[str]:
         lines.append(f"Next experiment: {part['next_experiment']}.")
     if part["override"]:
         lines.append(f"To add it, run with overrides='{part['override']}'.")
+    return lines
+
+
+def _unknown(part: Mapping[str, Any], sensor: str) -> list[str]:
+    """Say what the residual depends on, in which shape, and how to try that as an effect."""
+    lines = []
+    for found in part["unexplained"]:
+        if found.get("explained_by"):
+            continue
+        shape = f": {found['shape']} (delta BIC {found['delta_bic']:.0f})" if found.get("shape") else ""
+        p = f"p = {found['p_value']:.1g}" if found["p_value"] > 0 else "p < 1e-300"
+        lines.append(f"The residual depends on {plain(found['covariate'])} ({p}) beyond that{shape}.")
+    effect = part.get("suggested_effect")
+    if effect:
+        names = [*part["configured"], *part["selected"], effect["name"]]
+        file = part.get("suggested_file", f"<unit>_{sensor}_unknown.yaml")
+        lines.append(
+            f"To try that shape, copy diagnoses/{file} from the results to effects/{effect['name']}.yaml in the "
+            f"campaign's directory and run with overrides='effects.{sensor}=[{','.join(names)}]'."
+        )
     return lines
 
 

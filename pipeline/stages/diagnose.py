@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from pipeline.atomic import write_atomically
 from pipeline.diagnosis.diagnose import diagnose
+from pipeline.diagnosis.guess_words import effect_file
 from pipeline.formats.parquet import load_recordings
 from pipeline.signal.noise import estimate_noise
 from pipeline.stages.batch import parse_job, run_batch, write_json
@@ -23,7 +25,15 @@ def main(argv: Sequence[str]) -> int:
         document: dict[str, Any] = {"schema_version": 1, "unit": unit}
         for sensor, calibration in load_fits(job.inputs, unit).items():
             noise = estimate_noise(sensor, recordings, part["sensor"][sensor])
-            document[sensor] = calibration and diagnose(calibration, recordings, noise, part)
+            document[sensor] = found = calibration and diagnose(calibration, recordings, noise, part)
+            if found and found["suggested_effect"]:
+                found["suggested_file"] = suggested_file(unit, sensor)
+                write_atomically(job.output / found["suggested_file"], effect_file(found["suggested_effect"], unit))
         write_json(job.output / f"{unit}.json", document)
 
     return run_batch(job, work)
+
+
+def suggested_file(unit: str, sensor: str) -> str:
+    """Return the name of the file that holds the effect which a diagnosis suggests for unknown physics."""
+    return f"{unit}_{sensor}_unknown.yaml"

@@ -42,6 +42,10 @@ def main(argv: Sequence[str]) -> int:
             for stage, folder in PUBLISHED.items():
                 documents[stage] = read_json(batch / stage / f"{unit}.json")
                 publish(batch / stage / f"{unit}.json", job.output / folder / f"{unit}.json")
+            for part in documents["diagnose"].values():
+                if isinstance(part, dict) and part.get("suggested_file"):
+                    name = part["suggested_file"]
+                    publish(batch / "diagnose" / name, job.output / "diagnoses" / name)
             for file in sorted((batch / "export" / unit).iterdir()):
                 publish(file, job.output / "exports" / unit / file.name)
         rows.append(summary_row(unit, calibration, documents["validate"], documents["diagnose"], sheet_row))
