@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from omegaconf import OmegaConf
 
 from pipeline.config.compose import CONFIGS, GROUPS, RUN_SETTINGS, Composer, Problem, default_of_run, nearest, parse
+from pipeline.config.user_effects import ONLY_FROM_THE_COMMAND_LINE, PYTHON
 from pipeline.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -71,16 +72,17 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
     Parameters
     ----------
     settings : mapping
-        What ``snakemake --config`` gave: ``campaign``, ``results``, ``overrides``, ``unit_overrides``.
+        What ``snakemake --config`` gave: ``campaign``, ``results``, ``overrides``, ``unit_overrides``,
+        ``python_effects``.
 
     Raises
     ------
     ConfigurationError
         With one message for everything that is wrong.
     """
-    unknown = sorted(set(settings) - {"campaign", "results", "overrides", "unit_overrides"})
+    valid = ("campaign", "results", "overrides", "unit_overrides", PYTHON)
+    unknown = sorted(set(settings) - set(valid))
     if unknown:
-        valid = ("campaign", "results", "overrides", "unit_overrides")
         raise ConfigurationError(f"--config {unknown[0]}: unknown setting{nearest(unknown[0], valid)}")
     directory = find_campaign(str(settings.get("campaign", "demo")))
     rows = read_units(directory / "units.csv")
@@ -88,7 +90,7 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
     from_command = as_list(settings.get("overrides", []), "overrides")
     per_unit = unit_overrides(settings.get("unit_overrides", {}), rows)
     of_run, from_command = split_run_settings([*of_run, *from_command])
-    composer = Composer(directory)
+    composer = Composer(directory, as_list(settings.get(PYTHON, []), PYTHON, "paths of Python files"))
     units: dict[str, UnitRow] = {}
     problems: dict[str, list[str]] = {}
     for name, row in rows.items():
@@ -128,6 +130,8 @@ def read_units(path: Path) -> dict[str, dict[str, str]]:
             rows = [(reader.line_num, row) for row in reader]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ConfigurationError(f"cannot be read: {error}", str(path)) from error
+    if PYTHON in columns:
+        raise ConfigurationError(f"column {PYTHON}: {ONLY_FROM_THE_COMMAND_LINE}", f"{path}:1")
     if "unit" not in columns:
         raise ConfigurationError(f"has no column 'unit'; its columns are {', '.join(columns) or 'none'}", f"{path}:1")
     found: dict[str, dict[str, str]] = {}
@@ -161,6 +165,8 @@ def campaign_settings(path: Path, rows: Mapping[str, Any]) -> tuple[list[str], l
         raise ConfigurationError(f"is not YAML: {' '.join(str(error).split())}", str(path)) from error
     if not isinstance(content, dict):
         raise ConfigurationError("must be a mapping, for example 'overrides: [filter=rc_low_pass]'", str(path))
+    if PYTHON in content:
+        raise ConfigurationError(f"{PYTHON}: {ONLY_FROM_THE_COMMAND_LINE}", str(path))
     unknown = [str(k) for k in content if k not in ("overrides", "compare")]
     if unknown:
         raise ConfigurationError(f"{unknown[0]}: unknown key{nearest(unknown[0], ['overrides', 'compare'])}", str(path))
@@ -174,12 +180,12 @@ def campaign_settings(path: Path, rows: Mapping[str, Any]) -> tuple[list[str], l
     return units, run, compare
 
 
-def as_list(value: Any, where: str) -> list[str]:  # noqa: ANN401  (whatever the user wrote)
+def as_list(value: Any, where: str, what: str = "overrides KEY=VALUE") -> list[str]:  # noqa: ANN401  (the user's)
     """Return overrides as a list: a list of strings as it is, a plain string as one."""
     if isinstance(value, str):
         value = [value]
     if not isinstance(value, (list, tuple)) or not all(isinstance(v, str) for v in value):
-        raise ConfigurationError(f"{where}: a list of overrides KEY=VALUE is expected, got {value!r}")
+        raise ConfigurationError(f"{where}: a list of {what} is expected, got {value!r}")
     return list(value)
 
 

@@ -23,6 +23,7 @@ from omegaconf.errors import OmegaConfBaseException
 from pydantic import ValidationError
 
 from pipeline.config.schema import Unit
+from pipeline.config.user_effects import ONLY_FROM_THE_COMMAND_LINE, PYTHON, UserEffects, load_user_effects
 from pipeline.errors import ConfigurationError
 from pipeline.formats.settings import check_ingest
 
@@ -54,18 +55,25 @@ class Composer:
     Parameters
     ----------
     campaign : Path
-        The campaign's directory; its ``configs/<group>/*.yaml`` are options too.
+        The campaign's directory; its ``configs/<group>/*.yaml`` are options too, its ``effects/*.yaml`` effects.
+    python_effects : sequence of str
+        Python files with effects that the command line names.
+
+    Raises
+    ------
+    ConfigurationError
+        If an effect of the user's own is not as it should be.
     """
 
-    def __init__(self, campaign: Path) -> None:
+    def __init__(self, campaign: Path, python_effects: Sequence[str] = ()) -> None:
         own = campaign / "configs"
         self.searchpath = [own.resolve()] if own.is_dir() else []
         self.options = {
             group: {f.stem for root in (CONFIGS, *self.searchpath) for f in (root / group).glob("*.yaml")}
             for group in GROUPS
         }
-        self.effects = {f.stem for f in (CONFIGS / "effect").glob("*.yaml")}
-        self.effects |= {f.stem for f in (campaign / "effects").glob("*.yaml")}
+        self.user_effects: UserEffects = load_user_effects(campaign, [*self.searchpath, CONFIGS], python_effects)
+        self.effects = {f.stem for f in (CONFIGS / "effect").glob("*.yaml")} | set(self.user_effects.effects)
         self._bases: dict[tuple[tuple[str, str], ...], dict[str, Any]] = {}
         self._resolved: dict[str, dict[str, Any]] = {}
 
@@ -96,6 +104,8 @@ class Composer:
                 raise Problem(
                     f"{text}: {key} is a setting of the run, not of a unit; set it in campaign.yaml or overrides="
                 )
+            elif key == PYTHON:
+                raise Problem(f"{text}: {ONLY_FROM_THE_COMMAND_LINE}")
             elif key.startswith("method.stages"):
                 raise Problem(f"{text}: stages are what a method is; write a method of your own in configs/method/")
             else:
@@ -122,7 +132,8 @@ class Composer:
             raise Problem("\n".join(_explain(e, merged) for e in error.errors())) from None
         self._choose_stages(checked)
         self._check_meaning(checked)
-        return checked
+        self.user_effects.add_limits(checked["sensor"])
+        return checked | self.user_effects.section()
 
     def _complete(self, groups: dict[str, str]) -> dict[str, str]:
         """Fill in the defaults that depend on other choices: the procedure's table, the table's method."""
@@ -181,7 +192,8 @@ class Composer:
             for name in [] if names == "auto" else names:
                 if name not in self.effects:
                     raise Problem(f"effects.{sensor}: no effect is called {name!r}{nearest(name, self.effects)}")
-                applies = _read_option("effect", name, ()).get("sensors", [sensor])
+                own = self.user_effects.effects.get(name)
+                applies = own.sensors if own else _read_option("effect", name, ()).get("sensors", [sensor])
                 if sensor not in applies:
                     raise Problem(f"effects.{sensor}: {name} applies to the {' and '.join(applies)} only")
         try:

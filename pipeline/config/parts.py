@@ -11,6 +11,7 @@ import json
 from typing import TYPE_CHECKING, Any
 
 from pipeline.atomic import write_atomically
+from pipeline.config.user_effects import effects_for
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -97,6 +98,7 @@ def part(config: Mapping[str, Any], stage: str, sensor: str = "") -> dict[str, A
 def write_part(campaign: Campaign, stage: str, units: Sequence[str], sensor: str = "") -> str:
     """Write a stage's part of the configuration of some units, unless it is there; return the file's path."""
     content: dict[str, Any] = {"units": {u: part(campaign.units[u].config, stage, sensor) for u in units}}
+    content |= effects_for(stage, sensor, [campaign.units[u].config for u in units])
     if stage in ("ingest", "report"):
         content["campaign"] = campaign.name
     if stage == "ingest":

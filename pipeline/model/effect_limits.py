@@ -30,7 +30,8 @@ def parameter_limits(effect: Effect, sensor: str, limits: Mapping[str, float]) -
         ``effects`` of the sensor's configuration.
     """
     found = []
-    limits = {**effect.limits(sensor), **limits}
+    if effect.name not in limits:
+        limits = {**effect.limits(sensor), **limits}
     for parameter in effect.parameters(sensor):
         symbol = parameter.name.rpartition("_")[0]
         names = (f"{effect.name}_{parameter.name}", f"{effect.name}_{symbol}", effect.name)

@@ -19,6 +19,7 @@ Earth's rotation (15.041 deg/h) is added to omega where latitude and azimuth are
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -97,7 +98,7 @@ def reference_motion(
     temperature = recording.temperature
     if temperature is not None:
         temperature = smooth_temperature(recording.time, temperature)
-    return build(recording, gravity_g, earth_rate_level, offset, temperature)
+    return replace(build(recording, gravity_g, earth_rate_level, offset, temperature), recording=recording.name)
 
 
 def _motion_of_turn(

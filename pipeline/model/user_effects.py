@@ -225,5 +225,4 @@ def _layout(described: Definition) -> Layout:
 
 
 def _of(motion: Motion, before: str = " of recording") -> str:
-    name = getattr(motion, "recording", "")
-    return f"{before} {name}" if name else ""
+    return f"{before} {motion.recording}" if motion.recording else ""

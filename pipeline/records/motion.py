@@ -44,6 +44,8 @@ class Motion:
         None: not worked out yet (``pipeline.model.effects.base.turning_direction`` does it from the rates).
     followed : (n,) array of bool, or None
         Samples beside which the log is fine enough to know the trajectory between the samples.
+    recording : str
+        Name of the recording, for messages; empty where there is none.
     """
 
     time: NDArray[np.float64]
@@ -61,3 +63,4 @@ class Motion:
     level: NDArray[np.float64] | None = None
     direction: NDArray[np.float64] | None = None
     followed: NDArray[np.bool_] | None = None
+    recording: str = ""

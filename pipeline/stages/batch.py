@@ -58,6 +58,10 @@ def parse_job(stage: str, argv: Sequence[str], inputs: Sequence[str], options: S
         parser.add_argument(f"--{name}", default="", help=f"{name} of this stage")
     arguments = vars(parser.parse_args(argv))
     content = json.loads(arguments.pop("config").read_text())
+    if "user_effects" in content:
+        from pipeline.model.effect_files import register_user_effects  # noqa: PLC0415  (numpy, where there are any)
+
+        register_user_effects(content["user_effects"])
     run = {k: v for k, v in content.items() if k != "units"} | {name: arguments[name] for name in options}
     folders = {name: arguments[name] for name in inputs}
     return Job(stage, content.get("units", {}), run, folders, arguments["output"])
