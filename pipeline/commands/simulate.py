@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from pipeline.errors import ConfigurationError
+from pipeline.model.effect_files import read_effect_files
+from pipeline.model.effects import register
 from pipeline.simulation.campaign import write_campaign
 from pipeline.simulation.description import FORMATS, description_from, read_description
 from pipeline.simulation.options import add_recording_options, described
@@ -29,6 +31,9 @@ examples:
 
 An effect is hidden in one sensor (accelerometer.NAME) or in both (NAME); without a size it has the typical one of the
 sensor's configuration with random signs, with one number that size, with several its parameters' values.
+An effect of your own is hidden likewise, by the name of its file DIR/effects/NAME.yaml (docs/effects_of_your_own.md).
+In simulation.yaml a unit may also hide a formula that the campaign does not know, for a diagnosis to wonder at:
+  effects: {gyroscope.gear_mesh: {terms: {A: {formula: "cos(5 * radians(angle))", unit: deg/s}}, values: 0.03}}
 The truth is written to DIR/truth/<unit>.json.
 """
 
@@ -53,6 +58,8 @@ def main(argv: Sequence[str]) -> int:
         text = "# Read by: python -m pipeline simulate\n" + yaml.safe_dump(data, sort_keys=False)
         (directory / FILE).write_text(text, encoding="utf-8")
     directory.mkdir(parents=True, exist_ok=True)
+    for own in read_effect_files(sorted((directory / "effects").glob("*.yaml"))).values():
+        register(own)
     write_campaign(description, directory, (lambda _: None) if quiet else print)
     print(f"then: snakemake --cores 2 --config campaign={directory}")
     return 0

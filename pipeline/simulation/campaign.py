@@ -19,11 +19,11 @@ import numpy as np
 
 from pipeline.errors import ConfigurationError
 from pipeline.formats.csv_write import write_canonical_csv
-from pipeline.model.effects import effect
 from pipeline.records import AXES, SENSORS
 from pipeline.simulation.description import read_config
 from pipeline.simulation.draw import drawn_effects, drawn_sensors
 from pipeline.simulation.environment import random_environment
+from pipeline.simulation.inline_effects import inline_effects
 from pipeline.simulation.procedures import TABLE_PROCEDURES, Course, fit_to_samples, plan
 from pipeline.simulation.session import (
     ANGLE_DECIMALS,
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from pipeline.model.effects.base import Effect
     from pipeline.records import Recording
     from pipeline.simulation.description import Description, UnitDescription
     from pipeline.simulation.procedures import Planned
@@ -101,13 +102,14 @@ def simulate_unit(
     sheets = read_config("sensor", unit.sensor)
     table = read_config("table", unit.table)
     course = course_of(unit)
-    effects = drawn_effects(unit.effects, sheets, streams["effects"])
+    kinds, specification = inline_effects(unit.effects)
+    effects = drawn_effects(specification, sheets, streams["effects"], kinds)
     given = {s: getattr(unit, s) for s in SENSORS}
-    sensors = drawn_sensors(sheets, given, effects, streams["unit"])
+    sensors = drawn_sensors(sheets, given, effects, streams["unit"], kinds)
     bench = Bench(table, _imperfections(table, unit.imperfections, streams["bench"]), sensors)
     benches = {"": bench}
     if unit.held_out:
-        benches |= dict.fromkeys(("validation", "static"), _held_out_bench(unit, sheets, effects, streams))
+        benches |= dict.fromkeys(("validation", "static"), _held_out_bench(unit, sheets, effects, streams, kinds))
     by_hand = table["angle_accuracy_deg"] if table["motion"] == "none" else 0.0
     planned = [*plan(unit.procedure, course, streams["motion"], by_hand), *extra]
     total = sum(p.trajectory.duration + course.pause_s for p in planned)
@@ -168,22 +170,25 @@ def _held_out_bench(
     sheets: dict[str, Any],
     effects: dict[str, dict[str, NDArray[np.float64]]],
     streams: Streams,
+    kinds: dict[str, Effect],
 ) -> Bench:
     """Return the bench of the held-out motion; the sensors there are the same, mounted anew."""
     given = {s: {**getattr(unit, s), **unit.held_out.get(s, {})} for s in SENSORS}
     table = read_config("table", unit.held_out.get("table", unit.table))
     imperfections = _imperfections(table, unit.held_out.get("imperfections", {}), streams["bench"])
-    return Bench(table, imperfections, drawn_sensors(sheets, given, effects, streams["unit"]))
+    return Bench(table, imperfections, drawn_sensors(sheets, given, effects, streams["unit"], kinds))
 
 
 def _truth(sensor: SimulatedSensor, effects: dict[str, NDArray[np.float64]], interval: float) -> dict[str, Any]:
+    defined = {name: sensor.kind(name).definition for name in effects if sensor.kind(name).definition}
     return {
         "bias": sensor.bias.tolist(),
         "matrix": sensor.matrix.tolist(),
         "effects": {
-            name: {p.name: float(v) for p, v in zip(effect(name).parameters(sensor.sensor), values, strict=True)}
+            name: {p.name: float(v) for p, v in zip(sensor.kind(name).parameters(sensor.sensor), values, strict=True)}
             for name, values in effects.items()
         },
+        **({"definitions": defined} if defined else {}),
         "noise": {
             "white": sensor.white(interval),
             "wander": sensor.sheet["bias_wander"],

@@ -57,7 +57,8 @@ class UnitDescription:
         ``non_orthogonality_deg`` (yx, zx, zy) and ``mounting_deg`` (turns about x, then y, then z).
     effects : dict
         ``sensor.effect``, or ``effect`` alone for both sensors, to null (a typical size, at random), a number (that
-        size, with random signs) or the list of the parameters' values.
+        size, with random signs) or the list of the parameters' values; or to a formula of its own
+        (``inline_effects``).
     imperfections : dict
         What the table does otherwise than commanded; see ``table_errors.random_errors``, and ``tilt_deg`` (2,). What is
         left out follows from the accuracies of the table's configuration.

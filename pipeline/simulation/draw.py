@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from pipeline.model.effects.base import Effect
+
 KEYS = {"bias", "matrix", "scale_factor", "non_orthogonality_deg", "mounting_deg"}
 POSITIVE = {"time_constant", "tau"}
 # A typical size as a share of the largest plausible one, where that is not a half.
@@ -49,6 +51,7 @@ def drawn_sensors(
     given: Mapping[str, Mapping[str, Any]],
     effects: Mapping[str, dict[str, NDArray[np.float64]]],
     rng: np.random.Generator,
+    kinds: Mapping[str, Effect] | None = None,
 ) -> dict[str, SimulatedSensor]:
     """Return accelerometer and gyroscope of a unit.
 
@@ -59,6 +62,8 @@ def drawn_sensors(
     effects : mapping
         Sensor to its effects' values.
     rng : Generator
+    kinds : mapping, optional
+        Effects that are not in the catalogue, by name.
     """
     mounting = rng.uniform(-1.0, 1.0, 3)
     out = {}
@@ -70,12 +75,16 @@ def drawn_sensors(
         own = {name: values for name, values in effects[sensor].items() if name not in ALTERATIONS}
         bias = _limited(sheet["bias"], 3, rng)
         matrix = _matrix(sheet, given[sensor], mounting, rng)
-        out[sensor] = SimulatedSensor(sensor, sheet, np.array(given[sensor].get("bias", bias), float), matrix, own)
+        bias = np.array(given[sensor].get("bias", bias), float)
+        out[sensor] = SimulatedSensor(sensor, sheet, bias, matrix, own, dict(kinds or {}))
     return out
 
 
 def drawn_effects(
-    specification: Mapping[str, Any], sheets: Mapping[str, Mapping[str, Any]], rng: np.random.Generator
+    specification: Mapping[str, Any],
+    sheets: Mapping[str, Mapping[str, Any]],
+    rng: np.random.Generator,
+    kinds: Mapping[str, Effect] | None = None,
 ) -> dict[str, dict[str, NDArray[np.float64]]]:
     """Return the values of the parameters of each effect, per sensor.
 
@@ -85,6 +94,8 @@ def drawn_effects(
         ``sensor.effect``, or ``effect`` for both sensors, to None (typical, at random), a size or the values.
     sheets : mapping
     rng : Generator
+    kinds : mapping, optional
+        Effects that are not in the catalogue, by name.
 
     Raises
     ------
@@ -94,14 +105,14 @@ def drawn_effects(
     out: dict[str, dict[str, NDArray[np.float64]]] = {sensor: {} for sensor in SENSORS}
     for key, value in specification.items():
         sensor, _, name = str(key).rpartition(".")
-        kind = effect(name)
+        kind = (kinds or {}).get(name) or effect(name)
         if sensor not in (*kind.sensors, ""):
             raise ConfigurationError(f"effect {key}: {name} applies to the {' and '.join(kind.sensors)}")
         for each in kind.sensors if sensor == "" else (sensor,):
             if name in ALTERATIONS and each != kind.sensors[0] and sensor == "":
                 out[each][name] = out[kind.sensors[0]][name]  # one table, one clock: the same for both sensors
             else:
-                out[each][name] = _values(name, each, value, sheets[each]["effects"], rng)
+                out[each][name] = _values(kind, each, value, sheets[each]["effects"], rng)
     return out
 
 
@@ -135,16 +146,16 @@ def _limited(limit: float, count: int, rng: np.random.Generator) -> NDArray[np.f
 
 
 def _values(
-    name: str,
+    kind: Effect,
     sensor: str,
     value: Any,  # noqa: ANN401  (None, a number or a list, as YAML gives it)
     limits: Mapping[str, float],
     rng: np.random.Generator,
 ) -> NDArray[np.float64]:
-    parameters = effect(name).parameters(sensor)
+    name, parameters = kind.name, kind.parameters(sensor)
     positive = np.array([p.name in POSITIVE for p in parameters])
     sign = np.where(positive, 1.0, rng.choice([-1.0, 1.0], len(parameters)))
-    typical = TYPICAL_SHARE.get(name, 0.5) * parameter_limits(effect(name), sensor, limits)
+    typical = TYPICAL_SHARE.get(name, 0.5) * parameter_limits(kind, sensor, limits)
     drawn = sign * rng.uniform(0.7, 1.3, len(parameters)) * typical
     given = np.array([]) if value is None else np.atleast_1d(np.asarray(value, float))
     if len(given) == len(parameters):

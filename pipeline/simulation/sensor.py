@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from pipeline.model.effects.base import Effect
     from pipeline.records import Motion
 
 
@@ -45,6 +46,8 @@ class SimulatedSensor:
         The calibration matrix that a perfect calibration finds, body = matrix @ (reading - bias - effects).
     effects : dict of str to array
         Values of the parameters of each effect on the reading.
+    kinds : dict of str to Effect
+        Effects that are not in the catalogue, by name.
     """
 
     sensor: str
@@ -52,14 +55,19 @@ class SimulatedSensor:
     bias: NDArray[np.float64]
     matrix: NDArray[np.float64]
     effects: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+    kinds: dict[str, Effect] = field(default_factory=dict)
 
     def exact(self, motion: Motion) -> NDArray[np.float64]:
         """Return the reading without noise and quantisation: (n, 3) array."""
         K = np.asarray(np.linalg.solve(self.matrix, np.eye(3)), np.float64)
         reading: NDArray[np.float64] = self.bias + truth(self.sensor, motion) @ K.T
         for name, values in self.effects.items():
-            reading = reading + effect(name).reading(self.sensor, motion, K, values)
+            reading = reading + self.kind(name).reading(self.sensor, motion, K, values)
         return reading
+
+    def kind(self, name: str) -> Effect:
+        """Return an effect by name: one of its own, or of the catalogue."""
+        return self.kinds.get(name) or effect(name)
 
     def white(self, interval: float) -> float:
         """Return the standard deviation of one sample's white noise; interval in s."""
