@@ -29,6 +29,7 @@ GENTLE_DEG, EXACT_DEG = 1e-4, 1e-6  # smooth motion, where no bend is looked for
 MOVING_DPS = 0.02
 SAME_SHARE, SAME_DPS2 = 0.01, 0.1
 LAG_ROUNDING_DPS = 1e-11
+MEMORY_S = 0.3
 
 
 class TurnLog:
@@ -49,7 +50,8 @@ class TurnLog:
         Those, and intervals of smooth motion: ``dA = (r_0 + r_1) dt / 2 - (r'_1 - r'_0) dt^2 / 12`` to 1e-3 deg, or to
         what the log's own noise allows. In the others the trajectory is a guess.
     followed_samples : (n,) array of bool
-        Samples that lie between two such intervals.
+        Samples after which such an interval comes, and before which there were none but such for 0.3 s: a filter
+        inside the sensor remembers what came before.
     acceleration : (n,) array, deg/s^2
         At the samples.
     """
@@ -69,8 +71,15 @@ class TurnLog:
         self.explained: NDArray[np.bool_] = np.logical_and(even | bent, np.logical_not(gentle))
         self.acceleration = self._at_samples(slope)
         self.followed: NDArray[np.bool_] = self.explained | self._smooth(miss)
-        beside = np.concatenate([[True], self.followed, [True]])
-        self.followed_samples: NDArray[np.bool_] = np.logical_and(beside[1:], beside[:-1])
+        self.followed_samples = self._remembered()
+
+    def _remembered(self) -> NDArray[np.bool_]:
+        """Return the samples whose past, as far as a sensor's filter remembers it, and next interval are followed."""
+        lost = np.concatenate([[0], np.cumsum(~self.followed)])  # intervals not followed before each sample
+        first = np.searchsorted(self.time, self.time - MEMORY_S, side="right") - 1
+        past = lost - lost[np.maximum(first, 0)] == 0
+        known: NDArray[np.bool_] = np.logical_and(past, np.append(self.followed, True))
+        return known
 
     def _bends(self, even: NDArray[np.bool_]) -> tuple[Values, Values, Values, NDArray[np.bool_]]:
         """Return for each interval where it bends, the acceleration before and after, and whether that holds."""

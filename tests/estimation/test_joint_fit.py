@@ -15,6 +15,7 @@ from pipeline.estimation.accelerometer import effects as accelerometer_stage
 from pipeline.estimation.joint import fit_joint
 from pipeline.estimation.observations import observe
 from pipeline.estimation.wandering import Setting, Whitened, cells_of
+from pipeline.model.effects import effect
 from pipeline.records import SensorCalibration
 from pipeline.signal.filters import apply_filter
 
@@ -144,3 +145,14 @@ def test_uncertainty_covers_the_truth_in_nineteen_fits_of_twenty() -> None:
         inside += (np.abs(calibration.bias - BIAS["gyroscope"]) < bounds["bias"]).tolist()
         inside += (np.abs(calibration.matrix - np.linalg.inv(K["gyroscope"])) < bounds["matrix"]).ravel().tolist()
     assert 0.90 < np.mean(inside) <= 1.0
+
+
+def test_a_lag_leaves_nothing_of_a_ramp_that_the_log_does_not_follow() -> None:
+    """A 5 deg step has three ramps in a second; what a lag of 24 ms keeps of one that is lost would be 12 mdeg/s."""
+    tau = np.array([0.024])
+    quiet = Session(5, effects={"gyroscope": {"low_pass_lag": tau}}, white=0.0, wander=0.0)
+    table = {"gravity_g": 1.0, "latitude_deg": None, "azimuth_deg": None}
+    observations = observe("gyroscope", record(quiet), table)
+    felt = [effect("low_pass_lag").moved(part.motion, tau).angular_rate for part in observations.parts]
+    rest = observations.reading - (BIAS["gyroscope"] + np.concatenate(felt) @ K["gyroscope"].T)
+    assert np.abs(rest).max() < 3e-4
