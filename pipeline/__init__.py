@@ -33,6 +33,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from pipeline.model.compensation import Compensation
@@ -41,12 +42,14 @@ __version__ = "0.1.0"
 __all__ = ["__version__", "load_calibration"]
 
 
-def load_calibration(path: str | Path) -> Compensation:
+def load_calibration(path: str | Path, python_effects: Sequence[str | Path] = ()) -> Compensation:
     """Load ``calibrations/<unit>.json`` as an object that compensates arrays.
 
     Parameters
     ----------
     path : str or Path
+    python_effects : sequence of str or Path
+        Files of the effects in Python with which it was made; those from formulas come with the calibration.
 
     Returns
     -------
@@ -57,7 +60,9 @@ def load_calibration(path: str | Path) -> Compensation:
     ------
     InputError
         If the file does not exist, is no calibration, or is the record of a failed unit.
+    ConfigurationError
+        If a sensor's effect is one in Python whose file is not given.
     """
     from pipeline.model.compensation import load  # noqa: PLC0415  (numpy is imported only where it is needed)
 
-    return load(path)
+    return load(path, python_effects)

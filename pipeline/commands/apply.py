@@ -51,10 +51,14 @@ def main(argv: Sequence[str]) -> int:
         "--temperature-smoothing", type=float, default=SMOOTHING_S, metavar="S", dest="smoothing",
         help="memory of the causal smoothing of the temperature, s; 0: none (default: %(default)g)",
     )  # fmt: skip
+    parser.add_argument(
+        "--python-effect", action="append", default=[], metavar="FILE", dest="python_effects",
+        help="Python file of an effect of yours that the calibration was made with (it is run); may be repeated",
+    )  # fmt: skip
     arguments = parser.parse_args(argv)
     if arguments.smoothing < 0:
         raise ConfigurationError(f"--temperature-smoothing is {arguments.smoothing:g} s; it cannot be negative")
-    compensation = load(arguments.calibration)
+    compensation = load(arguments.calibration, arguments.python_effects)
     progress = _Progress(arguments.log)
     rows, sensors = compensate_csv(
         compensation, arguments.log, arguments.output, smoothing=arguments.smoothing, progress=progress

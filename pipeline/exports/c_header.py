@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 FILE_NAME = "calibration.h"
 ROUNDS = 12  # fixed point; each gains about two digits
 BAR = "\n * "
+PAST = "needs more than one sample"
+OWN = "an effect of the user's own; python -m pipeline apply takes it off"
 PRODUCTS = ("{v}[0] * {v}[1]", "{v}[1] * {v}[2]", "{v}[2] * {v}[0]")
 
 
@@ -39,8 +41,9 @@ def export(calibration: dict[str, Any], settings: dict[str, Any], validation: di
         *missing(calibration),
     ]
     for sensor, c in found.items():
+        own = {e.name for e in c.effects if e.definition}
         left = [e for e in sensor_effects(c) if e not in TERMS]
-        remarks += [f"Left out, {sensor}: {', '.join(left)} (needs more than one sample)."] if left else []
+        remarks += [f"Left out, {sensor}: {e} ({OWN if e in own else PAST})." for e in left]
         remarks += [f"Of the bench, not of the {sensor}: {', '.join(bench_effects(c))}."] if bench_effects(c) else []
     remarks += [f"The {line}." for line in final_errors(validation)]
     tables = "\n".join(_tables(sensor, found.get(sensor)) for sensor in ("accelerometer", "gyroscope"))

@@ -8,7 +8,7 @@ import numpy as np
 import yaml
 
 from pipeline.model.effects.base import Owner
-from pipeline.model.user_effects import effect_of
+from pipeline.model.user_effects import owner_of
 from pipeline.records import SENSORS, SensorCalibration
 
 if TYPE_CHECKING:
@@ -30,12 +30,12 @@ def missing(document: dict[str, Any]) -> list[str]:
 
 def sensor_effects(calibration: SensorCalibration) -> dict[str, NDArray[np.float64]]:
     """Return the values of the effects that belong to the sensor itself, by name."""
-    return {e.name: e.values for e in calibration.effects if effect_of(e).owner == Owner.SENSOR}
+    return {e.name: e.values for e in calibration.effects if owner_of(e) == Owner.SENSOR}
 
 
 def bench_effects(calibration: SensorCalibration) -> list[str]:
     """Return the effects of mounting, place, recording, table and timing, which no export carries."""
-    return [e.name for e in calibration.effects if effect_of(e).owner != Owner.SENSOR]
+    return [e.name for e in calibration.effects if owner_of(e) != Owner.SENSOR]
 
 
 def forward(calibration: SensorCalibration) -> NDArray[np.float64]:

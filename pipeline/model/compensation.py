@@ -15,12 +15,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pipeline.errors import InputError, MissingInputError
+from pipeline.errors import ConfigurationError, InputError, MissingInputError
+from pipeline.model.effects import register
 from pipeline.model.inversion import compensate, sensor_effects, solve
 from pipeline.model.log_motion import SIGNALS, LineThroughThePast, LogState, fields_used, log_motion
+from pipeline.model.user_effects import effect_of
 from pipeline.records import SENSORS, SensorCalibration
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from pipeline.records import FittedEffect, Motion
@@ -168,18 +172,27 @@ class CompensationStream:
                     )
 
 
-def load(path: str | Path) -> Compensation:
+def load(path: str | Path, python_effects: Sequence[str | Path] = ()) -> Compensation:
     """Read ``calibrations/<unit>.json``.
 
     Parameters
     ----------
     path : str or Path
+    python_effects : sequence of str or Path
+        Files of the effects in Python with which it was made; those from formulas come with the calibration.
 
     Raises
     ------
     InputError
         If the file does not exist, is no calibration, or is the record of a failed unit.
+    ConfigurationError
+        If a sensor's effect is one in Python whose file is not given.
     """
+    if python_effects:
+        from pipeline.model.effect_files import load_python_effect  # noqa: PLC0415  (only where there are any)
+
+        for python_file in python_effects:
+            register(load_python_effect(python_file))
     file = Path(path)
     try:
         data = json.loads(file.read_text(encoding="utf-8"))
@@ -197,9 +210,19 @@ def load(path: str | Path) -> Compensation:
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"this is no calibration of a unit: {error!r}", str(file)) from None
     for c in filter(None, parts.values()):
-        if c.bias.shape != (3,) or c.matrix.shape != (3, 3) or not np.isfinite([*c.bias, *c.matrix.flat]).all():
-            raise InputError(f"the {c.sensor}'s bias is not 3 or its matrix not 3 x 3 finite numbers", str(file))
+        _check_calibration(c, str(file))
     return Compensation(parts["accelerometer"], parts["gyroscope"], str(data.get("unit", "")))
+
+
+def _check_calibration(c: SensorCalibration, file: str) -> None:
+    """Refuse numbers that are none, and an effect that is not at hand."""
+    if c.bias.shape != (3,) or c.matrix.shape != (3, 3) or not np.isfinite([*c.bias, *c.matrix.flat]).all():
+        raise InputError(f"the {c.sensor}'s bias is not 3 or its matrix not 3 x 3 finite numbers", file)
+    for fitted in sensor_effects(c):
+        try:
+            effect_of(fitted)
+        except ConfigurationError as error:
+            raise ConfigurationError(error.message, file) from None
 
 
 def _checked(given: dict[str, Any]) -> tuple[dict[str, NDArray[np.float64]], bool]:

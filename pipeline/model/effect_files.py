@@ -124,7 +124,7 @@ def _checked(found: Any, file: Path, digest: str) -> Effect:  # noqa: ANN401  (w
         )
     if found.name in built_in():
         raise ConfigurationError(f"a built-in effect is called {found.name}; give yours another name", str(file))
-    found.definition = {"python": file.name, "sha256": digest}
+    found.definition = {"python": file.name, "sha256": digest, "owner": str(found.owner)}
     return found
 
 

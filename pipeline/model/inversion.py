@@ -17,7 +17,7 @@ import numpy as np
 
 from pipeline.errors import ConvergenceError
 from pipeline.model.effects.base import Owner
-from pipeline.model.user_effects import effect_of
+from pipeline.model.user_effects import effect_of, owner_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -73,7 +73,7 @@ def compensate(
 
 def sensor_effects(calibration: SensorCalibration) -> list[FittedEffect]:
     """Return the fitted effects that belong to the sensor itself."""
-    return [fitted for fitted in calibration.effects if effect_of(fitted).owner == Owner.SENSOR]
+    return [fitted for fitted in calibration.effects if owner_of(fitted) == Owner.SENSOR]
 
 
 def solve(

@@ -207,9 +207,17 @@ def effect_of(fitted: FittedEffect) -> Effect:
         state = "is not loaded" if found is None else "has another content than the one that was fitted"
         raise ConfigurationError(
             f"the effect {fitted.name} was fitted with the Python file {fitted.definition['python']} (sha256 "
-            f"{fitted.definition['sha256'][:16]}...), which {state}; name that file: --python-effect FILE"
+            f"{str(fitted.definition.get('sha256'))[:16]}...), which {state}; name that file: --python-effect FILE, or "
+            "in Python load_calibration(path, python_effects=[FILE])"
         )
     return found
+
+
+def owner_of(fitted: FittedEffect) -> str:
+    """Return whose a fitted effect is; a Python file need not be loaded for that."""
+    if fitted.definition and "owner" in fitted.definition:
+        return str(fitted.definition["owner"])
+    return effect_of(fitted).owner
 
 
 @lru_cache(maxsize=256)
