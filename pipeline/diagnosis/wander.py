@@ -55,5 +55,5 @@ def fitted_wander(selection: Selection, noise: Noise | None) -> dict[str, Any]:
         "time_s": settings[best].time if ratio else None,
         "standard_deviation": ratio * white,
         "expected": expected,
-        "inflated": inflated,
+        "inflated": bool(inflated),
     }
