@@ -21,7 +21,7 @@ from pipeline.estimation.effects_stage import AUTO
 from pipeline.estimation.joint import fit_terms
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import FAR_ABOVE, GATE_BIC, select
-from pipeline.model.effects import catalogue
+from pipeline.model.effects import catalogue, effect
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -196,6 +196,7 @@ def _entry(
         "held_out_error_after": after,
         "look_alikes": _look_alikes(selection, score),
         "plausible": _plausible(selection, score),
+        **({"meaning": effect(name).meaning} if effect(name).definition else {}),
     }
 
 

@@ -92,10 +92,11 @@ def _names(names: list[str]) -> str:
 
 
 def _selected(entry: Mapping[str, Any], sensor: str) -> list[str]:
-    meaning = catalogue()[entry["effect"]].meaning if entry["effect"] in catalogue() else ""
+    known = catalogue().get(entry["effect"])
+    meaning = entry.get("meaning") or (known.meaning if known else "")
     values = ", ".join(_value(name, p) for name, p in entry["parameters"].items())
     share = 100 * entry["explained_share"]
-    head = f"{plain(entry['effect']).capitalize()}: {meaning} {values}."
+    head = f"{plain(entry['effect']).capitalize()}: {f'{meaning} ' if meaning else ''}{values}."
     bic = f"(delta BIC {entry['delta_bic']:.0f})"
     lines = [f"{head} It explains {share:.0f} % of the excess over the noise {bic}."]
     if not entry["plausible"]:
