@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import hashlib
 import sys
-from importlib.util import module_from_spec, spec_from_file_location
+from importlib.abc import ExecutionLoader
+from importlib.util import decode_source
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import yaml
@@ -79,18 +81,32 @@ def load_python_effect(path: str | Path, sha256: str | None = None) -> Effect:
     digest = hashlib.sha256(content).hexdigest()
     if sha256 is not None and digest != sha256:
         raise ConfigurationError("the file has changed since the run began; start the run again", str(file))
-    spec = spec_from_file_location(f"imu_calibration_user_effect_{file.stem}", file)
-    assert spec is not None  # noqa: S101  (the suffix says that it is Python)
-    assert spec.loader is not None  # noqa: S101
-    module = module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses and pickle look a class up there
+    name = f"imu_calibration_user_effect_{file.stem}"
+    module = ModuleType(name)
+    module.__file__ = str(file)
+    sys.modules[name] = module  # dataclasses and pickle look a class up there
     try:
-        spec.loader.exec_module(module)
+        _ThisContent(file, content).exec_module(module)
     except PipelineError:
         raise
     except Exception as error:
         raise ConfigurationError(f"cannot be run: {type(error).__name__}: {error}", str(file)) from error
     return _checked(getattr(module, "EFFECT", None), file, digest)
+
+
+class _ThisContent(ExecutionLoader):
+    """Loads the very bytes that were hashed; no cache of compiled code is read or written."""
+
+    def __init__(self, file: Path, content: bytes) -> None:
+        self.file, self.content = file, content
+
+    def get_source(self, fullname: str) -> str:
+        del fullname
+        return decode_source(self.content)
+
+    def get_filename(self, fullname: str) -> str:
+        del fullname
+        return str(self.file)
 
 
 def register_user_effects(part: Mapping[str, Any]) -> None:
