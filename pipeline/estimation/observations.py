@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 ROLES = ("accelerometer", "gyroscope", "static")
 UNSOUND = 0b0110  # flags of clipped and stuck samples
 MEAN_S = 1.0
+MEDIAN_OF_DIFFERENCES = 0.9099  # median of (w[n+1] - w[n])^2 of white noise of variance 1: 2 times that of chi-square
+SCATTERED = 6.0  # standard deviations of a chi-square above its mean, and half its square for the tail of few samples
 BEND_DPS, BEND_SHARE = 0.05, 1e-3
 ARRAYS = (
     "time",
@@ -68,6 +70,34 @@ class Rows:
     first: NDArray[np.intp]
     count: NDArray[np.float64]
     total: int
+
+    def settled(self, reading: NDArray[np.float64]) -> Rows:
+        """Return rows in which groups that scatter too much are taken apart into their samples.
+
+        By the table's log they are at rest; where the sensor's clock is off, it still moves at their edge.
+
+        Parameters
+        ----------
+        reading : (n, 3) array, g or deg/s
+        """
+        size = self.count.astype(int)
+        if np.all(size < 2):
+            return self
+        kept = reading[self.kept]
+        inside = np.ones(len(kept) - 1, bool)
+        inside[self.first[1:] - 1] = False
+        white = np.median(np.diff(kept, axis=0)[inside] ** 2, axis=0) / MEDIAN_OF_DIFFERENCES
+        deviation = (kept - np.repeat(self.means(reading), size, axis=0)) ** 2
+        scatter = np.add.reduceat(deviation, self.first, axis=0)
+        freedom = np.maximum(self.count - 1.0, 0.0)
+        most = freedom + SCATTERED * np.sqrt(2.0 * freedom) + SCATTERED**2 / 2.0
+        apart = np.any((scatter > most[:, None] * white) & (white > 0), axis=1) & (size > 1)
+        if not apart.any():
+            return self
+        new = np.repeat(apart, size)
+        new[self.first] = True
+        first = np.flatnonzero(new)
+        return replace(self, first=first, count=np.diff(np.append(first, len(kept))).astype(float))
 
     def means(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the group means of (n, ...) values: (m, ...) array."""
@@ -213,7 +243,7 @@ def _part(sensor: str, recording: Recording, gravity: float, earth: NDArray[np.f
     sound: NDArray[np.bool_] = np.all(np.isfinite(reading), axis=1)
     if recording.flags is not None:
         sound = np.logical_and(sound, (recording.flags & UNSOUND) == 0)
-    rows = rows_of(motion, sound, together=not filtered)
+    rows = rows_of(motion, sound, together=not filtered).settled(reading)
     if len(rows.first) == 0:
         return None
     information = min(float(recording.filter.get("noise_gain", 1.0)) ** 2, 1.0)

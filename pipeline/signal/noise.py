@@ -48,6 +48,8 @@ FEWEST_SAMPLES = 60
 WINDOW, WINDOW_DEGREE, WINDOW_ARC_DEG = 16, 4, 60.0
 WARM_UP_S = (60.0, 180.0, 500.0)
 SMALLEST_WHITE = 1e-9  # keeps the weights of a noise-free recording finite
+EDGE_S, FEWEST_TO_SETTLE, SETTLED = 0.5, 6, 8.0
+MEDIAN_STEP = 0.9539  # median of |w[n+1] - w[n]| of white noise of standard deviation 1
 SEEN, AGREES = 6.0, 4.0  # twice the gain in log-likelihood
 
 
@@ -130,7 +132,27 @@ def _rests(recording: Recording, sensor: str, *, everything: bool) -> list[Rest]
         still &= resting
     if everything:  # a gap does not end a static rest: the likelihood knows the times
         return [(recording.time[still], values[still])] if still.any() else []
-    return [(recording.time[a:b], values[a:b]) for a, b in _stretches(recording, still) if b - a > 2]
+    return [
+        (recording.time[a:b], values[a:b])
+        for a, b in (_settled(recording, values, *stretch) for stretch in _stretches(recording, still))
+        if b - a > 2
+    ]
+
+
+def _settled(recording: Recording, values: NDArray[np.float64], start: int, stop: int) -> tuple[int, int]:
+    """Return a rest without the samples at its edges that still move; the sensor's clock may be off the table's."""
+    inside = values[start:stop]
+    edge = min(int(EDGE_S / recording.interval) + 1, len(inside) // 3)
+    if len(inside) < FEWEST_TO_SETTLE or edge == 0:
+        return start, stop
+    spread = np.median(np.abs(np.diff(inside, axis=0)), axis=0) / MEDIAN_STEP
+    for side in (1, -1):
+        ordered = inside[::side]
+        off = np.abs(ordered[:edge] - np.median(ordered[edge : 3 * edge], axis=0)) > SETTLED * spread
+        moving = np.flatnonzero(np.any(off & (spread > 0), axis=1))
+        cut = int(moving[-1]) + 1 if len(moving) else 0
+        start, stop = (start + cut, stop) if side == 1 else (start, stop - cut)
+    return start, stop
 
 
 def _noise_of_rests(

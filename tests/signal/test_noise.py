@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import bench_session
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -231,3 +232,13 @@ def test_what_a_filter_still_holds_of_a_turn_is_no_noise() -> None:
     noise = estimate_noise("gyroscope", [apply_filter(recording, settings)], sheet)
     assert noise.source == "rests"
     assert noise.white == pytest.approx(0.01, rel=0.1)
+
+
+def test_a_clock_that_is_off_by_a_sample_leaves_the_noise_of_the_rests() -> None:
+    """By the log it rests, by the sensor's clock it still moves at 100 deg/s^2 at the edge of each rest."""
+    off = {"clock_rate": np.array([160.0])}
+    recordings = bench_session.record(bench_session.Session(9, effects={"gyroscope": off}))
+    sheet = {"noise_density": 0.005, "bias_wander": 0.003, "wander_time_s": 100.0}
+    assert estimate_noise("gyroscope", recordings, sheet).white == pytest.approx(
+        np.full(3, bench_session.WHITE["gyroscope"]), rel=0.05
+    )
