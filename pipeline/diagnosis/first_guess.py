@@ -191,6 +191,7 @@ def _scanned(selection: Selection, covariate: str, signal: str) -> Guess:
     places = span.places()
     single = shapes.steps(span, places)
     if signal in ("temperature", "time"):
+        single += shapes.soft_steps(span, places, [span.size / shapes.PLACES])
         single += shapes.exponentials(span, [span.size * c for c in shapes.CONSTANTS])
     pairs = shapes.bands(span, places) if signal == "speed" else []
     shape, gain, leftover, weights = _best_of(selection, single, pairs)

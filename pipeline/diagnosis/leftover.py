@@ -143,15 +143,14 @@ class Leftover:
         """
         inner = np.einsum("qm,tcqm->tcm", weights, self.inner @ weights)
         cross = self.cross @ weights
-        size = np.einsum("qm,qm->m", (self.size[:, None] * weights), (self.size[:, None] * weights))
-        least = NEW**2 * size / (self.scale[:, None] ** 2)
-        good = inner > least[None]
-        return np.where(good, cross**2 / np.where(good, inner, 1.0), 0.0)
+        left = np.einsum("qm,qm->m", weights, self.white @ weights)
+        new = left > NEW**2 * np.sum((self.size[:, None] * weights) ** 2, axis=0)
+        return np.where(new, cross**2 / np.where(new, inner, 1.0), 0.0)
 
     def drop(self, index: Sequence[int]) -> Values:
         """Return what several curves explain together, by the number of them from the first on: (t, 3, r) array."""
         inner, cross = self.inner[:, :, index][:, :, :, index], self.cross[:, :, index]
-        factor = np.linalg.cholesky(inner + _ridge(inner))
+        factor = np.linalg.cholesky(inner + self._ridge(index))
         each = np.linalg.solve(factor, cross[..., None])[..., 0]
         together: Values = np.cumsum(each**2, axis=2)
         return together
@@ -199,17 +198,17 @@ class Leftover:
         assert best is not None  # noqa: S101
         return best
 
+    def _ridge(self, index: Sequence[int]) -> Values:
+        """Return what keeps products of curves definite that the noise nearly swallows: (3, r, r) array."""
+        squares = (self.size[index] / self.scale[:, None]) ** 2
+        ridge: Values = RIDGE * squares[:, :, None] * np.eye(len(index))
+        return ridge
+
     def coefficients(self, index: Sequence[int], setting: int) -> Values:
         """Return the estimates of some curves under one noise: (3, r) array, unit of the sensor."""
         inner, cross = self.inner[setting][:, index][:, :, index], self.cross[setting][:, index]
-        found: Values = np.linalg.solve(inner + _ridge(inner), cross[..., None])[..., 0]
+        found: Values = np.linalg.solve(inner + self._ridge(index), cross[..., None])[..., 0]
         return found
-
-
-def _ridge(inner: Values) -> Values:
-    diagonal = np.maximum(np.einsum("...ii->...i", inner), 1e-300)
-    ridge: Values = RIDGE * diagonal[..., None] * np.eye(inner.shape[-1])
-    return ridge
 
 
 def _columns(

@@ -172,6 +172,21 @@ def steps(span: Span, places: Sequence[float] | Values) -> list[Shape]:
     ]
 
 
+def soft_steps(span: Span, places: Sequence[float] | Values, widths: Sequence[float]) -> list[Shape]:
+    """Return soft steps at some places, of some widths each."""
+    return [
+        Shape(
+            "step",
+            span.signal,
+            (f"0.5 * (1 + tanh(({span.signal} - {p:.7g}) / {width:.3g}))",),
+            2,
+            {"at": float(f"{p:.7g}"), "width": float(f"{width:.3g}")},
+        )
+        for p in places
+        for width in widths
+    ]
+
+
 def bands(span: Span, places: Values) -> list[Shape]:
     """Return bands between any two of some places, as differences of the steps there."""
     return [
@@ -210,18 +225,7 @@ def finer(shape: Shape, span: Span) -> list[Shape]:
             near = places[np.argsort(np.abs(places - shape.figures["at"]))[:3]]
             apart = float(np.ptp(near)) / 2.0
         beside = shape.figures["at"] + apart * np.arange(-FINE, FINE + 1) / FINE
-        soft = [
-            Shape(
-                "step",
-                span.signal,
-                (f"0.5 * (1 + tanh(({span.signal} - {p:.7g}) / {width:.3g}))",),
-                2,
-                {"at": float(f"{p:.7g}"), "width": float(f"{width:.3g}")},
-            )
-            for p in beside[::3]
-            for width in apart * np.array(WIDTHS)
-        ]
-        return steps(span, beside) + soft
+        return steps(span, beside) + soft_steps(span, beside[::3], [apart * w for w in WIDTHS])
     if shape.kind == "exponential":
         return exponentials(span, [shape.figures["constant"] * f for f in np.geomspace(0.6, 1.6, 9)])
     return []

@@ -7,18 +7,26 @@ Generic curves in one covariate at a time are tried beside base, configured and 
     angle             : cos and sin of n periods a turn, n = 3 to 8, one n and all of them
     specific_force    : Chebyshev polynomials of degree 3 to 5 of one component, and of all
 
-A covariate is named where one of its tests has delta BIC > 10 and m p < 1e-3, m the number of all tests. The curves
-never take part in the selection: a flexible curve would win against physics in the first round. Which shape the
-dependence has is looked for only then (``pipeline.diagnosis.first_guess``).
+and, where effects were selected or the residual is above white noise, something sudden:
+
+    temperature, time, |omega| : a step at one of 16 places of the span
+
+A covariate is named where one of its tests has delta BIC > 10 and m p < 1e-3, m the number of all tests, and has it too
+where the noise is not held to what a static recording says of it. The curves never take part in the selection: a
+flexible curve would win against physics in the first round. Which shape the dependence has is looked for only then
+(``pipeline.diagnosis.first_guess``).
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.diagnosis.leftover import Leftover
+from pipeline.diagnosis.shapes import Span
+from pipeline.estimation.wandering import settings_for
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -31,11 +39,14 @@ if TYPE_CHECKING:
     Values = NDArray[np.float64]
     Curves = Callable[[Motion], Values]
     Block = tuple[Sequence[int], int]
+    Tests = tuple[list[str], Values, NDArray[np.intp], float]
 
 GATE_BIC = 10.0
 GATE_P = 1e-3
 DEGREE = 5
 FEWEST, MOST = 3, 8  # periods a turn: one and two look like base and catalogue
+PLACES = 16
+ABOVE = 1.1  # times the white noise: a residual that may hold something sudden
 
 
 def dependences(selection: Selection, beside: Curves | None = None) -> list[tuple[str, float]]:
@@ -47,13 +58,39 @@ def dependences(selection: Selection, beside: Curves | None = None) -> list[tupl
     beside : callable, optional
         Motion to (n, m) further curves that count as explained.
     """
+    found = _significant(selection, beside)
+    if found and any(setting.prior for setting in selection.settings):
+        least = min(setting.prior for setting in selection.settings)
+        free = [replace(setting, prior=least) for setting in settings_for(None)]
+        freely = _significant(replace(selection, settings=[*selection.settings, *free]), beside)
+        found = {name: values for name, values in freely.items() if name in found}
+    return [(name, p) for name, (_, p) in sorted(found.items(), key=lambda item: -item[1][0])]
+
+
+def _significant(selection: Selection, beside: Curves | None) -> dict[str, tuple[float, float]]:
+    """Return delta BIC and p-value of the best test in each covariate that passes the gate."""
     from scipy.special import chdtrc  # noqa: PLC0415  (0.1 s that only a diagnosis pays)
 
+    tests = [_smooth(selection, beside)]
+    if selection.names or selection.fit.residual_rms > ABOVE * float(np.sqrt(np.mean(selection.start.scale**2))):
+        tests.append(_sudden(selection, beside))
+    count = sum(len(names) for names, _, _, _ in tests)
+    found: dict[str, tuple[float, float]] = {}
+    for names, delta, parameters, samples in tests:
+        p = chdtrc(parameters, np.maximum(delta + parameters * np.log(samples), 0.0))
+        for k in np.argsort(delta):
+            if delta[k] > GATE_BIC and p[k] * count < GATE_P and delta[k] > found.get(names[k], (0.0, 0.0))[0]:
+                found[names[k]] = (float(delta[k]), float(p[k]))
+    return found
+
+
+def _smooth(selection: Selection, beside: Curves | None) -> Tests:
+    """Return covariate, delta BIC and number of parameters of each test with smooth curves, and the samples."""
     bases = bases_of(selection)
     leftover = Leftover(selection, lambda motion: np.concatenate([b(motion) for _, b, _ in bases], axis=1), beside)
     names: list[str] = []
     counts: list[int] = []
-    drops, at = [], 0
+    drops, at = [np.zeros((*leftover.left.shape, 0))], 0
     for covariate, _, blocks in bases:
         for block, least in blocks:
             kept = leftover.independent(at + np.asarray(block))
@@ -62,13 +99,30 @@ def dependences(selection: Selection, beside: Curves | None = None) -> list[tupl
                 counts += range(least, len(kept) + 1)
                 names += [covariate] * (len(kept) + 1 - least)
         at += 1 + max(max(block) for block, _ in blocks)
-    if not names:
-        return []
-    parameters = 3 * np.array(counts)
-    delta = leftover.gains(np.concatenate(drops, axis=2), parameters)
-    p = chdtrc(parameters, np.maximum(delta + parameters * np.log(leftover.samples), 0.0))
-    found = [k for k in np.argsort(-delta) if delta[k] > GATE_BIC and p[k] * len(names) < GATE_P]
-    return list({names[k]: (names[k], float(p[k])) for k in reversed(found)}.values())[::-1]
+    parameters = 3 * np.array(counts, int)
+    return names, leftover.gains(np.concatenate(drops, axis=2), parameters), parameters, leftover.samples
+
+
+def _sudden(selection: Selection, beside: Curves | None) -> Tests:
+    """Return the same of the tests with steps."""
+    observations = selection.observations
+    names: list[str] = []
+    values: list[tuple[Callable[[Motion], Values | None], Values]] = []
+    for covariate in {name for name, _, _ in bases_of(selection)} & set(SIGNALS):
+        signal, of = SIGNALS[covariate]
+        places = Span.of(observations, signal).places()
+        values.append((of, places[max(1, len(places) // PLACES) // 2 :: max(1, len(places) // PLACES)]))
+        names += [covariate] * 2 * len(values[-1][1])
+
+    def curves(motion: Motion) -> Values:
+        known = [(np.asarray(of(motion))[:, None] - places, np.ptp(places) / PLACES) for of, places in values]
+        return np.concatenate(
+            [k for d, width in known for k in ((d >= 0).astype(float), np.tanh(d / (width + 1e-12)))], axis=1
+        )
+
+    leftover = Leftover(selection, curves, beside)
+    parameters = np.full(len(names), 4)
+    return names, leftover.gains(leftover.drops(np.eye(len(names))), parameters), parameters, leftover.samples
 
 
 def bases_of(selection: Selection) -> list[tuple[str, Curves, list[Block]]]:
@@ -82,9 +136,9 @@ def bases_of(selection: Selection) -> list[tuple[str, Curves, list[Block]]]:
     components: list[Block] = [(range(3 * i, 3 * i + 3), 3) for i in range(3)]
     bases: list[tuple[str, Curves, list[Block]]] = [("specific_force", _force, [*components, (range(9), 9)])]
     if observations.clock_shared:
-        bases.append(("time", _chebyshev(lambda m: m.time, motions), degrees))
+        bases.append(("time", _chebyshev(SIGNALS["time"][1], motions), degrees))
     if all(m.temperature is not None for m in motions):
-        bases.append(("temperature", _chebyshev(lambda m: m.temperature, motions), degrees))
+        bases.append(("temperature", _chebyshev(SIGNALS["temperature"][1], motions), degrees))
     if any(np.any(~m.still) for m in motions):
         bases.append(("rate", _chebyshev(speed, motions), degrees))
     if any(m.axis is not None for m in motions):
@@ -98,6 +152,13 @@ def speed(motion: Motion) -> Values:
     """Return the magnitude of the angular rate: (n,) array, deg/s."""
     size: Values = np.sqrt(np.einsum("ij,ij->i", motion.angular_rate, motion.angular_rate))
     return size
+
+
+SIGNALS: dict[str, tuple[str, Callable[[Motion], Values | None]]] = {
+    "temperature": ("temperature", lambda motion: motion.temperature),
+    "time": ("time", lambda motion: motion.time),
+    "rate": ("speed", speed),
+}
 
 
 def _chebyshev(of: Callable[[Motion], Values | None], motions: list[Motion]) -> Curves:
