@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.diagnosis.advice import next_experiment
-from pipeline.diagnosis.first_guess import suggested_effect, unexplained
+from pipeline.diagnosis.first_guess import select_beside, suggested_effect, unexplained
 from pipeline.diagnosis.held_out import held_out_error
 from pipeline.diagnosis.observability import facts_of, not_observable
 from pipeline.diagnosis.wander import fitted_wander
@@ -68,7 +68,10 @@ def diagnose(
         selection = select(observations, configured, noise, settings["sensor"][sensor], calibration)
     except NotObservableError as reason:
         return _nothing(sensor, configured, reason.message)
-    return _document(selection, configured, recordings, noise, settings["table"])
+    unknown = unexplained(selection)
+    beside = select_beside(selection, unknown, configured, noise, settings["sensor"][sensor])
+    document = _document(beside, unknown, configured, recordings, noise, table=settings["table"])
+    return document | {"residual_over_noise": _over_noise(selection, recordings, noise)}
 
 
 def _nothing(sensor: str, configured: list[str], reason: str) -> dict[str, Any]:
@@ -90,12 +93,13 @@ def _nothing(sensor: str, configured: list[str], reason: str) -> dict[str, Any]:
 
 def _document(
     selection: Selection,
+    unknown: list[dict[str, Any]],
     configured: list[str],
     recordings: Sequence[Recording],
     noise: Noise | None,
+    *,
     table: Mapping[str, Any],
 ) -> dict[str, Any]:
-    unknown = unexplained(selection)
     sensor, selected = selection.observations.sensor, selection.names
     hidden = not_observable(selection, configured)
     ladder = _ladder(selection, recordings, table)
@@ -107,7 +111,6 @@ def _document(
     adds = ",".join([*configured, *selected])
     return {
         "verdict": verdict,
-        "residual_over_noise": _over_noise(selection, recordings, noise),
         "selected": selected,
         "ranking": ranking,
         "not_observable": [{"effect": name, "reason": reason} for name, reason in hidden.items()],

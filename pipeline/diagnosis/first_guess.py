@@ -21,7 +21,10 @@ from pipeline.diagnosis import shapes
 from pipeline.diagnosis.guess_words import Guess, in_words
 from pipeline.diagnosis.leftover import Leftover
 from pipeline.diagnosis.unknown import dependences
+from pipeline.estimation.selection import select
+from pipeline.model.effects import catalogue, forget, register
 from pipeline.model.effects.base import unit_of
+from pipeline.model.user_effects import effect_from
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
@@ -31,6 +34,7 @@ if TYPE_CHECKING:
     from pipeline.diagnosis.leftover import Gain
     from pipeline.diagnosis.shapes import Shape
     from pipeline.estimation.selection import Selection
+    from pipeline.records import Noise
 
     Values = NDArray[np.float64]
 
@@ -49,8 +53,8 @@ def unexplained(selection: Selection) -> list[dict[str, Any]]:
     Returns
     -------
     list of dict
-        ``covariate, p_value, shape`` (words), ``axes, formulas, size, unit, delta_bic``, ``explained_by`` (another
-        covariate whose shape says it all, or None) and ``kind``.
+        ``covariate, p_value, shape`` (words), ``axes, formulas, coefficients`` (of each axis), ``size, unit,
+        delta_bic, explained_by`` (another covariate whose shape says it all, or None) and ``kind``.
     """
     found = dict(dependences(selection))
     if not found:
@@ -67,6 +71,7 @@ def unexplained(selection: Selection) -> list[dict[str, Any]]:
             "kind": guess.shape.kind,
             "axes": ["xyz"[c] for c in guess.gain.axes],
             "formulas": list(guess.shape.formulas),
+            "coefficients": [guess.coefficients[c].tolist() for c in guess.gain.axes],
             "size": float(np.abs(guess.sizes).max()),
             "unit": unit_of(sensor),
             "delta_bic": guess.gain.delta_bic,
@@ -111,6 +116,35 @@ def suggested_effect(
         "axes": list(entry["axes"]),
         "source": "what a diagnosis found in the residual",
     }
+
+
+def select_beside(
+    selection: Selection,
+    unknown: Sequence[Mapping[str, Any]],
+    configured: Sequence[str],
+    noise: Noise | None,
+    sheet: Mapping[str, Any],
+) -> Selection:
+    """Select again with the best shape in the base: what the catalogue took of it, it takes no longer.
+
+    Parameters
+    ----------
+    selection : Selection
+    unknown : sequence of mapping
+        What ``unexplained`` returned of it; where nothing was found or selected, there is nothing to do.
+    configured : sequence of str
+    noise : Noise or None
+    sheet : mapping
+        As for ``selection.select``.
+    """
+    definition = suggested_effect(unknown, selection.observations.sensor, catalogue())
+    if definition is None or not selection.names:
+        return selection
+    register(effect_from(definition, "a first guess"))
+    try:
+        return select(selection.observations, [*configured, definition["name"]], noise, sheet)
+    finally:
+        forget(definition["name"])
 
 
 def guess_of(selection: Selection, covariate: str) -> Guess:

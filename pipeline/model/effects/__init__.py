@@ -47,6 +47,11 @@ def register(effect: Effect) -> None:
     _registered[effect.name] = effect
 
 
+def forget(name: str) -> None:
+    """Take one registered effect out of the catalogue again."""
+    _registered.pop(name, None)
+
+
 def forget_registered() -> None:
     """Take every registered effect out of the catalogue again."""
     _registered.clear()
