@@ -1,0 +1,140 @@
+"""Tell what a procedure could find before it is recorded."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shlex
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.errors import ConfigurationError
+from pipeline.planning.plan import best_changes, plan_of
+from pipeline.planning.words import helps_most, in_words, side_by_side
+from pipeline.simulation.description import UnitDescription, read_description
+from pipeline.simulation.options import add_recording_options, described
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.planning.plan import Gain
+
+FILE = "simulation.yaml"
+EPILOG = """\
+For each effect: the smallest size that this procedure would find in half of the units, at the noise of the sensor's
+data sheet; its share of the data sheet's limit; what looks like it; and up to which size it would be taken for that.
+
+examples:
+  python -m pipeline plan
+  python -m pipeline plan --sensor stim300 --step 10 --dwell 2 --rate 20 60 100
+  python -m pipeline plan --rate 60 --against "--both-directions"
+  python -m pipeline plan --campaign data/demo --unit mpu6050-1
+"""
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run ``python -m pipeline plan``."""
+    arguments = vars(_parser().parse_args(_joined(argv)))
+    first = unit_of(arguments, _described_unit(arguments))
+    document = plan_of(first)
+    second = plan_of(_other(arguments["against"], arguments, first)) if arguments["against"] is not None else None
+    gains = [] if second is not None or not arguments["extra"] else best_changes(first, document)
+    if arguments["json"]:
+        more = {"against": second} if second is not None else {"extra": [_of_gain(gain) for gain in gains]}
+        print(json.dumps({**document, **more}, indent=1))
+        return 0
+    lines = in_words(document) if second is None else side_by_side(document, second)
+    print("\n".join([*lines, *(["", *helps_most(gains)] if gains else [])]))
+    return 0
+
+
+def _joined(argv: Sequence[str]) -> list[str]:
+    """Return the arguments with what follows ``--against`` joined to it, as it begins with a dash itself."""
+    found: list[str] = []
+    for argument in argv:
+        if found and found[-1] == "--against":
+            found[-1] = f"--against={argument}"
+        else:
+            found.append(argument)
+    return found
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m pipeline plan",
+        description=__doc__,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        argument_default=argparse.SUPPRESS,
+    )
+    add = parser.add_argument
+    add(
+        "--from", dest="source", type=Path, default=None, metavar="FILE", help="procedure as a simulation's description"
+    )
+    add("--campaign", type=Path, default=None, metavar="DIR", help=f"likewise, from DIR/{FILE}")
+    add("--unit", default=None, metavar="NAME", help="which unit of the description (the first)")
+    add("--against", default=None, metavar="OPTIONS", help="a second procedure: what differs from the first, in quotes")
+    add("--json", action="store_true", default=False, help="print the plan as JSON")
+    add("--no-extra", dest="extra", action="store_false", default=True, help="leave out what to record more")
+    add_recording_options(parser)
+    return parser
+
+
+def unit_of(arguments: Mapping[str, Any], base: UnitDescription | None) -> UnitDescription:
+    """Return what is to be planned: the options, over a description where there is one."""
+    given = described(arguments)
+    if base is None:
+        return UnitDescription(unit="plan", **given)
+    if not {"table", "procedure"} & set(arguments):
+        del given["table"]
+    course = {**base.course, **given.pop("course", {})}
+    return replace(base, **given, course=course)
+
+
+def _described_unit(arguments: Mapping[str, Any]) -> UnitDescription | None:
+    """Return the unit of the description that is asked for, None where none is."""
+    source, campaign, name = (arguments[key] for key in ("source", "campaign", "unit"))
+    if source is not None and campaign is not None:
+        raise ConfigurationError("--from and --campaign both name a description; give one of them")
+    if campaign is not None:
+        source = campaign / FILE
+        if campaign.is_dir() and not source.is_file():
+            raise ConfigurationError(
+                f"this campaign has no {FILE}, so how it is recorded is not known; "
+                "give its sensor, table, procedure and course as options",
+                str(campaign),
+            )
+    if source is None:
+        if name is not None:
+            raise ConfigurationError("--unit chooses a unit of a description; give one by --from or --campaign")
+        return None
+    units = {unit.unit: unit for unit in read_description(source).units}
+    if name is not None and name not in units:
+        raise ConfigurationError(f"no unit is called {name!r}; known: {', '.join(units)}", str(source))
+    return units[name] if name is not None else next(iter(units.values()))
+
+
+def _other(options: str, arguments: Mapping[str, Any], first: UnitDescription) -> UnitDescription:
+    """Return the second procedure: the first with some options changed."""
+    parser = argparse.ArgumentParser(prog="--against", argument_default=argparse.SUPPRESS, exit_on_error=False)
+    add_recording_options(parser)
+    try:
+        given, unknown = parser.parse_known_args(shlex.split(options))
+    except (argparse.ArgumentError, ValueError) as error:
+        raise ConfigurationError(f"--against {options!r}: {error}") from None
+    if unknown:
+        raise ConfigurationError(f"--against {options!r}: {' '.join(unknown)} is not known; see plan --help")
+    kept = {"table": first.table} if "table" in arguments and "procedure" not in given else {}
+    return unit_of({**kept, **vars(given)}, first)
+
+
+def _of_gain(gain: Gain) -> dict[str, Any]:
+    return {
+        "what": gain.change.what,
+        "options": gain.change.options,
+        "minutes": gain.minutes,
+        "shows": list(gain.shown),
+        "tells_apart": list(gain.told),
+        "size_factor": gain.factor,
+    }

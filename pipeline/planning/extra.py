@@ -1,0 +1,118 @@
+"""What could be recorded beside a procedure: one change at a time.
+
+Each change is a further course of the same unit, and is planned like the procedure itself. Those with options can be
+planned and simulated by them; the others are further recordings, to be named in the procedure's configuration.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.simulation.campaign import course_of
+from pipeline.simulation.description import read_config
+from pipeline.simulation.gimbals import Gimbals, random_gimbals
+from pipeline.simulation.procedures import TABLE_PROCEDURES, Planned, plan
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from pipeline.simulation.description import UnitDescription
+    from pipeline.simulation.procedures import Course
+
+FASTER_DPS = (100.0, 200.0)
+CLEARLY_FASTER = 1.3
+WITHIN = 0.9  # of the gyroscope's full scale: its bias needs the rest
+MOTION_S, MOTION_DPS = 120.0, 100.0
+UPRIGHT_DPS = 60.0
+LONG_REST_S = 600.0
+POSITIONS = 2
+
+
+@dataclass(frozen=True)
+class Change:
+    """One thing to record more.
+
+    Attributes
+    ----------
+    what : str
+        As advice to the reader.
+    options : str
+        Of the command line that do it; empty where none does.
+    unit : UnitDescription
+    extra : tuple of Planned
+    """
+
+    what: str
+    options: str
+    unit: UnitDescription
+    extra: tuple[Planned, ...] = ()
+
+
+def changes(unit: UnitDescription) -> list[Change]:
+    """Return what could be recorded beside the procedure of a unit."""
+    course = course_of(unit)
+    fixed = replace(unit, samples=None, course=asdict(course))
+    of = _on_a_table if unit.procedure in TABLE_PROCEDURES else _by_hand
+    return [*of(fixed, course), *_anywhere(fixed, course)]
+
+
+def _with(unit: UnitDescription, what: str, options: str, **course: Any) -> Change:  # noqa: ANN401  (any attribute)
+    return Change(what, options, replace(unit, course={**unit.course, **course}))
+
+
+def _longer(unit: UnitDescription, course: Course) -> Change:
+    dwell = 2.0 * course.dwell_s
+    return _with(unit, "rest twice as long at each stop", f"--dwell {dwell:g}", dwell_s=dwell)
+
+
+def _on_a_table(unit: UnitDescription, course: Course) -> Iterator[Change]:
+    if not course.both_directions:
+        what = "make every turn in the other direction too"
+        yield _with(unit, what, "--both-directions", both_directions=True)
+    full = float(read_config("sensor", unit.sensor)["gyroscope"]["full_scale"])
+    faster = [r for r in FASTER_DPS if CLEARLY_FASTER * max(course.rates_dps) < r <= WITHIN * full]
+    if faster:
+        rates = (*course.rates_dps, *faster)
+        options = "--rate " + " ".join(f"{r:g}" for r in rates)
+        what = f"turn at {' and '.join(f'{r:g}' for r in faster)} deg/s too, both sensors recorded"
+        yield _with(unit, what, options, rates_dps=rates)
+    yield _with(unit, "make twice as many turns", f"--turns {2 * course.turns}", turns=2 * course.turns)
+    if not course.accelerometer_rates_dps:
+        yield _longer(unit, course)
+    if unit.procedure == "three_axis_turns":
+        what = f"heat and cool the unit by {course.thermal_ramp_degc:g} degC meanwhile, in a thermal chamber"
+        yield Change(what, "--procedure thermal_ramp", replace(unit, procedure="thermal_ramp"))
+    yield from _further(unit, course, full)
+
+
+def _further(unit: UnitDescription, course: Course, full: float) -> Iterator[Change]:
+    """Return recordings for which the procedure has no option."""
+    again = plan(unit.procedure, replace(course, validation_s=0.0, static_s=0.0), np.random.default_rng(0))
+    named = tuple(replace(p, name=f"{p.name}_again") for p in again)
+    yield Change("run the whole procedure a second time, once the unit is warm", "", unit, named)
+    if unit.table == "single_axis":
+        return
+    rate = min(MOTION_DPS, WITHIN * full)
+    motion = random_gimbals(MOTION_S, rate, np.random.default_rng(0))
+    what = f"random motion about all axes up to {rate:g} deg/s for {MOTION_S / 60.0:g} min, attitude logged, in the fit"
+    yield Change(what, "", unit, (Planned("motion", "gyroscope", None, motion),))
+    still = np.zeros((3, 1))
+    turn = Gimbals(np.array([0.0, 0.0, UPRIGHT_DPS]), still, still, still, 360.0 / UPRIGHT_DPS)
+    what = "turn about z with z upright, attitude logged, in the fit"
+    yield Change(what, "", unit, (Planned("upright_z", "gyroscope", None, turn),))
+
+
+def _by_hand(unit: UnitDescription, course: Course) -> Iterator[Change]:
+    yield _longer(unit, course)
+    if unit.procedure == "multi_position":
+        more = POSITIONS * course.positions
+        yield _with(unit, f"rest in {more} positions", f"--positions {more}", positions=more)
+
+
+def _anywhere(unit: UnitDescription, course: Course) -> Iterator[Change]:
+    if course.static_s < LONG_REST_S:
+        what = f"a long rest of {LONG_REST_S / 60.0:g} min, to pin the noise"
+        yield _with(unit, what, f"--static {LONG_REST_S:g}", static_s=LONG_REST_S)

@@ -1,0 +1,189 @@
+"""The plan of a procedure as a document: what it would find of each effect, and what to record more.
+
+    {"sensor", "table", "procedure", "minutes", "samples", "warnings": [text],
+     "accelerometer": {"noise": {"white", "wander"}, "unit",
+        "effects": [{"effect", "smallest", "unit", "share_of_limit", "almost_sure", "named", "sizes", "taken_for",
+                      "look_alikes": [{"effect", "share"}]}],
+        "not_observable": [{"effect", "reason"}], "reason": null | why nothing can be planned},
+     "gyroscope": {...}}
+
+Sizes are those that half of the units would show. An effect that would pass only beyond its limit is not observable.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.diagnosis.observability import not_observable
+from pipeline.errors import NotObservableError
+from pipeline.estimation.observations import observe
+from pipeline.estimation.selection import unselected
+from pipeline.model.effects import effect
+from pipeline.model.effects.base import Owner
+from pipeline.planning.detection import Expectation
+from pipeline.planning.extra import changes
+from pipeline.planning.rehearsal import limits_broken, rehearse
+from pipeline.records import SENSORS
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.planning.detection import Detection
+    from pipeline.planning.extra import Change
+    from pipeline.planning.rehearsal import Rehearsal
+    from pipeline.simulation.description import UnitDescription
+    from pipeline.simulation.procedures import Planned
+
+UNITS = {"accelerometer": "g", "gyroscope": "deg/s"}
+Document = dict[str, Any]
+
+
+def plan_of(unit: UnitDescription, extra: Sequence[Planned] = (), *, half_only: bool = False) -> Document:
+    """Return the plan of a procedure.
+
+    Parameters
+    ----------
+    unit : UnitDescription
+        Sensor, table, procedure, course and sampling.
+    extra : sequence of Planned
+        Further recordings.
+    half_only : bool
+        Leave out ``almost_sure`` and ``named``.
+
+    Raises
+    ------
+    ConfigurationError
+        If a name is not known or the course cannot be run.
+    """
+    rehearsal = rehearse(unit, extra)
+    return {
+        "sensor": unit.sensor,
+        "table": unit.table,
+        "procedure": unit.procedure,
+        "minutes": rehearsal.minutes,
+        "samples": sum(r.samples for r in rehearsal.recordings),
+        "warnings": limits_broken(rehearsal, unit),
+        **{sensor: _of_sensor(sensor, rehearsal, half_only=half_only) for sensor in SENSORS},
+    }
+
+
+def _of_sensor(sensor: str, rehearsal: Rehearsal, *, half_only: bool) -> Document:
+    noise, sheet = rehearsal.noise[sensor], rehearsal.sheets[sensor]
+    document: Document = {
+        "unit": UNITS[sensor],
+        "noise": {"white": float(noise.white[0]), "wander": float(noise.wander[0])},
+        "effects": [],
+        "not_observable": [],
+        "reason": None,
+    }
+    try:
+        selection = unselected(observe(sensor, rehearsal.recordings, rehearsal.table), [], noise, sheet)
+    except NotObservableError as error:
+        return {**document, "reason": error.message}
+    hidden = not_observable(selection, [])
+    expectation = Expectation(selection, noise)
+    for name in sorted(set(expectation.names) - set(hidden)):
+        found = expectation.detection(name, half_only=half_only)
+        assert found is not None  # noqa: S101  (what the motion does not excite is hidden)
+        if found.found > 1.0 and np.isfinite(selection.limits[name]).any():
+            hidden[name] = _faint(sensor, found)
+        else:
+            document["effects"].append(_entry(sensor, found, limited=bool(np.isfinite(selection.limits[name]).any())))
+    document["not_observable"] = [{"effect": n, "reason": hidden[n]} for n in sorted(hidden)]
+    return document
+
+
+def _entry(sensor: str, found: Detection, *, limited: bool) -> Document:
+    parameters = effect(found.effect).parameters(sensor)
+    sizes = {p.name: found.found * float(u) for p, u in zip(parameters, found.unit_sizes, strict=True) if u}
+    first = float(found.unit_sizes[0])
+    return {
+        "effect": found.effect,
+        "smallest": found.found * first,
+        "unit": parameters[0].unit,
+        "share_of_limit": found.found if limited else None,
+        "almost_sure": _finite(found.sure * first),
+        "named": _finite(found.named * first),
+        "sizes": sizes,
+        "taken_for": found.taken_for,
+        "look_alikes": [{"effect": n, "share": s} for n, s in found.look_alikes.items()],
+    }
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _faint(sensor: str, found: Detection) -> str:
+    this = effect(found.effect)
+    unit = this.parameters(sensor)[0].unit
+    limit = f"{found.unit_sizes[0]:.2g}{'' if unit == '1' else ' ' + unit}"
+    times = f", {found.found:.2g} times that would show" if np.isfinite(found.found) else ""
+    return f"even at its limit of {limit} it would hide in the noise{times}; it needs {this.excitation}"
+
+
+@dataclass(frozen=True)
+class Gain:
+    """What a change would bring.
+
+    Attributes
+    ----------
+    change : Change
+    minutes : float
+        More at the table.
+    shown : tuple of str
+        ``sensor.effect`` that become observable; one of the table only if neither sensor showed it.
+    told : tuple of str
+        Those that would no longer be taken for a look-alike.
+    factor : float
+        Geometric mean of the new smallest sizes over the old ones, of effects that are observable in both.
+    """
+
+    change: Change
+    minutes: float
+    shown: tuple[str, ...]
+    told: tuple[str, ...]
+    factor: float
+
+
+def best_changes(unit: UnitDescription, before: Document) -> list[Gain]:
+    """Return what each change would bring, the most helpful first.
+
+    First goes the change that shows most effects for each minute at the table (at least one: nothing is set up in
+    less); of those that show nothing new, the one that lowers the smallest sizes most.
+
+    Parameters
+    ----------
+    unit : UnitDescription
+    before : dict
+        Its plan.
+    """
+    gains = [_gain(change, before, plan_of(change.unit, change.extra, half_only=True)) for change in changes(unit)]
+    return sorted(gains, key=lambda gain: (-len(gain.shown) / max(gain.minutes, 1.0), gain.factor))
+
+
+def _gain(change: Change, before: Document, after: Document) -> Gain:
+    old, new = _entries(before), _entries(after)
+    both = old.keys() & new.keys()
+    ratios = [np.log(new[key]["smallest"] / old[key]["smallest"]) for key in sorted(both)]
+    return Gain(
+        change,
+        after["minutes"] - before["minutes"],
+        tuple(key for key in new if key not in old and not _shared(key, old)),
+        tuple(key for key in new if key in both and old[key]["taken_for"] and not new[key]["taken_for"]),
+        float(np.exp(np.mean(ratios))) if ratios else 1.0,
+    )
+
+
+def _shared(key: str, old: Mapping[str, Any]) -> bool:
+    """Return whether an effect is the table's and the other sensor shows it already."""
+    name = key.partition(".")[2]
+    return effect(name).owner == Owner.TABLE and any(other.partition(".")[2] == name for other in old)
+
+
+def _entries(document: Mapping[str, Any]) -> dict[str, Document]:
+    """Return the observable effects by ``sensor.effect``."""
+    return {f"{s}.{entry['effect']}": entry for s in SENSORS for entry in document[s]["effects"]}

@@ -1,0 +1,158 @@
+"""A plan as text: aligned tables."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from pipeline.records import SENSORS
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.planning.plan import Gain
+
+CLEARLY_LARGER = 1.2
+CLEARLY_SMALLER = 99.5  # per cent
+TOP = 3
+
+
+def in_words(document: Mapping[str, Any]) -> list[str]:
+    """Return a plan as lines.
+
+    Parameters
+    ----------
+    document : mapping
+        Of ``plan.plan_of``.
+    """
+    lines = [heading(document), *(f"note: {text}" for text in document["warnings"])]
+    for sensor in SENSORS:
+        lines += ["", *_of_sensor(sensor, document[sensor])]
+    return lines
+
+
+def heading(document: Mapping[str, Any]) -> str:
+    """Return what is planned, as a line."""
+    what = f"{document['sensor']} on {document['table']}, {document['procedure']}"
+    return f"{what}: {document['minutes']:.1f} min at the table, {document['samples']} samples"
+
+
+def _of_sensor(sensor: str, part: Mapping[str, Any]) -> list[str]:
+    if part["reason"]:
+        return [f"{sensor}: nothing can be planned: {part['reason']}"]
+    noise, unit = part["noise"], part["unit"]
+    lines = [f"{sensor} (noise {noise['white']:.2g} {unit} a sample, bias wander {noise['wander']:.2g} {unit})"]
+    head = ["effect", "smallest size", "of limit", "looks like", "note"]
+    lines += aligned([head, *(_row(entry) for entry in part["effects"])])
+    if part["not_observable"]:
+        lines.append("  cannot be seen:")
+        lines += aligned([[e["effect"], e["reason"]] for e in part["not_observable"]])
+    return lines
+
+
+def _row(entry: Mapping[str, Any]) -> list[str]:
+    alike = ", ".join(f"{a['effect']} {a['share']:.2f}" for a in entry["look_alikes"][:2])
+    return [
+        entry["effect"],
+        size(entry["smallest"], entry["unit"]),
+        share(entry["share_of_limit"]),
+        alike,
+        _note(entry),
+    ]
+
+
+def _note(entry: Mapping[str, Any]) -> str:
+    """Return up to which size an effect would be taken for another."""
+    named, smallest, taken = entry["named"], entry["smallest"], entry["taken_for"]
+    limit = None if entry["share_of_limit"] is None else smallest / entry["share_of_limit"]
+    never = named is None or (limit is not None and named > limit)
+    if taken:
+        return f"taken for {taken}" + ("" if never else f" below {size(named, entry['unit'])}")
+    if never:
+        return "not told from its look-alikes"
+    return f"by its name from {size(named, entry['unit'])}" if named > CLEARLY_LARGER * smallest else ""
+
+
+def size(value: float, unit: str) -> str:
+    """Return a size with its unit."""
+    return f"{value:.2g}" + ("" if unit == "1" else f" {unit}")
+
+
+def share(value: float | None) -> str:
+    """Return a share of a limit in per cent."""
+    if value is None:
+        return "no limit"
+    return f"{100.0 * value:.2g} %" if value >= 1e-3 else "< 0.1 %"
+
+
+def side_by_side(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]:
+    """Return two plans beside each other as lines.
+
+    Parameters
+    ----------
+    first, second : mapping
+        Of ``plan.plan_of``.
+    """
+    lines = [f"A: {heading(first)}", f"B: {heading(second)}"]
+    for name, document in (("A", first), ("B", second)):
+        lines += [f"note on {name}: {text}" for text in document["warnings"]]
+    for sensor in SENSORS:
+        lines += ["", sensor, *_compared(first[sensor], second[sensor])]
+    return lines
+
+
+def _compared(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]:
+    reasons = [f"  {n}: nothing can be planned: {p['reason']}" for n, p in (("A", first), ("B", second)) if p["reason"]]
+    a, b = ({entry["effect"]: entry for entry in part["effects"]} for part in (first, second))
+    rows = [["effect", "smallest in A", "of limit", "smallest in B", "of limit", "B / A"]]
+    hidden = {e["effect"] for part in (first, second) for e in part["not_observable"]}
+    for name in sorted(a.keys() | b.keys() | hidden):
+        cells = [name]
+        for found in (a.get(name), b.get(name)):
+            cells += [size(found["smallest"], found["unit"]), share(found["share_of_limit"])] if found else ["-", ""]
+        both = name in a and name in b
+        rows.append([*cells, f"{b[name]['smallest'] / a[name]['smallest']:.2f}" if both else ""])
+    return [*reasons, *(aligned(rows) if len(rows) > 1 else [])]
+
+
+def helps_most(gains: Sequence[Gain]) -> list[str]:
+    """Return the changes that help most as lines; the first is the most helpful.
+
+    Parameters
+    ----------
+    gains : sequence of Gain
+        In order.
+    """
+    lines = ["what to record more, the most helpful first:"]
+    for number, gain in enumerate(gains[:TOP], start=1):
+        options = f" ({gain.change.options})" if gain.change.options else ""
+        lines.append(f"  {number}. {gain.change.what}{options}: {_cost(gain.minutes)}")
+        lines.append(f"     {_brought(gain)}")
+    return lines
+
+
+def _cost(minutes: float) -> str:
+    return f"{minutes:+.1f} min at the table"
+
+
+def _brought(gain: Gain) -> str:
+    parts = []
+    if gain.shown:
+        parts.append("shows " + _listed(gain.shown))
+    if gain.told:
+        parts.append("tells apart " + _listed(gain.told))
+    percent = 100.0 * gain.factor
+    earlier = f"at {percent:.0f} % of the size" if percent < CLEARLY_SMALLER else "no earlier"
+    return "; ".join([*parts, f"finds the others {earlier}"])
+
+
+def _listed(keys: Sequence[str]) -> str:
+    by_sensor = {s: [k.partition(".")[2] for k in keys if k.startswith(f"{s}.")] for s in SENSORS}
+    return " and ".join(f"{', '.join(names)} of the {sensor}" for sensor, names in by_sensor.items() if names)
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return rows as lines whose columns begin at the same place."""
+    widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
+    return [
+        "  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
+    ]
