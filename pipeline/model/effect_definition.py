@@ -128,6 +128,9 @@ class _Check:
         terms = self._terms(given["terms"], sensors, limits)
         texts = {key: self._text(given[key], (key,), LONGEST_TEXT) for key in TEXTS if key in given}
         self._require_meaning(terms, axes, owner)
+        if limits and set(limits) != set(given["terms"]):
+            expected = ", ".join(given["terms"])
+            raise self._wrong(("limits",), f"a limit for each term is expected ({expected}), or none at all")
         source = {**given, "sensors": list(sensors), **({"axes": list(axes)} if "axes" in given else {})}
         return Definition(name, Owner(owner), sensors, axes, terms, texts, source)
 
@@ -140,8 +143,6 @@ class _Check:
         given = self._mapping(given, ("terms",), "terms")
         if not 1 <= len(given) <= MOST_TERMS:
             raise self._wrong(("terms",), f"{len(given)} terms; from 1 to {MOST_TERMS} are expected")
-        if limits and set(limits) != set(given):
-            raise self._wrong(("limits",), f"a limit for each term is expected ({', '.join(given)}), or none at all")
         return tuple(self._term(name, content, sensors, limits) for name, content in given.items())
 
     def _term(
@@ -162,7 +163,7 @@ class _Check:
             raise self._wrong((*path, "formula"), "one formula, or a list of three (x, y, z), is expected")
         formulas = tuple(self._formula(text, (*path, "formula")) for text in texts)
         units = {s: self._text(v, (*path, "unit"), LONGEST_UNIT) for s, v in self._each(given["unit"], sensors, path)}
-        sizes = self._each(limits[name], sensors, ("limits", name)) if limits else []
+        sizes = self._each(limits[name], sensors, ("limits", name)) if name in limits else []
         return TermDefinition(name, formulas, units, {s: self._size(v, ("limits", name)) for s, v in sizes})
 
     def _formula(self, text: object, path: tuple[str, ...]) -> Formula:

@@ -24,7 +24,7 @@ from pipeline.model.user_effects import FormulaEffect, effect_from
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-LARGEST_BYTES = 65536
+LARGEST_BYTES, DEEPEST = 16384, 8
 
 
 def read_effect_files(files: Iterable[Path]) -> dict[str, FormulaEffect]:
@@ -171,7 +171,7 @@ def _read_yaml(text: str, where: str) -> tuple[Any, dict[tuple[str, ...], int]]:
     lines: dict[tuple[str, ...], int] = {}
     loader = yaml.SafeLoader(text)
     try:
-        _refuse_references(yaml.parse(text, Loader=yaml.SafeLoader), where)
+        _refuse_all_but_plain(yaml.parse(text, Loader=yaml.SafeLoader), where)
         node = loader.get_single_node()
         value = None if node is None else _value(node, (), loader, lines, where)
     except yaml.YAMLError as error:
@@ -180,18 +180,25 @@ def _read_yaml(text: str, where: str) -> tuple[Any, dict[tuple[str, ...], int]]:
         raise ConfigurationError(f"is not YAML: {getattr(error, 'problem', None) or error}", place) from None
     except ValueError as error:
         raise ConfigurationError(f"holds a value that cannot be read: {error}", where) from None
-    except RecursionError:
-        raise ConfigurationError("is nested too deeply", where) from None
     finally:
         loader.dispose()
     return value, lines
 
 
-def _refuse_references(events: Iterable[yaml.Event], where: str) -> None:
+def _refuse_all_but_plain(events: Iterable[yaml.Event], where: str) -> None:
+    """Refuse references, tags and nesting, before anything is built of them."""
+    depth = 0
     for event in events:
-        if getattr(event, "anchor", None):
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        found = [
+            (getattr(event, "anchor", None), "anchors and aliases (& and *) have no place in an effect"),
+            (getattr(event, "tag", None), "a tag (!) has no place in an effect"),
+            (depth > DEEPEST, "is nested too deeply"),
+        ]
+        reason = next((reason for applies, reason in found if applies), None)
+        if reason:
             line = event.start_mark.line + 1 if event.start_mark else 1
-            raise ConfigurationError("anchors and aliases (& and *) have no place in an effect", f"{where}:{line}")
+            raise ConfigurationError(reason, f"{where}:{line}")
 
 
 def _value(

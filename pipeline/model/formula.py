@@ -15,6 +15,7 @@ import re
 import warnings
 from dataclasses import dataclass
 from functools import partial
+from itertools import accumulate
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -135,6 +136,9 @@ def parse(text: str, where: str | None = None) -> Formula:
     if strange:
         found = strange.group()
         raise _refusal(line, strange.start(), f"{found!r} has no place in a formula{HINTS.get(found, '')}", where)
+    depth = accumulate((character == "(") - (character == ")") for character in line)
+    if max(depth) > DEEPEST:
+        raise ConfigurationError(f"a formula with brackets {DEEPEST} deep; use several terms", where)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
