@@ -1,0 +1,132 @@
+"""An effect of a user's own through the real Snakefile: hidden, found, fitted, and taken off a field log."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from .conftest import ROOT, Bench, Run
+
+pytestmark = pytest.mark.workflow
+
+GEAR = """\
+name: gear_mesh
+owner: table
+sensors: [gyroscope]
+meaning: The gear of the table pushes five times a turn.
+terms:
+  A: {formula: "cos(5 * radians(angle))", unit: deg/s}
+  B: {formula: "sin(5 * radians(angle))", unit: deg/s}
+limits: {A: 0.1, B: 0.1}
+"""
+LOOSE = """\
+name: loose_part
+owner: sensor
+sensors: [accelerometer]
+meaning: A loose part of the sensor tips over with gravity.
+terms:
+  d: {formula: "tanh(8 * fz)", unit: g}
+limits: {d: 0.05}
+"""
+SHEET = """\
+unit,sensor,overrides
+found,mpu6050,
+known,mpu6050,"effects.gyroscope=[gear_mesh];effects.accelerometer=[loose_part]"
+"""
+SIMULATE = "--sensor mpu6050 --step 15 --dwell 1 --rates 20 60 --both-directions --validation 60 --seed 4"
+HIDDEN = {"gyroscope": "gear_mesh", "accelerometer": "loose_part"}
+
+
+def command(*arguments: str) -> subprocess.CompletedProcess[str]:
+    line = [sys.executable, "-m", "pipeline", *arguments]
+    return subprocess.run(line, cwd=ROOT, capture_output=True, text=True, check=True)
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
+    directory = tmp_path_factory.mktemp("own")
+    campaign = directory / "own"
+    (campaign / "effects").mkdir(parents=True)
+    (campaign / "effects" / "gear_mesh.yaml").write_text(GEAR)
+    (campaign / "effects" / "loose_part.yaml").write_text(LOOSE)
+    hide = ["--effect", "gyroscope.gear_mesh=0.03", "--effect", "accelerometer.loose_part=0.01"]
+    command("simulate", str(campaign), *SIMULATE.split(), *hide)
+    (campaign / "raw" / "U001").rename(campaign / "raw" / "found")
+    (campaign / "raw" / "known").symlink_to("found")
+    (campaign / "units.csv").write_text(SHEET)
+    return Bench(directory, campaign)
+
+
+@pytest.fixture(scope="module")
+def run(bench: Bench) -> Run:
+    done = bench.snakemake()
+    assert done.code == 0, done.output
+    return done
+
+
+def result(bench: Bench, kind: str, unit: str) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads((bench.results / kind / f"{unit}.json").read_text())
+    return content
+
+
+@pytest.mark.usefixtures("run")
+def test_a_hidden_formula_is_found_and_once_configured_nothing_is_missing(bench: Bench) -> None:
+    found, known = (result(bench, "diagnoses", unit) for unit in ("found", "known"))
+    for sensor, name in HIDDEN.items():
+        assert found[sensor]["verdict"] == "missing_effect"
+        assert found[sensor]["selected"] == [name]
+        assert found[sensor]["override"] == f"effects.{sensor}=[{name}]"
+        assert known[sensor]["verdict"] == "nothing_missing"
+
+
+@pytest.mark.usefixtures("run")
+def test_the_hidden_size_is_found_within_its_uncertainty(bench: Bench) -> None:
+    truth = json.loads((bench.campaign / "truth" / "U001.json").read_text())
+    for sensor, name in HIDDEN.items():
+        (fitted,) = result(bench, "calibrations", "known")[sensor]["effects"]
+        for parameter, size in truth[sensor]["effects"][name].items():
+            entry = fitted["parameters"][parameter]
+            assert abs(entry["value"] - size) < 2 * entry["expanded_uncertainty"] < 0.2 * abs(size)
+
+
+@pytest.mark.usefixtures("run")
+def test_validation_words_page_and_exports_know_it(bench: Bench) -> None:
+    before, after = result(bench, "validations", "known")["accelerometer"]["steps"][-2:]
+    assert after["name"] == "+ loose_part"
+    assert after["vector_rms_error"] < 0.2 * before["vector_rms_error"]
+    words = command("explain", str(bench.results)).stdout
+    assert "The model of the accelerometer misses loose part." in words
+    assert "A loose part of the sensor tips over with gravity." in words
+    assert "loose_part" in (bench.results / "reports" / "known.html").read_text()
+    header = (bench.results / "exports" / "known" / "calibration.h").read_text()
+    assert "Left out, accelerometer: loose_part (an effect of the user's own" in header
+    assert "Of the bench, not of the gyroscope: gear_mesh." in header
+
+
+@pytest.mark.usefixtures("run")
+def test_the_calibration_alone_takes_the_sensors_formula_off_a_log(bench: Bench, tmp_path: Path) -> None:
+    file = bench.results / "calibrations" / "known.json"
+    own = json.loads(file.read_text())["accelerometer"]
+    size = np.array([p["value"] for p in own["effects"][0]["parameters"].values()])
+    force = np.random.default_rng(7).normal(0.0, 0.6, (200, 3))
+    reading = np.array(own["bias"]) + force @ np.linalg.inv(own["matrix"]).T + np.tanh(8.0 * force[:, 2:]) * size
+    log, out = tmp_path / "log.csv", tmp_path / "out.csv"
+    rows = "\n".join(",".join(map(repr, map(float, row))) for row in reading)
+    log.write_text(f"accel_x_g,accel_y_g,accel_z_g\n{rows}\n")
+    command("apply", "--calibration", str(file), str(log), "-o", str(out))
+    np.testing.assert_allclose(np.loadtxt(out, delimiter=",", skiprows=1), force, atol=1e-9)
+
+
+@pytest.mark.usefixtures("run")
+def test_a_changed_formula_reruns_its_fit_and_what_follows(bench: Bench) -> None:
+    file = bench.campaign / "effects" / "loose_part.yaml"
+    file.write_text(LOOSE.replace("8 * fz", "9 * fz"))
+    batch = "reference_least_squares-0001"
+    after = {f"{s}/{batch}" for s in ("validate", "diagnose", "calibration", "export", "report")}
+    jobs = bench.snakemake(dry=True).jobs
+    file.write_text(LOOSE)
+    assert jobs == {f"fit/{batch}/accelerometer/effects", "gather", "verdict", "all"} | after
