@@ -131,14 +131,14 @@ def select_beside(
     ----------
     selection : Selection
     unknown : sequence of mapping
-        What ``unexplained`` returned of it; where nothing was found or selected, there is nothing to do.
+        What ``unexplained`` returned of it; where nothing was found, there is nothing to do.
     configured : sequence of str
     noise : Noise or None
     sheet : mapping
         As for ``selection.select``.
     """
     definition = suggested_effect(unknown, selection.observations.sensor, catalogue())
-    if definition is None or not selection.names:
+    if definition is None:
         return selection
     register(effect_from(definition, "a first guess"))
     try:

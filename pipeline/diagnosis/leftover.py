@@ -216,14 +216,20 @@ def _columns(
 ) -> tuple[Values, list[NDArray[np.intp]], list[NDArray[np.intp]]]:
     """Return the columns [1, u, effects, curves, readings], and of each axis which are known and which are curves."""
     terms = [Term(t.effect, t.values, full=True) for t in selection.fit.terms]
-    parts = [_of_part(selection, part, terms, curves, beside) for part in selection.observations.parts]
-    groups = [np.concatenate([part[k] for part in parts]) for k in range(4)]
-    common, effects, shapes = groups[0], groups[1], groups[2]
-    a, e = common.shape[1], effects.shape[2]
-    shared = shapes.ndim == 2
-    q = shapes.shape[-1]
-    flat = shapes if shared else shapes.reshape(len(shapes), 3 * q)
-    A = np.column_stack([common, effects.reshape(len(effects), 3 * e), flat, groups[3]])
+    parts = selection.observations.parts
+    A, row, a, e, q, shared = np.zeros((0, 0)), 0, 0, 0, 0, True
+    for part in parts:
+        groups = _of_part(selection, part, terms, curves, beside)
+        if row == 0:
+            common, effects, shapes, _ = groups
+            a, e, q, shared = common.shape[1], effects.shape[2], shapes.shape[-1], shapes.ndim == 2
+            A = np.empty((sum(len(p.weight) for p in parts), a + 3 * e + (q if shared else 3 * q) + 3))
+        column = 0
+        for group in groups:
+            flat = group.reshape(len(group), -1)
+            A[row : row + len(group), column : column + flat.shape[1]] = flat
+            column += flat.shape[1]
+        row += len(part.weight)
     known = [np.concatenate([np.arange(a), a + c * e + np.arange(e)]) for c in range(3)]
     own = [a + 3 * e + (0 if shared else c * q) + np.arange(q) for c in range(3)]
     return A, known, own

@@ -70,10 +70,11 @@ def columns_of(formulas: Sequence[str], sensor: str) -> Callable[[Motion], Value
     parsed = [parse(text) for text in formulas]
 
     def columns(motion: Motion) -> Values:
+        signals = signals_of(motion)
         if not any("u" in formula.signals for formula in parsed):
-            return np.stack([_value(formula, signals_of(motion)) for formula in parsed], axis=1)
+            return np.stack([_value(formula, signals) for formula in parsed], axis=1)
         u = truth(sensor, motion)
-        each = [[_value(f, signals_of(motion) | {"u": u[:, c]}) for f in parsed] for c in range(3)]
+        each = [[_value(f, signals | {"u": u[:, c]}) for f in parsed] for c in range(3)]
         return np.stack([np.stack(axis, axis=1) for axis in each], axis=1)
 
     return columns
