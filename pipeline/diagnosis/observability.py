@@ -20,9 +20,12 @@ from pipeline.estimation.selection import GATE_BIC
 from pipeline.model.effects import catalogue
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from pipeline.estimation.observations import Observations
     from pipeline.estimation.selection import Selection
     from pipeline.model.effects.base import Effect
+    from pipeline.records import Motion
 
 LEAST_SPAN_DEGC = 1.0
 MOVING = {
@@ -35,6 +38,7 @@ MOVING = {
     "clock_rate",
     "table_rate_ripple",
 }
+OF_A_TABLE = {"angle": "no angle of a table", "rate": "no rate of a table", "level": "nothing that tells the heading"}
 BOTH_WAYS = {"scale_factor_asymmetry", "vibration_rectification", "table_backlash", "rate_dependence"}
 
 
@@ -112,15 +116,22 @@ def not_observable(selection: Selection, configured: list[str]) -> dict[str, str
 def _reason(this: Effect, selection: Selection, facts: Facts) -> str | None:
     places = selection.first.indices(this.name)
     hidden = _hidden(this, selection, places)
+    motions = [part.motion for part in selection.observations.parts]
+    lacking = [text for need, text in OF_A_TABLE.items() if need in this.needs and _nowhere(need, motions)]
     checks = [
         (selection.observations.sensor in this.unseen, this.unseen.get(selection.observations.sensor, "")),
         ("temperature" in this.needs and not facts.temperature, "the recordings hold no temperature"),
         (this.needs_clock and not facts.clock_shared, "the time between the recordings is not known"),
+        (bool(lacking), f"the recordings hold {' and '.join(lacking)}"),
         (not places, _unexcited(this, facts)),
         ("temperature" in this.needs and facts.span < LEAST_SPAN_DEGC, _steady(facts)),
         (hidden, _faint(this, selection) if hidden else ""),
     ]
     return next((reason for applies, reason in checks if applies), None)
+
+
+def _nowhere(need: str, motions: Sequence[Motion]) -> bool:
+    return all(getattr(motion, need) is None for motion in motions)
 
 
 def _steady(facts: Facts) -> str:
