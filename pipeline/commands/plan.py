@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import ConfigurationError
+from pipeline.model.effect_files import read_effect_files
+from pipeline.model.effects import register
 from pipeline.planning.plan import best_changes, plan_of
 from pipeline.planning.words import helps_most, in_words, side_by_side
 from pipeline.simulation.description import UnitDescription, read_description
@@ -36,6 +38,7 @@ examples:
 def main(argv: Sequence[str]) -> int:
     """Run ``python -m pipeline plan``."""
     arguments = vars(_parser().parse_args(_joined(argv)))
+    _register_effects(arguments)
     first = unit_of(arguments, _described_unit(arguments))
     document = plan_of(first)
     second = plan_of(_other(arguments["against"], arguments, first)) if arguments["against"] is not None else None
@@ -74,11 +77,21 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--campaign", type=Path, default=None, metavar="DIR", help=f"likewise, from DIR/{FILE}")
     add("--unit", default=None, metavar="NAME", help="which unit of the description (the first)")
+    add("--effect", dest="effects", action="append", type=Path, default=[], metavar="FILE",
+        help="an effect of your own (YAML); those of the campaign are read anyway")  # fmt: skip
     add("--against", default=None, metavar="OPTIONS", help="a second procedure: what differs from the first, in quotes")
     add("--json", action="store_true", default=False, help="print the plan as JSON")
     add("--no-extra", dest="extra", action="store_false", default=True, help="leave out what to record more")
     add_recording_options(parser)
     return parser
+
+
+def _register_effects(arguments: Mapping[str, Any]) -> None:
+    """Take effects of the user's own among the candidates."""
+    campaign: Path | None = arguments["campaign"]
+    beside = sorted((campaign / "effects").glob("*.yaml")) if campaign is not None else []
+    for own in read_effect_files([*beside, *arguments["effects"]]).values():
+        register(own)
 
 
 def unit_of(arguments: Mapping[str, Any], base: UnitDescription | None) -> UnitDescription:

@@ -1,6 +1,6 @@
 """The plan of a procedure as a document: what it would find of each effect, and what to record more.
 
-    {"sensor", "table", "procedure", "minutes", "samples", "warnings": [text],
+    {"sensor", "table", "procedure", "at_a_table", "minutes", "samples", "warnings": [text],
      "accelerometer": {"noise": {"white", "wander"}, "unit",
         "effects": [{"effect", "smallest", "unit", "share_of_limit", "almost_sure", "named", "sizes", "taken_for",
                       "look_alikes": [{"effect", "share"}]}],
@@ -63,9 +63,10 @@ def plan_of(unit: UnitDescription, extra: Sequence[Planned] = (), *, half_only: 
         "sensor": unit.sensor,
         "table": unit.table,
         "procedure": unit.procedure,
+        "at_a_table": rehearsal.table["motion"] != "none",
         "minutes": rehearsal.minutes,
         "samples": sum(r.samples for r in rehearsal.recordings),
-        "warnings": limits_broken(rehearsal, unit),
+        "warnings": limits_broken(rehearsal),
         **{sensor: _of_sensor(sensor, rehearsal, half_only=half_only) for sensor in SENSORS},
     }
 
@@ -152,8 +153,8 @@ class Gain:
 def best_changes(unit: UnitDescription, before: Document) -> list[Gain]:
     """Return what each change would bring, the most helpful first.
 
-    First goes the change that shows most effects for each minute at the table (at least one: nothing is set up in
-    less); of those that show nothing new, the one that lowers the smallest sizes most.
+    First goes the change that shows most effects for each minute that it takes (at least one: nothing is set up in
+    less); of those that show nothing new, the one that lowers the smallest sizes most, as a logarithm a minute.
 
     Parameters
     ----------
@@ -161,8 +162,16 @@ def best_changes(unit: UnitDescription, before: Document) -> list[Gain]:
     before : dict
         Its plan.
     """
+    if all(before[sensor]["reason"] for sensor in SENSORS):
+        return []
     gains = [_gain(change, before, plan_of(change.unit, change.extra, half_only=True)) for change in changes(unit)]
-    return sorted(gains, key=lambda gain: (-len(gain.shown) / max(gain.minutes, 1.0), gain.factor))
+    return sorted(gains, key=_worth)
+
+
+def _worth(gain: Gain) -> tuple[float, float]:
+    """Return what sorts the most helpful change first."""
+    minutes = max(gain.minutes, 1.0)
+    return -len(gain.shown) / minutes, float(np.log(gain.factor)) / minutes
 
 
 def _gain(change: Change, before: Document, after: Document) -> Gain:

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.records import Noise, Recording
-from pipeline.simulation.campaign import course_of, simulate_unit
+from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import read_config
 
 if TYPE_CHECKING:
@@ -103,7 +103,7 @@ def noise_of_sheet(sheet: Mapping[str, Any], interval: float, *, long_rest: bool
     return Noise(np.full(3, np.sqrt(variance)), np.full(3, wander), float(sheet.get("wander_time_s") or 100.0), source)
 
 
-def limits_broken(rehearsal: Rehearsal, unit: UnitDescription) -> list[str]:
+def limits_broken(rehearsal: Rehearsal) -> list[str]:
     """Return what the procedure asks of sensor and table that they cannot do, as sentences."""
     full = float(rehearsal.sheets["gyroscope"]["full_scale"])
     rates = [float(np.abs(r.table_rate).max()) for r in rehearsal.recordings if r.table_rate is not None]
@@ -116,6 +116,4 @@ def limits_broken(rehearsal: Rehearsal, unit: UnitDescription) -> list[str]:
             f"the table logs its program, not what it did: angle errors of {angle:g} deg read as "
             f"{1000.0 * np.radians(angle):.2g} mg, and sizes below that are only found if they repeat from stop to stop"
         )
-    if course_of(unit).validation_s <= 0.0:
-        found.append("nothing is held out, so no effect is judged on motion that its fit has not seen")
     return found

@@ -33,7 +33,8 @@ def in_words(document: Mapping[str, Any]) -> list[str]:
 def heading(document: Mapping[str, Any]) -> str:
     """Return what is planned, as a line."""
     what = f"{document['sensor']} on {document['table']}, {document['procedure']}"
-    return f"{what}: {document['minutes']:.1f} min at the table, {document['samples']} samples"
+    where = " at the table" if document["at_a_table"] else ""
+    return f"{what}: {document['minutes']:.1f} min{where}, {document['samples']} samples"
 
 
 def _of_sensor(sensor: str, part: Mapping[str, Any]) -> list[str]:
@@ -125,24 +126,19 @@ def helps_most(gains: Sequence[Gain]) -> list[str]:
     lines = ["what to record more, the most helpful first:"]
     for number, gain in enumerate(gains[:TOP], start=1):
         options = f" ({gain.change.options})" if gain.change.options else ""
-        lines.append(f"  {number}. {gain.change.what}{options}: {_cost(gain.minutes)}")
+        lines.append(f"  {number}. {gain.change.what}{options}: {gain.minutes:+.1f} min")
         lines.append(f"     {_brought(gain)}")
     return lines
 
 
-def _cost(minutes: float) -> str:
-    return f"{minutes:+.1f} min at the table"
-
-
 def _brought(gain: Gain) -> str:
-    parts = []
-    if gain.shown:
-        parts.append("shows " + _listed(gain.shown))
-    if gain.told:
-        parts.append("tells apart " + _listed(gain.told))
+    """Return what a change brings; the factor is a mean over effects and sensors."""
+    parts = [f"shows {_listed(gain.shown)}"] if gain.shown else []
+    parts += [f"tells apart {_listed(gain.told)}"] if gain.told else []
     percent = 100.0 * gain.factor
-    earlier = f"at {percent:.0f} % of the size" if percent < CLEARLY_SMALLER else "no earlier"
-    return "; ".join([*parts, f"finds the others {earlier}"])
+    whose = "the others" if parts else "effects"
+    parts.append(f"finds {whose} " + (f"at {percent:.0f} % of the size" if percent < CLEARLY_SMALLER else "no earlier"))
+    return "; ".join(parts)
 
 
 def _listed(keys: Sequence[str]) -> str:

@@ -28,6 +28,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 TABLE_PROCEDURES = ("three_axis_turns", "thermal_ramp")
+ABOVE_ZERO = (
+    "step_deg", "dwell_s", "accelerometer_rates_dps", "rates_dps", "turns", "acceleration_dps2", "step_rate_dps",
+    "validation_rate_dps",
+)  # fmt: skip
+ZERO_OR_MORE = ("warm_up_rest_s", "rest_s", "validation_s", "static_s", "pause_s", "thermal_ramp_degc")
 STEPS_DEG = (1.0, 2.0, 3.0, 5.0, 10.0, 15.0, 30.0, 45.0, 90.0)
 
 
@@ -81,6 +86,19 @@ class Course:
     pause_s: float = 30.0
     positions: int = 40
     thermal_ramp_degc: float = 15.0
+
+    def __post_init__(self) -> None:
+        for name in ABOVE_ZERO:
+            value = getattr(self, name)
+            if not all(v > 0.0 for v in (value if isinstance(value, tuple) else (value,))):
+                raise ConfigurationError(f"course: {name} is {value}; it must be above 0")
+        for name in ZERO_OR_MORE:
+            if not getattr(self, name) >= 0.0:
+                raise ConfigurationError(f"course: {name} is {getattr(self, name)}; it cannot be below 0")
+        if not self.rates_dps or self.positions < 2 or self.step_deg > 360.0:
+            raise ConfigurationError(
+                "course: give at least one rate in rates_dps, 2 positions, and steps up to 360 deg"
+            )
 
 
 @dataclass(frozen=True)
