@@ -4,7 +4,8 @@ In each round every candidate competes at its own best noise setting. The best o
 
     delta BIC > 10   and   m p < 0.01
 
-where p is that of the likelihood ratio and m the number of candidates (Bonferroni). Where the residual stays above
+where p is that of the likelihood ratio and m the number of candidates (Bonferroni). Beside what is selected, whose
+equations are of first order, it must bring 1/2000 of what that has brought. Where the residual stays above
 twice the noise, an effect must also explain 5 % of the excess: a model that misses something large is mended a little
 by anything small.
 After an effect of timing or with
@@ -48,6 +49,7 @@ CONSTANT_SHARE = 0.6  # the same for an effect with a time constant, whose start
 DELAYS = ("time_offset", "low_pass_lag")  # of the two the first is taken unless the second is clearly better
 CLEARLY = 6.0
 TIE = 0.5
+SECOND_ORDER = 5e-4  # of the gain in 2 log L by what is selected: what equations of first order may leave of it
 FAR_ABOVE = 2.0  # times the noise: the residual of a model that misses more than the catalogue holds
 WORTH_NAMING = 0.05  # share of such a residual's excess that an effect must explain
 ANOTHER_K = 2e-3  # change of K that changes the columns of effects that the axes share
@@ -235,6 +237,7 @@ class _Search:
             self.steps[best.name] = best
             self._accept(best.name)
             self._drop()
+            self._merge()
 
     def _accept(self, name: str) -> None:
         """Fit with the new effect; rebuild the candidates if their columns depend on what has changed."""
@@ -319,8 +322,12 @@ class _Search:
         if any(score.name in effect(name).contains or name in effect(score.name).contains for name in held):
             return False
         real = score.name != DELAYS[1] or score.values[0] > 0
-        significant = score.delta_bic > GATE_BIC and score.p_value * len(self.effects) < GATE_P
+        significant = score.delta_bic > self._gate() and score.p_value * len(self.effects) < GATE_P
         return bool(score.admissible and significant and real and self._matters(score))
+
+    def _gate(self) -> float:
+        """Return the delta BIC to pass: beside large effects, what their equations leave may not pass for another."""
+        return max(GATE_BIC, SECOND_ORDER * 2.0 * (self.fit.log_likelihood - self.base.log_likelihood))
 
     def _matters(self, score: Score) -> bool:
         """Return whether an effect explains a part worth naming of an excess that is far above the noise."""
@@ -365,6 +372,30 @@ class _Search:
                 self.fit = replace(self.fit, terms=tuple(t for t in self.fit.terms if t.effect.name != name))
                 if effect(name).nonlinear:
                     self._refit()
+
+    def _merge(self) -> None:
+        """Replace two selected effects by one that contains the first, where that explains about as much."""
+        for general in self.effects:
+            part = next((n for n in self.names if n in general.contains), None)
+            if part is None or general.name in self.names or not self.ranking.indices(general.name):
+                continue
+            for other in [n for n in self.names if n != part and not effect(n).moves]:
+                kept = [n for n in self.names if n not in (part, other)]
+                if self._criterion([*kept, general.name]) > self._criterion(self.names) - GATE_BIC:
+                    scores = self.ranking.scores(self._selected(kept), self.limits)
+                    self.steps[general.name] = next(s for s in scores if s.name == general.name)
+                    del self.steps[part], self.steps[other]
+                    self.names = [general.name if n == part else n for n in self.names if n != other]
+                    gone = (part, other)
+                    self.fit = replace(self.fit, terms=tuple(t for t in self.fit.terms if t.effect.name not in gone))
+                    self._refit()
+                    return
+
+    def _criterion(self, names: Sequence[str]) -> float:
+        """Return ``2 log L - k log N`` of base and some candidates, at the values of the ranking."""
+        found, _ = self.ranking.of_model(self._selected(names))
+        count = sum(len(effect(n).parameters(self.observations.sensor)) for n in names)
+        return 2.0 * found - count * float(np.log(self.ranking.samples))
 
     def _exchange(self) -> bool:
         """Replace a selected effect by one that explains clearly more in its place."""
