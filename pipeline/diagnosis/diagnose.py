@@ -14,6 +14,7 @@ from pipeline.diagnosis.advice import next_experiment
 from pipeline.diagnosis.first_guess import select_beside, suggested_effect, unexplained
 from pipeline.diagnosis.held_out import held_out_error
 from pipeline.diagnosis.observability import facts_of, not_observable
+from pipeline.diagnosis.pictures import pictures
 from pipeline.diagnosis.wander import fitted_wander
 from pipeline.errors import NotObservableError
 from pipeline.estimation.design import Start, Term
@@ -58,7 +59,7 @@ def diagnose(
     -------
     dict
         ``verdict, residual_over_noise, selected, ranking, not_observable, unexplained, next_experiment, override``;
-        beside these ``configured``, and ``wander`` (``pipeline.diagnosis.wander``).
+        beside these ``configured, wander`` (``pipeline.diagnosis.wander``) and ``pictures`` (``...pictures``).
     """
     sensor = calibration.sensor
     wanted = settings["effects"][sensor]
@@ -71,7 +72,8 @@ def diagnose(
     unknown = unexplained(selection)
     beside = select_beside(selection, unknown, configured, noise, settings["sensor"][sensor])
     document = _document(beside, unknown, configured, recordings, noise, table=settings["table"])
-    return document | {"residual_over_noise": _over_noise(selection, recordings, noise)}
+    shown = pictures(selection, unknown, noise, beside)
+    return document | {"residual_over_noise": _over_noise(selection, recordings, noise), "pictures": shown}
 
 
 def _nothing(sensor: str, configured: list[str], reason: str) -> dict[str, Any]:

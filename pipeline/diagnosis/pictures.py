@@ -48,15 +48,20 @@ MOST = 3  # pictures of what is unexplained
 SIGNALS = {"rate": "speed", "specific_force": "u"}  # what a covariate means where no shape names a signal
 
 
-def pictures(selection: Selection, unexplained: Sequence[Mapping[str, Any]], noise: Noise | None) -> JSON:
+def pictures(
+    selection: Selection, unexplained: Sequence[Mapping[str, Any]], noise: Noise | None, beside: Selection | None = None
+) -> JSON:
     """Return what the pictures of a diagnosis show, small enough to be kept in its document.
 
     Parameters
     ----------
     selection : Selection
+        To which ``unexplained`` belongs.
     unexplained : sequence of mapping
         Entries of the diagnosis: ``covariate``, and ``axes, formulas, coefficients`` of the suggested shape.
     noise : Noise or None
+    beside : Selection, optional
+        The one that the diagnosis reports, where it is another: with the suggested shape in its base.
 
     Returns
     -------
@@ -66,14 +71,15 @@ def pictures(selection: Selection, unexplained: Sequence[Mapping[str, Any]], noi
         the slope, with ``unit, value, standard_uncertainty``; those of the unexplained, where a shape is suggested,
         ``curve_x, curve``.
     """
+    reported = beside or selection
     told = [entry for entry in unexplained if not entry.get("explained_by")][:MOST]
-    if not selection.names and not told:
-        return {"added_variable": None, "unexplained": []}
-    regression = Regression.of(selection)
-    return {
-        "added_variable": _added_variable(regression, selection) if selection.names else None,
-        "unexplained": [_unexplained(regression, selection, entry, noise) for entry in told],
-    }
+    found: JSON = {"added_variable": None, "unexplained": []}
+    if reported.names:
+        found["added_variable"] = _added_variable(Regression.of(reported), reported)
+    if told:
+        regression = Regression.of(selection)
+        found["unexplained"] = [_unexplained(regression, selection, entry, noise) for entry in told]
+    return found
 
 
 def _added_variable(regression: Regression, selection: Selection) -> JSON:
