@@ -19,6 +19,7 @@ from pipeline.diagnosis.wander import fitted_wander
 from pipeline.errors import NotObservableError
 from pipeline.estimation.design import Start, Term
 from pipeline.estimation.effects_stage import AUTO
+from pipeline.estimation.hand_held.rests import by_hand
 from pipeline.estimation.joint import fit_terms
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import FAR_ABOVE, GATE_BIC, select
@@ -41,7 +42,11 @@ CLOSE = 1.1  # mean square of a residual over that of noise, under which there i
 
 
 def diagnose(
-    calibration: SensorCalibration, recordings: Sequence[Recording], noise: Noise | None, settings: Mapping[str, Any]
+    calibration: SensorCalibration,
+    recordings: Sequence[Recording],
+    noise: Noise | None,
+    settings: Mapping[str, Any],
+    accelerometer: SensorCalibration | None = None,
 ) -> dict[str, Any]:
     """Return a sensor's part of ``diagnoses/<unit>.json``.
 
@@ -53,7 +58,9 @@ def diagnose(
         All of the unit; those of role ``validation`` judge, and take no part in the selection.
     noise : Noise or None
     settings : mapping
-        Sections ``sensor``, ``table`` and ``effects``.
+        Sections ``sensor``, ``table`` and ``effects``; ``procedure`` for recordings by hand.
+    accelerometer : SensorCalibration, optional
+        For the gyroscope by hand, which needs the direction of gravity; without it, it is calibrated again.
 
     Returns
     -------
@@ -62,6 +69,10 @@ def diagnose(
         beside these ``configured, wander`` (``pipeline.diagnosis.wander``) and ``pictures`` (``...pictures``).
     """
     sensor = calibration.sensor
+    if by_hand(sensor, recordings):
+        from pipeline.diagnosis.by_hand import diagnose_by_hand  # noqa: PLC0415  (recordings by hand alone)
+
+        return diagnose_by_hand(calibration, recordings, noise, settings, accelerometer)
     wanted = settings["effects"][sensor]
     configured = [] if wanted == AUTO else list(wanted)
     observations = observe(sensor, recordings, settings["table"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import ConfigurationError, InputError
+from pipeline.estimation.hand_held.rests import by_hand
 from pipeline.estimation.joint import fit_joint
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import select
@@ -31,7 +32,7 @@ def fit_effects(
     previous : SensorCalibration or None
         The stage before.
     settings : mapping
-        Sections ``effects``, ``sensor`` and ``table``.
+        Sections ``effects``, ``sensor`` and ``table``; ``procedure`` for recordings by hand.
 
     Returns
     -------
@@ -43,6 +44,10 @@ def fit_effects(
     if not wanted:
         return before
     noise = noise_of(sensor, recordings, settings["sensor"][sensor])
+    if by_hand(sensor, recordings):
+        from pipeline.estimation.hand_held.result import fit_effects_by_hand  # noqa: PLC0415  (recordings by hand alone)
+
+        return fit_effects_by_hand(before, recordings, noise, settings)
     names = list(wanted)
     if wanted == AUTO:
         observations = observe(sensor, recordings, settings["table"])

@@ -23,9 +23,12 @@ def main(argv: Sequence[str]) -> int:
     def work(unit: str, part: dict[str, Any]) -> None:
         recordings = load_recordings(job.inputs["filter"] / f"{unit}.parquet")
         document: dict[str, Any] = {"schema_version": 1, "unit": unit}
-        for sensor, calibration in load_fits(job.inputs, unit).items():
+        fits = load_fits(job.inputs, unit)
+        for sensor, calibration in fits.items():
             noise = estimate_noise(sensor, recordings, part["sensor"][sensor])
-            document[sensor] = found = calibration and diagnose(calibration, recordings, noise, part)
+            document[sensor] = found = calibration and diagnose(
+                calibration, recordings, noise, part, fits["accelerometer"]
+            )
             if found and found["suggested_effect"]:
                 found["suggested_file"] = suggested_file(unit, sensor)
                 write_atomically(job.output / found["suggested_file"], effect_file(found["suggested_effect"], unit))

@@ -1,0 +1,206 @@
+"""Which physical effect is missing, where no table says what the body did: from hand-held rests and moves.
+
+The selection is ``pipeline.estimation.hand_held.selection``; here it becomes the same document that
+``pipeline.diagnosis.diagnose`` makes of a table's recordings. The residual of the rests is compared with what white
+noise and the expected bias wander leave; how firmly a unit rests by hand nobody knows, so that a scatter of the rests
+beyond that is told, but is by itself no sign of a missing effect.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.diagnosis.by_hand_hidden import hidden_effects, next_experiment, nothing_to_see
+from pipeline.diagnosis.by_hand_left import dependences
+from pipeline.errors import CannotCalibrateError
+from pipeline.estimation.hand_held.equations import HandNoise
+from pipeline.estimation.hand_held.likelihood import beside
+from pipeline.estimation.hand_held.result import AUTO, model_of
+from pipeline.estimation.hand_held.selection import select
+from pipeline.estimation.selection import GATE_BIC, INFLATED
+from pipeline.model.effects import effect
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.estimation.hand_held.fit import HandFit
+    from pipeline.estimation.hand_held.selection import HandSelection, Scored
+    from pipeline.estimation.ranking import Score
+    from pipeline.records import Noise, Recording, SensorCalibration
+
+ALIKE = 0.8
+EVIDENCE = 5.0
+
+
+def diagnose_by_hand(
+    calibration: SensorCalibration,
+    recordings: Sequence[Recording],
+    noise: Noise | None,
+    settings: Mapping[str, Any],
+    accelerometer: SensorCalibration | None = None,
+) -> dict[str, Any]:
+    """Return a sensor's part of ``diagnoses/<unit>.json``.
+
+    Parameters
+    ----------
+    calibration : SensorCalibration
+    recordings : sequence of Recording
+        All of the unit; rests that are held out judge, and take no part in the selection.
+    noise : Noise or None
+    settings : mapping
+        Sections ``sensor``, ``table``, ``procedure`` and ``effects``.
+    accelerometer : SensorCalibration, optional
+        For the gyroscope, which needs the direction of gravity; without it, it is calibrated again.
+
+    Returns
+    -------
+    dict
+        As of ``pipeline.diagnosis.diagnose.diagnose``.
+    """
+    sensor = calibration.sensor
+    wanted = settings["effects"][sensor]
+    configured = [] if wanted == AUTO else list(wanted)
+    try:
+        model = model_of(recordings, calibration, noise, settings, accelerometer)
+    except CannotCalibrateError as lack:
+        return nothing_to_see(sensor, configured, lack.message)
+    if model is None:
+        return nothing_to_see(sensor, configured, f"no recording holds a rest with readings of the {sensor}")
+    return _document(select(model, calibration, configured, noise, settings["sensor"][sensor]), configured, noise)
+
+
+def _document(selection: HandSelection, configured: list[str], noise: Noise | None) -> dict[str, Any]:
+    sensor, selected = selection.model.sensor, selection.names
+    hidden = hidden_effects(selection, configured)
+    unknown = dependences(selection)
+    held = [selection.model.held_out_error(fit.state) if selected else None for fit in selection.fits]
+    seen = [s for s in selection.first.scores.values() if s.name not in selected and s.name not in hidden]
+    order = [*selected, *(s.name for s in sorted(seen, key=lambda s: -s.delta_bic))]
+    chi = [_chi(selection, fit, noise) for fit in selection.fits]
+    ranking = [_entry(selection, name, held, chi) for name in order]
+    verdict = "missing_effect" if selected else "nothing_missing" if ranking else "not_enough_data"
+    if unknown and not selected:
+        verdict = "unexplained"
+    over = _over_noise(selection, noise)
+    return {
+        "verdict": verdict,
+        "residual_over_noise": over,
+        "selected": list(selected),
+        "ranking": ranking,
+        "not_observable": [{"effect": name, "reason": reason} for name, reason in hidden.items()],
+        "unexplained": unknown,
+        "suggested_effect": None,
+        "next_experiment": next_experiment(selection, verdict, ranking, hidden, unknown=unknown, over_noise=over),
+        "override": f"effects.{sensor}=[{','.join([*configured, *selected])}]" if selected else "",
+        "configured": configured,
+        "wander": _wander(selection, noise),
+    }
+
+
+def _entry(selection: HandSelection, name: str, held: Sequence[float | None], chi: Sequence[float]) -> dict[str, Any]:
+    """Return one line of the ranking."""
+    score = selection.steps.get(name) or selection.first.scores[name]
+    before = after = None
+    scored, drop = selection.first, 0.0
+    if name in selection.names:
+        step = selection.names.index(name)
+        before, after = held[step], held[step + 1]
+        scored, drop = selection.own[name], chi[step] - chi[step + 1]
+    elif name in scored.signal:
+        drop = float(scored.signal[name] @ scored.signal[name])
+    return {
+        "effect": name,
+        "delta_bic": score.delta_bic,
+        "p_value": score.p_value,
+        "parameters": _parameters(selection, score),
+        "explained_share": _share(drop, chi, len(selection.fits[0].residual) - selection.fits[0].rank),
+        "held_out_error_before": before,
+        "held_out_error_after": after,
+        "look_alikes": _look_alikes(scored, score) if score.delta_bic > GATE_BIC else [],
+        "plausible": score.plausible,
+    }
+
+
+def _share(drop: float, chi: Sequence[float], spare: int) -> float:
+    excess = max(chi[0] - spare, chi[0] - chi[-1], drop)
+    return float(np.clip(drop / excess, 0.0, 1.0)) if excess > 0 else 0.0
+
+
+def _parameters(selection: HandSelection, score: Score) -> dict[str, dict[str, Any]]:
+    """Return the estimates: of the fit of all selected effects, or of the effect alone."""
+    values, uncertainty = score.values, score.uncertainty
+    found = selection.fits[-1]
+    at = selection.model.directions.shape[1]
+    for term in found.state.terms:
+        own = slice(at, at + len(term.values))
+        if term.effect.name == score.name and score.name in selection.names:
+            values, uncertainty = term.values, np.sqrt(np.clip(np.diag(found.covariance)[own], 0.0, None))
+        at = own.stop
+    described = effect(score.name).parameters(selection.model.sensor)
+    return {
+        p.name: {"value": float(v), "unit": p.unit, "standard_uncertainty": float(u) if u > 0 else None}
+        for p, v, u in zip(described, values, uncertainty, strict=True)
+    }
+
+
+def _look_alikes(scored: Scored, score: Score) -> list[dict[str, Any]]:
+    """Return the effects that reproduce most of an effect's fitted signal."""
+    signal = scored.signal.get(score.name)
+    power = 0.0 if signal is None else float(signal @ signal)
+    if signal is None or power == 0.0:
+        return []
+    shares = {
+        name: float(np.sum((shown.T @ signal) ** 2)) / power
+        for name, shown in scored.shown.items()
+        if name != score.name
+    }
+    alike = sorted(((share, name) for name, share in shares.items() if share > ALIKE), reverse=True)
+    return [{"effect": name, "share": min(share, 1.0)} for share, name in alike]
+
+
+def _expected(selection: HandSelection, noise: Noise | None) -> HandNoise:
+    """Return the noise without scatter of the rests, with the wander that is expected."""
+    nothing = (0.0,) * selection.model.kinds
+    if noise is None:
+        return HandNoise(0.0, 1.0, nothing, 0.0)
+    ratio = float(np.sqrt(np.mean(noise.wander**2) / np.mean(noise.white**2)))
+    return HandNoise(ratio, noise.correlation_time, nothing, 0.0)
+
+
+def _chi(selection: HandSelection, fit: HandFit, noise: Noise | None) -> float:
+    """Return the sum of squares of a fit's residual, whitened by the expected noise."""
+    found = beside(selection.model.equations(fit.state), [_expected(selection, noise)])
+    return float(np.sum(found.residual**2))
+
+
+def _over_noise(selection: HandSelection, noise: Noise | None) -> float:
+    """Return the rms residual of the rests, of base and configured effects, over that of noise alone."""
+    equations = selection.model.equations(selection.fits[0].state)
+    at_rest = equations.rows(selection.model.rests_equations)
+    found = beside(at_rest, [_expected(selection, noise)])
+    spare = max(len(at_rest.residual) - float(np.sum(found.basis[0] ** 2)), 1.0)
+    return float(np.sqrt(np.sum(found.residual**2) / spare))
+
+
+def _wander(selection: HandSelection, noise: Noise | None) -> dict[str, Any]:
+    """Return the wander and the scatter of the rests under which the whole model explains the readings best."""
+    found = beside(selection.model.equations(selection.fits[-1].state), selection.noises)
+    scores = found.log_likelihood(np.sum(found.residual**2, axis=1))
+    best = selection.noises[int(np.argmax(scores))]
+    white = float(np.sqrt(np.mean(selection.model.white**2)))
+    expected = None if noise is None else float(np.sqrt(np.mean(noise.wander**2)))
+    inflated = False
+    if expected is not None:
+        most = INFLATED * expected / white
+        believed = [score for score, n in zip(scores, selection.noises, strict=True) if n.ratio <= most]
+        inflated = best.ratio > most and (not believed or bool(scores.max() - max(believed) > EVIDENCE))
+    return {
+        "ratio": float(best.ratio),
+        "time_s": float(best.time) if best.ratio else None,
+        "standard_deviation": float(best.ratio * white),
+        "expected": expected,
+        "inflated": bool(inflated),
+        "scatter_over_noise": float(best.scatter[0]),
+    }

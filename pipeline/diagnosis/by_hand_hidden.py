@@ -1,0 +1,151 @@
+"""Which effects hand-held rests and moves cannot show, and what to record next.
+
+An effect is not observable by hand where there is no table to show it, where it needs what the recordings do not hold,
+where it adds nothing at rest (or in the moves) that bias and matrix do not, where too few rests are left to judge it,
+or where even at the sensor's limits the gain that it reaches on average,
+
+    factor n log(1 + lambda / n),   lambda = sum_j limit_j^2 |column_j|^2,
+
+stays below the gate ``v log n + 10`` (see ``pipeline.estimation.hand_held.likelihood``).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.diagnosis.advice import UNKNOWN
+from pipeline.diagnosis.observability import LEAST_SPAN_DEGC
+from pipeline.estimation.hand_held.model import refusal
+from pipeline.estimation.selection import GATE_BIC
+from pipeline.model.effects import catalogue
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.estimation.hand_held.selection import HandSelection
+    from pipeline.estimation.ranking import Score
+    from pipeline.model.effects.base import Effect
+
+FIRM = 2.0  # times the noise, above which the scatter of the rests is worth a word
+ENOUGH = 40  # rests that leave room for what the catalogue holds
+MORE = f"record {ENOUGH} rests or more, each in another orientation, all three axes inclined in most of them"
+
+
+def hidden_effects(selection: HandSelection, configured: Sequence[str]) -> dict[str, str]:
+    """Return the effects that these recordings cannot show, each with the reason.
+
+    Parameters
+    ----------
+    selection : HandSelection
+    configured : sequence of str
+        Effects of the model, which are not asked for.
+    """
+    found = {}
+    for name, this in catalogue().items():
+        if selection.model.sensor in this.sensors and name not in (*configured, *selection.names):
+            reason = _reason(this, selection)
+            if reason:
+                found[name] = reason
+    return found
+
+
+def _reason(this: Effect, selection: HandSelection) -> str:
+    model = selection.model
+    refused = refusal(this, model.sensor, model.rests)
+    if refused:
+        return refused
+    span = float(np.ptp(model.rests.temperature))
+    if "temperature" in this.needs and span < LEAST_SPAN_DEGC:
+        return f"the temperature changes by no more than {span:.2g} degC; it needs {this.excitation}"
+    score = selection.first.scores.get(this.name)
+    if score is None:
+        seen = "rests and moves by hand" if model.kinds > 1 else "rests"
+        return f"in {seen} bias and matrix explain all that it would add"
+    if not score.admissible:
+        return f"{len(model.rests.time)} rests are too few to tell it from their scatter; {MORE}"
+    return "" if score.delta_bic > GATE_BIC else _faint(this, score, selection)
+
+
+def _faint(this: Effect, score: Score, selection: HandSelection) -> str:
+    """Return why an effect that did not show would not have; empty where it would."""
+    gate = score.parameters * float(np.log(len(selection.fits[0].residual))) + GATE_BIC
+    if selection.last.visible.get(this.name, selection.first.visible[this.name]) >= gate:
+        return ""
+    limit, unit = selection.limits[this.name][0], this.parameters(selection.model.sensor)[0].unit
+    size = f"{limit:.2g}{'' if unit == '1' else ' ' + unit}"
+    rests = len(selection.model.rests.time)
+    return f"even at its limit of {size} it would hide in the scatter of {rests} rests; it needs {this.excitation}"
+
+
+def next_experiment(
+    selection: HandSelection,
+    verdict: str,
+    ranking: Sequence[Mapping[str, Any]],
+    hidden: Mapping[str, str],
+    *,
+    unknown: Sequence[Mapping[str, Any]],
+    over_noise: float,
+) -> str:
+    """Return the experiment that would tell most, as one sentence.
+
+    Parameters
+    ----------
+    selection : HandSelection
+    verdict : str
+    ranking : sequence of mapping
+        Entries of the diagnosis.
+    hidden : mapping
+        Effect that is not observable to the reason.
+    unknown : sequence of mapping
+        Entries of ``unexplained``.
+    over_noise : float
+        Residual of the rests over that of noise.
+    """
+    if verdict == "unexplained":
+        covariate = str(unknown[0]["covariate"])
+        return f"to find out on what the residual depends beside {_plain(covariate)}: {UNKNOWN[covariate]}"
+    if selection.names:
+        return _of_selected({entry["effect"]: entry for entry in ranking}, selection.names)
+    if verdict == "not_enough_data":
+        return MORE
+    if over_noise > FIRM:
+        return (
+            f"set the unit down firmly for each rest: the rests scatter {over_noise:.2g} times the noise and follow "
+            "nothing that is recorded"
+        )
+    if "bias_temperature" in hidden:
+        return f"to see bias temperature: record {catalogue()['bias_temperature'].excitation}"
+    return "none is needed: nothing that these recordings can show is missing"
+
+
+def _of_selected(entries: Mapping[str, Mapping[str, Any]], selected: Sequence[str]) -> str:
+    name = next((n for n in selected if entries[n]["look_alikes"]), selected[0])
+    alike = entries[name]["look_alikes"]
+    if not alike:
+        return f"to confirm {_plain(name)}: {catalogue()[name].experiment}"
+    others = " or ".join(_plain(a["effect"]) for a in alike[:2])
+    return f"to tell {_plain(name)} from {others}: {catalogue()[name].experiment}"
+
+
+def nothing_to_see(sensor: str, configured: list[str], reason: str) -> dict[str, Any]:
+    """Return the document of recordings that tell nothing, for one reason."""
+    names = [n for n, this in catalogue().items() if sensor in this.sensors and n not in configured]
+    return {
+        "verdict": "not_enough_data",
+        "residual_over_noise": None,
+        "selected": [],
+        "ranking": [],
+        "not_observable": [{"effect": name, "reason": reason} for name in names],
+        "unexplained": [],
+        "suggested_effect": None,
+        "next_experiment": MORE,
+        "override": "",
+        "configured": configured,
+        "wander": None,
+    }
+
+
+def _plain(name: str) -> str:
+    return name.replace("_", " ")

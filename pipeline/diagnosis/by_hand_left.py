@@ -1,0 +1,116 @@
+"""What the residual of hand-held rests depends on beside the catalogue.
+
+Curves in one covariate at a time, each with coefficients of its own in every axis, beside base and chosen effects:
+
+    time, temperature : Chebyshev polynomials of degree 1 to d over their span, d = 2 and 3
+    specific_force    : those of degree 4 and 5 of the axis' own component; the catalogue has those below
+
+A covariate is named where one of its tests has delta BIC > 10 and m p < 1e-3, m the number of all tests.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.estimation.design import Term
+from pipeline.estimation.hand_held.likelihood import beside
+from pipeline.estimation.selection import GATE_BIC
+from pipeline.model.effects.base import Effect, Layout, Owner, Parameter
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from pipeline.estimation.hand_held.selection import HandSelection
+    from pipeline.records import Motion
+
+    Values = NDArray[np.float64]
+
+GATE_P = 1e-3
+LEAST_SPAN = 1.0  # s or degC
+
+
+class Curves(Effect):
+    """Curves in a covariate: (n, 3, q) for a motion, an axis' own q."""
+
+    owner = Owner.RECORDING
+    layout = Layout.PER_AXIS
+    excitation = "recordings in which the covariate changes"
+    source = "Chebyshev polynomials"
+
+    def __init__(self, name: str, curves: Callable[[Motion], Values], count: int) -> None:
+        self._name, self._curves, self._count = name, curves, count
+
+    @property
+    def name(self) -> str:  # type: ignore[override]  # curves are named after their covariate
+        """Name of the covariate."""
+        return self._name
+
+    def parameters(self, sensor: str) -> tuple[Parameter, ...]:
+        """Return the coefficients."""
+        del sensor
+        return tuple(Parameter(f"{a}_{j}", "1", "coefficient") for a in "xyz" for j in range(self._count))
+
+    def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
+        """Return the curves."""
+        del sensor, K, values
+        return self._curves(motion)
+
+
+def dependences(selection: HandSelection) -> list[dict[str, Any]]:
+    """Return the covariates on which the residual still depends, each with its p-value, the likeliest first.
+
+    Parameters
+    ----------
+    selection : HandSelection
+    """
+    from scipy.special import chdtrc  # noqa: PLC0415  (0.1 s that only a diagnosis pays)
+
+    curves = _curves_of(selection)
+    terms = [Term(c, np.zeros(len(c.parameters(selection.model.sensor)))) for c in curves]
+    equations = selection.model.equations(selection.fits[-1].state, terms)
+    found = beside(equations, selection.noises)
+    before, at = found.of_model()
+    named: dict[str, tuple[float, float]] = {}
+    for j, this in enumerate(curves):
+        count = found.count(j, at)
+        factor = found.correction(j, at, count, equations.scatter) if count else 0.0
+        gain = factor * max(2.0 * (found.of_candidate(j)[0] - before), 0.0)
+        delta = gain - count * float(np.log(len(equations.residual)))
+        p = float(chdtrc(max(count, 1), gain))
+        if delta > GATE_BIC and p * len(curves) < GATE_P and delta > named.get(this.name, (0.0, 1.0))[0]:
+            named[this.name] = (delta, p)
+    ordered = sorted(named.items(), key=lambda item: -item[1][0])
+    return [{"covariate": name, "p_value": p} for name, (_, p) in ordered]
+
+
+def _curves_of(selection: HandSelection) -> list[Curves]:
+    rests = selection.model.rests
+    curves = []
+    if np.ptp(rests.time) > LEAST_SPAN and rests.clock_shared:
+        curves += [Curves("time", _along(lambda m: m.time, rests.time, d), d) for d in (2, 3)]
+    if not np.isnan(rests.temperature).any() and np.ptp(rests.temperature) > LEAST_SPAN:
+        curves += [Curves("temperature", _along(lambda m: m.temperature, rests.temperature, d), d) for d in (2, 3)]
+    if selection.model.sensor == "accelerometer":
+        curves.append(Curves("specific_force", _force, 2))
+    return curves
+
+
+def _along(of: Callable[[Motion], Values | None], values: Values, degree: int) -> Callable[[Motion], Values]:
+    low, high = float(values.min()), float(values.max())
+
+    def curves(motion: Motion) -> Values:
+        value = of(motion)
+        assert value is not None  # noqa: S101
+        scaled = np.asarray(2.0 * (value - low) / (high - low) - 1.0)
+        powers = np.polynomial.chebyshev.chebvander(scaled, degree)[:, 1:]
+        return np.asarray(np.broadcast_to(powers[:, None, :], (len(scaled), 3, degree)), np.float64)
+
+    return curves
+
+
+def _force(motion: Motion) -> Values:
+    return np.asarray(np.polynomial.chebyshev.chebvander(motion.specific_force, 5)[:, :, 4:], np.float64)

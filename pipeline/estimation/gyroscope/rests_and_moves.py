@@ -1,0 +1,112 @@
+"""Bias and matrix of the gyroscope from hand-held rests and moves (Tedaldi, Pretto & Menegatti, ICRA 2014).
+
+At rest the reading is the bias; in a move, the integrated reading must turn the direction of gravity before it into
+that after it. The accelerometer is calibrated on the way, and gives the frame. The equations are those of
+``pipeline.estimation.hand_held.gyroscope``; both kinds are weighted by their own scatter.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.errors import CannotCalibrateError, ConfigurationError, InputError, NotObservableError
+from pipeline.estimation.hand_held.equations import noises_for
+from pipeline.estimation.hand_held.fit import fit as fit_by_hand
+from pipeline.estimation.hand_held.gyroscope import FEWEST_MOVES, model_of
+from pipeline.estimation.hand_held.likelihood import NEW
+from pipeline.estimation.hand_held.model import State
+from pipeline.estimation.hand_held.rests import by_hand
+from pipeline.records import AXES, SensorCalibration, StageResult
+from pipeline.signal.noise import estimate_noise
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.records import Recording
+
+NAME = "rests_and_moves"
+ADVICE = "record some 24 rests, each in another orientation, with moves about changing axes between them"
+
+
+def fit(
+    recordings: Sequence[Recording], previous: SensorCalibration | None, settings: Mapping[str, Any]
+) -> SensorCalibration:
+    """Fit bias and matrix of the gyroscope.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+        Those of role ``rests``.
+    previous : SensorCalibration or None
+        Only its stages are kept.
+    settings : mapping
+        Sections ``table`` (``gravity_g``), ``procedure`` (``holdout_every``) and ``sensor``.
+
+    Returns
+    -------
+    SensorCalibration
+
+    Raises
+    ------
+    CannotCalibrateError
+        If there are no rests by hand, or the accelerometer cannot be calibrated.
+    NotObservableError
+        If the moves are too few or too much alike.
+    """
+    if not by_hand("gyroscope", recordings):
+        raise CannotCalibrateError(f"rests and moves need a recording by hand with the gyroscope's readings: {ADVICE}")
+    try:
+        noise = estimate_noise("gyroscope", list(recordings), settings["sensor"]["gyroscope"])
+    except (ConfigurationError, InputError):
+        noise = None
+    model = model_of(recordings, None, noise, settings)
+    if model is None or model.moves is None:
+        raise NotObservableError(
+            f"the gyroscope's matrix needs at least {FEWEST_MOVES} moves between rests, without gaps or clipped "
+            f"readings: {ADVICE}"
+        )
+    start = State(np.average(model.rests.reading, axis=0, weights=model.rests.count), np.eye(3))
+    _require_determined(model.equations(start).base)
+    found = fit_by_hand(model, start, noises_for(noise, model.kinds))
+    names = [f"bias_{a}" for a in AXES] + [f"matrix_{a}{b}" for a in AXES for b in AXES]
+    values = np.concatenate([found.state.bias, found.state.matrix.ravel()])
+    uncertainty = np.sqrt(np.diag(found.covariance))
+    parameters = {
+        name: {"value": float(v), "unit": "deg/s" if i < 3 else "1", "standard_uncertainty": float(u)}
+        for i, (name, v, u) in enumerate(zip(names, values, uncertainty, strict=True))
+    }
+    apart = found.residual[model.rests_equations :] * found.error[model.rests_equations :]
+    at_rest = found.residual[: model.rests_equations] * found.error[: model.rests_equations]
+    details = {
+        "rests": len(model.rests.time),
+        "moves": model.moves.count,
+        "direction_error_rms_deg": float(np.sqrt(np.mean(apart**2))),
+        "scatter_of_rests": found.noise.scatter[0],
+        "scatter_of_moves": found.noise.scatter[1],
+        "condition": found.condition,
+        "degrees_of_freedom": found.degrees_of_freedom,
+    }
+    correction = {"steps": [{"subtract": found.state.bias.tolist()}, {"matrix": found.state.matrix.tolist()}]}
+    result = StageResult(NAME, parameters, float(np.sqrt(np.mean(at_rest**2))), correction, details)
+    return SensorCalibration(
+        sensor="gyroscope",
+        bias=found.state.bias,
+        matrix=found.state.matrix,
+        stages=(*(previous.stages if previous else ()), result),
+        covariance=found.covariance,
+        degrees_of_freedom=found.degrees_of_freedom,
+        converged=found.converged,
+    )
+
+
+def _require_determined(base: NDArray[np.float64]) -> None:
+    size = np.linalg.norm(base, axis=0)
+    s = np.linalg.svd(base / np.where(size > 0.0, size, 1.0), compute_uv=False)
+    if s[-1] < NEW * s[0]:
+        raise NotObservableError(
+            f"the moves are too much alike to determine the gyroscope's matrix, as if all were about one axis: {ADVICE}"
+        )

@@ -1,0 +1,150 @@
+"""The linear form to which rests and moves are brought, and the noise that is in it.
+
+    r = X d + e,    cov e = k C,    C = I + S + sum_j a_j^2 diag(g_j) + q^2 H R H^T
+
+where
+
+r   : (n,) residuals of base and effects, each over the standard deviation that white noise gives it
+X   : (n, p) derivatives of the model with respect to its parameters, d the step of these
+S   : (n, n) what the reference, the accelerometer, has in common for several equations of the gyroscope
+g_j : (n,) scatter of the rests, or of the moves, beyond white noise (tremor, creep), in units of a typical white error;
+      a_j is its size
+H   : (n, 3 t) what a bias of each axis in each of t stretches of time does to the equations, over its white noise
+R   : (t, t) correlation of a bias wander between the stretches, averaged over each, the same for the axes
+q   : wander over white noise
+k   : at least 1, what is left of the scatter when the noise is chosen from a grid
+
+By hand nobody knows beforehand how firmly a unit rests, so that ``a``, ``q`` and ``k`` are free in every comparison.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from itertools import product
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.estimation.wandering import settings_for
+from pipeline.signal.wander import block_covariance
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.records import Noise
+
+    Values = NDArray[np.float64]
+
+LEVELS = (0.0, 2.0, 6.0, 20.0)
+
+
+@dataclass(frozen=True)
+class HandNoise:
+    """One noise: wander over white noise, its correlation time in s, scatter of each kind, a prior log weight."""
+
+    ratio: float
+    time: float
+    scatter: tuple[float, ...]
+    prior: float
+
+
+@dataclass(frozen=True)
+class Equations:
+    """The linear form at some parameters.
+
+    Attributes
+    ----------
+    residual : (n,) array
+    base : (n, b) array
+        Columns of bias and matrix.
+    effects : list of (n, p) array
+        Columns of the effects of the model.
+    candidates : list of (n, p) array
+        Columns of effects that are not in it.
+    scatter : (s, n) array
+        The g_j.
+    wander : (3, n, t) array
+        H, axis by axis.
+    start, length : (t,) arrays, s
+        The stretches of time.
+    joined : (t, t) array of bool
+        Whether the time between them is known.
+    error : (n,) array, g, deg/s or deg
+        By how much white noise scatters each equation.
+    common : (n, n) array or None
+        S.
+    """
+
+    residual: Values
+    base: Values
+    effects: list[Values]
+    candidates: list[Values]
+    scatter: Values
+    wander: Values
+    start: Values
+    length: Values
+    joined: NDArray[np.bool_]
+    error: Values
+    common: Values | None = None
+    _kernels: dict[float, Values] = field(default_factory=dict, compare=False, repr=False)
+
+    @property
+    def columns(self) -> Values:
+        """Columns of the model: (n, b + p) array."""
+        return np.concatenate([self.base, *self.effects], axis=1)
+
+    def rows(self, count: int) -> Equations:
+        """Return the first equations alone."""
+        return Equations(
+            self.residual[:count],
+            self.base[:count],
+            [columns[:count] for columns in self.effects],
+            [columns[:count] for columns in self.candidates],
+            self.scatter[:, :count],
+            self.wander[:, :count],
+            self.start,
+            self.length,
+            self.joined,
+            self.error[:count],
+            None if self.common is None else self.common[:count, :count],
+        )
+
+    def kernel(self, time: float) -> Values:
+        """Return ``H R H^T`` for a correlation time: (n, n) array."""
+        if time not in self._kernels:
+            R = np.where(self.joined, block_covariance(self.start, self.length, time), 0.0)
+            self._kernels[time] = np.sum(self.wander @ R @ self.wander.transpose(0, 2, 1), axis=0)
+        return self._kernels[time]
+
+    def covariance(self, noise: HandNoise) -> Values:
+        """Return C: (n, n) array."""
+        C = np.diag(1.0 + np.square(noise.scatter) @ self.scatter)
+        if self.common is not None:
+            C += self.common
+        return C + noise.ratio**2 * self.kernel(noise.time) if noise.ratio else C
+
+    def whitened(self, noise: HandNoise, values: Values) -> tuple[Values, float]:
+        """Return (n, p) values with ``L^-1`` applied, where ``L L^T = C``, and log det C."""
+        from scipy.linalg.lapack import dpotrf, dtrtrs  # noqa: PLC0415  (0.1 s that only fits pay)
+
+        L, failed = dpotrf(self.covariance(noise), lower=1)
+        assert failed == 0  # noqa: S101
+        solved, failed = dtrtrs(L, values, lower=1)
+        assert failed == 0  # noqa: S101
+        return solved, 2.0 * float(np.sum(np.log(np.diag(L))))
+
+
+def noises_for(noise: Noise | None, kinds: int) -> list[HandNoise]:
+    """Return the noises over which likelihoods are maximised: every wander with every scatter of each kind.
+
+    Parameters
+    ----------
+    noise : Noise or None
+        A static recording pins the wander.
+    kinds : int
+        Of scatter: that of rests, and that of moves.
+    """
+    levels: Sequence[tuple[float, ...]] = list(product(LEVELS, repeat=kinds))
+    return [HandNoise(s.ratio, s.time, level, s.prior) for s in settings_for(noise) for level in levels]

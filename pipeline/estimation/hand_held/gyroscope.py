@@ -1,0 +1,325 @@
+"""The gyroscope by hand: at rest it feels nothing, and a move must turn gravity before into gravity after.
+
+    at rest:  r = (y - b - z) / s_e,     dr/db = -1/s_e,   dr/dp = -dz/dp / s_e
+    a move:   r = W E^T (u_after - A_0 u_before),   omega = M (y - b - z)
+
+where
+
+    y, b, M : reading and bias, deg/s, and matrix
+    z, p    : effects and their parameters, with the specific force of the accelerometer, at rest and as it is turned on
+    u       : direction of gravity by the calibrated accelerometer; A_0 as in ``pipeline.estimation.hand_held.moves``
+    E       : two directions across u_after; W whitens what noise of the gyroscope, integrated, and of the accelerometer
+              leave there
+
+The errors of u are those of the rests' means, which two moves share, and those of the accelerometer's calibration,
+which all share: ``du = (1 - u u^T) (M_a dy - M_a db_a + dM_a v_a) / G``.
+
+Source of the moves: Tedaldi, Pretto & Menegatti, ICRA 2014, eq. 12. A turn about the vertical says nothing in one move,
+but in another move it does, as the vertical is elsewhere in the body. The frame is that of the accelerometer's matrix.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.errors import CannotCalibrateError, NotObservableError
+from pipeline.estimation.accelerometer import nonlinear_least_squares
+from pipeline.estimation.hand_held.accelerometer import SMALLEST_NOISE, white_of
+from pipeline.estimation.hand_held.equations import Equations
+from pipeline.estimation.hand_held.model import State, added, motion_of
+from pipeline.estimation.hand_held.moves import moves_of, skew, tangents, to_the_end
+from pipeline.estimation.hand_held.rests import rests_of
+from pipeline.model.effects import effect
+from pipeline.model.inversion import compensate
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.estimation.design import Term
+    from pipeline.estimation.hand_held.moves import Moves
+    from pipeline.estimation.hand_held.rests import Rests
+    from pipeline.records import Motion, Noise, Recording, SensorCalibration
+
+    Values = NDArray[np.float64]
+
+FEWEST_MOVES = 6  # two equations each, for the nine of the matrix
+ROUNDS = 6
+SETTLED_DPS = 1e-7
+
+
+class HandHeldGyroscope:
+    """Equations of the gyroscope's rests and moves.
+
+    Parameters
+    ----------
+    rests : Rests
+        All, also those held out: a move may begin at one.
+    moves : Moves or None
+    force : (m, 3) array, g
+        Specific force of each rest by the accelerometer.
+    spread : (m,) array, g
+        Standard deviation of each by the scatter of the accelerometer's rests.
+    shared : (m, 3, 12) array, g
+        What the errors of the accelerometer's calibration, each of its standard uncertainty, do to the force.
+    noise : Noise or None
+    """
+
+    sensor = "gyroscope"
+
+    def __init__(  # noqa: PLR0917  (they are the observations)
+        self, rests: Rests, moves: Moves | None, force: Values, spread: Values, shared: Values, noise: Noise | None
+    ) -> None:
+        self.white = np.maximum(white_of(rests, noise), SMALLEST_NOISE)
+        self.rests, self.force = rests.select(~rests.held_out), force[~rests.held_out]
+        self.held, self.held_force = rests.select(rests.held_out), force[rests.held_out]
+        self.moves = moves if moves is not None and moves.count >= FEWEST_MOVES else None
+        self.kinds = 1 if self.moves is None else 2
+        self.directions = np.eye(12)[:, : 3 if self.moves is None else 12]
+        self.rests_equations = 3 * len(self.rests.time)
+        self.gravity = float(np.median(np.linalg.norm(force, axis=1)))
+        if self.moves is not None:
+            u = force / np.linalg.norm(force, axis=1, keepdims=True)
+            self.before, self.after = u[self.moves.before], u[self.moves.after]
+            across = np.eye(3) - u[:, :, None] * u[:, None, :]
+            self.spread = np.degrees(spread / self.gravity)[:, None, None] * across
+            self.shared = np.degrees(across @ shared / self.gravity)
+            self.every = rests
+
+    def equations(self, state: State, candidates: Sequence[Term] = ()) -> Equations:
+        """Return the linear form at some parameters."""
+        pieces = [self._at_rest(state, candidates)]
+        if self.moves is not None:
+            pieces.append(self._of_moves(state, candidates))
+        sizes = [len(piece["residual"]) for piece in pieces]
+        stretches = [piece["wander"].shape[2] for piece in pieces]
+        wander = np.zeros((3, sum(sizes), sum(stretches)))
+        scatter = np.zeros((len(pieces), sum(sizes)))
+        row = column = 0
+        for kind, piece in enumerate(pieces):
+            own = slice(row, row + sizes[kind])
+            wander[:, own, column : column + stretches[kind]] = piece["wander"]
+            scatter[kind, own] = np.square(np.median(piece["error"]) / piece["error"])
+            row, column = own.stop, column + stretches[kind]
+        recording = np.concatenate([piece["recording"] for piece in pieces])
+        same = recording[:, None] == recording
+
+        def stacked(name: str) -> Any:  # noqa: ANN401
+            return np.concatenate([piece[name] for piece in pieces])
+
+        return Equations(
+            residual=stacked("residual"),
+            base=stacked("base") @ self.directions,
+            effects=[np.concatenate(z) for z in zip(*(piece["effects"] for piece in pieces), strict=True)],
+            candidates=[np.concatenate(z) for z in zip(*(piece["candidates"] for piece in pieces), strict=True)],
+            scatter=scatter,
+            wander=wander,
+            start=stacked("start"),
+            length=stacked("length"),
+            joined=np.ones_like(same) if self.rests.clock_shared else same,
+            error=stacked("error"),
+            common=None if self.moves is None else _placed(pieces[1]["common"], sizes[0]),
+        )
+
+    def samples(self) -> float:
+        """Return how many samples are behind the equations."""
+        return float(self.rests.count.sum()) + (0.0 if self.moves is None else float(np.sum(self.moves.weight > 0)))
+
+    def held_out_error(self, state: State) -> float | None:
+        """Return the rms of the rate at rests that no fit sees, deg/s; None where there are none."""
+        if len(self.held.time) == 0:
+            return None
+        nothing = np.zeros_like(self.held_force)
+        motion = motion_of(self.held.time, self.held_force, nothing, self.held.temperature, still=True)
+        left = self.held.reading - state.bias - added(self.sensor, state.terms, motion, state.K)
+        return float(np.sqrt(np.mean(np.sum((left @ state.matrix.T) ** 2, axis=1))))
+
+    def _at_rest(self, state: State, candidates: Sequence[Term]) -> dict[str, Any]:
+        rests, K = self.rests, state.K
+        motion = motion_of(rests.time, self.force, np.zeros_like(self.force), rests.temperature, still=True)
+        error = np.sqrt(rests.share[:, None]) * self.white
+        left = rests.reading - state.bias - added(self.sensor, state.terms, motion, K)
+        m = len(rests.time)
+        base = np.zeros((m, 3, 12))
+        base[:, :, :3] = np.eye(3)
+        wander = np.zeros((3, m, 3, m))
+        for c in range(3):
+            wander[c, np.arange(m), c, np.arange(m)] = self.white[c] / error[:, c]
+
+        def columns(term: Term) -> Values:
+            Z = term.effect.columns(self.sensor, motion, K, term.values) / error[:, :, None]
+            return np.asarray(Z.reshape(3 * m, -1))
+
+        return {
+            "residual": (left / error).ravel(),
+            "base": (base / error[:, :, None]).reshape(3 * m, 12),
+            "effects": [columns(term) for term in state.terms],
+            "candidates": [columns(term) for term in candidates],
+            "wander": wander.reshape(3, 3 * m, m),
+            "error": error.ravel(),
+            "start": rests.start,
+            "length": rests.length,
+            "recording": rests.recording,
+        }
+
+    def _of_moves(self, state: State, candidates: Sequence[Term]) -> dict[str, Any]:
+        moves = self.moves
+        assert moves is not None  # noqa: S101
+        motion, v, A = self._turned(state)
+        predicted = np.einsum("kij,kj->ki", A[:, 0], self.before)
+        E = tangents(self.after)
+        P = moves.weight[:, :, None, None] * (
+            (E @ skew(predicted))[:, None] @ A
+        )  # of a rate at a sample, deg per deg/s
+        PM = P @ state.matrix
+        directions = self._directions(E, A[:, 0])
+        own = np.einsum("ksij,j,kslj->kil", PM, self.white**2, PM)
+        means = np.einsum("kimc,mcd->kimd", directions, self.spread)
+        variance = own + np.einsum("kimd,klmd->kil", means, means)
+        W = np.asarray(np.linalg.solve(np.linalg.cholesky(variance), np.eye(2)), np.float64)
+        base = np.concatenate([-PM.sum(axis=1), np.einsum("ksei,ksj->keij", P, v).reshape(moves.count, 2, 9)], axis=2)
+        n = 2 * moves.count
+        wander = np.zeros((3, moves.count, 2, moves.count))
+        held = -W @ PM.sum(axis=1) * self.white
+        wander[:, np.arange(moves.count), :, np.arange(moves.count)] = held.transpose(0, 2, 1)
+
+        def columns(term: Term) -> Values:
+            K = state.K
+            Z = term.effect.columns(self.sensor, motion, K, term.values).reshape(*moves.weight.shape, 3, -1)
+            return np.asarray((W @ -np.einsum("ksej,ksjp->kep", PM, Z)).reshape(n, -1))
+
+        apart = np.degrees(np.einsum("kej,kj->ke", E, self.after - predicted))
+        return {
+            "residual": np.einsum("kij,kj->ki", W, apart).ravel(),
+            "base": (W @ base).reshape(n, 12),
+            "effects": [columns(term) for term in state.terms],
+            "candidates": [columns(term) for term in candidates],
+            "wander": wander.reshape(3, n, moves.count),
+            "error": np.sqrt(np.einsum("kii->ki", variance)).ravel(),
+            "common": self._common(W, directions),
+            "start": moves.time[:, 0],
+            "length": moves.time[:, -1] - moves.time[:, 0],
+            "recording": self.every.recording[moves.after],
+        }
+
+    def _directions(self, E: Values, A: Values) -> Values:
+        """Return what an error of each rest's direction does to each move: (k, 2, m, 3) array."""
+        assert self.moves is not None  # noqa: S101
+        out = np.zeros((self.moves.count, 2, len(self.every.time), 3))
+        rows = np.arange(self.moves.count)
+        out[rows, :, self.moves.after] = E
+        out[rows, :, self.moves.before] = -E @ A
+        return out
+
+    def _common(self, W: Values, directions: Values) -> Values:
+        """Return what the accelerometer's errors have in common for different moves: (2 k, 2 k) array."""
+        n = 2 * len(W)
+        directions = np.einsum("kij,kjmc->kimc", W, directions)
+        means = np.einsum("kimc,mcd->kimd", directions, self.spread).reshape(n, -1)
+        calibration = np.einsum("kimc,mcp->kip", directions, self.shared).reshape(n, -1)
+        apart = np.kron(np.eye(len(W)), np.ones((2, 2))) == 0.0
+        common: Values = np.where(apart, means @ means.T, 0.0) + calibration @ calibration.T
+        return common
+
+    def _turned(self, state: State) -> tuple[Motion, Values, Values]:
+        """Return the motion of all samples of the moves, ``v = y - b - z`` and A."""
+        moves, K = self.moves, state.K
+        assert moves is not None  # noqa: S101
+        plain = moves.reading - state.bias
+        rate, A = self._integrated(plain, state)
+        v = plain
+        for _ in range(ROUNDS if state.terms else 0):
+            v = plain - added(self.sensor, state.terms, self._motion(rate, A), K).reshape(plain.shape)
+            before = rate
+            rate, A = self._integrated(v, state)
+            if np.abs(rate - before).max() < SETTLED_DPS:
+                break
+        return self._motion(rate, A), v, A
+
+    def _integrated(self, v: Values, state: State) -> tuple[Values, Values]:
+        assert self.moves is not None  # noqa: S101
+        rate = v @ state.matrix.T
+        return rate, to_the_end(rate, self.moves.time)
+
+    def _motion(self, rate: Values, A: Values) -> Motion:
+        assert self.moves is not None  # noqa: S101
+        end = np.einsum("kij,kj->ki", A[:, 0], self.before)
+        force = self.gravity * np.einsum("ksij,ki->ksj", A, end)
+        shape = (-1, 3)
+        warmth = self.moves.temperature.ravel()
+        return motion_of(self.moves.time.ravel(), force.reshape(shape), rate.reshape(shape), warmth, still=False)
+
+
+def _placed(block: Values, first: int) -> Values:
+    """Return a block behind ``first`` rows and columns of zeros."""
+    out = np.zeros((first + len(block), first + len(block)))
+    out[first:, first:] = block
+    return out
+
+
+def model_of(
+    recordings: Sequence[Recording],
+    calibration: SensorCalibration | None,
+    noise: Noise | None,
+    settings: Mapping[str, Any],
+    accelerometer: SensorCalibration | None = None,
+) -> HandHeldGyroscope | None:
+    """Return the model of the recordings' rests and moves, or None where they hold no rest.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+    calibration : SensorCalibration or None
+        Of the gyroscope; not looked at.
+    noise : Noise or None
+    settings : mapping
+        Sections ``table`` and ``procedure``.
+    accelerometer : SensorCalibration, optional
+        Without it, the accelerometer is calibrated here.
+
+    Raises
+    ------
+    CannotCalibrateError
+        If the accelerometer cannot be calibrated.
+    """
+    del calibration
+    if accelerometer is None:
+        try:
+            accelerometer = nonlinear_least_squares.fit(recordings, None, settings)
+        except NotObservableError as lack:
+            raise CannotCalibrateError(
+                f"the gyroscope by hand needs the direction of gravity by a calibrated accelerometer: {lack.message}"
+            ) from lack
+    felt = rests_of("accelerometer", recordings, settings, accelerometer)
+    turned = rests_of("gyroscope", recordings, settings, accelerometer)
+    if felt is None or turned is None:
+        return None
+    keys = [set(zip(r.recording.tolist(), r.span[:, 0].tolist(), strict=True)) for r in (felt, turned)]
+    both = keys[0] & keys[1]
+    felt, turned = (
+        r.select(np.array([key in both for key in zip(r.recording.tolist(), r.span[:, 0].tolist(), strict=True)]))
+        for r in (felt, turned)
+    )
+    if len(turned.time) == 0:
+        return None
+    motion = motion_of(felt.time, felt.reading, np.zeros_like(felt.reading), felt.temperature, still=True)
+    known = [e for e in accelerometer.effects if not effect(e.name).moves]
+    force = compensate(accelerometer, felt.reading, motion, known)
+    between = [float(stage.details.get("scatter_between_rests") or 0.0) for stage in accelerometer.stages]
+    spread = np.sqrt(felt.share * float(np.mean(felt.white**2)) + max(between, default=0.0) ** 2)
+    shared = _of_calibration(accelerometer, felt.reading)
+    return HandHeldGyroscope(turned, moves_of(recordings, turned), force, spread, shared, noise)
+
+
+def _of_calibration(accelerometer: SensorCalibration, reading: Values) -> Values:
+    """Return what errors of one standard uncertainty, independent of each other, do to the force: (m, 3, 12) array."""
+    if accelerometer.covariance is None:
+        return np.zeros((len(reading), 3, 12))
+    values, vectors = np.linalg.eigh(accelerometer.covariance[:12, :12])
+    root = vectors * np.sqrt(np.clip(values, 0.0, None))
+    v = reading - accelerometer.bias
+    change: Values = -accelerometer.matrix @ root[:3] + np.einsum("mj,ijp->mip", v, root[3:].reshape(3, 3, -1))
+    return change

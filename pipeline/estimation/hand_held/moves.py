@@ -1,0 +1,156 @@
+"""Moves between rests: how the gyroscope's readings turn the direction of gravity.
+
+    dR/dt = R [omega]x,   R[k+1] = R[k] exp [phi_k]x,   phi_k = (omega_k + omega_k+1) dt/2 + omega_k x omega_k+1 dt^2/12
+    u_end = A_0 u_start,   A_k = R_end^T R_k,   du_end = u_end x sum_k A_k domega_k w_k
+
+where
+
+    omega : angular rate in the body frame, rad/s; between two samples a straight line (Savage 1998, coning term)
+    u     : unit vector along the specific force, in the body frame
+    A_k   : takes vectors from the body at sample k to the body at the end of the move
+    w_k   : weight of sample k in an integral by the trapezoidal rule, s
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.estimation.rest_means import sound_samples
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.estimation.hand_held.rests import Rests
+    from pipeline.records import Recording
+
+    Values = NDArray[np.float64]
+
+LONGEST_S = 60.0
+GAP = 3.5  # intervals without a sample, over which a rate is not interpolated
+LEAST_TURN_DEG = 5.0
+
+
+@dataclass(frozen=True)
+class Moves:
+    """The samples of all moves, padded to the longest.
+
+    Attributes
+    ----------
+    before, after : (k,) array of int
+        Rests between which each move lies.
+    reading : (k, s, 3) array, deg/s
+        The last sample is repeated.
+    time : (k, s) array, s
+    temperature : (k, s) array, degC
+        As of the rests before and after, in between by straight line; NaN where none was recorded.
+    weight : (k, s) array, s
+        0 beyond a move's end.
+    """
+
+    before: NDArray[np.intp]
+    after: NDArray[np.intp]
+    reading: Values
+    time: Values
+    temperature: Values
+    weight: Values
+
+    @property
+    def count(self) -> int:
+        """Number of moves."""
+        return len(self.before)
+
+
+def moves_of(recordings: Sequence[Recording], rests: Rests) -> Moves | None:
+    """Return the moves of which the rest at the end is for the fit, or None where there is none.
+
+    Left out are those with clipped, stuck or missing readings, with a gap, or longer than a minute.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+    rests : Rests
+        All of the gyroscope, also those held out.
+    """
+    found = []
+    for i, j in zip(range(len(rests.time) - 1), range(1, len(rests.time)), strict=True):
+        recording = recordings[rests.recording[j]]
+        span = slice(int(rests.span[i, 1]) - 1, int(rests.span[j, 0]) + 1)
+        if rests.held_out[j] or rests.recording[i] != rests.recording[j] or not _sound(recording, span):
+            continue
+        found.append((i, j, span))
+    if not found:
+        return None
+    longest = max(span.stop - span.start for _, _, span in found)
+    shape = (len(found), longest)
+    reading, time, weight = np.zeros((*shape, 3)), np.zeros(shape), np.zeros(shape)
+    for row, (_, j, span) in enumerate(found):
+        recording = recordings[rests.recording[j]]
+        n = span.stop - span.start
+        values = recording.gyroscope
+        assert values is not None  # noqa: S101
+        reading[row, :n], reading[row, n:] = values[span], values[span.stop - 1]
+        time[row, :n], time[row, n:] = recording.time[span], recording.time[span.stop - 1]
+        step = np.diff(recording.time[span])
+        weight[row, : n - 1] += step / 2.0
+        weight[row, 1:n] += step / 2.0
+    before, after = np.array([[i, j] for i, j, _ in found]).T
+    share = (time - rests.time[before][:, None]) / (rests.time[after] - rests.time[before])[:, None]
+    warm = rests.temperature[before][:, None]
+    temperature = warm + share * (rests.temperature[after][:, None] - warm)
+    return Moves(before, after, reading, time, temperature, weight)
+
+
+def _sound(recording: Recording, span: slice) -> bool:
+    time = recording.time[span]
+    whole = bool(np.all(sound_samples(recording, "gyroscope")[span]))
+    return whole and len(time) > 2 and time[-1] - time[0] < LONGEST_S and np.diff(time).max() < GAP * recording.interval
+
+
+def to_the_end(rate: Values, time: Values) -> Values:
+    """Return A_k for every sample of every move: (k, s, 3, 3) array.
+
+    Parameters
+    ----------
+    rate : (k, s, 3) array, deg/s
+    time : (k, s) array, s
+    """
+    omega, dt = np.radians(rate), np.diff(time, axis=1)[:, :, None]
+    phi = 0.5 * (omega[:, 1:] + omega[:, :-1]) * dt + np.cross(omega[:, :-1], omega[:, 1:]) * dt**2 / 12.0
+    back = _exponential(-phi)
+    A = np.empty((*rate.shape[:2], 3, 3))
+    A[:, -1] = np.eye(3)
+    for k in range(rate.shape[1] - 2, -1, -1):
+        np.matmul(A[:, k + 1], back[:, k], out=A[:, k])
+    return A
+
+
+def _exponential(phi: Values) -> Values:
+    """Return ``exp [phi]x``: (..., 3, 3) array."""
+    angle = np.linalg.norm(phi, axis=-1)
+    small = angle < 1e-6
+    safe = np.where(small, 1.0, angle)
+    s = np.where(small, 1.0, np.sin(safe) / safe)
+    c = np.where(small, 0.5, (1.0 - np.cos(safe)) / safe**2)
+    cross = skew(phi)
+    out: Values = np.eye(3) + s[..., None, None] * cross + c[..., None, None] * (cross @ cross)
+    return out
+
+
+def skew(v: Values) -> Values:
+    """Return ``[v]x``: (..., 3, 3) array."""
+    out = np.zeros((*v.shape, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
+    return out
+
+
+def tangents(u: Values) -> Values:
+    """Return two unit vectors across each of (k, 3) unit vectors: (k, 2, 3) array."""
+    first = np.cross(u, np.eye(3)[np.argmin(np.abs(u), axis=1)])
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([first, np.cross(u, first)], axis=1)

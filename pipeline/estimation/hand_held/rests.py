@@ -1,0 +1,173 @@
+"""The rests that a fit by hand sees of one sensor: their mean readings, times and temperatures.
+
+Used are the rests that the accelerometer's method uses: sound, and not held out for validation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+
+from pipeline.estimation.rest_means import holdout_interval, rest_means, sound_samples, split_rests
+from pipeline.signal.noise import filter_autocovariance
+from pipeline.signal.temperature import smooth_temperature
+from pipeline.signal.wander import variance_of_mean
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.records import Recording, SensorCalibration
+    from pipeline.signal.rests import Rest
+
+    Values = NDArray[np.float64]
+
+ROLE, HELD_OUT = "rests", "validation"
+
+
+@dataclass(frozen=True)
+class Rests:
+    """Rests of all recordings, in order.
+
+    Attributes
+    ----------
+    reading : (m, 3) array, g or deg/s
+        Means.
+    count : (m,) array
+        Samples of each.
+    share : (m,) array
+        Variance of each mean by white noise, over that of a raw sample.
+    scatter : (m, 3) array
+        Sums of squares about the means.
+    start, length, time : (m,) arrays, s
+        When each begins, how long it is, and its mean time.
+    temperature : (m,) array, degC
+        NaN where none was recorded.
+    recording : (m,) array of int
+        Index of the recording that each belongs to.
+    held_out : (m,) array of bool
+    span : (m, 2) array of int
+        Its first sample, and the one after its last.
+    clock_shared : bool
+        Whether the time between the recordings is known.
+    """
+
+    reading: Values
+    count: NDArray[np.int64]
+    share: Values
+    scatter: Values
+    start: Values
+    length: Values
+    time: Values
+    temperature: Values
+    recording: NDArray[np.intp]
+    held_out: NDArray[np.bool_]
+    span: NDArray[np.intp]
+    clock_shared: bool
+
+    def select(self, index: NDArray[np.bool_]) -> Self:
+        """Return some of the rests."""
+        arrays = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "clock_shared"}
+        return replace(self, **{name: values[index] for name, values in arrays.items()})
+
+    @property
+    def white(self) -> Values:
+        """Standard deviation of a sample about the mean of its rest: (3,) array."""
+        return np.asarray(np.sqrt(self.scatter.sum(axis=0) / max(float(np.sum(self.count - 1)), 1.0)))
+
+    @property
+    def freedom(self) -> float:
+        """Degrees of freedom of the scatter within the rests."""
+        return float(3 * np.sum(self.count - 1))
+
+    @property
+    def joined(self) -> NDArray[np.bool_]:
+        """Whether the time from each rest to each other is known: (m, m) array."""
+        same: NDArray[np.bool_] = self.recording[:, None] == self.recording
+        return np.ones_like(same) if self.clock_shared else same
+
+
+def by_hand(sensor: str, recordings: Sequence[Recording]) -> bool:
+    """Return whether a sensor was recorded by hand: rests and moves, and no motion of a table."""
+    own = [r for r in recordings if r.reading(sensor) is not None and r.role != HELD_OUT]
+    logged = any(r.table_angle is not None or r.table_attitude is not None for r in own)
+    return any(r.role == ROLE for r in own) and not logged
+
+
+def rests_of(
+    sensor: str,
+    recordings: Sequence[Recording],
+    settings: Mapping[str, Any],
+    accelerometer: SensorCalibration | None = None,
+    role: str = ROLE,
+) -> Rests | None:
+    """Return the rests of the recordings of a role, or None where there are none.
+
+    Parameters
+    ----------
+    sensor : str
+    recordings : sequence of Recording
+    settings : mapping
+        Section ``procedure``: ``holdout_every``.
+    accelerometer : SensorCalibration, optional
+        Rests that its method left out are left out here.
+    role : str
+        ``rests``, or ``validation``, whose rests are all held out.
+    """
+    every = holdout_interval(recordings, settings) if role == ROLE else 0
+    refused = _left_out(accelerometer)
+    chosen = [(i, r) for i, r in enumerate(recordings) if r.role == role and r.reading(sensor) is not None]
+    columns: dict[str, list[Any]] = {}
+    for index, recording in chosen:
+        split = split_rests(recording, every)
+        rests = sorted([*split.used, *split.held_out], key=lambda rest: rest.start)
+        rests = [r for r in rests if (recording.name, float(recording.time[r.start])) not in refused]
+        found = _of_recording(sensor, recording, rests)
+        out = [rest.start for rest in split.held_out]
+        found["held_out"] = np.isin(found["span"][:, 0], out) | (role == HELD_OUT)
+        found["recording"] = np.full(len(found["count"]), index)
+        for name, values in found.items():
+            columns.setdefault(name, []).append(values)
+    if not columns or sum(len(c) for c in columns["count"]) == 0:
+        return None
+    alone = len(np.unique(np.concatenate(columns["recording"]))) == 1
+    shared = alone or all(recording.clock_shared for _, recording in chosen)
+    return Rests(**{name: np.concatenate(values) for name, values in columns.items()}, clock_shared=shared)
+
+
+def _left_out(accelerometer: SensorCalibration | None) -> set[tuple[str, float]]:
+    return {
+        (rest["recording"], float(rest["time_s"]))
+        for stage in (accelerometer.stages if accelerometer else ())
+        for rest in stage.details.get("rests_left_out", ())
+    }
+
+
+def _of_recording(sensor: str, recording: Recording, rests: Sequence[Rest]) -> dict[str, Any]:
+    """Return the columns of ``Rests`` for one recording; rests without a sound sample are left out."""
+    means, counts = rest_means(recording, rests, sensor)
+    kept = counts > 0
+    span = np.array([[rest.start, rest.stop] for rest in rests], np.intp).reshape(-1, 2)[kept]
+    means, counts, time = means[kept], counts[kept], recording.time
+    reading, good = recording.reading(sensor), sound_samples(recording, sensor)
+    assert reading is not None  # noqa: S101
+    inside = [slice(a, b) for a, b in span]
+    scatter = [np.sum((reading[s][good[s]] - mean) ** 2, axis=0) for s, mean in zip(inside, means, strict=True)]
+    warmth = np.full(recording.samples, np.nan)
+    if recording.temperature is not None:
+        warmth = smooth_temperature(time, recording.temperature)
+    start = time[span[:, 0]]
+    return {
+        "reading": means,
+        "count": counts,
+        "share": variance_of_mean(filter_autocovariance(recording), counts) if len(counts) else np.zeros(0),
+        "scatter": np.array(scatter).reshape(-1, 3),
+        "start": start,
+        "length": time[span[:, 1] - 1] - start + recording.interval,
+        "time": np.array([time[s].mean() for s in inside]),
+        "temperature": np.array([warmth[s].mean() for s in inside]),
+        "span": span,
+    }
