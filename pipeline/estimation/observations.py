@@ -7,7 +7,8 @@ Kept are, where readings and log are sound,
 * samples at which the log follows the motion. Where it is too coarse for a ramp or a step, the angular acceleration,
   and with it a lever arm or a delay, would be the log's and not the table's; those samples are left out.
 
-Where the readings went through a filter, the motion goes through it too.
+Where the readings went through a filter, the motion goes through it too, and a gyroscope's samples are left out while
+the filter still holds rates that a log without them does not tell.
 """
 
 from __future__ import annotations
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
 ROLES = ("accelerometer", "gyroscope", "static")
 UNSOUND = 0b0110  # flags of clipped and stuck samples
 MEAN_S = 1.0
+FORGOTTEN, FORGOTTEN_DPS = 1e-5, 1e-4  # share of the largest rate that a filter may still hold of a doubtful one
+LONGEST_RESPONSE = 400  # samples
 MEDIAN_OF_DIFFERENCES = 0.9099  # median of (w[n+1] - w[n])^2 of white noise of variance 1: 2 times that of chi-square
 SCATTERED = 6.0  # standard deviations of a chi-square above its mean, and half its square for the tail of few samples
 BEND_DPS, BEND_SHARE = 0.05, 1e-3
@@ -239,7 +242,8 @@ def _part(sensor: str, recording: Recording, gravity: float, earth: NDArray[np.f
     motion = replace(motion, direction=turning_direction(motion))
     filtered = recording.filter["name"] != "none"
     if filtered:
-        motion = through_filter(motion, recording)
+        sure = remembered(motion, recording) if sensor == "gyroscope" else followed(motion)
+        motion = replace(through_filter(motion, recording), followed=sure)
     sound: NDArray[np.bool_] = np.all(np.isfinite(reading), axis=1)
     if recording.flags is not None:
         sound = np.logical_and(sound, (recording.flags & UNSOUND) == 0)
@@ -294,6 +298,45 @@ def through_filter(motion: Motion, recording: Recording) -> Motion:
         at_offset=None if motion.at_offset is None else partial(at, motion.at_offset),
         at_lag=None if motion.at_lag is None else partial(at, motion.at_lag),
     )
+
+
+def remembered(motion: Motion, recording: Recording) -> NDArray[np.bool_]:
+    """Return at which samples the log says what a filtered rate is: (n,) array of bool.
+
+    Where no rate is logged, that of a sample at which the log does not follow the table is wrong by up to half of the
+    rate's bend there, and a filter holds on to it: where the bends, through the filter's absolute impulse response,
+    leave more than 1e-5 of the largest rate, the sample is left out.
+
+    Parameters
+    ----------
+    motion : Motion
+        Before the filter.
+    recording : Recording
+        With the filter's settings.
+    """
+    sure = followed(motion)
+    if (recording.table_rate is not None and motion.axis is not None) or sure.all():
+        return sure
+    rate = motion.angular_rate
+    bend = np.zeros(len(rate))
+    bend[1:-1] = np.linalg.norm(rate[2:] - 2.0 * rate[1:-1] + rate[:-2], axis=1)
+    wide = np.max([bend, np.append(bend[1:], 0.0), np.append(0.0, bend[:-1])], axis=0)
+    answer = _impulse_response(recording)
+    left = np.convolve(np.where(sure, 0.0, 0.5 * wide), answer)[len(answer) // 2 :][: len(rate)]
+    forgotten = left <= max(FORGOTTEN * float(np.abs(rate).max()), FORGOTTEN_DPS)
+    return np.logical_and(sure, forgotten)
+
+
+def _impulse_response(recording: Recording) -> NDArray[np.float64]:
+    """Return the size of a filter's answer to an impulse: (2 m + 1,) array, the impulse in the middle."""
+    half = min(recording.samples, LONGEST_RESPONSE)
+    impulse = np.zeros((2 * half + 1, 3))
+    impulse[half] = 1.0
+    time = np.round(np.arange(len(impulse)) * recording.interval * 1e9).astype(np.int64)
+    carrier = replace(recording, time_ns=time, accelerometer=impulse, gyroscope=None, notes=(), encodings={})
+    answer = apply_filter(carrier, recording.filter).accelerometer
+    assert answer is not None  # noqa: S101
+    return np.asarray(np.abs(answer[:, 0]), np.float64)
 
 
 def rows_of(motion: Motion, sound: NDArray[np.bool_], *, together: bool = True) -> Rows:

@@ -1,0 +1,77 @@
+"""Filtered readings beside a log of the angle alone: what a filter still holds of a doubtful rate is left out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+import yaml
+from bench_session import CONTINUOUS, STOP_AND_GO, WHITE, Session, record
+
+from pipeline.diagnosis.unknown import dependences
+from pipeline.estimation.observations import observe
+from pipeline.estimation.selection import select
+from pipeline.signal.filters import apply_filter
+from pipeline.signal.noise import estimate_noise
+
+if TYPE_CHECKING:
+    from pipeline.records import Recording
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+SHEET = yaml.safe_load((CONFIGS / "sensor/mpu6050.yaml").read_text(encoding="utf-8"))
+TABLE = {"gravity_g": 1.0, "latitude_deg": None, "azimuth_deg": None}
+
+
+def filtered(recordings: list[Recording], name: str = "rc_low_pass") -> list[Recording]:
+    settings = yaml.safe_load((CONFIGS / f"filter/{name}.yaml").read_text(encoding="utf-8"))
+    return [apply_filter(r, settings) for r in recordings]
+
+
+def without_rates(recordings: list[Recording]) -> list[Recording]:
+    return [replace(r, table_rate=None) if r.table_angle is not None else r for r in recordings]
+
+
+@pytest.mark.parametrize("name", ["rc_low_pass", "low_pass"])
+def test_the_filtered_rate_of_every_sample_that_is_used_is_that_of_a_log_with_rates(name: str) -> None:
+    recordings = record(Session(3))
+    known = {part.name: part for part in observe("gyroscope", filtered(recordings, name), TABLE).parts}
+    for part in observe("gyroscope", filtered(without_rates(recordings), name), TABLE).parts:
+        everything = next(r for r in filtered(recordings, name) if r.name == part.name)
+        exact = apply_filter(
+            replace(everything, gyroscope=known_rate(everything), accelerometer=None, encodings={}), everything.filter
+        ).gyroscope
+        assert exact is not None
+        at = np.searchsorted(everything.time, part.motion.time)
+        error = np.abs(part.motion.angular_rate - exact[at]).max()
+        assert error < 0.1 * WHITE["gyroscope"], part.name
+        assert len(at) > (0.25 if part.role == "gyroscope" else 0.0) * len(known[part.name].weight)
+
+
+def known_rate(recording: Recording) -> np.ndarray:
+    """The table's own rate as a vector."""
+    assert recording.axis is not None
+    assert recording.table_rate is not None
+    rate = np.zeros((recording.samples, 3))
+    rate[:, "xyz".index(recording.axis)] = recording.table_rate
+    return rate
+
+
+def test_the_accelerometer_keeps_its_rests_as_the_angle_says_what_gravity_does() -> None:
+    recordings = record(Session(3))
+    with_rates = observe("accelerometer", filtered(recordings), TABLE)
+    without = observe("accelerometer", filtered(without_rates(recordings)), TABLE)
+    rests = [sum(int(np.sum(part.motion.still)) for part in found.parts) for found in (with_rates, without)]
+    assert rests[1] > 0.85 * rests[0]
+
+
+def test_no_effect_of_timing_is_invented_in_twenty_filtered_units_without_one() -> None:
+    for seed in range(20):
+        course = (STOP_AND_GO, CONTINUOUS)[seed % 2]
+        recordings = filtered(without_rates(record(Session(700 + seed, course, static=seed % 4 < 2))))
+        noise = estimate_noise("gyroscope", recordings, SHEET["gyroscope"])
+        found = select(observe("gyroscope", recordings, TABLE), [], noise, SHEET["gyroscope"])
+        assert found.names == [], seed
+        assert dependences(found) == [], seed
