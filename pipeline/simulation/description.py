@@ -54,7 +54,8 @@ class UnitDescription:
         ``csv`` or ``mcap``.
     accelerometer, gyroscope : dict
         ``bias`` (g or deg/s), ``matrix``, or in its place ``scale_factor`` (of the correction),
-        ``non_orthogonality_deg`` (yx, zx, zy) and ``mounting_deg`` (turns about x, then y, then z).
+        ``non_orthogonality_deg`` (yx, zx, zy) and ``mounting_deg`` (turns about x, then y, then z); and
+        ``noise_density``, ``bias_wander``, ``wander_time_s`` in place of the data sheet's.
     effects : dict
         ``sensor.effect``, or ``effect`` alone for both sensors, to null (a typical size, at random), a number (that
         size, with random signs) or the list of the parameters' values; or to a formula of its own

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from pipeline.model.effects.base import Effect
 
 KEYS = {"bias", "matrix", "scale_factor", "non_orthogonality_deg", "mounting_deg"}
+NOISE_KEYS = {"noise_density", "bias_wander", "wander_time_s"}  # in place of those of the data sheet
 POSITIVE = {"time_constant", "tau"}
 # A typical size as a share of the largest plausible one, where that is not a half.
 TYPICAL_SHARE = {
@@ -68,10 +69,11 @@ def drawn_sensors(
     mounting = rng.uniform(-1.0, 1.0, 3)
     out = {}
     for sensor in SENSORS:
-        unknown = sorted(set(given[sensor]) - KEYS)
+        unknown = sorted(set(given[sensor]) - KEYS - NOISE_KEYS)
         if unknown:
-            raise ConfigurationError(f"{sensor}: {', '.join(unknown)} is not known; known: {', '.join(sorted(KEYS))}")
-        sheet = sheets[sensor]
+            known = ", ".join(sorted(KEYS | NOISE_KEYS))
+            raise ConfigurationError(f"{sensor}: {', '.join(unknown)} is not known; known: {known}")
+        sheet = {**sheets[sensor], **{key: given[sensor][key] for key in NOISE_KEYS & set(given[sensor])}}
         own = {name: values for name, values in effects[sensor].items() if name not in ALTERATIONS}
         bias = _limited(sheet["bias"], 3, rng)
         matrix = _matrix(sheet, given[sensor], mounting, rng)

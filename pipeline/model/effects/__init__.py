@@ -6,6 +6,7 @@ them (``pipeline.model.user_effects`` makes them from formulas); they are known 
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -14,9 +15,12 @@ from typing import TYPE_CHECKING
 from pipeline.errors import ConfigurationError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
     from pipeline.model.effects.base import Effect
 
 _registered: dict[str, Effect] = {}
+_left_out: set[str] = set()
 
 
 @cache
@@ -31,7 +35,19 @@ def built_in() -> dict[str, Effect]:
 
 def catalogue() -> dict[str, Effect]:
     """Return every effect by name: the built-in ones in alphabetical order, then the registered ones."""
-    return {**built_in(), **_registered}
+    every = {**built_in(), **_registered}
+    return {name: this for name, this in every.items() if name not in _left_out} if _left_out else every
+
+
+@contextmanager
+def leaving_out(names: Iterable[str]) -> Iterator[None]:
+    """Take effects out of the catalogue for a while, as if nobody knew of them; for studies of the diagnosis."""
+    fresh = set(names) - _left_out
+    _left_out.update(fresh)
+    try:
+        yield
+    finally:
+        _left_out.difference_update(fresh)
 
 
 def register(effect: Effect) -> None:

@@ -1,0 +1,159 @@
+"""A case as recordings: simulated with exact geometry, with noises and physics that the diagnosis has no model of.
+
+Further noise goes on over the recordings of a unit, at the time steps t:
+
+    ar_06, ar_09 : first-order autoregression with that coefficient, of the white noise's standard deviation
+    random_walk  : sigma_b sqrt(t / T), the data sheet's wander sigma_b per its correlation time T
+    one_over_f   : amplitudes of a spectrum 1/f, scaled to three times the data sheet's wander
+
+and physics in another form than the catalogue's, A of the data sheet's order, on every axis:
+
+    gear_mesh        : A cos(5 angle)                   while a table turns
+    temperature_step : A tanh((T - T_middle) / 0.2) / 2
+    saturation       : A tanh((T - 25) / 2)
+    exponential      : A (exp((T - 25) / 5) - 1)
+    band             : A where 4 < |omega| < 7 deg/s
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.model.kinematics import reference_motion
+from pipeline.records import SENSORS
+from pipeline.simulation.campaign import simulate_unit
+from pipeline.simulation.description import UnitDescription, read_config
+from pipeline.study.cases import COURSES
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pipeline.records import Recording
+    from pipeline.study.cases import Case
+
+INTERVAL_S = 0.12
+OF_WHITE = ("ar_06", "ar_09")
+AMPLITUDE = {
+    "gear_mesh": {"accelerometer": 2e-3, "gyroscope": 0.03},
+    "temperature_step": {"accelerometer": 4e-3, "gyroscope": 0.06},
+    "saturation": {"accelerometer": 2e-3, "gyroscope": 0.3},
+    "exponential": {"accelerometer": 2e-3, "gyroscope": 0.3},
+    "band": {"accelerometer": 2e-3, "gyroscope": 0.05},
+}
+
+
+def recordings_of(case: Case) -> list[Recording]:
+    """Return the recordings of a case; nothing in them tells what is hidden."""
+    sheets = read_config("sensor", case.model)
+    own = {
+        sensor: {
+            "bias_wander": case.wander * sheets[sensor]["bias_wander"],
+            "noise_density": 0.0 if case.noise in OF_WHITE else sheets[sensor]["noise_density"],
+        }
+        for sensor in SENSORS
+    }
+    unit = UnitDescription(
+        "unit",
+        sensor=case.model,
+        course=COURSES["stop_and_go" if case.procedure == "at_rest" else case.procedure],
+        lost=0.1 if case.noise == "lost" else 0.0,
+        accelerometer=own["accelerometer"],
+        gyroscope=own["gyroscope"],
+        effects={f"{case.sensor}.{name}": values for name, values in case.hidden.items()},
+    )
+    recordings, _ = simulate_unit(unit, case.seed, case.number)
+    if case.procedure == "at_rest":
+        recordings = [_at_rest(r) for r in recordings if r.role != "gyroscope"]
+    rng = np.random.default_rng([case.seed, case.number, 1])
+    for sensor in SENSORS:
+        recordings = _with_noise(recordings, sensor, case.noise, sheets[sensor], rng)
+    if case.shape:
+        recordings = [_with_shape(r, case.sensor, case.shape) for r in recordings]
+    if case.noise == "cold":
+        recordings = [replace(r, temperature=None) for r in recordings]
+    if case.noise == "coarse":
+        recordings = [replace(r, temperature=np.round(2.0 * _temperature(r)) / 2.0) for r in recordings]
+    return recordings
+
+
+def _at_rest(recording: Recording) -> Recording:
+    """Return the samples at which a table stands still; of motion held out, all."""
+    if recording.table_angle is None or recording.table_rate is None:
+        return recording
+    return recording.select((recording.table_rate == 0.0) & (np.diff(recording.table_angle, prepend=0.0) == 0.0))
+
+
+def _with_noise(
+    recordings: list[Recording], sensor: str, noise: str, sheet: dict[str, Any], rng: np.random.Generator
+) -> list[Recording]:
+    white = sheet["noise_density"] * np.sqrt(0.5 / INTERVAL_S)
+    first = min(float(r.time[0]) for r in recordings)
+    last = max(float(r.time[-1]) for r in recordings)
+    count = int((last - first) / INTERVAL_S) + 2
+    if noise in OF_WHITE:
+        added = white * _autoregression(count, float(noise[-1]) / 10.0, rng)
+    elif noise == "random_walk":
+        step = sheet["bias_wander"] * np.sqrt(INTERVAL_S / sheet["wander_time_s"])
+        added = np.cumsum(step * rng.standard_normal((count, 3)), axis=0)
+    elif noise == "one_over_f":
+        added = 3.0 * sheet["bias_wander"] * _one_over_f(count, rng)
+    else:
+        return recordings
+    out = []
+    for recording in recordings:
+        at = np.rint((recording.time - first) / INTERVAL_S).astype(int)
+        out.append(_added(recording, sensor, added[at]))
+    return out
+
+
+def _autoregression(count: int, coefficient: float, rng: np.random.Generator) -> NDArray[np.float64]:
+    from scipy.signal import lfilter  # noqa: PLC0415  (0.3 s, as in the simulator)
+
+    drive = np.sqrt(1.0 - coefficient**2) * rng.standard_normal((count, 3))
+    drive[0] = rng.standard_normal(3)
+    found: NDArray[np.float64] = lfilter([1.0], [1.0, -coefficient], drive, axis=0)
+    return found
+
+
+def _one_over_f(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Return noise with a spectrum of power 1/f and variance 1: (n, 3) array."""
+    frequency = np.fft.rfftfreq(count)
+    shape = np.zeros(len(frequency))
+    shape[1:] = 1.0 / np.sqrt(frequency[1:])
+    spectrum = np.fft.rfft(rng.standard_normal((count, 3)), axis=0) * shape[:, None]
+    noise = np.fft.irfft(spectrum, count, axis=0)
+    return np.asarray(noise / noise.std(axis=0), np.float64)
+
+
+def _with_shape(recording: Recording, sensor: str, shape: str) -> Recording:
+    motion = reference_motion(recording, 1.0)
+    signal = np.zeros(recording.samples)
+    warmth = _temperature(recording) - 25.0
+    if shape == "gear_mesh" and recording.table_angle is not None and recording.role != "static":
+        signal = np.cos(np.radians(5.0 * recording.table_angle))
+    elif shape == "temperature_step":
+        signal = 0.5 * np.tanh((warmth - 2.0) / 0.2)
+    elif shape == "saturation":
+        signal = np.tanh(warmth / 2.0)
+    elif shape == "exponential":
+        signal = np.exp(warmth / 5.0) - 1.0
+    elif shape == "band" and motion is not None:
+        speed = np.linalg.norm(motion.angular_rate, axis=1)
+        signal = ((speed > 4.0) & (speed < 7.0)).astype(float)
+    return _added(recording, sensor, AMPLITUDE[shape][sensor] * signal[:, None] * np.ones(3))
+
+
+def _temperature(recording: Recording) -> NDArray[np.float64]:
+    assert recording.temperature is not None  # noqa: S101  (the simulator logs it)
+    return recording.temperature
+
+
+def _added(recording: Recording, sensor: str, values: NDArray[np.float64]) -> Recording:
+    reading = recording.reading(sensor)
+    assert reading is not None  # noqa: S101  (the simulator reads both sensors)
+    if sensor == "accelerometer":
+        return replace(recording, accelerometer=reading + values)
+    return replace(recording, gyroscope=reading + values)

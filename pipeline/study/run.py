@@ -1,0 +1,90 @@
+"""Run the cases of a study, in some processes, and keep what was said.
+
+    <directory>/truth.jsonl      what is hidden in each case
+    <directory>/results.jsonl    what the diagnosis said of it
+
+A case whose result is there is not run again, so that a study can be interrupted and made larger.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from typing import TYPE_CHECKING, Any
+
+from pipeline.study.cases import draw
+from pipeline.study.judge import judge
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+    from pathlib import Path
+
+TRUTH, RESULTS = "truth.jsonl", "results.jsonl"
+Planned = tuple[str, int, int]
+
+
+def run_study(
+    directory: Path,
+    families: Sequence[str],
+    count: int,
+    seed: int,
+    *,
+    processes: int,
+    progress: Callable[[int, int], None],
+) -> None:
+    """Run what is not there yet.
+
+    Parameters
+    ----------
+    directory : Path
+        Made if need be.
+    families : sequence of str
+    count : int
+        Cases of each family.
+    seed : int
+    processes : int
+    progress : callable
+        Told how many of how many are done.
+    """
+    directory.mkdir(parents=True, exist_ok=True)
+    done = {line["key"] for line in read_lines(directory / RESULTS)}
+    planned: list[Planned] = [(family, number, seed) for number in range(count) for family in families]
+    planned = [item for item in planned if draw(*item).key not in done]
+    with (
+        (directory / TRUTH).open("a", encoding="utf-8") as truth,
+        (directory / RESULTS).open("a", encoding="utf-8") as results,
+    ):
+        for number, (item, entries) in enumerate(_judged(planned, processes), start=1):
+            truth.write(json.dumps(draw(*item).to_json()) + "\n")
+            results.writelines(json.dumps(entry) + "\n" for entry in entries)
+            truth.flush()
+            results.flush()
+            progress(number, len(planned))
+
+
+def _judged(planned: Sequence[Planned], processes: int) -> Iterator[tuple[Planned, list[dict[str, Any]]]]:
+    if processes == 1:
+        yield from map(judged, planned)
+        return
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ.setdefault(name, "1")  # a process is one core
+    with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
+        yield from pool.map(judged, planned, chunksize=4)
+
+
+def judged(planned: Planned) -> tuple[Planned, list[dict[str, Any]]]:
+    """Return a case and what was said of it; a fault is a result, not the end of the study."""
+    case = draw(*planned)
+    try:
+        return planned, judge(case)
+    except Exception as error:  # noqa: BLE001  (whatever it is, it is what the diagnosis did with this case)
+        return planned, [{"key": case.key, "sensor": case.sensor, "error": f"{type(error).__name__}: {error}"}]
+
+
+def read_lines(path: Path) -> list[dict[str, Any]]:
+    """Return the entries of a file of one JSON document a line; none where it is not there."""
+    if not path.is_file():
+        return []
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line]
