@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,13 +20,13 @@ from pipeline.model.effect_files import load_python_effect, read_effect_file, re
 from pipeline.model.effect_limits import parameter_limits
 from pipeline.model.effects import built_in, catalogue, effect, forget_registered, register
 from pipeline.model.effects.base import Layout
+from pipeline.model.formula import FUNCTIONS, SIGNALS
 from pipeline.model.kinematics import reference_motion
 from pipeline.model.user_effects import effect_from, effect_of
 from pipeline.records import FittedEffect, Motion, Recording, SensorCalibration
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
 SETTINGS: dict[str, Any] = {"table": {"gravity_g": 1.0, "latitude_deg": None, "azimuth_deg": None}}
 GEAR = """\
@@ -365,3 +367,21 @@ def test_a_python_file_without_an_effect_is_refused(code: str, message: str, tmp
         load_python_effect(file)
     with pytest.raises(MissingInputError):
         load_python_effect(tmp_path / "absent.py")
+
+
+def test_the_page_on_effects_of_ones_own_holds(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "effects_of_your_own.md").read_text()
+    example, vector = (yaml.safe_load(text) for text in re.findall(r"```yaml\n(.*?)```", page, re.DOTALL))
+    assert effect_from(example, "page").name == "gear_mesh"
+    assert effect_from({**example, **vector, "limits": {"pull": 1}}, "page").layout == Layout.SHARED
+    (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    (tmp_path / "loose_part.py").write_text(code)
+    assert load_python_effect(tmp_path / "loose_part.py").limits("accelerometer") == {"loose_part": 0.05}
+    words = set(re.findall(r"[a-z]+", page))
+    assert {*SIGNALS, *FUNCTIONS} <= words
+    (tmp_path / "gear_mesh.yaml").write_text(yaml.safe_dump(example).replace("(angle)", "(angel)", 1))
+    message = re.search(r"formula 'cos\(5 \* radians\(angel\)\)', position 17: no signal is called 'angel'", page)
+    with pytest.raises(ConfigurationError) as caught:
+        read_effect_file(tmp_path / "gear_mesh.yaml")
+    assert message is not None
+    assert message.group() in caught.value.message
