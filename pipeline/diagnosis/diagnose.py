@@ -13,6 +13,7 @@ import numpy as np
 from pipeline.diagnosis.advice import next_experiment
 from pipeline.diagnosis.first_guess import select_beside, suggested_effect, unexplained
 from pipeline.diagnosis.held_out import held_out_error
+from pipeline.diagnosis.method_errors import method_errors
 from pipeline.diagnosis.observability import facts_of, not_observable
 from pipeline.diagnosis.pictures import pictures
 from pipeline.diagnosis.wander import fitted_wander
@@ -66,7 +67,8 @@ def diagnose(
     -------
     dict
         ``verdict, residual_over_noise, selected, ranking, not_observable, unexplained, next_experiment, override``;
-        beside these ``configured, wander`` (``pipeline.diagnosis.wander``) and ``pictures`` (``...pictures``).
+        beside these ``configured, suggested_effect`` (``pipeline.diagnosis.first_guess``), ``wander``
+        (``...wander``), ``pictures`` (``...pictures``) and ``method_errors`` (``...method_errors``).
     """
     sensor = calibration.sensor
     if by_hand(sensor, recordings):
@@ -83,8 +85,11 @@ def diagnose(
     unknown = unexplained(selection)
     beside = select_beside(selection, unknown, configured, noise, settings["sensor"][sensor])
     document = _document(beside, unknown, configured, recordings, noise, table=settings["table"])
-    shown = pictures(selection, unknown, noise, beside)
-    return document | {"residual_over_noise": _over_noise(selection, recordings, noise), "pictures": shown}
+    return document | {
+        "residual_over_noise": _over_noise(selection, recordings, noise),
+        "pictures": pictures(selection, unknown, noise, beside),
+        "method_errors": method_errors(calibration, beside, recordings, settings),
+    }
 
 
 def _nothing(sensor: str, configured: list[str], reason: str) -> dict[str, Any]:
@@ -97,6 +102,7 @@ def _nothing(sensor: str, configured: list[str], reason: str) -> dict[str, Any]:
         "not_observable": [{"effect": name, "reason": reason} for name in names],
         "unexplained": [],
         "suggested_effect": None,
+        "method_errors": [],
         "next_experiment": "record turns about all three axes on a table whose angle and rate are logged",
         "override": "",
         "configured": configured,

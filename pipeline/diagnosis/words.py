@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from pipeline.diagnosis import method_words
 from pipeline.model.effects import catalogue
 
 if TYPE_CHECKING:
@@ -38,6 +39,7 @@ def in_words(part: Mapping[str, Any] | None, sensor: str) -> list[str]:
             f"The bias seems to wander by {wander['standard_deviation']:.2g} {UNITS[sensor]}, against "
             f"{wander['expected']:.2g} expected: something slow may be missing that the noise model has swallowed."
         )
+    lines += method_words.in_words(part.get("method_errors") or [], sensor)
     if part["not_observable"]:
         lines.append(_hidden(part))
     if part["next_experiment"]:

@@ -29,7 +29,7 @@ def main(argv: Sequence[str]) -> int:
             document[sensor] = found = calibration and diagnose(
                 calibration, recordings, noise, part, fits["accelerometer"]
             )
-            if found and found["suggested_effect"]:
+            if found and found.get("suggested_effect"):
                 found["suggested_file"] = suggested_file(unit, sensor)
                 write_atomically(job.output / found["suggested_file"], effect_file(found["suggested_effect"], unit))
         write_json(job.output / f"{unit}.json", document)
