@@ -52,6 +52,9 @@ class FormulaEffect(Effect):
 
     described: ClassVar[Definition]
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return effect_from, (self.definition, f"effect {self.name}")
+
     def fields(self, sensor: str) -> set[str]:
         """Return the fields of a motion that the formulas look at."""
         signals = set().union(*(term.signals for term in self.described.terms))

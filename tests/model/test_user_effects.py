@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import re
 from dataclasses import replace
@@ -129,6 +130,13 @@ def test_an_angle_counts_nothing_where_there_is_no_turn_axis(motions: list[Motio
     assert made.needs == ("angle",)
     assert not made.available(motion)
     assert not made.columns("gyroscope", motion, K["gyroscope"], np.ones(6)).any()
+
+
+def test_an_effect_goes_to_another_process(motions: list[Motion]) -> None:
+    made = effect_from(own("mine", "gyroscope", {"a": "fx * u"}), "mine.yaml")
+    sent = copy.deepcopy(made)  # by __reduce__, as pickle does
+    columns = [e.columns("gyroscope", motions[0], K["gyroscope"], np.ones(3)) for e in (made, sent)]
+    assert np.array_equal(*columns)
 
 
 def test_time_asks_for_one_clock() -> None:
