@@ -8,6 +8,7 @@ beyond that is told, but is by itself no sign of a missing effect.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -68,7 +69,20 @@ def diagnose_by_hand(
         return nothing_to_see(sensor, configured, lack.message)
     if model is None:
         return nothing_to_see(sensor, configured, f"no recording holds a rest with readings of the {sensor}")
-    return _document(select(model, calibration, configured, noise, settings["sensor"][sensor]), configured, noise)
+    sheet = settings["sensor"][sensor]
+    selection = select(model, calibration, configured, noise, sheet)
+    return _document(selection, configured, _without_creep(noise, sheet))
+
+
+def _without_creep(noise: Noise | None, sheet: Mapping[str, Any]) -> Noise | None:
+    """Return the noise with the data sheet's wander, where only rests by hand tell one.
+
+    A unit that creeps from its attitude moves gravity from one axis to another, which is no wander of a bias.
+    """
+    if noise is None or noise.source == "static":
+        return noise
+    wander = np.full(3, float(sheet.get("bias_wander") or 0.0))
+    return replace(noise, wander=wander, correlation_time=float(sheet.get("wander_time_s") or noise.correlation_time))
 
 
 def _document(selection: HandSelection, configured: list[str], noise: Noise | None) -> dict[str, Any]:

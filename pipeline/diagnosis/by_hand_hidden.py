@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.diagnosis.advice import UNKNOWN
-from pipeline.diagnosis.observability import LEAST_SPAN_DEGC
+from pipeline.diagnosis.observability import LEAST_SPAN_DEGC, MOVING
 from pipeline.estimation.hand_held.model import refusal
 from pipeline.estimation.selection import GATE_BIC
 from pipeline.model.effects import catalogue
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from pipeline.estimation.ranking import Score
     from pipeline.model.effects.base import Effect
 
+ONLY_MOVING = {*MOVING, "hysteresis"}
 FIRM = 2.0  # times the noise, above which the scatter of the rests is worth a word
 ENOUGH = 40  # rests that leave room for what the catalogue holds
 MORE = f"record {ENOUGH} rests or more, each in another orientation, all three axes inclined in most of them"
@@ -60,6 +61,8 @@ def _reason(this: Effect, selection: HandSelection) -> str:
     if "temperature" in this.needs and span < LEAST_SPAN_DEGC:
         return f"the temperature changes by no more than {span:.2g} degC; it needs {this.excitation}"
     score = selection.first.scores.get(this.name)
+    if score is None and model.kinds == 1 and this.name in ONLY_MOVING:
+        return "at rest nothing moves, and it adds nothing"
     if score is None:
         seen = "rests and moves by hand" if model.kinds > 1 else "rests"
         return f"in {seen} bias and matrix explain all that it would add"

@@ -71,7 +71,7 @@ def fit(
         )
     start = State(np.average(model.rests.reading, axis=0, weights=model.rests.count), np.eye(3))
     _require_determined(model.equations(start).base)
-    found = fit_by_hand(model, start, noises_for(noise, model.kinds))
+    found = fit_by_hand(model, start, noises_for(noise, model.kinds), {})
     names = [f"bias_{a}" for a in AXES] + [f"matrix_{a}{b}" for a in AXES for b in AXES]
     values = np.concatenate([found.state.bias, found.state.matrix.ravel()])
     uncertainty = np.sqrt(np.diag(found.covariance))

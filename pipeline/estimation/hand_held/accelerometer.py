@@ -143,6 +143,7 @@ def _directions(calibration: SensorCalibration) -> Values:
     directions = [np.eye(12)[i] for i in range(3)]
     known = calibration.covariance
     plain = bool(np.allclose(Q, np.eye(3), atol=1e-9))
+    Q = np.eye(3) if plain else Q
     for i, j in zip(*np.tril_indices(3), strict=True):
         at = 3 + 3 * i + j
         if i != j and plain and known is not None and known[at, at] == 0.0:

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
     Values = NDArray[np.float64]
 
-LEVELS = (0.0, 2.0, 6.0, 20.0)
+LEVELS = ((0.0, 2.0, 6.0, 20.0), (0.0, 4.0, 16.0))  # of rests, and of moves
 
 
 @dataclass(frozen=True)
@@ -146,5 +146,5 @@ def noises_for(noise: Noise | None, kinds: int) -> list[HandNoise]:
     kinds : int
         Of scatter: that of rests, and that of moves.
     """
-    levels: Sequence[tuple[float, ...]] = list(product(LEVELS, repeat=kinds))
+    levels: Sequence[tuple[float, ...]] = list(product(*LEVELS[:kinds]))
     return [HandNoise(s.ratio, s.time, level, s.prior) for s in settings_for(noise) for level in levels]

@@ -1,14 +1,16 @@
 """Base and effects fitted to rests and moves, by generalised least squares in Gauss-Newton rounds.
 
-    step = (X^T C^-1 X)^-1 X^T C^-1 r,    covariance = sum over noises of weight k (X^T C^-1 X)^-1
+    step = (N + k P)^-1 (X^T C^-1 r - k P p),    covariance = sum over noises of weight k (N + k P)^-1,   N = X^T C^-1 X
 
 The step is taken at the most likely noise; the covariance is averaged over the noises by their restricted likelihood,
 
-    -2 log L_R = rss / k + nu log k + log det C + log det(X^T C^-1 X),    k = max(1, rss / nu),   nu = n - p
+    -2 log L_R = rss / k + nu log k + log det C + log det(N + k P),    k = max(1, rss / nu),   nu = n - p
 
-A combination of effects' parameters that the equations do not determine (as of the nine cross-axis terms of an
-accelerometer at rest, two) stays at its shortest, and its uncertainty is that of the data sheet's limits taken for
-two standard deviations.
+A few rests leave some combinations of parameters open: two of the nine cross-axis terms of an accelerometer at rest, or
+the amplitude of a warm-up that is still far from its end. So the data sheet's limits of an effect's parameters p, taken
+for two standard deviations, stand beside the equations with the precision P; it is zero for bias, matrix and time
+constants, and where there is no limit. What the rests determine it does not move: its weight is the square of
+uncertainty over limit.
 """
 
 from __future__ import annotations
@@ -33,9 +35,13 @@ if TYPE_CHECKING:
 
     Values = NDArray[np.float64]
 
-ROUNDS = 30
-SMALL_STEP = 1e-3  # of a standard uncertainty
-LEAST_WEIGHT = 1e-6
+ROUNDS = 60
+SMALL_STEP = 3e-3  # of a standard uncertainty
+STALLED = 0.1
+HALVINGS = 12
+ROUNDING = 1e-9
+NONE = 1e-8  # share of its columns below which a combination of parameters is not determined
+FAR = 12.0  # of log L below the best, where a noise is not believed
 
 
 @dataclass(frozen=True)
@@ -50,8 +56,6 @@ class HandFit:
     log_likelihood : float
     noise : HandNoise
         The most likely one.
-    scale : float
-        k.
     degrees_of_freedom : float
     residual : (n,) array
         Over the white noise of each equation.
@@ -68,7 +72,6 @@ class HandFit:
     covariance: Values
     log_likelihood: float
     noise: HandNoise
-    scale: float
     degrees_of_freedom: float
     residual: Values
     error: Values
@@ -80,11 +83,10 @@ class HandFit:
 
 @dataclass(frozen=True)
 class Solved:
-    """A step with its precision, at one noise: ``step``, ``half half^T = (X^T C^-1 X)^-1``, null directions."""
+    """A step at one noise, and its covariance k (N + k P)^-1."""
 
     step: Values
-    half: Values
-    null: Values
+    covariance: Values
     condition: float
     log_likelihood: float
     restricted: float
@@ -92,7 +94,19 @@ class Solved:
     rank: int
 
 
-def fit(model: Model, start: State, noises: Sequence[HandNoise]) -> HandFit:
+@dataclass(frozen=True)
+class Limits:
+    """What is believed of the parameters before: precision P (diagonal) and the values p, base first."""
+
+    precision: Values
+    values: Values
+
+    def penalty(self) -> float:
+        """Return ``p^T P p``."""
+        return float(self.precision @ self.values**2)
+
+
+def fit(model: Model, start: State, noises: Sequence[HandNoise], limits: Mapping[str, Values]) -> HandFit:
     """Fit bias, matrix and effects from given values.
 
     Parameters
@@ -100,6 +114,8 @@ def fit(model: Model, start: State, noises: Sequence[HandNoise]) -> HandFit:
     model : Model
     start : State
     noises : sequence of HandNoise
+    limits : mapping
+        Effect to the limits of its parameters, infinite where there are none.
 
     Returns
     -------
@@ -108,43 +124,79 @@ def fit(model: Model, start: State, noises: Sequence[HandNoise]) -> HandFit:
     state, converged, rounds = start, False, 0
     equations = model.equations(state)
     best = beside(equations, noises).of_model()[1]
-    while rounds < ROUNDS and not converged:
+    while rounds < ROUNDS:
         rounds += 1
-        solved = solve(equations, noises[best])
-        state, taken = stepped(model, state, solved.step)
-        equations = model.equations(state)
-        small = SMALL_STEP * np.sqrt(solved.scale * np.sum(solved.half**2, axis=1))
-        if np.all(np.abs(taken) <= np.maximum(small, 1e-13)):
+        solved = solve(equations, noises[best], limits_at(model, state, limits))
+        state, equations, taken = _lowered(model, state, equations, noises[best], solved, limits)
+        uncertainty = np.sqrt(np.diag(solved.covariance))
+        if np.all(np.abs(taken) <= np.maximum(SMALL_STEP * uncertainty, 1e-13)):
             now = beside(equations, noises).of_model()[1]
-            converged, best = now == best or rounds > ROUNDS // 2, now
-    return _assessed(state, equations, noises, rounds, converged=converged)
+            if now == best or rounds > ROUNDS // 2:
+                converged = bool(np.all(np.abs(solved.step) <= np.maximum(STALLED * uncertainty, 1e-13)))
+                break
+            best = now
+    return _assessed(state, equations, noises, limits_at(model, state, limits), (rounds, converged))
+
+
+def limits_at(model: Model, state: State, limits: Mapping[str, Values]) -> Limits:
+    """Return the limits as precision, two standard deviations each, with the parameters' values."""
+    base = model.directions.shape[1]
+    precision, values = [np.zeros(base)], [np.zeros(base)]
+    for term in state.terms:
+        nonlinear = [p.name in term.effect.nonlinear for p in term.effect.parameters(model.sensor)]
+        limit = limits.get(term.effect.name, np.full(len(term.values), np.inf))
+        precision.append(np.where(nonlinear, 0.0, (2.0 / limit) ** 2))
+        values.append(term.values)
+    return Limits(np.concatenate(precision), np.concatenate(values))
+
+
+def _lowered(  # noqa: PLR0917  (they are the problem)
+    model: Model,
+    state: State,
+    equations: Equations,
+    noise: HandNoise,
+    solved: Solved,
+    limits: Mapping[str, Values],
+) -> tuple[State, Equations, Values]:
+    """Take a step, halved while it makes the residual longer; after the last one there is none left to take."""
+
+    def length(at: State, there: Equations) -> float:
+        white = there.whitened(noise, there.residual[:, None])[0]
+        return float(np.sum(white**2)) / solved.scale + limits_at(model, at, limits).penalty()
+
+    before = length(state, equations)
+    for halving in range(HALVINGS):
+        moved, taken = stepped(model, state, solved.step * 0.5**halving)
+        there = model.equations(moved)
+        if length(moved, there) <= before * (1.0 + ROUNDING):
+            return moved, there, taken
+    return state, equations, np.zeros(len(solved.step))
 
 
 def _assessed(
-    state: State, equations: Equations, noises: Sequence[HandNoise], rounds: int, *, converged: bool
+    state: State, equations: Equations, noises: Sequence[HandNoise], limits: Limits, how: tuple[int, bool]
 ) -> HandFit:
-    every = [solve(equations, noise) for noise in noises]
+    found = beside(equations, noises)
+    scores = found.log_likelihood(np.sum(found.residual**2, axis=1))
+    noises = [noise for noise, score in zip(noises, scores, strict=True) if score > scores.max() - FAR]
+    every = [solve(equations, noise, limits) for noise in noises]
     best = int(np.argmax([s.log_likelihood for s in every]))
     restricted = np.array([s.restricted for s in every])
     weight = np.exp(restricted - restricted.max())
     weight /= weight.sum()
-    kept = [(w, s, noise) for w, s, noise in zip(weight, every, noises, strict=True) if w > LEAST_WEIGHT]
-    covariances = np.array([s.scale * s.half @ s.half.T for _, s, _ in kept])
-    share = np.array([w for w, _, _ in kept])
-    covariance = np.tensordot(share, covariances, 1) / share.sum()
+    covariances = np.array([s.covariance for s in every])
+    covariance: Values = np.tensordot(weight, covariances, 1)
     spare = max(len(equations.residual) - every[best].rank, 1)
     return HandFit(
         state,
         covariance,
         every[best].log_likelihood,
         noises[best],
-        every[best].scale,
-        _freedom(covariances, covariance, share / share.sum(), spare),
+        _freedom(covariances, covariance, weight, spare),
         equations.residual,
         equations.error,
         every[best].rank,
-        rounds,
-        converged,
+        *how,
         every[best].condition,
     )
 
@@ -156,7 +208,7 @@ def _freedom(covariances: Values, mean: Values, weight: Values, spare: float) ->
     return float(1.0 / (1.0 / spare + (0.0 if spread < 1e-12 else 1.0 / (4.0 + 2.0 / spread))))
 
 
-def solve(equations: Equations, noise: HandNoise) -> Solved:
+def solve(equations: Equations, noise: HandNoise, limits: Limits) -> Solved:
     """Solve for the step under one noise."""
     X = equations.columns
     n, p = X.shape
@@ -164,20 +216,22 @@ def solve(equations: Equations, noise: HandNoise) -> Solved:
     X, r = white[:, :p], white[:, p]
     size = np.linalg.norm(X, axis=0)
     size = np.where(size > 0.0, size, 1.0)
-    U, s, Vt = np.linalg.svd(X / size, full_matrices=True)
-    kept = s > NEW * s[0] * 0.1
-    rank = int(kept.sum())
-    half = (Vt[: len(s)][kept] / s[kept, None]).T / size[:, None]
-    along = U[:, : len(s)][:, kept].T @ r
-    rss = float(r @ r - along @ along)
+    values, vectors = np.linalg.eigh((X / size).T @ (X / size))
+    kept = values > NONE * values[-1]
+    along = (vectors[:, kept] / np.sqrt(values[kept])).T @ ((X / size).T @ r)
+    rank, rss = int(kept.sum()), max(float(r @ r - along @ along), 0.0)
     spare = max(n - rank, 1)
     k, k_free = max(1.0, rss / n), max(1.0, rss / spare)
-    inner = 2.0 * float(np.sum(np.log(s[kept]))) + 2.0 * float(np.sum(np.log(size)))
+    believed = k_free * limits.precision
+    N = ((X / size).T @ (X / size)) + np.diag(believed / size**2)
+    values, vectors = np.linalg.eigh(N)
+    kept = values > 1e-14 * values[-1]
+    half = vectors[:, kept] / np.sqrt(values[kept]) / size[:, None]
+    inner = float(np.sum(np.log(values[kept]))) + 2.0 * float(np.sum(np.log(size)))
     return Solved(
-        half @ along,
-        half,
-        np.concatenate([Vt[: len(s)][~kept], Vt[len(s) :]]).T,
-        float(s[0] / s[-1]) if s[-1] > 0 else float("inf"),
+        half @ (half.T @ (X.T @ r - believed * limits.values)),
+        k_free * half @ half.T,
+        float(np.sqrt(values[-1] / max(values[0], 1e-300))),
         -0.5 * (rss / k + n * float(np.log(k)) + logarithm) + noise.prior,
         -0.5 * (rss / k_free + spare * float(np.log(k_free)) + logarithm + inner) + noise.prior,
         k_free,
@@ -185,54 +239,33 @@ def solve(equations: Equations, noise: HandNoise) -> Solved:
     )
 
 
-def with_limits(
-    model: Model, found: HandFit, noises: Sequence[HandNoise], limits: Mapping[str, Values]
-) -> tuple[Values, list[str]]:
-    """Return the covariance with what the equations leave open, and the names of the parameters concerned.
-
-    Parameters
-    ----------
-    model : Model
-    found : HandFit
-    noises : sequence of HandNoise
-    limits : mapping
-        Effect to the limits of its parameters.
+def require_observable(model: Model, found: HandFit, limits: Mapping[str, Values]) -> None:
+    """Refuse a fit with an effect of which rests and moves say nothing.
 
     Raises
     ------
     NotObservableError
-        If an effect is not determined at all, or the data sheet has no limit for it.
+        Naming the effects, or the parameters that nothing determines.
     """
     equations = model.equations(found.state)
+    believed = limits_at(model, found.state, limits).precision
     names = parameter_names(model.sensor, [term.effect for term in found.state.terms])
-    columns = equations.columns
-    solved = solve(equations, noises[0])
-    if solved.null.shape[1] == 0:
-        return found.covariance, []
-    size = np.linalg.norm(equations.whitened(noises[0], columns)[0], axis=0)
-    open_ = solved.null / np.where(size > 0.0, size, 1.0)[:, None]
-    precision = np.zeros(len(found.covariance))
-    at = columns.shape[1] - len(names)
-    for term in found.state.terms:
-        own = slice(at, at + len(term.values))
-        known = np.asarray(limits.get(term.effect.name, np.full(len(term.values), np.inf)))
-        precision[own] = (2.0 / known) ** 2
-        at = own.stop
-    gram = open_.T @ (precision[:, None] * open_)
-    reach = np.sqrt(np.sum(open_[-len(names) :] ** 2 * precision[-len(names) :, None], axis=1))
-    concerned = [name for name, share in zip(names, reach, strict=True) if share > NEW * reach.max()]
-    lost = [t.effect for t, Z in zip(found.state.terms, equations.effects, strict=True) if _lost(equations.base, Z)]
-    if lost or np.linalg.eigvalsh(gram)[0] <= 1e-12 * max(float(np.trace(gram)), 1e-300):
-        effects = lost or [t.effect for t in found.state.terms]
-        advice = "; ".join(f"{e.name} needs {e.excitation}" for e in effects)
+    pairs = zip(found.state.terms, equations.effects, strict=True)
+    lost = [term.effect for term, Z in pairs if _explained(equations.base, Z)]
+    scaled = equations.columns / np.maximum(np.linalg.norm(equations.columns, axis=0), 1e-300)
+    gram = scaled.T @ scaled + np.diag(np.where(believed > 0.0, 1.0, 0.0))
+    weak = np.linalg.eigh(gram)
+    open_ = np.abs(weak.eigenvectors[:, weak.eigenvalues < NONE])
+    loose = [name for name, row in zip(names, open_[-len(names) :], strict=True) if np.any(row > 0.2)]
+    if lost or loose:
+        advice = "; ".join(f"{e.name} needs {e.excitation}" for e in lost or [t.effect for t in found.state.terms])
         raise NotObservableError(
-            f"the rests of the {model.sensor} do not determine {', '.join(e.name for e in effects)}: {advice}; or take "
-            f"it out of effects.{model.sensor}"
+            f"the rests of the {model.sensor} do not determine {', '.join([e.name for e in lost] or loose)}: {advice}; "
+            f"or take it out of effects.{model.sensor}"
         )
-    return found.covariance + open_ @ np.linalg.solve(gram, open_.T), concerned
 
 
-def _lost(base: Values, Z: Values) -> bool:
+def _explained(base: Values, Z: Values) -> bool:
     """Return whether base columns explain all of an effect's."""
     size = np.linalg.norm(Z, axis=0)
     Q, _ = np.linalg.qr(base)

@@ -42,10 +42,10 @@ class Beside:
 
     Attributes
     ----------
-    shown : list of (t, n, p) array
-        Orthonormal directions of each candidate, zeros where it shows fewer than it has columns.
     raw : list of (t, n, p) array
         What is left of each candidate's columns.
+    half : list of (t, p, p) array
+        ``raw @ half`` are orthonormal directions, zeros where a candidate shows fewer than it has columns.
     residual : (t, n) array
     basis : (t, n, b) array
         Orthonormal, of the model's columns.
@@ -53,8 +53,8 @@ class Beside:
         log det C, less twice the prior of the noise.
     """
 
-    shown: list[Values]
     raw: list[Values]
+    half: list[Values]
     residual: Values
     basis: Values
     logarithm: Values
@@ -73,13 +73,18 @@ class Beside:
 
     def of_candidate(self, j: int) -> tuple[float, int]:
         """Return log L with candidate j, and the index of its best noise."""
-        gained = np.sum(np.einsum("tnp,tn->tp", self.shown[j], self.residual) ** 2, axis=1)
+        along = (self.residual[:, None, :] @ self.raw[j]) @ self.half[j]
+        gained = np.sum(along**2, axis=(1, 2))
         scores = self.log_likelihood(np.sum(self.residual**2, axis=1) - gained)
         return float(scores.max()), int(np.argmax(scores))
 
     def count(self, j: int, at: int) -> int:
         """Return how many directions candidate j shows under a noise."""
-        return int(np.sum(self.shown[j][at] ** 2) + 0.5)
+        return int(np.any(self.half[j][at], axis=0).sum())
+
+    def shown(self, j: int, at: int) -> Values:
+        """Return the orthonormal directions of candidate j under a noise: (n, p) array."""
+        return np.asarray(self.raw[j][at] @ self.half[j][at])
 
     def correction(self, j: int, at: int, added: int, kinds: Values) -> float:
         """Return the factor on the gain by candidate j; 0 where it leaves fewer than two equations to judge it by.
@@ -93,7 +98,7 @@ class Beside:
         kinds : (s, n) array
             Positive where an equation is of a kind.
         """
-        power = np.sum(self.shown[j][at] ** 2, axis=1)
+        power = np.sum(self.shown(j, at) ** 2, axis=1)
         leverage = np.sum(self.basis[at] ** 2, axis=1) + power
         factor = 0.0
         for kind in kinds > 0:
@@ -103,8 +108,8 @@ class Beside:
         return max((spare + 0.5 * (added - 2)) / n, 0.0) if spare >= 2.0 - 1e-9 else 0.0
 
 
-def orthonormal(columns: Values, sizes: Values) -> Values:
-    """Return orthonormal bases of stacked columns: (t, n, p) array; directions below ``NEW`` of the sizes are zeros.
+def halves(columns: Values, sizes: Values) -> Values:
+    """Return what makes stacked columns orthonormal: (t, p, p) array; directions below ``NEW`` of the sizes are zeros.
 
     Parameters
     ----------
@@ -112,12 +117,12 @@ def orthonormal(columns: Values, sizes: Values) -> Values:
     sizes : (t, p) array
         Norms before something was taken out of the columns.
     """
-    if columns.shape[2] == 0:
-        return columns
-    scaled = columns / np.where(sizes > 0.0, sizes, 1.0)[:, None, :]
-    U, s, _ = np.linalg.svd(scaled, full_matrices=False)
-    basis: Values = U * (s > NEW)[:, None, :]
-    return basis
+    size = np.where(sizes > 0.0, sizes, 1.0)
+    products = columns.transpose(0, 2, 1) @ columns / (size[:, :, None] * size[:, None, :])
+    values, vectors = np.linalg.eigh(products)
+    kept = values > NEW**2
+    half: Values = vectors * (kept / np.sqrt(np.where(kept, values, 1.0)))[:, None, :] / size[:, :, None]
+    return half
 
 
 def beside(equations: Equations, noises: Sequence[HandNoise]) -> Beside:
@@ -128,9 +133,9 @@ def beside(equations: Equations, noises: Sequence[HandNoise]) -> Beside:
     whitened = [equations.whitened(noise, together) for noise in noises]
     white = np.array([w for w, _ in whitened])
     sizes = np.linalg.norm(white, axis=1)
-    basis = orthonormal(white[:, :, : edges[0]], sizes[:, : edges[0]])
+    basis = white[:, :, : edges[0]] @ halves(white[:, :, : edges[0]], sizes[:, : edges[0]])
     rest = white - basis @ (basis.transpose(0, 2, 1) @ white)
     blocks = [slice(start, stop) for start, stop in pairwise(edges.tolist())]
-    shown = [orthonormal(rest[:, :, block], sizes[:, block]) for block in blocks]
+    half = [halves(rest[:, :, block], sizes[:, block]) for block in blocks]
     logarithm = np.array([log - 2.0 * noise.prior for (_, log), noise in zip(whitened, noises, strict=True)])
-    return Beside(shown, [rest[:, :, block] for block in blocks], rest[:, :, -1], basis, logarithm)
+    return Beside([rest[:, :, block] for block in blocks], half, rest[:, :, -1], basis, logarithm)

@@ -10,7 +10,7 @@ import numpy as np
 from pipeline.errors import NotObservableError
 from pipeline.estimation.hand_held import accelerometer, gyroscope
 from pipeline.estimation.hand_held.equations import noises_for
-from pipeline.estimation.hand_held.fit import with_limits
+from pipeline.estimation.hand_held.fit import require_observable
 from pipeline.estimation.hand_held.model import refusal
 from pipeline.estimation.hand_held.selection import fit_configured, limits_of, select
 from pipeline.model.effects import effect
@@ -20,9 +20,6 @@ from pipeline.records.calibration import coverage_factor
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
-
-    from pipeline.estimation.hand_held.equations import HandNoise
     from pipeline.estimation.hand_held.fit import HandFit
     from pipeline.estimation.hand_held.model import Model
     from pipeline.records import Noise, Recording
@@ -94,25 +91,20 @@ def fit_effects_by_hand(
         if reason:
             raise NotObservableError(f"{name} cannot be fitted by hand: {reason}; take it out of effects.{sensor}")
     noises = noises_for(noise, model.kinds)
-    found = fit_configured(model, before, names, noises)
-    spare = len(found.residual) - model.directions.shape[1] - sum(len(t.values) for t in found.state.terms)
-    if spare < 1:
+    limits = limits_of(sensor, sheet)
+    found = fit_configured(model, before, names, noises, limits)
+    if len(found.residual) <= found.rank:
         raise NotObservableError(
             f"{len(model.rests.time)} rests of the {sensor} are too few for {', '.join(names)} beside bias and matrix: "
-            f"record at least {len(model.rests.time) + 2 - spare} rests in as many orientations"
+            f"record at least {found.rank + 10} rests in as many orientations"
         )
-    return calibration_of(model, found, noises, limits_of(sensor, sheet), before)
+    require_observable(model, found, limits)
+    return calibration_of(model, found, before)
 
 
-def calibration_of(
-    model: Model,
-    found: HandFit,
-    noises: Sequence[HandNoise],
-    limits: Mapping[str, NDArray[np.float64]],
-    before: SensorCalibration,
-) -> SensorCalibration:
+def calibration_of(model: Model, found: HandFit, before: SensorCalibration) -> SensorCalibration:
     """Return a fit as a calibration with the stage ``effects``."""
-    covariance, undetermined = with_limits(model, found, noises, limits)
+    covariance = found.covariance
     count = covariance.shape[0] - model.directions.shape[1]
     place = np.zeros((12 + count, covariance.shape[0]))
     place[:12, : model.directions.shape[1]] = model.directions
@@ -136,9 +128,9 @@ def calibration_of(
         "equations": len(found.residual),
         "rounds": found.rounds,
         "condition": found.condition if np.isfinite(found.condition) else None,
-        "wander_ratio": found.noise.ratio,
-        "wander_time_s": found.noise.time,
-        "undetermined": undetermined,
+        "wander_ratio": float(found.noise.ratio),
+        "wander_time_s": float(found.noise.time),
+        "scatter_over_noise": list(found.noise.scatter),
     }
     rests = slice(0, model.rests_equations)
     rms = float(np.sqrt(np.mean((found.residual[rests] * found.error[rests]) ** 2)))

@@ -124,13 +124,17 @@ def select(
 
 
 def fit_configured(
-    model: Model, start: SensorCalibration, configured: Sequence[str], noises: Sequence[HandNoise]
+    model: Model,
+    start: SensorCalibration,
+    configured: Sequence[str],
+    noises: Sequence[HandNoise],
+    limits: Mapping[str, Values],
 ) -> HandFit:
     """Fit base and configured effects, from the best of their starts."""
     fits = []
     for terms in starts_of(configured, model.sensor, start):
         state = State(start.bias, start.matrix, tuple(Term(t.effect, np.array(t.values, float)) for t in terms))
-        fits.append(fit(model, state, noises))
+        fits.append(fit(model, state, noises, limits))
     return max(fits, key=lambda found: found.log_likelihood)
 
 
@@ -155,11 +159,12 @@ class _Search:
         self.noises = noises_for(noise, model.kinds)
         self.limits = limits_of(model.sensor, sheet)
         self.effects = candidates_for(model.sensor, model.rests, configured)
-        self.base = fit_configured(model, start, configured, self.noises)
+        self.base = fit_configured(model, start, configured, self.noises, self.limits)
         self.held = len(self.base.state.terms)
         self.names: list[str] = []
         self.steps: dict[str, Score] = {}
         self.fit = self.base
+        self.known: dict[tuple[tuple[str, ...], tuple[str, ...]], Scored] = {}
 
     def run(self) -> HandSelection:
         first = scored = self._scored([])
@@ -186,11 +191,17 @@ class _Search:
 
     def _scored(self, names: Sequence[str]) -> Scored:
         """Score every effect beside base, configured and some of the selected effects."""
+        key = tuple(self.names), tuple(names)
+        if key not in self.known:
+            self.known[key] = self._score_all(names)
+        return self.known[key]
+
+    def _score_all(self, names: Sequence[str]) -> Scored:
         terms, found, equations = self._beside(names)
         before, at = found.of_model()
         out = Scored({}, {}, {}, {}, {})
         for j, term in enumerate(terms):
-            name, shown, count = term.effect.name, found.shown[j][at], found.count(j, at)
+            name, count = term.effect.name, found.count(j, at)
             if count == 0:
                 continue
             added = count + len(term.effect.nonlinear)
@@ -201,6 +212,7 @@ class _Search:
             score = replace(score, log_likelihood=after, setting=own, admissible=factor > 0.0)
             if name in out.scores and out.scores[name].delta_bic >= score.delta_bic:
                 continue
+            shown = found.shown(j, at)
             out.scores[name], out.spare[name], out.shown[name] = score, factor, shown
             out.signal[name] = shown @ (shown.T @ found.residual[at])
             out.visible[name] = self._reach(term, found.raw[j][at], factor)
@@ -258,7 +270,7 @@ class _Search:
                 continue
             terms = [t for i, t in enumerate(self.fit.state.terms) if i < self.held or t.effect.name in names]
             start = replace(self.fit.state, terms=(*terms, Term(effect(score.name), score.values)))
-            found = fit(self.model, start, self.noises)
+            found = fit(self.model, start, self.noises, self.limits)
             gain = max(2.0 * (found.log_likelihood - before), 0.0) * scored.spare[score.name]
             scored.scores[score.name] = replace(
                 score,
@@ -284,13 +296,13 @@ class _Search:
         self.names.append(score.name)
         self.steps[score.name] = score
         terms = (*self.fit.state.terms, Term(effect(score.name), score.values))
-        self.fit = fit(self.model, replace(self.fit.state, terms=terms), self.noises)
+        self.fit = fit(self.model, replace(self.fit.state, terms=terms), self.noises, self.limits)
 
     def _remove(self, name: str) -> None:
         self.names.remove(name)
         del self.steps[name]
         terms = tuple(t for t in self.fit.state.terms if t.effect.name != name)
-        self.fit = fit(self.model, replace(self.fit.state, terms=terms), self.noises)
+        self.fit = fit(self.model, replace(self.fit.state, terms=terms), self.noises, self.limits)
 
     def _own(self, name: str) -> Scored:
         return self._scored([n for n in self.names if n != name])
@@ -319,7 +331,7 @@ class _Search:
         fits = [self.base]
         for count in range(1, len(self.names)):
             terms = self.fit.state.terms[: self.held + count]
-            fits.append(fit(self.model, replace(self.fit.state, terms=terms), self.noises))
+            fits.append(fit(self.model, replace(self.fit.state, terms=terms), self.noises, self.limits))
         return [*fits, self.fit] if self.names else fits
 
 
