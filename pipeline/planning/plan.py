@@ -67,11 +67,12 @@ def plan_of(unit: UnitDescription, extra: Sequence[Planned] = (), *, half_only: 
         "minutes": rehearsal.minutes,
         "samples": sum(r.samples for r in rehearsal.recordings),
         "warnings": limits_broken(rehearsal),
-        **{sensor: _of_sensor(sensor, rehearsal, half_only=half_only) for sensor in SENSORS},
+        **{sensor: of_sensor(sensor, rehearsal, half_only=half_only) for sensor in SENSORS},
     }
 
 
-def _of_sensor(sensor: str, rehearsal: Rehearsal, *, half_only: bool) -> Document:
+def of_sensor(sensor: str, rehearsal: Rehearsal, *, half_only: bool = False) -> Document:
+    """Return the plan of one sensor: what it would find in the recordings of a rehearsal."""
     noise, sheet = rehearsal.noise[sensor], rehearsal.sheets[sensor]
     document: Document = {
         "unit": UNITS[sensor],

@@ -1,0 +1,106 @@
+"""``python -m pipeline plan``: options in, tables or JSON out."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import pytest
+
+from pipeline.__main__ import main
+from pipeline.model.effects import forget_registered
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+QUICK = ["--step", "15", "--validation", "0", "--static", "60"]
+OWN = """\
+name: gear_mesh
+owner: table
+sensors: [gyroscope]
+meaning: The gear of the table pushes five times a turn.
+terms:
+  A: {formula: "cos(5 * radians(angle))", unit: deg/s}
+limits: {A: 0.1}
+"""
+
+
+def _out(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    assert main(["plan", *arguments]) == 0
+    return capsys.readouterr().out
+
+
+def test_a_plan_is_printed_with_sizes_and_reasons(capsys: pytest.CaptureFixture[str]) -> None:
+    lines = _out(capsys, *QUICK, "--no-extra").splitlines()
+    assert lines[0].startswith("mpu6050 on acutronic, three_axis_turns: ")
+    assert "min at the table" in lines[0]
+    lever = next(line.split() for line in lines if line.strip().startswith("lever_arm"))
+    assert lever[2] == "m"
+    assert 0.0 < float(lever[1]) < 0.1
+    assert any(line.startswith("  scale_factor_asymmetry") and "one direction" in line for line in lines)
+    assert max(line.index("of limit") for line in lines if "of limit" in line) < 80
+
+
+def test_two_procedures_stand_side_by_side(capsys: pytest.CaptureFixture[str]) -> None:
+    lines = _out(capsys, *QUICK, "--against", "--both-directions").splitlines()
+    assert lines[0].startswith("A: mpu6050")
+    assert lines[1].startswith("B: mpu6050")
+    asymmetry = [line.split() for line in lines if line.strip().startswith("scale_factor_asymmetry")]
+    assert asymmetry[1][1] == "-"
+    assert float(asymmetry[1][2]) < 4e-3
+    tilt = next(line.split() for line in lines if line.strip().startswith("table_tilt"))
+    assert float(tilt[-1]) < 1.0
+
+
+def test_a_machine_reads_the_same_plan_as_json(capsys: pytest.CaptureFixture[str]) -> None:
+    plan = json.loads(_out(capsys, *QUICK, "--sensor", "stim300", "--no-extra", "--json"))
+    assert plan["sensor"] == "stim300"
+    assert plan["extra"] == []
+    entry = next(e for e in plan["accelerometer"]["effects"] if e["effect"] == "lever_arm")
+    assert entry["smallest"] == pytest.approx(0.2 * entry["share_of_limit"])
+    assert entry["smallest"] < entry["almost_sure"]
+
+
+def test_an_effect_of_the_users_own_is_planned(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    file = tmp_path / "gear_mesh.yaml"
+    file.write_text(OWN, encoding="utf-8")
+    try:
+        plan = json.loads(_out(capsys, *QUICK, "--no-extra", "--json", "--effect", str(file)))
+    finally:
+        forget_registered()
+    entry = next(e for e in plan["gyroscope"]["effects"] if e["effect"] == "gear_mesh")
+    assert 0.0 < entry["smallest"] < 0.1
+    assert entry["unit"] == "deg/s"
+
+
+def test_a_campaigns_description_is_planned(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    course = "course: {step_deg: 15.0, validation_s: 0.0, static_s: 60.0, both_directions: true}"
+    text = f"defaults: {{sensor: stim300, {course}}}\nunits:\n- unit: A\n- unit: B\n  sensor: mpu6050\n"
+    (tmp_path / "simulation.yaml").write_text(text, encoding="utf-8")
+    plan = json.loads(_out(capsys, "--campaign", str(tmp_path), "--unit", "B", "--no-extra", "--json"))
+    given = json.loads(_out(capsys, *QUICK, "--both-directions", "--no-extra", "--json"))
+    assert plan == given
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--sensor", "mpu9999"], "no sensor is called 'mpu9999'; known: generic, mpu6050, stim300"),
+        (["--procedure", "dance"], "no procedure is called 'dance'"),
+        (["--rate", "0"], "rates_dps is (0.0,); it must be above 0"),
+        (["--samples", "100"], "cannot be recorded in 100 samples"),
+        (["--unit", "A"], "--unit chooses a unit of a description"),
+        (["--against", "--frobnicate"], "--frobnicate is not known"),
+        (["--against", "--rate fast"], "invalid float value: 'fast'"),
+        (["--campaign", "."], "has no simulation.yaml"),
+        (["--from", "nowhere.yaml"], "nowhere.yaml: this file does not exist"),
+    ],
+)
+def test_wrong_options_are_one_line_and_exit_code_2(
+    capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    assert main(["plan", "--no-extra", *QUICK[:2], *arguments]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("python -m pipeline plan: ")
+    assert message in error
+    assert error.count("\n") == 1
