@@ -1,9 +1,9 @@
-"""Horizontal bars, one a row, with their text above: the staircase of errors and the ranking of effects.
+"""Horizontal bars, one a row, with their text above: the staircase of errors; and upright bars in groups.
 
     length = log(value / low) / log(high / low)
 
 on a logarithmic axis from ``low`` to ``high``; a bar's length there is no quantity, its end is. So each bar carries its
-number, and the levels (noise floor, gate) are lines that cross all rows.
+number, and the levels (the noise floor) are lines that cross all rows.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def bars(
         out.append(text(min(max(x, LEFT + half), WIDTH - half), top - 4, words, "m"))
     out += [text(scale.pixels(v), bottom + 13, tick_label(v, v), "m") for v in at]
     out.append(text((LEFT + WIDTH - RIGHT) / 2, bottom + 27, unit, "m"))
-    return frame(name, title, description, bottom + 32, "".join(out))
+    return frame(name, title, description, bottom + 34, "".join(out))
 
 
 def _row(bar: Bar, scale: Scale, top: float) -> str:
@@ -84,7 +84,14 @@ def _row(bar: Bar, scale: Scale, top: float) -> str:
 
 
 def columns(
-    name: str, title: str, description: str, groups: dict[str, list[float]], label: str, *, x_label: str
+    name: str,
+    title: str,
+    description: str,
+    groups: dict[str, list[float]],
+    label: str,
+    *,
+    x_label: str,
+    levels: list[float] | None = None,
 ) -> Markup:
     """Return a chart of upright bars in groups: one colour for each place in a group.
 
@@ -97,9 +104,11 @@ def columns(
         Of the values, with unit.
     x_label : str
         Of the groups.
+    levels : list of float, optional
+        A dash over each group.
     """
-    high = max((v for g in groups.values() for v in g), default=1.0) or 1.0
-    left, top, bottom = 58, 8, 118
+    high = max((v for g in [*groups.values(), levels or []] for v in g), default=1.0) or 1.0
+    left, top, bottom = 60, 8, 138
     y = Scale(0.0, high * 1.05, bottom, top)
     pitch = (WIDTH - 8 - left) / max(len(groups), 1)
     at = ticks(0.0, y.high, 4)
@@ -114,6 +123,9 @@ def columns(
                 f'<path class="bar c{j}" d="M{x:.1f} {bottom}V{y.pixels(value):.1f}h{wide:.1f}V{bottom}z"/>',
             )
         out.append(text(left + pitch * (i + 0.5), bottom + 13, below, "m"))
-    out.append(f'<text class="m" transform="translate(10 {(top + bottom) / 2:g}) rotate(-90)">{escape(label)}</text>')
+    dashes = "".join(f"M{left + pitch * i:.1f} {y.pixels(v):.1f}h{pitch:.1f}" for i, v in enumerate(levels or []))
+    if dashes:
+        out.append(f'<path class="level" d="{dashes}"/>')
+    out.append(f'<text class="m" transform="translate(11 {(top + bottom) / 2:g}) rotate(-90)">{escape(label)}</text>')
     out.append(text((left + WIDTH - 8) / 2, bottom + 27, x_label, "m"))
-    return frame(name, title, description, bottom + 32, "".join(out))
+    return frame(name, title, description, bottom + 34, "".join(out))

@@ -1,39 +1,28 @@
-"""The charts of a unit's page, each with its caption and legend."""
+"""The charts of readings, model and held-out error, each with its finding, caption and legend."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.report.axes import span
-from pipeline.report.bars import Bar, bars, columns
+from pipeline.report.bars import Bar, bars
+from pipeline.report.figure import AXES, AXES_LEGEND, JSON, UNITS, Figure, plain
+from pipeline.report.limits import final_step
 from pipeline.report.numbers import number
-from pipeline.report.residuals import BinnedMean, Residual, covariates, harmonics, white_noise
-from pipeline.report.shapes import Band, Layer, Line, Means, Samples
+from pipeline.report.residuals import Residual, white_noise
+from pipeline.report.shapes import Band, Layer, Line, Samples
 from pipeline.report.svg import Panel, chart
 from pipeline.report.tables import step_label
 
 if TYPE_CHECKING:
-    from markupsafe import Markup
     from numpy.typing import NDArray
 
     from pipeline.records import Recording
 
-JSON = dict[str, Any]
-AXES = "xyz"
-UNITS = {"accelerometer": "g", "gyroscope": "deg/s"}
-AXES_LEGEND = (("c0", "x"), ("c1", "y"), ("c2", "z"))
-
-
-@dataclass(frozen=True)
-class Figure:
-    """A chart, a sentence below it, and its legend as (CSS class, text) pairs."""
-
-    svg: Markup
-    caption: str
-    legend: tuple[tuple[str, str], ...] = ()
+NOISE = 1.1  # of the band: a residual up to it is noise
+ALIKE = 1.2  # factor between a held-out error of the validation and the diagnosis's own, for both to mean the same
 
 
 def measurement_and_model(sensor: str, residual: Residual, sigma: NDArray[np.float64] | None) -> Figure:
@@ -49,7 +38,7 @@ def measurement_and_model(sensor: str, residual: Residual, sigma: NDArray[np.flo
     unit, motion = UNITS[sensor], residual.motion
     angle = motion.angle is not None and np.ptp(motion.angle) > 1.0
     x = motion.angle if angle and motion.angle is not None else motion.time
-    source = "of the noise model" if sigma is not None else "from its own sample-to-sample scatter"
+    source = "" if sigma is not None else " Its σ is taken from the sample-to-sample scatter."
     sigma = white_noise(residual.error) if sigma is None else sigma
     layers: list[Layer] = [Samples(x, residual.reading[:, i], i) for i in range(3)]
     layers += [Line(x, residual.predicted[:, i], 5, "model") for i in range(3)]
@@ -69,19 +58,19 @@ def measurement_and_model(sensor: str, residual: Residual, sigma: NDArray[np.flo
     name = residual.recording.name
     outside = float(np.mean(np.abs(residual.error) > 2 * sigma))
     caption = (
-        f"{name}: readings and model (thin line); below, reading minus model, its mean over short stretches, and the "
-        f"band of ±2 σ {source}. "
-        f"{100 * outside:.1f} % of the residuals lie outside of it; white noise alone puts 4.6 % there."
+        f"{100 * outside:.1f} % of the residuals lie outside the band; white noise alone puts 4.6 % there.{source}"
     )
+    ratio = max(r / s for r, s in zip(rms(residual.error), sigma, strict=True))
+    finding = f"{name}: the residual is {number(ratio)} × the noise" + ("" if ratio > NOISE else ", so nothing is left")
     svg = chart(
         f"{sensor}-{name}",
-        f"{sensor}, {name}: measurement and model",
+        f"{sensor}: measurement and model. {finding}",
         f"Root mean square of the residual: {', '.join(number(r) for r in rms(residual.error))} {unit} on x, y, z.",
         panels,
         "table angle, deg" if angle else "time, s",
         angle=bool(angle),
     )
-    return Figure(svg, caption, (*AXES_LEGEND, ("c5", "model")))
+    return Figure(svg, caption, (*AXES_LEGEND, ("c5", "model")), finding)
 
 
 def rms(error: NDArray[np.float64]) -> list[float]:
@@ -113,115 +102,67 @@ def held_out_over_time(
         Panel([Samples(x, raw, 3), Samples(x, calibrated, 2)], f"error, {unit}", 120, {"": 0.0}),
         Panel(zoom, f"after, {unit}", 80, limits=span([calibrated, np.array([-2.2, 2.2]) * (floor or 0.0)])),
     ]
+    before, after = rms(raw[:, None])[0], rms(calibrated[:, None])[0]
+    finding = f"In {recording.name} the error goes from {number(before)} to {number(after)} {unit}"
     svg = chart(
         f"{sensor}-held-out",
-        f"{sensor}: error in held-out motion",
-        f"Root mean square {number(rms(raw[:, None])[0])} {unit} before, {number(rms(calibrated[:, None])[0])} after.",
+        f"{sensor}: {finding}",
+        f"Root mean square {number(before)} {unit} before, {number(after)} after.",
         panels,
         "time, s",
     )
     what = "specific force minus gravity" if sensor == "accelerometer" else "angular rate minus the table's rate"
     return Figure(
         svg,
-        f"{recording.name}, which no fit saw: magnitude of the {what}, before and after calibration; below, after "
-        "alone with the band of ±2 noise floors.",
+        f"Magnitude of the {what}, before and after calibration, in a recording that no fit saw; below, after alone "
+        "with the band of ±2 noise floors.",
         (("c3", "before"), ("c2", "after")),
+        finding,
     )
 
 
-def staircase(sensor: str, held_out: JSON, *, vector: bool) -> Figure | None:
+def staircase(sensor: str, held_out: JSON, found: JSON, *, vector: bool) -> Figure | None:
     """Draw the held-out error step by step, raw to stages to calibrated to effects, above the noise floor.
 
-    ``vector`` chooses the error of the vector instead of the magnitude's; None where it is not known.
+    Parameters
+    ----------
+    sensor : str
+    held_out, found : dict
+        The sensor's parts of validation and diagnosis; effects that the diagnosis selected continue the stairs.
+    vector : bool
+        The error of the vector instead of the magnitude's. None is returned where it is not known.
     """
     key, floor_key = ("vector_rms_error", "vector_noise_floor") if vector else ("rms_error", "noise_floor")
-    steps, floor = held_out.get("steps", []), held_out.get(floor_key)
+    steps, floor, unit = held_out.get("steps", []), held_out.get(floor_key), UNITS[sensor]
     if not steps or all(s.get(key) is None for s in steps):
         return None
     rows = [Bar(step_label(s["name"]), s.get(key), 3 if s["name"] == "raw" else 2) for s in steps]
-    kind = "vector" if vector else "magnitude"
+    if vector or all(s.get("vector_rms_error") is None for s in steps):
+        rows += _if_added(found, final_step(held_out).get(key))
+    kind, reached = "vector" if vector else "magnitude", final_step(held_out).get(key)
+    finding = f"The error of the {kind} ends at {number(reached)} {unit}"
+    if reached and floor:
+        finding += f", {number(reached / floor)} × the noise floor"
+    if rows[-1].colour == 4:
+        finding += f"; with what is missing, at {number(rows[-1].value)}"
     svg = bars(
         f"{sensor}-staircase-{kind}",
-        f"{sensor}: held-out error of the {kind}, step by step",
-        "; ".join(f"{r.label} {number(r.value)}" for r in rows) + f"; noise floor {number(floor)} {UNITS[sensor]}",
+        f"{sensor}: {finding}",
+        "; ".join(f"{r.label} {number(r.value)}" for r in rows) + f"; noise floor {number(floor)} {unit}",
         rows,
-        f"root mean square error, {UNITS[sensor]} (logarithmic)",
+        f"root mean square error, {unit} (logarithmic)",
         levels={"noise floor": floor} if floor else {},
     )
-    return Figure(svg, f"Held-out error of the {kind}, as each step is added; the line is what noise alone leaves.")
+    caption = f"Held-out error of the {kind}, as each step is added; the line is what noise alone leaves."
+    return Figure(svg, caption, (("c4", "if it were added"),) if rows[-1].colour == 4 else (), finding)
 
 
-def ranking(sensor: str, diagnosis: JSON) -> Figure | None:
-    """Draw the evidence for each effect that helps: its delta BIC on a logarithmic axis, with the gate at 10."""
-    found = [r for r in diagnosis.get("ranking", []) if (r.get("delta_bic") or 0.0) > 1.0][:12]
-    if not found:
-        return None
-    rows = [
-        Bar(
-            r["effect"].replace("_", " ")
-            + "".join(f" (like {a['effect'].replace('_', ' ')})" for a in (r.get("look_alikes") or [])[:1]),
-            r["delta_bic"],
-            2 if r["effect"] in diagnosis.get("selected", []) else 4,
-        )
-        for r in found
-    ]
-    svg = bars(
-        f"{sensor}-ranking",
-        f"{sensor}: evidence for missing effects",
-        "; ".join(f"{r.label} {number(r.value)}" for r in rows),
-        rows,
-        "ΔBIC (logarithmic): larger is stronger evidence",
-        levels={"strong evidence": 10.0},
-    )
-    return Figure(svg, "Evidence for each effect beyond the configured model; above 10 is strong.")
-
-
-def residual_figures(sensor: str, found: list[Residual]) -> list[Figure]:
-    """Draw binned means of the residual against each covariate (worst first), and its harmonics of the turn."""
-    figures = [_covariate(sensor, label, mean) for label, mean in covariates(found).items()]
-    for residual in found:
-        amplitudes = harmonics(residual)
-        if amplitudes is not None:
-            figures.append(_harmonics(sensor, residual, amplitudes))
-    return figures
-
-
-def _covariate(sensor: str, label: str, mean: BinnedMean) -> Figure:
-    unit, slug = UNITS[sensor], label.split(",", maxsplit=1)[0]
-    top = 1.05 * float(np.nanmax(np.abs(mean.mean) + 2 * mean.error))
-    panels = [
-        Panel(
-            [Means(mean.centre, mean.mean[:, i], 2 * mean.error[:, i], i)],
-            f"{AXES[i]}, {unit}",
-            height=64,
-            levels={"": 0.0},
-            limits=(-top, top),
-        )
-        for i in range(3)
-    ]
-    svg = chart(
-        f"{sensor}-residual-{slug}",
-        f"{sensor}: residual against {slug}",
-        f"Means in bins; on the worst axis their mean square is {number(mean.excess)} times what noise gives.",
-        panels,
-        label,
-        angle=slug == "angle",
-    )
-    return Figure(svg, f"Mean residual against {slug}, with ±2 standard errors; flat at zero if nothing is missing.")
-
-
-def _harmonics(sensor: str, residual: Residual, amplitudes: NDArray[np.float64]) -> Figure:
-    name = residual.recording.name
-    svg = columns(
-        f"{sensor}-harmonics-{name}",
-        f"{sensor}, {name}: harmonics of the residual",
-        "; ".join(f"{k} cycles: {', '.join(number(v, 2) for v in row)}" for k, row in enumerate(amplitudes.tolist())),
-        {str(k): row for k, row in enumerate(amplitudes.tolist())},
-        f"amplitude, {UNITS[sensor]}",
-        x_label="cycles a turn",
-    )
-    caption = (
-        f"{name}: residual by cycles a turn. 1: misalignment, tilt, encoder; 2 and 4: quadratic nonlinearity, "
-        "asymmetry; 3: cubic nonlinearity."
-    )
-    return Figure(svg, caption, AXES_LEGEND)
+def _if_added(found: JSON, reached: float | None) -> list[Bar]:
+    """Return the steps that the effects which a diagnosis selected would be, where its errors continue the stairs."""
+    entries = {r["effect"]: r for r in found.get("ranking") or []}
+    chosen = [entries[name] for name in found.get("selected") or [] if name in entries]
+    if not chosen or not reached or any(r.get("held_out_error_after") is None for r in chosen):
+        return []
+    if not 1.0 / ALIKE < chosen[0]["held_out_error_before"] / reached < ALIKE:
+        return []
+    return [Bar(f"+ {plain(r['effect'])}, if added", r["held_out_error_after"], 4) for r in chosen]

@@ -31,7 +31,9 @@ if TYPE_CHECKING:
     from pipeline.records import Motion, Recording
 
 BINS = 36
-HARMONICS = 6
+FEWEST = 5
+HARMONICS = 12
+ONE_IN_A_THOUSAND = float(np.sqrt(2.0 * np.log(1000.0)))  # of a Rayleigh distribution
 
 
 @dataclass(frozen=True)
@@ -121,10 +123,11 @@ class BinnedMean:
     mean: NDArray[np.float64]
     error: NDArray[np.float64]
 
-    @property
-    def excess(self) -> float:
-        """Mean square of the means in standard errors, of the worst axis."""
-        return float(np.max(np.nanmean((self.mean / self.error) ** 2, axis=0)))
+    def excess(self, wander: NDArray[np.float64] | None = None) -> float:
+        """Return the mean square of the means over that of noise and a wander of (3,) deviations, of the worst axis."""
+        filled = np.isfinite(self.mean[:, 0])
+        variance = self.error[filled] ** 2 + (0.0 if wander is None else wander**2)
+        return float(np.max(np.add.reduce(self.mean[filled] ** 2 / variance, axis=0)) / np.count_nonzero(filled))
 
 
 def binned_mean(covariate: NDArray[np.float64], error: NDArray[np.float64], bins: int = BINS) -> BinnedMean | None:
@@ -138,19 +141,23 @@ def binned_mean(covariate: NDArray[np.float64], error: NDArray[np.float64], bins
     error : (n, 3) array
     bins : int
     """
-    known = np.isfinite(covariate) & np.isfinite(error).all(1)
-    covariate, error = covariate[known], error[known]
+    known = np.isfinite(covariate)
+    known &= np.isfinite(error.sum(axis=1))
+    if not known.all():
+        covariate, error = covariate[known], error[known]
     low, high = (float(covariate.min()), float(covariate.max())) if len(covariate) else (0.0, 0.0)
     if not high - low > 1e-9 * max(1.0, abs(low)):
         return None
     cell = np.minimum(((covariate - low) * (bins / (high - low))).astype(np.int64), bins - 1)
     count = np.bincount(cell, minlength=bins).astype(float)
-    count[count < 5] = np.nan
+    count[count < FEWEST] = np.nan
     if np.isfinite(count).sum() < 2:
         return None
     mean = np.stack([np.bincount(cell, e, bins) / count for e in error.T], 1)
-    square = np.stack([np.bincount(cell, e * e, bins) / count for e in error.T], 1)
-    scatter = np.sqrt(np.nanmean(np.maximum(square - mean**2, 0.0), axis=0)) + 1e-300
+    filled = np.isfinite(count)
+    squares = np.einsum("ij,ij->j", error, error) / len(error)
+    between = np.sum(mean[filled] ** 2 * count[filled, None], axis=0) / count[filled].sum()
+    scatter = np.sqrt(np.maximum(squares - between, 0.0)) + 1e-300
     centre = low + (np.arange(bins) + 0.5) * (high - low) / bins
     return BinnedMean(centre, mean, scatter / np.sqrt(count)[:, None])
 
@@ -158,33 +165,58 @@ def binned_mean(covariate: NDArray[np.float64], error: NDArray[np.float64], bins
 COVARIATES: dict[str, Callable[[Residual], NDArray[np.float64] | None]] = {
     "angle, deg": lambda r: None if r.motion.angle is None else np.mod(r.motion.angle, 360.0),
     "rate, deg/s": lambda r: r.motion.rate,
+    "specific force x, g": lambda r: r.motion.specific_force[:, 0],
+    "specific force y, g": lambda r: r.motion.specific_force[:, 1],
+    "specific force z, g": lambda r: r.motion.specific_force[:, 2],
     "temperature, degC": lambda r: r.motion.temperature,
     "time, s": lambda r: r.motion.time if r.recording.clock_shared else r.motion.time - r.motion.time[0],
 }
 
 
-def covariates(found: list[Residual]) -> dict[str, BinnedMean]:
-    """Return binned means over all recordings by covariate, the largest excess first."""
-    out = {}
+def covariates(found: list[Residual], wander: NDArray[np.float64] | None = None) -> dict[str, BinnedMean]:
+    """Return binned means over all recordings by covariate, the largest excess first.
+
+    Of the three components of the specific force the one with the largest excess stands for all.
+
+    Parameters
+    ----------
+    found : list of Residual
+    wander : (3,) array, optional
+        Standard deviation of the bias wander.
+    """
+    out: dict[str, BinnedMean] = {}
+    errors = [r.error for r in found]
+    everything = np.concatenate(errors) if errors else np.zeros((0, 3))
     for label, value in COVARIATES.items():
-        pairs = [(v, r.error) for r in found if (v := value(r)) is not None]
-        if pairs:
-            binned = binned_mean(np.concatenate([v for v, _ in pairs]), np.concatenate([e for _, e in pairs]))
-            if binned is not None:
-                out[label] = binned
-    return dict(sorted(out.items(), key=lambda item: -item[1].excess))
+        values = [value(r) for r in found]
+        pairs = [(v, e) for v, e in zip(values, errors, strict=True) if v is not None]
+        if not pairs:
+            continue
+        together = everything if len(pairs) == len(found) else np.concatenate([e for _, e in pairs])
+        binned = binned_mean(np.concatenate([v for v, _ in pairs]), together)
+        if binned is not None:
+            out[label] = binned
+    excess = {label: mean.excess(wander) for label, mean in out.items()}
+    order = sorted(out, key=lambda label: -excess[label])
+    forces = [label for label in order if label.startswith("specific force")]
+    return {label: out[label] for label in order if label not in forces[1:]}
+
+
+def angle_bins(angle: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return in which of 36 bins of a turn each of (n,) angles in deg lies, and how many lie in each bin."""
+    cell = (np.mod(angle, 360.0) * (BINS / 360.0)).astype(np.int64) % BINS
+    return cell, np.bincount(cell, minlength=BINS)
 
 
 def harmonics(residual: Residual) -> NDArray[np.float64] | None:
-    """Return the amplitudes of 0 to 6 cycles a turn: (7, 3) array, None where not all angles of a turn were visited.
+    """Return the amplitudes of 0 to 12 cycles a turn: (13, 3) array, None where not all angles of a turn were visited.
 
     From means in 36 bins of the angle; ``sinc`` undoes what averaging over a bin takes away.
     """
     angle = residual.motion.angle
     if angle is None:
         return None
-    cell = (np.mod(angle, 360.0) * (BINS / 360.0)).astype(np.int64) % BINS
-    count = np.bincount(cell, minlength=BINS)
+    cell, count = angle_bins(angle)
     if not count.all():
         return None
     mean = np.stack([np.bincount(cell, e, BINS) / count for e in residual.error.T], 1)
@@ -192,3 +224,33 @@ def harmonics(residual: Residual) -> NDArray[np.float64] | None:
     amplitude[0] /= 2.0
     scaled: NDArray[np.float64] = amplitude / np.sinc(np.arange(HARMONICS + 1) / BINS)[:, None]
     return scaled
+
+
+def harmonic_noise(
+    residual: Residual, white: NDArray[np.float64], wander: NDArray[np.float64], time: float
+) -> NDArray[np.float64]:
+    """Return the amplitude that noise alone exceeds once in a thousand, by cycles a turn: (13,) array.
+
+    ``a^2 + b^2`` of a harmonic has the mean ``2 (2 white^2 / n + 2 S(f) / D)``, where S is the two-sided spectrum of
+    the wander, ``2 s^2 T / (1 + (2 pi f T)^2)``, D the time that was recorded, and n the samples, as many as they are
+    worth where the bins hold unequally many: ``1 / n`` is the mean of ``1 / (36 n_bin)``.
+
+    Parameters
+    ----------
+    residual : Residual
+    white, wander : (3,) array
+        Standard deviations; the largest axis counts.
+    time : float, s
+        Correlation time of the wander.
+    """
+    motion = residual.motion
+    assert motion.angle is not None  # noqa: S101
+    duration = max(float(np.ptp(motion.time)), 1e-9)
+    turns = max(float(np.abs(np.diff(motion.angle)).sum()) / 360.0, 1.0)
+    frequency = np.arange(HARMONICS + 1) * turns / duration
+    spectrum = 2.0 * float(wander.max()) ** 2 * time / (1.0 + (2.0 * np.pi * frequency * time) ** 2)
+    each = float(white.max()) ** 2 * float(np.mean(1.0 / np.maximum(angle_bins(motion.angle)[1], 1))) / BINS
+    spread = np.sqrt(2.0 * each + 2.0 * spectrum / duration)
+    spread[0] = np.hypot(np.sqrt(each), wander.max())  # a mean, not an amplitude
+    level: NDArray[np.float64] = ONE_IN_A_THOUSAND * spread
+    return level

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 MAXIMUM_DOTS = 240
-BUCKETS = 200
+BUCKETS = 160
 
 
 @dataclass(frozen=True)

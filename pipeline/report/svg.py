@@ -6,24 +6,20 @@ that a chart follows the page into the dark. Each has a title and a description 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from html import escape
 
 import numpy as np
 from markupsafe import Markup
 
-from pipeline.report.axes import (
-    SUBDIVISION,
-    Scale,
-    span,
-    tick_label,
-    tick_step,
-    ticks,
-)
+from pipeline.report.axes import SUBDIVISION, Scale, log_ticks, span, tick_label, tick_step, ticks
 from pipeline.report.shapes import Band, Layer, Means, draw
 
 WIDTH = 420
-LEFT, RIGHT, TOP, BOTTOM, GAP = 58, 14, 8, 34, 10
+LEFT, RIGHT, TOP, BOTTOM, GAP = 60, 14, 8, 36, 14
+
+Tick = tuple[float, str]
 
 
 @dataclass(frozen=True)
@@ -50,7 +46,16 @@ class Panel:
     limits: tuple[float, float] | None = None
 
 
-def chart(name: str, title: str, description: str, panels: list[Panel], x_label: str, *, angle: bool = False) -> Markup:
+def chart(
+    name: str,
+    title: str,
+    description: str,
+    panels: list[Panel],
+    x_label: str,
+    *,
+    angle: bool = False,
+    logarithmic: bool = False,
+) -> Markup:
     """Return a chart of panels that share the axis x.
 
     Parameters
@@ -63,13 +68,17 @@ def chart(name: str, title: str, description: str, panels: list[Panel], x_label:
     x_label : str
     angle : bool
         Whether x is an angle in deg.
+    logarithmic : bool
+        Whether what is drawn are logarithms to base 10, on both axes; ticks tell the values.
     """
     x = Scale(*span([layer.x for p in panels for layer in p.layers], 0.0), LEFT, WIDTH - RIGHT)
+    x_ticks = _decades(x) if logarithmic else _x_ticks(x, angle=angle)
     parts, top = [], TOP
     for panel in panels:
-        parts.append(_panel(panel, x, top, angle=angle))
+        parts.append(_panel(panel, x, x_ticks, top, logarithmic=logarithmic))
         top += panel.height + GAP
-    parts.append(_x_axis(x, top - GAP, x_label, angle=angle))
+    parts += [text(x.pixels(at), top - GAP + 13, label, "m") for at, label in x_ticks]
+    parts.append(text((LEFT + WIDTH - RIGHT) / 2, top - GAP + 28, x_label, "m"))
     return frame(name, title, description, top - GAP + BOTTOM, "".join(parts))
 
 
@@ -87,33 +96,46 @@ def text(x: float, y: float, content: str, kind: str = "") -> str:
     return f'<text x="{x:.4g}" y="{y:.4g}" class="{kind}">{escape(content)}</text>'
 
 
-def _panel(panel: Panel, x: Scale, top: float, *, angle: bool) -> str:
+def _panel(panel: Panel, x: Scale, x_ticks: list[Tick], top: float, *, logarithmic: bool) -> str:
     bottom = top + panel.height
     y = Scale(*_limits(panel), bottom, top)
-    values, step = _y_ticks(y, panel.height)
-    grid = "".join(f"M{LEFT} {y.pixels(v):.1f}H{WIDTH - RIGHT}" for v in values)
-    grid += "".join(f"M{x.pixels(v):.1f} {top:g}V{bottom:g}" for v in ticks(x.low, x.high, 6, angle=angle))
+    values = _decades(y) if logarithmic else _y_ticks(y, panel.height)
+    grid = "".join(f"M{LEFT} {y.pixels(v):.1f}H{WIDTH - RIGHT}" for v, _ in values)
+    grid += "".join(f"M{x.pixels(v):.1f} {top:g}V{bottom:g}" for v, _ in x_ticks)
     out = [f'<path class="grid" d="{grid}"/>']
-    out += [text(LEFT - 4, y.pixels(v) + 3.5, tick_label(v, step), "e") for v in values]
+    out += [text(LEFT - 4, y.pixels(v) + 3.5, label, "e") for v, label in values]
     middle = (top + bottom) / 2
-    out.append(f'<text class="m" transform="translate(10 {middle:g}) rotate(-90)">{escape(panel.label)}</text>')
+    out.append(f'<text class="m" transform="translate(11 {middle:g}) rotate(-90)">{escape(panel.label)}</text>')
     drawn = "".join(draw(layer, x, y) for layer in panel.layers)
     out.append(f'<g transform="scale({1 / SUBDIVISION:g})">{drawn}</g>')
     for label, value in (panel.levels or {}).items():
         at = y.pixels(value)
         out.append(f'<path class="level" d="M{LEFT} {at:.1f}H{WIDTH - RIGHT}"/>')
-        out.append(text(WIDTH - RIGHT - 2, at - 3, label, "e"))
+        if label:
+            out.append(text(WIDTH - RIGHT - 2, at - 3, label, "e"))
     return "".join(out)
 
 
-def _y_ticks(y: Scale, height: int) -> tuple[list[float], float]:
-    """Return ticks and their distance: as many as fit, and at least two."""
+def _x_ticks(x: Scale, *, angle: bool) -> list[Tick]:
+    step = tick_step(x.low, x.high, 6, angle=angle)
+    return [(v, tick_label(v, step)) for v in ticks(x.low, x.high, 6, angle=angle)]
+
+
+def _y_ticks(y: Scale, height: int) -> list[Tick]:
+    """Return as many ticks as fit, and at least two."""
     count = max(3, height // 28)
     values = ticks(y.low, y.high, count)
     if len(values) < 2:
         count += 2
         values = ticks(y.low, y.high, count)
-    return values, tick_step(y.low, y.high, count)
+    step = tick_step(y.low, y.high, count)
+    return [(v, tick_label(v, step)) for v in values]
+
+
+def _decades(scale: Scale) -> list[Tick]:
+    """Return ticks of an axis of logarithms."""
+    values = log_ticks(10.0**scale.low, 10.0**scale.high)
+    return [(math.log10(v), tick_label(v, v)) for v in values]
 
 
 def _limits(panel: Panel) -> tuple[float, float]:
@@ -128,9 +150,3 @@ def _limits(panel: Panel) -> tuple[float, float]:
         else:
             arrays.append(layer.y)
     return span(arrays)
-
-
-def _x_axis(x: Scale, top: float, label: str, *, angle: bool) -> str:
-    values, step = ticks(x.low, x.high, 6, angle=angle), tick_step(x.low, x.high, 6, angle=angle)
-    out = [text(x.pixels(v), top + 13, tick_label(v, step), "m") for v in values]
-    return "".join(out) + text((LEFT + WIDTH - RIGHT) / 2, top + 28, label, "m")

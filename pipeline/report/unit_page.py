@@ -15,7 +15,12 @@ from pipeline.model.kinematics import reference_motion
 from pipeline.model.user_effects import effect_of
 from pipeline.records import SENSORS, SensorCalibration
 from pipeline.report import figures, tables
+from pipeline.report.evidence_figures import added_variable, unexplained
+from pipeline.report.figure import UNITS, Figure
 from pipeline.report.limits import checks, final_step, verdict
+from pipeline.report.noise_figure import allan
+from pipeline.report.ranking_chart import ranking
+from pipeline.report.residual_figures import residual_figures
 from pipeline.report.residuals import Residual, residuals
 from pipeline.report.templating import template
 
@@ -86,7 +91,7 @@ def _sensor(  # noqa: PLR0917  (the inputs of the page, passed on)
     settings: JSON,
     words: dict[str, list[str]],
 ) -> JSON:
-    part, unit = calibration.get(sensor), figures.UNITS[sensor]
+    part, unit = calibration.get(sensor), UNITS[sensor]
     if part is None:
         reason = (calibration.get("not_calibrated") or {}).get(sensor) or "the procedure does not calibrate it"
         return {"name": sensor, "unit": unit, "part": None, "reason": reason}
@@ -94,7 +99,8 @@ def _sensor(  # noqa: PLR0917  (the inputs of the page, passed on)
     sheet = (settings.get("sensor") or {}).get(sensor) or {}
     table = settings.get("table") or {}
     traces = residuals(sensor, part, recordings, table)
-    sigma = _sigma(held_out, found, traces)
+    noise = found.get("noise") or held_out.get("noise")
+    sigma = _sigma(noise, traces)
     steps = held_out.get("steps") or [{}]
     return {
         "name": sensor,
@@ -105,17 +111,19 @@ def _sensor(  # noqa: PLR0917  (the inputs of the page, passed on)
         "after": final_step(held_out).get("rms_error"),
         "floor": held_out.get("noise_floor"),
         "steps": tables.step_rows(held_out),
-        "staircases": [f for v in (False, True) if (f := figures.staircase(sensor, held_out, vector=v))],
+        "staircases": [f for v in (False, True) if (f := figures.staircase(sensor, held_out, found, vector=v))],
         "model_figures": [figures.measurement_and_model(sensor, r, sigma) for r in traces],
         "held_out_figures": _held_out(sensor, part, held_out, recordings, table),
-        "residual_figures": figures.residual_figures(sensor, traces),
+        "residual_figures": residual_figures(sensor, traces, noise),
+        "noise_figure": allan(sensor, recordings, noise, sheet, found.get("wander")),
         "matrix": tables.matrix_rows(part),
         "parameters": tables.parameter_rows(part, sheet) + tables.effect_rows(part, sheet),
         "stages": tables.stage_rows(part),
         "rests": tables.rest_rows(part),
         "diagnosis": found,
         "ranking": tables.ranking_rows(found),
-        "ranking_figure": figures.ranking(sensor, found),
+        "evidence_figures": [f for f in (ranking(sensor, found), added_variable(sensor, found)) if f]
+        + unexplained(sensor, found),
         "left_by_method": _left_by_method(held_out, found),
         "verdict": VERDICTS.get(found.get("verdict", ""), "There is no diagnosis."),
         "words": words.get(sensor) or [],
@@ -130,9 +138,8 @@ def _left_by_method(held_out: JSON, found: JSON) -> bool:
     return bool(after > FAR * floor and (found.get("residual_over_noise") or FAR) < FAR)
 
 
-def _sigma(held_out: JSON, found: JSON, traces: list[Residual]) -> NDArray[np.float64] | None:
-    noise = found.get("noise") or held_out.get("noise")
-    if not isinstance(noise, dict) or not noise.get("white") or not traces:
+def _sigma(noise: JSON | None, traces: list[Residual]) -> NDArray[np.float64] | None:
+    if not noise or not noise.get("white") or not traces:
         return None
     gain = float(traces[0].recording.filter.get("noise_gain", 1.0))
     wander = np.array(noise.get("wander") or [0.0] * 3, float)
@@ -140,9 +147,7 @@ def _sigma(held_out: JSON, found: JSON, traces: list[Residual]) -> NDArray[np.fl
     return sigma
 
 
-def _held_out(
-    sensor: str, part: JSON, held_out: JSON, recordings: list[Recording], table: JSON
-) -> list[figures.Figure]:
+def _held_out(sensor: str, part: JSON, held_out: JSON, recordings: list[Recording], table: JSON) -> list[Figure]:
     out = []
     calibration = SensorCalibration.from_json(sensor, part)
     for recording in recordings:
