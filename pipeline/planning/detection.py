@@ -170,14 +170,14 @@ class Expectation:
             ahead: NDArray[np.float64] = np.min(self._ahead(rivals, share, k), axis=0, initial=1.0)
             return found(share) * ahead
 
-        half = _smallest(found, 0.5)
+        half = smallest(found, 0.5)
         ahead = np.mean(self._ahead(rivals, half, k), axis=1) if np.isfinite(half) else np.ones(len(rivals.names))
         return Detection(
             name,
             sizes,
             half,
-            np.inf if half_only else _smallest(found, ALMOST_SURE),
-            np.inf if half_only else _smallest(named, 0.5),
+            np.inf if half_only else smallest(found, ALMOST_SURE),
+            np.inf if half_only else smallest(named, 0.5),
             rivals.names[int(np.argmin(ahead))] if np.any(ahead < 0.5) else None,
             self._alike(rivals, signal),
         )
@@ -283,7 +283,7 @@ class Expectation:
         return found
 
 
-def _smallest(probability: Callable[[float], NDArray[np.float64]], wanted: float) -> float:
+def smallest(probability: Callable[[float], NDArray[np.float64]], wanted: float) -> float:
     """Return the smallest share at which a probability, averaged over the signs, is reached; infinite if none."""
     low, high = np.log(LEAST), np.log(LARGEST)
     if np.mean(probability(LARGEST)) < wanted:

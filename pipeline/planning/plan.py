@@ -17,8 +17,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.diagnosis.by_hand_hidden import hidden_effects
 from pipeline.diagnosis.observability import not_observable
 from pipeline.errors import NotObservableError
+from pipeline.estimation.hand_held.rests import by_hand
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import unselected
 from pipeline.model.effects import effect
@@ -31,6 +33,7 @@ from pipeline.records import SENSORS
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from pipeline.planning.by_hand import HandExpectation
     from pipeline.planning.detection import Detection
     from pipeline.planning.extra import Change
     from pipeline.planning.rehearsal import Rehearsal
@@ -73,7 +76,7 @@ def plan_of(unit: UnitDescription, extra: Sequence[Planned] = (), *, half_only: 
 
 def of_sensor(sensor: str, rehearsal: Rehearsal, *, half_only: bool = False) -> Document:
     """Return the plan of one sensor: what it would find in the recordings of a rehearsal."""
-    noise, sheet = rehearsal.noise[sensor], rehearsal.sheets[sensor]
+    noise = rehearsal.noise[sensor]
     document: Document = {
         "unit": UNITS[sensor],
         "noise": {"white": float(noise.white[0]), "wander": float(noise.wander[0])},
@@ -82,20 +85,32 @@ def of_sensor(sensor: str, rehearsal: Rehearsal, *, half_only: bool = False) -> 
         "reason": None,
     }
     try:
-        selection = unselected(observe(sensor, rehearsal.recordings, rehearsal.table), [], noise, sheet)
+        expectation, hidden = _expectation(sensor, rehearsal)
     except NotObservableError as error:
         return {**document, "reason": error.message}
-    hidden = not_observable(selection, [])
-    expectation = Expectation(selection, noise)
     for name in sorted(set(expectation.names) - set(hidden)):
         found = expectation.detection(name, half_only=half_only)
         assert found is not None  # noqa: S101  (what the motion does not excite is hidden)
-        if found.found > 1.0 and np.isfinite(selection.limits[name]).any():
+        limited = bool(np.isfinite(expectation.limits[name]).any())
+        if limited and found.found > 1.0:
             hidden[name] = _faint(sensor, found)
         else:
-            document["effects"].append(_entry(sensor, found, limited=bool(np.isfinite(selection.limits[name]).any())))
+            document["effects"].append(_entry(sensor, found, limited=limited))
     document["not_observable"] = [{"effect": n, "reason": hidden[n]} for n in sorted(hidden)]
     return document
+
+
+def _expectation(sensor: str, rehearsal: Rehearsal) -> tuple[Expectation | HandExpectation, dict[str, str]]:
+    """Return what a selection is expected to see, and the effects that it cannot, each with the reason."""
+    noise, sheet = rehearsal.noise[sensor], rehearsal.sheets[sensor]
+    if by_hand(sensor, rehearsal.recordings):
+        from pipeline.planning.by_hand import HandExpectation, select_by_hand  # noqa: PLC0415  (by hand alone)
+
+        selected = select_by_hand(sensor, rehearsal)
+        hand = HandExpectation(selected, noise)
+        return hand, hidden_effects(selected, [])
+    selection = unselected(observe(sensor, rehearsal.recordings, rehearsal.table), [], noise, sheet)
+    return Expectation(selection, noise), not_observable(selection, [])
 
 
 def _entry(sensor: str, found: Detection, *, limited: bool) -> Document:

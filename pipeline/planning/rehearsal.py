@@ -46,8 +46,8 @@ class Rehearsal:
     Attributes
     ----------
     recordings : list of Recording
-    sheets, table : mapping
-        Configurations of sensor and table.
+    sheets, table, procedure : mapping
+        Configurations of sensor, table and procedure.
     noise : dict of str to Noise
         Sensor to what its data sheet says.
     minutes : float
@@ -57,6 +57,7 @@ class Rehearsal:
     recordings: list[Recording]
     sheets: Mapping[str, Any]
     table: Mapping[str, Any]
+    procedure: Mapping[str, Any]
     noise: dict[str, Noise]
     minutes: float
 
@@ -83,7 +84,8 @@ def rehearse(unit: UnitDescription, extra: Sequence[Planned] = ()) -> Rehearsal:
     sheets, table = read_config("sensor", unit.sensor), read_config("table", unit.table)
     long_rest = any(recording.role == "static" for recording in recordings)
     noise = {s: noise_of_sheet(sheets[s], unit.interval_s, long_rest=long_rest) for s in ("accelerometer", "gyroscope")}
-    return Rehearsal(recordings, sheets, table, noise, max(float(r.time[-1]) for r in recordings) / 60.0)
+    minutes = max(float(r.time[-1]) for r in recordings) / 60.0
+    return Rehearsal(recordings, sheets, table, read_config("procedure", unit.procedure), noise, minutes)
 
 
 def noise_of_sheet(sheet: Mapping[str, Any], interval: float, *, long_rest: bool) -> Noise:
