@@ -19,7 +19,7 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-MAXIMUM_POINTS = 400
+MAXIMUM_POINTS = 240
 SUBDIVISION = 10  # drawing units per pixel: coordinates are integers, which are short and quick to write
 ANGLE_STEPS = (1.0, 2.0, 5.0, 10.0, 15.0, 30.0, 45.0, 90.0, 180.0, 360.0, 720.0, 1800.0, 3600.0)
 

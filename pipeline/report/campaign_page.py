@@ -5,6 +5,7 @@ Units with the same serial are the same device calibrated in several ways (or se
 
 from __future__ import annotations
 
+from collections import Counter
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
@@ -111,7 +112,14 @@ def _fleet(sensor: str, name: str, rows: list[JSON]) -> JSON | None:
         "after": number(middle("error_after")),
         "floor": number(middle("noise_floor")),
         "verdicts": {VERDICTS[v][0]: verdicts.count(v) for v in VERDICTS if v in verdicts},
+        "missing": _missing(sensor, known),
     }
+
+
+def _missing(sensor: str, rows: list[JSON]) -> list[tuple[str, int]]:
+    """Return in how many units each effect is missing, the most frequent first."""
+    counts = Counter(name for r in rows for name in str(r.get(f"{sensor}_selected") or "").split(";") if name)
+    return [(name.replace("_", " "), count) for name, count in sorted(counts.items(), key=lambda c: (-c[1], c[0]))]
 
 
 def _lots(rows: list[JSON]) -> list[JSON]:

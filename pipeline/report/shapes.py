@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 MAXIMUM_DOTS = 240
-BUCKETS = 160
+BUCKETS = 140
 
 
 @dataclass(frozen=True)
