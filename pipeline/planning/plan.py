@@ -1,6 +1,6 @@
 """The plan of a procedure as a document: what it would find of each effect, and what to record more.
 
-    {"sensor", "table", "procedure", "at_a_table", "minutes", "samples", "warnings": [text],
+    {"sensor", "table", "procedure", "course": {how it is run}, "at_a_table", "minutes", "samples", "warnings": [text],
      "accelerometer": {"noise": {"white", "wander"}, "unit",
         "effects": [{"effect", "smallest", "unit", "share_of_limit", "almost_sure", "named", "sizes", "taken_for",
                       "look_alikes": [{"effect", "share"}]}],
@@ -12,7 +12,7 @@ Sizes are those that half of the units would show. An effect that would pass onl
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,6 +29,7 @@ from pipeline.planning.detection import Expectation
 from pipeline.planning.extra import changes
 from pipeline.planning.rehearsal import limits_broken, rehearse
 from pipeline.records import SENSORS
+from pipeline.simulation.campaign import course_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -66,12 +67,17 @@ def plan_of(unit: UnitDescription, extra: Sequence[Planned] = (), *, half_only: 
         "sensor": unit.sensor,
         "table": unit.table,
         "procedure": unit.procedure,
+        "course": {name: _plain(value) for name, value in asdict(course_of(unit)).items()},
         "at_a_table": rehearsal.table["motion"] != "none",
         "minutes": rehearsal.minutes,
         "samples": sum(r.samples for r in rehearsal.recordings),
         "warnings": limits_broken(rehearsal),
         **{sensor: of_sensor(sensor, rehearsal, half_only=half_only) for sensor in SENSORS},
     }
+
+
+def _plain(value: Any) -> Any:  # noqa: ANN401  (a setting)
+    return list(value) if isinstance(value, tuple) else value
 
 
 def of_sensor(sensor: str, rehearsal: Rehearsal, *, half_only: bool = False) -> Document:

@@ -94,6 +94,8 @@ def side_by_side(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[st
         Of ``plan.plan_of``.
     """
     lines = [f"A: {heading(first)}", f"B: {heading(second)}"]
+    a, b = first["course"], second["course"]
+    lines += [f"   {name}: {a[name]} in A, {b[name]} in B" for name in a if a[name] != b[name]]
     for name, document in (("A", first), ("B", second)):
         lines += [f"note on {name}: {text}" for text in document["warnings"]]
     for sensor in SENSORS:
