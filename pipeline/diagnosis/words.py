@@ -57,7 +57,8 @@ def _unknown(part: Mapping[str, Any], sensor: str) -> list[str]:
             continue
         shape = f": {found['shape']} (delta BIC {found['delta_bic']:.0f})" if found.get("shape") else ""
         p = f"p = {found['p_value']:.1g}" if found["p_value"] > 0 else "p < 1e-300"
-        lines.append(f"The residual depends on {plain(found['covariate'])} ({p}) beyond that{shape}.")
+        beyond = " beyond that" if part["selected"] else ""
+        lines.append(f"The residual depends on {plain(found['covariate'])} ({p}){beyond}{shape}.")
     effect = part.get("suggested_effect")
     if effect:
         names = [*part["configured"], *part["selected"], effect["name"]]

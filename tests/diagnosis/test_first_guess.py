@@ -1,0 +1,199 @@
+"""Physics that the catalogue does not know: its covariate, shape and place are told, and written as an effect."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from bench_session import CONTINUOUS, SIZE, STOP_AND_GO, Course, Session, record, values_of
+
+from pipeline.diagnosis.diagnose import diagnose
+from pipeline.diagnosis.first_guess import suggested_effect, unexplained
+from pipeline.diagnosis.guess_words import effect_file
+from pipeline.diagnosis.leftover import Leftover
+from pipeline.diagnosis.shapes import columns_of, harmonics
+from pipeline.diagnosis.words import in_words
+from pipeline.estimation.design import Term
+from pipeline.estimation.joint import fit_terms
+from pipeline.estimation.observations import observe
+from pipeline.estimation.selection import Selection, select
+from pipeline.model.effects import forget_registered, register
+from pipeline.model.user_effects import effect_from
+from pipeline.records import Recording, SensorCalibration
+from pipeline.signal.noise import estimate_noise
+from pipeline.signal.temperature import smooth_temperature
+
+SHEET = yaml.safe_load((Path(__file__).parents[2] / "configs/sensor/mpu6050.yaml").read_text(encoding="utf-8"))
+TABLE = {"gravity_g": 1.0, "latitude_deg": None, "azimuth_deg": None}
+SHORT = replace(STOP_AND_GO, validation_s=0.0)
+SLOW = replace(
+    CONTINUOUS,
+    accelerometer_rates_dps=(3.0, 5.0, 6.0, 8.0),
+    both_directions=False,
+    rates_dps=(5.0, 60.0),
+    validation_s=0.0,
+)
+Extra = Callable[[Recording], np.ndarray]
+
+
+@pytest.fixture(autouse=True)
+def _nothing_registered() -> Iterator[None]:
+    yield
+    forget_registered()
+
+
+def with_extra(sensor: str, extra: Extra, seed: int = 1, course: Course = SHORT, **session: Any) -> list[Recording]:
+    """Recordings whose readings of a sensor hold something more: (n, 3) or (n, 1), g or deg/s."""
+    recordings = record(Session(seed, course, **session))
+    return [replace(r, **{sensor: r.reading(sensor) + extra(r)}) for r in recordings]
+
+
+def gear(amplitude: float, axes: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Extra:
+    def extra(recording: Recording) -> np.ndarray:
+        angle = np.zeros(recording.samples) if recording.table_angle is None else recording.table_angle
+        turning = float(recording.table_angle is not None)
+        return turning * amplitude * np.cos(np.radians(5.0 * angle) + 1.0)[:, None] * np.array(axes)
+
+    return extra
+
+
+def warm(recording: Recording) -> np.ndarray:
+    assert recording.temperature is not None
+    return smooth_temperature(recording.time, recording.temperature)
+
+
+def diagnosed(sensor: str, recordings: list[Recording], configured: tuple[str, ...] = ()) -> dict[str, Any]:
+    noise = estimate_noise(sensor, recordings, SHEET[sensor])
+    settings = {"sensor": SHEET, "table": TABLE, "effects": {sensor: list(configured)}}
+    return diagnose(SensorCalibration(sensor), recordings, noise, settings)
+
+
+def selection_of(sensor: str, recordings: list[Recording]) -> Selection:
+    noise = estimate_noise(sensor, recordings, SHEET[sensor])
+    return select(observe(sensor, recordings, TABLE), [], noise, SHEET[sensor])
+
+
+def require_mended(sensor: str, recordings: list[Recording], part: dict[str, Any]) -> None:
+    """The suggested file, read back and configured, leaves noise alone."""
+    definition = yaml.safe_load(effect_file(part["suggested_effect"], "U1"))
+    register(effect_from(definition, "suggested"))
+    after = diagnosed(sensor, recordings, (definition["name"],))
+    assert after["verdict"] == "nothing_missing"
+    assert after["unexplained"] == []
+    assert 0.85 < after["residual_over_noise"] < 1.06 < part["residual_over_noise"]
+
+
+@pytest.mark.parametrize(("sensor", "amplitude"), [("accelerometer", 2e-3), ("gyroscope", 0.03)])
+def test_a_gear_that_pushes_five_times_a_turn_is_told_and_mended(sensor: str, amplitude: float) -> None:
+    recordings = with_extra(sensor, gear(amplitude, (1.0, 0.0, 1.0)))
+    part = diagnosed(sensor, recordings)
+    found = part["unexplained"][0]
+    assert (part["verdict"], part["selected"]) == ("unexplained", [])
+    assert (found["covariate"], found["axes"]) == ("angle", ["x", "z"])
+    assert found["shape"].startswith("5 cycles per turn of the table, amplitude ")
+    assert found["size"] == pytest.approx(amplitude, rel=0.06)
+    assert all(other["explained_by"] == "angle" for other in part["unexplained"][1:])
+    assert part["suggested_effect"]["owner"] == "table"
+    require_mended(sensor, recordings, part)
+
+
+@pytest.mark.parametrize(("sensor", "height"), [("accelerometer", 4e-3), ("gyroscope", 0.06)])
+def test_a_step_of_the_bias_at_a_temperature_is_placed_although_effects_of_temperature_take_most_of_it(
+    sensor: str, height: float
+) -> None:
+    recordings = with_extra(sensor, lambda r: height * (0.5 + 0.5 * np.tanh((warm(r) - 27.6) / 0.2))[:, None])
+    assert selection_of(sensor, recordings).names, "the catalogue would name something"
+    part = diagnosed(sensor, recordings)
+    found = part["unexplained"][0]
+    assert (part["verdict"], part["selected"], found["covariate"]) == ("unexplained", [], "temperature")
+    place = re.search(r"a step at ([\d.]+) degC", found["shape"])
+    assert place, found["shape"]
+    assert float(place.group(1)) == pytest.approx(27.6, abs=0.15)
+    assert found["size"] == pytest.approx(height, rel=0.15)
+    assert part["suggested_effect"]["owner"] == "sensor"
+    require_mended(sensor, recordings, part)
+
+
+def test_a_resonance_in_a_band_of_speeds_is_told_between_the_speeds_that_were_held() -> None:
+    def resonance(recording: Recording) -> np.ndarray:
+        rate = np.zeros(recording.samples) if recording.table_rate is None else np.abs(recording.table_rate)
+        return 0.003 * ((rate > 4.0) & (rate < 7.0))[:, None]
+
+    recordings = with_extra("accelerometer", resonance, course=SLOW)
+    part = diagnosed("accelerometer", recordings)
+    found = part["unexplained"][0]
+    assert found["covariate"] == "rate"
+    low, high = map(float, re.findall(r"a band from ([\d.]+) to ([\d.]+)", found["shape"])[0])
+    assert 3.0 < low < 5.0
+    assert 6.0 < high < 8.0
+    require_mended("accelerometer", recordings, part)
+
+
+@pytest.mark.parametrize(("sensor", "name"), [("accelerometer", "bias_temperature"), ("gyroscope", "g_sensitivity")])
+def test_a_known_effect_is_named_beside_unknown_physics_that_would_hide_or_distort_it(sensor: str, name: str) -> None:
+    hidden = {sensor: {name: values_of(sensor, name, np.random.default_rng(0))}}
+    amplitude = {"accelerometer": 2e-3, "gyroscope": 0.03}[sensor]
+    part = diagnosed(sensor, with_extra(sensor, gear(amplitude), 60, effects=hidden))
+    assert part["selected"] == [name]
+    assert part["unexplained"][0]["shape"].startswith("5 cycles")
+    text = "\n".join(in_words(part, sensor))
+    assert f"overrides='effects.{sensor}=[{name},unknown_angle]'" in text
+
+
+def test_a_shape_gains_what_a_joint_fit_with_it_gains() -> None:
+    selection = selection_of("gyroscope", with_extra("gyroscope", gear(5e-4)))
+    definition = {
+        "name": "gear",
+        "owner": "table",
+        "sensors": ["gyroscope"],
+        "meaning": "A gear.",
+        "terms": {
+            "A": {"formula": "cos(5 * radians(angle))", "unit": "deg/s"},
+            "B": {"formula": "sin(5 * radians(angle))", "unit": "deg/s"},
+        },
+    }
+    terms = [*selection.fit.terms, Term(effect_from(definition, "test"), np.zeros(6))]
+    fit = fit_terms(selection.observations, terms, selection.start, selection.settings)
+    formulas = harmonics()[4].formulas
+    leftover = Leftover(selection, columns_of(formulas, "gyroscope"))
+    gain = leftover.gain(leftover.drop([0, 1])[:, :, -1], 2, choose=False)
+    expected = 2.0 * (fit.log_likelihood - selection.fit.log_likelihood) - 6.0 * np.log(leftover.samples)
+    assert gain.delta_bic == pytest.approx(expected, abs=0.5)
+    values = fit.terms[-1].values.reshape(3, 2)
+    assert leftover.coefficients([0, 1], gain.setting) == pytest.approx(values, rel=0.02, abs=2e-6)
+
+
+def test_a_power_that_the_base_holds_already_says_nothing_new() -> None:
+    selection = selection_of("accelerometer", record(Session(2, SHORT)))
+    leftover = Leftover(
+        selection, columns_of(["fx", "fx ** 2", "2 * fx ** 2 + 3 * fy", "cos(radians(angle))"], "accelerometer")
+    )
+    assert leftover.independent([0, 1, 2]) == [1]
+    assert leftover.drops(np.eye(4))[:, :, 0].max() == 0.0
+
+
+def test_names_that_are_taken_are_not_given_again() -> None:
+    entry = {"covariate": "angle", "shape": "5 cycles", "kind": "harmonic", "formulas": ["cos(angle)"], "axes": ["x"]}
+    entry["unit"] = "g"
+    made = suggested_effect([entry], "accelerometer", {"unknown_angle", "unknown_angle_2"})
+    assert made is not None
+    assert made["name"] == "unknown_angle_3"
+    assert suggested_effect([], "accelerometer") is None
+
+
+@pytest.mark.study
+@pytest.mark.parametrize("sensor", SIZE)
+@pytest.mark.parametrize("wander", [1.0, 5.0])
+def test_nothing_is_guessed_in_sixty_units_without_anything_unknown(sensor: str, wander: float) -> None:
+    courses = (STOP_AND_GO, CONTINUOUS, replace(STOP_AND_GO, both_directions=False))
+    for seed in range(60):
+        session = Session(
+            9000 + seed, courses[seed % 3], wander=wander, static=bool(seed % 2), ramp=15.0 * (seed % 5 == 0)
+        )
+        assert unexplained(selection_of(sensor, record(session))) == [], seed
