@@ -59,7 +59,7 @@ def ranking(sensor: str, diagnosis: JSON) -> Figure | None:
     if any(_alike(r) for r in shown):
         caption += " Brackets join what looks alike: so much of the other one's signal that effect reproduces."
     if rest:
-        caption += f" {rest} more have less evidence; the tables below hold them."
+        caption += f" {rest} more {'has' if rest == 1 else 'have'} less evidence; the tables below tell of it."
     kinds = {_colour(r, selected) for r in shown}
     return Figure(svg, caption, tuple((f"c{c}", t) for c, t in COLOURS.items() if c in kinds), finding)
 

@@ -84,6 +84,7 @@ def _finding(words: str, mean: BinnedMean, wander: NDArray[np.float64], excess: 
 def _harmonics(sensor: str, name: str, amplitudes: NDArray[np.float64], level: NDArray[np.float64]) -> Figure:
     unit = UNITS[sensor]
     ratio = amplitudes / np.maximum(level[:, None], 1e-300)
+    ratio[0] = 0.0  # a bias
     cycles, axis = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
     if ratio.max() > 1.0:
         size = number(float(amplitudes[cycles, axis]), 2)

@@ -1,0 +1,280 @@
+"""The figures of a diagnosis stand where its numbers are: bars, gate, brackets, slopes, Allan deviation, harmonics."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.records import Recording
+from pipeline.report.evidence_figures import added_variable, column_unit, unexplained
+from pipeline.report.figures import staircase
+from pipeline.report.noise_figure import allan, deviations, expected, longest_rest
+from pipeline.report.ranking_chart import ranking, symlog
+from pipeline.report.residual_figures import residual_figures
+from pipeline.report.residuals import harmonic_noise, harmonics, residuals
+from pipeline.report.unit_page import render
+
+from .conftest import SIGMA, Unit, build_unit, diagnosis_of
+
+BAR = re.compile(r'class="bar c(\d)" d="M([\d.]+) ([\d.]+)H([\d.]+)')
+LEVEL = re.compile(r'class="level" d="M([\d.]+) ')
+
+
+@pytest.fixture(scope="module")
+def unit() -> Unit:
+    return build_unit()
+
+
+def entry(effect: str, delta_bic: float, **more: Any) -> dict[str, Any]:
+    return {"effect": effect, "delta_bic": delta_bic, "look_alikes": [], "plausible": True, **more}
+
+
+def ranked() -> dict[str, Any]:
+    alike = [{"effect": "scale_factor_asymmetry", "share": 0.94}]
+    return {
+        "selected": ["quadratic_nonlinearity"],
+        "ranking": [
+            entry("quadratic_nonlinearity", 2000.0, look_alikes=alike),
+            entry("scale_factor_asymmetry", 200.0),
+            entry("table_tilt", 5.0),
+            entry("hysteresis", -30.0),
+        ],
+        "not_observable": [{"effect": "lever_arm", "reason": "the table <turned> too slowly; " + 9 * "it needs more "}],
+    }
+
+
+def test_bars_end_where_their_evidence_is_and_the_gate_stands_at_ten() -> None:
+    figure = ranking("gyroscope", ranked())
+    assert figure is not None
+    bars = [(int(c), float(zero), float(end)) for c, zero, _, end in BAR.findall(figure.svg)]
+    assert [c for c, _, _ in bars] == [2, 4, 3]  # selected, passes the gate, does not
+    zero = bars[0][1]
+    gate = float(LEVEL.search(figure.svg).group(1))  # type: ignore[union-attr]
+    for (_, start, end), value in zip(bars, (2000.0, 200.0, 5.0), strict=True):
+        assert start == zero
+        assert (end - zero) / (gate - zero) == pytest.approx(symlog(value), abs=0.01)
+    assert symlog(10.0) == 1.0
+    assert symlog(-1000.0) == -3.0
+    assert "1 more has less evidence" in figure.caption
+
+
+def test_effects_that_cannot_be_seen_are_greyed_with_the_reason_and_look_alikes_are_bracketed() -> None:
+    figure = ranking("gyroscope", ranked())
+    assert figure is not None
+    assert figure.svg.count('class="off-bar"') == 1
+    assert "lever arm" in figure.svg
+    whole = "the table &lt;turned&gt; too slowly; " + 9 * "it needs more "
+    assert f"<title>{whole}</title>" in figure.svg  # the line itself is cut short
+    assert figure.svg.count('class="bracket"') == 1
+    assert ">94 %<" in figure.svg
+    assert "Quadratic nonlinearity stands out: ΔBIC 2000" in figure.finding
+
+
+def test_evidence_against_every_effect_is_drawn_to_the_left_of_zero() -> None:
+    figure = ranking("gyroscope", {"ranking": [entry("hysteresis", -8.0), entry("warm_up", -50.0)]})
+    assert figure is not None
+    (_, zero, _, near), (_, _, _, far) = BAR.findall(figure.svg)
+    assert float(far) < float(near) < float(zero)
+    assert figure.finding == "No effect passes the gate: at best, hysteresis reaches −8.00"
+    assert ranking("gyroscope", {"ranking": []}) is None
+
+
+def added(value: float, off: float = 0.0) -> dict[str, Any]:
+    x = np.linspace(-1.0, 1.0, 21)
+    points = {"x": x.tolist(), "mean": (value * x + off * x**2).tolist(), "standard_error": [0.01] * 21}
+    panel = {"axis": "y", "parameter": "G_yz", "unit": "deg/s/g", "value": value, "standard_uncertainty": 0.002}
+    return {"pictures": {"added_variable": {"effect": "g_sensitivity", "unit": "deg/s", "panels": [panel | points]}}}
+
+
+def test_the_line_of_an_added_variable_has_the_parameter_as_its_slope() -> None:
+    figure = added_variable("gyroscope", added(0.4))
+    assert figure is not None
+    path = re.search(r'class="line c5 model" d="M(\d+) (\d+)l(-?\d+) (-?\d+)"', figure.svg)
+    dots = re.search(r'class="dots c1" d="M(\d+) (\d+)h0(.*?)"', figure.svg)
+    assert path is not None
+    assert dots is not None
+    x, y, right, down = (int(v) for v in path.groups())
+    steps = [tuple(map(int, s)) for s in re.findall(r"m(-?\d+) (-?\d+)h0", dots.group(3))]
+    assert (int(dots.group(1)), int(dots.group(2))) == (x, y)
+    assert (sum(s[0] for s in steps), sum(s[1] for s in steps)) == (right, down)
+    assert "G_yz = 0.4000 ± 0.0040 deg/s/g, and the points follow the line" in figure.finding
+    assert ", g<" in figure.svg  # deg/s over deg/s/g
+    bent = added_variable("gyroscope", added(0.4, off=0.1))
+    assert bent is not None
+    assert "some points leave the line" in bent.finding
+    assert added_variable("gyroscope", diagnosis_of("gyroscope")) is None
+
+
+@pytest.mark.parametrize(
+    ("parameter", "unit", "column"),
+    [
+        ("1/g", "g", "g^2"),
+        ("1/(deg/s)^2", "deg/s", "(deg/s)^3"),
+        ("deg/s/g^2", "deg/s", "g^2"),
+        ("g/(deg/s)", "g", "deg/s"),
+        ("g/degC", "g", "degC"),
+        ("1", "deg/s", "deg/s"),
+        ("g", "g", ""),
+        ("m", "g", "g/m"),
+    ],
+)
+def test_what_a_parameter_multiplies_has_the_unit_that_makes_a_reading(parameter: str, unit: str, column: str) -> None:
+    assert column_unit(parameter, unit) == column
+
+
+def test_the_unexplained_is_drawn_with_its_shape_and_says_where_the_points_leave_it() -> None:
+    x = np.linspace(20.0, 40.0, 30)
+    step = np.where(x > 31.0, 0.004, 0.0)
+    panels = [
+        {"axis": a, "x": x.tolist(), "mean": m.tolist(), "standard_error": [1e-4] * 30, "curve_x": [20, 31, 31, 40]}
+        for a, m in (("x", step), ("y", step * 2.0))
+    ]
+    panels = [p | {"curve": [0.0, 0.0, 0.004, 0.004]} for p in panels]
+    shape = "a step at 31.0 degC of 4.0 mg on x"
+    found = {"unexplained": [{"covariate": "temperature", "p_value": 1e-9, "shape": shape, "delta_bic": 90.0}]}
+    for shown, follows in ((panels[:1], True), (panels, False)):
+        pictures = [{"covariate": "temperature", "signal": "temperature", "unit": "g", "panels": shown}]
+        (figure,) = unexplained("accelerometer", found | {"pictures": {"unexplained": pictures}})
+        assert figure.finding == f"The residual depends on temperature: {shape}"
+        assert "temperature, degC" in figure.svg
+        assert figure.svg.count('class="line c5 model"') == len(shown)
+        assert ("do not follow" not in figure.caption) is follows
+
+
+def test_the_allan_deviation_of_white_noise_falls_with_the_root_of_the_samples() -> None:
+    sigma, interval = 0.02, 0.01
+    white = sigma * np.random.default_rng(5).standard_normal((20_000, 3))
+    tau, found = deviations(white, interval)
+    samples = tau / interval
+    assert samples[0] == 1.0
+    assert samples[-1] > 2000
+    short = samples < 400
+    np.testing.assert_allclose(found[short].mean(axis=1), sigma / np.sqrt(samples[short]), rtol=0.08)
+    np.testing.assert_allclose(expected(sigma * np.sqrt(interval), 0.0, 100.0, tau), sigma / np.sqrt(samples))
+
+
+def test_the_allan_deviation_of_a_wander_is_that_of_a_simulated_one() -> None:
+    interval, time, s = 0.1, 5.0, 0.3
+    rng, keep = np.random.default_rng(8), np.exp(-interval / time)
+    drive = np.sqrt(1.0 - keep**2) * rng.standard_normal((40_000, 3))
+    wander = np.empty_like(drive)
+    wander[0] = rng.standard_normal(3)
+    for n in range(1, len(drive)):
+        wander[n] = keep * wander[n - 1] + drive[n]
+    tau, found = deviations(s * wander[:4000], interval)
+    model = expected(0.0, s, time, tau)
+    assert tau[int(np.argmax(model))] == pytest.approx(1.89 * time, rel=0.2)
+    late_tau, late = deviations(s * wander, interval)
+    close = (late_tau > 2.0) & (late_tau < 60.0)
+    np.testing.assert_allclose(late[close].mean(axis=1), expected(0.0, s, time, late_tau[close]), rtol=0.2)
+    assert found.shape == (len(tau), 3)
+
+
+def rest(name: str, role: str, samples: int) -> Recording:
+    rng = np.random.default_rng(samples)
+    time_ns = (np.arange(samples) * 120_000_000).astype(np.int64)
+    reading = 0.003 * rng.standard_normal((samples, 3)) + [0.0, 0.0, 1.0]
+    return Recording(name, role, None, time_ns, accelerometer=reading)
+
+
+def test_the_words_beside_the_allan_deviation_say_what_was_found_and_whether_it_is_inflated() -> None:
+    recordings = [rest("static", "static", 900), rest("validation", "validation", 5000)]
+    noise = {"white": [0.003] * 3, "wander": [1e-4] * 3, "correlation_time_s": 100.0, "source": "static"}
+    sheet = {"noise_density": 0.003 * np.sqrt(2 * 0.12), "bias_wander": 1e-4, "wander_time_s": 100.0}
+    wander = {"ratio": 0.3, "time_s": 50.0, "standard_deviation": 9e-4, "expected": 1e-4, "inflated": True}
+    figure = allan("accelerometer", recordings, noise, sheet, wander)
+    assert figure is not None
+    assert figure.finding == "White noise 0.00300 g a sample, as the data sheet says"
+    assert "static, 108 s at rest" in figure.caption
+    assert "needs a wander of 0.000900 g over 50.0 s, against 0.000100 expected: it is inflated" in figure.caption
+    assert [text for _, text in figure.legend[3:]] == ["noise model", "its white noise alone", "data sheet"]
+    calm = allan("accelerometer", recordings, noise, sheet | {"noise_density": 1e-3}, wander | {"inflated": False})
+    assert calm is not None
+    assert "inflated" not in calm.caption
+    assert "1.5 × that of the data sheet" in calm.finding
+    assert allan("accelerometer", recordings[1:], noise, sheet, wander) is None
+    assert longest_rest("gyroscope", recordings) is None
+
+
+def test_noise_alone_stays_below_the_dashes_of_the_harmonics(unit: Unit) -> None:
+    found = residuals("accelerometer", unit.calibration["accelerometer"], unit.recordings, unit.settings["table"])[0]
+    rng, sigma = np.random.default_rng(21), np.full(3, SIGMA["accelerometer"])
+    level = harmonic_noise(found, sigma, np.zeros(3), 100.0)
+    above = 0
+    for _ in range(150):
+        noise = sigma * rng.standard_normal(found.reading.shape)
+        amplitudes = harmonics(replace(found, reading=found.predicted + noise))
+        assert amplitudes is not None
+        above += int(np.sum(amplitudes[1:13] > level[1:, None] / np.sinc(np.arange(1, 13) / 36.0)[:, None]))
+    drawn = 150 * 12 * 3
+    assert 0 < above < 4 * drawn / 1000
+
+
+def test_the_covariate_that_matters_comes_first_and_says_its_size(unit: Unit) -> None:
+    found = residuals("accelerometer", unit.calibration["accelerometer"], unit.recordings, unit.settings["table"])
+    rng, sigma = np.random.default_rng(6), SIGMA["accelerometer"]
+    noise = {"white": [sigma] * 3, "wander": [1e-4] * 3, "correlation_time_s": 100.0}
+    made = []
+    for residual in found:
+        angle = residual.motion.angle
+        assert angle is not None
+        error = sigma * rng.standard_normal(residual.reading.shape)
+        error[:, 1] += 0.004 * np.sin(np.radians(6.0 * angle))  # no function of one force
+        made.append(replace(residual, reading=residual.predicted + error))
+    figures = residual_figures("accelerometer", made, noise)
+    said = re.fullmatch(r"Not flat against angle: (\S+) g on y at (\S+) deg, (\S+) σ", figures[0].finding)
+    assert said is not None
+    size, at = (float(v.replace("−", "-")) for v in said.group(1, 2))
+    assert size == pytest.approx(0.004 * np.sin(np.radians(6.0 * at)) * np.sinc(6.0 / 36.0), abs=8e-4)
+    names = [re.search(r'id="accelerometer-residual-([\w-]+)-t"', f.svg) for f in figures]
+    assert sum(m is not None and m.group(1).startswith("specific-force") for m in names) == 1
+    none = [replace(r, reading=r.predicted + sigma * rng.standard_normal(r.reading.shape)) for r in found]
+    flat = [
+        f.finding.startswith("Flat") for f in residual_figures("accelerometer", none, noise) if "-residual-" in f.svg
+    ]
+    assert flat == [True] * 4
+
+
+def test_a_harmonic_above_the_noise_is_named(unit: Unit) -> None:
+    found = residuals("accelerometer", unit.calibration["accelerometer"], unit.recordings, unit.settings["table"])
+    findings = [f.finding for f in residual_figures("accelerometer", found, None)]
+    assert any(re.match(r"accel_\w: 2 cycles a turn on \w, 0.00\d+ g, above the noise", f) for f in findings)
+
+
+def test_the_stairs_go_on_to_what_the_missing_effect_would_bring() -> None:
+    steps = [
+        {"name": "raw", "rms_error": 1.0, "vector_rms_error": 2.0},
+        {"name": "calibrated", "rms_error": 0.1, "vector_rms_error": 0.2},
+    ]
+    held_out = {"steps": steps, "noise_floor": 0.01, "vector_noise_floor": 0.02}
+    found = diagnosis_of("accelerometer")
+    found["ranking"][0] |= {"held_out_error_before": 0.19, "held_out_error_after": 0.021}
+    figure = staircase("accelerometer", held_out, found, vector=True)
+    assert figure is not None
+    assert "+ quadratic nonlinearity, if added" in figure.svg
+    assert figure.finding == (
+        "The error of the vector ends at 0.200 g, 10.0 × the noise floor; with what is missing, at 0.0210"
+    )
+    magnitude = staircase("accelerometer", held_out, found, vector=False)
+    assert magnitude is not None
+    assert "if added" not in magnitude.svg  # the diagnosis tells the error of the vector
+    found["ranking"][0]["held_out_error_before"] = 0.5
+    other = staircase("accelerometer", held_out, found, vector=True)
+    assert other is not None
+    assert "if added" not in other.svg  # the method's calibration is not the diagnosis's base
+
+
+def test_every_figure_of_the_page_says_its_finding(unit: Unit) -> None:
+    page = render(*unit.arguments)
+    figures = re.findall(r"<figure>.*?</figure>", page, re.DOTALL)
+    assert len(figures) >= 15
+    for figure in figures:
+        finding = re.search(r'<p class="finding">(.+?)</p>', figure)
+        assert finding is not None
+        title = re.search(r"<title[^>]*>(.+?)</title>", figure)
+        assert title is not None
+        assert finding.group(1) in title.group(1)
