@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 CLEARLY = 10.0
 MOST_HARMONICS = 3
-OWNERS = {"harmonic": "table", "band": "table"}
+OWNERS = {"harmonic": "table", "ripple": "table", "band": "table"}
 
 
 def unexplained(selection: Selection) -> list[dict[str, Any]]:
@@ -73,7 +73,7 @@ def unexplained(selection: Selection) -> list[dict[str, Any]]:
             "formulas": list(guess.shape.formulas),
             "coefficients": [guess.coefficients[c].tolist() for c in guess.gain.axes],
             "size": float(np.abs(guess.sizes).max()),
-            "unit": unit_of(sensor),
+            "unit": "1" if guess.shape.kind == "ripple" else unit_of(sensor),
             "delta_bic": guess.gain.delta_bic,
             "explained_by": None if guess is best or guess.covariate in beside else best.covariate,
         }
@@ -151,7 +151,8 @@ def guess_of(selection: Selection, covariate: str) -> Guess:
     """Return the best shape in a covariate."""
     sensor = selection.observations.sensor
     if covariate == "angle":
-        return _harmonic(selection)
+        factors = ("", "u") if sensor == "gyroscope" else ("",)
+        return max((_harmonic(selection, factor) for factor in factors), key=_worth)
     if covariate == "specific_force":
         signals = ["u"] if sensor == "accelerometer" else []
         return max((_polynomial(selection, covariate, s) for s in (*signals, "fx", "fy", "fz")), key=_worth)
@@ -166,9 +167,9 @@ def _worth(guess: Guess) -> float:
     return guess.gain.delta_bic
 
 
-def _harmonic(selection: Selection) -> Guess:
+def _harmonic(selection: Selection, factor: str) -> Guess:
     """Return the harmonics of the table's angle, one and then another while that helps."""
-    tried = shapes.harmonics()
+    tried = shapes.harmonics(factor)
     texts = [text for shape in tried for text in shape.formulas]
     leftover = _leftover(selection, texts)
     chosen: list[int] = []

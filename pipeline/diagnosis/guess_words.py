@@ -50,9 +50,10 @@ def in_words(guess: Guess, sensor: str) -> str:
     unit = UNITS.get(shape.signal, "")
     signed = shape.kind in ("step", "band")
     sizes = _sizes(guess, sensor, signed=signed)
-    if shape.kind == "harmonic":
+    if shape.kind in ("harmonic", "ripple"):
         cycles = " and ".join(str(n) for n in sorted(figures["cycles"]))
-        return f"{cycles} cycle{'' if cycles == '1' else 's'} per turn of the table, amplitude {sizes}"
+        rate = " in proportion to the rate" if shape.kind == "ripple" else ""
+        return f"{cycles} cycle{'' if cycles == '1' else 's'} per turn of the table{rate}, amplitude {sizes}"
     if shape.kind == "band":
         return f"a band from {figures['low']:.3g} to {figures['high']:.3g} {unit} of {sizes}"
     if shape.kind == "step":
@@ -75,6 +76,8 @@ def _sizes(guess: Guess, sensor: str, *, signed: bool) -> str:
     milli = sensor == "accelerometer" and float(np.abs(guess.sizes).max()) < 0.1
     unit = "mg" if milli else unit_of(sensor)
     values = guess.sizes * (1e3 if milli else 1.0)
+    if guess.shape.kind == "ripple":
+        unit, values = "%", 100.0 * guess.sizes
     told = [f"{values[c] if signed else abs(values[c]):.3g} {unit} on {'xyz'[c]}" for c in guess.gain.axes]
     return " and ".join(filter(None, [", ".join(told[:-1]), told[-1]]))
 

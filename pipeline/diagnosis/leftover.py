@@ -73,7 +73,7 @@ class Leftover:
     curves : callable
         Motion to (n, q) curves that act on every axis, or to (n, 3, q) where each axis has its own.
     beside : callable, optional
-        Motion to (n, m) further curves that belong to what is explained.
+        Motion to further curves, of the same shapes, that belong to what is explained.
     """
 
     def __init__(
@@ -253,7 +253,8 @@ def _of_part(
         else:
             effects.append(regressors)
     if beside is not None:
-        common.append(beside(everything))
+        further = beside(everything)
+        (common if further.ndim == 2 else effects).append(further)
     fit = selection.fit  # without bias and truth the readings keep their digits in the products
     rest = part.reading - fit.bias - common[1] @ fit.K.T
     return np.concatenate(common, axis=1), np.concatenate(effects, axis=2), curves(everything), rest

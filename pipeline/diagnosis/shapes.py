@@ -1,6 +1,7 @@
 """Simple shapes that a residual may have in one covariate, as formulas that a user's own effect file may hold.
 
     harmonic    : a cos(n A) + b sin(n A), A the angle of the table, n = 1 to 12 cycles a turn
+    ripple      : u (a cos(n A) + b sin(n A)), u the rate about the axis, of a gyroscope
     polynomial  : sum over p = 1 to d of a_p x^p, d = 2 to 5, x the covariate centred and scaled to its span
     step        : a where the covariate is above a value; or a (1 + tanh((v - v_0) / w)) / 2
     band        : a where the speed lies between two values
@@ -142,13 +143,13 @@ class Span:
         return middle[apart]
 
 
-def harmonics() -> list[Shape]:
-    """Return the harmonics of the table's angle."""
+def harmonics(factor: str = "") -> list[Shape]:
+    """Return the harmonics of the table's angle; with the factor ``u`` those in proportion to the rate."""
     return [
         Shape(
-            "harmonic",
+            "ripple" if factor else "harmonic",
             "angle",
-            tuple(f"{function}({n} * radians(angle))" for function in ("cos", "sin")),
+            tuple(f"{factor and factor + ' * '}{function}({n} * radians(angle))" for function in ("cos", "sin")),
             1,
             {"cycles": [n]},
         )

@@ -7,9 +7,10 @@ Generic curves in one covariate at a time are tried beside base, configured and 
     angle             : cos and sin of n periods a turn, n = 3 to 8, one n and all of them
     specific_force    : Chebyshev polynomials of degree 3 to 5 of one component, and of all
 
-and, where effects were selected or the residual is above white noise, something sudden:
+and, where effects were selected or the residual is above white noise,
 
-    temperature, time, |omega| : a step at one of 16 places of the span
+    temperature, time, |omega| : a step at one of 16 places of the span, sharp or soft
+    angle                      : for a gyroscope, n periods a turn in proportion to the rate, n = 2 to 8
 
 A covariate is named where one of its tests has delta BIC > 10 and m p < 1e-3, m the number of all tests, and has it too
 where the noise is not held to what a static recording says of it. The curves never take part in the selection: a
@@ -45,6 +46,7 @@ GATE_BIC = 10.0
 GATE_P = 1e-3
 DEGREE = 5
 FEWEST, MOST = 3, 8  # periods a turn: one and two look like base and catalogue
+LEAST_RIPPLE = 2  # one is an effect of the catalogue
 PLACES = 16
 ABOVE = 1.1  # times the white noise: a residual that may hold something sudden
 
@@ -73,7 +75,7 @@ def _significant(selection: Selection, beside: Curves | None) -> dict[str, tuple
 
     tests = [_smooth(selection, beside)]
     if selection.names or selection.fit.residual_rms > ABOVE * float(np.sqrt(np.mean(selection.start.scale**2))):
-        tests.append(_sudden(selection, beside))
+        tests.append(_further(selection, beside))
     count = sum(len(names) for names, _, _, _ in tests)
     found: dict[str, tuple[float, float]] = {}
     for names, delta, parameters, samples in tests:
@@ -103,26 +105,35 @@ def _smooth(selection: Selection, beside: Curves | None) -> Tests:
     return names, leftover.gains(np.concatenate(drops, axis=2), parameters), parameters, leftover.samples
 
 
-def _sudden(selection: Selection, beside: Curves | None) -> Tests:
-    """Return the same of the tests with steps."""
+def _further(selection: Selection, beside: Curves | None) -> Tests:
+    """Return the same of the tests with steps and ripples."""
     observations = selection.observations
+    held = [name for name, _, _ in bases_of(selection)]
     names: list[str] = []
     values: list[tuple[Callable[[Motion], Values | None], Values]] = []
-    for covariate in {name for name, _, _ in bases_of(selection)} & set(SIGNALS):
-        signal, of = SIGNALS[covariate]
-        places = Span.of(observations, signal).places()
-        values.append((of, places[max(1, len(places) // PLACES) // 2 :: max(1, len(places) // PLACES)]))
-        names += [covariate] * 2 * len(values[-1][1])
+    for covariate, (signal, of) in SIGNALS.items():
+        if covariate in held:
+            places = Span.of(observations, signal).places()
+            values.append((of, places[max(1, len(places) // PLACES) // 2 :: max(1, len(places) // PLACES)]))
+            names += [covariate] * 2 * len(values[-1][1])
+    steps = len(names)
+    ripples = (MOST - LEAST_RIPPLE + 1) if observations.sensor == "gyroscope" and "angle" in held else 0
 
     def curves(motion: Motion) -> Values:
         known = [(np.asarray(of(motion))[:, None] - places, np.ptp(places) / PLACES) for of, places in values]
-        return np.concatenate(
-            [k for d, width in known for k in ((d >= 0).astype(float), np.tanh(d / (width + 1e-12)))], axis=1
-        )
+        columns = [k for d, width in known for k in ((d >= 0).astype(float), np.tanh(d / (width + 1e-12)))]
+        if ripples:
+            rate = np.zeros(len(motion.time)) if motion.rate is None else motion.rate
+            columns.append(rate[:, None] * _harmonics(motion, LEAST_RIPPLE))
+        return np.concatenate(columns, axis=1)
 
     leftover = Leftover(selection, curves, beside)
-    parameters = np.full(len(names), 4)
-    return names, leftover.gains(leftover.drops(np.eye(len(names))), parameters), parameters, leftover.samples
+    weights = np.eye(steps + 2 * ripples)[:, :steps]
+    pairs = [leftover.independent((steps + j, steps + ripples + j)) for j in range(ripples)]
+    drops = [leftover.drops(weights), *(leftover.drop(pair)[:, :, -1:] for pair in pairs if pair)]
+    names += ["angle"] * (len(drops) - 1)
+    parameters = np.append(np.full(steps, 4), [3 * len(pair) for pair in pairs if pair]).astype(int)
+    return names, leftover.gains(np.concatenate(drops, axis=2), parameters), parameters, leftover.samples
 
 
 def bases_of(selection: Selection) -> list[tuple[str, Curves, list[Block]]]:
@@ -183,13 +194,13 @@ def chebyshev(x: Values) -> Values:
     return out
 
 
-def _harmonics(motion: Motion) -> Values:
-    count = MOST - FEWEST + 1
+def _harmonics(motion: Motion, fewest: int = FEWEST) -> Values:
+    count = MOST - fewest + 1
     if motion.angle is None:
         return np.zeros((len(motion.time), 2 * count))
     turn = np.exp(1j * np.radians(motion.angle))
     powers = np.empty((len(turn), count), complex)
-    powers[:, 0] = turn**FEWEST
+    powers[:, 0] = turn**fewest
     for j in range(1, count):
         powers[:, j] = powers[:, j - 1] * turn
     return np.concatenate([powers.real, powers.imag], axis=1)
