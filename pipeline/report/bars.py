@@ -69,7 +69,7 @@ def bars(
         words = f"{label} {number(value)}"
         half = 3.0 * len(words)  # a letter of this size is about 6 px wide
         out.append(text(min(max(x, LEFT + half), WIDTH - half), top - 4, words, "m"))
-    out += [text(scale.pixels(v), bottom + 13, tick_label(v, v), "m") for v in at]
+    out += [text(max(scale.pixels(v), LEFT + 14), bottom + 13, tick_label(v, v), "m") for v in at]
     out.append(text((LEFT + WIDTH - RIGHT) / 2, bottom + 27, unit, "m"))
     return frame(name, title, description, bottom + 34, "".join(out))
 
@@ -108,7 +108,7 @@ def columns(
         A dash over each group.
     """
     high = max((v for g in [*groups.values(), levels or []] for v in g), default=1.0) or 1.0
-    left, top, bottom = 60, 8, 138
+    left, top, bottom = 64, 8, 138
     y = Scale(0.0, high * 1.05, bottom, top)
     pitch = (WIDTH - 8 - left) / max(len(groups), 1)
     at = ticks(0.0, y.high, 4)
@@ -126,6 +126,6 @@ def columns(
     dashes = "".join(f"M{left + pitch * i:.1f} {y.pixels(v):.1f}h{pitch:.1f}" for i, v in enumerate(levels or []))
     if dashes:
         out.append(f'<path class="level" d="{dashes}"/>')
-    out.append(f'<text class="m" transform="translate(11 {(top + bottom) / 2:g}) rotate(-90)">{escape(label)}</text>')
+    out.append(f'<text class="m" transform="translate(10 {(top + bottom) / 2:g}) rotate(-90)">{escape(label)}</text>')
     out.append(text((left + WIDTH - 8) / 2, bottom + 27, x_label, "m"))
     return frame(name, title, description, bottom + 34, "".join(out))

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 ON_THE_LINE = 3.0  # mean square of the points about the line, in standard errors
+MOST = 0.97  # share of what the points show that a line must explain, where they leave it by more
 COVARIATES = {
     "temperature": "temperature, degC",
     "time": "time since power-on, s",
@@ -40,20 +41,23 @@ def added_variable(sensor: str, diagnosis: JSON) -> Figure | None:
     unit, effect, panels = shown["unit"], plain(shown["effect"]), []
     arrays = [_arrays(p) for p in shown["panels"]]
     ends = np.array([min(float(a[0].min()) for a in arrays), max(float(a[0].max()) for a in arrays)])
-    scatter = []
+    scatter, squares = [], np.zeros(2)
     for panel, (x, mean, error) in zip(shown["panels"], arrays, strict=True):
         colour = "xyz".index(panel["axis"])
         own = np.array([x.min(), x.max()]) if panel["value"] else ends
         layers: list[Layer] = [Line(own, panel["value"] * own, 5, "model"), Means(x, mean, 2.0 * error, colour)]
         panels.append(Panel(layers, f"{panel['axis']}, {unit}", 92, {"": 0.0}))
-        scatter.append(float(np.mean(((mean - panel["value"] * x) / np.maximum(error, 1e-300)) ** 2)))
+        weight = np.maximum(error, 1e-300) ** -2
+        scatter.append(float(np.mean(weight * (mean - panel["value"] * x) ** 2)))
+        squares += weight @ (mean - panel["value"] * x) ** 2, weight @ mean**2
+    share = 1.0 - squares[0] / max(squares[1], 1e-300)
     best = max(shown["panels"], key=lambda p: abs(p["value"]) / max(p["standard_uncertainty"], 1e-300))
-    straight = max(scatter) < ON_THE_LINE
+    straight = max(scatter) < ON_THE_LINE or share > MOST
     finding = f"{effect.capitalize()} shows: {_coefficient(best)}" + (
         ", and the points follow the line" if straight else "; some points leave the line"
     )
     names = ", ".join(dict.fromkeys(p["parameter"] for p in shown["panels"]))
-    slopes = "; ".join(f"{p['axis']}: {_coefficient(p)}" for p in shown["panels"])
+    slopes = "; ".join(dict.fromkeys(_coefficient(p) for p in shown["panels"]))
     svg = chart(
         f"{sensor}-added-variable",
         f"{sensor}: {finding}",

@@ -24,9 +24,10 @@ if TYPE_CHECKING:
 GATE = 10.0
 MOST, FEWEST, MOST_HIDDEN, LANES = 9, 3, 6, 2
 ROW, SMALL_ROW, LEFT, TOP = 29, 27, 6, 18
-BARS_END, NUMBERS, LANE = 296, 46, 38
+NUMBERS, LANE = 48, 44
 LONGEST = 66  # letters of a reason that fit into a line
 LOWEST = -100.0
+CLOSE = 0.8  # of the selected effect's delta BIC: another that reaches it is no clear loser
 COLOURS = {2: "selected", 4: "passes the gate", 3: "does not"}
 
 
@@ -83,11 +84,14 @@ def _finding(found: Sequence[JSON], selected: Sequence[str]) -> str:
     if not selected:
         verb = "No effect passes the gate" if best is None or _value(best) <= GATE else "No effect is selected"
         return f"{verb}: at best, {nearest}" if nearest else verb
-    first = next((r for r in found if r["effect"] == selected[0]), {})
-    head = f"{plain(selected[0]).capitalize()} stands out: ΔBIC {number(_value(first))}"
+    value = _value(next((r for r in found if r["effect"] == selected[0]), {}))
+    head, close = plain(selected[0]).capitalize(), best is not None and _value(best) > CLOSE * value
     if len(selected) > 1:
-        head += f"; with it {', '.join(plain(n) for n in selected[1:])}"
-    return f"{head}; of the others, {nearest}" if nearest else head
+        head += f", before {', '.join(plain(n) for n in selected[1:])},"
+    head += f" is selected with ΔBIC {number(value)}" if close else f" stands out: ΔBIC {number(value)}"
+    if not nearest:
+        return head
+    return f"{head}, but {nearest}" if close else f"{head}; of the others, {nearest}"
 
 
 def symlog(value: float) -> float:
@@ -98,7 +102,7 @@ def symlog(value: float) -> float:
 def _drawn(shown: Sequence[JSON], selected: Sequence[str], hidden: Sequence[JSON]) -> tuple[float, str]:
     """Return height and content of the chart."""
     lanes = _lanes(shown, selected)
-    end = BARS_END if lanes else WIDTH - NUMBERS
+    end = WIDTH - NUMBERS - LANE * len(lanes)
     values = [_value(r) for r in shown]
     low = max(min(*values, 0.0), LOWEST)
     x = Scale(symlog(low), symlog(max(*values, GATE * 2.0)), LEFT, end)

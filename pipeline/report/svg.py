@@ -17,7 +17,7 @@ from pipeline.report.axes import SUBDIVISION, Scale, log_ticks, span, tick_label
 from pipeline.report.shapes import Band, Layer, Means, draw
 
 WIDTH = 420
-LEFT, RIGHT, TOP, BOTTOM, GAP = 60, 14, 8, 36, 14
+LEFT, RIGHT, TOP, BOTTOM, GAP = 64, 14, 8, 36, 14
 
 Tick = tuple[float, str]
 
@@ -105,7 +105,7 @@ def _panel(panel: Panel, x: Scale, x_ticks: list[Tick], top: float, *, logarithm
     out = [f'<path class="grid" d="{grid}"/>']
     out += [text(LEFT - 4, y.pixels(v) + 3.5, label, "e") for v, label in values]
     middle = (top + bottom) / 2
-    out.append(f'<text class="m" transform="translate(11 {middle:g}) rotate(-90)">{escape(panel.label)}</text>')
+    out.append(f'<text class="m" transform="translate(10 {middle:g}) rotate(-90)">{escape(panel.label)}</text>')
     drawn = "".join(draw(layer, x, y) for layer in panel.layers)
     out.append(f'<g transform="scale({1 / SUBDIVISION:g})">{drawn}</g>')
     for label, value in (panel.levels or {}).items():
