@@ -47,8 +47,9 @@ def main(argv: Sequence[str]) -> int:
         more = {"against": second} if second is not None else {"extra": [_of_gain(gain) for gain in gains]}
         print(json.dumps({**document, **more}, indent=1))
         return 0
+    helps = helps_most(gains)
     lines = in_words(document) if second is None else side_by_side(document, second)
-    print("\n".join([*lines, *(["", *helps_most(gains)] if gains else [])]))
+    print("\n".join([*lines, *(["", *helps] if helps else [])]))
     return 0
 
 

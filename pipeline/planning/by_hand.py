@@ -22,7 +22,7 @@ from pipeline.estimation.hand_held.likelihood import beside
 from pipeline.estimation.hand_held.result import model_of
 from pipeline.estimation.hand_held.selection import select
 from pipeline.estimation.selection import GATE_BIC, GATE_P
-from pipeline.planning.detection import ALIKE, ALMOST_SURE, Detection, smallest
+from pipeline.planning.detection import ALIKE, ALMOST_SURE, PARTLY, Detection, smallest
 from pipeline.records import SensorCalibration
 
 if TYPE_CHECKING:
@@ -100,6 +100,8 @@ class HandExpectation:
             self.found.correction(j, self.at, v, equations.scatter) if v else 0.0 for j, v in enumerate(self.counts)
         ]
 
+        self.of_draws = [self._along(j, self.drawn) for j in range(len(self.terms))]
+
     def _count(self, j: int) -> int:
         shown = self.found.count(j, self.at)
         return shown + len(self.terms[j].effect.nonlinear) if shown else 0
@@ -126,10 +128,9 @@ class HandExpectation:
         j = min(places, key=self._far_from_typical)
         sizes = self._unit_sizes(j)
         signs = np.random.default_rng(1).choice([-1.0, 1.0], (DRAWS, len(sizes)))
-        signal = np.einsum("tnp,sp->tns", self.found.raw[j], signs * sizes)
-        rivals = self._rivals(j)
+        signal = self.found.raw[j] @ (signs * sizes).T
         own = self._squares(j, signal)
-        others = [self._squares(i, signal) for i in rivals]
+        rivals, others = self._rivals(j, signal)
         total = np.sum(self.drawn**2, axis=1), np.sum(self.drawn * signal, axis=1), np.sum(signal**2, axis=1)
 
         def bic(share: float, i: int, squares: tuple[Values, Values, Values]) -> Values:
@@ -179,16 +180,22 @@ class HandExpectation:
         linear = [p.name not in this.nonlinear for p in this.parameters(self.sensor)]
         return np.where(linear, limits, 0.0)
 
-    def _rivals(self, j: int) -> list[int]:
+    def _rivals(self, j: int, signal: Values) -> tuple[list[int], list[tuple[Values, Values, Values]]]:
+        """Return the candidates that reproduce a part of the signals, and what they take."""
         name = self.terms[j].effect.name
-        return [i for i, t in enumerate(self.terms) if t.effect.name != name and self.factors[i] > 0.0]
+        able = [i for i, t in enumerate(self.terms) if t.effect.name != name and self.factors[i] > 0.0]
+        part = PARTLY * float(np.sum(signal[self.at] ** 2))
+        taken = {i: squares for i in able if np.sum((squares := self._squares(i, signal))[2][self.at]) > part}
+        return list(taken), list(taken.values())
+
+    def _along(self, i: int, what: Values) -> Values:
+        """Return draws or signals, (t, n, s), along the directions of candidate i: (t, p, s) array."""
+        found: Values = self.found.half[i].transpose(0, 2, 1) @ (self.found.raw[i].transpose(0, 2, 1) @ what)
+        return found
 
     def _squares(self, i: int, signal: Values) -> tuple[Values, Values, Values]:
         """Return what candidate i takes of draws and signals: squares, products and squares, each (t, s)."""
-        of_draws, of_signal = (
-            np.einsum("tpq,tps->tqs", self.found.half[i], self.found.raw[i].transpose(0, 2, 1) @ what)
-            for what in (self.drawn, signal)
-        )
+        of_draws, of_signal = self.of_draws[i], self._along(i, signal)
         return np.sum(of_draws**2, axis=1), np.sum(of_draws * of_signal, axis=1), np.sum(of_signal**2, axis=1)
 
     def _alike(

@@ -110,6 +110,9 @@ def _by_hand(unit: UnitDescription, course: Course) -> Iterator[Change]:
     if unit.procedure == "multi_position":
         more = POSITIONS * course.positions
         yield _with(unit, f"rest in {more} positions", f"--positions {more}", positions=more)
+    else:
+        what = f"rest in {course.positions} positions, inclined each in another way, in their place"
+        yield Change(what, "--procedure multi_position", replace(unit, procedure="multi_position"))
 
 
 def _anywhere(unit: UnitDescription, course: Course) -> Iterator[Change]:

@@ -43,7 +43,8 @@ def _of_sensor(sensor: str, part: Mapping[str, Any]) -> list[str]:
     noise, unit = part["noise"], part["unit"]
     lines = [f"{sensor} (noise {noise['white']:.2g} {unit} a sample, bias wander {noise['wander']:.2g} {unit})"]
     head = ["effect", "smallest size", "of limit", "looks like", "note"]
-    lines += aligned([head, *(_row(entry) for entry in part["effects"])])
+    if part["effects"]:
+        lines += aligned([head, *(_row(entry) for entry in part["effects"])])
     if part["not_observable"]:
         lines.append("  cannot be seen:")
         lines += aligned([[e["effect"], e["reason"]] for e in part["not_observable"]])
@@ -125,8 +126,11 @@ def helps_most(gains: Sequence[Gain]) -> list[str]:
     gains : sequence of Gain
         In order.
     """
+    useful = [gain for gain in gains if gain.shown or gain.told or 100.0 * gain.factor < CLEARLY_SMALLER]
+    if not useful:
+        return ["what to record more: nothing of what was tried shows more"] if gains else []
     lines = ["what to record more, the most helpful first:"]
-    for number, gain in enumerate(gains[:TOP], start=1):
+    for number, gain in enumerate(useful[:TOP], start=1):
         options = f" ({gain.change.options})" if gain.change.options else ""
         lines.append(f"  {number}. {gain.change.what}{options}: {gain.minutes:+.1f} min")
         lines.append(f"     {_brought(gain)}")

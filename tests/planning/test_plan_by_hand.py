@@ -1,0 +1,49 @@
+"""What a plan says of rests and moves by hand, against units in which effects of such sizes are hidden."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from pipeline.estimation.selection import GATE_BIC
+from pipeline.planning.by_hand import select_by_hand
+from pipeline.planning.extra import changes
+from pipeline.planning.plan import of_sensor
+from pipeline.planning.rehearsal import ROOM, rehearse
+from pipeline.simulation.campaign import simulate_unit
+from pipeline.simulation.description import UnitDescription
+
+POSITIONS = UnitDescription("U", table="hand", procedure="multi_position", temperature=ROOM)
+SIX = replace(POSITIONS, procedure="six_positions")
+UNITS, MOST, FACTOR = 20, 15, 1.5  # were only half of the units found, 15 of 20 would be with a probability of 2 %
+
+
+def test_half_of_the_units_are_found_within_a_factor_of_the_planned_size_by_hand() -> None:
+    rehearsal = rehearse(POSITIONS)
+    planned = {e["effect"]: e for e in of_sensor("accelerometer", rehearsal)["effects"]}
+    sizes = np.array(list(planned["quadratic_nonlinearity"]["sizes"].values()))
+    found = {FACTOR: 0, 1.0 / FACTOR: 0}
+    for factor in found:
+        for number in range(UNITS):
+            signs = np.random.default_rng([number, 7]).choice([-1.0, 1.0], len(sizes))
+            hidden = {"accelerometer.quadratic_nonlinearity": (factor * sizes * signs).tolist()}
+            recordings, _ = simulate_unit(replace(POSITIONS, effects=hidden), 2, number)
+            selection = select_by_hand("accelerometer", replace(rehearsal, recordings=recordings))
+            found[factor] += selection.first.scores["quadratic_nonlinearity"].delta_bic > GATE_BIC
+    assert found[FACTOR] >= MOST, found
+    assert found[1.0 / FACTOR] <= UNITS - MOST, found
+
+
+def test_by_hand_no_table_and_no_lever_arm_can_be_seen() -> None:
+    part = of_sensor("accelerometer", rehearse(POSITIONS))
+    reasons = {entry["effect"]: entry["reason"] for entry in part["not_observable"]}
+    assert reasons["table_tilt"] == "there is no table"
+    assert "by hand nobody knows" in reasons["lever_arm"]
+    assert not reasons.keys() & {entry["effect"] for entry in part["effects"]}
+
+
+def test_six_positions_show_no_nonlinearity_and_more_positions_are_proposed() -> None:
+    part = of_sensor("accelerometer", rehearse(SIX))
+    assert "quadratic_nonlinearity" in {entry["effect"] for entry in part["not_observable"]}
+    assert "--procedure multi_position" in [change.options for change in changes(SIX)]
