@@ -135,6 +135,23 @@ def test_a_resonance_in_a_band_of_speeds_is_told_between_the_speeds_that_were_he
     require_mended("accelerometer", recordings, part)
 
 
+def test_a_ripple_of_the_rate_is_told_with_the_axes_whose_turns_have_it() -> None:
+    def ripple(recording: Recording) -> np.ndarray:
+        rate = np.zeros((recording.samples, 3))
+        if recording.axis in {"x", "z"} and recording.table_angle is not None and recording.table_rate is not None:
+            moved = 5e-3 * recording.table_rate * np.cos(np.radians(3.0 * recording.table_angle))
+            rate[:, "xyz".index(recording.axis)] = moved
+        return rate
+
+    recordings = with_extra("gyroscope", ripple)
+    part = diagnosed("gyroscope", recordings)
+    found = part["unexplained"][0]
+    assert (found["covariate"], found["axes"], found["unit"]) == ("angle", ["x", "z"], "1")
+    assert found["shape"].startswith("3 cycles per turn of the table in proportion to the rate, amplitude 0.")
+    assert found["size"] == pytest.approx(5e-3, rel=0.03)
+    require_mended("gyroscope", recordings, part)
+
+
 @pytest.mark.parametrize(("sensor", "name"), [("accelerometer", "bias_temperature"), ("gyroscope", "g_sensitivity")])
 def test_a_known_effect_is_named_beside_unknown_physics_that_would_hide_or_distort_it(sensor: str, name: str) -> None:
     hidden = {sensor: {name: values_of(sensor, name, np.random.default_rng(0))}}
