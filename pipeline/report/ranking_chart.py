@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 GATE = 10.0
 MOST, FEWEST, MOST_HIDDEN, LANES = 9, 3, 6, 2
 ROW, SMALL_ROW, LEFT, TOP = 29, 27, 6, 18
-NUMBERS, LANE = 48, 44
+NUMBERS, LANE = 52, 48
 LONGEST = 66  # letters of a reason that fit into a line
 LOWEST = -100.0
 CLOSE = 0.8  # of the selected effect's delta BIC: another that reaches it is no clear loser
-COLOURS = {2: "selected", 4: "passes the gate", 3: "does not"}
+COLOURS = {2: "selected", 4: "passes the gate", 3: "below it"}
 
 
 def ranking(sensor: str, diagnosis: JSON) -> Figure | None:
