@@ -4,7 +4,7 @@
 
 Each draw of w goes with signs d of its own through the likelihoods of ``pipeline.estimation.hand_held``, at any size a
 without a new simulation, as all sums of squares are polynomials in a. Equations are few by hand, and their noise is not
-known beforehand, so that the large-sample formulas of ``pipeline.planning.detection`` do not hold here.
+known beforehand, so that the large-sample formulas of ``pipeline.planning.expectation`` do not hold here.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import unselected
 from pipeline.model.effects import effect
 from pipeline.model.effects.base import Owner
-from pipeline.planning.detection import Expectation
+from pipeline.planning.expectation import Expectation
 from pipeline.planning.extra import changes
 from pipeline.planning.rehearsal import limits_broken, rehearse
 from pipeline.records import SENSORS

@@ -14,7 +14,7 @@ from pipeline.estimation.ranking import Ranking
 from pipeline.estimation.selection import GATE_BIC, GATE_P, select
 from pipeline.estimation.wandering import Cells, Setting, settings_for
 from pipeline.model.effects import catalogue, effect
-from pipeline.planning.detection import noise_sums
+from pipeline.planning.expectation import noise_sums
 from pipeline.planning.plan import plan_of
 from pipeline.planning.rehearsal import FAULTLESS, ROOM, noise_of_sheet
 from pipeline.records import SENSORS

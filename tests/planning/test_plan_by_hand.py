@@ -16,7 +16,7 @@ from pipeline.simulation.description import UnitDescription
 
 POSITIONS = UnitDescription("U", table="hand", procedure="multi_position", temperature=ROOM)
 SIX = replace(POSITIONS, procedure="six_positions")
-UNITS, MOST, FACTOR = 20, 15, 1.5  # were only half of the units found, 15 of 20 would be with a probability of 2 %
+UNITS, MOST, FACTOR = 12, 10, 1.5  # were only half of the units found, 10 of 12 would be with a probability of 2 %
 
 
 def test_half_of_the_units_are_found_within_a_factor_of_the_planned_size_by_hand() -> None:
