@@ -28,7 +28,7 @@ NUMBERS, LANE = 52, 48
 LONGEST = 66  # letters of a reason that fit into a line
 LOWEST = -100.0
 CLOSE = 0.8  # of the selected effect's delta BIC: another that reaches it is no clear loser
-COLOURS = {2: "selected", 4: "passes the gate", 3: "below it"}
+COLOURS = {2: "selected", 4: "passes the gate", 3: "below the gate"}
 
 
 def ranking(sensor: str, diagnosis: JSON) -> Figure | None:
