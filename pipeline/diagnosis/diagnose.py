@@ -86,6 +86,7 @@ def diagnose(
     beside = select_beside(selection, unknown, configured, noise, settings["sensor"][sensor])
     document = _document(beside, unknown, configured, recordings, noise, table=settings["table"])
     return document | {
+        "suggested_effect": None if beside is selection else suggested_effect(unknown, sensor, catalogue()),
         "residual_over_noise": _over_noise(selection, recordings, noise),
         "pictures": pictures(selection, unknown, noise, beside),
         "method_errors": method_errors(calibration, beside, recordings, settings),
@@ -134,7 +135,6 @@ def _document(
         "ranking": ranking,
         "not_observable": [{"effect": name, "reason": reason} for name, reason in hidden.items()],
         "unexplained": unknown,
-        "suggested_effect": suggested_effect(unknown, sensor, catalogue()),
         "next_experiment": next_experiment(
             verdict,
             ranking=ranking,
