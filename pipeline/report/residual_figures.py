@@ -8,8 +8,9 @@ import numpy as np
 
 from pipeline.report.bars import columns
 from pipeline.report.figure import AXES, AXES_LEGEND, JSON, UNITS, Figure
+from pipeline.report.harmonics import harmonic_noise, harmonics
 from pipeline.report.numbers import number
-from pipeline.report.residuals import BinnedMean, Residual, covariates, harmonic_noise, harmonics, white_noise
+from pipeline.report.residuals import BinnedMean, Residual, covariates, white_noise
 from pipeline.report.shapes import Band, Layer, Means
 from pipeline.report.svg import Panel, chart
 

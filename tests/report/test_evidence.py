@@ -12,10 +12,11 @@ import pytest
 from pipeline.records import Recording
 from pipeline.report.evidence_figures import added_variable, column_unit, unexplained
 from pipeline.report.figures import staircase
+from pipeline.report.harmonics import harmonic_noise, harmonics
 from pipeline.report.noise_figure import allan, deviations, expected, longest_rest
 from pipeline.report.ranking_chart import ranking, symlog
 from pipeline.report.residual_figures import residual_figures
-from pipeline.report.residuals import harmonic_noise, harmonics, residuals
+from pipeline.report.residuals import residuals
 from pipeline.report.unit_page import render
 
 from .conftest import SIGMA, Unit, build_unit, diagnosis_of

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from pipeline.report.residuals import binned_mean, harmonics, residuals
+from pipeline.report.harmonics import harmonics
+from pipeline.report.residuals import binned_mean, residuals
 from pipeline.signal.filters import apply_filter
 
 from .conftest import EFFECT, SIGMA, Unit, build_unit
