@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from pipeline.records import Recording
 
+MODEL_POINTS = 150
 NOISE = 1.1  # of the band: a residual up to it is noise
 ALIKE = 1.2  # factor between a held-out error of the validation and the diagnosis's own, for both to mean the same
 
@@ -41,7 +42,8 @@ def measurement_and_model(sensor: str, residual: Residual, sigma: NDArray[np.flo
     source = "" if sigma is not None else " Its σ is taken from the sample-to-sample scatter."
     sigma = white_noise(residual.error) if sigma is None else sigma
     layers: list[Layer] = [Samples(x, residual.reading[:, i], i) for i in range(3)]
-    layers += [Line(x, residual.predicted[:, i], 5, "model") for i in range(3)]
+    every = slice(None, None, -(-len(x) // MODEL_POINTS))  # the model has no noise whose extremes could be lost
+    layers += [Line(x[every], residual.predicted[every, i], 5, "model") for i in range(3)]
     ends = np.array([x.min(), x.max()])
     top = max(float(np.abs(residual.error).max()), 2.2 * float(sigma.max()))
     panels = [Panel(layers, f"reading, {unit}")]
