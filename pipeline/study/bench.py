@@ -6,13 +6,16 @@ Further noise goes on over the recordings of a unit, at the time steps t:
     random_walk  : sigma_b sqrt(t / T), the data sheet's wander sigma_b per its correlation time T
     one_over_f   : amplitudes of a spectrum 1/f, scaled to three times the data sheet's wander
 
-and physics in another form than the catalogue's, A of the data sheet's order, on every axis:
+and physics in another form than the catalogue's, A of the data sheet's order, on every axis with a size and a sign of
+its own:
 
-    gear_mesh        : A cos(5 angle)                   while a table turns
-    temperature_step : A tanh((T - T_middle) / 0.2) / 2
-    saturation       : A tanh((T - 25) / 2)
-    exponential      : A (exp((T - 25) / 5) - 1)
+    gear_mesh        : A cos(5 angle)
+    temperature_step : A (1 + tanh((x - 1/2) / 0.04)) / 2
+    saturation       : A tanh(4 x)
+    exponential      : A (exp(3 x) - 1) / (exp(3) - 1)
     band             : A where 4 < |omega| < 7 deg/s
+
+where x is the true temperature from the coldest sample of the unit, 0, to the warmest, 1.
 """
 
 from __future__ import annotations
@@ -26,7 +29,9 @@ from pipeline.model.kinematics import reference_motion
 from pipeline.records import SENSORS
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, read_config
-from pipeline.study.cases import COURSES
+from pipeline.simulation.environment import random_environment
+from pipeline.simulation.session import Streams
+from pipeline.study.cases import COURSES, OF_TEMPERATURE
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -39,8 +44,8 @@ OF_WHITE = ("ar_06", "ar_09")
 AMPLITUDE = {
     "gear_mesh": {"accelerometer": 2e-3, "gyroscope": 0.03},
     "temperature_step": {"accelerometer": 4e-3, "gyroscope": 0.06},
-    "saturation": {"accelerometer": 2e-3, "gyroscope": 0.3},
-    "exponential": {"accelerometer": 2e-3, "gyroscope": 0.3},
+    "saturation": {"accelerometer": 3e-3, "gyroscope": 0.6},
+    "exponential": {"accelerometer": 3e-3, "gyroscope": 0.6},
     "band": {"accelerometer": 2e-3, "gyroscope": 0.05},
 }
 
@@ -63,6 +68,7 @@ def recordings_of(case: Case) -> list[Recording]:
         accelerometer=own["accelerometer"],
         gyroscope=own["gyroscope"],
         effects={f"{case.sensor}.{name}": values for name, values in case.hidden.items()},
+        temperature={} if case.room_degc is None else {"drift": case.room_degc},
     )
     recordings, _ = simulate_unit(unit, case.seed, case.number)
     if case.procedure == "at_rest":
@@ -71,7 +77,7 @@ def recordings_of(case: Case) -> list[Recording]:
     for sensor in SENSORS:
         recordings = _with_noise(recordings, sensor, case.noise, sheets[sensor], rng)
     if case.shape:
-        recordings = [_with_shape(r, case.sensor, case.shape) for r in recordings]
+        recordings = _with_shape(recordings, case)
     if case.noise == "cold":
         recordings = [replace(r, temperature=None) for r in recordings]
     if case.noise == "coarse":
@@ -128,22 +134,36 @@ def _one_over_f(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
     return np.asarray(noise / noise.std(axis=0), np.float64)
 
 
-def _with_shape(recording: Recording, sensor: str, shape: str) -> Recording:
-    motion = reference_motion(recording, 1.0)
-    signal = np.zeros(recording.samples)
-    warmth = _temperature(recording) - 25.0
+def _with_shape(recordings: list[Recording], case: Case) -> list[Recording]:
+    if case.shape in OF_TEMPERATURE:
+        room = random_environment(Streams(case.seed, case.number)["room"])
+        room = room if case.room_degc is None else replace(room, drift=case.room_degc)
+        warmth = [room.temperature(r.time) for r in recordings]
+        low, high = min(float(w.min()) for w in warmth), max(float(w.max()) for w in warmth)
+        signals = [_of_temperature(case.shape, (w - low) / (high - low)) for w in warmth]
+    else:
+        signals = [_of_motion(case.shape, r) for r in recordings]
+    size = AMPLITUDE[case.shape][case.sensor] * np.array(case.amplitude)
+    return [_added(r, case.sensor, signal[:, None] * size) for r, signal in zip(recordings, signals, strict=True)]
+
+
+def _of_temperature(shape: str, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    curves: dict[str, NDArray[np.float64]] = {
+        "temperature_step": 0.5 + 0.5 * np.tanh((x - 0.5) / 0.04),
+        "saturation": np.tanh(4.0 * x),
+        "exponential": np.expm1(3.0 * x) / np.expm1(3.0),
+    }
+    return curves[shape]
+
+
+def _of_motion(shape: str, recording: Recording) -> NDArray[np.float64]:
     if shape == "gear_mesh" and recording.table_angle is not None and recording.role != "static":
-        signal = np.cos(np.radians(5.0 * recording.table_angle))
-    elif shape == "temperature_step":
-        signal = 0.5 * np.tanh((warmth - 2.0) / 0.2)
-    elif shape == "saturation":
-        signal = np.tanh(warmth / 2.0)
-    elif shape == "exponential":
-        signal = np.exp(warmth / 5.0) - 1.0
-    elif shape == "band" and motion is not None:
+        return np.asarray(np.cos(np.radians(5.0 * recording.table_angle)), np.float64)
+    motion = reference_motion(recording, 1.0)
+    if shape == "band" and motion is not None:
         speed = np.linalg.norm(motion.angular_rate, axis=1)
-        signal = ((speed > 4.0) & (speed < 7.0)).astype(float)
-    return _added(recording, sensor, AMPLITUDE[shape][sensor] * signal[:, None] * np.ones(3))
+        return np.asarray((speed > 4.0) & (speed < 7.0), np.float64)
+    return np.zeros(recording.samples)
 
 
 def _temperature(recording: Recording) -> NDArray[np.float64]:
