@@ -108,4 +108,4 @@ def _sentence(error: Mapping[str, Any], sensor: str) -> str:
 
 
 def _plain(name: str) -> str:
-    return name.replace("_", " ")
+    return name.replace("non_", "non-").replace("_", " ")
