@@ -40,7 +40,8 @@ if TYPE_CHECKING:
     Values = NDArray[np.float64]
 
 ROUNDS = 3 * MOST
-CONSTANT_SHARE = 0.6  # of the best delta BIC above which an effect with a time constant is fitted to its optimum
+COMPETES = 0.6  # share of the best delta BIC above which an effect is fitted to its optimum
+CLEARLY = 6.0  # of delta BIC, that a time constant must bring beyond the best effect without one
 
 
 @dataclass(frozen=True)
@@ -261,12 +262,13 @@ class _Search:
         return factor * len(raw) * float(np.log1p(power / len(raw)))
 
     def _refine(self, scored: Scored, names: Sequence[str], before: float) -> None:
-        """Take those with a time constant that compete to their optimum."""
+        """Take those that compete to their optimum, where one linear step may not lead there."""
         from scipy.special import chdtrc  # noqa: PLC0415  (as above)
 
         top = max((s.delta_bic for s in scored.scores.values()), default=0.0)
         for score in list(scored.scores.values()):
-            if not effect(score.name).nonlinear or score.delta_bic < max(CONSTANT_SHARE * top, 0.0):
+            curved = bool(effect(score.name).nonlinear) or (self.model.kinds > 1 and top > GATE_BIC)
+            if not curved or score.delta_bic < max(COMPETES * top, 0.0):
                 continue
             terms = [t for i, t in enumerate(self.fit.state.terms) if i < self.held or t.effect.name in names]
             start = replace(self.fit.state, terms=(*terms, Term(effect(score.name), score.values)))
@@ -281,9 +283,16 @@ class _Search:
             )
 
     def _best(self, scored: Scored) -> Score | None:
-        """Return the candidate to accept; of two within the gate of each other a plausible one goes first."""
+        """Return the candidate to accept.
+
+        Of two within the gate of each other a plausible one goes first; of two closer still, the one without a time
+        constant.
+        """
         passing = [s for s in scored.scores.values() if s.name not in self.names and self._passes(s)]
-        worth = {s.name: s.delta_bic - (0.0 if s.plausible else GATE_BIC) for s in passing}
+        worth = {
+            s.name: s.delta_bic - (0.0 if s.plausible else GATE_BIC) - (CLEARLY if effect(s.name).nonlinear else 0.0)
+            for s in passing
+        }
         return max(passing, key=lambda s: worth[s.name], default=None)
 
     def _passes(self, score: Score) -> bool:
