@@ -23,7 +23,7 @@ import numpy as np
 
 from pipeline.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.design import BASE, BASE_NAMES, Design, Start, Term, motions_of, ordinary_base
-from pipeline.estimation.observations import observe
+from pipeline.estimation.observations import observe, weighted
 from pipeline.estimation.wandering import Setting, settings_for
 from pipeline.model.effects import effect
 from pipeline.model.effects.base import Layout, truth
@@ -379,7 +379,7 @@ def fit_joint(  # noqa: PLR0917  (the interface that the stages and the diagnosi
         If an effect is unknown or not one of this sensor.
     """
     combinations = starts_of(effects, sensor, start)
-    observations = observe(sensor, recordings, settings["table"])
+    observations = weighted(observe(sensor, recordings, settings["table"]), noise)
     base = ordinary_base(observations, noise)
     _require_available(observations, effects)
     grid = settings_for(noise, RATIOS, TIMES)

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.estimation.wandering import information
 from pipeline.model.effects.base import turning_direction
 from pipeline.model.kinematics import earth_rate, reference_motion
 from pipeline.signal.filters import apply_filter
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.records import Motion, Recording
+    from pipeline.records import Motion, Noise, Recording
 
 ROLES = ("accelerometer", "gyroscope", "static")
 UNSOUND = 0b0110  # flags of clipped and stuck samples
@@ -151,6 +152,8 @@ class Part:
     scatter : (3,) array
         Sum of squares about the means, weighted.
     clock_shared : bool
+    interval : float, s
+        Between the recording's samples.
     """
 
     name: str
@@ -160,6 +163,7 @@ class Part:
     weight: NDArray[np.float64]
     scatter: NDArray[np.float64]
     clock_shared: bool
+    interval: float
     moved: dict[tuple[tuple[str, bytes], ...], Motion] = field(default_factory=dict, compare=False, repr=False)
 
 
@@ -207,6 +211,22 @@ class Observations:
     def clock_shared(self) -> bool:
         """Whether the time between the recordings is known."""
         return all(part.clock_shared for part in self.parts) or len(self.parts) == 1
+
+
+def weighted(observations: Observations, noise: Noise | None) -> Observations:
+    """Return observations whose weights say how much correlated noise leaves of their information.
+
+    Parameters
+    ----------
+    observations : Observations
+    noise : Noise or None
+        See ``pipeline.estimation.wandering.information``.
+    """
+    parts = []
+    for part in observations.parts:
+        share = information(noise, part.interval)
+        parts.append(part if share == 1.0 else replace(part, weight=share * part.weight, scatter=share * part.scatter))
+    return replace(observations, parts=tuple(parts))
 
 
 def observe(sensor: str, recordings: Sequence[Recording], table: Mapping[str, Any]) -> Observations:
@@ -262,6 +282,7 @@ def _part(sensor: str, recording: Recording, gravity: float, earth: NDArray[np.f
         rows.count * information,
         within * information,
         recording.clock_shared,
+        recording.interval,
     )
 
 

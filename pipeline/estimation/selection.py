@@ -5,7 +5,7 @@ In each round every candidate competes at its own best noise setting. The best o
     delta BIC > 10   and   m p < 0.01
 
 where p is that of the likelihood ratio and m the number of candidates (Bonferroni). Beside what is selected, whose
-equations are of first order, it must bring 1/2000 of what that has brought. Where the residual stays above
+equations are of first order, it must bring 1/5000 of what that has brought. Where the residual stays above
 twice the noise, an effect must also explain 5 % of the excess: a model that misses something large is mended a little
 by anything small.
 After an effect of timing or with
@@ -25,6 +25,7 @@ import numpy as np
 
 from pipeline.estimation.design import BASE, Start, Term, ordinary_base
 from pipeline.estimation.joint import Fit, fit_best, fit_terms, starts_of
+from pipeline.estimation.observations import weighted
 from pipeline.estimation.ranking import Ranking, Score
 from pipeline.estimation.wandering import settings_for
 from pipeline.model.effect_limits import parameter_limits
@@ -49,7 +50,7 @@ CONSTANT_SHARE = 0.6  # the same for an effect with a time constant, whose start
 DELAYS = ("time_offset", "low_pass_lag")  # of the two the first is taken unless the second is clearly better
 CLEARLY = 6.0
 TIE = 0.5
-SECOND_ORDER = 5e-4  # of the gain in 2 log L by what is selected: what equations of first order may leave of it
+SECOND_ORDER = 2e-4  # of the gain in 2 log L by what is selected: what equations of first order may leave of it
 FAR_ABOVE = 2.0  # times the noise: the residual of a model that misses more than the catalogue holds
 WORTH_NAMING = 0.05  # share of such a residual's excess that an effect must explain
 ANOTHER_K = 2e-3  # change of K that changes the columns of effects that the axes share
@@ -184,6 +185,7 @@ class _Search:
         sheet: Mapping[str, Any],
         known: SensorCalibration | None,
     ) -> None:
+        observations = weighted(observations, noise)
         self.observations = observations
         self.start = ordinary_base(observations, noise)
         self.settings = settings_for(noise)

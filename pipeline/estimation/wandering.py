@@ -36,7 +36,9 @@ if TYPE_CHECKING:
 
 CELLS = 600
 SHORTEST_CELL_S = 2.0
-STATIC_WIDTH = 0.35  # of the logarithm of the ratio that a static rest of some minutes gives
+FAST_S = 25.0
+WALK = 8.0  # times the correlation time seen, with the same variance of short differences
+STATIC_WIDTH = (0.35, 1.1)  # least and most of the logarithm of the ratio that a static rest gives
 
 
 @dataclass(frozen=True)
@@ -104,6 +106,25 @@ def cells_of(observations: Observations) -> Cells:
     return Cells(np.concatenate(first), np.concatenate(times), np.concatenate(joined)[1:], np.concatenate(weights))
 
 
+def wanders_fast(noise: Noise | None) -> bool:
+    """Return whether the noise is correlated over seconds: then it is taken for white noise with fewer samples."""
+    return noise is not None and noise.source == "static" and noise.correlation_time < FAST_S
+
+
+def information(noise: Noise | None, interval: float) -> float:
+    """Return how much a sample tells beside one of white noise alone: ``1 / (1 + 2 q tau / dt)``, at slow change.
+
+    Parameters
+    ----------
+    noise : Noise or None
+    interval : float, s
+    """
+    if noise is None or not wanders_fast(noise) or not np.all(noise.white > 0):
+        return 1.0
+    ratio = float(np.mean((noise.wander / noise.white) ** 2))
+    return 1.0 / (1.0 + 2.0 * ratio * noise.correlation_time / interval)
+
+
 def settings_for(
     noise: Noise | None,
     ratios: Sequence[float] = (0.03, 0.1, 0.3, 1.0, 3.0),
@@ -111,8 +132,10 @@ def settings_for(
 ) -> list[Setting]:
     """Return the noise settings over which the likelihood is maximised.
 
-    A static recording pins them: its ratio, halves and doubles of it, by a log-normal weight. Without one they span
-    what sensors of the field show, and no wander at all.
+    A static recording pins them: its ratio, halves and doubles of it, by a log-normal weight, and slower wanders with
+    the same short differences. Without one, and where
+    it wanders so fast that its length says nothing of what is slower, they span what sensors of the field show, and no
+    wander at all.
 
     Parameters
     ----------
@@ -120,12 +143,18 @@ def settings_for(
     ratios, times : sequence of float
         The free grid; times in s.
     """
-    if noise is not None and noise.source == "static" and np.any(noise.wander > 0) and np.all(noise.white > 0):
+    pinned = noise is not None and noise.source == "static" and not wanders_fast(noise)
+    if noise is not None and pinned and np.any(noise.wander > 0) and np.all(noise.white > 0):
         known = float(np.sqrt(np.mean((noise.wander / noise.white) ** 2)))
         factors = np.array([0.25, 0.5, 1.0, 2.0, 4.0])
-        priors = -0.5 * (np.log(factors) / STATIC_WIDTH) ** 2
-        pairs = zip(factors, priors, strict=True)
-        return [Setting(known * f, noise.correlation_time * t, p) for f, p in pairs for t in (0.5, 2.0)]
+        least, most = STATIC_WIDTH
+        width = np.clip(np.sqrt(noise.correlation_time / noise.length), least, most) if noise.length > 0 else least
+        priors = -0.5 * (np.log(factors) / width) ** 2
+        pairs = list(zip(factors, priors, strict=True))
+        found = [Setting(known * f, noise.correlation_time * t, p) for f, p in pairs for t in (0.5, 2.0)]
+        # A random walk looks like this over the static rest, and goes on to grow after it.
+        walk = [Setting(known * f * WALK**0.5, noise.correlation_time * WALK, p - 1.0) for f, p in pairs[:3]]
+        return found + walk
     return [Setting(0.0, 1.0)] + [Setting(ratio, time) for ratio in ratios for time in times]
 
 

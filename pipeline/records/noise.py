@@ -27,9 +27,13 @@ class Noise:
     source : str
         ``static`` (a long rest), ``rests`` (rest parts of the recordings), ``residual`` (what a fit left) or
         ``data_sheet``.
+    length : float, s
+        Of the static rest that told it; 0 where none did. It bounds how well the wander is known: its standard
+        deviation has a relative uncertainty of about ``sqrt(correlation_time / length)``.
     """
 
     white: NDArray[np.float64]
     wander: NDArray[np.float64]
     correlation_time: float
     source: str
+    length: float = 0.0

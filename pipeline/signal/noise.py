@@ -19,6 +19,7 @@ A recording held out for validation is not looked at.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -41,7 +42,7 @@ __all__ = ["allan_deviation", "estimate_noise", "filter_autocovariance"]
 
 GAP = 1.5
 WANDER_TIME_S = 100.0  # where the data sheet gives none
-TIMES = np.exp2(np.arange(-4.0, 4.0))  # correlation times tried, in those of the data sheet
+TIMES = np.exp2(np.arange(-6.0, 4.0))  # correlation times tried, in those of the data sheet
 IMPULSE_SAMPLES = 4096
 SHORTEST_BLOCK = 8
 FEWEST_SAMPLES = 60
@@ -76,7 +77,9 @@ def estimate_noise(sensor: str, recordings: list[Recording], data_sheet: dict[st
     for source, found, more in (("static", long_rests, rests), ("rests", rests, [])):
         if sum(len(time) for time, _ in found) >= FEWEST_SAMPLES:
             chosen = static if source == "static" else usable
-            return _noise_of_rests(found, more, chosen, data_sheet, source)
+            noise = _noise_of_rests(found, more, chosen, data_sheet, source)
+            length = sum(float(time[-1] - time[0]) for time, _ in found) if source == "static" else 0.0
+            return replace(noise, length=length)
     white = _white_of_turns(usable, sensor)
     return _with_sheet_wander(white, data_sheet, "residual") if white is not None else _of_sheet(usable, data_sheet)
 

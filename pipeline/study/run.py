@@ -1,7 +1,7 @@
 """Run the cases of a study, in some processes, and keep what was said.
 
     <directory>/truth.jsonl      what is hidden in each case
-    <directory>/results.jsonl    what the diagnosis said of it
+    <directory>/results.jsonl    what the diagnosis said of it, and a digest of the code that said it
 
 A case whose result is there is not run again, so that a study can be interrupted and made larger.
 """
@@ -14,6 +14,8 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from typing import TYPE_CHECKING, Any
 
+from pipeline.config import code_digest
+from pipeline.errors import ConfigurationError
 from pipeline.study.cases import draw
 from pipeline.study.judge import judge
 
@@ -47,9 +49,16 @@ def run_study(
     processes : int
     progress : callable
         Told how many of how many are done.
+
+    Raises
+    ------
+    ConfigurationError
+        If the directory holds cases of another seed.
     """
     directory.mkdir(parents=True, exist_ok=True)
+    _refuse_another_seed(directory / TRUTH, seed)
     done = {line["key"] for line in read_lines(directory / RESULTS)}
+    code = code_digest("pipeline.study.judge")
     planned: list[Planned] = [(family, number, seed) for number in range(count) for family in families]
     planned = [item for item in planned if draw(*item).key not in done]
     with (
@@ -58,10 +67,18 @@ def run_study(
     ):
         for number, (item, entries) in enumerate(_judged(planned, processes), start=1):
             truth.write(json.dumps(draw(*item).to_json()) + "\n")
-            results.writelines(json.dumps(entry) + "\n" for entry in entries)
+            results.write("".join(json.dumps({**entry, "code": code}) + "\n" for entry in entries))
             truth.flush()
             results.flush()
             progress(number, len(planned))
+
+
+def _refuse_another_seed(truth: Path, seed: int) -> None:
+    found = {line["seed"] for line in read_lines(truth)} - {seed}
+    if found:
+        raise ConfigurationError(
+            f"holds cases of seed {min(found)}, not {seed}; choose another directory, or that seed", str(truth)
+        )
 
 
 def _judged(planned: Sequence[Planned], processes: int) -> Iterator[tuple[Planned, list[dict[str, Any]]]]:
