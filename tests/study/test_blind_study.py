@@ -110,9 +110,8 @@ def test_what_cannot_be_seen_is_said_to_be_so(number: int) -> None:
     assert not_seen(case.to_json(), judge(case)[0])
 
 
-def test_an_effect_that_nobody_knows_of_is_not_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_effect_that_nobody_knows_of_is_not_named() -> None:
     case = next(c for k in range(50) if (c := draw("removed", k, SEED)).left_out == ("bias_drift",))
-    monkeypatch.setattr("pipeline.study.judge.recordings_of", lambda _: recordings_of(case))
     (found,) = judge(case)
     assert "bias_drift" not in {*found["selected"], *found["not_observable"]}
     assert found["whole"]["selected"] == ["bias_drift"]
