@@ -15,6 +15,7 @@ import numpy as np
 
 from pipeline.diagnosis.by_hand_hidden import hidden_effects, next_experiment, nothing_to_see
 from pipeline.diagnosis.by_hand_left import dependences
+from pipeline.diagnosis.by_hand_picture import added_variable
 from pipeline.errors import CannotCalibrateError
 from pipeline.estimation.hand_held.equations import HandNoise
 from pipeline.estimation.hand_held.likelihood import beside
@@ -110,6 +111,8 @@ def _document(selection: HandSelection, configured: list[str], noise: Noise | No
         "override": f"effects.{sensor}=[{','.join([*configured, *selected])}]" if selected else "",
         "configured": configured,
         "wander": _wander(selection, noise),
+        "pictures": {"added_variable": added_variable(selection), "unexplained": []},
+        "method_errors": [],
     }
 
 

@@ -147,6 +147,7 @@ def nothing_to_see(sensor: str, configured: list[str], reason: str) -> dict[str,
         "override": "",
         "configured": configured,
         "wander": None,
+        "method_errors": [],
     }
 
 

@@ -41,7 +41,6 @@ if TYPE_CHECKING:
 
 ROUNDS = 3 * MOST
 COMPETES = 0.6  # share of the best delta BIC above which an effect is fitted to its optimum
-CLEARLY = 6.0  # of delta BIC, that a time constant must bring beyond the best effect without one
 
 
 @dataclass(frozen=True)
@@ -283,16 +282,9 @@ class _Search:
             )
 
     def _best(self, scored: Scored) -> Score | None:
-        """Return the candidate to accept.
-
-        Of two within the gate of each other a plausible one goes first; of two closer still, the one without a time
-        constant.
-        """
+        """Return the candidate to accept; of two within the gate of each other a plausible one goes first."""
         passing = [s for s in scored.scores.values() if s.name not in self.names and self._passes(s)]
-        worth = {
-            s.name: s.delta_bic - (0.0 if s.plausible else GATE_BIC) - (CLEARLY if effect(s.name).nonlinear else 0.0)
-            for s in passing
-        }
+        worth = {s.name: s.delta_bic - (0.0 if s.plausible else GATE_BIC) for s in passing}
         return max(passing, key=lambda s: worth[s.name], default=None)
 
     def _passes(self, score: Score) -> bool:
