@@ -30,6 +30,7 @@ MOVING_DPS = 0.02
 SAME_SHARE, SAME_DPS2 = 0.01, 0.1
 LAG_ROUNDING_DPS = 1e-11
 MEMORY_S = 0.3
+CORNER_DPS2 = 3.0
 
 
 class TurnLog:
@@ -51,7 +52,7 @@ class TurnLog:
         what the log's own noise allows. In the others the trajectory is a guess.
     followed_samples : (n,) array of bool
         Samples after which such an interval comes, and before which there were none but such for 0.3 s: a filter
-        inside the sensor remembers what came before.
+        inside the sensor remembers what came before. Left out are samples at which one stretch ends.
     acceleration : (n,) array, deg/s^2
         At the samples.
     """
@@ -79,7 +80,15 @@ class TurnLog:
         first = np.searchsorted(self.time, self.time - MEMORY_S, side="right") - 1
         past = lost - lost[np.maximum(first, 0)] == 0
         known: NDArray[np.bool_] = np.logical_and(past, np.append(self.followed, True))
+        known[1:-1] &= ~self._corners()
         return known
+
+    def _corners(self) -> NDArray[np.bool_]:
+        """Return which inner samples a stretch ends at: there the acceleration is that before or that after."""
+        jump = np.abs(self._before[1:] - self._after[:-1])
+        both = self.explained[1:] & self.explained[:-1]
+        ends: NDArray[np.bool_] = both & (jump > CORNER_DPS2)
+        return ends
 
     def _bends(self, even: NDArray[np.bool_]) -> tuple[Values, Values, Values, NDArray[np.bool_]]:
         """Return for each interval where it bends, the acceleration before and after, and whether that holds."""

@@ -156,3 +156,18 @@ def test_a_lag_leaves_nothing_of_a_ramp_that_the_log_does_not_follow() -> None:
     felt = [effect("low_pass_lag").moved(part.motion, tau).angular_rate for part in observations.parts]
     rest = observations.reading - (BIAS["gyroscope"] + np.concatenate(felt) @ K["gyroscope"].T)
     assert np.abs(rest).max() < 3e-4
+
+
+def test_a_lever_arm_leaves_nothing_at_the_corners_of_a_ramp() -> None:
+    """At a sample at which a ramp ends the acceleration is that before or that after, and 0.05 m make it 4 mg."""
+    arm = np.array([0.05, 0.03, -0.04])
+    quiet = Session(5, effects={"accelerometer": {"lever_arm": arm}}, white=0.0, wander=0.0)
+    table = {"gravity_g": 1.0, "latitude_deg": None, "azimuth_deg": None}
+    observations = observe("accelerometer", record(quiet), table)
+    matrix, row = K["accelerometer"], 0
+    for part in observations.parts:
+        added = effect("lever_arm").reading("accelerometer", part.motion, matrix, arm)
+        model = BIAS["accelerometer"] + part.motion.specific_force @ matrix.T + added
+        reading = observations.reading[row : row + len(model)]
+        row += len(model)
+        assert np.abs(reading - model).max() < 1e-9
