@@ -1,1 +1,9 @@
-"""Modules beside this file, such as ``bench_session``, can be imported by tests of any folder."""
+"""Modules beside this file, such as ``bench_session``, can be imported by tests of any folder.
+
+A test is one core, as a job is: linear algebra on small matrices is slower on several.
+"""
+
+import os
+
+for _threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(_threads, "1")  # before numpy is imported
