@@ -7,19 +7,21 @@ effect would be, beside base, configured and selected effects, on the axes that 
 
 with r coefficients on each of a axes and s scanned parameters (``pipeline.diagnosis.shape_search``). The best one is
 told in words and written as the definition of an effect, to be named, tried and confirmed by the user. A covariate that
-says nothing more beside the best shape of another is named as explained by it.
+says nothing more beside the best shape of another is named as explained by it. And where slow effects were selected, a
+step or exponential of the temperature is tried in their place: it is taken for the truth if it explains far more.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pipeline.diagnosis import shapes
 from pipeline.diagnosis.guess_words import in_words
-from pipeline.diagnosis.shape_search import CLEARLY, guess_of
-from pipeline.diagnosis.unknown import dependences
+from pipeline.diagnosis.shape_search import CLEARLY, best_scanned, guess_of
+from pipeline.diagnosis.unknown import SLOW, dependences
 from pipeline.estimation.selection import FAR_ABOVE, select
 from pipeline.model.effects import catalogue, forget, register
 from pipeline.model.effects.base import unit_of
@@ -32,6 +34,7 @@ if TYPE_CHECKING:
     from pipeline.estimation.selection import Selection
     from pipeline.records import Noise
 
+FAR_MORE = 0.05  # of what they gain
 OWNERS = {"harmonic": "table", "ripple": "table", "band": "table"}
 
 
@@ -49,10 +52,13 @@ def unexplained(selection: Selection) -> list[dict[str, Any]]:
         delta_bic, explained_by`` (another covariate whose shape says it all, or None) and ``kind``.
     """
     found = dict(dependences(selection))
-    if not found:
-        return []
     sensor = selection.observations.sensor
     guesses = sorted((guess_of(selection, covariate) for covariate in found), key=_rank)
+    if not found:
+        instead = _instead(selection)
+        if instead is None:
+            return []
+        guesses, found = [instead], {instead.covariate: instead.gain.p_value}
     best = guesses[0]
     beside = dict(dependences(selection, shapes.columns_of(best.shape.formulas, sensor)))
     return [
@@ -71,6 +77,24 @@ def unexplained(selection: Selection) -> list[dict[str, Any]]:
         }
         for guess in guesses
     ]
+
+
+def _instead(selection: Selection) -> Guess | None:
+    """Return a step or exponential of the temperature that explains far more than the slow effects that were selected.
+
+    Where the unit only warms up, all of these are one curve in time, and none is far better.
+    """
+    slow = [term for term in selection.fit.terms if term.effect.name in SLOW and term.effect.name in selection.names]
+    if not slow or any(part.motion.temperature is None for part in selection.observations.parts):
+        return None
+    others = tuple(term for term in selection.fit.terms if term not in slow)
+    names = [name for name in selection.names if name not in SLOW]
+    without = replace(selection, names=names, fit=replace(selection.fit, terms=others))
+    guess, before = best_scanned(without, "temperature", "temperature")
+    gain = 2.0 * (selection.fit.log_likelihood - before)
+    parameters = sum(len(term.values) for term in slow)
+    worth = gain - parameters * float(np.log(3.0 * selection.observations.samples))
+    return guess if guess.gain.delta_bic > worth + max(2.0 * CLEARLY, FAR_MORE * gain) else None
 
 
 def _rank(guess: Guess) -> float:

@@ -39,7 +39,7 @@ def guess_of(selection: Selection, covariate: str) -> Guess:
         signals = ["u"] if sensor == "accelerometer" else []
         return max((_polynomial(selection, covariate, s) for s in (*signals, "fx", "fy", "fz")), key=_worth)
     signal = "speed" if covariate == "rate" else covariate
-    guesses = [_scanned(selection, covariate, signal), _polynomial(selection, covariate, signal)]
+    guesses = [best_scanned(selection, covariate, signal)[0], _polynomial(selection, covariate, signal)]
     if sensor == "gyroscope" and covariate == "rate":
         guesses.append(_polynomial(selection, covariate, "u"))
     return max(guesses, key=_worth)
@@ -102,8 +102,16 @@ def _spanned(selection: Selection, signal: str) -> str:
     return "fz" if selection.observations.sensor == "accelerometer" else "wz"
 
 
-def _scanned(selection: Selection, covariate: str, signal: str) -> Guess:
-    """Return the best step, band or exponential: the best of a coarse scan, then of a fine one about it."""
+def best_scanned(selection: Selection, covariate: str, signal: str) -> tuple[Guess, float]:
+    """Return the best step, band or exponential, and the log likelihood without it.
+
+    It is the best of a coarse scan, then of a fine one about it.
+
+    Parameters
+    ----------
+    selection : Selection
+    covariate, signal : str
+    """
     span = shapes.Span.of(selection.observations, signal)
     places = span.places()
     single = shapes.steps(span, places)
@@ -120,7 +128,7 @@ def _scanned(selection: Selection, covariate: str, signal: str) -> Guess:
     inner = np.einsum("q,cqp,p->c", weights, leftover.inner[gain.setting], weights)
     found = _on_axes((leftover.cross[gain.setting] @ weights / np.maximum(inner, 1e-300))[:, None], gain)
     sizes = found[:, 0] if shape.kind != "exponential" else _spread(selection, shape.formulas, found)
-    return Guess(covariate, shape, gain, found, sizes)
+    return Guess(covariate, shape, gain, found, sizes), leftover.before
 
 
 def _best_of(

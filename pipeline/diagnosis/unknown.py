@@ -48,6 +48,8 @@ DEGREE = 5
 FEWEST, MOST = 3, 8  # periods a turn: one and two look like base and catalogue
 LEAST_RIPPLE = 2  # one is an effect of the catalogue
 PLACES = 16
+SLOW = ("bias_drift", "bias_temperature", "bias_temperature_quadratic", "scale_factor_temperature", "warm_up")
+EQUATION = 0.05  # of what slow effects gain: less may be the error of a smoothed temperature where it turns
 ABOVE = 1.1  # times the white noise: a residual that may hold something sudden
 
 
@@ -61,6 +63,9 @@ def dependences(selection: Selection, beside: Curves | None = None) -> list[tupl
         Motion to (n, m) further curves that count as explained.
     """
     found = _significant(selection, beside)
+    if any(name in SLOW for name in selection.names):
+        least = EQUATION * 2.0 * (selection.fit.log_likelihood - selection.base.log_likelihood)
+        found = {k: v for k, v in found.items() if v[0] > least or k not in ("temperature", "time")}
     if found and any(setting.prior for setting in selection.settings):
         least = min(setting.prior for setting in selection.settings)
         free = [replace(setting, prior=least) for setting in settings_for(None)]
