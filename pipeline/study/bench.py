@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from pipeline.study.cases import Case
 
 INTERVAL_S = 0.12
+PERFECT = {"angle_accuracy_deg": 0.0, "rate_error": (0.0, 0.0, 0.0), "direction_deg": [[0.0, 0.0]] * 3}
 OF_WHITE = ("ar_06", "ar_09")
 AMPLITUDE = {
     "gear_mesh": {"accelerometer": 2e-3, "gyroscope": 0.03},
@@ -69,6 +70,7 @@ def recordings_of(case: Case) -> list[Recording]:
         gyroscope=own["gyroscope"],
         effects={f"{case.sensor}.{name}": values for name, values in case.hidden.items()},
         temperature={} if case.room_degc is None else {"drift": case.room_degc},
+        imperfections=PERFECT,  # a table's own accuracy would be an effect that the study does not know of
     )
     recordings, _ = simulate_unit(unit, case.seed, case.number)
     if case.procedure == "at_rest":
