@@ -25,28 +25,25 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.diagnosis.method_difference import difference_of
 from pipeline.diagnosis.method_words import meaning
-from pipeline.estimation.design import Start
-from pipeline.estimation.joint import fit_terms
 from pipeline.estimation.observations import through_filter
 from pipeline.model.effects.base import truth, unit_of
 from pipeline.model.kinematics import earth_rate, reference_motion
-from pipeline.model.user_effects import effect_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from pipeline.estimation.joint import Fit
+    from pipeline.diagnosis.method_difference import Difference
     from pipeline.estimation.selection import Selection
-    from pipeline.records import Motion, Recording, SensorCalibration
+    from pipeline.records import Recording, SensorCalibration
 
     Values = NDArray[np.float64]
 
 FREE = ("reference_least_squares", "effects")  # stages that leave bias and matrix free
 LEAST_SHARE = 0.02
-SURE = 5.0  # standard uncertainties of both fits together
 
 
 @dataclass(frozen=True)
@@ -55,63 +52,6 @@ class Error:
 
     vector: Values
     magnitude: Values
-
-
-@dataclass(frozen=True)
-class Difference:
-    """A method against the free fit.
-
-    Attributes
-    ----------
-    method : SensorCalibration
-    bias : (3,) array, g or deg/s
-        M (b - b_m).
-    matrix : (3, 3) array
-        M K - 1.
-    uncertainty : (12,) array
-        Of both, row by row.
-    free : Fit
-    """
-
-    method: SensorCalibration
-    bias: Values
-    matrix: Values
-    uncertainty: Values
-    free: Fit
-
-    def parts(self, motion: Motion) -> dict[str, Values]:
-        """Return the error of the calibrated reading by its cause, but for the filter's: (n, 3) arrays.
-
-        Parameters
-        ----------
-        motion : Motion
-            As the filter leaves it.
-        """
-        u = truth(self.method.sensor, motion)
-        diagonal = np.diag(np.diag(self.matrix))
-        even = 0.5 * (self.matrix + self.matrix.T) - diagonal
-        odd = 0.5 * (self.matrix - self.matrix.T)
-        return {
-            "bias": np.broadcast_to(self.bias, u.shape),
-            "scale_factor": u @ diagonal.T,
-            "non_orthogonality": u @ even.T,
-            "rotation": u @ odd.T,
-            "two_sided": self._of_effects(motion) @ self.method.matrix.T,
-        }
-
-    def _of_effects(self, motion: Motion) -> Values:
-        """Return what the free fit's values of the method's effects add, less what the method's do."""
-        added = np.zeros((len(motion.time), 3))
-        fitted = {term.effect.name: term for term in self.free.terms}
-        for effect in self.method.effects:
-            this = effect_of(effect)
-            if this.moves or not this.available(motion):
-                continue
-            K = self.free.K
-            added -= this.reading(self.method.sensor, motion, K, effect.values)
-            if effect.name in fitted:
-                added += this.reading(self.method.sensor, motion, K, fitted[effect.name].values)
-        return added
 
 
 def method_errors(
@@ -142,14 +82,14 @@ def method_errors(
     stages = [stage.name for stage in calibration.stages]
     if not stages or stages[-1] in FREE:
         return []
-    difference = _difference(calibration, selection)
+    difference = difference_of(calibration, selection)
     own = _together([_errors(difference, r, settings["table"]) for r in recordings if r.role == calibration.sensor])
     held_out = _together([_errors(difference, r, settings["table"]) for r in recordings if r.role == "validation"])
     if not own:
         return []
     share, held = (_shares({name: e.vector for name, e in found.items()}) for found in (own, held_out))
     magnitude = _shares({name: e.magnitude[:, None] for name, e in held_out.items()})
-    sure = _certain(difference, selection.names)
+    sure = difference.certain(selection.names)
     printed = bool((settings.get("method") or {}).get("as_printed"))
     found = [
         {
@@ -165,51 +105,6 @@ def method_errors(
         if max(share[name], magnitude.get(name, 0.0)) > LEAST_SHARE and sure.get(name, True)
     ]
     return sorted(found, key=lambda entry: -float(entry["share"]))
-
-
-def _difference(calibration: SensorCalibration, selection: Selection) -> Difference:
-    """Compare with the free fit of base, configured effects and those selected that the method has too."""
-    free, names = selection.base, [effect.name for effect in calibration.effects]
-    shared = [term for term in selection.fit.terms if term.effect.name in names]
-    known = {term.effect.name for term in free.terms}
-    if any(term.effect.name not in known for term in shared):
-        terms = [*free.terms, *(term for term in shared if term.effect.name not in known)]
-        start = Start(free.bias, free.K, selection.start.scale)
-        free = fit_terms(selection.observations, terms, start, selection.settings)
-    M = calibration.matrix
-    own = np.zeros((12, 12)) if calibration.covariance is None else calibration.covariance[:12, :12]
-    change = np.zeros((12, 12))
-    change[:3, :3] = M
-    change[3:, 3:] = np.kron(M, np.eye(3))
-    theirs = np.zeros((12, 12))
-    theirs[:3, :3] = M
-    theirs[3:, 3:] = np.kron(np.eye(3), free.K.T)
-    covariance = change @ free.covariance[:12, :12] @ change.T + theirs @ own @ theirs.T
-    return Difference(
-        calibration,
-        M @ (free.bias - calibration.bias),
-        M @ free.K - np.eye(3),
-        np.sqrt(np.clip(np.diag(covariance), 0.0, None)),
-        free,
-    )
-
-
-def _certain(difference: Difference, selected: Sequence[str]) -> dict[str, bool]:
-    """Return which parts are more than the noise leaves in the two fits."""
-    u = difference.uncertainty[3:].reshape(3, 3)
-    E = difference.matrix
-    off = ~np.eye(3, dtype=bool)
-    both = np.hypot(u, u.T) / 2.0
-    diagonal = np.abs(np.diag(E)) > SURE * np.diag(u)
-    has = {effect.name for effect in difference.method.effects}
-    whole = all(name in has for name in selected)
-    return {
-        "two_sided": whole,
-        "bias": whole and bool(np.any(np.abs(difference.bias) > SURE * difference.uncertainty[:3])),
-        "scale_factor": bool(np.any(diagonal)),
-        "non_orthogonality": bool(np.any(np.abs(E + E.T)[off] / 2.0 > SURE * both[off])),
-        "rotation": bool(np.any(np.abs(E - E.T)[off] / 2.0 > SURE * both[off])),
-    }
 
 
 def _errors(difference: Difference, recording: Recording, table: Mapping[str, Any]) -> dict[str, Error]:
