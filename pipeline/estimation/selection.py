@@ -5,7 +5,7 @@ In each round every candidate competes at its own best noise setting. The best o
     delta BIC > 10   and   m p < 0.01
 
 where p is that of the likelihood ratio and m the number of candidates (Bonferroni). Beside what is selected, whose
-equations are of first order, it must bring 1/5000 of what that has brought. Where the residual stays above
+equations are of first order, it must bring 1/5000 of what that has brought, or 30. Where the residual stays above
 twice the noise, an effect must also explain 5 % of the excess: a model that misses something large is mended a little
 by anything small.
 After an effect of timing or with
@@ -51,6 +51,7 @@ DELAYS = ("time_offset", "low_pass_lag")  # of the two the first is taken unless
 CLEARLY = 6.0
 TIE = 0.5
 SECOND_ORDER = 2e-4  # of the gain in 2 log L by what is selected: what equations of first order may leave of it
+HIGHEST_GATE = 30.0
 FAR_ABOVE = 2.0  # times the noise: the residual of a model that misses more than the catalogue holds
 WORTH_NAMING = 0.05  # share of such a residual's excess that an effect must explain
 ANOTHER_K = 2e-3  # change of K that changes the columns of effects that the axes share
@@ -329,7 +330,8 @@ class _Search:
 
     def _gate(self) -> float:
         """Return the delta BIC to pass: beside large effects, what their equations leave may not pass for another."""
-        return max(GATE_BIC, SECOND_ORDER * 2.0 * (self.fit.log_likelihood - self.base.log_likelihood))
+        left = SECOND_ORDER * 2.0 * (self.fit.log_likelihood - self.base.log_likelihood)
+        return float(np.clip(left, GATE_BIC, HIGHEST_GATE))
 
     def _matters(self, score: Score) -> bool:
         """Return whether an effect explains a part worth naming of an excess that is far above the noise."""

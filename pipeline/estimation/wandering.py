@@ -146,14 +146,14 @@ def settings_for(
     pinned = noise is not None and noise.source == "static" and not wanders_fast(noise)
     if noise is not None and pinned and np.any(noise.wander > 0) and np.all(noise.white > 0):
         known = float(np.sqrt(np.mean((noise.wander / noise.white) ** 2)))
-        factors = np.array([0.25, 0.5, 1.0, 2.0, 4.0])
+        factors = np.array([0.5, 1.0, 2.0, 4.0])
         least, most = STATIC_WIDTH
         width = np.clip(np.sqrt(noise.correlation_time / noise.length), least, most) if noise.length > 0 else least
         priors = -0.5 * (np.log(factors) / width) ** 2
         pairs = list(zip(factors, priors, strict=True))
         found = [Setting(known * f, noise.correlation_time * t, p) for f, p in pairs for t in (0.5, 2.0)]
         # A random walk looks like this over the static rest, and goes on to grow after it.
-        walk = [Setting(known * f * WALK**0.5, noise.correlation_time * WALK, p - 1.0) for f, p in pairs[:3]]
+        walk = [Setting(known * f * WALK**0.5, noise.correlation_time * WALK, p - 1.0) for f, p in pairs]
         return found + walk
     return [Setting(0.0, 1.0)] + [Setting(ratio, time) for ratio in ratios for time in times]
 
