@@ -1,259 +1,315 @@
-"""ROS 2 logs in MCAP files to channels.
+"""Logs in MCAP files to channels.
 
     specific force [g]   = linear_acceleration [m/s^2] / 9.80665
     angular rate [deg/s] = angular_velocity [rad/s] * 180/pi
 
 Times are the stamps in the messages' headers, integer ns: the sensor's clock, not the recorder's. The rows are the Imu
 messages; table messages belong to them by equal stamps, and a temperature with stamps of its own is interpolated. A
-covariance whose first element is -1 says that the quantity is absent (sensor_msgs/Imu).
+covariance whose first element is -1 says that the quantity is absent (sensor_msgs/Imu). Messages of other types are
+read by the map of fields in the profile; their rows are the messages of the first topic with an accelerometer or a
+gyroscope.
 """
 
 from __future__ import annotations
 
-import hashlib
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from mcap_ros2.decoder import DecoderFactory
 
-from pipeline.errors import InputError
 from pipeline.formats.channel_table import ChannelTable
-from pipeline.formats.mcap_container import read_container
-from pipeline.formats.ros2 import IMU, JOINT_STATE, QUATERNION_STAMPED, TEMPERATURE, encoded_length
-from pipeline.formats.text_file import read_bytes
-from pipeline.formats.units import ACCELEROMETER, ATTITUDE, GYROSCOPE, to_house_unit
-from pipeline.records import Note
+from pipeline.formats.field_path import ONLY, FieldPath
+from pipeline.formats.ingest_error import IngestError
+from pipeline.formats.mcap_decode import Wanted
+from pipeline.formats.mcap_records import MAGIC
+from pipeline.formats.mcap_series import ABSENT, Gatherer, Series
+from pipeline.formats.mcap_settings import TIME
+from pipeline.formats.mcap_walk import Walk
+from pipeline.formats.message_definition import short_name
+from pipeline.formats.ros2 import IMU, JOINT_STATE, QUATERNION_STAMPED, TEMPERATURE
+from pipeline.formats.text_file import FOREIGN
+from pipeline.formats.units import ACCELEROMETER, ATTITUDE, COUNTS, GYROSCOPE, decode, to_house_unit
+from pipeline.records import Encoding, Note
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Mapping
     from pathlib import Path
+    from typing import BinaryIO
 
     from numpy.typing import NDArray
 
     from pipeline.formats.mcap_container import Container
-    from pipeline.formats.settings import McapFormat
+    from pipeline.formats.mcap_settings import MappedField, McapFormat
 
-MAGIC = b"\x89MCAP0\r\n"
-
-
-@dataclass(frozen=True)
-class Series:
-    """The decoded messages of one topic.
-
-    Attributes
-    ----------
-    topic : str
-    time_ns : (n,) array of int64, ns
-        Stamps of the headers, increasing.
-    messages : list
-    """
-
-    topic: str
-    time_ns: NDArray[np.int64]
-    messages: list[Any]
+SHORT = {short_name(kind): kind for kind in (IMU, TEMPERATURE, JOINT_STATE, QUATERNION_STAMPED)}
+MAP = "map"
+VECTORS = {"linear_acceleration": (ACCELEROMETER, "m/s^2"), "angular_velocity": (GYROSCOPE, "rad/s")}
+TABLE_UNITS = {"table_angle": "rad", "table_rate": "rad/s"}
 
 
 def read_mcap(path: Path, settings: McapFormat) -> ChannelTable:
-    """Read a ROS 2 log.
+    """Read a log.
 
     Raises
     ------
-    InputError
-        If the file is damaged or incomplete, has no or several Imu topics, or its stamps do not increase.
+    IngestError
+        If the file is damaged or incomplete, has no or several Imu topics, or its times cannot be.
     """
-    data, where = read_bytes(path), str(path)
-    if not data.startswith(MAGIC):
-        start = data[:8].decode("ascii", "replace")
-        raise InputError(f"not an MCAP file: it starts with {start!r}; a text log needs the suffix .csv", where)
-    container = read_container(data, where)
-    notes: list[Note] = []
-    if not container.verified:
-        notes.append(Note("N-NOCRC", 1, 0, 0, "written without checksums: damage cannot be told from data"))
-    imu = _series(container, IMU, settings.imu_topic, where, required=True)
-    assert imu is not None  # noqa: S101  (required)
-    values = _imu_values(imu, where)
-    used = {imu.topic}
-    for kind, topic, read in (
-        (TEMPERATURE, settings.temperature_topic, _temperature),
-        (JOINT_STATE, settings.joint_topic, _joint_reader(settings.joint)),
-        (QUATERNION_STAMPED, settings.attitude_topic, _attitude),
-    ):
-        series = _series(container, kind, topic, where, required=topic is not None)
-        if series is not None:
-            used.add(series.topic)
-            values |= read(series, imu, where, notes)
-    _check_finite(values, imu, where)
-    ignored = sorted({c.topic for c in container.channels.values()} - used)
-    if ignored:
-        notes.append(Note("N-IGNORED", len(ignored), 0, 0, f"topics not used: {', '.join(ignored)}"))
-    source = {"file": where, "sha256": hashlib.sha256(data).hexdigest(), "rows": len(imu.messages)}
-    return ChannelTable(where, imu.time_ns, values, source, lambda _row: 0, notes=tuple(notes))
-
-
-def _series(container: Container, kind: str, topic: str | None, path: str, *, required: bool) -> Series | None:
-    """Decode the messages of the named topic, or of the only topic of a type."""
-    kinds = {c.topic: getattr(container.schemas.get(c.schema_id), "name", "?") for c in container.channels.values()}
-    topics = [t for t, k in kinds.items() if k == kind and topic in (None, t)]
-    if not topics and required:
-        found = ", ".join(f"{t} ({k})" for t, k in kinds.items()) or "no topics"
-        raise InputError(f"no topic {topic or ''} of type {kind}; the file has {found}".replace("  ", " "), path)
-    if len(topics) > 1:
-        raise InputError(
-            f"{len(topics)} topics are of type {kind}: {', '.join(topics)}; choose one in ingest.mcap", path
-        )
-    messages = [m for t in topics for m in _decoded(container, t, kind, path)]
-    if not messages:
-        if required:
-            raise InputError(f"topic {topics[0]} holds no messages", path)
-        return None
-    return Series(topics[0], _stamps(messages, topics[0], path), messages)
-
-
-def _decoded(container: Container, topic: str, kind: str, path: str) -> list[Any]:
-    factory = DecoderFactory()
-    out: list[Any] = []
-    for channel in container.channels.values():
-        if channel.topic != topic:
-            continue
-        schema = container.schemas[channel.schema_id]
-        try:
-            decoder = factory.decoder_for(channel.message_encoding, schema)
-        except Exception as error:
-            raise InputError(f"topic {topic}: its message definition cannot be read ({error})", path) from error
-        if decoder is None:
-            raise InputError(
-                f"topic {topic} is encoded as {channel.message_encoding!r} with {schema.encoding!r} definitions; "
-                "cdr with ros2msg is supported",
-                path,
-            )
-        for message in container.messages.get(channel.id, []):
-            out.append(_decode(decoder, message.data, kind, f"message {len(out) + 1} on {topic}", path))
-    return out
-
-
-def _decode(decoder: Callable[[bytes], Any], data: bytes, kind: str, which: str, path: str) -> Any:  # noqa: ANN401
-    """Decode one message and see that it has the length that its content needs."""
     try:
-        message = decoder(data)
-        needed = encoded_length(kind, message)
-    except Exception as error:
-        raise InputError(f"{which} ({len(data)} bytes) is no {kind} ({type(error).__name__} {error})", path) from error
-    if len(data) != needed:
-        raise InputError(f"{which} has {len(data)} bytes where {kind} needs {needed}: damaged, or another type", path)
-    return message
+        with path.open("rb") as stream:
+            return _Reader(stream, str(path), settings).table()
+    except OSError as error:
+        raise IngestError(f"cannot be read: {error.strerror or error}", str(path), fault="unreadable") from error
 
 
-def _stamps(messages: Sequence[Any], topic: str, path: str) -> NDArray[np.int64]:
-    stamps = np.array([(m.header.stamp.sec, m.header.stamp.nanosec) for m in messages], np.int64)
-    if not stamps.any() and len(stamps) > 1:
-        raise InputError(f"topic {topic}: all header stamps are 0; the sensor's own times are needed", path)
-    time: NDArray[np.int64] = stamps[:, 0] * 1_000_000_000 + stamps[:, 1]
-    back = np.flatnonzero(np.diff(time) <= 0)
-    if back.size:
-        row = int(back[0]) + 1
-        raise InputError(
-            f"message {row + 1} on {topic}: header stamp {time[row] / 1e9:.9g} s after {time[row - 1] / 1e9:.9g} s "
-            f"({back.size} such messages); stamps have to increase",
-            path,
+class _Reader:
+    """One file on its way to channels."""
+
+    def __init__(self, stream: BinaryIO, path: str, settings: McapFormat) -> None:
+        _check_magic(stream.read(64), path)
+        self.path, self.settings = path, settings
+        self.walk = Walk(stream, path, allow_truncated=settings.allow_truncated)
+        self.gatherers: dict[str, Gatherer] = {}
+        self.notes: list[Note] = []
+        self.encodings: dict[str, Encoding] = {}
+
+    def table(self) -> ChannelTable:
+        for rows in self.walk.rows():
+            channel = self.walk.found.channels[rows.channel]
+            schema = self.walk.found.schemas.get(channel.schema_id)
+            gatherer = self._gatherer(channel.topic, schema.name if schema else "")
+            if gatherer is not None:
+                gatherer.read(rows, channel, schema)
+        self._note_container(self.walk.found)
+        base, values = self._mapped() if self.settings.topics else self._imu()
+        for kind, topic, read in (
+            (TEMPERATURE, self.settings.temperature_topic, self._temperature),
+            (JOINT_STATE, self.settings.joint_topic, self._table_values),
+            (QUATERNION_STAMPED, self.settings.attitude_topic, self._table_values),
+        ):
+            series = self._only(kind, topic, required=topic is not None)
+            if series is not None:
+                values |= {n: v for n, v in read(series, base).items() if n not in values}
+        _check_finite(values, base, self.path)
+        self._note_ignored()
+        source = {"file": self.path, "sha256": self.walk.found.sha256, "rows": len(base.time_ns)}
+        return ChannelTable(
+            self.path, base.time_ns, values, source, lambda _row: 0, self.encodings, notes=tuple(self.notes)
         )
-    return time
 
+    def _gatherer(self, topic: str, schema: str) -> Gatherer | None:
+        """Return what takes in the messages of a topic; None if none are wanted."""
+        if topic not in self.gatherers:
+            if topic in self.settings.topics:
+                self.gatherers[topic] = Gatherer(topic, MAP, self._wanted_by_map(topic), self.path)
+            else:
+                kind = SHORT.get(short_name(schema), "")
+                chosen = {
+                    IMU: self.settings.imu_topic,
+                    TEMPERATURE: self.settings.temperature_topic,
+                    JOINT_STATE: self.settings.joint_topic,
+                    QUATERNION_STAMPED: self.settings.attitude_topic,
+                }
+                if not kind or chosen[kind] not in (None, topic) or (kind == IMU and self.settings.topics):
+                    return None
+                self.gatherers[topic] = Gatherer(topic, kind, self._wanted(kind), self.path)
+        return self.gatherers[topic]
 
-def _imu_values(imu: Series, path: str) -> dict[str, NDArray[np.float64]]:
-    values: dict[str, NDArray[np.float64]] = {}
-    for channels, name, unit in (
-        (ACCELEROMETER, "linear_acceleration", "m/s^2"),
-        (GYROSCOPE, "angular_velocity", "rad/s"),
-    ):
-        absent = np.array([getattr(m, f"{name}_covariance")[0] == -1.0 for m in imu.messages])
-        if absent.all():
-            continue
-        if absent.any():
-            row = int(np.argmax(absent != absent[0])) + 1
-            raise InputError(
-                f"{name} is absent (covariance -1) in some messages on {imu.topic}, see message {row}", path
+    def _wanted(self, kind: str) -> Wanted:
+        paths: dict[str, FieldPath] = {}
+        if kind == IMU:
+            for vector, (channels, _unit) in VECTORS.items():
+                paths |= {c: FieldPath.parse(f"{vector}.{a}") for c, a in zip(channels, "xyz", strict=True)}
+                paths[vector + ABSENT] = FieldPath.parse(f"{vector}_covariance[0]")
+        elif kind == TEMPERATURE:
+            paths["temperature"] = FieldPath.parse("temperature")
+        elif kind == JOINT_STATE:
+            joint = self.settings.joint or ONLY
+            which = "the only joint" if joint == ONLY else f"joint {joint}"
+            paths["table_angle"] = FieldPath(f"position of {which}", "position", joint)
+            paths["table_rate"] = FieldPath(f"velocity of {which}", "velocity", joint)
+        else:
+            paths = {c: FieldPath.parse(f"quaternion.{a}") for c, a in zip(ATTITUDE, "wxyz", strict=True)}
+        time = FieldPath.parse("header.stamp") if self.settings.time_source == "header" else None
+        return Wanted(paths, time)
+
+    def _wanted_by_map(self, topic: str) -> Wanted:
+        fields = self.settings.topics[topic]
+        time = fields.get(TIME) if self.settings.time_source == "header" else None
+        paths = {c: f.path for c, f in fields.items() if c != TIME}
+        return Wanted(paths, time.path if time else None, time.unit if time else "ns")
+
+    def _only(self, kind: str, topic: str | None, *, required: bool) -> Series | None:
+        """Return the messages of the named topic, or of the only topic of a type."""
+        found = [g for g in self.gatherers.values() if g.kind == kind]
+        named = [c.topic for c in self.walk.found.channels.values() if c.topic == topic]
+        if not found and required and not (named and self._kind_of(named[0]) == kind):
+            listed = ", ".join(self._topics()) or "no topics"
+            raise IngestError(
+                f"no topic {topic or ''} of type {kind}; the file has {listed}".replace("  ", " "),
+                self.path,
+                fault="missing_topic",
+                hint="" if kind != IMU else "ingest.mcap.topics reads other types by their fields",
             )
-        vectors = [getattr(m, name) for m in imu.messages]
-        numbers = np.array([(v.x, v.y, v.z) for v in vectors])
-        values |= {c: to_house_unit(c, np.ascontiguousarray(numbers[:, i]), unit) for i, c in enumerate(channels)}
-    if not values:
-        raise InputError(f"topic {imu.topic} says that both quantities are absent (covariance -1)", path)
-    return values
+        if len(found) > 1:
+            raise IngestError(
+                f"{len(found)} topics are of type {kind}: {', '.join(g.topic for g in found)}; choose one in "
+                "ingest.mcap",
+                self.path,
+                fault="ambiguous",
+            )
+        if not found or not found[0].count:
+            if required:
+                raise IngestError(f"topic {topic} holds no messages", self.path, fault="missing_topic")
+            return None
+        return found[0].series(self.settings, self.notes)
 
+    def _kind_of(self, topic: str) -> str:
+        container = self.walk.found
+        schemas = [container.schemas.get(c.schema_id) for c in container.channels.values() if c.topic == topic]
+        return SHORT.get(short_name(schemas[0].name), "") if schemas and schemas[0] else ""
 
-def _temperature(series: Series, imu: Series, _path: str, notes: list[Note]) -> dict[str, NDArray[np.float64]]:
-    degrees = np.array([m.temperature for m in series.messages])
-    if np.array_equal(series.time_ns, imu.time_ns):
-        return {"temperature": degrees}
-    detail = f"temperature of {len(degrees)} messages with stamps of their own, interpolated, held at the ends"
-    notes.append(Note("N-INTERPOLATED", len(imu.messages), 0, 0, detail))
-    origin = imu.time_ns[0]
-    return {"temperature": np.interp(imu.time_ns - origin, series.time_ns - origin, degrees)}
+    def _topics(self) -> list[str]:
+        """Return all topics with their types."""
+        container = self.walk.found
+        listed = []
+        for channel in container.channels.values():
+            schema = container.schemas.get(channel.schema_id)
+            listed.append(f"{channel.topic} ({schema.name if schema else channel.message_encoding})")
+        return sorted(set(listed))
 
+    def _imu(self) -> tuple[Series, dict[str, NDArray[np.float64]]]:
+        series = self._only(IMU, self.settings.imu_topic, required=True)
+        assert series is not None  # noqa: S101  (required)
+        values: dict[str, NDArray[np.float64]] = {}
+        for vector, (channels, unit) in VECTORS.items():
+            absent = series.values.pop(vector + ABSENT)
+            numbers = [series.values.pop(c) for c in channels]
+            if absent.all():
+                continue
+            if absent.any():
+                row = int(np.argmax(absent != absent[0])) + 1
+                raise IngestError(
+                    f"{vector} is absent (covariance -1) in some messages on {series.topic}, see message {row}",
+                    self.path,
+                    fault="absent",
+                )
+            values |= {c: to_house_unit(c, column, unit) for c, column in zip(channels, numbers, strict=True)}
+        if not values:
+            raise IngestError(
+                f"topic {series.topic} says that both quantities are absent (covariance -1)", self.path, fault="absent"
+            )
+        return series, values
 
-def _joint_reader(joint: str | None) -> Callable[..., dict[str, NDArray[np.float64]]]:
-    """Return the reader of the table's encoder, the joint of that name or the only one."""
+    def _mapped(self) -> tuple[Series, dict[str, NDArray[np.float64]]]:
+        """Return the rows and channels of the topics whose fields the profile names."""
+        topics = self.settings.topics
+        empty = [t for t in topics if t not in self.gatherers]
+        if empty:
+            raise IngestError(
+                f"no messages on {', '.join(empty)}; the file has {', '.join(self._topics()) or 'no topics'}",
+                self.path,
+                fault="missing_topic",
+            )
+        first = next((t for t, f in topics.items() if {ACCELEROMETER[0], GYROSCOPE[0]} & set(f)), None)
+        base = None if first is None else self.gatherers[first].series(self.settings, self.notes)
+        if base is None:
+            base = self._only(IMU, self.settings.imu_topic, required=True)
+        assert base is not None  # noqa: S101  (required)
+        values: dict[str, NDArray[np.float64]] = {}
+        for topic, fields in topics.items():
+            series = base if topic == first else self.gatherers[topic].series(self.settings, self.notes)
+            numbers = {c: self._in_unit(c, series.values[c], f) for c, f in fields.items() if c != TIME}
+            rows = Series(topic, series.time_ns, numbers)
+            if topic != first:
+                numbers = (
+                    self._temperature(rows, base) if set(numbers) == {"temperature"} else self._matched(rows, base)
+                )
+            values |= numbers
+        return base, values
 
-    def read(series: Series, imu: Series, path: str, notes: list[Note]) -> dict[str, NDArray[np.float64]]:
-        messages = _matched(series, imu, path, notes)
-        names = list(messages[0].name)
-        if joint is None and len(names) != 1:
-            raise InputError(f"topic {series.topic} has the joints {', '.join(names)}; set ingest.mcap.joint", path)
-        name = joint or names[0]
-        values = {}
-        for channel, field, unit in (("table_angle", "position", "rad"), ("table_rate", "velocity", "rad/s")):
-            numbers = [_of_joint(m, name, field, series.topic, path) for m in messages]
-            given = [v for v in numbers if v is not None]
-            if given and len(given) != len(numbers):
-                raise InputError(f"{field} of joint {name} is empty in some messages on {series.topic}", path)
-            if given:
-                values[channel] = to_house_unit(channel, np.array(given), unit)
-        return values
+    def _in_unit(self, channel: str, numbers: NDArray[np.float64], found: MappedField) -> NDArray[np.float64]:
+        if found.unit != COUNTS:
+            return to_house_unit(channel, numbers, found.unit)
+        encoding = Encoding(1.0 / found.counts_per_unit, found.offset)
+        self.encodings[channel] = encoding
+        return decode(numbers, encoding)
 
-    return read
-
-
-def _of_joint(message: Any, name: str, field: str, topic: str, path: str) -> float | None:  # noqa: ANN401
-    numbers = getattr(message, field)
-    if name not in message.name:
-        raise InputError(f"joint {name} is not on {topic}, which has {', '.join(message.name)}", path)
-    if len(numbers) == 0:
-        return None
-    if len(numbers) != len(message.name):
-        raise InputError(f"{topic} has {len(numbers)} numbers of {field} for {len(message.name)} joints", path)
-    return float(numbers[message.name.index(name)])
-
-
-def _attitude(series: Series, imu: Series, path: str, notes: list[Note]) -> dict[str, NDArray[np.float64]]:
-    quaternions = [m.quaternion for m in _matched(series, imu, path, notes)]
-    numbers = np.array([(q.w, q.x, q.y, q.z) for q in quaternions])
-    return {c: np.ascontiguousarray(numbers[:, i]) for i, c in enumerate(ATTITUDE)}
-
-
-def _matched(series: Series, imu: Series, path: str, notes: list[Note]) -> list[Any]:
-    """Return the messages with the stamps of the Imu messages."""
-    index = np.minimum(np.searchsorted(series.time_ns, imu.time_ns), len(series.time_ns) - 1)
-    unmatched = np.flatnonzero(series.time_ns[index] != imu.time_ns)
-    if unmatched.size:
-        raise InputError(
-            f"{unmatched.size} of {len(index)} Imu messages have no message of equal stamp on {series.topic}, the "
-            f"first at {imu.time_ns[unmatched[0]] / 1e9:.9g} s; the table has to be logged with the Imu's stamps",
-            path,
+    def _temperature(self, series: Series, base: Series) -> dict[str, NDArray[Any]]:
+        if np.array_equal(series.time_ns, base.time_ns):
+            return dict(series.values)
+        detail = (
+            f"temperature of {len(series.time_ns)} messages with stamps of their own, interpolated, held at the ends"
         )
-    extra = len(series.time_ns) - len(index)
-    if extra:
-        notes.append(Note("N-UNMATCHED", extra, 0, 0, f"messages on {series.topic} between the Imu's were not used"))
-    return [series.messages[i] for i in index]
+        self.notes.append(Note("N-INTERPOLATED", len(base.time_ns), 0, 0, detail))
+        origin = base.time_ns[0]
+        self.encodings.pop("temperature", None)
+        return {
+            n: np.interp(base.time_ns - origin, series.time_ns - origin, numbers)
+            for n, numbers in series.values.items()
+        }
+
+    def _table_values(self, series: Series, base: Series) -> dict[str, NDArray[Any]]:
+        matched = self._matched(series, base)
+        return {c: to_house_unit(c, v, TABLE_UNITS[c]) if c in TABLE_UNITS else v for c, v in matched.items()}
+
+    def _matched(self, series: Series, base: Series) -> dict[str, NDArray[Any]]:
+        """Return the numbers of the messages with the stamps of the Imu messages."""
+        index = np.minimum(np.searchsorted(series.time_ns, base.time_ns), len(series.time_ns) - 1)
+        unmatched = np.flatnonzero(series.time_ns[index] != base.time_ns)
+        if unmatched.size:
+            raise IngestError(
+                f"{unmatched.size} of {len(index)} Imu messages have no message of equal stamp on {series.topic}, the "
+                f"first at {base.time_ns[unmatched[0]] / 1e9:.9g} s; the table has to be logged with the Imu's stamps",
+                self.path,
+                fault="bad_time",
+            )
+        extra = len(series.time_ns) - len(index)
+        if extra:
+            detail = f"messages on {series.topic} between the Imu's were not used"
+            self.notes.append(Note("N-UNMATCHED", extra, 0, 0, detail))
+        return {c: numbers[index] for c, numbers in series.values.items()}
+
+    def _note_container(self, found: Container) -> None:
+        if not found.verified:
+            detail = "integrity: not_verifiable; written without checksums: damage cannot be told from data"
+            self.notes.append(Note("N-NOCRC", 1, 0, 0, detail))
+        if found.truncated:
+            self.notes.append(Note("N-TRUNCATED", 1, 0, 0, f"{found.truncated}, and were used"))
+        if self.settings.time_source != "header":
+            detail = "times are the recorder's (ingest.mcap.time_source), not the sensor's"
+            self.notes.append(Note("N-LOGTIME", found.count, 0, 0, detail))
+
+    def _note_ignored(self) -> None:
+        ignored = [t for t in self._topics() if t.rpartition(" (")[0] not in self.gatherers]
+        if ignored:
+            self.notes.append(Note("N-IGNORED", len(ignored), 0, 0, f"topics not used: {', '.join(ignored)}"))
 
 
-def _check_finite(values: dict[str, NDArray[np.float64]], imu: Series, path: str) -> None:
+def _check_magic(start: bytes, path: str) -> None:
+    """Say what a file is that is no MCAP file."""
+    if start.startswith(MAGIC):
+        return
+    if not start:
+        raise IngestError("the file is empty (0 bytes)", path, fault="not_mcap")
+    if MAGIC.startswith(start):
+        raise IngestError(f"truncated: the file has only {len(start)} bytes", path, fault="truncated")
+    what = next((what for known, what in FOREIGN.items() if start.startswith(known) and known not in MAGIC), "")
+    if not what and not start.strip(b"\0"):
+        what = "zeros: data that a memory card lost"
+    if not what:
+        what = f"it starts with {start[:8].decode('ascii', 'replace')!r}"
+        what += "; a text log needs the suffix .csv" if start.isascii() and b"\0" not in start else ""
+    raise IngestError(f"not an MCAP file: {what}", path, fault="not_mcap", offset=0)
+
+
+def _check_finite(values: Mapping[str, NDArray[np.float64]], base: Series, path: str) -> None:
     for channel, numbers in values.items():
         wrong = np.flatnonzero(~np.isfinite(numbers))
         if wrong.size:
             row = int(wrong[0])
-            raise InputError(
-                f"{channel} is {numbers[row]} at {imu.time_ns[row] / 1e9:.9g} s ({wrong.size} such samples); finite "
+            raise IngestError(
+                f"{channel} is {numbers[row]} at {base.time_ns[row] / 1e9:.9g} s ({wrong.size} such samples); finite "
                 "numbers are expected",
                 path,
+                fault="bad_message",
             )

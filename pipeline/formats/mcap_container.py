@@ -1,29 +1,18 @@
-"""The messages of an MCAP file, complete and undamaged, or an error.
+"""What an MCAP file holds, and the proof that it is all there.
 
-The official reader walks the data section from front to back, which is the only way that meets every checksum. What it
-does not compare is compared here: the summary's checksum, the message counts of the summary's statistics, that the data
-and the file end where they should, and that a chunk does not claim to be larger than any log is.
+A recorder that closes its file writes a summary: how many messages each channel has, and where each chunk lies. What
+was met between the file's two ends is compared with it, so that a lost chunk does not pass for a shorter recording. A
+checksum of 0 means that the recorder gave none: then ``verified`` is False, and nothing else follows from it.
 """
 
 from __future__ import annotations
 
-import zlib
 from collections import Counter
 from dataclasses import dataclass, field
-from io import BytesIO
 from typing import TYPE_CHECKING
 
-from mcap.records import Channel, Chunk, DataEnd, Footer, McapRecord, Message, Schema, Statistics
-from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
-
-from pipeline.errors import InputError
-
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-LARGEST_CHUNK = 1 << 30  # bytes; recorders write about 1 MiB
-LARGEST_EXPANSION = 1000
-FOOTER_TAIL = 4 + 8  # the summary's checksum and the closing magic bytes
+    from mcap.records import Attachment, Channel, Header, Message, Metadata, Schema, Statistics
 
 
 @dataclass
@@ -32,120 +21,87 @@ class Container:
 
     Attributes
     ----------
+    header : Header or None
     schemas : dict of int to Schema
     channels : dict of int to Channel
     messages : dict of int to list of Message
-        Channel to its messages, in the order of the file.
+        Channel to its messages, in the order of the file; filled by ``read_container`` only.
+    attachments : list of Attachment
+    metadata : list of Metadata
+    counts : Counter
+        Channel to number of messages.
+    chunks : list of int
+        Byte at which each chunk begins.
+    statistics : Statistics or None
+        What the file's summary says.
+    chunk_index : list of int
+        Bytes at which chunks begin, by the file's summary.
     verified : bool
         Whether every message lies under a checksum; a file may be written without.
+    truncated : str
+        What is missing at the end of a file whose complete chunks are read on request; else empty.
+    sha256 : str
+        Of the file.
     """
 
+    header: Header | None = None
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     messages: dict[int, list[Message]] = field(default_factory=dict)
+    attachments: list[Attachment] = field(default_factory=list)
+    metadata: list[Metadata] = field(default_factory=list)
+    counts: Counter[int] = field(default_factory=Counter)
+    chunks: list[int] = field(default_factory=list)
+    statistics: Statistics | None = None
+    chunk_index: list[int] = field(default_factory=list)
     verified: bool = True
-
-    def add(self, record: McapRecord, path: str) -> None:
-        """Take in a record of the data section."""
-        if isinstance(record, Message):
-            self.messages.setdefault(record.channel_id, []).append(record)
-            return
-        known: dict[int, Schema] | dict[int, Channel]
-        if isinstance(record, Schema):
-            known = self.schemas
-        elif isinstance(record, Channel):
-            known = self.channels
-        else:
-            return
-        if known.setdefault(record.id, record) != record:  # type: ignore[arg-type]
-            raise InputError(f"{type(record).__name__} {record.id} is defined twice, differently", path)
+    truncated: str = ""
+    sha256: str = ""
 
     @property
     def count(self) -> int:
         """Number of messages."""
-        return sum(map(len, self.messages.values()))
+        return self.counts.total()
 
+    def define_schema(self, schema: Schema) -> None:
+        """Take in a message definition; a second one of the same number has to be the same."""
+        if self.schemas.setdefault(schema.id, schema) != schema:
+            raise ValueError(f"Schema {schema.id} is defined twice, differently")
 
-def read_container(data: bytes, path: str) -> Container:
-    """Read all messages of an MCAP file.
+    def define_channel(self, channel: Channel) -> None:
+        """Take in a channel; a second one of the same number has to be the same."""
+        if self.channels.setdefault(channel.id, channel) != channel:
+            raise ValueError(f"Channel {channel.id} is defined twice, differently")
 
-    Parameters
-    ----------
-    data : bytes
-        The whole file.
-    path : str
-        For messages.
+    def check_complete(self) -> None:
+        """Compare what was met with what the summary says.
 
-    Raises
-    ------
-    InputError
-        If a byte is damaged or missing; never anything else.
-    """
-    container = Container()
-    try:
-        _walk(data, path, container)
-    except InputError:
-        raise
-    except CRCValidationError as error:
-        raise InputError(
-            f"damaged: the checksum of a {type(error.record).__name__} after {container.count} messages is wrong; "
-            "copy the file again from its source",
-            path,
-        ) from error
-    except Exception as error:
-        reason = f"{type(error).__name__} {error}".strip()
-        raise InputError(
-            f"truncated or damaged MCAP file ({reason}); {container.count} messages were readable before; "
-            "copy the file again from its source, or run `mcap recover` and look at what it keeps",
-            path,
-        ) from error
-    return container
-
-
-def _walk(data: bytes, path: str, container: Container) -> None:
-    stream = BytesIO(data)
-    reader = StreamReader(stream, emit_chunks=True, validate_crcs=True, record_size_limit=len(data))
-    footer: Footer | None = None
-    statistics: Statistics | None = None
-    checked, ended, loose = True, False, False
-    for record in reader.records:
-        if isinstance(record, DataEnd):
-            ended = True
-            container.verified = record.data_section_crc != 0 or (checked and not loose)
-        elif isinstance(record, Statistics):
-            statistics = record
-        elif isinstance(record, Footer):
-            footer = record
-        elif isinstance(record, Chunk):
-            checked &= record.uncompressed_crc != 0
-            for inner in _records(record, len(data), path):
-                container.add(inner, path)
-        elif not ended:
-            loose |= isinstance(record, Message)
-            container.add(record, path)
-    if footer is None or not ended or stream.tell() != len(data):
-        raise InputError("the file does not end where its data end: truncated, or another file was appended", path)
-    _check_summary(data, path, footer, statistics, container)
-
-
-def _records(chunk: Chunk, size: int, path: str) -> Iterator[McapRecord]:
-    claimed = chunk.uncompressed_size
-    if claimed > min(LARGEST_CHUNK, LARGEST_EXPANSION * size):
-        raise InputError(f"a chunk claims to hold {claimed} bytes, in a file of {size}: damaged, or no log", path)
-    yield from breakup_chunk(chunk, validate_crc=True)
-
-
-def _check_summary(data: bytes, path: str, footer: Footer, statistics: Statistics | None, container: Container) -> None:
-    start = footer.summary_start or len(data) - FOOTER_TAIL - 8 - 8 - 9  # no summary: the footer alone
-    if footer.summary_crc and zlib.crc32(data[start:-FOOTER_TAIL]) != footer.summary_crc:
-        raise InputError("damaged: the checksum of the summary is wrong; copy the file again from its source", path)
-    if statistics is None:
-        return
-    found = Counter({channel: len(messages) for channel, messages in container.messages.items()})
-    said = Counter(statistics.channel_message_counts)
-    if statistics.message_count != container.count or (said and said != found):
-        raise InputError(
-            f"the summary says {statistics.message_count} messages, the file holds {container.count}: "
-            "a part is missing",
-            path,
-        )
+        Raises
+        ------
+        ValueError
+            If a part is missing, or messages belong to no channel.
+        """
+        nameless = sorted(set(self.counts) - set(self.channels))
+        if nameless:
+            raise ValueError(f"messages of channel {nameless[0]}, which is not defined")
+        if self.chunk_index and sorted(self.chunk_index) != self.chunks:
+            raise ValueError(
+                f"the summary lists {len(self.chunk_index)} chunks, and the file holds {len(self.chunks)} where it "
+                "may look for them: a part is missing"
+            )
+        said = self.statistics
+        if said is None:
+            return
+        by_channel = Counter(said.channel_message_counts)
+        if said.message_count != self.count or (by_channel and by_channel != self.counts):
+            raise ValueError(
+                f"the summary says {said.message_count} messages, the file holds {self.count}: a part is missing"
+                if said.message_count != self.count
+                else f"the summary says {said.message_count} messages, which the file does not hold by channel"
+            )
+        met = (len(self.chunks), len(self.attachments), len(self.metadata))
+        if (said.chunk_count, said.attachment_count, said.metadata_count) != met:
+            raise ValueError(
+                f"the summary says {said.chunk_count} chunks, {said.attachment_count} attachments and "
+                f"{said.metadata_count} metadata records, the file holds {met[0]}, {met[1]} and {met[2]}"
+            )

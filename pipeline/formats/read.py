@@ -13,10 +13,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.errors import InputError, MissingInputError
+from pipeline.errors import MissingInputError
 from pipeline.formats.axes import to_body_axes
+from pipeline.formats.checks import checks_of
 from pipeline.formats.files import candidate_files, recording_files
-from pipeline.formats.plausibility import examine
+from pipeline.formats.ingest_error import IngestError
+from pipeline.formats.plausibility import check_axis, examine
 from pipeline.formats.units import ATTITUDE, TRIADS
 from pipeline.records import Note, Recording
 
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.formats.channel_table import ChannelTable
+    from pipeline.formats.checks import Checks
 
 EPOCH_AFTER_NS = 100_000_000 * 1_000_000_000  # 3 years: no sensor has been on for longer
 
@@ -60,11 +63,12 @@ def read_recordings(
     files = recording_files(procedure, ingest, folder)
     wanted = candidate_files(procedure, ingest)
     _check_complete(procedure, files, wanted, folder)
+    checks = checks_of(ingest)
     recordings = []
     for name, paths in files.items():
         table = read_table(paths, ingest)
         other = [f for c in wanted[name] for f in c if folder / f not in paths and (folder / f).exists()]
-        recording = _to_recording(name, procedure["recordings"][name], table, sensor)
+        recording = to_recording(name, procedure["recordings"][name], table, sensor, checks)
         if other:
             detail = f"{', '.join(other)} exists too and was not read"
             recording = replace(recording, notes=(*recording.notes, Note("N-NOTREAD", len(other), 0, 0, detail)))
@@ -77,13 +81,13 @@ def read_table(paths: Sequence[Path], ingest: Mapping[str, Any]) -> ChannelTable
     """Read the file or files of one recording, by their suffix."""
     if paths[0].suffix == ".mcap":
         from pipeline.formats.mcap import read_mcap  # noqa: PLC0415  (the decoder costs what a text log need not pay)
-        from pipeline.formats.settings import mcap_format  # noqa: PLC0415
+        from pipeline.formats.mcap_settings import mcap_format  # noqa: PLC0415
 
         return read_mcap(paths[0], mcap_format(ingest))
     from pipeline.formats.csv_read import read_csv  # noqa: PLC0415
-    from pipeline.formats.settings import csv_formats  # noqa: PLC0415
+    from pipeline.formats.csv_settings import csv_formats  # noqa: PLC0415
 
-    return read_csv(paths, csv_formats(ingest))
+    return read_csv(paths, csv_formats(ingest), checks_of(ingest))
 
 
 def _check_complete(
@@ -106,9 +110,25 @@ def _check_complete(
         raise MissingInputError(f"missing recordings: {'; '.join(missing)}{reason}", str(folder))
 
 
-def _to_recording(name: str, entry: Mapping[str, Any], table: ChannelTable, sensor: Mapping[str, Any]) -> Recording:
-    flags, notes = examine(table, sensor)
+def to_recording(
+    name: str, entry: Mapping[str, Any], table: ChannelTable, sensor: Mapping[str, Any], checks: Checks
+) -> Recording:
+    """Return a table's samples as a recording in body axes, examined and marked.
+
+    Parameters
+    ----------
+    name : str
+    entry : mapping
+        What the procedure says of the recording: ``role``, ``axis``.
+    table : ChannelTable
+        Its channels are taken out of it.
+    sensor : mapping
+        Section of the unit's configuration.
+    checks : Checks
+    """
+    flags, notes = examine(table, sensor, checks)
     table = to_body_axes(table, sensor.get("axis_map") or ("+x", "+y", "+z"))
+    check_axis(table, entry.get("axis"))
     values = table.values
     return Recording(
         name=name,
@@ -128,8 +148,8 @@ def _to_recording(name: str, entry: Mapping[str, Any], table: ChannelTable, sens
     )
 
 
-def _stack(values: Mapping[str, NDArray[np.float64]], channels: Sequence[str]) -> NDArray[np.float64] | None:
-    return np.column_stack([values[c] for c in channels]) if channels[0] in values else None
+def _stack(values: dict[str, NDArray[np.float64]], channels: Sequence[str]) -> NDArray[np.float64] | None:
+    return np.column_stack([values.pop(c) for c in channels]) if channels[0] in values else None
 
 
 def _check_different(recordings: Sequence[Recording]) -> None:
@@ -138,10 +158,11 @@ def _check_different(recordings: Sequence[Recording]) -> None:
     for recording in recordings:
         twin = seen.setdefault(recording.source["sha256"], recording)
         if twin is not recording:
-            raise InputError(
+            raise IngestError(
                 f"recordings {twin.name} and {recording.name} are the same file, byte for byte "
                 f"({twin.source['file']}); each needs its own",
                 recording.source["file"],
+                fault="same_file",
             )
 
 

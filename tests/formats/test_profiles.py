@@ -12,7 +12,8 @@ from sample_logs import procedure, profile
 from pipeline.config.compose import Composer
 from pipeline.errors import ConfigurationError
 from pipeline.formats.files import candidate_files
-from pipeline.formats.settings import check_ingest, csv_formats, mcap_format
+from pipeline.formats.mcap_settings import mcap_format
+from pipeline.formats.settings import check_ingest, csv_formats
 
 if TYPE_CHECKING:
     from pathlib import Path
