@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from pipeline.records import Noise, Recording, SensorCalibration
 
 ALIKE = 0.8
+FAR_ABOVE = 10.0  # times the noise: no unit that somebody sets down or holds rests so badly
 EVIDENCE = 5.0
 
 
@@ -96,9 +97,10 @@ def _document(selection: HandSelection, configured: list[str], noise: Noise | No
     chi = [_chi(selection, fit, noise) for fit in selection.fits]
     ranking = [_entry(selection, name, held, chi) for name in order]
     verdict = "missing_effect" if selected else "nothing_missing" if ranking else "not_enough_data"
-    if unknown and not selected:
+    over = _over_noise(selection, selection.fits[0], noise)
+    left = _over_noise(selection, selection.fits[-1], noise)
+    if (unknown and not selected) or left > FAR_ABOVE:
         verdict = "unexplained"
-    over = _over_noise(selection, noise)
     return {
         "verdict": verdict,
         "residual_over_noise": over,
@@ -107,7 +109,7 @@ def _document(selection: HandSelection, configured: list[str], noise: Noise | No
         "not_observable": [{"effect": name, "reason": reason} for name, reason in hidden.items()],
         "unexplained": unknown,
         "suggested_effect": None,
-        "next_experiment": next_experiment(selection, verdict, ranking, hidden, unknown=unknown, over_noise=over),
+        "next_experiment": next_experiment(selection, verdict, ranking, hidden, unknown=unknown, over_noise=left),
         "override": f"effects.{sensor}=[{','.join([*configured, *selected])}]" if selected else "",
         "configured": configured,
         "wander": _wander(selection, noise),
@@ -187,14 +189,15 @@ def _expected(selection: HandSelection, noise: Noise | None) -> HandNoise:
 
 
 def _chi(selection: HandSelection, fit: HandFit, noise: Noise | None) -> float:
-    """Return the sum of squares of a fit's residual, whitened by the expected noise."""
-    found = beside(selection.model.equations(fit.state), [_expected(selection, noise)])
+    """Return the sum of squares of a fit's residual, whitened by the expected noise and the scatter that is left."""
+    expected = replace(_expected(selection, noise), scatter=selection.fits[-1].noise.scatter)
+    found = beside(selection.model.equations(fit.state), [expected])
     return float(np.sum(found.residual**2))
 
 
-def _over_noise(selection: HandSelection, noise: Noise | None) -> float:
-    """Return the rms residual of the rests, of base and configured effects, over that of noise alone."""
-    equations = selection.model.equations(selection.fits[0].state)
+def _over_noise(selection: HandSelection, fit: HandFit, noise: Noise | None) -> float:
+    """Return the rms residual of the rests, of a fit, over that of noise alone."""
+    equations = selection.model.equations(fit.state)
     at_rest = equations.rows(selection.model.rests_equations)
     found = beside(at_rest, [_expected(selection, noise)])
     spare = max(len(at_rest.residual) - float(np.sum(found.basis[0] ** 2)), 1.0)

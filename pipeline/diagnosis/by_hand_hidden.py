@@ -29,8 +29,15 @@ if TYPE_CHECKING:
     from pipeline.model.effects.base import Effect
 
 ONLY_MOVING = {*MOVING, "hysteresis"}
+FEWEST = 3  # equations beyond bias and matrix, from which on an effect of one coefficient can be judged
 FIRM = 2.0  # times the noise, above which the scatter of the rests is worth a word
 ENOUGH = 40  # rests that leave room for what the catalogue holds
+EXPERIMENTS = {  # where that of the effect asks for a table
+    "g_sensitivity": "repeat the rests on another day and facing another way: Earth's rotation turns with the heading, "
+    "the sensitivity stays with the unit",
+    "g_squared_sensitivity": "record more rests in which two axes are inclined alike, and some with one axis upright",
+    "cross_axis_nonlinearity": "record more rests in which all three axes are inclined, such as body diagonals up",
+}
 MORE = f"record {ENOUGH} rests or more, each in another orientation, all three axes inclined in most of them"
 
 
@@ -63,11 +70,13 @@ def _reason(this: Effect, selection: HandSelection) -> str:
     score = selection.first.scores.get(this.name)
     if score is None and model.kinds == 1 and this.name in ONLY_MOVING:
         return "at rest nothing moves, and it adds nothing"
+    base = selection.fits[0]
+    few = len(base.residual) - base.rank < FEWEST
+    if few if score is None else selection.first.spare[this.name] == 0.0:
+        return f"{len(model.rests.time)} rests are too few to tell it from their scatter; {MORE}"
     if score is None:
         seen = "rests and moves by hand" if model.kinds > 1 else "rests"
         return f"in {seen} bias and matrix explain all that it would add"
-    if not score.admissible:
-        return f"{len(model.rests.time)} rests are too few to tell it from their scatter; {MORE}"
     return "" if score.delta_bic > GATE_BIC else _faint(this, score, selection)
 
 
@@ -106,14 +115,14 @@ def next_experiment(
     over_noise : float
         Residual of the rests over that of noise.
     """
-    if verdict == "unexplained":
+    if verdict == "unexplained" and unknown:
         covariate = str(unknown[0]["covariate"])
         return f"to find out on what the residual depends beside {_plain(covariate)}: {UNKNOWN[covariate]}"
     if selection.names:
         return _of_selected({entry["effect"]: entry for entry in ranking}, selection.names)
     if verdict == "not_enough_data":
         return MORE
-    if over_noise > FIRM:
+    if over_noise > FIRM or verdict == "unexplained":
         return (
             f"set the unit down firmly for each rest: the rests scatter {over_noise:.2g} times the noise and follow "
             "nothing that is recorded"
@@ -126,10 +135,11 @@ def next_experiment(
 def _of_selected(entries: Mapping[str, Mapping[str, Any]], selected: Sequence[str]) -> str:
     name = next((n for n in selected if entries[n]["look_alikes"]), selected[0])
     alike = entries[name]["look_alikes"]
+    experiment = EXPERIMENTS.get(name, catalogue()[name].experiment)
     if not alike:
-        return f"to confirm {_plain(name)}: {catalogue()[name].experiment}"
+        return f"to confirm {_plain(name)}: {experiment}"
     others = " or ".join(_plain(a["effect"]) for a in alike[:2])
-    return f"to tell {_plain(name)} from {others}: {catalogue()[name].experiment}"
+    return f"to tell {_plain(name)} from {others}: {experiment}"
 
 
 def nothing_to_see(sensor: str, configured: list[str], reason: str) -> dict[str, Any]:

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 
     Values = NDArray[np.float64]
 
+UNLIKELY = -4.0
 LEVELS = ((0.0, 2.0, 6.0, 20.0), (0.0, 4.0, 16.0))  # of rests, and of moves
 
 
@@ -146,5 +147,8 @@ def noises_for(noise: Noise | None, kinds: int) -> list[HandNoise]:
     kinds : int
         Of scatter: that of rests, and that of moves.
     """
+    wanders = settings_for(noise)
+    if kinds > 1:  # beside two kinds of scatter, a wander far from that of a static rest tells nothing more
+        wanders = [s for s in wanders if s.prior > UNLIKELY]
     levels: Sequence[tuple[float, ...]] = list(product(*LEVELS[:kinds]))
-    return [HandNoise(s.ratio, s.time, level, s.prior) for s in settings_for(noise) for level in levels]
+    return [HandNoise(s.ratio, s.time, level, s.prior) for s in wanders for level in levels]

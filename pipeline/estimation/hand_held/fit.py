@@ -7,10 +7,10 @@ The step is taken at the most likely noise; the covariance is averaged over the 
     -2 log L_R = rss / k + nu log k + log det C + log det(N + k P),    k = max(1, rss / nu),   nu = n - p
 
 A few rests leave some combinations of parameters open: two of the nine cross-axis terms of an accelerometer at rest, or
-the amplitude of a warm-up that is still far from its end. So the data sheet's limits of an effect's parameters p, taken
-for two standard deviations, stand beside the equations with the precision P; it is zero for bias, matrix and time
-constants, and where there is no limit. What the rests determine it does not move: its weight is the square of
-uncertainty over limit.
+the amplitude of a warm-up that is still far from its end. So the last fit of effects that are plausible has the data
+sheet's limits of their parameters p, taken for two standard deviations, beside the equations, with the precision P; it
+is zero for bias, matrix and time constants, and where there is no limit. What the rests determine it does not move: its
+weight is the square of uncertainty over limit.
 """
 
 from __future__ import annotations
@@ -239,6 +239,18 @@ def solve(equations: Equations, noise: HandNoise, limits: Limits) -> Solved:
     )
 
 
+def plausible(model: Model, found: HandFit, limits: Mapping[str, Values]) -> bool:
+    """Return whether every effect is within its limits, as far as its uncertainty tells."""
+    uncertainty = np.sqrt(np.diag(found.covariance))
+    at, within = model.directions.shape[1], True
+    for term in found.state.terms:
+        own = slice(at, at + len(term.values))
+        limit = limits.get(term.effect.name, np.full(len(term.values), np.inf))
+        within &= bool(np.all(np.abs(term.values) - 2.0 * uncertainty[own] <= limit))
+        at = own.stop
+    return within
+
+
 def require_observable(model: Model, found: HandFit, limits: Mapping[str, Values]) -> None:
     """Refuse a fit with an effect of which rests and moves say nothing.
 
@@ -248,12 +260,12 @@ def require_observable(model: Model, found: HandFit, limits: Mapping[str, Values
         Naming the effects, or the parameters that nothing determines.
     """
     equations = model.equations(found.state)
-    believed = limits_at(model, found.state, limits).precision
+    limited = limits_at(model, found.state, limits).precision > 0.0
     names = parameter_names(model.sensor, [term.effect for term in found.state.terms])
     pairs = zip(found.state.terms, equations.effects, strict=True)
     lost = [term.effect for term, Z in pairs if _explained(equations.base, Z)]
     scaled = equations.columns / np.maximum(np.linalg.norm(equations.columns, axis=0), 1e-300)
-    gram = scaled.T @ scaled + np.diag(np.where(believed > 0.0, 1.0, 0.0))
+    gram = scaled.T @ scaled + np.diag(limited.astype(float))
     weak = np.linalg.eigh(gram)
     open_ = np.abs(weak.eigenvectors[:, weak.eigenvalues < NONE])
     loose = [name for name, row in zip(names, open_[-len(names) :], strict=True) if np.any(row > 0.2)]

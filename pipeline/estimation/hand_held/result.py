@@ -10,7 +10,7 @@ import numpy as np
 from pipeline.errors import NotObservableError
 from pipeline.estimation.hand_held import accelerometer, gyroscope
 from pipeline.estimation.hand_held.equations import noises_for
-from pipeline.estimation.hand_held.fit import require_observable
+from pipeline.estimation.hand_held.fit import plausible, require_observable
 from pipeline.estimation.hand_held.model import refusal
 from pipeline.estimation.hand_held.selection import fit_configured, limits_of, select
 from pipeline.model.effects import effect
@@ -92,7 +92,9 @@ def fit_effects_by_hand(
             raise NotObservableError(f"{name} cannot be fitted by hand: {reason}; take it out of effects.{sensor}")
     noises = noises_for(noise, model.kinds)
     limits = limits_of(sensor, sheet)
-    found = fit_configured(model, before, names, noises, limits)
+    found = fit_configured(model, before, names, noises)
+    if plausible(model, found, limits):
+        found = fit_configured(model, before, names, noises, limits)
     if len(found.residual) <= found.rank:
         raise NotObservableError(
             f"{len(model.rests.time)} rests of the {sensor} are too few for {', '.join(names)} beside bias and matrix: "

@@ -3,8 +3,9 @@
     delta BIC > 10   and   m p < 0.01
 
 with the gain, delta BIC and p of ``pipeline.estimation.hand_held.likelihood`` and m the number of candidates. After
-each acceptance all is fitted anew and every column is rebuilt there. Selected effects whose own delta BIC has become
-negative are dropped, and one that a rival replaces with delta BIC > 10 is exchanged.
+each acceptance all is fitted anew and every column is rebuilt there. An effect that would need ten times what the data
+sheet allows is no explanation of a few rests. Selected effects whose own delta BIC has become negative are dropped, and
+one that a rival replaces with delta BIC > 10 is exchanged.
 """
 
 from __future__ import annotations
@@ -40,6 +41,8 @@ if TYPE_CHECKING:
     Values = NDArray[np.float64]
 
 ROUNDS = 3 * MOST
+POSSIBLE = 10.0  # times its limits, beyond which an effect is no explanation
+FAR = 5.0  # times its limits, which keep an amplitude that goes with a time constant from running away
 COMPETES = 0.6  # share of the best delta BIC above which an effect is fitted to its optimum
 
 
@@ -128,13 +131,13 @@ def fit_configured(
     start: SensorCalibration,
     configured: Sequence[str],
     noises: Sequence[HandNoise],
-    limits: Mapping[str, Values],
+    limits: Mapping[str, Values] | None = None,
 ) -> HandFit:
     """Fit base and configured effects, from the best of their starts."""
     fits = []
     for terms in starts_of(configured, model.sensor, start):
         state = State(start.bias, start.matrix, tuple(Term(t.effect, np.array(t.values, float)) for t in terms))
-        fits.append(fit(model, state, noises, limits))
+        fits.append(fit(model, state, noises, limits or {}))
     return max(fits, key=lambda found: found.log_likelihood)
 
 
@@ -159,7 +162,8 @@ class _Search:
         self.noises = noises_for(noise, model.kinds)
         self.limits = limits_of(model.sensor, sheet)
         self.effects = candidates_for(model.sensor, model.rests, configured)
-        self.base = fit_configured(model, start, configured, self.noises, self.limits)
+        self.kept_near = {n: FAR * limit for n, limit in self.limits.items() if effect(n).nonlinear}
+        self.base = fit_configured(model, start, configured, self.noises, self.kept_near)
         self.held = len(self.base.state.terms)
         self.names: list[str] = []
         self.steps: dict[str, Score] = {}
@@ -271,7 +275,7 @@ class _Search:
                 continue
             terms = [t for i, t in enumerate(self.fit.state.terms) if i < self.held or t.effect.name in names]
             start = replace(self.fit.state, terms=(*terms, Term(effect(score.name), score.values)))
-            found = fit(self.model, start, self.noises, self.limits)
+            found = fit(self.model, start, self.noises, self.kept_near)
             gain = max(2.0 * (found.log_likelihood - before), 0.0) * scored.spare[score.name]
             scored.scores[score.name] = replace(
                 score,
@@ -291,19 +295,25 @@ class _Search:
         held = [term.effect.name for term in self.fit.state.terms]
         if any(score.name in effect(name).contains or name in effect(score.name).contains for name in held):
             return False
-        return score.admissible and score.delta_bic > GATE_BIC and score.p_value * len(self.effects) < GATE_P
+        significant = score.delta_bic > GATE_BIC and score.p_value * len(self.effects) < GATE_P
+        return score.admissible and significant and self._possible(score)
+
+    def _possible(self, score: Score) -> bool:
+        """Return whether an effect needs no more than ten times its limits: beyond, it is no explanation."""
+        least = np.abs(score.values) - 2.0 * score.uncertainty
+        return bool(np.all(least <= POSSIBLE * self.limits[score.name]))
 
     def _add(self, score: Score) -> None:
         self.names.append(score.name)
         self.steps[score.name] = score
         terms = (*self.fit.state.terms, Term(effect(score.name), score.values))
-        self.fit = fit(self.model, replace(self.fit.state, terms=terms), self.noises, self.limits)
+        self.fit = fit(self.model, replace(self.fit.state, terms=terms), self.noises, self.kept_near)
 
     def _remove(self, name: str) -> None:
         self.names.remove(name)
         del self.steps[name]
         terms = tuple(t for t in self.fit.state.terms if t.effect.name != name)
-        self.fit = fit(self.model, replace(self.fit.state, terms=terms), self.noises, self.limits)
+        self.fit = fit(self.model, replace(self.base.state, terms=terms), self.noises, self.kept_near)
 
     def _own(self, name: str) -> Scored:
         return self._scored([n for n in self.names if n != name])
@@ -319,7 +329,7 @@ class _Search:
         for name in self.names:
             scores = self._own(name).scores
             own = scores[name].delta_bic if name in scores else float("-inf")
-            rivals = [s for s in scores.values() if s.name not in self.names and s.admissible]
+            rivals = [s for s in scores.values() if s.name not in self.names and s.admissible and self._possible(s)]
             rival = max(rivals, key=lambda s: s.delta_bic, default=None)
             if rival is not None and rival.delta_bic > own + GATE_BIC:
                 self._remove(name)
@@ -332,7 +342,7 @@ class _Search:
         fits = [self.base]
         for count in range(1, len(self.names)):
             terms = self.fit.state.terms[: self.held + count]
-            fits.append(fit(self.model, replace(self.fit.state, terms=terms), self.noises, self.limits))
+            fits.append(fit(self.model, replace(self.fit.state, terms=terms), self.noises, self.kept_near))
         return [*fits, self.fit] if self.names else fits
 
 

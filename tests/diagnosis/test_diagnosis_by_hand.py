@@ -1,0 +1,161 @@
+"""The diagnosis without a table: rests and moves name what is hidden, invent nothing, and say what they cannot see."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hand_session import WARM, Unit, hand_held
+
+from pipeline.diagnosis.words import in_words
+
+NAMED = [
+    ("mpu6050", "accelerometer", "scale_factor_asymmetry"),
+    ("mpu6050", "accelerometer", "quadratic_nonlinearity"),
+    ("mpu6050", "accelerometer", "cubic_nonlinearity"),
+    ("mpu6050", "accelerometer", "cross_axis_nonlinearity"),
+    ("mpu6050", "accelerometer", "bias_temperature"),
+    ("mpu6050", "accelerometer", "scale_factor_temperature"),
+    ("stim300", "accelerometer", "bias_temperature"),
+    ("mpu6050", "gyroscope", "g_sensitivity"),
+]
+
+
+def reasons(part: dict[str, Any]) -> dict[str, str]:
+    return {e["effect"]: e["reason"] for e in part["not_observable"]}
+
+
+def with_readings(unit: Unit, change: Any) -> Unit:
+    """Return a unit whose accelerometer reads more, a function of the time."""
+    first, *others = unit.recordings
+    assert first.accelerometer is not None
+    return replace(unit, recordings=[replace(first, accelerometer=first.accelerometer + change(first.time)), *others])
+
+
+@pytest.mark.parametrize(("model", "sensor", "name"), NAMED)
+def test_an_effect_of_data_sheet_size_is_named_alone_and_mended(model: str, sensor: str, name: str) -> None:
+    unit = hand_held(
+        model, 11, {f"{sensor}.{name}": None}, temperature=WARM if "temperature" in name else None, holdout_every=3
+    )
+    before = unit.calibrated(sensor)
+    part = unit.diagnosed(sensor, calibration=before)
+    assert part["verdict"] == "missing_effect"
+    assert part["selected"] == [name]
+    assert part["override"] == f"effects.{sensor}=[{name}]"
+    best = part["ranking"][0]
+    assert best["effect"] == name
+    assert best["plausible"]
+    assert best["delta_bic"] > 10.0
+    assert best["explained_share"] > 0.8
+    assert best["held_out_error_after"] < best["held_out_error_before"]
+    mended = unit.diagnosed(sensor, [name], before)
+    assert mended["selected"] == []
+    assert mended["residual_over_noise"] < 1.5 < part["residual_over_noise"]
+
+
+@pytest.mark.parametrize("model", ["mpu6050", "stim300"])
+def test_nothing_is_selected_where_nothing_is_hidden(model: str) -> None:
+    ratios = []
+    for seed in range(20):
+        part = hand_held(model, 500 + seed).diagnosed("accelerometer")
+        assert part["selected"] == [], (seed, part["ranking"][0])
+        assert part["unexplained"] == [], seed
+        ratios.append(part["residual_over_noise"])
+    assert 0.85 < np.mean(ratios) < 1.1
+
+
+def test_nothing_is_selected_of_a_gyroscope_without_effects() -> None:
+    for seed in range(2):
+        part = hand_held("mpu6050", 600 + seed).diagnosed("gyroscope")
+        assert (part["selected"], part["unexplained"], part["verdict"]) == ([], [], "nothing_missing"), seed
+
+
+def test_rests_that_scatter_are_told_but_no_effect_is_blamed() -> None:
+    rng = np.random.default_rng(8)
+
+    def tremor(time: np.ndarray) -> np.ndarray:
+        block = (time // 3.0).astype(int)
+        return 1e-3 * rng.standard_normal((block.max() + 1, 3))[block]
+
+    part = with_readings(hand_held("mpu6050", 12), tremor).diagnosed("accelerometer")
+    assert part["selected"] == []
+    assert part["verdict"] == "nothing_missing"
+    assert part["residual_over_noise"] > 2.0
+    assert "firmly" in part["next_experiment"]
+
+
+def test_a_bias_that_follows_time_in_no_way_of_the_catalogue_is_unexplained() -> None:
+    def swing(time: np.ndarray) -> np.ndarray:
+        return 0.02 * np.sin(2.0 * np.pi * time[:, None] / 300.0 + np.array([0.0, 1.0, 2.0]))
+
+    part = with_readings(hand_held("mpu6050", 13, holdout_every=0), swing).diagnosed("accelerometer")
+    told = [entry["covariate"] for entry in part["unexplained"]]
+    assert "time" in told
+    assert part["verdict"] == "unexplained"
+    assert part["selected"] == []
+
+
+def test_effects_of_a_table_and_of_motion_are_not_observable_each_with_its_reason() -> None:
+    told = reasons(hand_held("mpu6050", 14).diagnosed("accelerometer"))
+    for name in ("table_tilt", "table_encoder_error", "time_offset", "low_pass_lag", "clock_rate"):
+        assert told[name] == "there is no table"
+    for name in ("hysteresis", "rate_dependence", "vibration_rectification", "inner_lever_arms"):
+        assert told[name] == "at rest nothing moves, and it adds nothing"
+    assert "nobody knows" in told["lever_arm"]
+    gyroscope = reasons(hand_held("mpu6050", 14).diagnosed("gyroscope"))
+    assert "heading" in gyroscope["earth_rotation"]
+    assert "g_sensitivity" not in gyroscope
+
+
+def test_a_small_effect_is_not_called_absent() -> None:
+    part = hand_held("stim300", 15).diagnosed("accelerometer")
+    told = reasons(part)
+    assert "would hide in the scatter of 27 rests" in told["scale_factor_temperature"]
+    assert "scale_factor_temperature" not in {entry["effect"] for entry in part["ranking"]}
+
+
+def test_without_a_temperature_nothing_is_said_of_it() -> None:
+    unit = hand_held("mpu6050", 16)
+    bare = replace(unit, recordings=[replace(r, temperature=None) for r in unit.recordings])
+    part = bare.diagnosed("accelerometer")
+    assert reasons(part)["bias_temperature"] == "the recordings hold no temperature"
+    assert "bias temperature" in part["next_experiment"]
+
+
+def test_six_positions_are_not_enough_and_the_advice_says_what_is() -> None:
+    part = hand_held("mpu6050", 17, procedure="six_positions", holdout_every=0).diagnosed("accelerometer")
+    assert part["verdict"] == "not_enough_data"
+    assert part["ranking"] == []
+    assert "6 rests are too few" in reasons(part)["quadratic_nonlinearity"]
+    assert "record 40 rests" in part["next_experiment"]
+
+
+def test_twenty_four_orientations_select_nothing_where_nothing_is_hidden() -> None:
+    for seed in range(5):
+        part = hand_held("mpu6050", 700 + seed, procedure="orientations_24").diagnosed("accelerometer")
+        assert part["selected"] == [], seed
+
+
+def test_what_looks_alike_on_a_one_g_sphere_is_printed() -> None:
+    part = hand_held("mpu6050", 11, {"accelerometer.quadratic_nonlinearity": None}).diagnosed("accelerometer")
+    alike = {a["effect"]: a["share"] for a in part["ranking"][0]["look_alikes"]}
+    assert 0.85 < alike["scale_factor_asymmetry"] < 1.0
+    assert "scale factor asymmetry" in part["next_experiment"]
+
+
+def test_the_added_variable_has_the_slope_that_was_fitted_a_point_a_rest() -> None:
+    part = hand_held("mpu6050", 11, {"accelerometer.quadratic_nonlinearity": None}).diagnosed("accelerometer")
+    for panel in part["pictures"]["added_variable"]["panels"]:
+        x, y = np.array(panel["x"]), np.array(panel["mean"])
+        assert len(x) == 27
+        assert x @ y / (x @ x) == pytest.approx(panel["value"], rel=0.02)
+
+
+def test_a_part_is_json_and_is_told_in_words() -> None:
+    part = hand_held("mpu6050", 11, {"accelerometer.quadratic_nonlinearity": None}).diagnosed("accelerometer")
+    text = " ".join(in_words(json.loads(json.dumps(part)), "accelerometer"))
+    assert "misses quadratic nonlinearity" in text
+    assert "there is no table" in text

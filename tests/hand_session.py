@@ -1,0 +1,98 @@
+"""Units that are calibrated by hand: simulated rests and moves, their truth, and the settings of a run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.diagnosis.diagnose import diagnose
+from pipeline.estimation.accelerometer import nonlinear_least_squares
+from pipeline.estimation.gyroscope import rests_and_moves
+from pipeline.signal.noise import estimate_noise
+from pipeline.simulation.campaign import simulate_unit
+from pipeline.simulation.description import UnitDescription, read_config
+
+if TYPE_CHECKING:
+    from pipeline.records import Recording, SensorCalibration
+
+METHODS = {"accelerometer": nonlinear_least_squares, "gyroscope": rests_and_moves}
+WARM = {"warm_up": 25.0}  # degC in a session of some minutes: a unit that is heated
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A simulated unit.
+
+    Attributes
+    ----------
+    recordings : list of Recording
+    truth : dict
+    settings : dict
+        As a stage reads them.
+    """
+
+    recordings: list[Recording]
+    truth: dict[str, Any]
+    settings: dict[str, Any]
+
+    def calibrated(self, sensor: str) -> SensorCalibration:
+        return METHODS[sensor].fit(self.recordings, None, self.settings)
+
+    def diagnosed(self, sensor: str, configured: Any = (), calibration: SensorCalibration | None = None) -> Any:
+        names = configured if isinstance(configured, str) else list(configured)
+        settings = {**self.settings, "effects": {**self.settings["effects"], sensor: names}}
+        noise = estimate_noise(sensor, self.recordings, settings["sensor"][sensor])
+        return diagnose(calibration or self.calibrated(sensor), self.recordings, noise, settings)
+
+    def true_matrix(self, sensor: str) -> np.ndarray:
+        """Return the true matrix in the frame of the calibration: that in which the accelerometer's is triangular."""
+        return frame_of(np.array(self.truth["accelerometer"]["matrix"])).T @ np.array(self.truth[sensor]["matrix"])
+
+
+@cache
+def _simulated(  # noqa: PLR0917  (its arguments are the key)
+    model: str, seed: int, procedure: str, effects: tuple, temperature: tuple, other: tuple
+) -> Any:
+    unit = UnitDescription(
+        "U",
+        sensor=model,
+        table="hand",
+        procedure=procedure,
+        effects=dict(effects),
+        temperature=dict(temperature),
+        **dict(other),
+    )
+    return simulate_unit(unit, seed, 0)
+
+
+def hand_held(
+    model: str = "mpu6050",
+    seed: int = 1,
+    effects: dict[str, Any] | None = None,
+    *,
+    procedure: str = "multi_position",
+    temperature: dict[str, float] | None = None,
+    holdout_every: int = 3,
+    **other: Any,
+) -> Unit:
+    """Return a unit; ``effects`` maps ``sensor.effect`` to None for a size of the data sheet, at random."""
+    parts = (tuple((effects or {}).items()), tuple((temperature or {}).items()), tuple(other.items()))
+    recordings, truth = _simulated(model, seed, procedure, *parts)
+    settings = {
+        "sensor": read_config("sensor", model),
+        "table": read_config("table", "hand"),
+        "procedure": {"holdout_every": holdout_every},
+        "effects": {"accelerometer": [], "gyroscope": []},
+        "limits": {},
+    }
+    return Unit(recordings, truth, settings)
+
+
+def frame_of(matrix: np.ndarray) -> np.ndarray:
+    """Return the rotation Q of ``matrix = Q L`` with L lower triangular and positive on its diagonal."""
+    flipped, _ = np.linalg.qr(matrix[:, ::-1])
+    Q = flipped[:, ::-1]
+    return Q * np.sign(np.diag(Q.T @ matrix))
