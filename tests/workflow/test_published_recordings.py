@@ -17,6 +17,8 @@ SHEET = f"""unit,procedure,sensor,ingest,overrides
 xsens,multi_position,generic,xsens_mti_multi_position,procedure.folder={DATA}/xsens_mti_multi_position
 xsens-all,multi_position,generic,xsens_mti_multi_position,\
 procedure.folder={DATA}/xsens_mti_multi_position;procedure.holdout_every=0
+xsens-moves,multi_position,generic,xsens_mti_multi_position,\
+procedure.folder={DATA}/xsens_mti_multi_position;method.gyroscope=rests_and_moves
 mpu6050,multi_position,mpu6050,mpu6050_multi_position,procedure.folder={DATA}/mpu6050_multi_position;\
 procedure.recordings.recording.file=example_data_calibration.csv;procedure.holdout_every=0
 """
@@ -30,9 +32,8 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> Bench:
     (directory / "published").mkdir()
     (directory / "published" / "units.csv").write_text(SHEET)
     bench = Bench(directory, directory / "published")
-    run = bench.snakemake(
-        f"unit_overrides={{xsens: [table.gravity_g={GRAVITY}], xsens-all: [table.gravity_g={GRAVITY}]}}"
-    )
+    gravity = ", ".join(f"{unit}: [table.gravity_g={GRAVITY}]" for unit in ("xsens", "xsens-all", "xsens-moves"))
+    run = bench.snakemake(f"unit_overrides={{{gravity}}}")
     assert run.code == 0, run.output
     return bench
 
@@ -70,6 +71,34 @@ def test_the_gyroscope_that_hand_held_rests_do_not_give_is_null_with_the_reason(
     assert found["gyroscope"] is None
     assert "record turns about x, y and z" in found["not_calibrated"]["gyroscope"]
     assert document(published, "validations", unit)["gyroscope"] is None
+
+
+def test_the_gyroscope_by_rests_and_moves_agrees_with_the_factory_certificate(published: Bench) -> None:
+    found = document(published, "calibrations", "xsens-moves")["gyroscope"]
+    scale = np.degrees(83.2) * np.linalg.norm(np.linalg.inv(found["matrix"]), axis=1)  # counts per rad/s
+    assert np.abs(scale / [4778, 4758, 4766] - 1).max() < 0.003
+    assert np.max(found["expanded_uncertainty"]["matrix"]) < 0.01
+
+
+def test_nothing_is_claimed_of_an_accelerometer_whose_rests_are_at_the_noise(published: Bench) -> None:
+    for unit in ("xsens", "xsens-all"):
+        part = document(published, "diagnoses", unit)["accelerometer"]
+        assert part["verdict"] == "nothing_missing"
+        assert part["residual_over_noise"] < 1.5
+
+
+def test_ten_rests_are_not_enough_to_tell_an_effect(published: Bench) -> None:
+    part = document(published, "diagnoses", "mpu6050")["accelerometer"]
+    assert part["verdict"] == "not_enough_data"
+    assert "10 rests are too few" in " ".join(entry["reason"] for entry in part["not_observable"])
+
+
+def test_the_g_sensitivity_of_a_vibrating_gyroscope_is_named_and_mends_held_out_rests(published: Bench) -> None:
+    part = document(published, "diagnoses", "xsens-moves")["gyroscope"]
+    assert part["selected"] == ["g_sensitivity"]
+    best = part["ranking"][0]
+    assert best["held_out_error_after"] < 0.4 * best["held_out_error_before"]
+    assert 0.02 < np.max([abs(p["value"]) for p in best["parameters"].values()]) < 0.3  # deg/s/g, as such sensors have
 
 
 def test_no_moving_sample_is_averaged_into_a_rest(published: Bench) -> None:
