@@ -71,6 +71,7 @@ class _Reader:
         self.gatherers: dict[str, Gatherer] = {}
         self.notes: list[Note] = []
         self.encodings: dict[str, Encoding] = {}
+        self.end_ns = np.iinfo(np.int64).max  # the topics of a truncated file end at different times
 
     def table(self) -> ChannelTable:
         for rows in self.walk.rows():
@@ -91,10 +92,10 @@ class _Reader:
                 values |= {n: v for n, v in read(series, base).items() if n not in values}
         _check_finite(values, base, self.path)
         self._note_ignored()
-        source = {"file": self.path, "sha256": self.walk.found.sha256, "rows": len(base.time_ns)}
-        return ChannelTable(
-            self.path, base.time_ns, values, source, lambda _row: 0, self.encodings, notes=tuple(self.notes)
-        )
+        time = base.time_ns[base.time_ns <= self.end_ns]
+        values = {c: v[: len(time)] for c, v in values.items()}
+        source = {"file": self.path, "sha256": self.walk.found.sha256, "rows": len(time)}
+        return ChannelTable(self.path, time, values, source, lambda _row: 0, self.encodings, notes=tuple(self.notes))
 
     def _gatherer(self, topic: str, schema: str) -> Gatherer | None:
         """Return what takes in the messages of a topic; None if none are wanted."""
@@ -255,7 +256,9 @@ class _Reader:
     def _matched(self, series: Series, base: Series) -> dict[str, NDArray[Any]]:
         """Return the numbers of the messages with the stamps of the Imu messages."""
         index = np.minimum(np.searchsorted(series.time_ns, base.time_ns), len(series.time_ns) - 1)
-        unmatched = np.flatnonzero(series.time_ns[index] != base.time_ns)
+        if self.walk.found.truncated:
+            self.end_ns = min(self.end_ns, int(series.time_ns[-1]))
+        unmatched = np.flatnonzero((series.time_ns[index] != base.time_ns) & (base.time_ns <= self.end_ns))
         if unmatched.size:
             raise IngestError(
                 f"{unmatched.size} of {len(index)} Imu messages have no message of equal stamp on {series.topic}, the "
@@ -264,7 +267,7 @@ class _Reader:
                 fault="bad_time",
             )
         extra = len(series.time_ns) - len(index)
-        if extra:
+        if extra > 0:
             detail = f"messages on {series.topic} between the Imu's were not used"
             self.notes.append(Note("N-UNMATCHED", extra, 0, 0, detail))
         return {c: numbers[index] for c, numbers in series.values.items()}
