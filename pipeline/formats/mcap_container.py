@@ -84,7 +84,8 @@ class Container:
         nameless = sorted(set(self.counts) - set(self.channels))
         if nameless:
             raise ValueError(f"messages of channel {nameless[0]}, which is not defined")
-        if self.chunk_index and sorted(self.chunk_index) != self.chunks:
+        lost = set(self.chunk_index) - set(self.chunks)
+        if lost or (self.chunk_index and not self.truncated and sorted(self.chunk_index) != self.chunks):
             raise ValueError(
                 f"the summary lists {len(self.chunk_index)} chunks, and the file holds {len(self.chunks)} where it "
                 "may look for them: a part is missing"
