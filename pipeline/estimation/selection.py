@@ -240,6 +240,7 @@ class _Search:
             self.steps[best.name] = best
             self._accept(best.name)
             self._drop()
+            self._drop_refuted()
             self._merge()
 
     def _accept(self, name: str) -> None:
@@ -377,6 +378,32 @@ class _Search:
                 if effect(name).nonlinear:
                     self._refit()
 
+    def _drop_refuted(self) -> None:
+        """Drop what the full fit does not need: the columns of the last ranking were those of another matrix."""
+        at = BASE + sum(len(term.values) for term in self.base.terms)
+        refuted = []
+        for term in self.fit.terms[len(self.base.terms) :]:
+            block = slice(at, at + len(term.values))
+            at = block.stop
+            if term.effect.name not in self.names or term.effect.moves:
+                continue
+            covariance = self.fit.covariance[block, block]
+            size = np.sqrt(np.diag(covariance))
+            known = size > 0
+            z = (term.values / np.where(known, size, 1.0))[known]
+            correlation = (covariance / np.outer(np.where(known, size, 1.0), np.where(known, size, 1.0)))[known][
+                :, known
+            ]
+            wald = float(z @ np.linalg.lstsq(correlation, z, rcond=1e-9)[0])
+            if wald < len(z) * float(np.log(self.ranking.samples)):
+                refuted.append(term.effect.name)
+        for name in refuted:
+            self.names.remove(name)
+            del self.steps[name]
+        if refuted:
+            self.fit = replace(self.fit, terms=tuple(t for t in self.fit.terms if t.effect.name not in refuted))
+            self._refit()
+
     def _merge(self) -> None:
         """Replace two selected effects by one that contains the first, where that explains about as much."""
         for general in self.effects:
@@ -416,8 +443,8 @@ class _Search:
                 self.steps[rival.name] = rival
                 del self.steps[name]
                 self.fit = replace(self.fit, terms=tuple(t for t in self.fit.terms if t.effect.name != name))
-                if effect(name).nonlinear or effect(rival.name).nonlinear:
-                    self._refit()
+                self._refit()
+                self._drop_refuted()
                 return True
         return False
 
