@@ -270,6 +270,8 @@ class Walk:
         self._absorb(head, content)
         end = self.stream.read()
         self._absorb(end)
+        if len(end) < len(records.MAGIC) and records.MAGIC.startswith(end):
+            raise _Truncated("its last bytes are missing")
         if end != records.MAGIC:
             raise ValueError("the file does not end where its data end: truncated, or another file was appended")
         if self._unknown and self.found.statistics is None:
