@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
 ALIKE = 0.8
 MOSTLY = 0.5
+BELIEVED = 3  # effects at once; a longer chain is what the catalogue makes of physics that it does not hold
 UNKNOWN_SHARE = 0.03  # of the gain in 2 log L by what was selected, above which what is left is worth naming
 CLOSE = 1.1  # mean square of a residual over that of noise, under which there is no excess to share
 
@@ -161,6 +162,8 @@ def _verdict(selection: Selection, unknown: Sequence[Any], noise: Noise | None) 
         left = selection.fit.residual_rms**2 > FAR_ABOVE**2 * floor
     share = _share(selection.base.residual_rms**2 - selection.fit.residual_rms**2, selection, noise)
     if (unknown or left) and (not selection.names or share < MOSTLY):
+        return "unexplained"
+    if len(selection.names) > BELIEVED:
         return "unexplained"
     gain = 2.0 * (selection.fit.log_likelihood - selection.base.log_likelihood)
     if unknown and max(float(found["delta_bic"]) for found in unknown) > UNKNOWN_SHARE * gain:

@@ -33,6 +33,11 @@ def in_words(part: Mapping[str, Any] | None, sensor: str) -> list[str]:
     for name in part["selected"]:
         lines += _selected(entries[name], sensor)
     lines += _unknown(part, sensor)
+    if len(part["selected"]) > 3 and part["verdict"] == "unexplained":
+        lines.append(
+            f"It takes {len(part['selected'])} effects together to explain this, more than a unit usually has: "
+            "the true one may not be in the catalogue."
+        )
     wander = part.get("wander") or {}
     if wander.get("inflated"):
         lines.append(
