@@ -131,11 +131,12 @@ class Limits(Section):
 
 
 class Ingest(Section):
-    """How files become recordings; ``pipeline.formats`` documents the keys of ``csv`` and ``mcap``."""
+    """How files become recordings; ``pipeline.formats`` documents the keys of ``csv``, ``mcap`` and ``checks``."""
 
     name: str
     csv: dict[str, Any]
     mcap: dict[str, Any]
+    checks: dict[str, Any] = {}
 
 
 class Unit(Section):

@@ -1,6 +1,7 @@
-"""What is wrong with a text log that did not parse: line, column and value.
+"""What is wrong with the lines of a text log that did not parse: line, column and value of each.
 
-The fast parser says that a cell is bad but not where. This slow walk over the lines runs on refused files only.
+The fast parser says that a cell is bad but not where. So the data are parsed again in blocks of some thousand lines,
+and only the lines of the blocks that fail are looked at one by one.
 """
 
 from __future__ import annotations
@@ -8,59 +9,146 @@ from __future__ import annotations
 import csv
 import math
 import re
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from pipeline.errors import InputError
+import pyarrow as pa
+
+from pipeline.formats.csv_parse import all_finite, parse
+from pipeline.formats.ingest_error import IngestError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from pipeline.formats.csv_layout import Layout
 
-NUMBER = re.compile(r"\s*[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\s*")
+BLOCK_BYTES = 1 << 18
+LISTED = 5
+HINTS = {
+    "bad_row": "ingest.csv.bad_rows=drop leaves a gap in place of such rows",
+    "nul": "ingest.csv.bad_rows=drop leaves a gap in place of such rows",
+    "not_a_number": "ingest.csv.bad_rows=drop leaves a gap in place of such rows",
+    "not_finite": "ingest.csv.nan=gap leaves a gap in place of such rows",
+    "decimal_comma": "set ingest.csv.decimal=',' and a delimiter that is none",
+    "restarted": "the log was restarted: set ingest.csv.session=1, 2 .. to read one part of it",
+}
+KIND_OF_SETTING = {"bad_row": "bad_rows", "nul": "bad_rows", "not_a_number": "bad_rows", "not_finite": "nan"}
 
 
-def explain(layout: Layout, reason: str) -> InputError:
+@dataclass(frozen=True)
+class Fault:
+    """One bad line.
+
+    Attributes
+    ----------
+    row : int
+        Counted from 0 among the data lines.
+    line : int
+        Of the file, counted from 1.
+    kind : str
+        ``bad_row``, ``nul``, ``restarted``, ``not_finite``, ``decimal_comma`` or ``not_a_number``.
+    message : str
+    text : str
+        The line.
+    short : bool
+        Whether it has fewer fields than are expected.
+    """
+
+    row: int
+    line: int
+    kind: str
+    message: str
+    text: str
+    short: bool = False
+
+
+def refusal(layout: Layout, faults: list[Fault], reason: str) -> IngestError:
     """Return the error that names the first bad line of a log, and how many there are.
 
     Parameters
     ----------
     layout : Layout
+    faults : list of Fault
     reason : str
-        What the parser said, used if the walk finds nothing.
+        What the parser said, used if there are none.
     """
-    faults = list(_faults(layout))
     if not faults:
-        return InputError(f"cannot be read as numbers: {reason}", layout.path)
-    line, message = faults[0]
-    more = f" ({len(faults) - 1} more such lines, up to line {faults[-1][0]})" if len(faults) > 1 else ""
-    return InputError(message + more, f"{layout.path}:{line}")
+        return IngestError(f"cannot be read as numbers: {reason}", layout.path, fault="not_a_number")
+    worst = next((f for f in faults if f.kind == "restarted"), faults[0])
+    others = [str(f.line) for f in faults if f is not worst]
+    more = f" ({len(others)} more such lines, up to line {faults[-1].line})" if others else ""
+    if len(others) > 1:
+        more = more[:-1] + f": {', '.join(others[: LISTED - 1])}{' ..' if len(others) >= LISTED else ''})"
+    return IngestError(worst.message + more, f"{layout.path}:{worst.line}", fault=worst.kind, hint=HINTS[worst.kind])
 
 
-def _faults(layout: Layout) -> Iterator[tuple[int, str]]:
+def find_faults(layout: Layout) -> list[Fault]:
+    """Return every bad line of a log."""
+    found, start, row = [], 0, 0
+    while start < len(layout.body):
+        end = layout.body.find(b"\n", start + BLOCK_BYTES) + 1 or len(layout.body)
+        block = layout.body[start:end]
+        rows = block.count(b"\n")
+        if not _sound(layout, block):
+            found += list(_faults(layout, block, row))
+        start, row = end, row + rows
+    return found
+
+
+def _sound(layout: Layout, block: bytes) -> bool:
+    if b"\0" in block:
+        return False
+    wanted = dict.fromkeys([index for _, index in layout.columns], pa.float64())
+    try:
+        table = parse(block, layout.delimiter, layout.decimal, len(layout.names), wanted)
+    except pa.ArrowInvalid:
+        return False
+    return table.num_rows == block.count(b"\n") and all_finite(table)
+
+
+def _faults(layout: Layout, block: bytes, first: int) -> Iterator[Fault]:
     width = len(layout.names)
-    for offset, raw in enumerate(layout.body.split(b"\n")):
-        if not raw:
-            continue
+    for offset, raw in enumerate(block.split(b"\n")[:-1]):
         text = raw.decode("utf-8", "replace")
-        cells = next(csv.reader([text], delimiter=layout.delimiter), [])
-        message = None
-        if len(cells) != width:
+        row = first + offset
+        line = layout.line_of(row)
+        if b"\0" in raw:
+            yield Fault(row, line, "nul", f"{raw.count(0)} NUL bytes within the line: {text[:60]!r}", text)
+            continue
+        try:
+            cells = next(csv.reader([text], delimiter=layout.delimiter, strict=True), [])
+        except csv.Error as error:
+            yield Fault(row, line, "bad_row", f"the line cannot be split into fields ({error}): {text[:120]!r}", text)
+            continue
+        if _is_header(cells, layout):
+            yield Fault(row, line, "restarted", _cell(layout, layout.columns[0], cells)[1] + ": a header again", text)
+        elif len(cells) != width:
             message = f"the line has {len(cells)} fields where {width} are expected: {text[:120]!r}"
+            yield Fault(row, line, "bad_row", message, text, short=len(cells) < width)
         else:
-            message = next((m for c, i in layout.columns if (m := _cell(layout.names[i], c.channel, cells[i]))), None)
-        if message:
-            yield layout.first_line + offset, message
+            bad = next((b for c in layout.columns if (b := _cell(layout, c, cells))[0]), None)
+            if bad:
+                yield Fault(row, line, *bad, text)
 
 
-def _cell(name: str, channel: str, cell: str) -> str | None:
-    """Return what is wrong with a cell, None if it is a finite number."""
-    column = f"column {name}" if not name.startswith("column ") else name
-    text = cell.strip()
+def _is_header(cells: list[str], layout: Layout) -> bool:
+    return [cell.strip() for cell in cells] == layout.names
+
+
+def _cell(layout: Layout, where: tuple[object, int], cells: list[str]) -> tuple[str, str]:
+    """Return the kind of fault of a cell, empty where it is a finite number, and what is wrong with it."""
+    column, index = where
+    name, channel = layout.names[index], getattr(column, "channel", "")
+    label = f"column {name}" if not name.startswith("column ") else name
+    text = cells[index].strip()
+    point = re.escape(layout.decimal)
     if not text:
-        return f"{column} ({channel}) is empty; a number is expected"
-    if NUMBER.fullmatch(text):
-        return None if math.isfinite(float(text)) else f"{column} ({channel}) is {text!r}, more than a number can hold"
+        return "not_finite", f"{label} ({channel}) is empty; a number is expected"
+    if re.fullmatch(rf"[+-]?(\d+{point}?\d*|{point}\d+)([eE][+-]?\d+)?", text):
+        if math.isfinite(float(text.replace(",", "."))):
+            return "", ""
+        return "not_finite", f"{label} ({channel}) is {text!r}, more than a number can hold"
     if re.fullmatch(r"[+-]?\d+,\d+", text):
-        return f"{column} ({channel}) is {text!r}, a decimal comma; write numbers with a point"
-    return f"{column} ({channel}) is {text[:40]!r}; a finite number is expected"
+        return "decimal_comma", f"{label} ({channel}) is {text!r}, a decimal comma; write numbers with a point"
+    kind = "not_finite" if re.fullmatch(r"[+-]?(nan|inf(inity)?)", text, re.IGNORECASE) else "not_a_number"
+    return kind, f"{label} ({channel}) is {text[:40]!r}; a finite number is expected"

@@ -1,19 +1,56 @@
-"""Where the columns of a text log lie: preamble, header, data, and which column holds which channel."""
+"""Where the columns of a text log lie: preamble, header, data, and which column holds which channel.
+
+Columns are found by name, never by position, unless the profile says that there is no header. What is no data line
+(empty, or a comment where the profile says how comments start) is left out; ``LineNumbers`` keeps the way back to the
+lines of the file.
+"""
 
 from __future__ import annotations
 
 import csv
-import difflib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from pipeline.errors import InputError
-from pipeline.formats.settings import WHITESPACE
+import numpy as np
+
+from pipeline.formats.csv_columns import find_columns, refuse_twice
+from pipeline.formats.csv_settings import AUTO, COMMENTED, WHITESPACE
+from pipeline.formats.ingest_error import IngestError
 from pipeline.records import Note
 
 if TYPE_CHECKING:
-    from pipeline.formats.settings import Column, CsvFormat
+    from numpy.typing import NDArray
+
+    from pipeline.formats.csv_settings import Column, CsvFormat
     from pipeline.formats.text_file import TextFile
+
+DELIMITERS = ",;\t|"
+
+
+@dataclass(frozen=True)
+class LineNumbers:
+    """Rows, counted from 0, to lines of the file, counted from 1.
+
+    Attributes
+    ----------
+    first : int
+        Line of the first row, where every line from there on is a row.
+    lines : (n,) array of int64, or None
+        The line of each row, where some lines are no rows.
+    """
+
+    first: int
+    lines: NDArray[np.int64] | None = None
+
+    def __call__(self, row: int) -> int:
+        """Return the line of a row; 0 where there is no such row."""
+        if self.lines is None:
+            return self.first + row
+        return int(self.lines[row]) if row < len(self.lines) else 0
+
+    def select(self, index: NDArray[np.intp]) -> LineNumbers:
+        """Return the lines of some rows, in their order."""
+        return LineNumbers(self.first, index + self.first if self.lines is None else self.lines[index])
 
 
 @dataclass(frozen=True)
@@ -25,9 +62,9 @@ class Layout:
     path : str
     body : bytes
         The data lines, fields separated by ``delimiter``.
-    first_line : int
-        Line of the file, counted from 1, on which the data start.
+    line_of : LineNumbers
     delimiter : str
+    decimal : str
     names : list of str
         All columns, for messages.
     columns : list of (Column, int)
@@ -37,22 +74,12 @@ class Layout:
 
     path: str
     body: bytes
-    first_line: int
+    line_of: LineNumbers
     delimiter: str
+    decimal: str
     names: list[str]
     columns: list[tuple[Column, int]]
     notes: tuple[Note, ...]
-
-    def line_of(self, row: int) -> int:
-        """Return the line of a data row counted from 0, past any empty lines."""
-        if b"\n\n" not in self.body and not self.body.startswith(b"\n"):
-            return self.first_line + row
-        seen = -1
-        for index, line in enumerate(self.body.split(b"\n")):
-            seen += bool(line)
-            if line and seen == row:
-                return self.first_line + index
-        return 0
 
 
 def find_layout(text: TextFile, settings: CsvFormat) -> Layout:
@@ -60,32 +87,67 @@ def find_layout(text: TextFile, settings: CsvFormat) -> Layout:
 
     Raises
     ------
-    InputError
+    IngestError
         If there are no data, a column that is needed is missing, or a name stands twice.
     """
     start, line = _after_lines(text, settings.skip_lines)
-    body = text.data[start:]
-    delimiter = settings.delimiter
-    if delimiter == WHITESPACE:
-        body, delimiter = _single_blanks(body), " "
-    if settings.header:
-        head, _, body = body.partition(b"\n")
-        names = _fields(head.decode("utf-8"), delimiter)
-        line += 1
+    body, notes = text.data[start:], list(text.notes)
+    lines = LineNumbers(line)
+    head = None
+    if settings.comment is not None:
+        body, lines, head = _without_comments(body, line, settings.comment, notes)
+    delimiter = _delimiter(settings, (head or body).lstrip(b"\n").partition(b"\n")[0], notes)
+    if settings.delimiter == WHITESPACE:
+        body, delimiter = single_blanks(body), " "
+    if settings.header == COMMENTED:
+        first, names = body.partition(b"\n")[0], _commented_names(head, settings, delimiter, text.path)
+    elif settings.header:
+        first, _, body = body.partition(b"\n")
+        names = fields(first.decode("utf-8"), delimiter)
+        at, lines = lines(0), _without_first(lines)
     else:
-        first = body.lstrip(b"\n").partition(b"\n")[0].decode("utf-8")
-        names = [f"column {i}" for i in range(len(_fields(first, delimiter)))]
-    where = f"{text.path}:{line - 1 if settings.header else line}"
+        first = body.lstrip(b"\n").partition(b"\n")[0]
+        names = [f"column {i}" for i in range(len(fields(first.decode("utf-8"), delimiter)))]
+    at = at if settings.header is True else lines(0)
     if not body or body.isspace():
-        found = f"header on line {line - 1}, " if settings.header else ""
-        raise InputError(f"{found}0 data rows; at least 2 are needed", text.path)
-    columns = _find_columns(names, settings, where)
-    ignored = [n for i, n in enumerate(names) if i not in {index for _, index in columns}]
-    notes = list(text.notes)
-    if ignored:
-        at = line - 1 if settings.header else 0
-        notes.append(Note("N-IGNORED", len(ignored), at, at, f"columns not used: {', '.join(ignored)}"))
-    return Layout(text.path, body, line, delimiter, names, columns, tuple(notes))
+        found = f"header on line {at}, " if settings.header else ""
+        raise IngestError(f"{found}0 data rows; at least 2 are needed", text.path, fault="no_rows")
+    where = f"{text.path}:{at}"
+    refuse_twice(names, where)
+    columns = find_columns(names, settings, where, body, first)
+    body, lines = without_empty_lines(body, lines)
+    notes += ignored_columns(names, columns, at if settings.header is True else 0)
+    return Layout(text.path, body, lines, delimiter, settings.decimal, names, columns, tuple(notes))
+
+
+def ignored_columns(names: list[str], columns: list[tuple[Column, int]], line: int) -> list[Note]:
+    """Return a note on the columns that the profile does not ask for."""
+    used = {index for _, index in columns}
+    ignored = [n for i, n in enumerate(names) if i not in used]
+    detail = f"columns not used: {', '.join(ignored)}"
+    return [Note("N-IGNORED", len(ignored), line, line, detail)] if ignored else []
+
+
+def fields(line: str, delimiter: str) -> list[str]:
+    """Return the fields of a line, without blanks around them."""
+    return [name.strip() for name in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])]
+
+
+def single_blanks(body: bytes) -> bytes:
+    """Turn every run of blanks and tabs into one blank, none at the ends of lines."""
+    body = body.replace(b"\t", b" ")
+    while b"  " in body:
+        body = body.replace(b"  ", b" ")
+    return body.replace(b"\n ", b"\n").replace(b" \n", b"\n").lstrip(b" ")
+
+
+def without_empty_lines(body: bytes, lines: LineNumbers) -> tuple[bytes, LineNumbers]:
+    """Return data without empty lines, and the lines that are left."""
+    if b"\n\n" not in body and not body.startswith(b"\n"):
+        return body, lines
+    ends = np.flatnonzero(np.frombuffer(body, np.uint8) == ord("\n"))
+    kept = np.flatnonzero(np.diff(ends, prepend=-1) > 1)
+    return b"\n".join(part for part in body.split(b"\n") if part) + b"\n", lines.select(kept)
 
 
 def _after_lines(text: TextFile, count: int) -> tuple[int, int]:
@@ -94,48 +156,51 @@ def _after_lines(text: TextFile, count: int) -> tuple[int, int]:
     for _ in range(count):
         start = text.data.find(b"\n", start) + 1
         if start == 0:
-            raise InputError(f"the file ends within the {count} lines that ingest.csv.skip_lines skips", text.path)
+            raise IngestError(
+                f"the file ends within the {count} lines that ingest.csv.skip_lines skips", text.path, fault="no_rows"
+            )
     return start, count + 1
 
 
-def _single_blanks(body: bytes) -> bytes:
-    """Turn every run of blanks and tabs into one blank, none at the ends of lines."""
-    body = body.replace(b"\t", b" ")
-    while b"  " in body:
-        body = body.replace(b"  ", b" ")
-    return body.replace(b"\n ", b"\n").replace(b" \n", b"\n").lstrip(b" ")
+def _without_first(lines: LineNumbers) -> LineNumbers:
+    return LineNumbers(lines.first + 1, None if lines.lines is None else lines.lines[1:])
 
 
-def _fields(line: str, delimiter: str) -> list[str]:
-    return [name.strip() for name in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])]
+def _without_comments(body: bytes, first: int, comment: str, notes: list[Note]) -> tuple[bytes, LineNumbers, bytes]:
+    """Return the lines that are no comments, where they stand, and the last comment before the first of them."""
+    parts, mark = body.split(b"\n")[:-1], comment.encode()
+    is_comment = [part.lstrip().startswith(mark) for part in parts]
+    kept = np.flatnonzero(~np.array(is_comment, bool))
+    found = np.flatnonzero(is_comment)
+    head = b""
+    if found.size:
+        before = found[: np.searchsorted(found, kept[0] if kept.size else len(parts))]
+        head = parts[before[-1]].lstrip()[len(mark) :] if before.size else b""
+        detail = f"lines that start with {comment!r} are no data"
+        notes.append(Note("N-COMMENT", found.size, first + int(found[0]), first + int(found[-1]), detail))
+    return b"".join(parts[i] + b"\n" for i in kept), LineNumbers(first, kept + first), head
 
 
-def _find_columns(names: list[str], settings: CsvFormat, where: str) -> list[tuple[Column, int]]:
-    twice = sorted({n for n in names if n and names.count(n) > 1})
-    if twice:
-        raise InputError(f"column name {', '.join(twice)} stands more than once in the header", where)
-    found, missing = [], []
-    for column in settings.columns:
-        index = column.column if isinstance(column.column, int) else _index(names, column.column)
-        if 0 <= index < len(names):
-            found.append((column, index))
-        elif not column.optional:
-            missing.append(str(column.column))
-    if missing:
-        raise InputError(_missing_message(missing, names), where)
+def _commented_names(head: bytes | None, settings: CsvFormat, delimiter: str, path: str) -> list[str]:
+    if not head:
+        raise IngestError(
+            f"no line that starts with {settings.comment!r} stands before the data, where ingest.csv.header looks for "
+            "the column names",
+            path,
+            fault="no_header",
+        )
+    if settings.delimiter == WHITESPACE:
+        return head.decode("utf-8").split()
+    return fields(head.decode("utf-8"), delimiter)
+
+
+def _delimiter(settings: CsvFormat, line: bytes, notes: list[Note]) -> str:
+    """Return the separator, where it is to be taken from the header the one that occurs most often in it."""
+    if settings.delimiter != AUTO:
+        return settings.delimiter
+    counts = {d: line.count(d.encode()) for d in DELIMITERS if d != settings.decimal or settings.decimal == "."}
+    found = max(counts, key=lambda d: counts[d])
+    if counts[found] == 0:
+        found = " "
+    notes.append(Note("N-DELIM", 1, 0, 0, f"the separator is {found!r}, by the header"))
     return found
-
-
-def _index(names: list[str], name: str) -> int:
-    return names.index(name) if name in names else -1
-
-
-def _missing_message(missing: list[str], names: list[str]) -> str:
-    near = {m: difflib.get_close_matches(m, names, 1) for m in missing}
-    hints = [f"{m} (nearest: {n[0]})" if n else m for m, n in near.items()]
-    message = f"column {', '.join(hints)} missing; found {', '.join(names)[:300]}"
-    if len(names) == 1:
-        separators = [repr(c) for c in ",;\t| " if c in names[0]]
-        if separators:
-            message += f"; is the separator {' or '.join(separators)}? Set ingest.csv.delimiter"
-    return message + "; describe the file's columns in ingest.csv.columns"

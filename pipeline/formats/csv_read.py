@@ -2,25 +2,22 @@
 
     value = (count - offset) / counts_per_unit
 
-    time  = integer nanoseconds: round(t * 10^9), from the decimal digits themselves where doubles are too coarse
-
-where a double of t seconds is finer than half a nanosecond up to t = 10^6 s (and Unix time, 1.7*10^9 s, is not).
+Files of one recording that were logged at the same times are joined row by row; a table's log with a clock of its own
+is brought to the sensor's (``pipeline.formats.table_clock``).
 """
 
 from __future__ import annotations
 
-from decimal import Decimal
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pyarrow as pa
-from pyarrow import csv
 
-from pipeline.errors import InputError
 from pipeline.formats.channel_table import ChannelTable
-from pipeline.formats.csv_fault import explain
-from pipeline.formats.csv_layout import find_layout
-from pipeline.formats.text_file import load_text
+from pipeline.formats.checks import Checks
+from pipeline.formats.csv_order import in_order
+from pipeline.formats.csv_rows import read_rows
+from pipeline.formats.csv_time import LONGEST_S, refuse_coarse, seconds_per_unit, whole_times
+from pipeline.formats.ingest_error import IngestError
 from pipeline.formats.units import COUNTS, UNITS, decode, to_house_unit
 from pipeline.records import Encoding, Note
 
@@ -30,22 +27,21 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.formats.csv_layout import Layout
-    from pipeline.formats.settings import Column, CsvFormat
+    from pipeline.formats.csv_rows import Rows
+    from pipeline.formats.csv_settings import Column, CsvFormat
 
-EXACT_BELOW_S = 1e6
-LONGEST_S = 9.2e9  # int64 nanoseconds end at 292 years
-DECIMAL_DIGITS = {"s": 9, "ms": 6, "us": 3, "ns": 0}
+TABLE_TIME = "table_time"
 
 
-def read_csv(paths: Sequence[Path], formats: Sequence[CsvFormat]) -> ChannelTable:
-    """Read a text log, or the parts of one that were logged at the same times.
+def read_csv(paths: Sequence[Path], formats: Sequence[CsvFormat], checks: Checks | None = None) -> ChannelTable:
+    """Read a text log, or the parts of one.
 
     Parameters
     ----------
     paths : sequence of Path
     formats : sequence of CsvFormat
         The layout of each file.
+    checks : Checks, optional
 
     Returns
     -------
@@ -56,12 +52,47 @@ def read_csv(paths: Sequence[Path], formats: Sequence[CsvFormat]) -> ChannelTabl
     InputError
         With ``path:line`` where a line is to blame.
     """
-    tables = [_read_one(path, layout) for path, layout in zip(paths, formats, strict=True)]
+    tables = [read_one(path, layout, checks or Checks()) for path, layout in zip(paths, formats, strict=True)]
+    same = [t for t, layout in zip(tables, formats, strict=True) if not layout.own_clock]
+    others = [t for t, layout in zip(tables, formats, strict=True) if layout.own_clock]
+    joined = _joined(same)
+    if others or TABLE_TIME in joined.values:
+        from pipeline.formats.table_clock import align, own_rows  # noqa: PLC0415  (few logs need it)
+
+        for log in others or [own_rows(joined)]:
+            joined = align(joined, log)
+    return joined
+
+
+def read_one(path: Path, settings: CsvFormat, checks: Checks) -> ChannelTable:
+    """Read one file."""
+    rows = read_rows(path, settings, checks)
+    tick_ns = float(settings.tick_ns or UNITS["time"][_unit_of_time(rows)][0])
+    ordered = in_order(rows, _times(rows, settings), settings.session, checks, tick_ns)
+    rows = ordered.rows
+    source = {"file": rows.path, "sha256": rows.sha256, "rows": rows.count}
+    values, encodings, notes = {}, {}, list(rows.notes)
+    if settings.rate_hz is not None:
+        notes.append(Note("N-SYNTHTIME", rows.count, 0, 0, f"no time column: rows counted at {settings.rate_hz:g} Hz"))
+    for column, index in rows.columns:
+        if column.channel != "time":
+            uses = sum(i == index for _, i in rows.columns)
+            numbers = rows.numbers[index] if uses > 1 else rows.numbers.pop(index)
+            values[column.channel], encoding = _channel(column, numbers)
+            if encoding is not None:
+                encodings[column.channel] = encoding
+    return ChannelTable(
+        rows.path, ordered.time_ns, values, source, rows.line_of, encodings, tuple(notes), ordered.flags
+    )
+
+
+def _joined(tables: Sequence[ChannelTable]) -> ChannelTable:
+    """Return the files of one recording as one, row by row."""
     first = tables[0]
-    for other in tables[1:]:
-        _check_same_times(first, other)
     if len(tables) == 1:
         return first
+    for other in tables[1:]:
+        _check_same_times(first, other)
     return ChannelTable(
         path=first.path,
         time_ns=first.time_ns,
@@ -70,49 +101,7 @@ def read_csv(paths: Sequence[Path], formats: Sequence[CsvFormat]) -> ChannelTabl
         line_of=first.line_of,
         encodings={k: v for t in tables for k, v in t.encodings.items()},
         notes=tuple(n for t in tables for n in t.notes),
-    )
-
-
-def _read_one(path: Path, settings: CsvFormat) -> ChannelTable:
-    text = load_text(path)
-    layout = find_layout(text, settings)
-    wanted = sorted({index for _, index in layout.columns})
-    try:
-        table = _parse(layout, dict.fromkeys(wanted, pa.float64()))
-    except pa.ArrowInvalid as error:
-        raise explain(layout, str(error)) from error
-    numbers = {i: table.column(str(i)).to_numpy() for i in wanted}
-    if not all(np.isfinite(v).all() for v in numbers.values()):
-        raise explain(layout, "a value is not finite")
-    notes = list(layout.notes)
-    time_ns, values, encodings = _times(layout, settings, numbers, table.num_rows, notes), {}, {}
-    for column, index in layout.columns:
-        if column.channel != "time":
-            values[column.channel], encoding = _channel(column, numbers[index])
-            if encoding is not None:
-                encodings[column.channel] = encoding
-    source = {"file": text.path, "sha256": text.sha256, "rows": table.num_rows}
-    return ChannelTable(text.path, time_ns, values, source, layout.line_of, encodings, tuple(notes))
-
-
-def _parse(layout: Layout, types: dict[int, Any]) -> Any:  # noqa: ANN401  (pyarrow has no types)
-    """Parse some columns, named by their index; no value stands for a missing one."""
-    return csv.read_csv(
-        pa.py_buffer(layout.body),
-        read_options=csv.ReadOptions(
-            use_threads=False,
-            block_size=min(len(layout.body) + 1, 1 << 24),
-            column_names=[str(i) for i in range(len(layout.names))],
-        ),
-        parse_options=csv.ParseOptions(
-            delimiter=layout.delimiter, quote_char='"' if b'"' in layout.body else False, newlines_in_values=False
-        ),
-        convert_options=csv.ConvertOptions(
-            column_types={str(i): t for i, t in types.items()},
-            include_columns=[str(i) for i in types],
-            null_values=[],
-            check_utf8=False,
-        ),
+        flags=first.flags,
     )
 
 
@@ -125,38 +114,30 @@ def _channel(column: Column, numbers: NDArray[np.float64]) -> tuple[NDArray[np.f
     return decode(numbers, encoding), encoding if whole else None
 
 
-def _times(
-    layout: Layout, settings: CsvFormat, numbers: dict[int, NDArray[np.float64]], rows: int, notes: list[Note]
-) -> NDArray[np.int64]:
+def _unit_of_time(rows: Rows) -> str:
+    return next((c.unit for c, _ in rows.columns if c.channel == "time"), "s")
+
+
+def _times(rows: Rows, settings: CsvFormat) -> NDArray[np.int64]:
     """Return the time of each row, ns."""
     if settings.rate_hz is not None:
-        notes.append(Note("N-SYNTHTIME", rows, 0, 0, f"no time column: rows counted at {settings.rate_hz:g} Hz"))
-        counted: NDArray[np.int64] = np.rint(np.arange(rows) * (1e9 / settings.rate_hz)).astype(np.int64)
+        counted: NDArray[np.int64] = np.rint(np.arange(rows.count) * (1e9 / settings.rate_hz)).astype(np.int64)
         return counted
-    column, index = next((c, i) for c, i in layout.columns if c.channel == "time")
-    seconds = numbers[index] * (UNITS["time"][column.unit][0] / 1e9)
-    largest = float(np.max(np.abs(seconds)))
+    column, index = next((c, i) for c, i in rows.columns if c.channel == "time")
+    values, name = rows.numbers[index], rows.names[index]
+    unit_s = float(settings.tick_ns) / 1e9 if settings.tick_ns is not None else seconds_per_unit(column.unit)
+    largest = float(np.max(np.abs(values[[np.argmin(values), np.argmax(values)]]))) * unit_s
     if largest >= LONGEST_S:
-        row = int(np.argmax(np.abs(seconds)))
-        raise InputError(
-            f"time {seconds[row]:g} s is out of range; is {column.unit} the unit of column {layout.names[index]}?",
-            f"{layout.path}:{layout.line_of(row)}",
+        row = int(np.argmax(np.abs(values)))
+        raise IngestError(
+            f"time {values[row] * unit_s:g} s is out of range; is {column.unit} the unit of column {name}?",
+            f"{rows.path}:{rows.line_of(row)}",
+            fault="wrong_rate",
         )
-    if largest >= EXACT_BELOW_S:
-        return _exact_times(layout, index, DECIMAL_DIGITS[column.unit])
-    rounded: NDArray[np.int64] = np.rint(numbers[index] * UNITS["time"][column.unit][0]).astype(np.int64)
-    return rounded
-
-
-def _exact_times(layout: Layout, index: int, digits: int) -> NDArray[np.int64]:
-    """Return times in ns from their decimal digits: a decimal with ``digits`` places is an integer of ns."""
-    try:
-        decimals = _parse(layout, {index: pa.decimal128(38, digits)}).column(0).combine_chunks()
-        words = np.frombuffer(decimals.buffers()[1], np.int64)
-        return words[2 * decimals.offset : 2 * (decimals.offset + len(decimals)) : 2].copy()  # low words of 128 bits
-    except pa.ArrowInvalid:  # more digits than whole ns have
-        strings = _parse(layout, {index: pa.string()}).column(0).to_pylist()
-        return np.array([int(Decimal(s.strip()).scaleb(digits).to_integral_value()) for s in strings], np.int64)
+    if rows.exact_ns is not None:
+        refuse_coarse(values, rows.exact_ns, column.unit, name, rows.path)
+        return rows.exact_ns
+    return whole_times(values, column.unit, settings.tick_ns)
 
 
 def _check_same_times(first: ChannelTable, other: ChannelTable) -> None:
@@ -166,14 +147,17 @@ def _check_same_times(first: ChannelTable, other: ChannelTable) -> None:
     rows = min(len(first.time_ns), len(other.time_ns))
     differs = np.flatnonzero(first.time_ns[:rows] != other.time_ns[:rows])
     if differs.size == 0:
-        raise InputError(
+        raise IngestError(
             f"{other.source['rows']} rows, but {first.path} has {first.source['rows']}; parts of one recording need "
             "the same times",
             other.path,
+            fault="other_times",
         )
     row = int(differs[0])
-    raise InputError(
+    raise IngestError(
         f"time {other.time_ns[row] / 1e9:.9g} s differs from {first.time_ns[row] / 1e9:.9g} s in {first.place(row)}; "
         "parts of one recording need the same times",
         other.place(row),
+        fault="other_times",
+        hint="a table's log with a clock of its own is marked own_clock: true",
     )

@@ -1,8 +1,8 @@
 """Which files a unit's recordings lie in.
 
 A procedure names a recording's file without suffix; the first kind of file that exists is taken, ``.csv`` before
-``.mcap``. A name with a suffix is taken as it is. Where the ingest profile says that a recording comes in several
-``parts`` (files of one logger, joined on time), these stand in place of the ``.csv``.
+``.gcsv`` before ``.mcap``. A name with a suffix is taken as it is. Where the ingest profile says that a recording comes
+in several ``parts`` (files of one logger, joined on time), these stand in place of the ``.csv``.
 
 Only the standard library is imported here: the Snakefile asks for the files of thousands of units while it is parsed.
 """
@@ -18,7 +18,7 @@ from pipeline.errors import ConfigurationError
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-SUFFIXES = (".csv", ".mcap")
+SUFFIXES = (".csv", ".gcsv", ".mcap")
 FILE = "{file}"
 
 

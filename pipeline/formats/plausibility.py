@@ -1,10 +1,10 @@
-"""What cannot be true of a recording, and what has to be marked in it.
+"""What cannot be true of a recording: refused, because it would calibrate without complaint.
 
-Refused: time that does not increase, specific force far from gravity, readings that the sensor cannot give, an attitude
-that is no rotation. Each is nearly always a wrong unit or column, and would calibrate without complaint.
+Time that does not increase or keeps another rate than is known, specific force far from gravity, readings that the
+sensor cannot give, rates that do not fit the table or the way in which gravity turns, an axis that is not the one that
+the table turned about, an attitude that is no rotation. Each is nearly always a wrong unit or column.
 
-Marked in ``flags``: a gap before a sample (its interval is longer than 1.5 times the median), and readings at full
-scale. Nothing is filled in.
+What is merely marked (gaps, clipped and stuck readings) is found in ``pipeline.formats.marks``.
 """
 
 from __future__ import annotations
@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.errors import InputError
-from pipeline.formats.units import ATTITUDE, TRIADS
-from pipeline.records import Note
+from pipeline.formats.checks import Checks
+from pipeline.formats.csv_time import time_error
+from pipeline.formats.ingest_error import IngestError
+from pipeline.formats.marks import mark_clipped, mark_gaps, mark_stuck
+from pipeline.formats.units import ATTITUDE, DEGREES, TRIADS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -23,25 +25,27 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.formats.channel_table import ChannelTable
+    from pipeline.records import Note
 
-GAP, CLIPPED = np.uint16(1), np.uint16(2)
-GAP_INTERVALS = 1.5
 FORCE_RANGE_G = (0.3, 3.0)
-FULL_SCALE_MARGIN = 1.2
-RAIL = 1e-4  # relative; the top code of 16 bits lies 3e-5 below full scale
-BEYOND = 1e-3  # relative; with nominal counts per unit the top code lies up to so far above
 QUATERNION_TOLERANCE = 0.01
-UNIT_NAMES = {"accelerometer": "g", "gyroscope": "deg/s"}
+RATE_TOLERANCE = 0.2
+ENOUGH = 200_000  # samples that a median is taken of
+TURNING_DPS = 5.0
+ALIKE, UNLIKE = 0.9, 0.5
 
 
-def examine(table: ChannelTable, sensor: Mapping[str, Any]) -> tuple[NDArray[np.uint16] | None, list[Note]]:
-    """Refuse what cannot be true, mark gaps and clipped readings.
+def examine(
+    table: ChannelTable, sensor: Mapping[str, Any], checks: Checks | None = None
+) -> tuple[NDArray[np.uint16] | None, list[Note]]:
+    """Refuse what cannot be true, mark gaps, clipped and stuck readings.
 
     Parameters
     ----------
     table : ChannelTable
     sensor : mapping
         Section of the unit's configuration; its full scales may be absent.
+    checks : Checks, optional
 
     Returns
     -------
@@ -51,18 +55,22 @@ def examine(table: ChannelTable, sensor: Mapping[str, Any]) -> tuple[NDArray[np.
 
     Raises
     ------
-    InputError
+    IngestError
     """
+    checks = checks or Checks()
     _check_whole(table)
     _check_times(table)
+    _check_rate(table, checks)
     _check_force(table)
     _check_attitude(table)
-    flags = np.zeros(len(table.time_ns), np.uint16)
-    notes = _mark_gaps(table, flags)
+    flags = np.zeros(len(table.time_ns), np.uint16) if table.flags is None else table.flags.copy()
+    notes = mark_gaps(table, flags, checks)
     for name in TRIADS:
         full_scale = (sensor.get(name) or {}).get("full_scale")
         if full_scale is not None:
-            notes += _mark_clipped(table, name, float(full_scale), flags)
+            notes += mark_clipped(table, name, float(full_scale), flags)
+        notes += mark_stuck(table, name, flags)
+    _check_turn_rate(table)
     return (flags if flags.any() else None), notes
 
 
@@ -70,31 +78,54 @@ def _check_whole(table: ChannelTable) -> None:
     for channels in (*TRIADS.values(), ATTITUDE):
         missing = [c for c in channels if c not in table.values]
         if 0 < len(missing) < len(channels):
-            raise InputError(
-                f"{', '.join(missing)} missing; {', '.join(channels)} come together or not at all", table.path
+            raise IngestError(
+                f"{', '.join(missing)} missing; {', '.join(channels)} come together or not at all",
+                table.path,
+                fault="missing_column",
             )
 
 
 def _check_times(table: ChannelTable) -> None:
     time = table.time_ns
     if len(time) < 2:
-        raise InputError(f"{len(time)} data rows; at least 2 are needed", table.path)
-    steps = np.diff(time)
-    back = np.flatnonzero(steps <= 0)
-    if back.size:
-        row = int(back[0]) + 1
-        what = "repeats" if steps[row - 1] == 0 else "goes back to"
-        raise InputError(
-            f"time {what} {time[row] / 1e9:.9g} s after {time[row - 1] / 1e9:.9g} s ({back.size} such samples); time "
-            "has to increase: a log that was restarted belongs in two files",
-            table.place(row),
-        )
+        raise IngestError(f"{len(time)} data rows; at least 2 are needed", table.path, fault="no_rows")
+    back = time[1:] <= time[:-1]
+    if back.any():
+        row = int(np.argmax(back)) + 1
+        raise time_error(time, table.place(row), row)
+
+
+def _check_rate(table: ChannelTable, checks: Checks) -> None:
+    if checks.rate_hz is None:
+        return
+    interval_us = float(np.median(np.diff(table.time_ns))) / 1e3
+    ratio = interval_us * checks.rate_hz / 1e6
+    if abs(ratio - 1.0) <= RATE_TOLERANCE:
+        return
+    unit = next((f"; the numbers look like {u}" for f, u in _OTHER_UNITS if abs(ratio * f - 1.0) <= RATE_TOLERANCE), "")
+    raise IngestError(
+        f"the median interval is {interval_us:g} us, and ingest.checks.rate_hz of {checks.rate_hz:g} Hz asks for "
+        f"{1e6 / checks.rate_hz:g} us{unit}",
+        table.path,
+        fault="wrong_rate",
+        hint="correct the unit of the time or the rate",
+    )
+
+
+_OTHER_UNITS = (
+    (1e-3, "times of a unit a thousand times shorter"),
+    (1e3, "times of a unit a thousand times longer"),
+    (1e-6, "times of a unit a million times shorter"),
+    (1e6, "times of a unit a million times longer"),
+    (1e-9, "ns"),
+)
 
 
 def _check_force(table: ChannelTable) -> None:
     if "accel_x" not in table.values:
         return
-    squares = sum(table.values[c] ** 2 for c in TRIADS["accelerometer"])
+    stride = -(-len(table.time_ns) // ENOUGH)
+    squares = sum(table.values[c][::stride] ** 2 for c in TRIADS["accelerometer"])
     median = float(np.sqrt(np.median(squares)))
     low, high = FORCE_RANGE_G
     if low <= median <= high:
@@ -105,10 +136,11 @@ def _check_force(table: ChannelTable) -> None:
             hint = f"the numbers look like {unit}"
     if median > 1500.0:
         hint = "the numbers look like raw counts, which need counts_per_unit"
-    raise InputError(
+    raise IngestError(
         f"median specific force is {median:.4g} g, and a log of rests and turns has about 1 g (allowed {low} to "
         f"{high}): {hint}; correct the units in ingest.csv.columns",
         table.path,
+        fault="implausible_force",
     )
 
 
@@ -119,65 +151,77 @@ def _check_attitude(table: ChannelTable) -> None:
     wrong = np.flatnonzero(np.abs(norm - 1.0) > QUATERNION_TOLERANCE)
     if wrong.size:
         row = int(wrong[0])
-        raise InputError(
+        raise IngestError(
             f"the table's quaternion has the length {norm[row]:.4g} at {table.time_ns[row] / 1e9:.9g} s "
             f"({wrong.size} such samples); 1 is expected",
             table.place(row),
+            fault="bad_attitude",
         )
 
 
-def _mark_gaps(table: ChannelTable, flags: NDArray[np.uint16]) -> list[Note]:
-    steps = np.diff(table.time_ns)
-    median = float(np.median(steps))
-    rows = np.flatnonzero(steps > GAP_INTERVALS * median) + 1
-    if rows.size == 0:
-        return []
-    flags[rows] |= GAP
-    lengths = steps[rows - 1]
-    lost = float(np.sum(lengths - median)) / float(table.time_ns[-1] - table.time_ns[0])
-    detail = (
-        f"gaps longer than {GAP_INTERVALS} times the median interval of {median / 1e6:.6g} ms; "
-        f"the longest lasts {lengths.max() / 1e9:.6g} s, {lost:.3%} of the time is missing"
-    )
-    return [_note("N-GAP", table, rows, detail)]
+def _check_turn_rate(table: ChannelTable) -> None:
+    """Refuse rates that are a radian's number of degrees off those of the table, or of the way gravity turns."""
+    if "gyro_x" not in table.values:
+        return
+    stride = -(-len(table.time_ns) // ENOUGH)
+    if "table_rate" in table.values:
+        rate = np.abs(table.values["table_rate"][::stride])
+        turning = rate > max(TURNING_DPS, 0.3 * float(rate.max()))
+        if turning.sum() < 20:
+            return
+        size = np.sqrt(sum(table.values[c][::stride][turning] ** 2 for c in TRIADS["gyroscope"]))
+        ratio = float(np.median(size / rate[turning]))
+        seen = f"while the table turns the angular rate is {ratio:.3g} times the table's"
+    else:
+        from pipeline.formats.turn_evidence import declared_scale  # noqa: PLC0415  (imported where there is no table)
 
-
-def _mark_clipped(table: ChannelTable, sensor: str, full_scale: float, flags: NDArray[np.uint16]) -> list[Note]:
-    notes = []
-    for channel in TRIADS[sensor]:
-        if channel not in table.values:
-            continue
-        size = np.abs(table.values[channel])
-        if size.max() > FULL_SCALE_MARGIN * full_scale:
-            row = int(np.argmax(size > FULL_SCALE_MARGIN * full_scale))
-            raise InputError(
-                f"{channel} is {table.values[channel][row]:.6g} {UNIT_NAMES[sensor]} at {table.time_ns[row] / 1e9:.9g} "
-                f"s, beyond {FULL_SCALE_MARGIN} times the full scale of {full_scale:g}; correct the column's unit or "
-                f"sensor.{sensor}.full_scale",
-                table.place(row),
+        found = declared_scale(table)
+        if found is None:
+            return
+        ratio, seen = found
+    for factor, what in ((1 / DEGREES, "rad/s that were declared as deg/s"), (DEGREES, "deg/s declared as rad/s")):
+        if 0.7 < ratio / factor < 1.4:
+            raise IngestError(
+                f"{seen}: the numbers look like {what}",
+                table.path,
+                fault="implausible_rate",
+                hint="correct the unit of gyro_x, gyro_y and gyro_z in ingest.csv.columns",
             )
-        count = abs(table.encodings[channel].scale) if channel in table.encodings else 0.0
-        rows = np.flatnonzero(_at_rail(size, full_scale, count))
-        if rows.size:
-            flags[rows] |= CLIPPED
-            detail = f"{channel} reaches the full scale of {full_scale:g} {UNIT_NAMES[sensor]} and may be clipped"
-            notes.append(_note("N-CLIP", table, rows, detail))
-    return notes
 
 
-def _at_rail(size: NDArray[np.float64], full_scale: float, count: float) -> NDArray[np.bool_]:
-    """Return which sizes lie at full scale, or at a largest value beyond it that occurs more than once.
+def check_axis(table: ChannelTable, axis: str | None) -> None:
+    """Refuse a turn about another axis than the procedure says, or the other way round.
 
-    Many sensors read on past their nominal range (131 counts per deg/s reach 250.1 deg/s), some by a fifth.
+    The cosine between the readings of a body axis and the table's rate tells which one turned:
+
+        c_i = sum(w_i r) / sqrt(sum(w_i^2) sum(r^2))
+
+    Parameters
+    ----------
+    table : ChannelTable
+        In body axes.
+    axis : str or None
+        Body axis that the table turned about.
     """
-    clipped = (size >= full_scale - max(1.5 * count, RAIL * full_scale)) & (size <= (1.0 + BEYOND) * full_scale)
-    largest = size.max()
-    if largest > full_scale:
-        at_largest = size >= largest - 1.5 * count
-        if at_largest.sum() > 1:
-            clipped |= at_largest
-    return np.asarray(clipped)
-
-
-def _note(code: str, table: ChannelTable, rows: NDArray[np.intp], detail: str) -> Note:
-    return Note(code, int(rows.size), table.line_of(int(rows[0])), table.line_of(int(rows[-1])), detail)
+    if axis is None or "table_rate" not in table.values or "gyro_x" not in table.values:
+        return
+    rate = table.values["table_rate"]
+    power = float(rate @ rate)
+    if power < len(rate) * TURNING_DPS**2 / 100:
+        return
+    gyro = {c[-1]: table.values[c] for c in TRIADS["gyroscope"]}
+    alike = {a: float(w @ rate) / np.sqrt(max(float(w @ w), 1e-30) * power) for a, w in gyro.items()}
+    other = max(alike, key=lambda a: abs(alike[a]))
+    listed = ", ".join(f"{a} {c:+.2f}" for a, c in alike.items())
+    if alike[axis] < -ALIKE:
+        problem = f"the readings about {axis} have the sign opposite to the table's rate"
+    elif abs(alike[axis]) < UNLIKE and abs(alike[other]) > ALIKE:
+        problem = f"the table is said to turn about {axis}, and {other} turns with it"
+    else:
+        return
+    raise IngestError(
+        f"{problem} (correlation with the table's rate: {listed})",
+        table.path,
+        fault="wrong_axis",
+        hint="correct sensor.axis_map, the columns, or the recording's axis in the procedure",
+    )

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from pipeline.formats.channel_table import ChannelTable
     from pipeline.formats.checks import Checks
 
+AXIS_MAP = ("+x", "+y", "+z")
 EPOCH_AFTER_NS = 100_000_000 * 1_000_000_000  # 3 years: no sensor has been on for longer
 
 
@@ -84,6 +85,10 @@ def read_table(paths: Sequence[Path], ingest: Mapping[str, Any]) -> ChannelTable
         from pipeline.formats.mcap_settings import mcap_format  # noqa: PLC0415
 
         return read_mcap(paths[0], mcap_format(ingest))
+    if paths[0].suffix == ".gcsv":
+        from pipeline.formats.gcsv import read_gcsv  # noqa: PLC0415
+
+        return read_gcsv(paths[0], checks_of(ingest))
     from pipeline.formats.csv_read import read_csv  # noqa: PLC0415
     from pipeline.formats.csv_settings import csv_formats  # noqa: PLC0415
 
@@ -127,7 +132,16 @@ def to_recording(
     checks : Checks
     """
     flags, notes = examine(table, sensor, checks)
-    table = to_body_axes(table, sensor.get("axis_map") or ("+x", "+y", "+z"))
+    axis_map = tuple(sensor.get("axis_map") or AXIS_MAP)
+    stated = table.source.get("gcsv", {}).get("orientation", "XYZ")
+    if stated != "XYZ" and axis_map != AXIS_MAP:
+        raise IngestError(
+            f"the file states its orientation ({stated}) and sensor.axis_map is [{', '.join(axis_map)}]",
+            table.path,
+            fault="gcsv",
+            hint="one of them has to go: write orientation,XYZ in the file, or set sensor.axis_map=[+x,+y,+z]",
+        )
+    table = to_body_axes(table, axis_map)
     check_axis(table, entry.get("axis"))
     values = table.values
     return Recording(

@@ -8,29 +8,35 @@ the raw bytes cost less than reading the file.
 from __future__ import annotations
 
 import hashlib
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from pipeline.errors import InputError
+from pipeline.formats.ingest_error import IngestError
 from pipeline.records import Note
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
 BOM = b"\xef\xbb\xbf"
+UTF_16 = "UTF-16 text: save it as UTF-8"
 # First bytes of files that carry a wrong name, and what to do.
 FOREIGN = {
     b"\x89MCAP": "an MCAP file: give it the suffix .mcap",
     b"\x1f\x8b": "a gzip file: decompress it first",
     b"\x28\xb5\x2f\xfd": "a zstd file: decompress it first",
+    b"BZh": "a bzip2 file: decompress it first",
+    b"\xfd7zXZ": "an xz file: decompress it first",
     b"PK\x03\x04": "a zip or Excel file: export it as text",
+    b"\xd0\xcf\x11\xe0": "an Excel file of the old kind: export it as text",
     b"SQLite format 3": "an SQLite database (a ROS 2 bag of the old kind): convert it to MCAP",
     b"#ROSBAG": "a ROS 1 bag: convert it to MCAP",
     b"\x89HDF": "an HDF5 or MATLAB file: export it as text",
     b"MATLAB 5.0": "a MATLAB file: export it as text",
     b"PAR1": "a Parquet file: export it as text",
-    b"\xff\xfe": "UTF-16 text: save it as UTF-8",
-    b"\xfe\xff": "UTF-16 text: save it as UTF-8",
+    b"\xff\xfe": UTF_16,
+    b"\xfe\xff": UTF_16,
 }
 
 
@@ -54,35 +60,62 @@ class TextFile:
     notes: tuple[Note, ...]
 
 
+@contextmanager
+def unchanged(path: Path) -> Iterator[None]:
+    """Refuse a file that cannot be opened, is empty, or is written to while it is read."""
+    try:
+        before = path.stat()
+        if before.st_size == 0 and path.is_file():
+            raise IngestError("the file is empty (0 bytes)", str(path), fault="empty")
+        yield
+        after = path.stat()
+    except OSError as error:
+        raise IngestError(f"cannot be read: {error.strerror or error}", str(path), fault="unreadable") from error
+    if (before.st_size, before.st_mtime_ns, before.st_ino) != (after.st_size, after.st_mtime_ns, after.st_ino):
+        raise IngestError(
+            f"the file changed while it was read ({before.st_size} bytes, then {after.st_size})",
+            str(path),
+            fault="changed",
+            hint="is it still being recorded or copied? Run again when that is done",
+        )
+
+
 def read_bytes(path: Path) -> bytes:
     """Return a file's bytes, or say why they cannot be had."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror or error}", str(path)) from error
-    if not data:
-        raise InputError("the file is empty (0 bytes)", str(path))
-    return data
+    with unchanged(path):
+        return path.read_bytes()
 
 
-def load_text(path: Path) -> TextFile:
+def refuse_foreign(start: bytes, path: str) -> None:
+    """Refuse a file whose first bytes are those of another kind of file."""
+    for magic, what in FOREIGN.items():
+        if start.startswith(magic):
+            fault = "utf16" if what == UTF_16 else "foreign"
+            raise IngestError(f"not a text log but {what}", path, fault=fault)
+
+
+def load_text(path: Path, *, keep_nul: bool = False) -> TextFile:
     """Read a text log and make its line ends uniform.
+
+    Parameters
+    ----------
+    path : Path
+    keep_nul : bool
+        Whether lines with NUL bytes inside are kept, to be dropped with other bad rows.
 
     Raises
     ------
-    InputError
+    IngestError
         If it cannot be read, is empty, holds NUL bytes or is no UTF-8 text.
     """
     raw = read_bytes(path)
-    for start, what in FOREIGN.items():
-        if raw.startswith(start):
-            raise InputError(f"not a text log but {what}", str(path))
+    refuse_foreign(raw[:16], str(path))
     notes: list[Note] = []
     data = raw
     if data.startswith(BOM):
         data = data[len(BOM) :]
         notes.append(Note("N-BOM", 1, 1, 1, "a byte order mark before the first line was skipped"))
-    data = _without_nul(data, str(path), notes)
+    data = _without_nul(data, str(path), notes, keep_nul=keep_nul)
     _check_utf8(data, str(path))
     if b"\r" in data:
         data = _uniform_line_ends(data, notes)
@@ -91,21 +124,26 @@ def load_text(path: Path) -> TextFile:
     return TextFile(str(path), data, hashlib.sha256(raw).hexdigest(), tuple(notes))
 
 
-def _without_nul(data: bytes, path: str, notes: list[Note]) -> bytes:
+def _without_nul(data: bytes, path: str, notes: list[Note], *, keep_nul: bool) -> bytes:
     if b"\0" not in data:
         return data
     kept = data.rstrip(b"\0")
     position = kept.find(b"\0")
-    if position >= 0 or not kept:
+    if position >= 0 and data[1::2].count(0) > len(data) // 8 > data[::2].count(0):
+        raise IngestError(f"not a text log but {UTF_16}", path, fault="utf16")
+    if not kept or (position >= 0 and not keep_nul):
         line = data.count(b"\n", 0, max(position, 0)) + 1
         count = kept.count(b"\0") if kept else len(data)
-        raise InputError(
-            f"{count} NUL bytes, the first at byte {max(position, 0)}: data that a memory card lost, or UTF-16 text; "
-            "cut the file before them",
+        raise IngestError(
+            f"{count} NUL bytes, the first at byte {max(position, 0)}: data that a memory card lost, or UTF-16 text",
             f"{path}:{line}",
+            fault="nul",
+            hint="cut the file before them, or set ingest.csv.bad_rows=drop to leave a gap in their place",
         )
-    line = kept.count(b"\n") + 1
-    notes.append(Note("N-NULTAIL", len(data) - len(kept), line, line, "NUL bytes at the end of the file were cut off"))
+    if len(kept) < len(data):
+        line = kept.count(b"\n") + 1
+        detail = "NUL bytes at the end of the file were cut off"
+        notes.append(Note("N-NULTAIL", len(data) - len(kept), line, line, detail))
     return kept
 
 
@@ -116,8 +154,10 @@ def _check_utf8(data: bytes, path: str) -> None:
         data.decode("utf-8")
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
-        raise InputError(
-            f"byte {error.start} (0x{data[error.start]:02x}) is not UTF-8; save the file as UTF-8", f"{path}:{line}"
+        raise IngestError(
+            f"byte {error.start} (0x{data[error.start]:02x}) is not UTF-8; save the file as UTF-8",
+            f"{path}:{line}",
+            fault="not_utf8",
         ) from error
 
 
@@ -131,7 +171,7 @@ def _uniform_line_ends(data: bytes, notes: list[Note]) -> bytes:
 
 def _without_open_line(data: bytes, notes: list[Note]) -> bytes:
     end = data.rfind(b"\n") + 1
-    line, text = data.count(b"\n") + 1, data[end:].decode("utf-8")
+    line, text = data.count(b"\n") + 1, data[end:].decode("utf-8", "replace")
     detail = f"the last line does not end in a newline and may be cut, so it was dropped: {text[:200]!r}"
     notes.append(Note("N-TAIL", 1, line, line, detail))
     return data[:end]

@@ -38,6 +38,7 @@ _TIME = {"s": (1e9, 1.0), "ms": (1e6, 1.0), "us": (1e3, 1.0), "ns": (1.0, 1.0)}
 
 UNITS: dict[str, dict[str, tuple[float, float]]] = {
     "time": _TIME,
+    "table_time": _TIME,
     **dict.fromkeys(ACCELEROMETER, _FORCE),
     **dict.fromkeys(GYROSCOPE, _RATE),
     "temperature": _TEMPERATURE,

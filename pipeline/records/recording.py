@@ -34,6 +34,8 @@ class Note:
         First and last line of the file concerned, counted from 1; 0 where lines do not apply.
     detail : str
         One sentence.
+    start_s, end_s : float or None, s
+        Times of the first and the last sample concerned, in the clock of the file; None where none is.
     """
 
     code: str
@@ -41,6 +43,8 @@ class Note:
     first: int
     last: int
     detail: str
+    start_s: float | None = None
+    end_s: float | None = None
 
 
 @dataclass(frozen=True)

@@ -49,6 +49,7 @@ def test_any_values_and_times_come_back_bit_for_bit(
     force[np.linalg.norm(force, axis=1) > 3.0] = [0.0, 0.0, 1.0]
     times = start + np.concatenate([[0], np.cumsum(steps)]).astype(np.int64)
     written = Recording("accel_x", "accelerometer", "x", times, accelerometer=force, gyroscope=values[:, 3:])
+    canonical["checks"] = {"missing_time": 1.0}
     write_canonical_csv(tmp_path / "accel_x.csv", written)
     read = replace(read_back(tmp_path, canonical), flags=None)  # irregular steps are gaps
     assert_same_bits(read, written)
@@ -174,6 +175,7 @@ def test_gap_is_marked_and_measured(tmp_path: Path, canonical: dict[str, Any]) -
     keep = np.ones(100, bool)
     keep[40:60] = False
     write_canonical_csv(tmp_path / "accel_x.csv", whole.select(keep))
+    canonical["checks"] = {"missing_time": 0.25}
     read = read_back(tmp_path, canonical)
     assert read.flags is not None
     assert np.flatnonzero(read.flags).tolist() == [40]

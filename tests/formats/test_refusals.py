@@ -154,7 +154,7 @@ def test_missing_files_are_named_together_with_what_was_tried(tmp_path: Path, ca
     write_canonical_csv(tmp_path / "b.csv", make_recording())
     with pytest.raises(MissingInputError) as caught:
         read_recordings(procedure("a", "b", "c", optional=("d",)), canonical, SENSOR, tmp_path)
-    assert caught.value.message == "missing recordings: a (tried a.csv, or a.mcap); c (tried c.csv, or c.mcap)"
+    assert caught.value.message == "missing recordings: a (tried a.csv, or a.gcsv, or a.mcap); c (tried c.csv, or c.gcsv, or c.mcap)"
     assert caught.value.file == str(tmp_path)
 
 
@@ -255,7 +255,8 @@ def change(ingest: dict[str, Any], key: str, value: Any) -> None:
         ("csv/header", "yes", "header is 'yes'; it is true or false"),
         ("csv/header", False, "it is an index from 0, for header is false"),
         ("csv/skip_lines", -1, "skip_lines is -1; it is a number of lines"),
-        ("csv/decimal", ",", "csv.decimal is unknown"),
+        ("csv/decimal", ";", "csv.decimal is ';'; it is '.' or ','"),
+        ("csv/decimals", ",", "csv.decimals is unknown; did you mean decimal?"),
         ("mcap/imu_topic", 3, "imu_topic is 3; it is a name"),
         ("mcap/topic", "/imu", "mcap.topic is unknown"),
         ("csv/columns", [], "describes neither an accelerometer nor a gyroscope"),
