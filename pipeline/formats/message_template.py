@@ -193,9 +193,15 @@ class _SampleWalk:
         self.template.places[path] = Place(self.at, self.order + code, count)
         self.take(size * many)
 
+    def count(self) -> None:
+        self.steps += 1
+        if self.steps > MOST_FIELDS:
+            raise ValueError(f"it has more than {MOST_FIELDS} fields")
+
     def message(self, key: str, prefix: str, depth: int) -> None:
         if depth > DEEPEST:
             raise ValueError(f"{key} is defined by itself")
+        self.count()
         fields = self.definitions[key]
         if not fields and self.cdr:
             self.take(1)  # an empty message is sent as one byte
@@ -203,9 +209,7 @@ class _SampleWalk:
             self.field(item, prefix + item.name, depth)
 
     def field(self, item: Field, path: str, depth: int) -> None:
-        self.steps += 1
-        if self.steps > MOST_FIELDS:
-            raise ValueError(f"it has more than {MOST_FIELDS} fields")
+        self.count()
         count = self.length() if item.sequence else item.count
         if count is not None and count > len(self.sample):
             raise ValueError(f"{path} claims {count} elements in a message of {len(self.sample)} bytes")

@@ -32,7 +32,6 @@ def test_damage_never_changes_a_value_in_silence(tmp_path: Path, recorder: str, 
     assert bits.ours["wrong"] == ends.ours["wrong"] == 0
     assert bits.ours["refused"] > flipped / 2
     assert ends.ours["refused"] == ends.ours.total() > cut / 2
-    assert bits.oracle["wrong"] == 0  # the oracle is one: it never reads wrong either
 
 
 @pytest.mark.parametrize("recorder", ["zstd, data checksum", "lz4", "uncompressed"])
