@@ -26,7 +26,7 @@ from pipeline.formats.mcap_settings import TIME
 from pipeline.formats.mcap_walk import Walk
 from pipeline.formats.message_definition import short_name
 from pipeline.formats.ros2 import IMU, JOINT_STATE, QUATERNION_STAMPED, TEMPERATURE
-from pipeline.formats.text_file import FOREIGN
+from pipeline.formats.text_file import FOREIGN, unchanged
 from pipeline.formats.units import ACCELEROMETER, ATTITUDE, COUNTS, GYROSCOPE, decode, to_house_unit
 from pipeline.records import Encoding, Note
 
@@ -54,11 +54,8 @@ def read_mcap(path: Path, settings: McapFormat) -> ChannelTable:
     IngestError
         If the file is damaged or incomplete, has no or several Imu topics, or its times cannot be.
     """
-    try:
-        with path.open("rb") as stream:
-            return _Reader(stream, str(path), settings).table()
-    except OSError as error:
-        raise IngestError(f"cannot be read: {error.strerror or error}", str(path), fault="unreadable") from error
+    with unchanged(path), path.open("rb") as stream:
+        return _Reader(stream, str(path), settings).table()
 
 
 class _Reader:
