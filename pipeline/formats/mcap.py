@@ -17,21 +17,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.formats.channel_table import ChannelTable
-from pipeline.formats.field_path import ONLY, FieldPath
 from pipeline.formats.ingest_error import IngestError
-from pipeline.formats.mcap_decode import Wanted
-from pipeline.formats.mcap_records import MAGIC
-from pipeline.formats.mcap_series import ABSENT, Gatherer, Series
+from pipeline.formats.mcap_kinds import ABSENT, SHORT, TABLE_UNITS, VECTORS, topic_of, wanted_by_map, wanted_of
+from pipeline.formats.mcap_series import Gatherer, Series, check_finite
 from pipeline.formats.mcap_settings import TIME
 from pipeline.formats.mcap_walk import Walk
 from pipeline.formats.message_definition import short_name
+from pipeline.formats.record_stream import check_magic
 from pipeline.formats.ros2 import IMU, JOINT_STATE, QUATERNION_STAMPED, TEMPERATURE
-from pipeline.formats.text_file import FOREIGN, unchanged
-from pipeline.formats.units import ACCELEROMETER, ATTITUDE, COUNTS, GYROSCOPE, decode, to_house_unit
+from pipeline.formats.text_file import unchanged
+from pipeline.formats.units import ACCELEROMETER, COUNTS, GYROSCOPE, decode, to_house_unit
 from pipeline.records import Encoding, Note
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
     from pathlib import Path
     from typing import BinaryIO
 
@@ -40,10 +38,7 @@ if TYPE_CHECKING:
     from pipeline.formats.mcap_container import Container
     from pipeline.formats.mcap_settings import MappedField, McapFormat
 
-SHORT = {short_name(kind): kind for kind in (IMU, TEMPERATURE, JOINT_STATE, QUATERNION_STAMPED)}
 MAP = "map"
-VECTORS = {"linear_acceleration": (ACCELEROMETER, "m/s^2"), "angular_velocity": (GYROSCOPE, "rad/s")}
-TABLE_UNITS = {"table_angle": "rad", "table_rate": "rad/s"}
 
 
 def read_mcap(path: Path, settings: McapFormat) -> ChannelTable:
@@ -62,7 +57,7 @@ class _Reader:
     """One file on its way to channels."""
 
     def __init__(self, stream: BinaryIO, path: str, settings: McapFormat) -> None:
-        _check_magic(stream.read(64), path)
+        check_magic(stream.read(64), path)
         self.path, self.settings = path, settings
         self.walk = Walk(stream, path, allow_truncated=settings.allow_truncated)
         self.gatherers: dict[str, Gatherer] = {}
@@ -79,15 +74,16 @@ class _Reader:
                 gatherer.read(rows, channel, schema)
         self._note_container(self.walk.found)
         base, values = self._mapped() if self.settings.topics else self._imu()
-        for kind, topic, read in (
-            (TEMPERATURE, self.settings.temperature_topic, self._temperature),
-            (JOINT_STATE, self.settings.joint_topic, self._table_values),
-            (QUATERNION_STAMPED, self.settings.attitude_topic, self._table_values),
+        for kind, read in (
+            (TEMPERATURE, self._temperature),
+            (JOINT_STATE, self._table_values),
+            (QUATERNION_STAMPED, self._table_values),
         ):
+            topic = topic_of(kind, self.settings)
             series = self._only(kind, topic, required=topic is not None)
             if series is not None:
                 values |= {n: v for n, v in read(series, base).items() if n not in values}
-        _check_finite(values, base, self.path)
+        check_finite(values, base, self.path)
         self._note_ignored()
         time = base.time_ns[base.time_ns <= self.end_ns]
         values = {c: v[: len(time)] for c, v in values.items()}
@@ -98,43 +94,17 @@ class _Reader:
         """Return what takes in the messages of a topic; None if none are wanted."""
         if topic not in self.gatherers:
             if topic in self.settings.topics:
-                self.gatherers[topic] = Gatherer(topic, MAP, self._wanted_by_map(topic), self.path)
+                self.gatherers[topic] = Gatherer(topic, MAP, wanted_by_map(topic, self.settings), self.path)
             else:
                 kind = SHORT.get(short_name(schema), "")
-                chosen = {
-                    IMU: self.settings.imu_topic,
-                    TEMPERATURE: self.settings.temperature_topic,
-                    JOINT_STATE: self.settings.joint_topic,
-                    QUATERNION_STAMPED: self.settings.attitude_topic,
-                }
-                if not kind or chosen[kind] not in (None, topic) or (kind == IMU and self.settings.topics):
+                if (
+                    not kind
+                    or topic_of(kind, self.settings) not in (None, topic)
+                    or (kind == IMU and self.settings.topics)
+                ):
                     return None
-                self.gatherers[topic] = Gatherer(topic, kind, self._wanted(kind), self.path)
+                self.gatherers[topic] = Gatherer(topic, kind, wanted_of(kind, self.settings), self.path)
         return self.gatherers[topic]
-
-    def _wanted(self, kind: str) -> Wanted:
-        paths: dict[str, FieldPath] = {}
-        if kind == IMU:
-            for vector, (channels, _unit) in VECTORS.items():
-                paths |= {c: FieldPath.parse(f"{vector}.{a}") for c, a in zip(channels, "xyz", strict=True)}
-                paths[vector + ABSENT] = FieldPath.parse(f"{vector}_covariance[0]")
-        elif kind == TEMPERATURE:
-            paths["temperature"] = FieldPath.parse("temperature")
-        elif kind == JOINT_STATE:
-            joint = self.settings.joint or ONLY
-            which = "the only joint" if joint == ONLY else f"joint {joint}"
-            paths["table_angle"] = FieldPath(f"position of {which}", "position", joint)
-            paths["table_rate"] = FieldPath(f"velocity of {which}", "velocity", joint)
-        else:
-            paths = {c: FieldPath.parse(f"quaternion.{a}") for c, a in zip(ATTITUDE, "wxyz", strict=True)}
-        time = FieldPath.parse("header.stamp") if self.settings.time_source == "header" else None
-        return Wanted(paths, time)
-
-    def _wanted_by_map(self, topic: str) -> Wanted:
-        fields = self.settings.topics[topic]
-        time = fields.get(TIME) if self.settings.time_source == "header" else None
-        paths = {c: f.path for c, f in fields.items() if c != TIME}
-        return Wanted(paths, time.path if time else None, time.unit if time else "ns")
 
     def _only(self, kind: str, topic: str | None, *, required: bool) -> Series | None:
         """Return the messages of the named topic, or of the only topic of a type."""
@@ -283,33 +253,3 @@ class _Reader:
         ignored = [t for t in self._topics() if t.rpartition(" (")[0] not in self.gatherers]
         if ignored:
             self.notes.append(Note("N-IGNORED", len(ignored), 0, 0, f"topics not used: {', '.join(ignored)}"))
-
-
-def _check_magic(start: bytes, path: str) -> None:
-    """Say what a file is that is no MCAP file."""
-    if start.startswith(MAGIC):
-        return
-    if not start:
-        raise IngestError("the file is empty (0 bytes)", path, fault="not_mcap")
-    if MAGIC.startswith(start):
-        raise IngestError(f"truncated: the file has only {len(start)} bytes", path, fault="truncated")
-    what = next((what for known, what in FOREIGN.items() if start.startswith(known) and known not in MAGIC), "")
-    if not what and not start.strip(b"\0"):
-        what = "zeros: data that a memory card lost"
-    if not what:
-        what = f"it starts with {start[:8].decode('ascii', 'replace')!r}"
-        what += "; a text log needs the suffix .csv" if start.isascii() and b"\0" not in start else ""
-    raise IngestError(f"not an MCAP file: {what}", path, fault="not_mcap", offset=0)
-
-
-def _check_finite(values: Mapping[str, NDArray[np.float64]], base: Series, path: str) -> None:
-    for channel, numbers in values.items():
-        wrong = np.flatnonzero(~np.isfinite(numbers))
-        if wrong.size:
-            row = int(wrong[0])
-            raise IngestError(
-                f"{channel} is {numbers[row]} at {base.time_ns[row] / 1e9:.9g} s ({wrong.size} such samples); finite "
-                "numbers are expected",
-                path,
-                fault="bad_message",
-            )

@@ -13,7 +13,6 @@ the official decoder writes Python code from the definition and runs it, and a l
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field
 from decimal import Decimal
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -24,6 +23,7 @@ from pipeline.formats.field_path import STAMPS, FieldPath, number_at, place_of, 
 from pipeline.formats.ingest_error import IngestError
 from pipeline.formats.message_definition import ROS1_TIME, ROS2_TIME, parse_definition, short_name
 from pipeline.formats.message_template import Template, find_template
+from pipeline.formats.official_decoders import object_decoder, ros2_decoder
 from pipeline.formats.stamps import nanoseconds, of_number, of_pair
 
 if TYPE_CHECKING:
@@ -116,7 +116,7 @@ class ChannelDecoder:
         try:
             if self.ros and schema is not None:
                 self.definitions = parse_definition(schema.name, schema.data.decode("utf-8"), given)
-            self._official = None if self.ros else _object_decoder(channel, schema)
+            self._official = None if self.ros else object_decoder(channel, schema)
         except Exception as error:
             raise IngestError(
                 f"topic {self.topic}: its message definition cannot be read ({error})", path, fault="unsupported"
@@ -186,7 +186,7 @@ class ChannelDecoder:
             if self.ros == "ros1":
                 return _of_template(template, self.wanted)
             if self._official is None:
-                self._official = _ros2_decoder(self.schema)
+                self._official = ros2_decoder(self.schema)
         assert self._official is not None  # noqa: S101  (made above, or in the constructor)
         message = self._official(payload)
         numbers = {name: number_at(path, message) for name, path in self.wanted.values.items()}
@@ -241,24 +241,3 @@ def _of_template(template: Template, wanted: Wanted) -> tuple[dict[str, float | 
     if len(moment) == 2:
         return numbers, nanoseconds((int(moment[0]), int(moment[1])), wanted.time_unit)
     return numbers, nanoseconds(moment[0] if isinstance(moment[0], int) else Decimal(moment[0]), wanted.time_unit)
-
-
-def _ros2_decoder(schema: Schema | None) -> Callable[[bytes], Any]:
-    from mcap_ros2.decoder import DecoderFactory  # noqa: PLC0415  (few logs need it)
-
-    decoder = DecoderFactory().decoder_for("cdr", schema)
-    if decoder is None:
-        raise ValueError("the official decoder does not know its definition")
-    return decoder
-
-
-def _object_decoder(channel: Channel, schema: Schema | None) -> Callable[[bytes], Any]:
-    """Return the decoder of protobuf or JSON messages."""
-    if channel.message_encoding == "json":
-        return lambda payload: json.loads(payload.decode("utf-8"), parse_float=Decimal)
-    from mcap_protobuf.decoder import DecoderFactory  # noqa: PLC0415  (few logs need it)
-
-    decoder = DecoderFactory().decoder_for("protobuf", schema)
-    if decoder is None:
-        raise ValueError("the official decoder does not know it")
-    return decoder

@@ -9,18 +9,19 @@ import numpy as np
 
 from pipeline.formats.ingest_error import IngestError
 from pipeline.formats.mcap_decode import ChannelDecoder, Wanted
+from pipeline.formats.mcap_kinds import ABSENT
 from pipeline.formats.stamps import check_fine, check_plausible, in_order
 from pipeline.records import Note
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from mcap.records import Channel, Schema
     from numpy.typing import NDArray
 
     from pipeline.formats.mcap_chunk import Rows
     from pipeline.formats.mcap_decode import Batch
     from pipeline.formats.mcap_settings import McapFormat
-
-ABSENT = "_absent"  # ends the name of a column that is -1 where a quantity is absent (sensor_msgs/Imu)
 
 
 @dataclass(frozen=True)
@@ -146,3 +147,17 @@ class Gatherer:
             )
         check_plausible(self.topic, time, recorded, settings.clock_difference_s, self.path)
         return time
+
+
+def check_finite(values: Mapping[str, NDArray[np.float64]], base: Series, path: str) -> None:
+    """Refuse values that are no numbers."""
+    for channel, numbers in values.items():
+        wrong = np.flatnonzero(~np.isfinite(numbers))
+        if wrong.size:
+            row = int(wrong[0])
+            raise IngestError(
+                f"{channel} is {numbers[row]} at {base.time_ns[row] / 1e9:.9g} s ({wrong.size} such samples); finite "
+                "numbers are expected",
+                path,
+                fault="bad_message",
+            )

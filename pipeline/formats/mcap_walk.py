@@ -10,19 +10,14 @@ proven only when the walk has ended without an error.
 
 from __future__ import annotations
 
-import hashlib
-import os
-import struct
 import zlib
-from io import BytesIO
 from typing import TYPE_CHECKING, BinaryIO
-
-from mcap.records import Message
 
 from pipeline.formats import mcap_records as records
 from pipeline.formats.ingest_error import IngestError
 from pipeline.formats.mcap_chunk import Run, split, unpack
 from pipeline.formats.mcap_container import Container
+from pipeline.formats.record_stream import RecordStream, Truncated
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -32,14 +27,9 @@ if TYPE_CHECKING:
 COPY_AGAIN = "copy the file again from its source"
 RUN_SIZE = 1 << 20  # bytes of messages outside chunks that are handed on at once
 CHUNK_TIMES = 8 + 8  # bytes of a chunk's earliest and latest time
-_RECORD = struct.Struct("<BQ")
 
 
-class _Truncated(Exception):  # noqa: N818  (becomes an IngestError, or a note)
-    """The file ends before its data do."""
-
-
-class Walk:
+class Walk(RecordStream):
     """One pass over a file.
 
     Parameters
@@ -58,15 +48,10 @@ class Walk:
     """
 
     def __init__(self, stream: BinaryIO, path: str, *, allow_truncated: bool = False) -> None:
-        self.stream, self.path, self.allow_truncated = stream, path, allow_truncated
-        self.size = stream.seek(0, os.SEEK_END)
-        stream.seek(0)
+        super().__init__(stream)
+        self.path, self.allow_truncated = path, allow_truncated
         self.found = Container()
-        self.position = 0
-        self._crc = 0
-        self._sha256 = hashlib.sha256()
         self._loose: list[bytes] = []  # messages outside chunks, not yet handed on
-        self._loose_size = 0
         self._chunk: Run | None = None  # not yet handed on, because its index may follow
         self._bare = False  # messages or definitions lie outside chunks
         self._unknown = False  # records of kinds that the format does not know (yet)
@@ -85,7 +70,7 @@ class Walk:
             try:
                 yield from self._data()
                 self._summary()
-            except _Truncated as error:
+            except Truncated as error:
                 yield from self._flush()
                 self._accept_truncation(str(error))
             self.found.check_complete()
@@ -101,52 +86,23 @@ class Walk:
                 offset=self.position,
                 hint=COPY_AGAIN,
             ) from error
-        self.found.sha256 = self._sha256.hexdigest()
-
-    def _take(self, size: int) -> bytes:
-        data = self.stream.read(size)
-        if len(data) < size:
-            raise _Truncated(f"it ends {size - len(data)} bytes before a record does")
-        return data
-
-    def _absorb(self, *parts: bytes) -> None:
-        """Count bytes as read, for the checksums of the data and of the file."""
-        for part in parts:
-            self._crc = zlib.crc32(part, self._crc)
-            self._sha256.update(part)
-            self.position += len(part)
-
-    def _record(self) -> tuple[int, bytes, bytes]:
-        """Return the next record: its kind, its first nine bytes, its content."""
-        if self.position + self._loose_size == self.size:
-            raise _Truncated("it ends after a complete record; the recorder did not close it")
-        head = self._take(records.RECORD_HEAD)
-        opcode, length = _RECORD.unpack(head)
-        left = self.size - self.position - self._loose_size - records.RECORD_HEAD
-        if length > left:
-            what = f"a record of kind {opcode} claims {length} bytes where {left} are left"
-            if opcode in records.IN_DATA | records.IN_SUMMARY:
-                raise _Truncated(what)
-            raise ValueError(what)
-        if opcode == 0:
-            raise ValueError("a record has the kind 0, which none has")
-        return opcode, head, self._take(length)
+        self.found.sha256 = self.sha256.hexdigest()
 
     def _data(self) -> Iterator[Rows]:
         """Read up to the end of the data section."""
-        magic = self._take(len(records.MAGIC))
+        magic = self.take(len(records.MAGIC))
         if magic != records.MAGIC:
             raise ValueError(f"it begins with {magic!r}, and an MCAP file with {records.MAGIC!r}")
-        self._absorb(magic)
+        self.absorb(magic)
         while True:
-            opcode, head, content = self._record()
+            opcode, head, content = self.record()
             if opcode == records.MESSAGE:
                 self._bare = True
                 if not self._loose:
                     yield from self._flush()
                 self._loose += [head, content]
-                self._loose_size += len(head) + len(content)
-                if self._loose_size >= RUN_SIZE:
+                self.waiting += len(head) + len(content)
+                if self.waiting >= RUN_SIZE:
                     yield from self._flush()
                 continue
             if opcode != records.MESSAGE_INDEX or self._loose:
@@ -154,7 +110,7 @@ class Walk:
             if opcode == records.DATA_END:
                 return self._end_data(head, content)
             self._take_in(opcode, content)
-            self._absorb(head, content)
+            self.absorb(head, content)
 
     def _take_in(self, opcode: int, content: bytes) -> None:
         """Read a record of the data section other than a message."""
@@ -206,8 +162,8 @@ class Walk:
             run, self._chunk = self._chunk, None
         elif self._loose:
             run = Run(b"".join(self._loose), self.position, "the messages outside chunks")
-            self._loose, self._loose_size = [], 0
-            self._absorb(bytes(run.data))
+            self._loose, self.waiting = [], 0
+            self.absorb(bytes(run.data))
         else:
             return
         others, found = split(run)
@@ -232,16 +188,16 @@ class Walk:
         crc = records.Cursor(content).number(4)
         if self.found.header is None:
             raise ValueError("no Header record")
-        if crc and crc != self._crc:
+        if crc and crc != self.crc:
             raise ValueError("the checksum of the data is wrong")
         self.found.verified = self._proven = bool(crc) or (self._chunks_checked and not self._bare)
-        self._absorb(head, content)
+        self.absorb(head, content)
         self._unknown &= not crc
 
     def _summary(self) -> None:
         """Read from the end of the data to the end of the file."""
         found, start, opcode = self.found, self.position, 0
-        self._crc = 0
+        self.crc = 0
         readers: dict[int, Callable[[bytes], None]] = {
             records.STATISTICS: self._take_statistics,
             records.CHUNK_INDEX: lambda c: found.chunk_index.append(int.from_bytes(c[16:24], "little")),
@@ -249,12 +205,13 @@ class Walk:
             records.CHANNEL: lambda c: self._define(records.CHANNEL, c),
         }
         while opcode != records.FOOTER:
-            opcode, head, content = self._record()
+            opcode, head, content = self.record()
             if opcode in records.IN_DATA - records.IN_SUMMARY:
                 raise ValueError(f"a record of kind {opcode} of the data stands after their end")
-            readers.get(opcode, lambda _content: None)(content)
+            if opcode in readers:
+                readers[opcode](content)
             if opcode != records.FOOTER:
-                self._absorb(head, content)
+                self.absorb(head, content)
         self._close(head, content, start)
 
     def _take_statistics(self, content: bytes) -> None:
@@ -262,16 +219,16 @@ class Walk:
 
     def _close(self, head: bytes, content: bytes, start: int) -> None:
         footer = records.footer(content)
-        crc = zlib.crc32(head + content[:16], self._crc)
+        crc = zlib.crc32(head + content[:16], self.crc)
         if footer.summary_crc and footer.summary_crc != crc:
             raise ValueError("the checksum of the summary is wrong")
         if footer.summary_start not in (0, start):
             raise ValueError(f"the summary begins at byte {start}, and the file says {footer.summary_start}")
-        self._absorb(head, content)
+        self.absorb(head, content)
         end = self.stream.read()
-        self._absorb(end)
+        self.absorb(end)
         if len(end) < len(records.MAGIC) and records.MAGIC.startswith(end):
-            raise _Truncated("its last bytes are missing")
+            raise Truncated("its last bytes are missing")
         if end != records.MAGIC:
             raise ValueError("the file does not end where its data end: truncated, or another file was appended")
         if self._unknown and self.found.statistics is None:
@@ -288,43 +245,9 @@ class Walk:
             found.truncated = facts
             self.stream.seek(self.position)
             for part in iter(lambda: self.stream.read(RUN_SIZE), b""):
-                self._sha256.update(part)
+                self.sha256.update(part)
             return
         hint = f"{COPY_AGAIN}, or set ingest.mcap.allow_truncated=true to use the complete chunks"
         if self.allow_truncated:
             hint = f"{COPY_AGAIN}: {unproven or 'no chunk is complete'}"
         raise IngestError(facts, self.path, fault="truncated", offset=self.size, hint=hint)
-
-
-def read_container(data: bytes, path: str, *, allow_truncated: bool = False) -> Container:
-    """Return all that an MCAP file holds, each message by itself.
-
-    Parameters
-    ----------
-    data : bytes
-        The whole file.
-    path : str
-        For messages.
-    allow_truncated : bool
-        Whether the complete chunks of a file without end are read.
-
-    Raises
-    ------
-    IngestError
-        If a byte is damaged or missing; never anything else.
-    """
-    walk = Walk(BytesIO(data), path, allow_truncated=allow_truncated)
-    for rows in walk.rows():
-        messages = walk.found.messages.setdefault(rows.channel, [])
-        columns = [rows.heads[n].tolist() for n in ("log_time", "publish_time", "sequence")]
-        for log_time, publish_time, sequence, payload in zip(*columns, rows.payloads(), strict=True):
-            messages.append(
-                Message(
-                    channel_id=rows.channel,
-                    log_time=log_time,
-                    data=payload,
-                    publish_time=publish_time,
-                    sequence=sequence,
-                )
-            )
-    return walk.found

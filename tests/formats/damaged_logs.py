@@ -14,8 +14,8 @@ from sample_logs import make_recording
 
 from pipeline.formats.ingest_error import IngestError
 from pipeline.formats.mcap import _Reader
+from pipeline.formats.mcap_messages import read_container
 from pipeline.formats.mcap_settings import McapFormat
-from pipeline.formats.mcap_walk import read_container
 from pipeline.formats.mcap_write import write_mcap
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Any
 
-from pipeline.formats.mcap_walk import read_container
+from pipeline.formats.mcap_messages import read_container
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -17,7 +17,8 @@ from sample_logs import SENSOR, channels, make_recording, procedure
 
 from pipeline.errors import InputError
 from pipeline.formats.csv_write import write_canonical_csv
-from pipeline.formats.mcap_walk import Walk, read_container
+from pipeline.formats.mcap_messages import read_container
+from pipeline.formats.mcap_walk import Walk
 from pipeline.formats.mcap_write import write_mcap
 from pipeline.formats.read import read_recordings
 from pipeline.formats.ros2 import DEFINITIONS, IMU, JOINT_STATE, TEMPERATURE
