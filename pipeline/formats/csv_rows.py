@@ -111,8 +111,9 @@ def _read_blocks(stream: BinaryIO, path: str, settings: CsvFormat) -> Rows | Non
     for text in lines:
         digest.update(text)
     names, columns, first, notes = found
-    store, rest = _Store(os.fstat(stream.fileno()).st_size), b""
-    while chunk := stream.read(BLOCK_BYTES):
+    size = os.fstat(stream.fileno()).st_size
+    store, rest = _Store(size), b""
+    while chunk := stream.read(min(BLOCK_BYTES, max(size - stream.tell(), 0))):
         digest.update(chunk)
         end = chunk.rfind(b"\n") + 1
         data, rest = rest + chunk[:end], chunk[end:] if end else rest + chunk

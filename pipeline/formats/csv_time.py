@@ -88,17 +88,18 @@ def whole_times(values: NDArray[np.float64], unit: str, tick_ns: Fraction | None
 def refuse_coarse(values: NDArray[np.float64], exact_ns: NDArray[np.int64], unit: str, name: str, path: str) -> None:
     """Refuse times that were stored as doubles too coarse for them, as nanoseconds since 1970 are.
 
-    Digits that only a double can have come back from one: the exact decimal of each equals its double's. Integers that
-    were never doubles do so by chance once in ``resolution`` cells.
+    Such times are the doubles themselves, or end in zeros where the digits of a double end.
     """
     scale = int(UNITS["time"][unit][0])
-    resolution = float(np.spacing(np.abs(values).max())) * scale
+    spacing = float(np.spacing(np.abs(values).max())) * scale
     step = float(np.median(np.abs(np.diff(exact_ns)))) if len(exact_ns) > 1 else 0.0
-    if resolution < 2 * scale or resolution <= COARSEST * step:
+    if spacing < 2 * scale or step == 0:
         return
-    if np.array_equal(exact_ns, values.astype(np.int64) * scale):
+    zeros = next(z for z in range(18, -1, -1) if not np.any(exact_ns % 10**z))
+    resolution = spacing if np.array_equal(exact_ns, values.astype(np.int64) * scale) else 10.0**zeros
+    if resolution >= spacing / 10 and resolution > COARSEST * step:
         raise IngestError(
-            f"the times in column {name} have passed through floating-point numbers, which are {resolution:g} ns apart "
+            f"the times in column {name} have passed through floating-point numbers, which are {spacing:g} ns apart "
             f"at {values[0]:.3g} {unit}: more than {COARSEST:.0%} of the median interval of {step:g} ns",
             path,
             fault="coarse_time",

@@ -12,10 +12,14 @@ where
     w, r   : angular rate read by the sensor and that of the table, deg/s
     a, b   : scale and bias of the reading, not used further
 
-``d`` is found by correlation on a grid, then all four by Gauss-Newton. The noise is correlated (the sensor's filter,
-the table's own vibration): its standard deviation is widened by ``sqrt((1 + q) / (1 - q))``, q its correlation from
-sample to sample. The table's channels are interpolated at the sensor's times; rows that its log does not cover are left
-out.
+``d`` is found by correlation on a grid, then all four by Gauss-Newton. What is left is no white noise: it is largest
+where the rate changes, which is where the clocks are seen, and correlated by the sensor's filter. So the covariance is
+taken from what the fit's blocks of a second say against each other,
+
+    C = (J'J)^-1 (sum_b s_b s_b') (J'J)^-1,   s_b = J_b' e_b
+
+where J are the derivatives and e the residuals. The table's channels are interpolated at the sensor's times; rows that
+its log does not cover are left out.
 """
 
 from __future__ import annotations
@@ -38,6 +42,8 @@ CHANNELS = ("table_angle", "table_rate", *ATTITUDE)
 GRID_S = 0.01
 MOST_GRID_POINTS = 1 << 18
 ALIKE = 0.9
+BLOCK_S = 1.0
+APART_S, AMBIGUOUS = 2.0, 0.98
 STEPS = 12
 
 
@@ -125,7 +131,14 @@ def fit_clocks(sensor: ChannelTable, log: ChannelTable) -> ClockFit:
     t, own = ((x.time_ns - x.time_ns[0]) / 1e9 for x in (sensor, log))
     w = np.sqrt(sum(sensor.values[c] ** 2 for c in TRIADS["gyroscope"]))
     r = np.abs(_table_rate(log, own))
-    offset = _coarse_offset(t, w, own, r)
+    offset, rival = _coarse_offset(t, w, own, r)
+    if rival > AMBIGUOUS:
+        raise IngestError(
+            "the motion repeats itself, and the table's log fits the gyroscope's at several times alike",
+            log.path,
+            fault="no_sync",
+            hint="begin or end the recording with a turn of its own",
+        )
     inside = (t + offset >= 0) & (t + offset <= own[-1])
     if inside.sum() < 20:
         raise _unlike(log, 0.0)
@@ -147,14 +160,17 @@ def _table_rate(log: ChannelTable, own: NDArray[np.float64]) -> NDArray[np.float
 
 def _coarse_offset(
     t: NDArray[np.float64], w: NDArray[np.float64], own: NDArray[np.float64], r: NDArray[np.float64]
-) -> float:
-    """Return the lag, in steps of a grid, at which the motions are most alike."""
+) -> tuple[float, float]:
+    """Return the lag at which the motions are most alike, s, and how alike they are elsewhere, relative to that."""
     step = max(GRID_S, (t[-1] + own[-1]) / MOST_GRID_POINTS)
     one, two = (np.interp(np.arange(0, x[-1], step), x, y) for x, y in ((t, w), (own, r)))
     size = len(one) + len(two)
     product = np.fft.irfft(np.fft.rfft(two - two.mean(), size) * np.conj(np.fft.rfft(one - one.mean(), size)), size)
     lag = int(np.argmax(product))
-    return float((lag if lag < len(two) else lag - size) * step)
+    away = np.roll(product, -lag)
+    near = round(APART_S / step)
+    rival = float(away[near:-near].max()) / float(max(product[lag], 1e-300)) if size > 2 * near else 0.0
+    return float((lag if lag < len(two) else lag - size) * step), rival
 
 
 def _refine(
@@ -178,15 +194,23 @@ def _refine(
         residual = w - (a * here + b)
         change = np.linalg.lstsq(J / size, residual, rcond=None)[0] / size
         d, k, a, b = d + change[0], k + change[1], a + change[2], b + change[3]
-    scatter = float(residual @ residual) / max(len(t) - 4, 1)
-    q = float(np.clip(residual[1:] @ residual[:-1] / max(residual @ residual, 1e-300), 0.0, 0.999))
-    R = np.linalg.qr(J / size, mode="r")
-    widened = float(np.sqrt(scatter * (1 + q) / (1 - q)))
-    spread: NDArray[np.float64] = np.asarray(np.linalg.norm(np.linalg.solve(R, np.eye(4)), axis=1)) / size * widened
-    correlation = float(np.corrcoef(w, here)[0, 1])
+    spread = _standard_uncertainty(J / size, residual, t) / size
+    correlation = float(np.corrcoef(w, here)[0, 1]) if np.ptp(here) * np.ptp(w) > 0 else 0.0
     if not correlation > ALIKE:
         raise _unlike(log, correlation)
     return ClockFit(float(d), float(k), float(spread[0]), float(spread[1]), middle, correlation)
+
+
+def _standard_uncertainty(
+    J: NDArray[np.float64], residual: NDArray[np.float64], t: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the standard uncertainties of parameters, by blocks of a second."""
+    starts = np.flatnonzero(np.diff(np.floor((t - t[0]) / BLOCK_S), prepend=-1.0))
+    scores = np.add.reduceat(J * residual[:, None], starts)
+    R = np.linalg.qr(J, mode="r")
+    inverse = np.linalg.solve(R, np.eye(R.shape[0]))
+    spread: NDArray[np.float64] = np.linalg.norm(inverse @ (inverse.T @ scores.T), axis=1)
+    return spread
 
 
 def _unlike(log: ChannelTable, correlation: float) -> IngestError:

@@ -1,0 +1,301 @@
+"""A sound log and the 44 ways in which it is spoilt, as they are numbered in ``docs/bad_inputs.md``."""
+
+from __future__ import annotations
+
+import copy
+import gzip
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from sample_logs import profile
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+HEADER = "time_s,accel_x_g,accel_y_g,accel_z_g,gyro_x_dps,gyro_y_dps,gyro_z_dps"
+SAMPLES = 3000
+INTERVAL_S = 0.01
+FILE = "log.csv"
+
+
+def readings(seed: int = 3) -> np.ndarray:
+    """Return time (s), specific force (g) and rate (deg/s) of rests and quarter turns about x: (3000, 7) array."""
+    generator = np.random.default_rng(seed)
+    time = INTERVAL_S * np.arange(SAMPLES)
+    rate = np.where(np.arange(SAMPLES) % 500 >= 400, 90.0, 0.0)
+    angle = np.radians(np.concatenate([[0.0], np.cumsum(rate[:-1]) * INTERVAL_S]))
+    force = np.stack([0 * angle, np.sin(angle), np.cos(angle)], axis=1) + 1e-3 * generator.normal(size=(SAMPLES, 3))
+    gyro = np.stack([rate, 0 * rate, 0 * rate], axis=1) + 0.05 * generator.normal(size=(SAMPLES, 3))
+    return np.column_stack([time, np.round(force, 5), np.round(gyro, 4)])
+
+
+VALUES = readings()
+
+
+def rows_of(values: np.ndarray) -> list[str]:
+    """Return rows as text that gives the same doubles."""
+    return [f"{row[0]:.2f}," + ",".join(repr(v) for v in row[1:]) for row in values.tolist()]
+
+
+ROWS = rows_of(VALUES)
+
+
+def text(rows: list[str] = ROWS, header: str = HEADER) -> bytes:
+    return ("\n".join([header, *rows]) + "\n").encode()
+
+
+@dataclass
+class Case:
+    """One bad input and what has to come of it.
+
+    ``fault`` of a refusal, else ``notes`` and the ``kept`` rows of the sound log that have to be read, bit for bit.
+    """
+
+    files: dict[str, bytes]
+    fault: str = ""
+    says: str = ""
+    line: int = 0
+    notes: tuple[str, ...] = ()
+    kept: Any = None
+    settings: dict[str, Any] = field(default_factory=dict)
+    flags: dict[int, int] = field(default_factory=dict)
+    procedure: Callable[[dict[str, Any]], None] | None = None
+
+    def ingest(self) -> dict[str, Any]:
+        """Return the canonical profile with the case's settings, given as ``section/key/...``."""
+        ingest = copy.deepcopy(profile("canonical_csv"))
+        for path, value in self.settings.items():
+            *steps, last = path.split("/")
+            node = ingest
+            for step in steps:
+                node = node.setdefault(step, {})
+            node[last] = value
+        return ingest
+
+
+def one(content: bytes, **expected: Any) -> Case:
+    return Case({FILE: content}, **expected)
+
+
+def without(*rows: int) -> np.ndarray:
+    return np.setdiff1d(np.arange(SAMPLES), rows)
+
+
+def changed(row: int, line: str) -> bytes:
+    rows = list(ROWS)
+    rows[row] = line
+    return text(rows)
+
+
+def cell(row: int, column: int, value: str) -> bytes:
+    cells = ROWS[row].split(",")
+    cells[column] = value
+    return changed(row, ",".join(cells))
+
+
+def table(values: np.ndarray, **columns: np.ndarray) -> bytes:
+    """Return a log of other values, with further columns."""
+    rows = [r + "".join(f",{float(c[i])!r}" for c in columns.values()) for i, r in enumerate(rows_of(values))]
+    return text(rows, ",".join([HEADER, *columns]))
+
+
+def times(cells: list[str]) -> bytes:
+    return text([c + "," + r.partition(",")[2] for c, r in zip(cells, ROWS, strict=True)])
+
+
+ALL = np.arange(SAMPLES)
+RATE = np.round(VALUES[:, 4])
+TABLE_ANGLE = np.concatenate([[0.0], np.cumsum(RATE[1:] + RATE[:-1]) / 2 * INTERVAL_S])
+DROP = {"csv/bad_rows": "drop"}
+CANONICAL_COLUMNS = dict(
+    zip(HEADER.split(","), ("time", *(f"{s}_{a}" for s in ("accel", "gyro") for a in "xyz")), strict=True)
+)
+
+
+def indexed() -> dict[str, Any]:
+    """Return the column map of a file without header."""
+    units = ["s", *["g"] * 3, *["deg/s"] * 3]
+    names = CANONICAL_COLUMNS.values()
+    return {n: {"column": i, "unit": u} for i, (n, u) in enumerate(zip(names, units, strict=True))}
+
+
+def stuck() -> bytes:
+    values = VALUES.copy()
+    values[1000:1100, 5] = values[1000, 5]
+    return text(rows_of(values))
+
+
+def clipped() -> bytes:
+    values = VALUES.copy()
+    values[420:424, 4] = 250.0
+    return text(rows_of(values))
+
+
+def scaled(columns: slice, factor: float) -> bytes:
+    values = VALUES.copy()
+    values[:, columns] *= factor
+    return text(rows_of(values))
+
+
+def reordered() -> list[str]:
+    rows = list(ROWS)
+    rows[700], rows[701] = rows[701], rows[700]
+    return rows
+
+
+def with_table_axis(order: tuple[int, int, int], sign: float = 1.0) -> bytes:
+    values = VALUES.copy()
+    values[:, 4:7] = sign * values[:, 4:7][:, order]
+    return table(values, table_rate_dps=RATE)
+
+
+def table_log(offset_s: float, drift: float) -> bytes:
+    """Return the log of a table whose clock is ahead by an offset and gains."""
+    own = np.arange(-200, SAMPLES + 200) * INTERVAL_S
+    lines = [
+        f"{(t * (1 + drift) + offset_s):.7f},{a:.6f}"
+        for t, a in zip(own, np.interp(own, VALUES[:, 0], TABLE_ANGLE), strict=True)
+    ]
+    return ("\n".join(["tau_s,angle_deg", *lines]) + "\n").encode()
+
+
+NEVER_DIES = 8
+
+
+def cases() -> dict[str, Case]:
+    """Return all cases, named by their number."""
+    whole = text()
+    micro = 2**32 - 12_345_678
+    wrapping = [str((micro + 10_000 * i) % 2**32) for i in range(SAMPLES)]
+    unix = [f"{1.7e18 + 5000.0 * i:.17g}" for i in range(SAMPLES)]
+    out = {
+        "01": Case({}, "unreadable", "Is a directory"),
+        "01 missing": Case({}, "missing_file", "missing recordings: log"),
+        "02": one(b"", fault="empty", says=r"the file is empty \(0 bytes\)"),
+        "03": one(text([]), fault="no_rows", says="header on line 1, 0 data rows"),
+        "04 gzip": one(gzip.compress(whole), fault="foreign", says="a gzip file: decompress it first"),
+        "04 excel": one(b"PK\x03\x04" + whole, fault="foreign", says="a zip or Excel file"),
+        "04 mcap": one(b"\x89MCAP0\r\n", fault="foreign", says="give it the suffix .mcap"),
+        "04 sqlite": one(b"SQLite format 3\0" + whole, fault="foreign", says="convert it to MCAP"),
+        "05": one(b"\xef\xbb\xbf" + whole, notes=("N-BOM",), kept=ALL),
+        "06": one(text().decode().encode("utf-16"), fault="utf16", says="UTF-16 text: save it as UTF-8"),
+        "06 without mark": one(text().decode().encode("utf-16-le"), fault="utf16", says="UTF-16 text"),
+        "07 mixed": one(whole.replace(b"\n", b"\r\n", 40), notes=("N-EOL",), kept=ALL),
+        "07 CR": one(whole.replace(b"\n", b"\r"), notes=("N-EOL",), kept=ALL),
+        "07 CRLF": one(whole.replace(b"\n", b"\r\n"), notes=(), kept=ALL),
+        "08": one(whole[:-1], notes=("N-TAIL",), kept=without(SAMPLES - 1)),
+        "08 in a number": one(whole[:-5], notes=("N-TAIL",), kept=without(SAMPLES - 1)),
+        "09": one(changed(SAMPLES - 1, "29.99,0.1"), notes=("N-TAIL",), kept=without(SAMPLES - 1)),
+        "10 short": one(changed(5, "0.05,0.1"), fault="bad_row", says="has 2 fields where 7 are expected", line=7),
+        "10 drop": one(changed(5, "0.05,0.1"), notes=("N-BADROW", "N-GAP"), kept=without(5), settings=DROP, flags={5: 1}),
+        "10 over budget": one(
+            text([r if i % 100 else "x" for i, r in enumerate(ROWS)]), fault="bad_row",
+            says="30 of 3000 rows would have to be repaired, more than the share of 0.001", line=2, settings=DROP,
+        ),
+        "11": one(changed(5, ROWS[5] + ROWS[6]), fault="bad_row", says="has 13 fields where 7 are expected", line=7),
+        "11 drop": one(
+            text([*ROWS[:5], ROWS[5] + ROWS[6], *ROWS[7:]]), notes=("N-BADROW", "N-GAP"), kept=without(5, 6), settings=DROP,
+        ),
+        "12": one(changed(5, "0.05" + "\0" * 64), fault="nul", says="64 NUL bytes, the first at byte", line=7),
+        "12 drop": one(changed(5, "0.05" + "\0" * 64), notes=("N-BADROW", "N-GAP"), kept=without(5), settings=DROP),
+        "13": one(whole + bytes(4096), notes=("N-NULTAIL",), kept=ALL),
+        "14": one(b"Fs,100\nmode,0\n" + whole, fault="missing_column", says="line 3 holds them: set ingest.csv.skip_lines", line=1),
+        "14 profile": one(b"Fs,100\nmode,0\n" + whole, kept=ALL, settings={"csv/skip_lines": 2}),
+        "15": one(b"# made by hand\n" + whole, fault="missing_column", says="found # made by hand", line=1),
+        "15 profile": one(b"# made by hand\n" + whole, notes=("N-COMMENT",), kept=ALL, settings={"csv/comment": "#"}),
+        "15 header": one(
+            b"# " + whole, notes=("N-COMMENT",), kept=ALL, settings={"csv/comment": "#", "csv/header": "commented"}
+        ),
+        "16": one(text(ROWS[1:], ROWS[0]), fault="no_header", says="set ingest.csv.header=false", line=1),
+        "16 indexed": one(whole.partition(b"\n")[2], kept=ALL, settings={"csv/header": False, "csv/columns": indexed()}),
+        "17": one(text([*ROWS[:1500], HEADER, *ROWS[:1500]]), fault="restarted", says="set ingest.csv.session", line=1502),
+        "17 session": one(
+            text([*ROWS[:1500], HEADER, *ROWS[:1500]]), notes=("N-SESSION",), kept=ALL[:1500], settings={"csv/session": 2}
+        ),
+        "18": one(whole.replace(b"gyro_y", b"gyro_x"), fault="duplicate_column", says="gyro_x_dps stands more than once", line=1),
+        "19": one(whole.replace(b"gyro_z_dps", b"gyro_z_dsp"), fault="missing_column", says="nearest: gyro_z_dsp", line=1),
+        "19 ignored": one(table(VALUES, mag_x=RATE), notes=("N-IGNORED",), kept=ALL),
+        "20": one(
+            text([",".join(r.split(",")[i] for i in (6, 5, 4, 3, 2, 1, 0)) for r in ROWS], ",".join(HEADER.split(",")[::-1])),
+            kept=ALL,
+        ),
+        "21": one(
+            whole.replace(b",", b";").replace(b".", b","), fault="decimal_comma", says="a decimal comma", line=2,
+            settings={"csv/delimiter": ";"},
+        ),
+        "21 profile": one(
+            whole.replace(b",", b";").replace(b".", b","), kept=ALL, settings={"csv/delimiter": ";", "csv/decimal": ","}
+        ),
+        "22": one(whole.replace(b",", b";"), fault="missing_column", says="is the separator ';'", line=1),
+        "22 auto": one(whole.replace(b",", b"\t"), notes=("N-DELIM",), kept=ALL, settings={"csv/delimiter": "auto"}),
+        "23": one(cell(5, 2, "ERR"), fault="not_a_number", says=r"column accel_y_g \(accel_y\) is 'ERR'", line=7),
+        "23 drop": one(cell(5, 2, "ERR"), notes=("N-BADROW", "N-GAP"), kept=without(5), settings=DROP),
+        "24 empty": one(cell(5, 2, ""), fault="not_finite", says=r"accel_y_g \(accel_y\) is empty", line=7),
+        "24 gap": one(cell(5, 2, "NaN"), notes=("N-NAN", "N-GAP"), kept=without(5), settings={"csv/nan": "gap"}),
+        "25 hexadecimal": one(cell(5, 2, "0x1F"), fault="not_a_number", says="is '0x1F'", line=7),
+        "25 thousands": one(cell(5, 2, '"1,000.5"'), fault="not_a_number", says="is '1,000.5'", line=7),
+        "25 minus": one(cell(5, 2, "\u22120.5"), fault="not_a_number", says="is '\u22120.5'", line=7),
+        "26": one(whole, fault="bad_configuration", says="accel_x.unit is None; allowed are g", settings={"csv/columns/accel_x/unit": None}),
+        "26 unknown": one(whole, fault="bad_configuration", says="unit is 'm/s2'", settings={"csv/columns/accel_x/unit": "m/s2"}),
+        "27": one(
+            whole.replace(b"accel_x_g", b"ax [m/s^2]"), fault="unit_contradiction", line=1,
+            says=r"'ax \[m/s\^2\]' is in m/s\^2, ingest.csv.columns.accel_x.unit says g",
+            settings={"csv/columns/accel_x/column": "ax [m/s^2]"},
+        ),
+        "28 counts": one(scaled(slice(1, 4), 16384.0), fault="implausible_force", says="look like raw counts"),
+        "28 m/s^2": one(scaled(slice(1, 4), 9.80665), fault="implausible_force", says=r"look like m/s\^2"),
+        "28 rad/s": one(scaled(slice(4, 7), np.pi / 180), fault="implausible_rate", says="look like rad/s that were declared as deg/s"),
+        "28 rad/s by the table": one(
+            table(np.column_stack([VALUES[:, :4], VALUES[:, 4:] * np.pi / 180]), table_rate_dps=RATE),
+            fault="implausible_rate", says="look like rad/s that were declared as deg/s",
+        ),
+        "28 full scale": one(scaled(slice(4, 7), 57.3), fault="beyond_full_scale", says="beyond 1.2 times the full scale"),
+        "29": one(whole.replace(b"time_s,", b"t,"), fault="missing_column", says="column time_s", line=1),
+        "29 rate": one(whole, notes=("N-IGNORED", "N-SYNTHTIME"), kept=ALL, settings={"csv/columns/time": None, "csv/rate_hz": 100.0}),
+        "30": one(
+            whole, fault="wrong_rate", says="the median interval is 10 us, .* asks for 10000 us; .* a thousand times longer",
+            settings={"csv/columns/time/unit": "ms", "checks/rate_hz": 100.0},
+        ),
+        "31": one(times(unix), fault="coarse_time", says="256 ns apart", settings={"csv/columns/time/unit": "ns"}),
+        "32": one(times(wrapping), notes=("N-WRAP",), kept=ALL, settings={"csv/columns/time/unit": "us"}),
+        "33": one(text([*ROWS[:1500], *ROWS[200:1000]]), fault="time_back", says="time goes back to 2 s after 14.99 s", line=1502),
+        "33 session": one(
+            text([*ROWS[:1500], *ROWS[200:1000]]), notes=("N-SESSION",), kept=ALL[200:1000], settings={"csv/session": 2}
+        ),
+        "34": one(text(reordered()), notes=("N-SORT",), kept=ALL, flags={700: NEVER_DIES, 701: NEVER_DIES}),
+        "35 same": one(text([*ROWS[:10], *ROWS[9:]]), notes=("N-DUP",), kept=ALL),
+        "35 different": one(
+            text([*ROWS[:10], ROWS[9][:-1] + "9", *ROWS[10:]]), fault="duplicate_time", says="time repeats 0.09 s", line=12
+        ),
+        "36": one(text([*ROWS[:600], *ROWS[610:]]), notes=("N-GAP",), kept=without(*range(600, 610)), flags={600: 1}),
+        "36 too long": one(
+            text([*ROWS[:600], *ROWS[700:]]), fault="missing_time", says="3.334% of the time is missing", line=602
+        ),
+        "37": one(
+            times([f"{0.01 * i + 0.004 * ((i * 7) % 3 == 0):.3f}" for i in range(SAMPLES)]), notes=("N-JITTER",), kept=ALL
+        ),
+        "38": one(stuck(), notes=("N-STUCK",), flags={1000: 4, 1099: 4}),
+        "38 dead": one(scaled(slice(6, 7), 0.0), fault="stuck", says="gyro_z is 0 deg/s in all 3000 rows"),
+        "39": one(clipped(), notes=("N-CLIP",), flags={420: 2, 423: 2}),
+        "40 axis": one(with_table_axis((2, 0, 1)), fault="wrong_axis", says="said to turn about x, and y turns with it"),
+        "40 sign": one(with_table_axis((0, 1, 2), -1.0), fault="wrong_axis", says="sign opposite to the table's rate"),
+        "41": Case(
+            {FILE: whole, "table.csv": table_log(5.25, 40e-6)}, notes=("N-SYNC",), kept=ALL,
+            settings={"csv/parts": [
+                {"file": "{file}.csv", "columns": {
+                    c: {"column": n, "unit": "s" if c == "time" else "g" if "accel" in c else "deg/s"}
+                    for n, c in CANONICAL_COLUMNS.items()}},
+                {"file": "table.csv", "own_clock": True, "columns": {
+                    "time": {"column": "tau_s", "unit": "s"}, "table_angle": {"column": "angle_deg", "unit": "deg"}}},
+            ], "csv/columns": {}},
+        ),
+        "41 unlike": Case(
+            {FILE: whole, "table.csv": b"tau_s,angle_deg\n" + b"".join(b"%d,%d\n" % (i, i * i % 7) for i in range(60))},
+            "no_sync", "does not show the motion that the gyroscope saw",
+        ),
+        "43": one(whole, fault="changed", says="the file changed while it was read"),
+        "44": Case({FILE: whole, "other.csv": whole}, "same_file", "recordings log and other are the same file, byte for byte"),
+    }  # fmt: skip
+    out["41 unlike"].settings = out["41"].settings
+    return out
