@@ -153,8 +153,8 @@ def mark_stuck(table: ChannelTable, sensor: str, flags: NDArray[np.uint16]) -> l
         others = [s is None or s <= QUIET for c, (_, s) in noisy.items() if c != channel]
         if same.all() and len(same) >= DEAD_ROWS and others and all(others):
             raise IngestError(
-                f"{channel} is {table.values[channel][0] + 0.0:.6g} {UNIT_NAMES[sensor]} in all {len(same) + 1} rows, while "
-                "the other axes change",
+                f"{channel} is {table.values[channel][0] + 0.0:.6g} {UNIT_NAMES[sensor]} in all {len(same) + 1} rows, "
+                "while the other axes change",
                 table.path,
                 fault="stuck",
                 hint="is the column right, and the sensor's axis alive?",

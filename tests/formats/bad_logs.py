@@ -188,19 +188,32 @@ def cases() -> dict[str, Case]:
         "08 in a number": one(whole[:-5], notes=("N-TAIL",), kept=without(SAMPLES - 1)),
         "09": one(changed(SAMPLES - 1, "29.99,0.1"), notes=("N-TAIL",), kept=without(SAMPLES - 1)),
         "10 short": one(changed(5, "0.05,0.1"), fault="bad_row", says="has 2 fields where 7 are expected", line=7),
-        "10 drop": one(changed(5, "0.05,0.1"), notes=("N-BADROW", "N-GAP"), kept=without(5), settings=DROP, flags={5: 1}),
+        "10 drop": one(
+            changed(5, "0.05,0.1"), notes=("N-BADROW", "N-GAP"), kept=without(5), settings=DROP, flags={5: 1}
+        ),
         "10 over budget": one(
-            text([r if i % 100 else "x" for i, r in enumerate(ROWS)]), fault="bad_row",
-            says="30 of 3000 rows would have to be repaired, more than the share of 0.001", line=2, settings=DROP,
+            text([r if i % 100 else "x" for i, r in enumerate(ROWS)]),
+            fault="bad_row",
+            says="30 of 3000 rows would have to be repaired, more than the share of 0.001",
+            line=2,
+            settings=DROP,
         ),
         "11": one(changed(5, ROWS[5] + ROWS[6]), fault="bad_row", says="has 13 fields where 7 are expected", line=7),
         "11 drop": one(
-            text([*ROWS[:5], ROWS[5] + ROWS[6], *ROWS[7:]]), notes=("N-BADROW", "N-GAP"), kept=without(5, 6), settings=DROP,
+            text([*ROWS[:5], ROWS[5] + ROWS[6], *ROWS[7:]]),
+            notes=("N-BADROW", "N-GAP"),
+            kept=without(5, 6),
+            settings=DROP,
         ),
         "12": one(changed(5, "0.05" + "\0" * 64), fault="nul", says="64 NUL bytes, the first at byte", line=7),
         "12 drop": one(changed(5, "0.05" + "\0" * 64), notes=("N-BADROW", "N-GAP"), kept=without(5), settings=DROP),
         "13": one(whole + bytes(4096), notes=("N-NULTAIL",), kept=ALL),
-        "14": one(b"Fs,100\nmode,0\n" + whole, fault="missing_column", says="line 3 holds them: set ingest.csv.skip_lines", line=1),
+        "14": one(
+            b"Fs,100\nmode,0\n" + whole,
+            fault="missing_column",
+            says="line 3 holds them: set ingest.csv.skip_lines",
+            line=1,
+        ),
         "14 profile": one(b"Fs,100\nmode,0\n" + whole, kept=ALL, settings={"csv/skip_lines": 2}),
         "15": one(b"# made by hand\n" + whole, fault="missing_column", says="found # made by hand", line=1),
         "15 profile": one(b"# made by hand\n" + whole, notes=("N-COMMENT",), kept=ALL, settings={"csv/comment": "#"}),
@@ -208,20 +221,40 @@ def cases() -> dict[str, Case]:
             b"# " + whole, notes=("N-COMMENT",), kept=ALL, settings={"csv/comment": "#", "csv/header": "commented"}
         ),
         "16": one(text(ROWS[1:], ROWS[0]), fault="no_header", says="set ingest.csv.header=false", line=1),
-        "16 indexed": one(whole.partition(b"\n")[2], kept=ALL, settings={"csv/header": False, "csv/columns": indexed()}),
-        "17": one(text([*ROWS[:1500], HEADER, *ROWS[:1500]]), fault="restarted", says="set ingest.csv.session", line=1502),
-        "17 session": one(
-            text([*ROWS[:1500], HEADER, *ROWS[:1500]]), notes=("N-SESSION",), kept=ALL[:1500], settings={"csv/session": 2}
+        "16 indexed": one(
+            whole.partition(b"\n")[2], kept=ALL, settings={"csv/header": False, "csv/columns": indexed()}
         ),
-        "18": one(whole.replace(b"gyro_y", b"gyro_x"), fault="duplicate_column", says="gyro_x_dps stands more than once", line=1),
-        "19": one(whole.replace(b"gyro_z_dps", b"gyro_z_dsp"), fault="missing_column", says="nearest: gyro_z_dsp", line=1),
+        "17": one(
+            text([*ROWS[:1500], HEADER, *ROWS[:1500]]), fault="restarted", says="set ingest.csv.session", line=1502
+        ),
+        "17 session": one(
+            text([*ROWS[:1500], HEADER, *ROWS[:1500]]),
+            notes=("N-SESSION",),
+            kept=ALL[:1500],
+            settings={"csv/session": 2},
+        ),
+        "18": one(
+            whole.replace(b"gyro_y", b"gyro_x"),
+            fault="duplicate_column",
+            says="gyro_x_dps stands more than once",
+            line=1,
+        ),
+        "19": one(
+            whole.replace(b"gyro_z_dps", b"gyro_z_dsp"), fault="missing_column", says="nearest: gyro_z_dsp", line=1
+        ),
         "19 ignored": one(table(VALUES, mag_x=RATE), notes=("N-IGNORED",), kept=ALL),
         "20": one(
-            text([",".join(r.split(",")[i] for i in (6, 5, 4, 3, 2, 1, 0)) for r in ROWS], ",".join(HEADER.split(",")[::-1])),
+            text(
+                [",".join(r.split(",")[i] for i in (6, 5, 4, 3, 2, 1, 0)) for r in ROWS],
+                ",".join(HEADER.split(",")[::-1]),
+            ),
             kept=ALL,
         ),
         "21": one(
-            whole.replace(b",", b";").replace(b".", b","), fault="decimal_comma", says="a decimal comma", line=2,
+            whole.replace(b",", b";").replace(b".", b","),
+            fault="decimal_comma",
+            says="a decimal comma",
+            line=2,
             settings={"csv/delimiter": ";"},
         ),
         "21 profile": one(
@@ -236,66 +269,119 @@ def cases() -> dict[str, Case]:
         "25 hexadecimal": one(cell(5, 2, "0x1F"), fault="not_a_number", says="is '0x1F'", line=7),
         "25 thousands": one(cell(5, 2, '"1,000.5"'), fault="not_a_number", says="is '1,000.5'", line=7),
         "25 minus": one(cell(5, 2, "\u22120.5"), fault="not_a_number", says="is '\u22120.5'", line=7),
-        "26": one(whole, fault="bad_configuration", says="accel_x.unit is None; allowed are g", settings={"csv/columns/accel_x/unit": None}),
-        "26 unknown": one(whole, fault="bad_configuration", says="unit is 'm/s2'", settings={"csv/columns/accel_x/unit": "m/s2"}),
+        "26": one(
+            whole,
+            fault="bad_configuration",
+            says="accel_x.unit is None; allowed are g",
+            settings={"csv/columns/accel_x/unit": None},
+        ),
+        "26 unknown": one(
+            whole, fault="bad_configuration", says="unit is 'm/s2'", settings={"csv/columns/accel_x/unit": "m/s2"}
+        ),
         "27": one(
-            whole.replace(b"accel_x_g", b"ax [m/s^2]"), fault="unit_contradiction", line=1,
+            whole.replace(b"accel_x_g", b"ax [m/s^2]"),
+            fault="unit_contradiction",
+            line=1,
             says=r"'ax \[m/s\^2\]' is in m/s\^2, ingest.csv.columns.accel_x.unit says g",
             settings={"csv/columns/accel_x/column": "ax [m/s^2]"},
         ),
         "28 counts": one(scaled(slice(1, 4), 16384.0), fault="implausible_force", says="look like raw counts"),
         "28 m/s^2": one(scaled(slice(1, 4), 9.80665), fault="implausible_force", says=r"look like m/s\^2"),
-        "28 rad/s": one(scaled(slice(4, 7), np.pi / 180), fault="implausible_rate", says="look like rad/s that were declared as deg/s"),
+        "28 rad/s": one(
+            scaled(slice(4, 7), np.pi / 180),
+            fault="implausible_rate",
+            says="look like rad/s that were declared as deg/s",
+        ),
         "28 rad/s by the table": one(
             table(np.column_stack([VALUES[:, :4], VALUES[:, 4:] * np.pi / 180]), table_rate_dps=RATE),
-            fault="implausible_rate", says="look like rad/s that were declared as deg/s",
+            fault="implausible_rate",
+            says="look like rad/s that were declared as deg/s",
         ),
-        "28 full scale": one(scaled(slice(4, 7), 57.3), fault="beyond_full_scale", says="beyond 1.2 times the full scale"),
+        "28 full scale": one(
+            scaled(slice(4, 7), 57.3), fault="beyond_full_scale", says="beyond 1.2 times the full scale"
+        ),
         "29": one(whole.replace(b"time_s,", b"t,"), fault="missing_column", says="column time_s", line=1),
-        "29 rate": one(whole, notes=("N-IGNORED", "N-SYNTHTIME"), kept=ALL, settings={"csv/columns/time": None, "csv/rate_hz": 100.0}),
+        "29 rate": one(
+            whole,
+            notes=("N-IGNORED", "N-SYNTHTIME"),
+            kept=ALL,
+            settings={"csv/columns/time": None, "csv/rate_hz": 100.0},
+        ),
         "30": one(
-            whole, fault="wrong_rate", says="the median interval is 10 us, .* asks for 10000 us; .* a thousand times longer",
+            whole,
+            fault="wrong_rate",
+            says="the median interval is 10 us, .* asks for 10000 us; .* a thousand times longer",
             settings={"csv/columns/time/unit": "ms", "checks/rate_hz": 100.0},
         ),
         "31": one(times(unix), fault="coarse_time", says="256 ns apart", settings={"csv/columns/time/unit": "ns"}),
         "32": one(times(wrapping), notes=("N-WRAP",), kept=ALL, settings={"csv/columns/time/unit": "us"}),
-        "33": one(text([*ROWS[:1500], *ROWS[200:1000]]), fault="time_back", says="time goes back to 2 s after 14.99 s", line=1502),
+        "33": one(
+            text([*ROWS[:1500], *ROWS[200:1000]]),
+            fault="time_back",
+            says="time goes back to 2 s after 14.99 s",
+            line=1502,
+        ),
         "33 session": one(
             text([*ROWS[:1500], *ROWS[200:1000]]), notes=("N-SESSION",), kept=ALL[200:1000], settings={"csv/session": 2}
         ),
         "34": one(text(reordered()), notes=("N-SORT",), kept=ALL, flags={700: NEVER_DIES, 701: NEVER_DIES}),
         "35 same": one(text([*ROWS[:10], *ROWS[9:]]), notes=("N-DUP",), kept=ALL),
         "35 different": one(
-            text([*ROWS[:10], ROWS[9][:-1] + "9", *ROWS[10:]]), fault="duplicate_time", says="time repeats 0.09 s", line=12
+            text([*ROWS[:10], ROWS[9][:-1] + "9", *ROWS[10:]]),
+            fault="duplicate_time",
+            says="time repeats 0.09 s",
+            line=12,
         ),
         "36": one(text([*ROWS[:600], *ROWS[610:]]), notes=("N-GAP",), kept=without(*range(600, 610)), flags={600: 1}),
         "36 too long": one(
             text([*ROWS[:600], *ROWS[700:]]), fault="missing_time", says="3.334% of the time is missing", line=602
         ),
         "37": one(
-            times([f"{0.01 * i + 0.004 * ((i * 7) % 3 == 0):.3f}" for i in range(SAMPLES)]), notes=("N-JITTER",), kept=ALL
+            times([f"{0.01 * i + 0.004 * ((i * 7) % 3 == 0):.3f}" for i in range(SAMPLES)]),
+            notes=("N-JITTER",),
+            kept=ALL,
         ),
         "38": one(stuck(), notes=("N-STUCK",), flags={1000: 4, 1099: 4}),
         "38 dead": one(scaled(slice(6, 7), 0.0), fault="stuck", says="gyro_z is 0 deg/s in all 3000 rows"),
         "39": one(clipped(), notes=("N-CLIP",), flags={420: 2, 423: 2}),
-        "40 axis": one(with_table_axis((2, 0, 1)), fault="wrong_axis", says="said to turn about x, and y turns with it"),
+        "40 axis": one(
+            with_table_axis((2, 0, 1)), fault="wrong_axis", says="said to turn about x, and y turns with it"
+        ),
         "40 sign": one(with_table_axis((0, 1, 2), -1.0), fault="wrong_axis", says="sign opposite to the table's rate"),
         "41": Case(
-            {FILE: whole, "table.csv": table_log(5.25, 40e-6)}, notes=("N-SYNC",), kept=ALL,
-            settings={"csv/parts": [
-                {"file": "{file}.csv", "columns": {
-                    c: {"column": n, "unit": "s" if c == "time" else "g" if "accel" in c else "deg/s"}
-                    for n, c in CANONICAL_COLUMNS.items()}},
-                {"file": "table.csv", "own_clock": True, "columns": {
-                    "time": {"column": "tau_s", "unit": "s"}, "table_angle": {"column": "angle_deg", "unit": "deg"}}},
-            ], "csv/columns": {}},
+            {FILE: whole, "table.csv": table_log(5.25, 40e-6)},
+            notes=("N-SYNC",),
+            kept=ALL,
+            settings={
+                "csv/parts": [
+                    {
+                        "file": "{file}.csv",
+                        "columns": {
+                            c: {"column": n, "unit": "s" if c == "time" else "g" if "accel" in c else "deg/s"}
+                            for n, c in CANONICAL_COLUMNS.items()
+                        },
+                    },
+                    {
+                        "file": "table.csv",
+                        "own_clock": True,
+                        "columns": {
+                            "time": {"column": "tau_s", "unit": "s"},
+                            "table_angle": {"column": "angle_deg", "unit": "deg"},
+                        },
+                    },
+                ],
+                "csv/columns": {},
+            },
         ),
         "41 unlike": Case(
-            {FILE: whole, "table.csv": b"tau_s,angle_deg\n" + b"".join(b"%d,%d\n" % (i, i * i % 7) for i in range(60))},
-            "no_sync", "does not show the motion that the gyroscope saw",
+            {FILE: whole, "table.csv": b"tau_s,angle_deg\n" + b"".join(b"%d,%d\n" % (i, i * i) for i in range(60))},
+            "no_sync",
+            "does not show the motion that the gyroscope saw",
         ),
         "43": one(whole, fault="changed", says="the file changed while it was read"),
-        "44": Case({FILE: whole, "other.csv": whole}, "same_file", "recordings log and other are the same file, byte for byte"),
-    }  # fmt: skip
+        "44": Case(
+            {FILE: whole, "other.csv": whole}, "same_file", "recordings log and other are the same file, byte for byte"
+        ),
+    }
     out["41 unlike"].settings = out["41"].settings
     return out

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -15,7 +15,9 @@ from pipeline.errors import ConfigurationError, InputError, MissingInputError
 from pipeline.formats.parquet import load_recordings, save_recordings
 from pipeline.formats.read import read_recordings
 from pipeline.formats.settings import check_ingest
-from pipeline.records import Recording
+
+if TYPE_CHECKING:
+    from pipeline.records import Recording
 
 CASES = cases()
 
