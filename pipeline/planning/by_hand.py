@@ -22,7 +22,7 @@ from pipeline.estimation.hand_held.likelihood import beside
 from pipeline.estimation.hand_held.result import model_of
 from pipeline.estimation.hand_held.selection import select
 from pipeline.estimation.selection import GATE_BIC, GATE_P
-from pipeline.planning.detection import ALIKE, ALMOST_SURE, PARTLY, Detection, smallest
+from pipeline.planning.detection import ALIKE, ALMOST_SURE, PARTLY, Detection, limits_or_none, smallest
 from pipeline.records import SensorCalibration
 
 if TYPE_CHECKING:
@@ -81,7 +81,8 @@ class HandExpectation:
 
     def __init__(self, selection: HandSelection, noise: Noise) -> None:
         model = selection.model
-        self.sensor, self.limits = model.sensor, selection.limits
+        self.sensor = model.sensor
+        self.limits = limits_or_none(selection.candidates, model.sensor, selection.limits)
         self.terms = [Term(this, v) for this in selection.candidates for v in this.starts(model.sensor)]
         self.names = [this.name for this in selection.candidates]
         equations = model.equations(selection.fits[0].state.without_effects(), self.terms)

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable, Mapping
 
     from numpy.typing import NDArray
+
+    from pipeline.model.effects.base import Effect
 
 STEPS = 14  # of bisection: a factor of 1e11 to 0.2 %
 LEAST, LARGEST = 1e-8, 1e3  # share of the limits
@@ -56,3 +58,18 @@ def smallest(probability: Callable[[float], NDArray[np.float64]], wanted: float)
         middle = 0.5 * (low + high)
         low, high = (low, middle) if np.mean(probability(float(np.exp(middle)))) >= wanted else (middle, high)
     return float(np.exp(high))
+
+
+def limits_or_none(
+    effects: Iterable[Effect], sensor: str, limits: Mapping[str, NDArray[np.float64]]
+) -> dict[str, NDArray[np.float64]]:
+    """Return the limits of every effect's parameters, infinite where an effect has none, such as one of a user's own.
+
+    Parameters
+    ----------
+    effects : iterable of Effect
+    sensor : str
+    limits : mapping of str to (p,) array
+        Of the effects that have limits.
+    """
+    return {this.name: limits.get(this.name, np.full(len(this.parameters(sensor)), np.inf)) for this in effects}

@@ -37,7 +37,7 @@ import numpy as np
 from pipeline.estimation.ranking import RIDGE
 from pipeline.estimation.selection import DELAYS, GATE_BIC, GATE_P
 from pipeline.estimation.wandering import Setting, cells_of
-from pipeline.planning.detection import ALIKE, ALMOST_SURE, PARTLY, Detection, smallest
+from pipeline.planning.detection import ALIKE, ALMOST_SURE, PARTLY, Detection, limits_or_none, smallest
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -87,7 +87,8 @@ class Expectation:
 
     def __init__(self, selection: Selection, noise: Noise) -> None:
         self.ranking: Ranking = selection.ranking
-        self.limits = selection.limits
+        kinds = [term.effect for term in self.ranking.candidates]
+        self.limits = limits_or_none(kinds, selection.observations.sensor, selection.limits)
         true = Setting(float(np.sqrt(np.mean((noise.wander / noise.white) ** 2))), noise.correlation_time)
         cells, samples = cells_of(selection.observations), selection.observations.samples
         self.noise_sum = 3.0 * noise_sums(cells, samples, self.ranking.settings, true)

@@ -73,6 +73,24 @@ def test_an_effect_of_the_users_own_is_planned(capsys: pytest.CaptureFixture[str
     assert entry["unit"] == "deg/s"
 
 
+@pytest.mark.parametrize("procedure", [QUICK, ["--procedure", "multi_position"]])
+def test_an_effect_without_limits_is_planned_in_its_unit(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, procedure: list[str]
+) -> None:
+    file = tmp_path / "sag.yaml"
+    terms = 'terms: {d: {formula: "fz ** 3 - 0.6 * fz", unit: g}}'
+    file.write_text(
+        f"name: sag\nowner: sensor\nsensors: [accelerometer]\nmeaning: It sags.\n{terms}\n", encoding="utf-8"
+    )
+    try:
+        lines = _out(capsys, *procedure, "--no-extra", "--effect", str(file)).splitlines()
+    finally:
+        forget_registered()
+    words = next(line.split() for line in lines if line.strip().startswith("sag "))
+    assert words[2:5] == ["g", "no", "limit"]
+    assert 1e-5 < float(words[1]) < 1e-2
+
+
 def test_a_campaigns_description_is_planned(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     course = "course: {step_deg: 15.0, validation_s: 0.0, static_s: 60.0, both_directions: true}"
     text = f"defaults: {{sensor: stim300, {course}}}\nunits:\n- unit: A\n- unit: B\n  sensor: mpu6050\n"
