@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.formats.csv_rows import over_budget
+from pipeline.formats.csv_careful import over_budget
 from pipeline.formats.csv_time import LARGEST_DISPLACEMENT, order_of, time_error, unwrap, wrap_note
 from pipeline.formats.ingest_error import IngestError
 from pipeline.records import Note

@@ -14,8 +14,9 @@ import numpy as np
 
 from pipeline.formats.channel_table import ChannelTable
 from pipeline.formats.checks import Checks
+from pipeline.formats.csv_careful import read_carefully
 from pipeline.formats.csv_order import in_order
-from pipeline.formats.csv_rows import read_rows
+from pipeline.formats.csv_quick import read_quickly
 from pipeline.formats.csv_time import LONGEST_S, refuse_coarse, seconds_per_unit, whole_times
 from pipeline.formats.ingest_error import IngestError
 from pipeline.formats.units import COUNTS, UNITS, decode, to_house_unit
@@ -66,7 +67,7 @@ def read_csv(paths: Sequence[Path], formats: Sequence[CsvFormat], checks: Checks
 
 def read_one(path: Path, settings: CsvFormat, checks: Checks) -> ChannelTable:
     """Read one file."""
-    rows = read_rows(path, settings, checks)
+    rows = read_quickly(path, settings) or read_carefully(path, settings, checks)
     tick_ns = float(settings.tick_ns or UNITS["time"][_unit_of_time(rows)][0])
     ordered = in_order(rows, _times(rows, settings), settings.session, checks, tick_ns)
     rows = ordered.rows

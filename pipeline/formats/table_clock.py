@@ -132,6 +132,11 @@ def fit_clocks(sensor: ChannelTable, log: ChannelTable) -> ClockFit:
     w = np.sqrt(sum(sensor.values[c] ** 2 for c in TRIADS["gyroscope"]))
     r = np.abs(_table_rate(log, own))
     offset, rival = _coarse_offset(t, w, own, r)
+    inside = (t + offset >= 0) & (t + offset <= own[-1])
+    if inside.sum() < 20:
+        raise _unlike(log, 0.0)
+    t, w = t[inside], w[inside]
+    fit = _refine((t, w), (own, r), offset, log)
     if rival > AMBIGUOUS:
         raise IngestError(
             "the motion repeats itself, and the table's log fits the gyroscope's at several times alike",
@@ -139,22 +144,18 @@ def fit_clocks(sensor: ChannelTable, log: ChannelTable) -> ClockFit:
             fault="no_sync",
             hint="begin or end the recording with a turn of its own",
         )
-    inside = (t + offset >= 0) & (t + offset <= own[-1])
-    if inside.sum() < 20:
-        raise _unlike(log, 0.0)
-    t, w = t[inside], w[inside]
-    return _refine((t, w), (own, r), offset, log)
+    return fit
 
 
 def _table_rate(log: ChannelTable, own: NDArray[np.float64]) -> NDArray[np.float64]:
     if "table_rate" in log.values:
-        return log.values["table_rate"]
+        return np.asarray(log.values["table_rate"])
     if "table_angle" in log.values:
         return np.asarray(np.gradient(log.values["table_angle"], own))
     if ATTITUDE[0] in log.values:
         q = np.column_stack([log.values[c] for c in ATTITUDE])
         steps = 2 * np.degrees(np.arccos(np.clip(np.abs(np.sum(q[1:] * q[:-1], axis=1)), 0, 1))) / np.diff(own)
-        return np.interp(own, (own[1:] + own[:-1]) / 2, steps)
+        return np.asarray(np.interp(own, (own[1:] + own[:-1]) / 2, steps))
     raise IngestError("the table's log holds neither rate, angle nor attitude", log.path, fault="no_sync")
 
 
@@ -207,8 +208,8 @@ def _standard_uncertainty(
     """Return the standard uncertainties of parameters, by blocks of a second."""
     starts = np.flatnonzero(np.diff(np.floor((t - t[0]) / BLOCK_S), prepend=-1.0))
     scores = np.add.reduceat(J * residual[:, None], starts)
-    R = np.linalg.qr(J, mode="r")
-    inverse = np.linalg.solve(R, np.eye(R.shape[0]))
+    R: NDArray[np.float64] = np.asarray(np.linalg.qr(J, mode="r"))
+    inverse = np.linalg.solve(R, np.eye(J.shape[1]))
     spread: NDArray[np.float64] = np.linalg.norm(inverse @ (inverse.T @ scores.T), axis=1)
     return spread
 

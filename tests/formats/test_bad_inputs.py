@@ -56,7 +56,7 @@ def test_bad_input_is_refused_by_its_code_with_its_facts(
 
 
 def _write_while_it_is_read(monkeypatch: pytest.MonkeyPatch, file: Path) -> None:
-    import pipeline.formats.csv_rows as module  # noqa: PLC0415
+    import pipeline.formats.csv_quick as module  # noqa: PLC0415
 
     parse = module.parse
 
