@@ -20,7 +20,9 @@ if TYPE_CHECKING:
 JSON = dict[str, Any]
 Pair = tuple[JSON, JSON]
 Z = 1.96
+OF_WHICH = "... of those in which each stands out (lambda >= 100)"
 IN_THE_CATALOGUE = ("single", "pairs", "triples", "one_axis")
+MAY_HIDE = ("single", "small", "tiny", "one_axis", "pairs", "pairs_wander", "triples")
 # Family, what is counted, how it is judged, goal.
 PLAN: list[tuple[str, str, Callable[[JSON, JSON], bool], str]] = [
     ("single", "one effect at its data sheet's size: named first", verdicts.first_is_right, ">= 98 %"),
@@ -109,6 +111,9 @@ def all_figures(cases: Sequence[Pair]) -> list[Figure]:
         if family == "removed":
             pairs = [p for p in pairs if "error" in p[1] or verdicts.hard_to_replace(*p)]
         found.append(share(name, pairs, right, goal))
+        able = [pair for pair in pairs if verdicts.stands_out(pair[0])]
+        if family in MAY_HIDE and len(able) < len(pairs):
+            found.append(share(OF_WHICH, able, right, ""))
     for family, pairs in by_family.items():
         if is_null(pairs[0][0]):
             noise = family.removeprefix("null_")

@@ -1,6 +1,6 @@
 """Run the cases of a study, in some processes, and keep what was said.
 
-    <directory>/truth.jsonl      what is hidden in each case
+    <directory>/truth.jsonl      what is hidden in each case, and how far it stands out of the noise
     <directory>/results.jsonl    what the diagnosis said of it, and a digest of the code that said it
 
 A case whose result is there is not run again, so that a study can be interrupted and made larger.
@@ -18,12 +18,14 @@ from pipeline.config import code_digest
 from pipeline.errors import ConfigurationError
 from pipeline.study.cases import draw
 from pipeline.study.judge import judge
+from pipeline.study.signal_left import signals_left
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
 TRUTH, RESULTS = "truth.jsonl", "results.jsonl"
+JSON = dict[str, Any]
 Planned = tuple[str, int, int]
 
 
@@ -65,8 +67,8 @@ def run_study(
         (directory / TRUTH).open("a", encoding="utf-8") as truth,
         (directory / RESULTS).open("a", encoding="utf-8") as results,
     ):
-        for number, (item, entries) in enumerate(_judged(planned, processes), start=1):
-            truth.write(json.dumps(draw(*item).to_json()) + "\n")
+        for number, (hidden, entries) in enumerate(_judged(planned, processes), start=1):
+            truth.write(json.dumps(hidden) + "\n")
             results.write("".join(json.dumps({**entry, "code": code}) + "\n" for entry in entries))
             truth.flush()
             results.flush()
@@ -81,7 +83,7 @@ def _refuse_another_seed(truth: Path, seed: int) -> None:
         )
 
 
-def _judged(planned: Sequence[Planned], processes: int) -> Iterator[tuple[Planned, list[dict[str, Any]]]]:
+def _judged(planned: Sequence[Planned], processes: int) -> Iterator[tuple[JSON, list[JSON]]]:
     if processes == 1:
         yield from map(judged, planned)
         return
@@ -91,16 +93,17 @@ def _judged(planned: Sequence[Planned], processes: int) -> Iterator[tuple[Planne
         yield from pool.map(judged, planned, chunksize=4)
 
 
-def judged(planned: Planned) -> tuple[Planned, list[dict[str, Any]]]:
-    """Return a case and what was said of it; a fault is a result, not the end of the study."""
+def judged(planned: Planned) -> tuple[JSON, list[JSON]]:
+    """Return the truth of a case and what was said of it; a fault is a result, not the end of the study."""
     case = draw(*planned)
+    hidden = {**case.to_json(), "signal_left": signals_left(case)}
     try:
-        return planned, judge(case)
+        return hidden, judge(case)
     except Exception as error:  # noqa: BLE001  (whatever it is, it is what the diagnosis did with this case)
-        return planned, [{"key": case.key, "sensor": case.sensor, "error": f"{type(error).__name__}: {error}"}]
+        return hidden, [{"key": case.key, "sensor": case.sensor, "error": f"{type(error).__name__}: {error}"}]
 
 
-def read_lines(path: Path) -> list[dict[str, Any]]:
+def read_lines(path: Path) -> list[JSON]:
     """Return the entries of a file of one JSON document a line; none where it is not there."""
     if not path.is_file():
         return []

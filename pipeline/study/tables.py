@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
-from pipeline.study.figures import families, mean_excess_gone
-from pipeline.study.verdicts import first_is_right, warned
+from pipeline.study.figures import families, mean_excess_gone, wilson
+from pipeline.study.verdicts import first_is_right, named, warned
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
 JSON = dict[str, Any]
 Pair = tuple[JSON, JSON]
 OF_SIZE = ("single", "small", "tiny")
+BOUNDS = (0.0, 30.0, 60.0, 100.0, 200.0, 500.0, float("inf"))
 
 
 def confusions(cases: Iterable[Pair]) -> Counter[tuple[str, str, str]]:
@@ -47,6 +49,25 @@ def found_at(cases: Iterable[Pair]) -> dict[tuple[str, str], dict[str, tuple[int
         hits, total = row.get(truth["family"], (0, 0))
         row[truth["family"]] = (hits + first_is_right(truth, said), total + 1)
     return dict(sorted(table.items()))
+
+
+def by_signal(cases: Iterable[Pair]) -> list[list[str]]:
+    """Return how many effects were selected, of how many, by the signal that each leaves beside the others."""
+    found = [
+        (left, any(named(name, said, selected) for selected in said["selected"]))
+        for truth, said in cases
+        if "error" not in said and not truth["left_out"] and truth["family"] != "unseen"
+        for name, left in (truth.get("signal_left") or {}).items()
+    ]
+    rows = []
+    for low, high in pairwise(BOUNDS):
+        within = [hit for left, hit in found if low <= left < high]
+        if within:
+            least, most = wilson(sum(within), len(within))
+            text = f"{low:g} to {high:g}" if high < BOUNDS[-1] else f"{low:g} and more"
+            value = f"{100 * sum(within) / len(within):.0f} %"
+            rows.append([text, str(len(within)), value, f"{100 * least:.0f} to {100 * most:.0f} %"])
+    return rows
 
 
 def of_shapes(cases: Iterable[Pair]) -> list[list[str]]:

@@ -11,6 +11,7 @@ from typing import Any
 JSON = dict[str, Any]
 ALIKE = 0.95
 EXCESS = 0.05
+STANDS_OUT = 100.0
 
 
 def named(hidden: str, said: JSON, name: str) -> bool:
@@ -79,3 +80,9 @@ def excess_gone(said: JSON) -> float | None:
     if not held or held["before"] < (1.0 + EXCESS) * held["floor"]:
         return None
     return float((held["before"] - held["after"]) / (held["before"] - held["floor"]))
+
+
+def stands_out(truth: JSON) -> bool:
+    """Return whether each hidden effect leaves a signal of lambda >= 100 beside the others; see ``signal_left``."""
+    left = truth.get("signal_left") or {}
+    return bool(left) and min(left.values()) >= STANDS_OUT

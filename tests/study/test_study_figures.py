@@ -9,7 +9,7 @@ from scipy.stats import binomtest
 
 from pipeline.study.figures import all_figures, in_the_catalogue, joined, mean_excess_gone, wilson
 from pipeline.study.page import page
-from pipeline.study.tables import confusions, found_at, instead, of_shapes
+from pipeline.study.tables import by_signal, confusions, found_at, instead, of_shapes
 from pipeline.study.verdicts import exact, excess_gone, first_is_right, hard_to_replace, not_silent
 
 
@@ -97,6 +97,21 @@ def test_tables_count_what_was_said() -> None:
     assert confusions(pairs) == {("gyroscope", "a", "b"): 1, ("gyroscope", "a", "nothing"): 1}
     assert instead(pairs) == {("gyroscope", "a", "c", True): 1}
     assert found_at(pairs) == {("gyroscope", "a"): {"single": (1, 2), "tiny": (0, 1)}}
+
+
+def test_units_in_which_every_effect_stands_out_are_counted_by_themselves() -> None:
+    lefts = [({"a": 500.0, "b": 99.0}, ["a"]), ({"a": 500.0, "b": 100.0}, ["b", "a"])]
+    keys = ["pairs-00000", "pairs-00001"]
+    pairs = [
+        (truth("a", "b", key=key, signal_left=left), said(*selected, key=key))
+        for key, (left, selected) in zip(keys, lefts, strict=True)
+    ]
+    assert [(f.hits, f.total) for f in all_figures(pairs)] == [(1, 2), (1, 1)]
+    assert by_signal(pairs) == [
+        ["60 to 100", "1", "0 %", "0 to 79 %"],
+        ["100 to 200", "1", "100 %", "21 to 100 %"],
+        ["500 and more", "2", "100 %", "34 to 100 %"],
+    ]
 
 
 def test_a_form_of_unknown_physics_is_unexplained_warned_of_silently_replaced_or_missed() -> None:
