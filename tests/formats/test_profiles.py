@@ -18,7 +18,14 @@ from pipeline.formats.settings import check_ingest, csv_formats
 if TYPE_CHECKING:
     from pathlib import Path
 
-PROFILES = ("canonical_csv", "mcap", "mcap_fields", "arduino_counts", "xsens_mti_multi_position", "mpu6050_multi_position")
+PROFILES = (
+    "canonical_csv",
+    "mcap",
+    "mcap_fields",
+    "arduino_counts",
+    "xsens_mti_multi_position",
+    "mpu6050_multi_position",
+)
 
 
 @pytest.mark.parametrize("name", PROFILES)
