@@ -17,6 +17,7 @@ rule all:
         f"{RESULTS}/complete.json",
 
 
+include: "workflow/rules/simulate.smk"
 include: "workflow/rules/ingest.smk"
 include: "workflow/rules/filter.smk"
 include: "workflow/rules/fit.smk"

@@ -44,6 +44,7 @@ def main(argv: Sequence[str]) -> int:
     directory: Path = arguments.pop("directory")
     source: Path | None = arguments.pop("source")
     quiet: bool = arguments.pop("quiet")
+    sheet_only: bool = arguments.pop("sheet_only")
     if source is None and not arguments and (directory / FILE).is_file():
         source = directory / FILE
     if source is not None and arguments:
@@ -58,9 +59,10 @@ def main(argv: Sequence[str]) -> int:
         text = "# Read by: python -m pipeline simulate\n" + yaml.safe_dump(data, sort_keys=False)
         (directory / FILE).write_text(text, encoding="utf-8")
     directory.mkdir(parents=True, exist_ok=True)
-    for own in read_effect_files(sorted((directory / "effects").glob("*.yaml"))).values():
+    beside = directory if source is None else source.parent
+    for own in read_effect_files(sorted((beside / "effects").glob("*.yaml"))).values():
         register(own)
-    write_campaign(description, directory, (lambda _: None) if quiet else print)
+    write_campaign(description, directory, (lambda _: None) if quiet else print, sheet_only=sheet_only)
     print(f"then: snakemake --cores 2 --config campaign={directory}")
     return 0
 
@@ -77,6 +79,7 @@ def _parser() -> argparse.ArgumentParser:
     add("directory", type=Path, metavar="DIR", help="the campaign's directory; made if need be")
     add("--from", dest="source", type=Path, default=None, metavar="FILE", help="description of what to simulate (YAML)")
     add("--quiet", action="store_true", default=False, help="do not name every unit")
+    add("--sheet-only", action="store_true", default=False, help="write units.csv, and leave the recordings to the run")
     add("--units", type=int, metavar="N", help="number of units (1)")
     add("--prefix", metavar="NAME", help="their names: NAME001, NAME002 ... (U)")
     add("--seed", type=int, help="every random number follows from it (0)")

@@ -8,9 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from omegaconf import OmegaConf
-
-from pipeline.config.compose import CONFIGS, GROUPS, RUN_SETTINGS, Composer, Problem, default_of_run, nearest, parse
+from pipeline.config.campaign_file import as_list, read_campaign_file, split_run_settings
+from pipeline.config.compose import CONFIGS, GROUPS, Composer, Problem, default_of_run, nearest, parse
 from pipeline.config.user_effects import ONLY_FROM_THE_COMMAND_LINE, PYTHON
 from pipeline.errors import ConfigurationError
 
@@ -50,6 +49,8 @@ class Campaign:
         Batch and sensor to the ordered stages of its fit.
     compare : list
         Groups of units that the campaign's page puts side by side.
+    simulation : Path or None
+        The description that the run makes the recordings from; None where they are recorded.
     """
 
     name: str
@@ -59,11 +60,17 @@ class Campaign:
     batches: dict[str, list[str]]
     chains: dict[str, dict[str, list[str]]] = field(default_factory=dict)
     compare: list[Any] = field(default_factory=list)
+    simulation: Path | None = None
+
+    @property
+    def recorded(self) -> Path:
+        """Where the recordings are: in the campaign's directory, or among the results of the run that makes them."""
+        return self.directory if self.simulation is None else self.results.absolute() / "simulated"
 
     def folder(self, unit: str) -> Path:
         """Return where a unit's recordings lie."""
         folder: str = self.units[unit].config["procedure"]["folder"]
-        return self.directory / folder
+        return self.recorded / folder
 
 
 def load_campaign(settings: Mapping[str, Any]) -> Campaign:
@@ -86,10 +93,10 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
         raise ConfigurationError(f"--config {unknown[0]}: unknown setting{nearest(unknown[0], valid)}")
     directory = find_campaign(str(settings.get("campaign", "demo")))
     rows = read_units(directory / "units.csv")
-    of_all, of_run, compare = campaign_settings(directory / "campaign.yaml", rows)
+    own_file = read_campaign_file(directory / "campaign.yaml", rows)
     from_command = as_list(settings.get("overrides", []), "overrides")
     per_unit = unit_overrides(settings.get("unit_overrides", {}), rows)
-    of_run, from_command = split_run_settings([*of_run, *from_command])
+    of_run, from_command = split_run_settings([*own_file.of_run, *from_command])
     composer = Composer(directory, as_list(settings.get(PYTHON, []), PYTHON, "paths of Python files"))
     units: dict[str, UnitRow] = {}
     problems: dict[str, list[str]] = {}
@@ -97,7 +104,7 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
         groups = [f"{g}={row[g]}" for g in GROUPS if row.get(g)]
         own = [o.strip() for o in row.get("overrides", "").split(";") if o.strip()]
         try:
-            config = composer.unit(name, [*of_all, *groups, *own, *from_command, *per_unit.get(name, [])])
+            config = composer.unit(name, [*own_file.of_units, *groups, *own, *from_command, *per_unit.get(name, [])])
             units[name] = UnitRow(name, row, config)
         except Problem as problem:
             for line in str(problem).splitlines():
@@ -106,7 +113,7 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
         raise ConfigurationError(_one_message(problems), str(directory / "units.csv"))
     batches, chains = cut_batches(units, batch_size(of_run))
     results = Path(str(settings.get("results", "results"))) / directory.name
-    return Campaign(directory.name, directory, results, units, batches, chains, compare)
+    return Campaign(directory.name, directory, results, units, batches, chains, own_file.compare, own_file.simulation)
 
 
 def find_campaign(name: str) -> Path:
@@ -155,40 +162,6 @@ def read_units(path: Path) -> dict[str, dict[str, str]]:
     return found
 
 
-def campaign_settings(path: Path, rows: Mapping[str, Any]) -> tuple[list[str], list[str], list[Any]]:
-    """Read ``campaign.yaml``: overrides of all units, overrides that are settings of the run, units to compare."""
-    if not path.is_file():
-        return [], [], []
-    try:
-        content = OmegaConf.to_container(OmegaConf.load(path)) or {}
-    except Exception as error:
-        raise ConfigurationError(f"is not YAML: {' '.join(str(error).split())}", str(path)) from error
-    if not isinstance(content, dict):
-        raise ConfigurationError("must be a mapping, for example 'overrides: [filter=rc_low_pass]'", str(path))
-    if PYTHON in content:
-        raise ConfigurationError(f"{PYTHON}: {ONLY_FROM_THE_COMMAND_LINE}", str(path))
-    unknown = [str(k) for k in content if k not in ("overrides", "compare")]
-    if unknown:
-        raise ConfigurationError(f"{unknown[0]}: unknown key{nearest(unknown[0], ['overrides', 'compare'])}", str(path))
-    run, units = split_run_settings(as_list(content.get("overrides", []), f"{path}: overrides"))
-    compare = content.get("compare") or []
-    for group in compare if isinstance(compare, list) else [compare]:
-        names = group.get("units") if isinstance(group, dict) else group
-        if not isinstance(names, list) or not all(str(n) in rows for n in names):
-            form = "a list of lists of units of units.csv, or of {title, units}"
-            raise ConfigurationError(f"compare: {form} is expected, got {group!r}", str(path))
-    return units, run, compare
-
-
-def as_list(value: Any, where: str, what: str = "overrides KEY=VALUE") -> list[str]:  # noqa: ANN401  (the user's)
-    """Return overrides as a list: a list of strings as it is, a plain string as one."""
-    if isinstance(value, str):
-        value = [value]
-    if not isinstance(value, (list, tuple)) or not all(isinstance(v, str) for v in value):
-        raise ConfigurationError(f"{where}: a list of {what} is expected, got {value!r}")
-    return list(value)
-
-
 def unit_overrides(value: Any, rows: Mapping[str, Any]) -> dict[str, list[str]]:  # noqa: ANN401
     """Check ``unit_overrides``: unit name to a list of overrides, of units that exist."""
     if not isinstance(value, dict):
@@ -198,12 +171,6 @@ def unit_overrides(value: Any, rows: Mapping[str, Any]) -> dict[str, list[str]]:
         if str(name) not in rows:
             raise ConfigurationError(f"unit_overrides: no unit {name!r} in units.csv{nearest(str(name), rows)}")
     return {str(name): as_list(v, f"unit_overrides of {name}") for name, v in value.items()}
-
-
-def split_run_settings(overrides: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Split overrides into those of the run and those of units."""
-    run = [o for o in overrides if o.lstrip("+").split("=")[0] in RUN_SETTINGS]
-    return run, [o for o in overrides if o not in run]
 
 
 def batch_size(overrides: Sequence[str]) -> int:

@@ -102,7 +102,7 @@ def write_part(campaign: Campaign, stage: str, units: Sequence[str], sensor: str
     if stage in ("ingest", "report"):
         content["campaign"] = campaign.name
     if stage == "ingest":
-        content["directory"] = str(campaign.directory)
+        content["directory"] = str(campaign.recorded)
     if stage == "gather":
         content = {"campaign": campaign.name, "rows": {u: campaign.units[u].row for u in units}}
         content["compare"] = campaign.compare

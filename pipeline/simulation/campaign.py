@@ -53,7 +53,13 @@ CAMPAIGN = "# Hydra overrides for all units of this campaign.\noverrides: []\n"
 BY_HAND = Course(dwell_s=4.0, step_rate_dps=60.0, acceleration_dps2=200.0, validation_s=0.0)
 
 
-def write_campaign(description: Description, directory: Path, progress: Callable[[str], None] = lambda _: None) -> None:
+def write_campaign(
+    description: Description,
+    directory: Path,
+    progress: Callable[[str], None] = lambda _: None,
+    *,
+    sheet_only: bool = False,
+) -> None:
     """Simulate every unit of a description and write the campaign.
 
     Parameters
@@ -63,9 +69,10 @@ def write_campaign(description: Description, directory: Path, progress: Callable
         Made if it does not exist; files of the same names are replaced.
     progress : callable
         Told of each unit that is done.
+    sheet_only : bool
+        Write ``units.csv`` without recordings and truth: for a campaign whose run makes them.
     """
-    rows = []
-    for number, unit in enumerate(description.units):
+    for number, unit in enumerate([] if sheet_only else description.units):
         origin = _origin(description, unit, number)
         recordings, truth = simulate_unit(description.units[origin], description.seed, origin)
         sheet = read_config("sensor", unit.sensor)
@@ -74,14 +81,17 @@ def write_campaign(description: Description, directory: Path, progress: Callable
         for recording in recordings:
             write_recording(folder, recording, unit.format, sheet)
         _write_json(directory / "truth" / f"{unit.unit}.json", {**truth, "unit": unit.unit})
-        rows.append(
-            {"unit": unit.unit, "sensor": unit.sensor, "table": unit.table, "procedure": unit.procedure, **unit.columns}
-        )
         progress(f"{unit.unit}: {sum(r.samples for r in recordings)} samples in {len(recordings)} recordings")
-    rows += [{str(k): v for k, v in row.items()} for row in description.rows]
-    (directory / "units.csv").write_text(_table(rows), encoding="utf-8")
+    (directory / "units.csv").write_text(_table(sheet_rows(description)), encoding="utf-8")
     if not (directory / "campaign.yaml").exists():
         (directory / "campaign.yaml").write_text(CAMPAIGN, encoding="utf-8")
+
+
+def sheet_rows(description: Description) -> list[dict[str, Any]]:
+    """Return the rows of ``units.csv``: of the units, then the further ones."""
+    named = ("unit", "sensor", "table", "procedure")
+    of_units = [{name: getattr(unit, name) for name in named} | unit.columns for unit in description.units]
+    return of_units + [{str(k): v for k, v in row.items()} for row in description.rows]
 
 
 def simulate_unit(

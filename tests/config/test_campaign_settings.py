@@ -154,3 +154,16 @@ def test_a_campaigns_own_configs_are_options(tmp_path: Path) -> None:
     own.joinpath("mine.yaml").write_text(shipped.read_text().replace("gravity_g: 1.0", "gravity_g: 0.999"))
     table = load(directory).units["A"].config["table"]
     assert (table["name"], table["gravity_g"]) == ("mine", 0.999)
+
+
+def test_a_campaign_whose_run_makes_the_recordings_reads_them_among_the_results(tmp_path: Path) -> None:
+    directory = campaign(tmp_path, "unit\nA\n", "simulate: true\n")
+    with pytest.raises(ConfigurationError, match=r"needs simulation.yaml beside it"):
+        load(directory)
+    (directory / "simulation.yaml").write_text("units: [{unit: A}]\n")
+    loaded = load(directory, results=str(tmp_path / "out"))
+    assert loaded.simulation == directory / "simulation.yaml"
+    assert loaded.folder("A") == tmp_path / "out" / "bench" / "simulated" / "raw" / "A"
+    directory.joinpath("campaign.yaml").write_text("simulate: yes please\n")
+    with pytest.raises(ConfigurationError, match="true or false is expected"):
+        load(directory)

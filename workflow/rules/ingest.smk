@@ -1,5 +1,7 @@
 # A unit's files -> one Parquet file. Files that do not exist are no input: their unit fails, the others go on.
 def recordings(wildcards):
+    if CAMPAIGN.simulation:
+        return [SIMULATED]
     found = []
     for unit in CAMPAIGN.batches[wildcards.batch]:
         config = CAMPAIGN.units[unit].config

@@ -1,0 +1,122 @@
+"""``campaign.yaml``: what a campaign says of all its units, of the run, and of its page.
+
+For example::
+
+    overrides: [filter=rc_low_pass]   # Hydra overrides of every unit, and settings of the run
+    compare: [[U1, U2]]               # units that the campaign's page puts side by side
+    simulate: true                    # the run makes the recordings, from simulation.yaml beside this file
+
+All of it is optional.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from omegaconf import OmegaConf
+
+from pipeline.config.compose import RUN_SETTINGS, nearest
+from pipeline.config.user_effects import ONLY_FROM_THE_COMMAND_LINE, PYTHON
+from pipeline.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+KEYS = ("overrides", "compare", "simulate")
+SIMULATION = "simulation.yaml"
+
+
+@dataclass(frozen=True)
+class CampaignFile:
+    """What ``campaign.yaml`` holds.
+
+    Attributes
+    ----------
+    of_units, of_run : list of str
+        Overrides of all units, and those that are settings of the run.
+    compare : list
+        Groups of units that the campaign's page puts side by side.
+    simulation : Path or None
+        The description that the run makes the recordings from; None where they are recorded.
+    """
+
+    of_units: list[str] = field(default_factory=list)
+    of_run: list[str] = field(default_factory=list)
+    compare: list[Any] = field(default_factory=list)
+    simulation: Path | None = None
+
+
+def read_campaign_file(path: Path, rows: Mapping[str, Any]) -> CampaignFile:
+    """Read ``campaign.yaml``; all of it is optional.
+
+    Parameters
+    ----------
+    path : Path
+    rows : mapping
+        Of ``units.csv``, by unit.
+
+    Raises
+    ------
+    ConfigurationError
+        If it is not as it should be.
+    """
+    if not path.is_file():
+        return CampaignFile()
+    content = _mapping(path)
+    run, units = split_run_settings(as_list(content.get("overrides", []), f"{path}: overrides"))
+    return CampaignFile(units, run, _compare(content.get("compare") or [], rows, path), _simulation(content, path))
+
+
+def as_list(value: Any, where: str, what: str = "overrides KEY=VALUE") -> list[str]:  # noqa: ANN401  (the user's)
+    """Return overrides as a list: a list of strings as it is, a plain string as one."""
+    if isinstance(value, str):
+        value = [value]
+    if not isinstance(value, (list, tuple)) or not all(isinstance(v, str) for v in value):
+        raise ConfigurationError(f"{where}: a list of {what} is expected, got {value!r}")
+    return list(value)
+
+
+def split_run_settings(overrides: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Split overrides into those of the run and those of units."""
+    run = [o for o in overrides if o.lstrip("+").split("=")[0] in RUN_SETTINGS]
+    return run, [o for o in overrides if o not in run]
+
+
+def _mapping(path: Path) -> dict[str, Any]:
+    try:
+        content = OmegaConf.to_container(OmegaConf.load(path)) or {}
+    except Exception as error:
+        raise ConfigurationError(f"is not YAML: {' '.join(str(error).split())}", str(path)) from error
+    if not isinstance(content, dict):
+        raise ConfigurationError("must be a mapping, for example 'overrides: [filter=rc_low_pass]'", str(path))
+    if PYTHON in content:
+        raise ConfigurationError(f"{PYTHON}: {ONLY_FROM_THE_COMMAND_LINE}", str(path))
+    unknown = [str(k) for k in content if k not in KEYS]
+    if unknown:
+        raise ConfigurationError(f"{unknown[0]}: unknown key{nearest(unknown[0], KEYS)}", str(path))
+    return {str(k): v for k, v in content.items()}
+
+
+def _compare(compare: Any, rows: Mapping[str, Any], path: Path) -> list[Any]:  # noqa: ANN401  (the user's)
+    groups: list[Any] = compare if isinstance(compare, list) else [compare]
+    for group in groups:
+        names = group.get("units") if isinstance(group, dict) else group
+        if not isinstance(names, list) or not all(str(n) in rows for n in names):
+            form = "a list of lists of units of units.csv, or of {title, units}"
+            raise ConfigurationError(f"compare: {form} is expected, got {group!r}", str(path))
+    return groups
+
+
+def _simulation(content: Mapping[str, Any], path: Path) -> Path | None:
+    """Return the description to simulate, where the campaign asks for it."""
+    asked = content.get("simulate", False)
+    if not isinstance(asked, bool):
+        raise ConfigurationError(f"simulate: true or false is expected, got {asked!r}", str(path))
+    if not asked:
+        return None
+    description = path.with_name(SIMULATION)
+    if not description.is_file():
+        raise ConfigurationError(f"simulate: true needs {SIMULATION} beside it, which does not exist", str(path))
+    return description

@@ -1,0 +1,16 @@
+# The recordings of a campaign that is simulated (simulate: true in its campaign.yaml): made anew, and not kept in data/.
+SIMULATED = f"{RESULTS}/simulated"
+
+if CAMPAIGN.simulation:
+
+    rule simulate:
+        input:
+            CAMPAIGN.simulation,
+        output:
+            directory(SIMULATED),
+        log:
+            f"{RESULTS}/logs/simulate.log",
+        params:
+            code=code_digest("pipeline.commands.simulate"),
+        shell:
+            "{RUN} simulate {output:q} --from {input:q} > {log:q} 2>&1"
