@@ -38,7 +38,7 @@ localrules:
 
 onsuccess:
     say_at_the_end(
-        f"{len(CAMPAIGN.units)} units are calibrated; look at {RESULTS}/index.html\n"
+        f"units calibrated: {len(CAMPAIGN.units)}; look at {RESULTS}/index.html\n"
     )
 
 

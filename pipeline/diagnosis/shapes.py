@@ -161,10 +161,11 @@ def powers(span: Span, signal: str | None = None) -> tuple[str, ...]:
     """Return the powers 1 to 5 of a signal, centred and scaled to its span; of ``u`` and forces only scaled."""
     name = signal or span.signal
     middle, half = _tidy(0.5 * (span.low + span.high), span.size), _tidy(0.5 * span.size, span.size)
-    x = f"({name} - {middle:g}) / {half:g}"
+    x = f"(({name} - {middle:g}) / {half:g})"
     if name == "u" or name.startswith("f"):
-        x = f"{name} / {_tidy(max(abs(span.low), abs(span.high)), span.size):g}"
-    return (x, *(f"({x}) ** {p}" for p in range(2, ORDER + 1)))
+        scale = f"{_tidy(max(abs(span.low), abs(span.high)), span.size):g}"
+        x = name if scale == "1" else f"({name} / {scale})"
+    return (x, *(f"{x} ** {p}" for p in range(2, ORDER + 1)))
 
 
 def steps(span: Span, places: Sequence[float] | Values) -> list[Shape]:

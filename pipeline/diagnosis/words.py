@@ -31,7 +31,7 @@ def in_words(part: Mapping[str, Any] | None, sensor: str) -> list[str]:
     lines = [_verdict(part, sensor)]
     entries = {entry["effect"]: entry for entry in part["ranking"]}
     for name in part["selected"]:
-        lines += _selected(entries[name], sensor)
+        lines += _selected(entries[name], sensor, with_shape=bool(part.get("suggested_effect")))
     lines += _unknown(part, sensor)
     if len(part["selected"]) > 3 and part["verdict"] == "unexplained":
         lines.append(
@@ -50,7 +50,8 @@ def in_words(part: Mapping[str, Any] | None, sensor: str) -> list[str]:
     if part["next_experiment"]:
         lines.append(f"Next experiment: {part['next_experiment']}.")
     if part["override"]:
-        lines.append(f"To add it, run with overrides='{part['override']}'.")
+        what = "it" if len(part["selected"]) == 1 else "them"
+        lines.append(f"To add {what}, run with overrides='{part['override']}'.")
     return lines
 
 
@@ -99,7 +100,7 @@ def _names(names: list[str]) -> str:
     return " and ".join(filter(None, [", ".join(words[:-1]), *words[-1:]]))
 
 
-def _selected(entry: Mapping[str, Any], sensor: str) -> list[str]:
+def _selected(entry: Mapping[str, Any], sensor: str, *, with_shape: bool) -> list[str]:
     known = catalogue().get(entry["effect"])
     meaning = entry.get("meaning") or (known.meaning if known else "")
     values = ", ".join(_value(name, p) for name, p in entry["parameters"].items())
@@ -114,7 +115,8 @@ def _selected(entry: Mapping[str, Any], sensor: str) -> list[str]:
         lines.append(f"It looks much like {alike} of the same signal.")
     before, after = entry["held_out_error_before"], entry["held_out_error_after"]
     if before is not None and after is not None:
-        lines.append(f"On held-out motion the rms error goes from {before:.4g} to {after:.4g} {UNITS[sensor]}.")
+        beside = ", the shape below fitted with it" if with_shape else ""
+        lines.append(f"On held-out motion the rms error goes from {before:.4g} to {after:.4g} {UNITS[sensor]}{beside}.")
     return lines
 
 

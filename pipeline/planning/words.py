@@ -140,7 +140,7 @@ def helps_most(gains: Sequence[Gain]) -> list[str]:
 def _brought(gain: Gain) -> str:
     """Return what a change brings; the factor is a mean over effects and sensors."""
     parts = [f"shows {_listed(gain.shown)}"] if gain.shown else []
-    parts += [f"tells apart {_listed(gain.told)}"] if gain.told else []
+    parts += [f"tells {_listed(gain.told)} from what looks like it"] if gain.told else []
     percent = 100.0 * gain.factor
     whose = "the others" if parts else "effects"
     parts.append(f"finds {whose} " + (f"at {percent:.0f} % of the size" if percent < CLEARLY_SMALLER else "no earlier"))

@@ -56,7 +56,8 @@ def added_variable(sensor: str, diagnosis: JSON) -> Figure | None:
     finding = f"{effect.capitalize()} shows: {_coefficient(best)}" + (
         ", and the points follow the line" if straight else "; some points leave the line"
     )
-    names = ", ".join(dict.fromkeys(p["parameter"] for p in shown["panels"]))
+    names = {p["parameter"] for p in shown["panels"]}
+    what = best["parameter"] if len(names) == 1 else "each parameter"
     slopes = "; ".join(dict.fromkeys(_coefficient(p) for p in shown["panels"]))
     svg = chart(
         f"{sensor}-added-variable",
@@ -64,7 +65,7 @@ def added_variable(sensor: str, diagnosis: JSON) -> Figure | None:
         f"Added-variable plot of {effect}. Slopes: {slopes}. Mean square of the points about the line, in standard "
         f"errors: {', '.join(number(s, 2) for s in scatter)}.",
         panels,
-        _with_unit(f"what {names} multipl{'y' if ',' in names else 'ies'}, less all other columns", best["unit"], unit),
+        _with_unit(f"what {what} multiplies, less all other columns", best["unit"], unit),
     )
     caption = (
         f"Readings less all that base, other effects and bias wander explain, in bins with ±2 standard errors; the "

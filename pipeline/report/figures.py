@@ -156,7 +156,8 @@ def staircase(sensor: str, held_out: JSON, found: JSON, *, vector: bool) -> Figu
         levels={"noise floor": floor} if floor else {},
     )
     caption = f"Held-out error of the {kind}, as each step is added; the line is what noise alone leaves."
-    return Figure(svg, caption, (("c4", "if it were added"),) if rows[-1].colour == 4 else (), finding)
+    added = "if it were added" + (" with the suggested shape" if found.get("suggested_effect") else "")
+    return Figure(svg, caption, (("c4", added),) if rows[-1].colour == 4 else (), finding)
 
 
 def _if_added(found: JSON, reached: float | None) -> list[Bar]:
