@@ -1,22 +1,30 @@
-# Every unit's files under their stable paths, the summary and the campaign page.
+# Every unit's files under their stable paths, the summary and the campaign page; `snakemake --report` shows the pages.
 rule gather:
     input:
         of_batches("report"),
         of_batches("export"),
     output:
-        f"{RESULTS}/index.html",
-        f"{RESULTS}/summary.csv",
+        report(
+            f"{RESULTS}/index.html",
+            category="Campaign",
+            labels={"page": "the campaign"},
+        ),
+        report(
+            f"{RESULTS}/summary.csv",
+            category="Campaign",
+            labels={"page": "one row a unit"},
+        ),
         f"{RESULTS}/failures.json",
         [
             directory(f"{RESULTS}/{name}")
-            for name in (
-                "calibrations",
-                "validations",
-                "diagnoses",
-                "reports",
-                "exports",
-            )
+            for name in ("calibrations", "validations", "diagnoses", "exports")
         ],
+        report(
+            directory(f"{RESULTS}/reports"),
+            patterns=["{unit}.html"],
+            category="Units",
+            labels={"unit": "{unit}"},
+        ),
     log:
         f"{RESULTS}/logs/gather.log",
     params:
