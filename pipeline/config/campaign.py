@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
+import json
 import re
+import shlex
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -51,6 +53,8 @@ class Campaign:
         Groups of units that the campaign's page puts side by side.
     simulation : Path or None
         The description that the run makes the recordings from; None where they are recorded.
+    settings : mapping
+        What ``snakemake --config`` gave.
     """
 
     name: str
@@ -61,11 +65,22 @@ class Campaign:
     chains: dict[str, dict[str, list[str]]] = field(default_factory=dict)
     compare: list[Any] = field(default_factory=list)
     simulation: Path | None = None
+    settings: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def recorded(self) -> Path:
         """Where the recordings are: in the campaign's directory, or among the results of the run that makes them."""
         return self.directory if self.simulation is None else self.results.absolute() / "simulated"
+
+    def command(self, unit: str) -> str:
+        """Return the command that makes a unit's results again, with the settings of this run that concern it."""
+        given = {k: v for k, v in self.settings.items() if k != "results" and v}
+        own = given.get("unit_overrides", {}).get(unit)
+        given = {k: v for k, v in given.items() if k != "unit_overrides"} | (
+            {"unit_overrides": {unit: own}} if own else {}
+        )
+        words = [shlex.quote(f"{k}={v if isinstance(v, str) else json.dumps(v)}") for k, v in given.items()]
+        return " ".join(["snakemake --cores 2", *(["--config"] * bool(words)), *words])
 
     def folder(self, unit: str) -> Path:
         """Return where a unit's recordings lie."""
@@ -113,7 +128,9 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
         raise ConfigurationError(_one_message(problems), str(directory / "units.csv"))
     batches, chains = cut_batches(units, batch_size(of_run))
     results = Path(str(settings.get("results", "results"))) / directory.name
-    return Campaign(directory.name, directory, results, units, batches, chains, own_file.compare, own_file.simulation)
+    return Campaign(
+        directory.name, directory, results, units, batches, chains, own_file.compare, own_file.simulation, settings
+    )
 
 
 def find_campaign(name: str) -> Path:

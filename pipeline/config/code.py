@@ -18,7 +18,8 @@ PACKAGE = Path(__file__).resolve().parents[1]
 def code_digest(module: str) -> str:
     """Return a digest of a module's source and of every module of the package that it imports, at any depth.
 
-    A package counts with all that lies beside its ``__init__`` where it finds its modules on disk (effects, exports).
+    A package counts with all that lies beside its ``__init__`` where it finds its modules on disk (effects, exports), a
+    module that imports jinja2 with the ``templates`` beside it.
 
     Parameters
     ----------
@@ -45,6 +46,8 @@ def _closure(module: str) -> frozenset[Path]:
 
 @cache
 def _imports(file: Path) -> tuple[Path, ...]:
+    if file.suffix != ".py":
+        return ()
     tree = ast.parse(file.read_bytes())
     found: list[Path | None] = []
     for node in ast.walk(tree):
@@ -52,6 +55,8 @@ def _imports(file: Path) -> tuple[Path, ...]:
             found += [_file_of(alias.name) for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
             found.append(_file_of(node.module))
+            if node.module == "jinja2":
+                found += (file.parent / "templates").glob("*")
             found += [_file_of(f"{node.module}.{alias.name}") for alias in node.names]
         elif (
             file.name == "__init__.py"

@@ -101,6 +101,13 @@ def write_part(campaign: Campaign, stage: str, units: Sequence[str], sensor: str
     content |= effects_for(stage, sensor, [campaign.units[u].config for u in units])
     if stage in ("ingest", "report"):
         content["campaign"] = campaign.name
+    if stage == "report":
+        for unit in units:
+            row = campaign.units[unit].row
+            content["units"][unit] |= {
+                "row": {c: row[c] for c in ("serial", "lot", "date") if row.get(c)},
+                "command": campaign.command(unit),
+            }
     if stage == "ingest":
         content["directory"] = str(campaign.recorded)
     if stage == "gather":

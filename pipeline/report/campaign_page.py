@@ -5,11 +5,15 @@ Units with the same serial are the same device calibrated in several ways (or se
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
+from markupsafe import Markup
+
 from pipeline.records import SENSORS
+from pipeline.report.fleet_figures import fleet_figures
 from pipeline.report.numbers import number
 from pipeline.report.summary import COLUMNS
 from pipeline.report.templating import template
@@ -18,6 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
 JSON = dict[str, Any]
+FIRST = 100  # rows that a browser shows at once; it shows the others when asked
 UNITS = {"accelerometer": "g", "gyroscope": "deg/s"}
 VERDICTS = {
     "nothing_missing": ("nothing missing", "good"),
@@ -62,10 +67,28 @@ def render(
             {"title": title, "rows": [by_unit[u] for u in units if u in by_unit]}
             for title, units in [*_same_serial(rows), *_asked_for(comparisons)]
         ],
+        figures=fleet_figures(rows),
+        causes=_causes(failures),
+        names=_script_data([row["unit"] for row in rows]),
+        first=FIRST,
         verdicts=VERDICTS,
         kept=sorted({key for row in rows for key in row} - set(COLUMNS)),
     )
     return page
+
+
+def _causes(failures: list[JSON]) -> list[tuple[str, list[str]]]:
+    """Return the units that failed by their kind of failure and stage, the most frequent first."""
+    causes: dict[str, list[str]] = {}
+    for failure in failures:
+        cause = f"{failure.get('code')} in stage {failure.get('stage') or 'unknown'}"
+        causes.setdefault(cause, []).append(str(failure.get("unit")))
+    return sorted(causes.items(), key=lambda c: -len(c[1]))
+
+
+def _script_data(value: object) -> Markup:
+    """Return a value as JSON that may stand within a script element."""
+    return Markup(json.dumps(value, ensure_ascii=False).replace("<", "\\u003c"))  # noqa: S704  (no tag can begin)
 
 
 def _cells(row: JSON) -> JSON:

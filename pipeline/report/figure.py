@@ -27,12 +27,15 @@ class Figure:
         CSS class and text of each colour.
     finding : str
         What it shows in one sentence, above the chart.
+    quiet : bool
+        Whether nothing is to be seen in it, so that it may stand folded.
     """
 
     svg: Markup
     caption: str = ""
     legend: tuple[tuple[str, str], ...] = ()
     finding: str = ""
+    quiet: bool = False
 
 
 def plain(name: str) -> str:

@@ -71,7 +71,7 @@ def allan(
         f"{sensor}-allan",
         f"{sensor}: {finding}",
         f"Allan deviation, mean of the axes: {values_said}.",
-        [Panel(layers, f"Allan deviation, {UNITS[sensor]}", 190)],
+        [Panel(layers, f"Allan deviation, {UNITS[sensor]}", 190, logarithmic=True)],
         "averaging time, s",
         logarithmic=True,
     )

@@ -70,7 +70,7 @@ def _covariate(sensor: str, label: str, mean: BinnedMean, wander: NDArray[np.flo
         label,
         angle=name == "angle",
     )
-    return Figure(svg, finding=finding)
+    return Figure(svg, finding=finding, quiet=excess < FLAT)
 
 
 def _finding(words: str, mean: BinnedMean, wander: NDArray[np.float64], excess: float, units: tuple[str, str]) -> str:
@@ -103,4 +103,4 @@ def _harmonics(sensor: str, name: str, amplitudes: NDArray[np.float64], level: N
         x_label="cycles a turn",
         levels=level.tolist(),
     )
-    return Figure(svg, legend=AXES_LEGEND, finding=finding)
+    return Figure(svg, legend=AXES_LEGEND, finding=finding, quiet=ratio.max() <= 1.0)

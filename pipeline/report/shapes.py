@@ -41,6 +41,15 @@ class Samples:
 
 
 @dataclass(frozen=True)
+class Dots:
+    """Values as dots, however many, each of which counts by itself; left out where not finite."""
+
+    x: NDArray[np.float64]
+    y: NDArray[np.float64]
+    colour: int = 0
+
+
+@dataclass(frozen=True)
 class Band:
     """The area between two curves."""
 
@@ -60,7 +69,7 @@ class Means:
     colour: int = 0
 
 
-Layer = Line | Samples | Band | Means
+Layer = Line | Samples | Dots | Band | Means
 
 
 def draw(layer: Layer, x: Scale, y: Scale) -> str:
@@ -69,6 +78,9 @@ def draw(layer: Layer, x: Scale, y: Scale) -> str:
         return _samples(layer, x, y)
     if isinstance(layer, Means):
         return _means(layer, x, y)
+    if isinstance(layer, Dots):
+        known = np.isfinite(layer.x) & np.isfinite(layer.y)
+        return f'<path class="dots c{layer.colour}" d="{dots(x.units(layer.x[known]), y.units(layer.y[known]))}"/>'
     if isinstance(layer, Band):
         at, low, high = x.units(layer.x), y.units(layer.low), y.units(layer.high)
         area = path(np.r_[at, at[::-1]], np.r_[high, low[::-1]])

@@ -1,7 +1,10 @@
 """Charts as inline SVG: panels one above the other that share the axis x, with lines, dots, bands and levels.
 
-A chart is text: no image, no script, no font, no other host. Colours are CSS classes of the page (``c0`` .. ``c5``), so
-that a chart follows the page into the dark. Each has a title and a description in words for those who cannot see it.
+A chart is text: no image, no font, no other host. Colours are CSS classes of the page (``c0`` .. ``c5``), so that a
+chart follows the page into the dark. Each has a title and a description in words for those who cannot see it.
+
+The chart itself and each panel say in ``data-scale`` what their axis is: value and place of both ends, whether it is
+logarithmic, and its text. With it the page's script reads values back from the paths, and zooms.
 """
 
 from __future__ import annotations
@@ -37,6 +40,8 @@ class Panel:
         Horizontal lines by their text.
     limits : (low, high), optional
         Of the axis y; from the layers where it is not given.
+    logarithmic : bool
+        Whether what is drawn are logarithms to base 10 of y; ticks tell the values.
     """
 
     layers: list[Layer]
@@ -44,6 +49,7 @@ class Panel:
     height: int = 140
     levels: dict[str, float] | None = None
     limits: tuple[float, float] | None = None
+    logarithmic: bool = False
 
 
 def chart(
@@ -55,6 +61,7 @@ def chart(
     *,
     angle: bool = False,
     logarithmic: bool = False,
+    names: str = "",
 ) -> Markup:
     """Return a chart of panels that share the axis x.
 
@@ -69,24 +76,29 @@ def chart(
     angle : bool
         Whether x is an angle in deg.
     logarithmic : bool
-        Whether what is drawn are logarithms to base 10, on both axes; ticks tell the values.
+        Whether what is drawn are logarithms to base 10 of x; ticks tell the values.
+    names : str
+        List of the page's script that names what stands at x = 1, 2, ...
     """
     x = Scale(*span([layer.x for p in panels for layer in p.layers], 0.0), LEFT, WIDTH - RIGHT)
     x_ticks = _decades(x) if logarithmic else _x_ticks(x, angle=angle)
     parts, top = [], TOP
     for panel in panels:
-        parts.append(_panel(panel, x, x_ticks, top, logarithmic=logarithmic))
+        parts.append(_panel(panel, x, x_ticks, top))
         top += panel.height + GAP
-    parts += [text(x.pixels(at), top - GAP + 13, label, "m") for at, label in x_ticks]
+    labels = "".join(text(x.pixels(at), top - GAP + 13, label, "m") for at, label in x_ticks)
+    parts.append(f'<g class="ticks">{labels}</g>')
     parts.append(text((LEFT + WIDTH - RIGHT) / 2, top - GAP + 28, x_label, "m"))
-    return frame(name, title, description, top - GAP + BOTTOM, "".join(parts))
+    scale = _scale(x, x_label, "angle" if angle else "log" if logarithmic else "")
+    scale += f' data-names="{names}"' if names else ""
+    return frame(name, title, description, top - GAP + BOTTOM, "".join(parts), scale=scale)
 
 
-def frame(name: str, title: str, description: str, height: float, content: str) -> Markup:
+def frame(name: str, title: str, description: str, height: float, content: str, *, scale: str = "") -> Markup:
     """Return the ``svg`` element with its text alternatives around drawn content."""
     name = escape(name)
     return Markup(  # noqa: S704  (every text in it is escaped where it is written)
-        f'<svg class="chart" viewBox="0 0 {WIDTH} {height:g}" role="img" aria-labelledby="{name}-t {name}-d">'
+        f'<svg class="chart" viewBox="0 0 {WIDTH} {height:g}" role="img" aria-labelledby="{name}-t {name}-d"{scale}>'
         f'<title id="{name}-t">{escape(title)}</title><desc id="{name}-d">{escape(description)}</desc>{content}</svg>'
     )
 
@@ -96,24 +108,35 @@ def text(x: float, y: float, content: str, kind: str = "") -> str:
     return f'<text x="{x:.4g}" y="{y:.4g}" class="{kind}">{escape(content)}</text>'
 
 
-def _panel(panel: Panel, x: Scale, x_ticks: list[Tick], top: float, *, logarithmic: bool) -> str:
+def _panel(panel: Panel, x: Scale, x_ticks: list[Tick], top: float) -> str:
     bottom = top + panel.height
     y = Scale(*_limits(panel), bottom, top)
-    values = _decades(y) if logarithmic else _y_ticks(y, panel.height)
+    values = _decades(y) if panel.logarithmic else _y_ticks(y, panel.height)
     grid = "".join(f"M{LEFT} {y.pixels(v):.1f}H{WIDTH - RIGHT}" for v, _ in values)
     grid += "".join(f"M{x.pixels(v):.1f} {top:g}V{bottom:g}" for v, _ in x_ticks)
-    out = [f'<path class="grid" d="{grid}"/>']
+    out = [
+        f'<g class="panel"{_scale(y, panel.label, "log" if panel.logarithmic else "")}><path class="grid" d="{grid}"/>'
+    ]
+    out.append('<g class="ticks">')
     out += [text(LEFT - 4, y.pixels(v) + 3.5, label, "e") for v, label in values]
     middle = (top + bottom) / 2
-    out.append(f'<text class="m" transform="translate(10 {middle:g}) rotate(-90)">{escape(panel.label)}</text>')
+    out.append(f'</g><text class="m" transform="translate(10 {middle:g}) rotate(-90)">{escape(panel.label)}</text>')
     drawn = "".join(draw(layer, x, y) for layer in panel.layers)
-    out.append(f'<g transform="scale({1 / SUBDIVISION:g})">{drawn}</g>')
+    out.append(f'<g class="layers" transform="scale({1 / SUBDIVISION:g})">{drawn}')
+    labels = ""
     for label, value in (panel.levels or {}).items():
         at = y.pixels(value)
-        out.append(f'<path class="level" d="M{LEFT} {at:.1f}H{WIDTH - RIGHT}"/>')
-        if label:
-            out.append(text(WIDTH - RIGHT - 2, at - 3, label, "e"))
-    return "".join(out)
+        out.append(
+            f'<path class="level" d="M{LEFT * SUBDIVISION} {SUBDIVISION * at:.0f}H{(WIDTH - RIGHT) * SUBDIVISION}"/>'
+        )
+        labels += text(WIDTH - RIGHT - 2, at - 3, label, "e") if label else ""
+    return "".join([*out, f"</g>{labels}</g>"])
+
+
+def _scale(scale: Scale, label: str, kind: str) -> str:
+    """Return the attribute that tells the page's script what an axis is."""
+    ends = f"{scale.low:.9g},{scale.high:.9g},{scale.start:g},{scale.stop:g}"
+    return f' data-scale="{ends},{kind},{escape(label)}"'
 
 
 def _x_ticks(x: Scale, *, angle: bool) -> list[Tick]:

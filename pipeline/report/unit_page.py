@@ -22,6 +22,7 @@ from pipeline.report.noise_figure import allan
 from pipeline.report.ranking_chart import ranking
 from pipeline.report.residual_figures import residual_figures
 from pipeline.report.residuals import Residual, residuals
+from pipeline.report.session import environment, recording_rows, rests_logged, segments
 from pipeline.report.templating import template
 
 if TYPE_CHECKING:
@@ -65,7 +66,7 @@ def render(
     -------
     str
     """
-    ok = calibration.get("status") == "ok"
+    ok, rests = calibration.get("status") == "ok", rests_logged(recordings)
     page: str = template("unit.html").render(
         calibration=calibration,
         ok=ok,
@@ -76,8 +77,17 @@ def render(
         ]
         if ok
         else [],
-        notes=[{"file": i.get("file"), "notes": i.get("notes") or []} for i in calibration.get("inputs") or []],
-        settings_text=json.dumps(settings, indent=1, ensure_ascii=False, default=str),
+        recordings=recording_rows(recordings, rests),
+        segments=segments(recordings, rests, calibration) if ok else None,
+        environment=environment(recordings, settings) if recordings else [],
+        row={k: v for k, v in (settings.get("row") or {}).items() if v},
+        command=settings.get("command"),
+        settings_text=json.dumps(
+            {k: v for k, v in settings.items() if k not in ("row", "command")},
+            indent=1,
+            ensure_ascii=False,
+            default=str,
+        ),
     )
     return page
 

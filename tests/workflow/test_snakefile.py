@@ -2,7 +2,9 @@
 
 import csv
 import json
+import re
 import shutil
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -57,6 +59,17 @@ def test_every_file_of_a_unit_is_published_under_its_stable_path(bench: Bench) -
         ("A2", "ok", ""),
         ("B1", "ok", "blue"),
     ]
+
+
+def test_a_report_of_snakemake_holds_every_page(bench: Bench) -> None:
+    run = bench.snakemake("--report", "report.zip")
+    assert run.code == 0, run.output
+    with zipfile.ZipFile(bench.directory / "report.zip") as report:
+        names = {Path(name).name for name in report.namelist()}
+        (index,) = (name for name in report.namelist() if name.endswith("/report.html"))
+        text = report.read(index).decode()
+    assert {"index.html", "summary.csv", "A1.html", "A2.html", "B1.html"} <= names
+    assert all(re.search(rf'"unit": ?"{unit}"', text) for unit in ("A1", "A2", "B1"))
 
 
 def test_an_unchanged_second_run_does_nothing(bench: Bench) -> None:

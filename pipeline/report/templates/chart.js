@@ -1,0 +1,237 @@
+"use strict";
+// Charts that answer: values at the pointer or by arrow keys, zoom by dragging, series that can be left out, a large view.
+// Everything is read back from the drawn paths and from data-scale (low, high, start, stop, kind, label) of each axis.
+const SVG = "http://www.w3.org/2000/svg", SUBDIVISION = 10;
+const scaleOf = (element) => {
+  const [low, high, start, stop, kind, ...label] = element.dataset.scale.split(",");
+  const ends = { low: +low, high: +high }, text = label.join(",").trim();
+  return { full: ends, view: { ...ends }, start: +start, stop: +stop, kind, label: text, unit: text.includes(", ") ? text.split(", ").pop() : "" };
+};
+const place = (axis, value, range = axis.view) => axis.start + (value - range.low) / (range.high - range.low) * (axis.stop - axis.start);
+const valueAt = (axis, at, range = axis.view) => range.low + (at - axis.start) / (axis.stop - axis.start) * (range.high - range.low);
+const plain = (value) => value === 0 ? "0" : Math.abs(value) >= 1e-4 && Math.abs(value) < 1e6 ? String(+value.toPrecision(4)) : value.toExponential(2);
+const say = (axis, value) => plain(axis.kind === "log" ? 10 ** value : value).replace("-", "\u2212");
+
+function ticksOf(axis, count) {
+  const { low, high } = axis.view, out = [];
+  if (axis.kind === "log" && high - low > 0.7) {
+    for (let k = Math.floor(low); k <= high; k++)
+      for (const m of high - low > 2 ? [1] : [1, 2, 5]) out.push(k + Math.log10(m));
+    return out.filter((v) => v >= low && v <= high).map((v) => [v, say(axis, v)]);
+  }
+  const coarse = (high - low) / count, power = 10 ** Math.floor(Math.log10(coarse));
+  const whole = axis.kind === "angle" && coarse > 2;
+  const step = whole ? [5, 10, 15, 30, 45, 90, 180, 360, 720].find((s) => s >= coarse) ?? 3600 : power * [1, 2, 5, 10].find((s) => s * power >= coarse * 0.999);
+  const decimals = Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
+  for (let n = Math.ceil(low / step - 1e-9); n * step <= high + 1e-9 * step; n++)
+    out.push([n * step, axis.kind === "log" ? say(axis, n * step) : step < 2e-4 ? (n * step).toExponential(1) : (n * step).toFixed(decimals)]);
+  return out;
+}
+
+const known = new WeakMap();
+function pointsOf(path) { // [x, low, high] of each vertex in drawing units; of a line or dots low is high
+  if (known.has(path)) return known.get(path);
+  const out = [];
+  let x = 0, y = 0;
+  for (const [, command, text] of path.getAttribute("d").matchAll(/([MlmhV])([^MlmhV]*)/g)) {
+    const n = text.match(/-?[\d.]+/g)?.map(Number) ?? [];
+    if (command === "V") { out[out.length - 1][2] = n[0]; continue; }
+    if (command === "h") continue;
+    for (let i = 0; i < n.length; i += 2) {
+      [x, y] = command === "M" ? [n[i], n[i + 1]] : [x + n[i], y + n[i + 1]];
+      out.push([x, y, y]);
+    }
+  }
+  known.set(path, out);
+  return out;
+}
+
+function prepare(svg) {
+  const figure = svg.closest("figure"), x = scaleOf(svg), names = window.chartNames?.[svg.dataset.names];
+  const panels = [...svg.querySelectorAll(".panel")].map((group) => ({ group, y: scaleOf(group), layers: group.querySelector(".layers"), grid: group.querySelector(".grid"), ticks: group.querySelector(".ticks") }));
+  const xTicks = svg.querySelector(":scope > .ticks"), xTop = +xTicks.firstElementChild?.getAttribute("y");
+  const readout = document.createElement("div"), cursor = document.createElementNS(SVG, "path"), frame = document.createElementNS(SVG, "rect");
+  readout.className = "readout"; readout.setAttribute("role", "status"); readout.hidden = true;
+  cursor.setAttribute("class", "cursor"); frame.setAttribute("class", "frame");
+  svg.tabIndex = 0;
+  figure.append(readout);
+  let current = 0, drag = null, shown = null;
+
+  const label = (at, top, text, kind) => {
+    const t = document.createElementNS(SVG, "text");
+    t.setAttribute("x", at); t.setAttribute("y", top); t.setAttribute("class", kind); t.textContent = text.replace("-", "\u2212");
+    return t;
+  };
+  const redraw = () => {
+    const sx = (x.full.high - x.full.low) / (x.view.high - x.view.low), tx = x.start - sx * place(x, x.view.low, x.full);
+    const across = ticksOf(x, 6);
+    xTicks.replaceChildren(...across.map(([v, text]) => label(place(x, v), xTop, text, "m")));
+    for (const { y, layers, grid, ticks } of panels) {
+      if (!layers.parentNode.classList.contains("clip")) { // an inner svg cuts off what lies outside
+        const clip = document.createElementNS(SVG, "svg"), width = x.stop - x.start, height = y.start - y.stop;
+        for (const [k, v] of Object.entries({ class: "clip", x: x.start, y: y.stop, width, height, viewBox: `${x.start} ${y.stop} ${width} ${height}` })) clip.setAttribute(k, v);
+        layers.replaceWith(clip); clip.append(layers);
+      }
+      const sy = (y.full.high - y.full.low) / (y.view.high - y.view.low), ty = y.start - sy * place(y, y.view.low, y.full);
+      layers.setAttribute("transform", `translate(${tx} ${ty}) scale(${sx / SUBDIVISION} ${sy / SUBDIVISION})`);
+      const up = ticksOf(y, Math.max(2, (y.start - y.stop) / 28));
+      ticks.replaceChildren(...up.map(([v, text]) => label(x.start - 4, place(y, v) + 3.5, text, "e")));
+      grid.setAttribute("d", up.map(([v]) => `M${x.start} ${place(y, v)}H${x.stop}`).join("") + across.map(([v]) => `M${place(x, v)} ${y.stop}V${y.start}`).join(""));
+    }
+  };
+  const zoom = (axis, low, high) => {
+    const limit = (axis.full.high - axis.full.low) * 1e-4;
+    if (high - low < limit) return;
+    axis.view = { low: Math.max(low, axis.full.low), high: Math.min(high, axis.full.high) };
+  };
+  const reset = () => { for (const axis of [x, ...panels.map((p) => p.y)]) axis.view = { ...axis.full }; redraw(); };
+  const hide = () => { readout.hidden = true; cursor.remove(); shown = null; };
+
+  const nearest = (panel, at, upright) => { // the vertex of each series that is nearest to a place in drawing units of the full view
+    const found = new Map();
+    for (const path of panel.layers.querySelectorAll(".line, .dots, .strokes")) {
+      const colour = [...path.classList].find((c) => /^c\d$/.test(c));
+      if (figure.classList.contains(`without-${colour}`)) continue;
+      let best = null, least = Infinity;
+      for (const p of pointsOf(path)) {
+        const far = Math.abs(p[0] - at) + (upright === null ? 0 : Math.abs(p[1] - upright));
+        if (far < least) [best, least] = [p, far];
+      }
+      if (!best) continue;
+      const entry = found.get(colour) ?? {};
+      if (path.classList.contains("strokes")) entry.range = best; else entry.point = best;
+      entry.far = least;
+      found.set(colour, entry);
+    }
+    return found;
+  };
+  const show = (panel, at, upright) => {
+    let found = [...nearest(panel, at, names ? upright : null)];
+    if (!found.length) return hide();
+    if (names) found = [found.reduce((a, b) => a[1].far <= b[1].far ? a : b)];
+    const first = found[0][1].point ?? found[0][1].range, value = valueAt(x, first[0] / SUBDIVISION, x.full);
+    const read = (v) => say(panel.y, valueAt(panel.y, v / SUBDIVISION, panel.y.full));
+    const head = document.createElement("b");
+    head.textContent = names ? names[Math.round(value) - 1] : `${x.label}: ${say(x, value)}`;
+    const rows = found.map(([colour, { point, range }]) => {
+      const row = document.createElement("span"), dot = document.createElement("i");
+      dot.className = colour;
+      const name = figure.querySelector(`.legend .${colour}`)?.parentNode.textContent.trim() ?? "";
+      const numbers = point ? read(point[1]) + (range ? ` (${read(Math.max(range[1], range[2]))} to ${read(Math.min(range[1], range[2]))})` : "") : `${read(Math.max(range[1], range[2]))} to ${read(Math.min(range[1], range[2]))}`;
+      row.append(dot, `${name} ${numbers} ${panel.y.unit}`);
+      return row;
+    });
+    readout.replaceChildren(head, ...rows);
+    readout.hidden = false;
+    shown = first[0];
+    const px = place(x, value);
+    cursor.setAttribute("d", `M${px} ${panel.y.stop}V${panel.y.start}`);
+    svg.append(cursor);
+    const box = svg.getBoundingClientRect(), outer = figure.getBoundingClientRect(), ratio = box.width / svg.viewBox.baseVal.width;
+    const left = box.left - outer.left + px * ratio;
+    readout.style.top = `${box.top - outer.top + panel.y.stop * ratio}px`;
+    readout.style.left = left < outer.width / 2 ? `${left + 10}px` : "";
+    readout.style.right = left < outer.width / 2 ? "" : `${outer.width - left + 10}px`;
+  };
+  const inside = (event) => {
+    const box = svg.getBoundingClientRect(), ratio = svg.viewBox.baseVal.width / box.width;
+    return [(event.clientX - box.left) * ratio, (event.clientY - box.top) * ratio];
+  };
+  const panelAt = (py) => panels.reduce((a, b) => Math.abs(py - (a.y.start + a.y.stop) / 2) <= Math.abs(py - (b.y.start + b.y.stop) / 2) ? a : b);
+  const base = (axis, at) => place(axis, valueAt(axis, at), axis.full) * SUBDIVISION;
+
+  svg.addEventListener("pointermove", (event) => {
+    const [px, py] = inside(event);
+    if (drag) {
+      const tall = Math.abs(py - drag.y) > 12, p = drag.panel.y;
+      frame.setAttribute("x", Math.min(px, drag.x)); frame.setAttribute("width", Math.abs(px - drag.x));
+      frame.setAttribute("y", tall ? Math.min(py, drag.y) : p.stop); frame.setAttribute("height", tall ? Math.abs(py - drag.y) : p.start - p.stop);
+      svg.append(frame);
+    } else if (px >= x.start && px <= x.stop) {
+      const panel = panelAt(py);
+      current = panels.indexOf(panel);
+      show(panel, base(x, px), base(panel.y, py));
+    } else hide();
+  });
+  svg.addEventListener("pointerdown", (event) => {
+    const [px, py] = inside(event);
+    if (event.pointerType !== "mouse" || event.button || px < x.start) return;
+    drag = { x: px, y: py, panel: panelAt(py) };
+    svg.setPointerCapture(event.pointerId);
+    hide();
+    event.preventDefault();
+    svg.focus();
+  });
+  svg.addEventListener("pointerup", (event) => {
+    if (!drag) return;
+    const [px, py] = inside(event), { x: ox, y: oy, panel } = drag, ends = (axis, a, b) => [valueAt(axis, a), valueAt(axis, b)].sort((p, q) => p - q);
+    drag = null;
+    frame.remove();
+    if (Math.abs(px - ox) > 6) zoom(x, ...ends(x, ox, px));
+    if (Math.abs(py - oy) > 12) zoom(panel.y, ...ends(panel.y, oy, py));
+    if (Math.abs(px - ox) > 6 || Math.abs(py - oy) > 12) redraw();
+  });
+  svg.addEventListener("pointercancel", () => { drag = null; frame.remove(); });
+  svg.addEventListener("pointerleave", () => { if (!drag) hide(); });
+  svg.addEventListener("blur", hide);
+  svg.addEventListener("dblclick", reset);
+  svg.addEventListener("keydown", (event) => {
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    const panel = panels[current], all = [...panel.layers.querySelectorAll(".line, .dots, .strokes")].flatMap((p) => pointsOf(p).map((q) => q[0]));
+    const column = [...new Set(all)].sort((a, b) => a - b).filter((v) => v >= base(x, x.start) - 1 && v <= base(x, x.stop) + 1);
+    const i = shown === null ? -1 : column.findIndex((v) => v >= shown), middle = valueAt(x, (x.start + x.stop) / 2), half = (x.view.high - x.view.low) / 2;
+    const step = { ArrowRight: 1, ArrowLeft: -1, PageDown: 10, PageUp: -10 }[event.key];
+    if (step) show(panel, column[Math.min(Math.max(i + step, 0), column.length - 1)], null);
+    else if (event.key === "ArrowDown" || event.key === "ArrowUp") {
+      if (panels.length === 1) return;
+      current = (current + (event.key === "ArrowDown" ? 1 : panels.length - 1)) % panels.length;
+      show(panels[current], shown ?? column[0], null);
+    } else if (event.key === "+" || event.key === "-") {
+      const about = shown === null ? middle : valueAt(x, shown / SUBDIVISION, x.full), wide = half * (event.key === "+" ? 0.5 : 2);
+      zoom(x, about - wide, about + wide);
+      redraw();
+    } else if (event.key === "0" || (event.key === "Escape" && (shown !== null || x.view.low !== x.full.low || x.view.high !== x.full.high))) { hide(); reset(); } else return;
+    event.preventDefault();
+    event.stopPropagation();
+  });
+}
+
+for (const svg of document.querySelectorAll("svg[data-scale]")) {
+  const start = () => { // prepared when it is first used: a page holds dozens of charts
+    svg.removeEventListener("pointerenter", start); svg.removeEventListener("focus", start);
+    prepare(svg);
+  };
+  svg.tabIndex = 0;
+  svg.addEventListener("pointerenter", start); svg.addEventListener("focus", start);
+}
+for (const item of document.querySelectorAll("figure .legend li")) {
+  const colour = item.querySelector("i").className, figure = item.closest("figure");
+  if (!figure.querySelector(`.layers .${colour}`)) continue;
+  const button = document.createElement("button");
+  button.type = "button";
+  button.setAttribute("aria-pressed", "true");
+  button.append(...item.childNodes);
+  button.addEventListener("click", () => button.setAttribute("aria-pressed", String(!figure.classList.toggle(`without-${colour}`))));
+  item.append(button);
+}
+const large = document.createElement("dialog");
+large.setAttribute("aria-label", "Enlarged chart");
+document.body.append(large);
+large.addEventListener("close", () => large.figure.space.replaceWith(large.figure));
+for (const figure of document.querySelectorAll("figure")) {
+  const button = document.createElement("button");
+  button.type = "button"; button.className = "enlarge"; button.textContent = "\u2922";
+  button.setAttribute("aria-label", "Enlarge or put back this chart");
+  button.addEventListener("click", () => {
+    if (large.open) { large.close(); button.focus(); return; }
+    figure.space = document.createElement("figure");
+    figure.replaceWith(figure.space);
+    large.figure = figure;
+    large.append(figure);
+    large.showModal();
+  });
+  figure.prepend(button);
+}
+for (const hint of document.querySelectorAll(".chart-hint")) hint.hidden = false;
+if (window.parent !== window) // shown inside of another page, such as a report of Snakemake: links to neighbours lead nowhere
+  for (const link of document.querySelectorAll("a[href]:not([href^='#'])")) link.replaceWith(...link.childNodes);

@@ -1,0 +1,261 @@
+"""The pages in headless Chromium: nothing leaves them, nothing fails in them, and what they offer works."""
+
+import re
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from playwright.sync_api import Browser, Page, sync_playwright
+
+from pipeline.report import campaign_page, unit_page
+from pipeline.report.shapes import Line
+from pipeline.report.svg import Panel, chart
+from pipeline.report.templating import asset
+
+from .conftest import build_unit
+
+UNITS = 1200
+FAILED = UNITS // 200
+PHONE = {"width": 390, "height": 844}
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    program = next((p for p in map(shutil.which, ("chromium", "chromium-browser", "google-chrome")) if p), None)
+    if program is None:
+        pytest.skip("there is no Chromium on this machine")
+    with sync_playwright() as playwright:
+        started = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
+        yield started
+        started.close()
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("pages")
+    unit = build_unit()
+    words = {"accelerometer": ["Quadratic nonlinearity is missing."], "gyroscope": []}
+    (folder / "unit.html").write_text(unit_page.render(*unit.arguments, words=words))
+    (folder / "campaign.html").write_text(campaign_page.render("factory", fleet(), failures()))
+    (folder / "chart.html").write_text(one_chart())
+    return folder
+
+
+def fleet() -> list[dict[str, Any]]:
+    """Units in an order that no column sorts them by; every 200th failed, every ninth lacks an effect."""
+    rng = np.random.default_rng(7)
+    rows = []
+    for i in rng.permutation(UNITS).tolist():
+        row: dict[str, Any] = {"unit": f"U{i}", "serial": f"S{i}", "lot": f"L{i // 240}", "date": "2026-02-03"}
+        row |= {"status": "failed" if i % 200 == 7 else "ok", "sensor": "mpu6050", "pass": i % 17 != 0}
+        row["method"] = "staged" if i % 3 == 0 else "reference_least_squares"
+        for sensor in ("accelerometer", "gyroscope"):
+            lacks = i % 9 == 0
+            row |= {
+                f"{sensor}_error_before": 0.05,
+                f"{sensor}_error_after": float(rng.uniform(0.0008, 0.02)),
+                f"{sensor}_noise_floor": 0.0008,
+                f"{sensor}_verdict": "missing_effect" if lacks else "nothing_missing",
+                f"{sensor}_selected": "g_sensitivity" if lacks else None,
+            }
+        rows.append(row if row["status"] == "ok" else {k: v for k, v in row.items() if "_" not in k})
+    return rows
+
+
+def failures() -> list[dict[str, Any]]:
+    failed = [r["unit"] for r in fleet() if r["status"] == "failed"]
+    return [
+        {"unit": u, "stage": "ingest", "code": "bad_input", "message": "no number", "file": "x.csv"} for u in failed
+    ]
+
+
+def one_chart() -> str:
+    """Return a page with the line y = 3 x - 1."""
+    x = np.linspace(0.0, 10.0, 11)
+    svg = chart("line", "A line", "It rises.", [Panel([Line(x, 3.0 * x - 1.0, 0)], "height, m")], "way, km")
+    legend = '<ul class="legend"><li><i class="c0"></i>the line</li></ul>'
+    style, script = asset("page.css"), asset("chart.js")
+    figure = f"<figure>{svg}<figcaption>{legend}</figcaption></figure>"
+    return f"<!doctype html><title>line</title><style>{style}</style>{figure}<script>{script}</script>"
+
+
+def opened(browser: Browser, path: Path, **settings: Any) -> Page:
+    """Open a page that fails the test at its end if it asks for anything or reports an error."""
+    page = browser.new_context(**settings).new_page()
+    page.set_default_timeout(20_000)
+    page.asked, page.wrong = [], []  # type: ignore[attr-defined]
+    page.on("request", lambda r: page.asked.append(r.url))  # type: ignore[attr-defined]
+    page.on("console", lambda m: page.wrong.append(m.text) if m.type in ("error", "warning") else None)  # type: ignore[attr-defined]
+    page.on("pageerror", lambda e: page.wrong.append(str(e)))  # type: ignore[attr-defined]
+    page.goto(path.as_uri())
+    return page
+
+
+def left_alone(page: Page, path: Path) -> bool:
+    """Return whether the page asked for itself only, and reported nothing."""
+    asked = [u for u in page.asked if not u.startswith("data:")]  # type: ignore[attr-defined]
+    return (asked, page.wrong) == ([path.as_uri()], [])  # type: ignore[attr-defined]
+
+
+def column(page: Page, number: int) -> list[str]:
+    cells = page.eval_on_selector_all(
+        f"#all tbody tr > :nth-child({number})", "c => c.map((e) => e.textContent.trim())"
+    )
+    return list(cells)
+
+
+@pytest.mark.parametrize("name", ["unit.html", "campaign.html"])
+@pytest.mark.parametrize("settings", [{}, {"color_scheme": "dark"}, {"viewport": PHONE, "has_touch": True}])
+def test_a_page_asks_for_nothing_reports_no_error_and_fits(
+    browser: Browser, pages: Path, name: str, settings: dict[str, Any]
+) -> None:
+    page = opened(browser, pages / name, **settings)
+    for picture in page.locator("svg[data-scale]").all()[:4]:
+        picture.scroll_into_view_if_needed()
+        picture.hover()
+    assert left_alone(page, pages / name)
+    assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+    ground = [int(v) for v in re.findall(r"\d+", page.evaluate("getComputedStyle(document.body).backgroundColor"))[:3]]
+    assert (max(ground) < 60) == (settings.get("color_scheme") == "dark")
+    page.context.close()
+
+
+@pytest.mark.parametrize("name", ["unit.html", "campaign.html"])
+def test_every_chart_has_a_name_and_a_description_for_those_who_cannot_see_it(
+    browser: Browser, pages: Path, name: str
+) -> None:
+    page = opened(browser, pages / name)
+    told = page.eval_on_selector_all(
+        "svg",
+        """all => all.map((svg) => [svg.getAttribute("role"), ...(svg.getAttribute("aria-labelledby") ?? "").split(" ")
+            .map((id) => document.getElementById(id)?.textContent ?? "")])""",
+    )
+    assert len(told) >= 2
+    assert all(role == "img" and len(title) > 5 and len(words) > 5 for role, title, words in told)
+    identifiers = page.eval_on_selector_all("[id]", "all => all.map((e) => e.id)")
+    assert len(identifiers) == len(set(identifiers))
+    page.context.close()
+
+
+def test_what_a_page_hides_without_its_script_is_little(browser: Browser, pages: Path) -> None:
+    page = opened(browser, pages / "unit.html", java_script_enabled=False)
+    assert page.locator("svg").count() > 10
+    assert page.locator("button:visible").count() == 0
+    page.context.close()
+
+
+def test_the_table_of_all_units_sorts_by_keyboard_with_empty_cells_last(browser: Browser, pages: Path) -> None:
+    page = opened(browser, pages / "campaign.html")
+    heading = page.locator("#all thead tr:nth-child(2) th:nth-child(9)")  # error after, accelerometer
+    heading.locator("button").focus()
+    page.keyboard.press("Enter")
+    assert heading.get_attribute("aria-sort") == "ascending"
+    known = sorted(r["accelerometer_error_after"] for r in fleet() if "accelerometer_error_after" in r)
+    first = [float(v) for v in column(page, 9)]
+    assert first == pytest.approx(known[: len(first)], rel=5e-3)
+    page.keyboard.press("Enter")
+    assert heading.get_attribute("aria-sort") == "descending"
+    assert [float(v) for v in column(page, 9)] == pytest.approx(known[::-1][: len(first)], rel=5e-3)
+    page.get_by_role("button", name=f"Show all {UNITS}").click()
+    everything = column(page, 9)
+    assert len(everything) == UNITS
+    assert [i for i, v in enumerate(everything) if v == ""] == list(range(UNITS - FAILED, UNITS))
+    page.locator("#all thead tr:nth-child(2) th:nth-child(1) button").click()
+    assert column(page, 1) == [f"U{i}" for i in range(UNITS)]  # U10 after U9
+    page.context.close()
+
+
+def test_the_filter_finds_rows_by_words_and_leaves_out_others(browser: Browser, pages: Path) -> None:
+    page = opened(browser, pages / "campaign.html")
+    box = page.get_by_label("Filter:")
+    box.fill("missing effect staged")
+    wanted = [i for i in range(UNITS) if i % 9 == 0 and i % 200 != 7]
+    assert page.locator("#shown").text_content() == f"100 of {len(wanted)} that match, of {UNITS} units shown"
+    assert set(column(page, 7)) == {"staged"}
+    box.fill("missing effect -l0 -l1 -l2 -l3")
+    assert sorted(column(page, 1)) == sorted(f"U{i}" for i in wanted if i >= 960)
+    box.fill("no unit has this")
+    assert column(page, 1) == []
+    box.fill("")
+    assert len(column(page, 1)) == 100
+    page.context.close()
+
+
+def test_a_dot_of_the_fleet_is_named(browser: Browser, pages: Path) -> None:
+    page = opened(browser, pages / "campaign.html")
+    picture = page.locator("svg[data-names]").first
+    picture.focus()
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("ArrowRight")
+    assert page.locator(".readout b").first.text_content() == fleet()[1]["unit"]
+    page.context.close()
+
+
+def test_arrow_keys_and_pointer_read_the_values_that_were_drawn(browser: Browser, pages: Path) -> None:
+    page = opened(browser, pages / "chart.html")
+    readout = page.locator(".readout")
+    page.locator("svg").focus()
+    for k in range(4):
+        page.keyboard.press("ArrowRight")
+        told = [float(v) for v in re.findall(r"-?[\d.]+", (readout.text_content() or "").replace("−", "-"))]
+        assert told == pytest.approx([k, 3.0 * k - 1.0], abs=0.05)
+    assert "way, km" in (readout.text_content() or "")
+    page.locator("svg").blur()
+    assert readout.is_hidden()
+    box = page.locator("svg").bounding_box() or {}
+    page.mouse.move(box["x"] + box["width"] * (64 + 342 * 0.7) / 420, box["y"] + 60)
+    told = [float(v) for v in re.findall(r"[\d.]+", readout.text_content() or "")]
+    assert told == pytest.approx([7.0, 20.0], abs=0.025)  # coordinates are drawn to a tenth of a pixel
+    assert left_alone(page, pages / "chart.html")
+    page.context.close()
+
+
+def test_dragging_zooms_into_what_was_marked_and_escape_goes_back(browser: Browser, pages: Path) -> None:
+    page = opened(browser, pages / "chart.html")
+
+    def labels() -> list[str]:
+        return list(page.eval_on_selector_all("svg > .ticks text", "all => all.map((e) => e.textContent)"))
+
+    before = labels()
+    box = page.locator("svg").bounding_box() or {}
+    left, right = (box["x"] + box["width"] * (64 + 342 * share) / 420 for share in (0.395, 0.605))
+    page.mouse.move(left, box["y"] + 40)
+    page.mouse.down()
+    page.mouse.move(right, box["y"] + 42, steps=3)
+    page.mouse.up()
+    assert [float(v) for v in labels()] == pytest.approx([4.0, 4.5, 5.0, 5.5, 6.0])
+    page.mouse.move((left + right) / 2, box["y"] + 60)
+    assert float(re.findall(r"[\d.]+", page.locator(".readout b").text_content() or "")[0]) == pytest.approx(
+        5.0, abs=0.01
+    )
+    page.keyboard.press("Escape")
+    assert labels() == before
+    page.context.close()
+
+
+def test_a_series_is_switched_off_and_a_chart_enlarged_and_put_back(browser: Browser, pages: Path) -> None:
+    page = opened(browser, pages / "chart.html")
+    name = page.get_by_role("button", name="the line")
+    assert name.get_attribute("aria-pressed") == "true"
+    name.click()
+    assert name.get_attribute("aria-pressed") == "false"
+    assert page.locator(".layers .line").is_hidden()
+    name.click()
+    narrow = (page.locator("svg").bounding_box() or {})["width"]
+    page.get_by_role("button", name="Enlarge").click()
+    assert page.locator("dialog[open] svg").count() == 1
+    page.keyboard.press("Escape")
+    page.locator("body > figure svg").wait_for()
+    assert (page.locator("svg").bounding_box() or {})["width"] == narrow
+    page.context.close()
+
+
+def test_on_paper_a_page_has_no_controls(browser: Browser, pages: Path) -> None:
+    page = opened(browser, pages / "unit.html", color_scheme="dark")
+    page.emulate_media(media="print")
+    assert page.locator("nav:visible, .enlarge:visible, input:visible, .chart-hint:visible").count() == 0
+    assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
+    page.context.close()
