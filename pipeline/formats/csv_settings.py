@@ -7,6 +7,7 @@ holds; nothing about names, units, separators or order is guessed from the file.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import ConfigurationError
@@ -15,8 +16,8 @@ from pipeline.formats.units import CHANNELS, COUNTS, TRIADS, UNITS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
-    from fractions import Fraction
 
+NANOSECONDS = 1_000_000_000
 WHITESPACE = "whitespace"
 AUTO = "auto"
 COMMENTED = "commented"
@@ -68,7 +69,7 @@ class CsvFormat:
     own_clock : bool
         Whether the times are those of another clock (a table's log).
     tick_ns : Fraction or None
-        Duration of one count of the time, where the file itself says it.
+        Duration of one count of the time, where it comes in counts.
     """
 
     delimiter: str
@@ -102,7 +103,7 @@ def csv_formats(ingest: Mapping[str, Any]) -> list[CsvFormat]:
         if not isinstance(own_clock, bool):
             raise ConfigurationError(f"{where}.own_clock is {own_clock!r}; it is true or false")
         columns = _columns(f"{where}.columns", part.get("columns") or {}, header=bool(shared["header"]))
-        formats.append(CsvFormat(**shared, columns=columns, own_clock=own_clock))
+        formats.append(CsvFormat(**shared, columns=columns, own_clock=own_clock, tick_ns=_tick_ns(columns)))
     _check_channels(formats, shared["rate_hz"])
     return formats
 
@@ -156,6 +157,12 @@ def _columns(where: str, columns: Mapping[str, Any], *, header: bool) -> tuple[C
     )
 
 
+def _tick_ns(columns: Iterable[Column]) -> Fraction | None:
+    """Return the duration of one count of the time, None where it comes in a unit."""
+    counted = next((c for c in columns if c.channel == "time" and c.unit == COUNTS), None)
+    return None if counted is None else NANOSECONDS / Fraction(repr(counted.counts_per_unit))
+
+
 def _column(where: str, channel: str, entry: Mapping[str, Any], *, header: bool) -> Column:
     refuse_unknown(where, entry, COLUMN_KEYS)
     column: Any = entry.get("column")
@@ -164,13 +171,16 @@ def _column(where: str, channel: str, entry: Mapping[str, Any], *, header: bool)
     index = isinstance(column, int) and not isinstance(column, bool) and column >= 0
     if not (isinstance(column, str) and column if header else index):
         raise ConfigurationError(f"{where}.column is {column!r}; it is {wanted}")
-    if str(unit) not in UNITS[channel]:
-        raise ConfigurationError(f"{where}.unit is {unit!r}; allowed are {', '.join(UNITS[channel])}")
+    allowed = (*UNITS[channel], COUNTS) if channel == "time" else tuple(UNITS[channel])
+    if str(unit) not in allowed:
+        raise ConfigurationError(f"{where}.unit is {unit!r}; allowed are {', '.join(allowed)}")
     scale, offset = entry.get("counts_per_unit"), entry.get("offset", 0.0)
     if unit == COUNTS and not (is_number(scale) and scale != 0):
         raise ConfigurationError(f"{where}.counts_per_unit is {scale!r}; counts need a number other than 0")
     if unit != COUNTS and (scale is not None or offset):
         raise ConfigurationError(f"{where}: counts_per_unit and offset belong to the unit counts; this is {unit}")
+    if channel == "time" and offset:
+        raise ConfigurationError(f"{where}.offset is {offset!r}; a time has none")
     if not is_number(offset):
         raise ConfigurationError(f"{where}.offset is {offset!r}; it is a number of counts")
     return Column(channel, column, str(unit), bool(entry.get("optional", False)), float(scale or 1.0), float(offset))

@@ -35,6 +35,7 @@ BLOCK_S = 0.25
 SHORTEST_BLOCK = 5
 STILL = 9.0  # times the 10th percentile of the variance
 SMALLEST_VARIANCE = 1e-7  # relative to the square of the specific force
+LARGEST_DRIFT_DEG = 2.0
 BINS = 64
 LONGEST_MOVE_S = 30.0
 SMALLEST_TURN_DEG = 20.0
@@ -85,7 +86,15 @@ def rests_of(force: NDArray[np.float64], interval_s: float) -> list[tuple[int, i
     size = float(np.median(np.linalg.norm(means, axis=1)))
     still = scatter < max(STILL * float(np.quantile(scatter, 0.1)), SMALLEST_VARIANCE * size**2)
     edges = np.flatnonzero(np.diff(still.astype(np.int8), prepend=0, append=0))
-    return [(int(a) * width, int(b) * width) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= 2]
+    found = [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= 2]
+    return [(a * width, b * width) for a, b in found if _keeps_its_direction(means[a:b])]
+
+
+def _keeps_its_direction(means: NDArray[np.float64]) -> bool:
+    """Return whether the ends of a stretch point the same way; slow motion all along is no rest."""
+    first, last = means[0], means[-1]
+    size = float(np.linalg.norm(first))
+    return bool(np.linalg.norm(last - first) <= np.radians(LARGEST_DRIFT_DEG) * max(size, 1e-30))
 
 
 def moves_of(force: NDArray[np.float64], rate: NDArray[np.float64], time_s: NDArray[np.float64]) -> list[Move]:

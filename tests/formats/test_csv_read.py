@@ -109,6 +109,19 @@ def test_times_are_exact_to_the_nanosecond(
     assert read_csv([file], csv_formats(canonical)).time_ns[:2].tolist() == nanoseconds[:2]
 
 
+def test_a_counter_of_clock_ticks_is_a_time_and_is_counted_on_where_it_overflows(
+    tmp_path: Path, canonical: dict[str, Any]
+) -> None:
+    """Ticks of 1/25600 s in 24 bits, as some sensors count them, start again at 0 every 10.9 minutes."""
+    canonical["csv"]["columns"]["time"] |= {"unit": "counts", "counts_per_unit": 25600.0}
+    ticks = [(2**24 - 512 + 256 * i) % 2**24 for i in range(5)]
+    file = tmp_path / "log.csv"
+    file.write_text(HEADER + "\n" + "".join(f"{t},0,0,1,0,0,0\n" for t in ticks))
+    read = read_csv([file], csv_formats(canonical))
+    assert np.diff(read.time_ns).tolist() == [10_000_000] * 4
+    assert [n.code for n in read.notes] == ["N-WRAP"]
+
+
 def test_times_since_1970_count_from_the_first_sample(tmp_path: Path, canonical: dict[str, Any]) -> None:
     for name, start in (("a", 1_700_000_000), ("b", 1_700_000_100)):
         written = make_recording(start_ns=start * 10**9, seed=start, name=name)

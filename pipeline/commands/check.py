@@ -1,0 +1,250 @@
+"""Tell what ingest makes of a file, and propose a profile for one that it does not know."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+import tempfile
+import textwrap
+from dataclasses import dataclass, field
+from pathlib import Path
+from shutil import copyfile
+from typing import TYPE_CHECKING, Any
+
+from pipeline.atomic import write_atomically
+from pipeline.config.campaign import load_campaign
+from pipeline.config.compose import Composer, Problem
+from pipeline.errors import ConfigurationError, PipelineError
+from pipeline.formats.checks import checks_of
+from pipeline.formats.files import FILE, candidate_files
+from pipeline.formats.ingest_error import IngestError
+from pipeline.formats.read import read_table, to_recording
+from pipeline.survey.facts import as_text, facts
+from pipeline.survey.mcap_topics import topic_lines
+from pipeline.survey.profile_text import as_yaml
+from pipeline.survey.proposal import propose
+from pipeline.survey.shape import find_shape
+from pipeline.survey.unit_evidence import UNKNOWN
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.survey.proposal import Proposal
+    from pipeline.survey.shape import Shape
+
+DEFAULT_PROFILE = "canonical_csv"
+LOOKED_AT_BYTES = 1 << 25
+ANOTHER_LAYOUT = ("missing_column", "no_header")
+EPILOG = """\
+A file of a campaign is read as the campaign's configuration says, any other with --ingest (canonical_csv) and, where
+--sensor is given, with its full scale. Nothing is written but what --save asks for.
+
+For a text log that the profile does not describe, a profile is proposed: each line with what speaks for it, and ???
+where you have to decide. It is never applied unasked: read it, save it, and name it.
+
+examples:
+  python -m pipeline check log.csv
+  python -m pipeline check log.csv --save my_bench/configs/ingest/my_logger.yaml
+  python -m pipeline check log.csv --ingest my_bench/configs/ingest/my_logger.yaml
+  python -m pipeline check raw/*.mcap --sensor mpu6050
+  snakemake --cores 2 --config campaign=my_bench overrides=ingest=my_logger
+
+exit code: 0 if ingest reads every file, 2 if it refuses one or does not know its layout.
+"""
+
+
+@dataclass
+class Reading:
+    """How some files are read as one recording."""
+
+    files: list[Path]
+    ingest: dict[str, Any]
+    sensor: dict[str, Any]
+    said: str
+    entry: dict[str, Any] = field(default_factory=lambda: {"role": "rests", "axis": None})
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run ``python -m pipeline check FILE...``."""
+    arguments = _parser().parse_args(argv)
+    refused: list[tuple[Reading, PipelineError]] = []
+    for reading in _readings(arguments.files, arguments.ingest, arguments.sensor):
+        error = _tell(reading)
+        if error is not None:
+            refused.append((reading, error))
+    unknown = [shape for reading, error in refused for shape in _shapes(reading, error)]
+    if unknown:
+        _tell_proposals(propose(unknown), refused[0][0].sensor, arguments.save)
+    elif arguments.save:
+        print(f"{arguments.save} was not written: there is nothing to propose")
+    sys.stdout.flush()
+    for reading, error in refused:
+        print(
+            f"python -m pipeline check: {error.file or reading.files[0]}: refused ({kind_of(error)})", file=sys.stderr
+        )
+    return 2 if refused else 0
+
+
+def kind_of(error: PipelineError) -> str:
+    """Return the machine-readable kind of a refusal."""
+    return str(getattr(error, "fault", error.code))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m pipeline check",
+        description=__doc__,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("files", type=Path, nargs="+", metavar="FILE", help=".csv or other text, .gcsv, .mcap")
+    parser.add_argument("--ingest", metavar="PROFILE", help="name in configs/ingest, or a file (YAML)")
+    parser.add_argument("--sensor", metavar="NAME", help="name in configs/sensor, for full scale and counts")
+    parser.add_argument("--save", type=Path, metavar="FILE", help="write the proposed profile there")
+    return parser
+
+
+def _readings(files: Sequence[Path], profile: str | None, sensor: str | None) -> list[Reading]:
+    """Return how each file, or the files of one recording, are to be read."""
+    as_campaigns_say = profile is None and sensor is None
+    directories = {_campaign_of(f) for f in files} - {None} if as_campaigns_say else set()
+    known: dict[Path, Reading] = {}
+    for reading in (r for directory in directories for r in _of_campaign(directory)):
+        for file in reading.files:
+            known.setdefault(file, reading)
+    readings, others = [], []
+    for file in files:
+        found = known.get(file.resolve())
+        if found is None:
+            others.append(file)
+        elif found not in readings:
+            readings.append(found)
+    if others:
+        ingest, sheet = _composed(profile or DEFAULT_PROFILE, sensor, _campaign_of(others[0]))
+        said = f"ingest={ingest['name']}" + (f", sensor={sensor}" if sensor else "")
+        parts = [p["file"] for p in (ingest["csv"] or {}).get("parts") or []]
+        readings += [Reading(group, ingest, sheet if sensor else {}, said) for group in _grouped(others, parts)]
+    return readings
+
+
+def _grouped(files: Sequence[Path], parts: Sequence[str]) -> list[list[Path]]:
+    """Return the files of each recording: one, or one for each part of the profile."""
+    groups: dict[Path, list[Path]] = {}
+    for file in files:
+        if not parts or file.suffix in (".mcap", ".gcsv"):
+            groups[file] = [file]
+            continue
+        patterns = [re.escape(p).replace(re.escape(FILE), "(.+)") for p in parts]
+        found = next((m for p in patterns if (m := re.fullmatch(p, file.name))), None)
+        if found is None:
+            raise ConfigurationError(f"suits none of the profile's parts ({', '.join(parts)})", str(file))
+        stem = found.group(1) if found.groups() else ""
+        groups[file.parent / stem] = [file.parent / p.replace(FILE, stem) for p in parts]
+    return list(groups.values())
+
+
+def _campaign_of(file: Path) -> Path | None:
+    return next((d for d in file.resolve().parents if (d / "units.csv").is_file()), None)
+
+
+def _of_campaign(directory: Path | None) -> list[Reading]:
+    """Return how the recordings of a campaign are read."""
+    campaign = load_campaign({"campaign": str(directory)})
+    readings = []
+    for name, unit in campaign.units.items():
+        config, folder = unit.config, campaign.folder(name)
+        for recording, candidates in candidate_files(config["procedure"], config["ingest"]).items():
+            entry = config["procedure"]["recordings"][recording]
+            said = f"unit {name} of campaign {campaign.name}, recording {recording}: "
+            said += f"ingest={config['ingest']['name']}, sensor={config['sensor']['name']}"
+            readings += [
+                Reading([(folder / f).resolve() for f in files], config["ingest"], config["sensor"], said, entry)
+                for files in candidates
+            ]
+    return readings
+
+
+def _composed(profile: str, sensor: str | None, campaign: Path | None) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the sections ingest and sensor of a configuration with a profile."""
+    path = Path(profile)
+    layers = ["procedure=multi_position", *([f"sensor={sensor}"] if sensor else [])]
+    with tempfile.TemporaryDirectory() as folder:
+        own = campaign or Path(folder)
+        if path.suffix in (".yaml", ".yml"):
+            if not path.is_file():
+                raise ConfigurationError("there is no such file", profile)
+            own = Path(folder)
+            (own / "configs" / "ingest").mkdir(parents=True)
+            copyfile(path, own / "configs" / "ingest" / f"{path.stem}.yaml")
+        try:
+            config = Composer(own).unit("check", [*layers, f"ingest={path.stem}"])
+        except Problem as problem:
+            raise ConfigurationError(str(problem), profile if own == Path(folder) else None) from None
+    return config["ingest"], config["sensor"]
+
+
+def _tell(reading: Reading) -> PipelineError | None:
+    """Print what ingest makes of files, and return its refusal."""
+    print(f"{', '.join(map(str, reading.files))}\n  {'read with':<16}{reading.said}")
+    try:
+        table = read_table(reading.files, reading.ingest)
+        checks = checks_of(reading.ingest)
+        recording = to_recording(reading.files[0].stem, reading.entry, table, reading.sensor, checks)
+    except PipelineError as error:
+        topics = topic_lines(reading.files[0], fields=kind_of(error) == "missing_topic") if _is_mcap(reading) else []
+        place = "" if error.file in (None, str(reading.files[0])) else f"{error.file}: "
+        print(as_text([("REFUSED", f"{place}{error.message}"), ("code", kind_of(error)), *topics]) + "\n")
+        return error
+    topics = topic_lines(reading.files[0], fields=False) if _is_mcap(reading) else []
+    print(as_text([*topics, *facts(recording, reading.sensor)]) + "\n")
+    return None
+
+
+def _is_mcap(reading: Reading) -> bool:
+    return reading.files[0].suffix == ".mcap"
+
+
+def _shapes(reading: Reading, error: PipelineError) -> list[Shape]:
+    """Return the shape of each text log that the profile does not describe."""
+    if not isinstance(error, IngestError) or error.fault not in ANOTHER_LAYOUT:
+        return []
+    found = []
+    for file in reading.files:
+        with file.open("rb") as stream:
+            data = stream.read(LOOKED_AT_BYTES)
+        try:
+            found.append(find_shape(data, str(file)))
+        except IngestError as none:
+            print(f"{file}: {none.message}")
+    return found
+
+
+def _tell_proposals(proposals: Sequence[Proposal], sensor: dict[str, Any], save: Path | None) -> None:
+    """Print the proposed profiles, what they would make of the files, and save the only one."""
+    if save is not None and len(proposals) > 1:
+        raise ConfigurationError(f"{len(proposals)} profiles are proposed and --save writes one: check fewer files")
+    name = "my_logger" if save is None else save.stem
+    for proposal in proposals:
+        print(f"PROPOSED PROFILE for {', '.join(proposal.files)}\n")
+        text = as_yaml(proposal, name)
+        print(textwrap.indent(text, "    "))
+        if proposal.complete:
+            print("With it:\n")
+            ingest = proposal.ingest(name)
+            groups = [[Path(f) for f in proposal.files]] if proposal.parts else [[Path(f)] for f in proposal.files]
+            for group in groups:
+                _tell(Reading(group, ingest, sensor, "the proposed profile"))
+        else:
+            print(f"Fill in {UNKNOWN} for {', '.join(proposal.unknown())}.")
+        if save is not None:
+            write_atomically(save, text)
+            print(f"Saved as {save}; nothing uses it yet.")
+        print(NEXT.format(name=name))
+
+
+NEXT = """\
+If every line is right, save it (--save FILE) in configs/ingest/{name}.yaml of your campaign, and look once more with
+python -m pipeline check FILE --ingest .../{name}.yaml; a run uses it with the override ingest={name} or by the column
+ingest of units.csv.
+"""

@@ -1,0 +1,225 @@
+"""What ingest makes of a log, in lines for a person: time, channels, rests, clipping, units, notes."""
+
+from __future__ import annotations
+
+import textwrap
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.formats.marks import CLIPPED, GAP, STUCK, UNIT_NAMES, equal_share
+from pipeline.formats.turn_evidence import misfit_deg, moves_of, rests_of
+from pipeline.records import AXES, SENSORS
+from pipeline.signal.rests import rests_from_table
+from pipeline.survey.unit_evidence import FEWEST_RESTS_FOR_A_SPHERE, sphere
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from typing import Any
+
+    from numpy.typing import NDArray
+
+    from pipeline.records import Note, Recording
+
+ENOUGH = 500_000  # samples that rests and moves are looked for in
+FEWEST_SAMPLES = 3
+PLATEAU = 3  # samples
+AS_SAID, ABOUT_AS_SAID = 0.1, 0.35  # of the angle; an accelerometer that is not calibrated leaves some degrees
+LABEL = 16
+WIDTH = 118
+LISTED_NOTES = 20
+
+Line = tuple[str, str]
+
+
+def facts(recording: Recording, sensor: Mapping[str, Any] | None = None) -> list[Line]:
+    """Return what a recording holds, as pairs of label and text.
+
+    Parameters
+    ----------
+    recording : Recording
+    sensor : mapping, optional
+        Section of a configuration, for the full scales.
+    """
+    rests = _rests(recording)
+    lines = [("time", _time(recording))]
+    for name in SENSORS:
+        readings = recording.reading(name)
+        lines.append((name, "none" if readings is None else _sensor(name, readings, rests)))
+    if recording.temperature is not None:
+        low, high = float(recording.temperature.min()), float(recording.temperature.max())
+        lines.append(("temperature", f"{low:.4g} to {high:.4g} degC" if high > low else f"{low:.4g} degC throughout"))
+    lines += _table(recording)
+    lines.append(("rests", _rests_in_words(recording, rests)))
+    lines.append(("clipping", _clipping(recording, sensor or {})))
+    lines += _units(recording, rests)
+    lines += [("notes" if i == 0 else "", text) for i, text in enumerate(_notes(recording.notes))]
+    return lines
+
+
+def as_text(lines: Sequence[Line], indent: str = "  ") -> str:
+    """Return facts as a table of text."""
+    out = []
+    for label, text in lines:
+        first = f"{indent}{label:<{LABEL}}"
+        out += textwrap.wrap(
+            text, WIDTH, initial_indent=first, subsequent_indent=" " * len(first), break_long_words=False
+        )
+    return "\n".join(out)
+
+
+def _time(recording: Recording) -> str:
+    interval, time = recording.interval, recording.time_ns
+    span = float(time[-1] - time[0]) / 1e9
+    jitter = float(np.std(np.diff(time) / 1e9)) / interval
+    text = f"{recording.samples:,} rows over {_number(span)} s at {1 / interval:.6g} Hz (median interval "
+    text += f"{_number(interval * 1e3)} ms), from {_number(float(time[0]) / 1e9)} s"
+    gaps = 0 if recording.flags is None else int(np.count_nonzero(recording.flags & GAP))
+    if gaps:
+        return f"{text}; {gaps} gap{'s'[: gaps > 1]} (see the notes)"
+    return text + ("; no gaps" + (f", intervals scatter by {jitter:.1%}" if jitter > 0.01 else ""))
+
+
+def _rests(recording: Recording) -> list[tuple[int, int]]:
+    by_table = rests_from_table(recording)
+    if by_table:
+        return [(r.start, r.stop) for r in by_table if r.stop - r.start >= FEWEST_SAMPLES]
+    force = recording.accelerometer
+    if force is None or recording.samples < 20 or recording.table_rate is not None:
+        return []
+    return rests_of(force[:ENOUGH], recording.interval)
+
+
+def _sensor(name: str, readings: NDArray[np.float64], rests: Sequence[tuple[int, int]]) -> str:
+    unit = UNIT_NAMES[name]
+    spans = [f"{a} {_number(v.min())} to {_number(v.max())}" for a, v in zip(AXES, readings.T, strict=True)]
+    text = f"{', '.join(spans)} {unit}"
+    if not rests:
+        return text
+    means = np.array([readings[a:b].mean(axis=0) for a, b in rests])
+    noise = np.sqrt(np.median([np.var(np.diff(readings[a:b], axis=0), axis=0) / 2 for a, b in rests], axis=0))
+    if name == "accelerometer":
+        size = np.linalg.norm(means, axis=1)
+        between = f" ({_number(size.min())} to {_number(size.max())})" if len(rests) > 1 else ""
+        text += f"; at rest |a| = {_number(float(np.median(size)))} {unit}{between}"
+    else:
+        text += f"; at rest {', '.join(_number(v) for v in np.median(means, axis=0))}"
+    return f"{text}, noise {_number(float(np.median(noise)), 2)} a sample"
+
+
+def _table(recording: Recording) -> list[Line]:
+    found = []
+    if recording.table_angle is not None:
+        angle = recording.table_angle
+        found.append(f"angle {_number(float(angle.min()))} to {_number(float(angle.max()))} deg")
+    if recording.table_rate is not None:
+        rate = recording.table_rate
+        text = f"rate {_number(float(rate.min()))} to {_number(float(rate.max()))} deg/s"
+        if recording.gyroscope is not None and np.ptp(rate) > 1.0:
+            alike = [float(np.corrcoef(rate, w)[0, 1]) if np.ptp(w) else 0.0 for w in recording.gyroscope.T]
+            axis = int(np.argmax(np.abs(alike)))
+            if abs(alike[axis]) > 0.9:
+                slope = float(np.polyfit(rate, recording.gyroscope[:, axis], 1)[0])
+                text += f" (the gyroscope's {AXES[axis]} reads {slope:.3f} of it, correlation {alike[axis]:.4f})"
+        found.append(text)
+    if recording.table_attitude is not None:
+        found.append("attitude")
+    clock = recording.source.get("table_clock")
+    if clock:
+        found.append(f"a clock of its own, {clock['offset_s']:.6g} s ahead and gaining {clock['drift_ppm']:.3g} ppm")
+    return [("table", "; ".join(found))] if found else []
+
+
+def _rests_in_words(recording: Recording, rests: Sequence[tuple[int, int]]) -> str:
+    if not rests:
+        return "none found"
+    lengths = np.array([b - a for a, b in rests]) * recording.interval
+    if len(rests) == 1:
+        whole = rests[0][1] - rests[0][0] > 0.9 * recording.samples
+        return f"1, of {_number(lengths[0], 3)} s" + (": the sensor did not move" if whole else "")
+    return f"{len(rests)}, {_number(lengths.min(), 2)} to {_number(lengths.max(), 3)} s long"
+
+
+def _clipping(recording: Recording, sensor: Mapping[str, Any]) -> str:
+    """Tell what reaches full scale or, where that is not known, what stays at its largest value."""
+    known = {s: (sensor.get(s) or {}).get("full_scale") for s in SENSORS}
+    flags = recording.flags
+    found = []
+    for name in SENSORS:
+        readings = recording.reading(name)
+        if readings is None:
+            continue
+        if known[name] is not None:
+            largest = float(np.abs(readings).max())
+            found.append(f"{name} up to {_number(largest)} of {known[name]:g} {UNIT_NAMES[name]}")
+            continue
+        for axis, values in zip(AXES, readings.T, strict=True):
+            short = "accel" if name == "accelerometer" else "gyro"
+            found += [f"{short}_{axis} stays at {t}: clipped?" for t in plateaus(values)]
+    marked = 0 if flags is None else int(np.count_nonzero(flags & CLIPPED))
+    stuck = 0 if flags is None else int(np.count_nonzero(flags & STUCK))
+    if all(known.values()):
+        found.append(f"{marked} rows at full scale" if marked else "none at full scale")
+    elif not found:
+        found.append("no reading stays at its largest value (--sensor NAME compares with a full scale)")
+    return "; ".join([*found, *([f"{stuck} rows stuck"] if stuck else [])])
+
+
+def plateaus(values: NDArray[np.float64]) -> list[str]:
+    """Return in words where a channel stays at its largest or smallest value, as one that is clipped does."""
+    same = values[1:] == values[:-1]
+    if same.mean() > 0.5 or equal_share(same) > 0.5:
+        return []  # too coarse or too quiet to tell
+    found = []
+    for extreme in (values.max(), values.min()):
+        at = values == extreme
+        longest = _longest_run(at)
+        if longest >= PLATEAU:
+            found.append(f"{_number(float(extreme))} for {longest} samples ({int(at.sum())} in all)")
+    return found
+
+
+def _longest_run(mask: NDArray[np.bool_]) -> int:
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
+    return int((edges[1::2] - edges[::2]).max()) if edges.size else 0
+
+
+def _units(recording: Recording, rests: Sequence[tuple[int, int]]) -> list[Line]:
+    """Tell whether gravity turns from rest to rest as the rates say."""
+    if recording.accelerometer is None or recording.gyroscope is None or recording.samples < 20:
+        return []
+    part = slice(0, ENOUGH)
+    force = recording.accelerometer[part]
+    means = [force[a:b].mean(axis=0) for a, b in rests]
+    centre = sphere(np.array(means))[0] if len(means) >= FEWEST_RESTS_FOR_A_SPHERE else np.zeros(3)
+    moves = moves_of(force - centre, recording.gyroscope[part], recording.time[part])
+    if not moves and recording.table_rate is not None:
+        return []
+    if not moves:
+        return [("units", "no move between rests turns gravity, so nothing shows whether the rates' unit is right")]
+    left = float(misfit_deg(moves, (1.0,))[0])
+    angle = float(np.median([m.angle_deg for m in moves]))
+    share = left / angle
+    verdict = "as" if share < AS_SAID else "about as" if share < ABOUT_AS_SAID else "NOT as"
+    over = f"{len(moves)} moves of {angle:.0f} deg" if len(moves) > 1 else f"a move of {angle:.0f} deg"
+    return [("units", f"gravity turns {verdict} the rates say: {left:.2g} deg are left over {over}")]
+
+
+def _notes(notes: Sequence[Note]) -> list[str]:
+    if not notes:
+        return ["none"]
+    lines = [in_words(n) for n in notes[:LISTED_NOTES]]
+    return lines + ([f"and {len(notes) - LISTED_NOTES} more"] if len(notes) > LISTED_NOTES else [])
+
+
+def in_words(note: Note) -> str:
+    """Return a note as one line."""
+    count = f" x {note.count}" if note.count > 1 else ""
+    last = f" to {note.last}" if note.last != note.first else ""
+    place = f", line {note.first}{last}" if note.first else ""
+    return f"{note.code}{count}{place}: {note.detail}"
+
+
+def _number(value: float, digits: int = 4) -> str:
+    text = f"{value:.{digits}g}"
+    return f"{value:.0f}" if "e" in text and 1 <= abs(value) < 1e7 else text

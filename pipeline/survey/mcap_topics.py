@@ -1,0 +1,93 @@
+"""What topics an MCAP file holds, and for types that ingest does not know the fields of their first message."""
+
+from __future__ import annotations
+
+from itertools import islice
+from typing import TYPE_CHECKING, Any
+
+from pipeline.formats.ingest_error import IngestError
+from pipeline.formats.mcap_kinds import SHORT
+from pipeline.formats.mcap_walk import Walk
+from pipeline.formats.message_definition import short_name
+from pipeline.formats.official_decoders import object_decoder, ros2_decoder
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from mcap.records import Channel, Schema
+
+MOST_FIELDS = 24
+LONGEST_LIST = 4
+
+
+def topic_lines(path: Path, *, fields: bool) -> list[tuple[str, str]]:
+    """Return what an MCAP file holds, as pairs of label and text; nothing where it cannot be walked through.
+
+    Parameters
+    ----------
+    path : Path
+    fields : bool
+        Whether the fields of messages of types that ingest does not know are listed.
+    """
+    first: dict[int, bytes] = {}
+    try:
+        with path.open("rb") as stream:
+            walk = Walk(stream, str(path))
+            for rows in walk.rows():
+                if rows.channel not in first:
+                    first[rows.channel] = bytes(next(iter(rows.payloads())))
+    except (IngestError, OSError):
+        return []
+    found = walk.found
+    library = f", written by {found.header.library}" if found.header and found.header.library else ""
+    proof = "every checksum and count verified" if found.verified else "integrity: not_verifiable, without checksums"
+    size = f"{counted(found.count, 'message')} in {counted(len(found.chunks), 'chunk')}"
+    lines = [("container", f"{size}{library}; {proof}")]
+    for number, channel in found.channels.items():
+        schema = found.schemas.get(channel.schema_id)
+        kind = f"{schema.name}, {channel.message_encoding}" if schema else channel.message_encoding or "no encoding"
+        text = f"{channel.topic} ({kind}): {counted(found.counts[number], 'message')}"
+        if fields and number in first and not (schema and short_name(schema.name) in SHORT):
+            text += _fields(channel, schema, first[number])
+        lines.append(("topic", text))
+    return lines
+
+
+def counted(number: int, what: str) -> str:
+    """Return a number of things in words."""
+    return f"{number:,} {what}{'s'[: number != 1]}"
+
+
+def _fields(channel: Channel, schema: Schema | None, payload: bytes) -> str:
+    """Return the paths of a message's numbers, for a map of fields."""
+    try:
+        decode = ros2_decoder(schema) if channel.message_encoding == "cdr" else object_decoder(channel, schema)
+        paths = list(islice(_numbers(decode(payload), ""), MOST_FIELDS + 1))
+    except Exception:  # noqa: BLE001  (any decoder's trouble with a stranger's message: then nothing is listed)
+        return ""
+    more = " .." if len(paths) > MOST_FIELDS else ""
+    return f", with {', '.join(paths[:MOST_FIELDS])}{more}" if paths else ""
+
+
+def _numbers(value: Any, path: str) -> Iterator[str]:  # noqa: ANN401  (a message of any decoder)
+    """Yield the paths of the numbers in a message."""
+    if isinstance(value, bool | str | bytes):
+        return
+    if hasattr(value, "__float__"):
+        yield path
+        return
+    if hasattr(value, "DESCRIPTOR"):
+        children = {f.name: getattr(value, f.name) for f in value.DESCRIPTOR.fields}
+    elif isinstance(value, dict):
+        children = value
+    elif hasattr(value, "__slots__"):
+        children = {n: getattr(value, n) for n in value.__slots__ if not n.startswith("_")}
+    elif hasattr(value, "__len__"):
+        for index in range(min(len(value), LONGEST_LIST)):
+            yield from _numbers(value[index], f"{path}[{index}]")
+        return
+    else:
+        children = getattr(value, "__dict__", {})
+    for name, child in children.items():
+        yield from _numbers(child, f"{path}.{name}" if path else name)

@@ -1,0 +1,247 @@
+"""A profile proposed for unknown text logs, each guess with what speaks for it; to be confirmed, never applied unasked.
+
+Names tell which column may hold which channel. Units follow from what a name states, else from physics
+(``pipeline.survey.unit_evidence``). Two files with the same times, one with the accelerometer and one with the
+gyroscope, are parts of one recording; what cannot be told of one file is taken from another of the same shape.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.formats.turn_evidence import moves_of
+from pipeline.formats.units import COUNTS, GYROSCOPE, TRIADS
+from pipeline.survey.column_names import stated_unit
+from pipeline.survey.columns import Columns, find_columns
+from pipeline.survey.unit_evidence import ASSUMED_HZ, UNKNOWN, Guess, force_unit, rate_unit, time_unit
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.formats.turn_evidence import Move
+    from pipeline.survey.shape import Shape
+
+UNITS_OF = {"accelerometer": ("g", "mg", "m/s^2"), "gyroscope": ("deg/s", "rad/s")}
+Entries = dict[str, dict[str, Any]]
+
+
+@dataclass
+class Proposal:
+    """A proposed profile.
+
+    Attributes
+    ----------
+    files : list of str
+        For which it is made; of a recording in parts the file of each part.
+    shapes : list of Shape
+        Of its parts, one where there are none.
+    csv : dict
+        The ``csv`` section without columns.
+    columns : list of dict
+        Of each part: channel to its entry; ``???`` stands for what has to be filled in.
+    evidence : dict of str to str
+        Key of ``csv``, ``time``, sensor or channel to what speaks for it.
+    remarks : list of str
+        What has to be decided, or is odd.
+    """
+
+    files: list[str]
+    shapes: list[Shape]
+    csv: dict[str, Any]
+    columns: list[Entries]
+    evidence: dict[str, str] = field(default_factory=dict)
+    remarks: list[str] = field(default_factory=list)
+
+    @property
+    def parts(self) -> list[str]:
+        """Names of the parts' files, empty where there is one file a recording."""
+        return [Path(s.path).name for s in self.shapes] if len(self.shapes) > 1 else []
+
+    @property
+    def complete(self) -> bool:
+        """Whether nothing is left to be filled in."""
+        channels = {c for entries in self.columns for c in entries}
+        return any(set(t) <= channels for t in TRIADS.values()) and not self.unknown()
+
+    def unknown(self) -> list[str]:
+        """Return the names of what has to be filled in."""
+        found = [k for k, v in self.csv.items() if v == UNKNOWN]
+        return found + [c for entries in self.columns for c, e in entries.items() if UNKNOWN in e.values()]
+
+    def ingest(self, name: str) -> dict[str, Any]:
+        """Return the proposal as the section ``ingest`` of a configuration."""
+        if not self.parts:
+            return {"name": name, "csv": {**self.csv, "columns": self.columns[0]}, "mcap": {}}
+        parts = [{"file": f, "columns": c} for f, c in zip(self.parts, self.columns, strict=True)]
+        return {"name": name, "csv": {**self.csv, "parts": parts, "columns": {}}, "mcap": {}}
+
+
+def propose(shapes: Sequence[Shape]) -> list[Proposal]:
+    """Return the profiles that text logs seem to ask for, those of the same shape together."""
+    found = [find_columns(shape) for shape in shapes]
+    proposals: list[Proposal] = []
+    for columns in _joined(found):
+        new = _proposal(columns)
+        twin = next((p for p in proposals if _alike(p, new)), None)
+        if twin is None:
+            proposals.append(new)
+        else:
+            _fill_in(twin, new)
+    return proposals
+
+
+def _joined(found: list[Columns]) -> list[list[Columns]]:
+    """Return the columns of each recording: of one file, or of two with the same times and one sensor each."""
+    out: list[list[Columns]] = []
+    for columns in found:
+        other = next((g for g in out if len(g) == 1 and _belong_together(g[0], columns)), None)
+        if other is None:
+            out.append([columns])
+        else:
+            other.append(columns)
+    return out
+
+
+def _belong_together(one: Columns, two: Columns) -> bool:
+    if len(one.triads) != 1 or len(two.triads) != 1 or set(one.triads) == set(two.triads):
+        return False
+    same = ("delimiter", "decimal", "skip_lines", "header", "comment")
+    if any(getattr(one.shape, k) != getattr(two.shape, k) for k in same) or one.time is None or two.time is None:
+        return False
+    return np.array_equal(one.shape.numbers[one.time], two.shape.numbers[two.time])
+
+
+def _alike(one: Proposal, two: Proposal) -> bool:
+    return [s.names for s in one.shapes] == [s.names for s in two.shapes] and one.csv == two.csv and not one.parts
+
+
+def _fill_in(proposal: Proposal, other: Proposal) -> None:
+    """Take from another file of the same shape what this one could not tell."""
+    proposal.files += other.files
+    for channel, entry in proposal.columns[0].items():
+        better = other.columns[0].get(channel, entry)
+        if UNKNOWN in entry.values() and UNKNOWN not in better.values():
+            proposal.columns[0][channel] = better
+            key = next((s for s, triad in TRIADS.items() if channel in triad), channel)
+            proposal.evidence[key] = f"{other.evidence[key]} ({Path(other.files[0]).name})"
+    proposal.remarks += [r for r in other.remarks if r not in proposal.remarks]
+
+
+def _proposal(parts: list[Columns]) -> Proposal:
+    shapes = [c.shape for c in parts]
+    proposal = Proposal([s.path for s in shapes], shapes, _csv_section(shapes[0]), [{} for _ in parts])
+    if shapes[0].rate_hz is not None:
+        proposal.evidence["rate_hz"] = f"the file says {shapes[0].rate_line!r}"
+    for columns in parts:
+        proposal.remarks += columns.remarks
+        if columns.shape.odd_rows:
+            proposal.remarks.append(f"{columns.shape.odd_rows} rows have another number of fields than the others")
+    time_s = _time(parts, proposal)
+    force = _readings("accelerometer", parts)
+    if force is not None:
+        interval = float(np.median(np.diff(time_s))) if time_s is not None else 1 / ASSUMED_HZ
+        guess = force_unit(force, interval)
+        _add("accelerometer", parts, proposal, guess)
+        force = force - guess.centre
+    rate = _readings("gyroscope", parts)
+    if rate is not None:
+        moves, why_none = _moves(force, rate, time_s, steady=parts[0].steady)
+        _add("gyroscope", parts, proposal, rate_unit(rate, moves, why_none, timed=time_s is not None))
+    if force is None and rate is None:
+        proposal.remarks.append("no three columns look like an accelerometer or a gyroscope: name them in columns")
+    for columns, entries in zip(parts, proposal.columns, strict=True):
+        _others(columns, entries, proposal)
+    return proposal
+
+
+def _csv_section(shape: Shape) -> dict[str, Any]:
+    commented = shape.header and shape.comment is not None
+    return {
+        "delimiter": "whitespace" if shape.delimiter == " " else shape.delimiter,
+        "decimal": shape.decimal,
+        "header": "commented" if commented else shape.header,
+        "skip_lines": 0 if shape.comment is not None else shape.skip_lines,
+        "comment": shape.comment,
+        "rate_hz": shape.rate_hz,
+    }
+
+
+def _time(parts: list[Columns], proposal: Proposal) -> NDArray[np.float64] | None:
+    """Propose where the time comes from, and return it in s; None where it is not known."""
+    first = parts[0].shape
+    count = len(next(iter(first.numbers.values())))
+    if parts[0].time is not None:
+        values, name = first.numbers[parts[0].time], first.names[parts[0].time]
+        guess = time_unit(values, *stated_unit(name, "time"))
+        proposal.csv["rate_hz"] = None
+        proposal.evidence.pop("rate_hz", None)
+        proposal.evidence["time"] = guess.evidence
+        for columns, entries in zip(parts, proposal.columns, strict=True):
+            assert columns.time is not None  # noqa: S101  (parts are joined by their times)
+            entries["time"] = {"column": columns.shape.key(columns.time), **guess.entry}
+        return None if guess.second_s is None else values * guess.second_s
+    if parts[0].counter is not None and first.rate_hz is None:
+        key = first.key(parts[0].counter)
+        proposal.csv["rate_hz"] = None
+        proposal.columns[0]["time"] = {"column": key, "unit": COUNTS, "counts_per_unit": UNKNOWN}
+        proposal.evidence["time"] = f"{key} counts samples: counts_per_unit is the sampling rate in Hz"
+        return None
+    if first.rate_hz is not None:
+        return np.arange(count) / first.rate_hz
+    proposal.csv["rate_hz"] = UNKNOWN
+    proposal.evidence["rate_hz"] = "there is no time column: the sampling rate in Hz"
+    return None
+
+
+def _moves(
+    force: NDArray[np.float64] | None, rate: NDArray[np.float64], time_s: NDArray[np.float64] | None, *, steady: bool
+) -> tuple[list[Move], str]:
+    """Return the moves in which gravity turns, and why there are none."""
+    if force is None:
+        return [], "no accelerometer beside it to tell the unit by"
+    if not steady:
+        return [], "the rows are not one series in time, so the turns of gravity cannot tell the unit"
+    moves = moves_of(force, rate, time_s if time_s is not None else np.arange(len(rate)) / ASSUMED_HZ)
+    return moves, "" if moves else "no move between rests turns gravity and tells the unit"
+
+
+def _readings(sensor: str, parts: list[Columns]) -> NDArray[np.float64] | None:
+    for columns in parts:
+        if sensor in columns.triads:
+            return np.column_stack([columns.shape.numbers[i] for i in columns.triads[sensor]])
+    return None
+
+
+def _add(sensor: str, parts: list[Columns], proposal: Proposal, guess: Guess) -> None:
+    """Add a sensor's channels with the unit that their names state, else the one guessed."""
+    place = next(i for i, c in enumerate(parts) if sensor in c.triads)
+    shape, triad = parts[place].shape, parts[place].triads[sensor]
+    proposal.evidence[sensor] = guess.evidence
+    for channel, index in zip(TRIADS[sensor], triad, strict=True):
+        stated, why = stated_unit(shape.names[index], channel) if shape.header else (None, "")
+        entry = {"unit": stated} if stated in UNITS_OF[sensor] else guess.entry
+        proposal.columns[place][channel] = {"column": shape.key(index), **entry}
+        if entry is not guess.entry:
+            proposal.evidence[sensor] = f"{why}; {guess.evidence}"
+            if guess.entry["unit"] not in (stated, UNKNOWN):
+                proposal.remarks.append(f"{shape.names[index]}: {why}, and yet {guess.evidence}")
+
+
+def _others(columns: Columns, entries: Entries, proposal: Proposal) -> None:
+    """Add temperature and the table's log."""
+    shape = columns.shape
+    for channel, index in columns.others.items():
+        values = shape.numbers[index]
+        usual = {"temperature": "degC", "table_angle": "deg", "table_rate": "deg/s"}.get(channel, "1")
+        stated, why = stated_unit(shape.names[index], channel)
+        entries[channel] = {"column": shape.key(index), "unit": stated or usual, "optional": True}
+        span = f"{values.min():.6g} to {values.max():.6g}"
+        proposal.evidence[channel] = f"{why}: {span}" if stated else f"{span}, so {usual}"
+    if GYROSCOPE[0] not in entries and "table_rate" in entries and not proposal.parts:
+        proposal.remarks.append("a table's log, without the sensor's readings")

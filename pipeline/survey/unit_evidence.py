@@ -1,0 +1,191 @@
+"""Units that numbers seem to have, each with the evidence in words.
+
+specific force : |f| at rest is 1 in g, 9.8 in m/s^2, 1000 in mg; of counts, it is the number of counts a g
+angular rate   : the unit in which the rates turn gravity from rest to rest (``pipeline.formats.turn_evidence``)
+time           : intervals of sensors are 0.05 to 200 ms long
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.formats.turn_evidence import misfit_deg, rests_of
+from pipeline.formats.units import COUNTS, DEGREES, STANDARD_GRAVITY, UNITS
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.formats.turn_evidence import Move
+
+UNKNOWN = "???"
+FORCE_UNITS = {"g": 1.0, "m/s^2": STANDARD_GRAVITY, "mg": 1000.0}
+CLOSE = 0.12  # bias and scale factor of a low-cost sensor in one position
+CLOSE_BY_TURNS = 0.2  # those of both sensors, in few moves
+USUAL_COUNTS_PER_G = (16384.0, 8192.0, 4096.0, 2048.0, 1024.0, 256.0)
+USUAL_COUNTS_PER_DPS = (131.0, 65.5, 32.8, 16.4, 8.2)
+OFFSETS = (0.0, 32768.0, 8192.0, 2048.0)
+SCALES = np.geomspace(1.0, 1000.0, 481)
+ASSUMED_HZ = 100.0  # where the time is not known
+CONVINCING_DEG = 12.0
+TOO_FAST_FOR_RADIANS = 40.0
+RATES_HZ = (5.0, 20_000.0)
+SINCE_1970_S = (1e9, 4e9)  # 2001 to 2096
+FEWEST_RESTS_FOR_A_SPHERE = 9
+
+
+@dataclass(frozen=True)
+class Guess:
+    """What may be said of a column.
+
+    Attributes
+    ----------
+    entry : dict
+        Of a profile; ``???`` stands for what has to be filled in.
+    evidence : str
+        What speaks for it.
+    second_s : float or None
+        Length of a time's unit in s.
+    centre : (3,) array
+        Of the sphere on which rests lie, zeros where it is not known: offset and bias.
+    """
+
+    entry: dict[str, Any]
+    evidence: str
+    second_s: float | None = None
+    centre: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+
+
+def whole(values: NDArray[np.float64]) -> bool:
+    """Return whether numbers are integers."""
+    return bool(np.all(values == np.rint(values)))
+
+
+def time_unit(values: NDArray[np.float64], stated: str | None, why: str) -> Guess:
+    """Return the unit of a time."""
+    steps = np.diff(values)
+    step = float(np.median(steps[steps > 0])) if np.any(steps > 0) else 0.0
+    seconds = {unit: length / 1e9 for unit, (length, _) in UNITS["time"].items() if unit != COUNTS}
+    if stated is not None:
+        rate = f", {1 / (step * seconds[stated]):.4g} Hz" if step else ""
+        return Guess({"unit": stated}, why + rate, seconds[stated])
+    suits = [u for u, s in seconds.items() if step and RATES_HZ[0] <= 1 / (step * s) <= RATES_HZ[1]]
+    since = [u for u in suits if SINCE_1970_S[0] < float(values[0]) * seconds[u] < SINCE_1970_S[1]]
+    for unit in since or suits:
+        others = [f", or {u} at {1 / (step * seconds[u]):.4g} Hz" for u in suits if u != unit and not since]
+        what = "since 1970, in " if since else ""
+        evidence = f"{what}steps of {step:.6g}, so {unit} at {1 / (step * seconds[unit]):.4g} Hz{''.join(others)}"
+        return Guess({"unit": unit}, evidence, seconds[unit])
+    return Guess({"unit": UNKNOWN}, f"steps of {step:g} suit no unit of time: s, ms, us or ns?")
+
+
+def force_unit(force: NDArray[np.float64], interval_s: float) -> Guess:
+    """Return the unit of a specific force.
+
+    Parameters
+    ----------
+    force : (n, 3) array
+    interval_s : float, s
+    """
+    rests = rests_of(force, interval_s)
+    means = np.array([force[a:b].mean(axis=0) for a, b in rests or [(0, len(force))]])
+    size = float(np.median(np.linalg.norm(means, axis=1)))
+    where = f"|a| is {size:.4g} at rest" if rests else f"|a| is {size:.4g} on the whole"
+    centre, radius = sphere(means) if len(means) >= FEWEST_RESTS_FOR_A_SPHERE else (np.zeros(3), size)
+    if whole(force):
+        guess = _counts_per_g(len(means), centre, radius, size, where)
+    else:
+        guess = Guess({"unit": UNKNOWN}, f"{where}, which is neither 1 (g), 9.8 (m/s^2) nor 1000 (mg)")
+        for unit, gravity in FORCE_UNITS.items():
+            if abs(size / gravity - 1) < CLOSE:
+                guess = Guess({"unit": unit}, f"{where}, so {unit}")
+    return replace(guess, centre=centre)
+
+
+def _counts_per_g(rests: int, centre: NDArray[np.float64], radius: float, size: float, where: str) -> Guess:
+    """Return counts per g: the usual number that is near, else the radius of the sphere through the rests."""
+    middle = float(np.mean(centre))
+    offset = min(OFFSETS, key=lambda o: abs(middle - o))
+    if offset and abs(middle - offset) > 0.5 * radius:
+        offset = 0.0
+    if offset:
+        entry = {"unit": COUNTS, "counts_per_unit": float(f"{radius:.3g}"), "offset": offset}
+        spread = f"{rests} rests lie on a sphere of radius {radius:.0f} about {middle:.0f}"
+        return Guess(entry, f"whole numbers; {spread}, so counts with an offset of {offset:.0f}")
+    usual = min(USUAL_COUNTS_PER_G, key=lambda c: abs(np.log(size / c)))
+    if abs(size / usual - 1) < CLOSE:
+        entry = {"unit": COUNTS, "counts_per_unit": usual}
+        return Guess(entry, f"whole numbers, {where}: counts, near the usual {usual:g} a g")
+    if abs(size / 1000.0 - 1) < CLOSE:
+        return Guess({"unit": "mg"}, f"{where}, so mg")
+    entry = {"unit": COUNTS, "counts_per_unit": float(f"{size:.3g}")}
+    return Guess(entry, f"whole numbers, {where}: counts, {size:.3g} a g (no usual number)")
+
+
+def sphere(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Return centre and radius of the sphere through points, by linear least squares."""
+    A = np.column_stack([2 * points, np.ones(len(points))])
+    solution = np.linalg.lstsq(A, np.sum(points**2, axis=1), rcond=None)[0]
+    centre = solution[:3]
+    return centre, float(np.sqrt(max(solution[3] + centre @ centre, 0.0)))
+
+
+def rate_unit(rate: NDArray[np.float64], moves: Sequence[Move], why_none: str, *, timed: bool) -> Guess:
+    """Return the unit of angular rates.
+
+    Parameters
+    ----------
+    rate : (n, 3) array
+    moves : sequence of Move
+        Between rests, in which gravity turns.
+    why_none : str
+        Why there are none.
+    timed : bool
+        Whether the time is known; else its unit is a hundredth of an interval, and only the product of scale and
+        sampling rate can be told.
+    """
+    largest = float(np.abs(rate - np.median(rate, axis=0)).max())
+    if whole(rate):
+        offset = {"offset": 32768.0} if abs(float(np.median(rate)) - 32768.0) < 2000 else {}
+        guess = _counts_per_dps(moves, f"whole numbers up to {largest:.4g}: counts; {why_none}", timed=timed)
+        return replace(guess, entry=guess.entry | offset)
+    if moves and timed:
+        return _degrees_or_radians(moves)
+    if largest > TOO_FAST_FOR_RADIANS:
+        return Guess({"unit": "deg/s"}, f"up to {largest:.4g}, too fast for rad/s, so deg/s")
+    return Guess({"unit": UNKNOWN}, f"up to {largest:.4g}; {why_none or 'the time is not known'}: deg/s or rad/s?")
+
+
+def _degrees_or_radians(moves: Sequence[Move]) -> Guess:
+    left = misfit_deg(moves, (1.0, DEGREES))
+    best = int(np.argmin(left))
+    unit = ("deg/s", "rad/s")[best]
+    text = f"taken as {unit} they turn gravity to within {left[best]:.1f} deg over {len(moves)} moves"
+    if left[best] > CONVINCING_DEG:
+        return Guess({"unit": UNKNOWN}, f"{text}, and no better otherwise: not convincing")
+    return Guess({"unit": unit}, f"{text} (the other unit misses by {left[1 - best]:.0f} deg)")
+
+
+def _counts_per_dps(moves: Sequence[Move], otherwise: str, *, timed: bool) -> Guess:
+    unknown = {"unit": COUNTS, "counts_per_unit": UNKNOWN}
+    if not moves:
+        return Guess(unknown, otherwise)
+    left = misfit_deg(moves, (1 / SCALES).tolist())
+    best = int(np.argmin(left))
+    measured, angle = float(SCALES[best]), left[best]
+    if angle > CONVINCING_DEG:
+        return Guess(unknown, f"counts; at best they turn gravity to within {angle:.0f} deg: not convincing")
+    seen = f"so gravity turns to within {angle:.1f} deg over {len(moves)} move{'s'[: len(moves) > 1]}"
+    if not timed:
+        product = measured * ASSUMED_HZ
+        listed = " or ".join(f"{c:g} at {product / c:.3g} Hz" for c in USUAL_COUNTS_PER_DPS if 50 < product / c < 1100)
+        return Guess(unknown, f"counts_per_unit times the sampling rate in Hz is near {product:.3g} ({listed}), {seen}")
+    usual = min(USUAL_COUNTS_PER_DPS, key=lambda c: abs(np.log(measured / c)))
+    near = abs(measured / usual - 1) < CLOSE_BY_TURNS
+    entry = {"unit": COUNTS, "counts_per_unit": usual if near else float(f"{measured:.3g}")}
+    taken = f"; {usual:g} is the usual number near it" if near else ""
+    return Guess(entry, f"counts, {measured:.3g} a deg/s, {seen}{taken}")

@@ -1,0 +1,184 @@
+"""``python -m pipeline check``: files in, what ingest makes of them out."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from pipeline.__main__ import main
+from pipeline.formats.csv_write import write_canonical_csv
+from pipeline.formats.mcap_write import write_mcap
+from pipeline.records import Recording
+
+REPOSITORY = Path(__file__).parents[2]
+REFERENCE = REPOSITORY.parent / "shared" / "data"
+DEMO = REPOSITORY / "data" / "demo" / "raw"
+
+
+def make_log(samples: int = 1000) -> Recording:
+    generator = np.random.default_rng(4)
+    force = np.array([0.0, 0.0, 1.0]) + 1e-3 * generator.standard_normal((samples, 3))
+    rate = 0.1 * generator.standard_normal((samples, 3))
+    return Recording("log", "rests", None, 10_000_000 * np.arange(samples), accelerometer=force, gyroscope=rate)
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    write_canonical_csv(tmp_path / "log.csv", make_log())
+    return tmp_path / "log.csv"
+
+
+class Checked:
+    """What a call of the command gave back and printed."""
+
+    def __init__(self, capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> None:
+        self.code = main(["check", *map(str, arguments)])
+        captured = capsys.readouterr()
+        self.out, self.err = captured.out, captured.err
+        self.words = " ".join(self.out.split())
+
+
+def test_a_sound_log_is_told_in_numbers(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    checked = Checked(capsys, log)
+    assert (checked.code, checked.err) == (0, "")
+    assert "1,000 rows over 9.99 s at 100 Hz (median interval 10 ms), from 0 s; no gaps" in checked.words
+    assert re.search(r"at rest \|a\| = 1(\.\d+)? g, noise 0\.00(1|09\d) a sample", checked.words)
+    assert "notes none" in checked.words
+    assert max(map(len, checked.out.splitlines())) <= 120
+
+
+def test_a_refused_log_gives_exit_code_2_its_line_and_code(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lines = log.read_text().splitlines()
+    lines[6] = lines[6].replace(",", ",ERR", 1)
+    log.write_text("\n".join(lines) + "\n")
+    checked = Checked(capsys, log)
+    assert checked.code == 2
+    assert f"REFUSED {log}:7: column accel_x_g (accel_x) is 'ERR" in checked.words
+    assert "code not_a_number" in checked.words
+    assert checked.err == f"python -m pipeline check: {log}:7: refused (not_a_number)\n"
+    assert "PROPOSED" not in checked.out
+
+
+def test_one_bad_file_does_not_hide_the_others(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    empty, missing = tmp_path / "empty.csv", tmp_path / "missing.csv"
+    empty.touch()
+    checked = Checked(capsys, empty, missing, log)
+    assert checked.code == 2
+    assert "the file is empty (0 bytes)" in checked.words
+    assert "No such file" in checked.words
+    assert "1,000 rows" in checked.words
+    assert len(checked.err.splitlines()) == 2
+
+
+def test_notes_are_shown_with_code_and_line(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log.write_bytes(b"\xef\xbb\xbf" + log.read_bytes() + b"10.0,0.1")
+    checked = Checked(capsys, log)
+    assert checked.code == 0
+    assert "N-BOM" in checked.out
+    assert "N-TAIL, line 1002: the last line does not end in a newline" in checked.words
+
+
+def test_a_log_of_ros_messages_is_told_with_its_topics_and_its_proof(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_mcap(tmp_path / "log.mcap", make_log())
+    checked = Checked(capsys, tmp_path / "log.mcap")
+    assert checked.code == 0
+    assert "1,000 messages in 1 chunk, written by imu-calibration; every checksum and count verified" in checked.words
+    assert "topic /imu/data (sensor_msgs/msg/Imu, cdr): 1,000 messages" in checked.words
+
+
+def test_a_damaged_mcap_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "log.mcap"
+    write_mcap(file, make_log())
+    data = bytearray(file.read_bytes())
+    data[len(data) // 2] ^= 4
+    file.write_bytes(bytes(data))
+    checked = Checked(capsys, file)
+    assert checked.code == 2
+    assert "checksum" in checked.words
+
+
+def test_a_self_describing_log_needs_no_profile(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = "".join(f"{10 * i},0,0,0,0,0,{2048 + i % 3}\n" for i in range(200))
+    head = "GYROFLOW IMU LOG\nversion,1.3\norientation,XYZ\ntscale,0.001\ngscale,0.001\nascale,0.00048828125\n"
+    (tmp_path / "log.gcsv").write_text(head + "t,gx,gy,gz,ax,ay,az\n" + rows)
+    checked = Checked(capsys, tmp_path / "log.gcsv")
+    assert checked.code == 0
+    assert "200 rows over 1.99 s at 100 Hz" in checked.words
+
+
+def test_a_file_of_a_campaign_is_read_as_the_campaign_says(capsys: pytest.CaptureFixture[str]) -> None:
+    checked = Checked(capsys, DEMO / "mpu6050-1" / "gyro_z.csv", DEMO / "mpu6050-1-mcap" / "gyro_z.mcap")
+    assert checked.code == 0
+    assert "unit mpu6050-1 of campaign demo, recording gyro_z: ingest=canonical_csv, sensor=mpu6050" in checked.words
+    assert "unit mpu6050-1-mcap of campaign demo, recording gyro_z" in checked.words
+    assert "of 250 deg/s; none at full scale" in checked.words
+    assert re.search(r"the gyroscope's z reads 1\.0\d\d of it, correlation 1\.0000", checked.words)
+
+
+def test_nothing_is_written_or_applied_unasked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("log.csv").write_text("t,ax,ay,az\n" + "".join(f"{0.01 * i:.2f},0,0,1\n" for i in range(100)))
+    checked = Checked(capsys, "log.csv")
+    assert checked.code == 2
+    assert "PROPOSED PROFILE for log.csv" in checked.out
+    assert [p.name for p in tmp_path.iterdir()] == ["log.csv"]
+
+
+def test_a_saved_proposal_is_used_when_it_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("log.csv").write_text("t,ax,ay,az\n" + "".join(f"{0.01 * i:.2f},0,0,1\n" for i in range(100)))
+    assert Checked(capsys, "log.csv", "--save", "mine.yaml").code == 2
+    assert yaml.safe_load(Path("mine.yaml").read_text())["name"] == "mine"
+    checked = Checked(capsys, "log.csv", "--ingest", "mine.yaml")
+    assert checked.code == 0
+    assert "ingest=mine" in checked.out
+
+
+def test_a_profile_with_something_left_to_fill_in_is_refused_by_name(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("log.csv").write_text("ax,ay,az\n" + "0,0,1\n" * 100)
+    Checked(capsys, "log.csv", "--save", "mine.yaml")
+    assert main(["check", "log.csv", "--ingest", "mine.yaml"]) == 2
+    assert "rate_hz" in capsys.readouterr().err
+
+
+def test_parts_of_one_recording_are_read_together(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source = REFERENCE / "xsens_mti_multi_position"
+    if not source.is_dir():
+        pytest.skip("reference data not beside the repository")
+    for name in ("accelerometer.txt", "gyroscope.txt"):
+        shutil.copy(source / name, tmp_path)
+    checked = Checked(capsys, tmp_path / "gyroscope.txt", "--ingest", "xsens_mti_multi_position")
+    assert checked.code == 0
+    assert "51,175 rows over 511.7 s" in checked.words
+    assert "gravity turns as the rates say" in checked.words
+
+
+@pytest.mark.parametrize(
+    "file",
+    ["mpu6050_multi_position/example_data_calibration.csv", "mpu6050_multi_position/imu_90_x_rot.csv"],
+)
+def test_published_logs_are_read_with_their_profile(file: str, capsys: pytest.CaptureFixture[str]) -> None:
+    if not (REFERENCE / file).is_file():
+        pytest.skip("reference data not beside the repository")
+    checked = Checked(capsys, REFERENCE / file, "--ingest", "mpu6050_multi_position", "--sensor", "mpu6050")
+    assert checked.code == 0
+    assert "N-SYNTHTIME" in checked.out
+
+
+def test_an_unknown_profile_is_refused_with_those_that_are_known(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", str(log), "--ingest", "canonical"]) == 2
+    assert "canonical_csv" in capsys.readouterr().err

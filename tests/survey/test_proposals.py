@@ -1,0 +1,130 @@
+"""What is proposed for an unknown log is what its writer meant, and reads it bit for bit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from loggers import GRAVITY, LOGGERS, Logger, motion
+
+from pipeline.config.compose import Composer
+from pipeline.formats.checks import Checks
+from pipeline.formats.csv_read import read_csv
+from pipeline.formats.csv_settings import csv_formats
+from pipeline.formats.ingest_error import IngestError
+from pipeline.survey.profile_text import as_yaml
+from pipeline.survey.proposal import Proposal, propose
+from pipeline.survey.shape import find_shape
+
+REFERENCE = Path(__file__).parents[3] / "shared" / "data"
+
+
+def proposed(*files: Path) -> Proposal:
+    (proposal,) = propose([find_shape(f.read_bytes(), str(f)) for f in files])
+    return proposal
+
+
+def written(folder: Path, logger: Logger) -> Path:
+    file = folder / logger.name
+    file.write_text(logger.text(), encoding="utf-8")
+    return file
+
+
+@pytest.mark.parametrize("kind", LOGGERS)
+def test_proposal_says_what_the_logger_meant(tmp_path: Path, kind: str) -> None:
+    logger = LOGGERS[kind]
+    proposal = proposed(written(tmp_path, logger))
+    assert tuple(proposal.unknown()) == logger.unknown, proposal.evidence
+    for key, value in logger.expected.get("csv", {}).items():
+        assert proposal.csv[key] == value, key
+    for channel, entry in logger.expected.items():
+        if channel != "csv":
+            found = proposal.columns[0][channel]
+            assert {k: found.get(k) for k in entry} == entry, (channel, proposal.evidence)
+
+
+@pytest.mark.parametrize("kind", [k for k, logger in LOGGERS.items() if not logger.unknown])
+def test_a_saved_proposal_works_as_a_profile(tmp_path: Path, kind: str) -> None:
+    """Read through Hydra with it, the log gives the motion that was written."""
+    file = written(tmp_path, LOGGERS[kind])
+    profile = tmp_path / "configs" / "ingest" / "mine.yaml"
+    profile.parent.mkdir(parents=True)
+    profile.write_text(as_yaml(proposed(file), "mine"), encoding="utf-8")
+    config = Composer(tmp_path).unit("U1", ["procedure=multi_position", "ingest=mine"])
+    table = read_csv([file], csv_formats(config["ingest"]), Checks())
+    data = motion()
+    offset = LOGGERS[kind].offset
+    tolerance = {"a": 0.02, "g": 0.06} if offset else {"a": 2e-3, "g": 2e-2}
+    for index, channel in enumerate(("accel_x", "accel_y", "accel_z", "gyro_x", "gyro_y", "gyro_z"), 1):
+        scale = np.abs(data[:, index]).max()
+        np.testing.assert_allclose(table.values[channel], data[:, index], rtol=0, atol=tolerance[channel[0]] * scale)
+    np.testing.assert_allclose((table.time_ns - table.time_ns[0]) / 1e9, data[:, 0], rtol=0, atol=2e-6)
+
+
+def test_scale_of_the_xsens_counts_is_found_as_its_certificate_says(reference: Path) -> None:
+    folder = reference / "xsens_mti_multi_position"
+    proposal = proposed(folder / "accelerometer.txt", folder / "gyroscope.txt")
+    assert proposal.complete
+    assert proposal.parts == ["accelerometer.txt", "gyroscope.txt"]
+    accelerometer, gyroscope = proposal.columns[0]["accel_x"], proposal.columns[1]["gyro_x"]
+    assert accelerometer["offset"] == gyroscope["offset"] == 32768.0
+    assert accelerometer["counts_per_unit"] == pytest.approx(414.0 * GRAVITY, rel=0.02)
+    assert gyroscope["counts_per_unit"] == pytest.approx(4767.0 * np.pi / 180, rel=0.02)
+
+
+def test_files_of_one_shape_share_what_one_of_them_tells(reference: Path) -> None:
+    """The counts of a rest alone do not tell the gyroscope's scale; a log with moves of the same logger does."""
+    folder = reference / "mpu6050_multi_position"
+    rest, moves = folder / "imu_static_test.csv", folder / "example_data_calibration.csv"
+    assert proposed(rest).unknown() == ["gyro_x", "gyro_y", "gyro_z"]
+    proposal = proposed(rest, moves)
+    assert proposal.complete
+    assert proposal.csv["rate_hz"] == 100.0
+    assert proposal.columns[0]["accel_y"]["counts_per_unit"] == 16384.0
+    assert proposal.columns[0]["gyro_y"]["counts_per_unit"] == 131.0
+    assert "example_data_calibration.csv" in proposal.evidence["gyroscope"]
+
+
+def test_units_of_the_wearable_are_found_and_its_rate_is_asked_for(reference: Path) -> None:
+    proposal = proposed(reference / "ferraris_wearable" / "example_ferraris_session.csv")
+    assert proposal.unknown() == ["time"]
+    assert proposal.columns[0]["time"]["column"] == "n_samples"
+    assert (proposal.columns[0]["accel_x"]["unit"], proposal.columns[0]["gyro_x"]["unit"]) == ("m/s^2", "deg/s")
+
+
+def test_sessions_one_after_the_other_are_noticed(reference: Path) -> None:
+    proposal = proposed(reference / "ferraris_wearable" / "annotated_session.csv")
+    assert proposal.columns[0]["accel_x"]["counts_per_unit"] == 2048.0
+    assert any("does not increase at 5 rows" in r for r in proposal.remarks)
+    assert any("part" in r for r in proposal.remarks)
+
+
+@pytest.mark.parametrize("cell", ["a: b", "x # y", "no", "${sensor.name}", 'say "ax"', "1e3", "ü"])
+def test_odd_names_of_columns_survive_yaml_and_hydra(tmp_path: Path, cell: str) -> None:
+    names = {"time": f"time {cell} [s]", "accel_x": "ax", "accel_y": "ay", "accel_z": "az"}
+    header = ",".join('"' + n.replace('"', '""') + '"' for n in names.values())
+    rows = "".join(f"{0.01 * i:.2f},0,0,1\n" for i in range(50))
+    file = tmp_path / "log.csv"
+    file.write_text(f"{header}\n{rows}", encoding="utf-8")
+    profile = tmp_path / "configs" / "ingest" / "mine.yaml"
+    profile.parent.mkdir(parents=True)
+    text = as_yaml(proposed(file), "mine")
+    profile.write_text(text, encoding="utf-8")
+    config = Composer(tmp_path).unit("U1", ["procedure=multi_position", "ingest=mine"])
+    assert config["ingest"]["csv"]["columns"]["time"]["column"] == names["time"]
+    assert read_csv([file], csv_formats(config["ingest"])).time_ns[-1] == 490_000_000
+
+
+def test_text_without_a_table_is_refused_with_its_beginning(tmp_path: Path) -> None:
+    with pytest.raises(IngestError, match="no table of numbers was found in it; it starts with 'Dear reader"):
+        find_shape(b"Dear reader,\nthere is nothing here.\n", str(tmp_path / "letter.txt"))
+
+
+def test_a_counter_of_samples_is_no_time_until_its_rate_is_stated() -> None:
+    text = "n,ax,ay,az\n" + "".join(f"{i},0,0,1.0\n" for i in range(100))
+    (proposal,) = propose([find_shape(text.encode(), "log.csv")])
+    entry: dict[str, Any] = yaml.safe_load(as_yaml(proposal, "mine"))["csv"]["columns"]["time"]
+    assert entry == {"column": "n", "unit": "counts", "counts_per_unit": "???"}
