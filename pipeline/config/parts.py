@@ -19,11 +19,22 @@ if TYPE_CHECKING:
     from pipeline.config.campaign import Campaign
 
 # Dotted keys that a stage reads; {sensor} is the sensor that the stage is about.
+ACCURACIES = (
+    "angle_accuracy_deg",
+    "rate_accuracy",
+    "orthogonality_deg",
+    "wobble_deg",
+    "levelling_deg",
+    "gravity_accuracy_g",
+    "azimuth_accuracy_deg",
+    "clock_accuracy_ppm",
+)
 FIT = (
     "table.motion",
     "table.gravity_g",
     "table.latitude_deg",
     "table.azimuth_deg",
+    *(f"table.{key}" for key in ACCURACIES),
     "procedure.holdout_every",
     "method.{sensor}",
     "method.as_printed",

@@ -56,6 +56,11 @@ class Table(Section):
     angle_accuracy_deg: NonNegative
     rate_accuracy: NonNegative
     orthogonality_deg: NonNegative
+    wobble_deg: NonNegative | None = None
+    levelling_deg: NonNegative | None = None
+    gravity_accuracy_g: NonNegative | None = None
+    azimuth_accuracy_deg: NonNegative | None = None
+    clock_accuracy_ppm: NonNegative | None = None
 
 
 class RecordingFile(Section):

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.errors import NotObservableError
+from pipeline.estimation.linear_map import LinearMap
 from pipeline.estimation.wandering import Whitened, cells_of
 from pipeline.model.effects.base import Layout, truth
 
@@ -256,6 +257,16 @@ class Design:
         for c in range(3):
             total[self._to[c]] += local.ravel()[self._from[c]] / self.scale[c] ** 2
         return total.reshape(self.count + 1, self.count + 1), 3.0 * logarithm
+
+    def linear_map(self, setting: Setting) -> LinearMap:
+        """Return what small changes of the readings do to the parameters, solved under a noise setting."""
+        gram = self.products(setting)[0][:-1, :-1]
+        size = np.where(self.sizes()[:-1] > 0, self.sizes()[:-1], 1.0)
+        inverse = np.linalg.pinv(gram / np.outer(size, size), rcond=1e-12, hermitian=True) / np.outer(size, size)
+        influence = self.whitened.influence(setting)
+        weights = [influence[index[:-1]] for index in self._local]
+        back = [inverse[:, index[:-1]] / s**2 for index, s in zip(self._total, self.scale, strict=True)]
+        return LinearMap((weights[0], weights[1], weights[2]), (back[0], back[1], back[2]))
 
     def sizes(self) -> NDArray[np.float64]:
         """Return the norm of each parameter's column before the base was taken out: (p + 1,) array."""

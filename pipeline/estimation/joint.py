@@ -22,13 +22,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import ConfigurationError, NotObservableError
+from pipeline.estimation.bench_budget import TEMPERATURE, TIME_BASE
+from pipeline.estimation.budget import combined, scatter_contribution
 from pipeline.estimation.design import BASE, BASE_NAMES, Design, Start, Term, motions_of, ordinary_base
+from pipeline.estimation.least_squares import certified
 from pipeline.estimation.observations import observe, weighted
+from pipeline.estimation.table_inputs import Reference, table_contributions
 from pipeline.estimation.wandering import Setting, settings_for
 from pipeline.model.effects import effect
 from pipeline.model.effects.base import Layout, truth
 from pipeline.records import FittedEffect, SensorCalibration, StageResult
-from pipeline.records.calibration import coverage_factor
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -44,6 +47,12 @@ SMALL_STEP = 1e-3  # of a standard uncertainty
 RATIOS = (0.01, 0.03, 0.1, 0.2, 0.3, 0.5, 1.0, 3.0)
 TIMES = (30.0, 100.0, 300.0, 1000.0)
 WHITE = Setting(0.0, 1.0)
+SCATTER = "white noise and bias wander, averaged over the wanders by their likelihood; lack of fit included"
+NOT_INCLUDED = {
+    "quantisation": "contained in the noise of the readings",
+    "temperature": TEMPERATURE,
+    "time base": TIME_BASE,
+}
 LEAST_EIGENVALUE = 1e-7  # of the products of columns of unit norm: a column is 3e-4 new
 
 
@@ -70,6 +79,12 @@ class Fit:
     converged : bool
     condition : float
         Of the scaled products of columns.
+    cosine : float
+        Largest between what is left of the readings and a column, both whitened.
+    rank : int
+        Parameters, or combinations of them, that the readings determine.
+    scale : (3,) array
+        White noise of each axis, for the weights between the axes.
     """
 
     bias: NDArray[np.float64]
@@ -83,6 +98,9 @@ class Fit:
     rounds: int
     converged: bool
     condition: float
+    cosine: float
+    rank: int
+    scale: NDArray[np.float64]
 
 
 def fit_terms(observations: Observations, terms: Sequence[Term], start: Start, settings: Sequence[Setting]) -> Fit:
@@ -126,6 +144,9 @@ def fit_terms(observations: Observations, terms: Sequence[Term], start: Start, s
         rounds,
         converged,
         solved.condition,
+        solved.left if linear else solved.cosine,
+        solved.rank,
+        start.scale,
     )
 
 
@@ -192,6 +213,9 @@ class _Solved:
     setting: Setting
     degrees_of_freedom: float
     condition: float
+    cosine: float
+    left: float
+    rank: int
 
 
 def _solve(design: Design, observations: Observations, settings: Sequence[Setting]) -> _Solved:
@@ -201,7 +225,7 @@ def _solve(design: Design, observations: Observations, settings: Sequence[Settin
     size = design.sizes()[:-1]
     size = np.where(size > 0, size, 1.0)
     spare = max(n - design.count, 1.0)
-    scores, steps, covariances, conditions = [], [], [], []
+    scores, steps, covariances, conditions, cosines = [], [], [], [], []
     for setting in settings:
         products, logarithm = design.products(setting)
         gram, rhs = products[:-1, :-1] / np.outer(size, size), products[:-1, -1] / size
@@ -210,6 +234,8 @@ def _solve(design: Design, observations: Observations, settings: Sequence[Settin
         kept = values > 1e-12 * values[-1]
         half = vectors[:, kept] / np.sqrt(values[kept]) / unit[:, None]
         step = half @ (half.T @ rhs)
+        norm = unit * np.sqrt(max(float(products[-1, -1]), 1e-300))
+        cosines.append([float(np.max(np.abs(v) / norm)) for v in (rhs, rhs - gram @ step)] + [int(kept.sum())])
         rss = max(products[-1, -1] - float(step @ rhs), 0.0) + within
         rss = max(rss, 1e-300)
         scores.append(-0.5 * n * np.log(rss / n) - 0.5 * logarithm + setting.prior)
@@ -219,7 +245,18 @@ def _solve(design: Design, observations: Observations, settings: Sequence[Settin
     best = int(np.argmax(scores))
     weight = np.exp(np.array(scores) - scores[best])
     covariance, freedom = _averaged(np.array(covariances), weight / weight.sum(), spare)
-    return _Solved(steps[best], covariance, float(scores[best]), settings[best], freedom, conditions[best])
+    cosine, left, rank = cosines[best]
+    return _Solved(
+        steps[best],
+        covariance,
+        float(scores[best]),
+        settings[best],
+        freedom,
+        conditions[best],
+        cosine,
+        left,
+        int(rank),
+    )
 
 
 def _averaged(
@@ -385,25 +422,31 @@ def fit_joint(  # noqa: PLR0917  (the interface that the stages and the diagnosi
     grid = settings_for(noise, RATIOS, TIMES)
     fit = fit_best(observations, combinations, base, grid)
     require_observable(observations, fit, base.scale)
-    return calibration_of(sensor, fit, observations, start)
+    return calibration_of(sensor, fit, observations, start, settings["table"])
 
 
 def calibration_of(
-    sensor: str, fit: Fit, observations: Observations, before: SensorCalibration | None
+    sensor: str,
+    fit: Fit,
+    observations: Observations,
+    before: SensorCalibration | None,
+    table: Mapping[str, Any] | None = None,
 ) -> SensorCalibration:
-    """Return a fit as a calibration: ``matrix = K^-1``, with ``d matrix = -matrix dK matrix``."""
+    """Return a fit as a calibration: ``matrix = K^-1``, with ``d matrix = -matrix dK matrix``.
+
+    With a ``table``, its accuracies are in the uncertainties, but for those that an effect of the fit estimates.
+    """
     matrix = np.asarray(np.linalg.solve(fit.K, np.eye(3)), np.float64)
     change = np.eye(len(fit.covariance))
     change[3:BASE, 3:BASE] = -np.kron(matrix, matrix.T)
     covariance = change @ fit.covariance @ change.T
     uncertainty = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
-    factor = coverage_factor(fit.degrees_of_freedom)
     effects, parameters, at = [], {}, BASE
     for term in fit.terms:
         described: dict[str, dict[str, Any]] = {}
         for parameter, value in zip(term.effect.parameters(sensor), term.values, strict=True):
             shared = {"value": float(value), "unit": parameter.unit}
-            described[parameter.name] = {**shared, "expanded_uncertainty": float(factor * uncertainty[at])}
+            described[parameter.name] = shared
             parameters[f"{term.effect.name}.{parameter.name}"] = {
                 **shared,
                 "standard_uncertainty": float(uncertainty[at]),
@@ -418,13 +461,20 @@ def calibration_of(
         "wander_time_s": fit.setting.time,
     }
     stage = StageResult("effects", parameters, fit.residual_rms, None, details)
-    return replace(
+    found = replace(
         before or SensorCalibration(sensor),
         bias=fit.bias,
         matrix=matrix,
         stages=(*(before.stages if before else ()), stage),
         effects=tuple(effects),
-        covariance=covariance,
-        degrees_of_freedom=fit.degrees_of_freedom,
         converged=fit.converged,
+        convergence=certified(fit.cosine, fit.condition, fit.rank, len(covariance)),
     )
+    lines, missing = [scatter_contribution(covariance, fit.degrees_of_freedom, remark=SCATTER)], dict(NOT_INCLUDED)
+    if table is not None:
+        design = _at(observations, fit.terms, fit.bias, fit.K, np.maximum(fit.scale, 1e-300))
+        motions = [part.motion for part in observations.parts]
+        reference = Reference(sensor, motions, design.linear_map(fit.setting).then(change), fit.K, table)
+        stated, absent = table_contributions(reference, [term.effect.name for term in fit.terms])
+        lines, missing = [*lines, *stated], {**absent, **missing}
+    return combined(found, lines, missing)

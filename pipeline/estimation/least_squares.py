@@ -21,7 +21,7 @@ the residual is orthogonal to all of them (Bates & Watts, Nonlinear Regression A
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -226,6 +226,36 @@ def refine(
                 break
     factors.require_full_rank(names)
     return _result(x, r, J, factors, sigma=sigma, evaluations=spent)
+
+
+def certificate(A: NDArray[np.float64], residual: NDArray[np.float64], condition: float, rank: int) -> dict[str, Any]:
+    """Return what shows that a linear estimate is a minimum, as ``SensorCalibration.convergence`` holds it.
+
+    Parameters
+    ----------
+    A : (n, p) array
+        Columns, the same for each channel.
+    residual : (n,) or (n, m) array
+        Of m channels.
+    condition : float
+        Of the scaled columns.
+    rank : int
+    """
+    products = np.abs(A.T @ residual)
+    size = np.multiply.outer(np.linalg.norm(A, axis=0), np.linalg.norm(residual, axis=0))
+    cosine = np.divide(products, size, out=np.zeros_like(products), where=size > 0.0)
+    return certified(float(cosine.max()), condition, rank, A.shape[1])
+
+
+def certified(cosine: float, condition: float, rank: int, parameters: int) -> dict[str, Any]:
+    """Return the certificate of a fit as ``SensorCalibration.convergence`` holds it."""
+    return {
+        "cosine": cosine,
+        "cosine_at_minimum": COSINE_AT_MINIMUM,
+        "condition": condition if np.isfinite(condition) else None,
+        "rank": rank,
+        "parameters": parameters,
+    }
 
 
 def _halved(

@@ -18,8 +18,8 @@ its attenuation and in every ramp. A filter that this cannot rebuild leaves the 
 The accelerometer of a table that stops and goes is fitted to its settled rests, otherwise to all samples; the gyroscope
 to all samples, but where the table's rate is only the derivative of its logged angle the ramps are left out.
 
-The covariance allows for a bias wander (``pipeline.estimation.serial_noise``); that of the matrix follows from
-``dM = -M dK M``. It holds what the noise does, not the accuracy of the table.
+The covariance allows for a bias wander (``pipeline.estimation.serial_noise``) and for the table's stated accuracies
+(``pipeline.estimation.table_inputs``); that of the matrix follows from ``dM = -M dK M``.
 """
 
 from __future__ import annotations
@@ -30,8 +30,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import ConfigurationError, NotObservableError
+from pipeline.estimation.bench_budget import budgeted
+from pipeline.estimation.budget import noise_contribution
+from pipeline.estimation.least_squares import certificate
+from pipeline.estimation.linear_map import LinearMap
 from pipeline.estimation.sample_blocks import make_blocks
-from pipeline.estimation.serial_noise import assess_noise, combine, prior_of
+from pipeline.estimation.serial_noise import assess_noise, prior_of
+from pipeline.estimation.table_inputs import Reference
 from pipeline.estimation.turns import Factors, parts_of, settled
 from pipeline.model.effects.base import truth
 from pipeline.records import AXES, SensorCalibration, StageResult
@@ -41,7 +46,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.estimation.serial_noise import SerialNoise
     from pipeline.estimation.turns import Part
     from pipeline.records import Recording
 
@@ -85,18 +89,20 @@ def fit_reference(
     y = np.concatenate([part.reading(sensor) for part in parts])
     u = np.concatenate([_reference(sensor, part)[part.keep] for part in parts])
     X = np.column_stack([np.ones(len(u)), u])
-    condition = _require_observable(sensor, X)
+    condition, rank = _require_observable(sensor, X), X.shape[1]
     factors = Factors.of(X)
     beta = factors.solve(y)
     residuals = y - X @ beta
     blocks = make_blocks([(part.recording, part.keep) for part in parts])
-    noise = assess_noise(residuals, X, blocks, prior_of(sensor, recordings, settings))
+    prior = prior_of(sensor, recordings, settings)
+    noise = assess_noise(residuals, X, blocks, prior)
     bias, K = beta[0], beta[1:].T
     matrix = np.asarray(np.linalg.solve(K, np.eye(3)), float)
-    covariance, freedom = _covariance(factors.weights(), noise, matrix)
+    fit = _linear_map(factors.weights(), matrix)
+    contributions = [noise_contribution(noise, fit, prior)]
     result = StageResult(
         name=NAME,
-        parameters=_parameters(sensor, bias, matrix, covariance),
+        parameters=_parameters(sensor, bias, matrix, contributions[0].covariance),
         residual_rms=float(np.sqrt(np.mean(residuals**2))),
         details={
             "condition": condition,
@@ -105,17 +111,18 @@ def fit_reference(
             "residual_rms": np.sqrt(np.mean(residuals**2, axis=0)).tolist(),
             "white_noise": noise.white.tolist(),
             "bias_wander": noise.wander.tolist(),
-            "degrees_of_freedom": freedom,
+            "degrees_of_freedom": float(contributions[0].degrees_of_freedom.min()),
         },
     )
-    return SensorCalibration(
+    found = SensorCalibration(
         sensor=sensor,
         bias=bias,
         matrix=matrix,
         stages=(*(previous.stages if previous else ()), result),
-        covariance=covariance,
-        degrees_of_freedom=freedom,
+        convergence=certificate(X, residuals, condition, rank),
     )
+    motions = [part.motion.select(part.keep) for part in parts]
+    return budgeted(found, Reference(sensor, motions, fit, K, settings["table"]), noise, contributions, settings)
 
 
 def _select(sensor: str, part: Part) -> Part:
@@ -171,18 +178,18 @@ def _require_observable(sensor: str, X: NDArray[np.float64]) -> float:
     return float(singular[0] / singular[-1])
 
 
-def _covariance(
-    weights: NDArray[np.float64], noise: SerialNoise, matrix: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], float]:
-    """Return the covariance of bias and matrix, and its degrees of freedom."""
-    unit = noise.covariances(weights)
-    candidates: NDArray[np.float64] | float = 0.0
-    for channel in range(3):
-        J = np.zeros((12, 4))
-        J[channel, 0] = 1.0
-        J[3:, 1:] = -np.einsum("i,bj->ijb", matrix[:, channel], matrix).reshape(9, 3)
-        candidates = candidates + J @ (noise.white_variance[:, channel, None, None] * unit) @ J.T
-    return combine(noise, np.asarray(candidates))
+def _linear_map(weights: NDArray[np.float64], matrix: NDArray[np.float64]) -> LinearMap:
+    """Return the map from readings to bias and matrix."""
+    x, y, z = (derivative_of_matrix(matrix, channel) for channel in range(3))
+    return LinearMap((weights, weights, weights), (x, y, z))
+
+
+def derivative_of_matrix(matrix: NDArray[np.float64], channel: int) -> NDArray[np.float64]:
+    """Return the derivative of bias and matrix with respect to bias and row of K of a channel: (12, 4) array."""
+    J = np.zeros((12, 4))
+    J[channel, 0] = 1.0
+    J[3:, 1:] = -np.einsum("i,bj->ijb", matrix[:, channel], matrix).reshape(9, 3)
+    return J
 
 
 def _parameters(

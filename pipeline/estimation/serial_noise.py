@@ -144,6 +144,10 @@ class SerialNoise:
         """Standard deviation of the bias wander: (3,) array."""
         return np.sqrt((self.weight * self.ratio) @ self.white_variance)
 
+    def expected_correlation(self, prior: Prior) -> NDArray[np.float64]:
+        """Return R of the correlation time that is believed: (b, b) array."""
+        return self.correlation[prior.time]
+
     def draws(self, rng: np.random.Generator, number: int) -> Iterator[NDArray[np.float64]]:
         """Yield noise of the likeliest candidate at each sample, (n, 3) arrays; wander is even over a block."""
         best = int(np.argmax(self.weight))
@@ -223,7 +227,7 @@ def assess_noise(
     )
 
 
-def combine(noise: SerialNoise, covariances: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+def combine(noise: SerialNoise, covariances: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Average the covariances of an estimate over the candidates.
 
     Parameters
@@ -235,20 +239,18 @@ def combine(noise: SerialNoise, covariances: NDArray[np.float64]) -> tuple[NDArr
     Returns
     -------
     covariance : (p, p) array
-    degrees_of_freedom : float
-        Smallest over the parameters.
+    degrees_of_freedom : (p,) array
+        Of each parameter; infinite where nothing is uncertain.
     """
     mean = np.tensordot(noise.weight, covariances, 1)
     variance = np.diagonal(covariances, axis1=1, axis2=2)
     average = np.diag(mean)
     known = average > 0
-    if not np.any(known):
-        return mean, float("inf")
-    spread = noise.weight @ (variance[:, known] - average[known]) ** 2 / average[known] ** 2
-    relative = float(np.max(spread))
-    grid = 4.0 + 2.0 / relative if relative > 0 else np.inf
-    shrink = (grid - 2.0) / grid if np.isfinite(grid) else 1.0
-    return mean * shrink, 1.0 / (1.0 / noise.spare + 1.0 / grid)
+    relative = np.where(known, noise.weight @ (variance - average) ** 2 / np.where(known, average, 1.0) ** 2, 0.0)
+    grid = 4.0 + 2.0 / np.maximum(relative, 1e-12)
+    shrink = np.sqrt((grid - 2.0) / grid)
+    freedom = np.where(known, 1.0 / (1.0 / noise.spare + 1.0 / grid), np.inf)
+    return mean * np.outer(shrink, shrink), freedom
 
 
 def _complement(means: NDArray[np.float64], design: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -148,12 +148,15 @@ class Sinusoid:
     weights : (p, n) array
         ``coefficients = weights @ readings``.
     residuals : (n,) array, g
+    condition : float
+        Of the columns, scaled.
     """
 
     coefficients: NDArray[np.float64]
     columns: NDArray[np.float64]
     weights: NDArray[np.float64]
     residuals: NDArray[np.float64]
+    condition: float
 
 
 def fit_sinusoid(angle_deg: NDArray[np.float64], reading: NDArray[np.float64], *, sides: bool, where: str) -> Sinusoid:
@@ -188,7 +191,8 @@ def fit_sinusoid(angle_deg: NDArray[np.float64], reading: NDArray[np.float64], *
         coefficients = factors.solve(reading)
         if abs(np.arctan2(coefficients[2], coefficients[1]) - phase) < SAME_PHASE:
             break
-    return Sinusoid(coefficients, columns, factors.weights(), reading - columns @ coefficients)
+    condition = float(np.linalg.cond(factors.R))
+    return Sinusoid(coefficients, columns, factors.weights(), reading - columns @ coefficients, condition)
 
 
 def wrap(angle_deg: NDArray[np.float64]) -> NDArray[np.float64]:

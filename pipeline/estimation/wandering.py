@@ -174,6 +174,7 @@ class Whitened:
         columns *= np.sqrt(weight)[:, None]
         self.white: NDArray[np.float64] = columns.T @ columns
         columns *= np.sqrt(weight)[:, None]
+        self.weight, self.weighted = weight, columns
         self.sums: NDArray[np.float64] = np.add.reduceat(columns, cells.first, axis=0)
 
     def products(self, setting: Setting) -> tuple[NDArray[np.float64], float]:
@@ -186,3 +187,16 @@ class Whitened:
         solved, info = dpttrs(d, e, self.sums)
         assert info == 0  # noqa: S101
         return self.white - self.sums.T @ solved, logarithm
+
+    def influence(self, setting: Setting) -> NDArray[np.float64]:
+        """Return ``A^T C^-1 s^2``: (p, n) array."""
+        if setting.ratio == 0.0:
+            return self.weighted.T
+        from scipy.linalg.lapack import dpttrs  # noqa: PLC0415  (as in Cells.factor)
+
+        d, e, _ = self.cells.factor(setting)
+        solved, info = dpttrs(d, e, self.sums)
+        assert info == 0  # noqa: S101
+        rows = np.diff(np.append(self.cells.first, len(self.weight)))
+        found: NDArray[np.float64] = (self.weighted - self.weight[:, None] * np.repeat(solved, rows, axis=0)).T
+        return found

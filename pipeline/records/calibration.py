@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
+from pipeline.records.budget import finite
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -78,9 +80,18 @@ class SensorCalibration:
     stages : tuple of StageResult
     effects : tuple of FittedEffect
     covariance : (12, 12) array or None
-        Of (bias_x..z, matrix_xx, matrix_xy .. matrix_zz), then each effect's parameters (then larger than 12).
+        Of (bias_x..z, matrix_xx, matrix_xy .. matrix_zz), then each effect's parameters (then larger than 12); of all
+        that the uncertainty budget includes.
     degrees_of_freedom : float
+        The smallest of the parameters.
     converged : bool
+    freedom : (p,) array or None
+        Effective degrees of freedom of each parameter; None: ``degrees_of_freedom`` for all.
+    budget : dict or None
+        The uncertainty budget as its file holds it; see ``pipeline.estimation.budget``.
+    convergence : dict or None
+        What shows that the estimate is a minimum: ``cosine``, the largest between the residual and a column of the
+        Jacobian, with ``condition`` and ``rank`` of its scaled columns, and ``parameters``, their number.
     """
 
     sensor: str
@@ -91,6 +102,9 @@ class SensorCalibration:
     covariance: NDArray[np.float64] | None = None
     degrees_of_freedom: float = float("inf")
     converged: bool = True
+    freedom: NDArray[np.float64] | None = None
+    budget: dict[str, Any] | None = None
+    convergence: dict[str, Any] | None = None
 
     def parameter_names(self) -> list[str]:
         """Return the names of the covariance's rows."""
@@ -101,18 +115,18 @@ class SensorCalibration:
         """Return the sensor's part of ``calibrations/<unit>.json``."""
         size = len(self.parameter_names())
         covariance = np.zeros((size, size)) if self.covariance is None else self.covariance
-        factor = coverage_factor(self.degrees_of_freedom)
-        expanded = factor * np.sqrt(np.clip(np.diag(covariance), 0.0, None))
+        freedom = np.full(size, self.degrees_of_freedom) if self.freedom is None else self.freedom
+        factors = coverage_factors(freedom)
+        standard = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
         return {
             "unit": UNITS[self.sensor],
             "bias": self.bias.tolist(),
             "matrix": self.matrix.tolist(),
-            "expanded_uncertainty": {
-                "bias": expanded[:3].tolist(),
-                "matrix": expanded[3:12].reshape(3, 3).tolist(),
-            },
-            "coverage_factor": {"bias": [factor] * 3, "matrix": [[factor] * 3] * 3},
+            "standard_uncertainty": _shaped(standard),
+            "expanded_uncertainty": _shaped(factors * standard),
+            "coverage_factor": _shaped(factors),
             "degrees_of_freedom": self.degrees_of_freedom if np.isfinite(self.degrees_of_freedom) else None,
+            "effective_degrees_of_freedom": finite(freedom),
             "covariance": {"parameters": self.parameter_names(), "values": covariance.tolist()},
             "stages": [
                 {
@@ -129,11 +143,14 @@ class SensorCalibration:
                 for e in self.effects
             ],
             "converged": self.converged,
+            "convergence": self.convergence,
+            "uncertainty_budget": self.budget,
         }
 
     @classmethod
     def from_json(cls, sensor: str, data: dict[str, Any]) -> Self:
         """Read back what ``to_json`` wrote."""
+        freedom = data.get("effective_degrees_of_freedom")
         return cls(
             sensor=sensor,
             bias=np.array(data["bias"], float),
@@ -143,7 +160,15 @@ class SensorCalibration:
             covariance=np.array(data["covariance"]["values"], float),
             degrees_of_freedom=float("inf") if data["degrees_of_freedom"] is None else data["degrees_of_freedom"],
             converged=data["converged"],
+            freedom=None if freedom is None else np.array([np.inf if nu is None else nu for nu in freedom]),
+            budget=data.get("uncertainty_budget"),
+            convergence=data.get("convergence"),
         )
+
+
+def _shaped(values: NDArray[np.float64]) -> dict[str, Any]:
+    """Return the values of bias and matrix in the shapes of these."""
+    return {"bias": values[:3].tolist(), "matrix": values[3:12].reshape(3, 3).tolist()}
 
 
 def coverage_factor(degrees_of_freedom: float, probability: float = 0.95) -> float:
@@ -160,7 +185,15 @@ def coverage_factor(degrees_of_freedom: float, probability: float = 0.95) -> flo
     -------
     float
     """
+    return float(coverage_factors(np.array([degrees_of_freedom]), probability)[0])
+
+
+def coverage_factors(degrees_of_freedom: NDArray[np.float64], probability: float = 0.95) -> NDArray[np.float64]:
+    """Return ``coverage_factor`` of each of (n,) degrees of freedom."""
     from scipy.special import ndtri, stdtrit  # noqa: PLC0415  (0.1 s that only writers of uncertainties pay)
 
-    upper = 0.5 + probability / 2.0
-    return float(ndtri(upper) if np.isinf(degrees_of_freedom) else stdtrit(degrees_of_freedom, upper))
+    upper, known = 0.5 + probability / 2.0, np.isfinite(degrees_of_freedom)
+    factors: NDArray[np.float64] = np.where(
+        known, stdtrit(np.where(known, degrees_of_freedom, 1.0), upper), ndtri(upper)
+    )
+    return factors

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    import numpy as np
     from numpy.typing import NDArray
 
 
@@ -64,3 +65,34 @@ class Motion:
     direction: NDArray[np.float64] | None = None
     followed: NDArray[np.bool_] | None = None
     recording: str = ""
+
+    def select(self, index: NDArray[Any]) -> Motion:
+        """Return the motion at some samples (a mask or integers); the trajectory between samples is left behind."""
+
+        def cut(values: NDArray[Any] | None) -> NDArray[Any] | None:
+            return None if values is None else values[index]
+
+        return replace(
+            self,
+            time=self.time[index],
+            specific_force=self.specific_force[index],
+            angular_rate=self.angular_rate[index],
+            angular_acceleration=self.angular_acceleration[index],
+            specific_force_rate=self.specific_force_rate[index],
+            temperature=cut(self.temperature),
+            angle=cut(self.angle),
+            rate=cut(self.rate),
+            still=self.still[index],
+            at_offset=None,
+            at_lag=None,
+            level=cut(self.level),
+            direction=cut(self.direction),
+            followed=cut(self.followed),
+        )
+
+
+def motion_at_rest(time: NDArray[np.float64]) -> Motion:
+    """Return the motion of a unit that rests, nobody knows how: forces and rates are zeros."""
+    nothing = np.zeros((len(time), 3))
+    still = np.ones(len(time), bool)
+    return Motion(time, nothing, nothing, nothing, nothing, None, None, None, None, still)

@@ -27,13 +27,14 @@ def parameter_rows(part: JSON, sheet: JSON) -> list[JSON]:
     sheet : dict
         The sensor's section of the configuration, with the data-sheet limits.
     """
-    unit, factor = part["unit"], part.get("coverage_factor", {}).get("bias", [None])[0]
+    unit, factors = part["unit"], part.get("coverage_factor") or {}
+    k_bias, k_matrix = factors.get("bias", [None] * 3), factors.get("matrix", [[None] * 3] * 3)
     matrix = np.array(part["matrix"], float)
     K = np.linalg.solve(matrix, np.eye(3))
     bias_U = part.get("expanded_uncertainty", {}).get("bias", [None] * 3)
     K_U = _uncertainty_of_inverse(K, part)
     rows = [
-        _row(f"Bias {a}", unit, part["bias"][i], expanded=bias_U[i], factor=factor, limit=sheet.get("bias"))
+        _row(f"Bias {a}", unit, part["bias"][i], expanded=bias_U[i], factor=k_bias[i], limit=sheet.get("bias"))
         for i, a in enumerate(AXES)
     ]
     rows += [
@@ -42,13 +43,13 @@ def parameter_rows(part: JSON, sheet: JSON) -> list[JSON]:
             "",
             K[i, i] - 1.0,
             expanded=K_U[i][i],
-            factor=factor,
+            factor=k_matrix[i][i],
             limit=sheet.get("scale_factor"),
         )
         for i, a in enumerate(AXES)
     ]
     return rows + [
-        _row(f"{a} reads of {b}", "", K[i, j], expanded=K_U[i][j], factor=factor, limit=sheet.get("cross_axis"))
+        _row(f"{a} reads of {b}", "", K[i, j], expanded=K_U[i][j], factor=k_matrix[i][j], limit=sheet.get("cross_axis"))
         for i, a in enumerate(AXES)
         for j, b in enumerate(AXES)
         if i != j
@@ -58,14 +59,14 @@ def parameter_rows(part: JSON, sheet: JSON) -> list[JSON]:
 def effect_rows(part: JSON, sheet: JSON) -> list[JSON]:
     """Return the parameters of the fitted effects beside their limits."""
     limits = sheet.get("effects") or {}
-    factor = part.get("coverage_factor", {}).get("bias", [None])[0]
+    own = iter(((part.get("uncertainty_budget") or {}).get("coverage_factor") or [])[12:])
     return [
         _row(
             f"{e['name'].replace('_', ' ')}: {name}",
             _unit(p),
             p["value"],
             expanded=p.get("expanded_uncertainty"),
-            factor=factor,
+            factor=next(own, None),
             limit=limit,
         )
         for e in part.get("effects", [])
@@ -165,12 +166,14 @@ def _row(
 
 def _uncertainty_of_inverse(K: np.ndarray, part: JSON) -> list[list[float | None]]:
     values = part.get("covariance", {}).get("values")
-    factor = part.get("coverage_factor", {}).get("bias", [None])[0]
+    factor = (part.get("coverage_factor") or {}).get("matrix")
     if values is None or factor is None:
         return [[None] * 3] * 3
     J = np.kron(K, K.T)
     variance = np.diag(J @ np.array(values, float)[3:12, 3:12] @ J.T)
-    expanded: list[list[float | None]] = (factor * np.sqrt(np.clip(variance, 0.0, None))).reshape(3, 3).tolist()
+    expanded: list[list[float | None]] = (
+        np.array(factor) * np.sqrt(np.clip(variance, 0.0, None)).reshape(3, 3)
+    ).tolist()
     return expanded
 
 

@@ -15,6 +15,7 @@ from pipeline.model.kinematics import reference_motion
 from pipeline.model.user_effects import effect_of
 from pipeline.records import SENSORS, SensorCalibration
 from pipeline.report import figures, tables
+from pipeline.report.budget_table import budget_of, convergence_of
 from pipeline.report.evidence_figures import added_variable, unexplained
 from pipeline.report.figure import UNITS, Figure
 from pipeline.report.limits import checks, final_step, verdict
@@ -128,6 +129,8 @@ def _sensor(  # noqa: PLR0917  (the inputs of the page, passed on)
         "noise_figure": allan(sensor, recordings, noise, sheet, found.get("wander")),
         "matrix": tables.matrix_rows(part),
         "parameters": tables.parameter_rows(part, sheet) + tables.effect_rows(part, sheet),
+        "budget": budget_of(part),
+        "convergence": convergence_of(part),
         "stages": tables.stage_rows(part),
         "rests": tables.rest_rows(part),
         "diagnosis": found,

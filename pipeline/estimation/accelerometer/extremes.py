@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.estimation.turns import Part, Sinusoid
-    from pipeline.records import Recording
+    from pipeline.records import Motion, Recording
 
 OTHERS = ((1, 2), (2, 0), (0, 1))  # first and second axis of a turn about x, y, z
 
@@ -109,11 +109,14 @@ class Turn:
     reading : (n, 3) array, g
     used : list of (Recording, array of bool)
         Where they come from, in order.
+    motions : list of Motion
+        By the table, at these samples.
     """
 
     angle: NDArray[np.float64]
     reading: NDArray[np.float64]
     used: list[tuple[Recording, NDArray[np.bool_]]]
+    motions: list[Motion]
 
 
 def turns_of(parts: Sequence[Part]) -> list[Turn]:
@@ -134,7 +137,8 @@ def turns_of(parts: Sequence[Part]) -> list[Turn]:
             )
         angle = np.concatenate([np.asarray(part.motion.angle)[keep] for part, keep in used])
         reading = np.concatenate([np.asarray(part.recording.accelerometer)[keep] for part, keep in used])
-        turns.append(Turn(angle, reading, [(part.recording, keep) for part, keep in used]))
+        motions = [part.motion.select(keep) for part, keep in used]
+        turns.append(Turn(angle, reading, [(part.recording, keep) for part, keep in used], motions))
     return turns
 
 

@@ -28,9 +28,12 @@ from pipeline.estimation.accelerometer.magnitude import (
     fit_ellipsoid,
 )
 from pipeline.estimation.accelerometer.orientations import orientations_of, without
+from pipeline.estimation.budget import combined, gravity_contribution, noise_contribution, scatter_contribution
+from pipeline.estimation.least_squares import certified
+from pipeline.estimation.linear_map import LinearMap
 from pipeline.estimation.sample_blocks import make_blocks
 from pipeline.estimation.scaled_columns import estimate_weights, factorise
-from pipeline.estimation.serial_noise import assess_noise, combine, prior_of
+from pipeline.estimation.serial_noise import assess_noise, prior_of
 from pipeline.records import SensorCalibration, StageResult
 from pipeline.records.calibration import coverage_factor
 
@@ -43,6 +46,7 @@ if TYPE_CHECKING:
     from pipeline.estimation.accelerometer.orientations import Orientations
     from pipeline.estimation.serial_noise import Prior, SerialNoise
     from pipeline.records import Recording
+    from pipeline.records.budget import Contribution
     from pipeline.signal.rests import Rest
 
     Values = NDArray[np.float64]
@@ -86,25 +90,38 @@ def fit(
     while refused := _outlier(orientations, found):
         orientations = without(orientations, refused)
         found = _fit_determined(orientations, gravity_g)
-    covariance, freedom = _covariance(orientations, found, prior_of("accelerometer", recordings, settings))
+    scatter = _scatter(orientations, found, prior_of("accelerometer", recordings, settings))
     result = StageResult(
         name=NAME,
-        parameters=_parameters(found, covariance),
+        parameters=_parameters(found, scatter.covariance),
         residual_rms=float(np.sqrt(np.mean(found.error**2))),
         correction={"steps": [{"subtract": found.bias.tolist()}, {"matrix": found.matrix.tolist()}]},
-        details=_details(orientations, found, freedom),
+        details=_details(orientations, found, float(scatter.degrees_of_freedom.min())),
     )
     place = np.zeros((12, 9))
     place[[0, 1, 2, *(3 + 3 * ROWS + COLUMNS).tolist()], np.arange(9)] = 1.0
-    return SensorCalibration(
+    calibration = SensorCalibration(
         sensor="accelerometer",
         bias=found.bias,
         matrix=found.matrix,
         stages=(*(previous.stages if previous else ()), result),
-        covariance=place @ covariance @ place.T,
-        degrees_of_freedom=freedom,
         converged=found.fit.converged,
+        convergence=certified(found.fit.cosine, found.fit.condition, found.fit.rank, int(found.free.sum())),
     )
+    gravity = gravity_contribution("accelerometer", found.matrix, settings["table"], 12)
+    lines = [scatter.placed(place), *([gravity] if gravity else [])]
+    return combined(calibration, lines, _not_included(gravity))
+
+
+def _not_included(gravity: Contribution | None) -> dict[str, str]:
+    reasons = {
+        "table angle, rate and orthogonality, levelling": "the length of gravity does not change with the attitude",
+        "quantisation": "contained in the noise of the readings, as the rests scatter",
+        "temperature": "the parameters hold at the temperature of these recordings; "
+        "no accuracy of the thermometer is stated",
+        "time base": "no time enters the length of gravity",
+    }
+    return reasons if gravity else {"local gravity": "table.gravity_accuracy_g is not stated", **reasons}
 
 
 def _fit_determined(orientations: Orientations, gravity_g: float) -> Ellipsoid:
@@ -162,41 +179,44 @@ def _outlier(orientations: Orientations, found: Ellipsoid) -> dict[int, str]:
     }
 
 
-def _covariance(orientations: Orientations, found: Ellipsoid, prior: Prior) -> tuple[Values, float]:
-    """Return the covariance of b and L (9, 9) and its degrees of freedom."""
-    covariance = np.zeros((9, 9))
-    free = np.ix_(found.free, found.free)
+def _scatter(orientations: Orientations, found: Ellipsoid, prior: Prior) -> Contribution:
+    """Return what the readings' scatter contributes to b and L."""
     spare = found.fit.degrees_of_freedom
     if not orientations.by_hand and spare > 1:
-        covariance[free], freedom = _serial_covariance(orientations, found, prior)
-    elif found.between > 0.0:
-        covariance[free], freedom = found.fit.covariance, float(spare)
+        return _serial_scatter(orientations, found, prior)
+    J = derivative_of(orientations.mean, found.values)[:, found.free]
+    gain = np.eye(9)[:, found.free] @ estimate_weights(J, found.weight)
+    white = gain * orientations.variance @ gain.T
+    if found.between > 0.0:
+        covariance, freedom = gain @ np.diag(orientations.variance + found.between**2) @ gain.T, float(spare)
+        rest = "scatter of the rests"
     else:  # the rests show no scatter of their own, or are too few to: what is believed of the bias wander stands in
-        J = derivative_of(orientations.mean, found.values)[:, found.free]
-        gain = estimate_weights(J, found.weight)
-        covariance[free] = gain * (orientations.variance + prior.wander**2) @ gain.T
+        covariance = gain * (orientations.variance + prior.wander**2) @ gain.T
         freedom = float(3 * np.sum(orientations.count - 1))
-    return covariance, freedom
+        rest = "bias wander"
+    parts = {"white noise": np.diag(white), rest: np.diag(covariance - white)}
+    return scatter_contribution(
+        covariance, freedom, {name: np.sqrt(np.clip(v, 0.0, None)) for name, v in parts.items()}
+    )
 
 
-def _serial_covariance(orientations: Orientations, found: Ellipsoid, prior: Prior) -> tuple[Values, float]:
-    """Return the covariance under white noise and bias wander, as the samples' own errors tell them.
+def _serial_scatter(orientations: Orientations, found: Ellipsoid, prior: Prior) -> Contribution:
+    """Return the scatter under white noise and bias wander, as the samples' own errors tell them.
 
     The error of a sample is its noise along the direction of gravity, ``n^T L noise``, so that the estimate is linear
     in the readings of each channel c with the weights ``J^+ (n^T L)_c``.
     """
     row, y, L = orientations.row, orientations.mean, found.matrix
-    u = (y - found.bias) @ L.T
-    along = (u / np.linalg.norm(u, axis=1, keepdims=True)) @ L
+    truth = (y - found.bias) @ L.T
+    along = (truth / np.linalg.norm(truth, axis=1, keepdims=True)) @ L
     J = derivative_of(y, found.values)[:, found.free]
     error = found.error[row] + np.einsum("ij,ij->i", along[row], orientations.reading() - y[row])
     noise = assess_noise(np.repeat(error[:, None], 3, axis=1), J[row], make_blocks(orientations.parts), prior)
     noise = _counted_once(noise, prior, float(np.sqrt(np.mean(error**2))))
     per_sample = (estimate_weights(J, found.weight) / orientations.count)[:, row]
-    candidates = [
-        noise.white_variance[:, c, None, None] * noise.covariances(per_sample * along[row, c]) for c in range(3)
-    ]
-    return combine(noise, np.sum(candidates, axis=0))
+    x, y, z = (per_sample * along[row, c] for c in range(3))
+    place = np.eye(9)[:, found.free]
+    return noise_contribution(noise, LinearMap((x, y, z), (place, place, place)), prior)
 
 
 def _counted_once(noise: SerialNoise, prior: Prior, white: float) -> SerialNoise:

@@ -24,13 +24,17 @@ from pipeline.estimation.accelerometer.extremes import (
     sinusoids_of,
     turns_of,
 )
+from pipeline.estimation.bench_budget import budgeted
+from pipeline.estimation.budget import combined, noise_contribution, scatter_contribution
 from pipeline.estimation.correction import apply_correction
+from pipeline.estimation.least_squares import certificate, certified
+from pipeline.estimation.linear_map import LinearMap
 from pipeline.estimation.sample_blocks import make_blocks
-from pipeline.estimation.serial_noise import assess_noise, combine, prior_of
+from pipeline.estimation.serial_noise import assess_noise, prior_of
+from pipeline.estimation.table_inputs import Reference
 from pipeline.estimation.turns import parts_of
 from pipeline.model.effects.scale_factor_asymmetry import EFFECT
 from pipeline.records import FittedEffect, SensorCalibration, StageResult
-from pipeline.records.calibration import coverage_factor
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -42,10 +46,12 @@ if TYPE_CHECKING:
     from pipeline.estimation.serial_noise import Prior, SerialNoise
     from pipeline.estimation.turns import Sinusoid
     from pipeline.records import Recording
+    from pipeline.records.budget import Contribution
 
 STAGES = ("orthogonality", "misalignment", "bias", "scale_factor")
 REPLICATES = 60
 SEED = 20190508
+AS_PRINTED = "the printed variant takes single samples, through which no error of the table can be followed"
 STEP = 1e-7  # g, of the differences: truncation and rounding are then both about 1e-8 of the derivative
 
 
@@ -74,37 +80,38 @@ def fit_stage(
     gravity_g = float(settings["table"].get("gravity_g", 1.0))
     turns = turns_of(parts_of(recordings, "accelerometer", settings["table"], "the staged method"))
     sinusoids = sinusoids_of(turns)
-    noise = _noise(turns, sinusoids, prior_of("accelerometer", recordings, settings))
+    prior = prior_of("accelerometer", recordings, settings)
+    noise = _noise(turns, sinusoids, prior)
 
     def run(extremes: Extremes) -> Chain:
         return follow(extremes, names, gravity_g, as_printed=as_printed)
 
     chain = run(extremes_of_samples(turns) if as_printed else extremes_of_sinusoids(_coefficients(sinusoids)))
-    if as_printed:
-        covariance, freedom = _resampled(turns, sinusoids, noise, run)
-    else:
-        covariance, freedom = _propagated(sinusoids, noise, run)
+    fit = _linear_map(sinusoids, run)
+    scatter = _resampled(turns, sinusoids, noise, run) if as_printed else noise_contribution(noise, fit, prior)
     after = apply_correction({"steps": chain.steps}, np.concatenate([turn.reading for turn in turns]))
     result = StageResult(
         name=name,
-        parameters=_parameters(chain, covariance),
+        parameters=_parameters(chain, scatter.covariance),
         residual_rms=float(np.sqrt(np.mean((np.linalg.norm(after, axis=1) - gravity_g) ** 2))),
         correction={"steps": chain.steps},
-        details=_details(turns, noise, freedom),
+        details=_details(turns, noise, float(scatter.degrees_of_freedom.min())),
     )
-    effects: tuple[FittedEffect, ...] = ()
-    known = 12
-    if name == "scale_factor":
-        effects, known = (_asymmetry(chain, covariance, freedom),), 15
-    return SensorCalibration(
+    last = name == "scale_factor"
+    found = SensorCalibration(
         sensor="accelerometer",
         bias=chain.bias,
         matrix=np.diag(1.0 / chain.k),
         stages=(*(previous.stages if previous else ()), result),
-        effects=effects,
-        covariance=covariance[:known, :known],
-        degrees_of_freedom=freedom,
+        effects=(_asymmetry(chain),) if last else (),
+        convergence=_certificate(sinusoids),
     )
+    kept = slice(0, 15 if last else 12)
+    if as_printed:
+        return combined(found, [scatter.of(kept)], {"everything but noise": AS_PRINTED})
+    motions = [motion for turn in turns for motion in turn.motions]
+    reference = Reference("accelerometer", motions, fit.results(kept), np.diag(chain.k), settings["table"])
+    return budgeted(found, reference, noise, [scatter.of(kept)], settings)
 
 
 def _parameters(chain: Chain, covariance: NDArray[np.float64]) -> dict[str, dict[str, Any]]:
@@ -127,17 +134,24 @@ def _details(turns: Sequence[Turn], noise: SerialNoise, freedom: float) -> dict[
     }
 
 
-def _asymmetry(chain: Chain, covariance: NDArray[np.float64], freedom: float) -> FittedEffect:
-    factor = coverage_factor(freedom)
-    expanded = factor * np.sqrt(np.diag(covariance)[12:15])
+def _asymmetry(chain: Chain) -> FittedEffect:
     names = EFFECT.parameters("accelerometer")
     return FittedEffect(
         EFFECT.name,
         {
-            parameter.name: {"value": float(value), "unit": parameter.unit, "expanded_uncertainty": float(u)}
-            for parameter, value, u in zip(names, chain.c, expanded, strict=True)
+            parameter.name: {"value": float(value), "unit": parameter.unit}
+            for parameter, value in zip(names, chain.c, strict=True)
         },
     )
+
+
+def _certificate(sinusoids: Sequence[Sequence[Sinusoid]]) -> dict[str, Any]:
+    """Return the certificate of the worst of the sinusoids' fits."""
+    every = [s for turn in sinusoids for s in turn]
+    parts = [certificate(s.columns, s.residuals, s.condition, s.columns.shape[1]) for s in every]
+    worst = {key: max(part[key] for part in parts) for key in ("cosine", "condition")}
+    count = sum(part["parameters"] for part in parts)
+    return certified(worst["cosine"], worst["condition"], count, count)
 
 
 def _stages_before(previous: SensorCalibration | None) -> list[str]:
@@ -179,13 +193,11 @@ def _side_by_side(matrices: Sequence[NDArray[np.float64]]) -> NDArray[np.float64
     return out
 
 
-def _propagated(
-    sinusoids: Sequence[Sequence[Sinusoid]], noise: SerialNoise, run: Callable[[Extremes], Chain]
-) -> tuple[NDArray[np.float64], float]:
-    """Return the covariance of ``Chain.vector`` by the derivative of the chain, and its degrees of freedom."""
+def _linear_map(sinusoids: Sequence[Sequence[Sinusoid]], run: Callable[[Extremes], Chain]) -> LinearMap:
+    """Return the map from readings to ``Chain.vector``, by the derivative of the chain."""
     coefficients = _coefficients(sinusoids)
     here = run(extremes_of_sinusoids(coefficients)).vector()
-    candidates: NDArray[np.float64] | float = 0.0
+    weights, derivatives = [], []
     for channel in range(3):
         columns = []
         for turn in range(3):
@@ -193,16 +205,15 @@ def _propagated(
                 moved = [[c.copy() for c in channels] for channels in coefficients]
                 moved[turn][channel][j] += STEP
                 columns.append((run(extremes_of_sinusoids(moved)).vector() - here) / STEP)
-        J = np.column_stack(columns)
-        A = _side_by_side([turn[channel].weights for turn in sinusoids])
-        candidates = candidates + J @ (noise.white_variance[:, channel, None, None] * noise.covariances(A)) @ J.T
-    return combine(noise, np.asarray(candidates))
+        derivatives.append(np.column_stack(columns))
+        weights.append(_side_by_side([turn[channel].weights for turn in sinusoids]))
+    return LinearMap((weights[0], weights[1], weights[2]), (derivatives[0], derivatives[1], derivatives[2]))
 
 
 def _resampled(
     turns: Sequence[Turn], sinusoids: Sequence[Sequence[Sinusoid]], noise: SerialNoise, run: Callable[[Extremes], Chain]
-) -> tuple[NDArray[np.float64], float]:
-    """Return the covariance of ``Chain.vector`` over synthetic turns, and its degrees of freedom."""
+) -> Contribution:
+    """Return the scatter of ``Chain.vector`` over synthetic turns."""
     rng = np.random.default_rng(SEED)
     means = [
         turn.reading - np.column_stack([s.residuals for s in fits]) for turn, fits in zip(turns, sinusoids, strict=True)
@@ -213,4 +224,4 @@ def _resampled(
         added = np.split(noisy, cuts)
         synthetic = [replace(turn, reading=mean + new) for turn, mean, new in zip(turns, means, added, strict=True)]
         vectors.append(run(extremes_of_samples(synthetic)).vector())
-    return np.cov(np.array(vectors).T), float(REPLICATES - 1)
+    return scatter_contribution(np.cov(np.array(vectors).T), REPLICATES - 1.0)

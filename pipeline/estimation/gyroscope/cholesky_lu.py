@@ -25,16 +25,20 @@ Y is linear in the readings, so the covariance of A under white noise and bias w
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pipeline.errors import ConfigurationError
+from pipeline.estimation.bench_budget import budgeted
+from pipeline.estimation.budget import noise_contribution, scatter_contribution
 from pipeline.estimation.gyroscope.integrated_turns import require_turns, turns_of
-from pipeline.estimation.least_squares import solve_linear
+from pipeline.estimation.least_squares import certified, solve_linear
+from pipeline.estimation.linear_map import LinearMap
 from pipeline.estimation.sample_blocks import make_blocks
-from pipeline.estimation.serial_noise import assess_noise, combine, prior_of
+from pipeline.estimation.serial_noise import assess_noise, prior_of
+from pipeline.estimation.table_inputs import Reference
 from pipeline.estimation.turns import parts_of
 from pipeline.records import AXES, SensorCalibration, StageResult
 
@@ -44,7 +48,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.estimation.gyroscope.integrated_turns import Turns
-    from pipeline.estimation.serial_noise import SerialNoise
     from pipeline.records import Recording
 
     Values = NDArray[np.float64]
@@ -96,18 +99,20 @@ def fit(
     turns = turns_of(parts_of(recordings, "gyroscope", settings["table"], "the Cholesky and LU method"))
     Y, U = turns.integral(turns.reading - previous.bias), turns.integral(turns.rate)
     require_turns(U)
-    A = np.array([solve_linear(U, Y[:, channel], sigma=1.0).x for channel in range(3)])
+    solved = [solve_linear(U, Y[:, channel], sigma=1.0) for channel in range(3)]
+    A = np.array([row.x for row in solved])
     as_printed = bool(settings["method"].get("as_printed", False))
     factors = factorise(A)
     residuals = turns.reading - previous.bias - turns.rate @ A.T
     design = np.column_stack([np.ones(len(turns.rate)), turns.rate])
     prior = prior_of("gyroscope", recordings, settings)
     noise = assess_noise(residuals, design, make_blocks(turns.parts), prior)
-    covariance, freedom = _covariance(turns, A, previous, noise, as_printed=as_printed)
+    fit, given = _linear_map(turns, A, previous, as_printed=as_printed)
+    scatter = noise_contribution(noise, fit, prior)
     matrix = _matrix(A, as_printed=as_printed)
     result = StageResult(
         name=NAME,
-        parameters=_parameters(factors, covariance),
+        parameters=_parameters(factors, scatter.covariance + given),
         residual_rms=_residual_rms(turns, previous.bias, matrix),
         correction={"steps": [{"subtract": previous.bias.tolist()}, {"matrix": matrix.tolist()}]},
         details={
@@ -118,17 +123,24 @@ def fit(
             "orthonormality_error": float(np.max(np.abs(factors.M @ factors.M.T - np.eye(3)))),
             "determinant_of_M": float(np.linalg.det(factors.M)),
             "condition": float(np.linalg.cond(U / np.linalg.norm(U, axis=0))),
-            "degrees_of_freedom": freedom,
+            "degrees_of_freedom": float(scatter.degrees_of_freedom.min()),
         },
     )
-    return SensorCalibration(
+    cosine, condition = max(row.cosine for row in solved), solved[0].condition
+    found = SensorCalibration(
         sensor="gyroscope",
         bias=previous.bias,
         matrix=matrix,
         stages=(*previous.stages, result),
-        covariance=covariance[:12, :12],
-        degrees_of_freedom=freedom,
+        convergence=certified(cosine, condition, solved[0].rank, 3),
     )
+    kept = slice(0, 12)
+    reference = Reference("gyroscope", turns.motions, fit.results(kept), A, settings["table"])
+    lines = [scatter.of(kept)]
+    if np.any(given):
+        before = np.inf if previous.freedom is None else float(previous.freedom[:3].min())
+        lines.append(replace(scatter_contribution(given[kept, kept], before), source="bias of the stage before"))
+    return budgeted(found, reference, noise, lines, settings)
 
 
 def factorise(A: Values) -> Factors:
@@ -151,29 +163,27 @@ def _matrix(A: Values, *, as_printed: bool) -> Values:
     return A if as_printed else np.asarray(np.linalg.solve(A, np.eye(3)))
 
 
-def _covariance(
-    turns: Turns, A: Values, previous: SensorCalibration, noise: SerialNoise, *, as_printed: bool
-) -> tuple[Values, float]:
-    """Return the covariance of bias, matrix, S, T and M (12 + 15) and its degrees of freedom."""
+def _linear_map(turns: Turns, A: Values, previous: SensorCalibration, *, as_printed: bool) -> tuple[LinearMap, Values]:
+    """Return the map from readings to bias, matrix, S, T and M (12 + 15), and what a bias that is given adds to them.
+
+    Without a rest in the turns' recordings the bias is that of another recording, with a covariance of its own.
+    """
     U = turns.integral(turns.rate)
     scale = np.linalg.norm(U, axis=0)
     inverse = np.linalg.pinv(U / scale) / scale[:, None]
     inside = turns.turn >= 0
     weights = np.zeros((4, len(turns.reading)))
     weights[1:, inside] = inverse[:, turns.turn[inside]] * turns.weight[inside]
-    from_rests = bool(turns.rest.any())  # else the bias is that of another recording
+    from_rests = bool(turns.rest.any())
     lever = np.array([1.0, *(-weights[1:].sum(axis=1))])
     if from_rests:
         weights += lever[:, None] * np.where(turns.rest, 1.0 / turns.rest.sum(), 0.0)
-    total = np.zeros((len(noise.weight), 27, 27))
-    theta = np.column_stack([previous.bias, A])
-    for channel in range(3):
-        own = noise.white_variance[:, channel, None, None] * noise.covariances(weights)
-        if not from_rests and previous.covariance is not None:
-            own = own + previous.covariance[channel, channel] * np.outer(lever, lever)
-        J = _derivative(theta, channel, as_printed=as_printed)
-        total += J @ own @ J.T
-    return combine(noise, total)
+    theta, given = np.column_stack([previous.bias, A]), np.zeros((27, 27))
+    x, y, z = (_derivative(theta, channel, as_printed=as_printed) for channel in range(3))
+    if not from_rests and previous.covariance is not None:
+        for channel, J in enumerate((x, y, z)):
+            given += previous.covariance[channel, channel] * np.outer(J @ lever, J @ lever)
+    return LinearMap((weights, weights, weights), (x, y, z)), given
 
 
 def _derivative(theta: Values, channel: int, *, as_printed: bool) -> Values:

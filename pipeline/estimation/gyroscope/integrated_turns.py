@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.estimation.turns import Part
-    from pipeline.records import Recording
+    from pipeline.records import Motion, Recording
 
     Values = NDArray[np.float64]
 
@@ -51,6 +51,8 @@ class Turns:
     parts : tuple of (Recording, (n,) array of bool)
     left_out : int
         Turns with clipped or stuck readings.
+    motions : tuple of Motion
+        By the table, at these samples.
     """
 
     reading: Values
@@ -60,6 +62,7 @@ class Turns:
     turn: NDArray[np.intp]
     parts: tuple[tuple[Recording, NDArray[np.bool_]], ...]
     left_out: int
+    motions: tuple[Motion, ...]
 
     def integral(self, values: Values) -> Values:
         """Return the integral of (n, 3) values over each turn: (t, 3) array, deg."""
@@ -80,7 +83,7 @@ def turns_of(parts: Sequence[Part]) -> Turns:
     -------
     Turns
     """
-    readings, rates, rests, weights, turns, chosen = [], [], [], [], [], []
+    readings, rates, rests, weights, turns, chosen, motions = [], [], [], [], [], [], []
     found = left_out = 0
     for part in parts:
         weight, turn = np.zeros(part.recording.samples), np.full(part.recording.samples, -1, np.intp)
@@ -101,6 +104,7 @@ def turns_of(parts: Sequence[Part]) -> Turns:
         weights.append(weight[keep])
         turns.append(turn[keep])
         chosen.append((part.recording, keep))
+        motions.append(part.motion.select(keep))
     return Turns(
         np.concatenate(readings),
         np.concatenate(rates),
@@ -109,6 +113,7 @@ def turns_of(parts: Sequence[Part]) -> Turns:
         np.concatenate(turns),
         tuple(chosen),
         left_out,
+        tuple(motions),
     )
 
 

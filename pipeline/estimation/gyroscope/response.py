@@ -22,6 +22,7 @@ from pipeline.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.sample_blocks import make_blocks
 from pipeline.estimation.turns import usable
 from pipeline.records import AXES
+from pipeline.records.motion import motion_at_rest
 from pipeline.signal.rests import runs
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 
     from pipeline.estimation.sample_blocks import Blocks
     from pipeline.estimation.turns import Part
-    from pipeline.records import Recording
+    from pipeline.records import Motion, Recording
 
 SLOWEST_SHARE = 0.02  # of the largest rate, below which a turn is not called one
 CHANGE_PER_SECOND = 0.25  # of the rate, above which a turn is not steady
@@ -89,12 +90,15 @@ class Samples:
     blocks : Blocks
     total : int
         Samples of the recordings.
+    motions : tuple of Motion
+        By the table, at these samples; at rest in a static recording.
     """
 
     reading: NDArray[np.float64]
     rate: NDArray[np.float64]
     blocks: Blocks
     total: int
+    motions: tuple[Motion, ...]
 
     @property
     def speed(self) -> NDArray[np.float64]:
@@ -106,7 +110,7 @@ class Samples:
 
 def samples_of(parts: Sequence[Part], recordings: Sequence[Recording]) -> Samples:
     """Return the samples at rest and in steady turns, and a static recording's where there is no other rest."""
-    chosen, readings, rates = [], [], []
+    chosen, readings, rates, motions = [], [], [], []
     for part in parts:
         memory = _memory(part.recording)
         steady, still = _steady(part, memory), _without_tails(part, memory)
@@ -118,6 +122,7 @@ def samples_of(parts: Sequence[Part], recordings: Sequence[Recording]) -> Sample
         readings.append(np.asarray(part.recording.gyroscope)[keep] - earth)
         rates.append(rate[keep])
         chosen.append((part.recording, keep))
+        motions.append(part.motion.select(keep))
     if all(np.any(rate, axis=1).all() for rate in rates):
         for recording in recordings:
             if recording.role == "static" and recording.gyroscope is not None:
@@ -125,8 +130,9 @@ def samples_of(parts: Sequence[Part], recordings: Sequence[Recording]) -> Sample
                 readings.append(recording.gyroscope[keep])
                 rates.append(np.zeros((int(keep.sum()), 3)))
                 chosen.append((recording, keep))
+                motions.append(motion_at_rest(recording.time[keep]))
     total = sum(recording.samples for recording, _ in chosen)
-    return Samples(np.concatenate(readings), np.concatenate(rates), make_blocks(chosen), total)
+    return Samples(np.concatenate(readings), np.concatenate(rates), make_blocks(chosen), total, tuple(motions))
 
 
 def _memory(recording: Recording) -> float:

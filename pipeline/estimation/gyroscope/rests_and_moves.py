@@ -12,12 +12,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import CannotCalibrateError, ConfigurationError, InputError, NotObservableError
+from pipeline.estimation.hand_held.budget import budgeted_by_hand
 from pipeline.estimation.hand_held.equations import noises_for
 from pipeline.estimation.hand_held.fit import fit as fit_by_hand
 from pipeline.estimation.hand_held.gyroscope import FEWEST_MOVES, model_of
 from pipeline.estimation.hand_held.likelihood import NEW
 from pipeline.estimation.hand_held.model import State
 from pipeline.estimation.hand_held.rests import by_hand
+from pipeline.estimation.least_squares import certified
 from pipeline.records import AXES, SensorCalibration, StageResult
 from pipeline.signal.noise import estimate_noise
 
@@ -92,15 +94,15 @@ def fit(
     }
     correction = {"steps": [{"subtract": found.state.bias.tolist()}, {"matrix": found.state.matrix.tolist()}]}
     result = StageResult(NAME, parameters, float(np.sqrt(np.mean(at_rest**2))), correction, details)
-    return SensorCalibration(
+    calibration = SensorCalibration(
         sensor="gyroscope",
         bias=found.state.bias,
         matrix=found.state.matrix,
         stages=(*(previous.stages if previous else ()), result),
-        covariance=found.covariance,
-        degrees_of_freedom=found.degrees_of_freedom,
         converged=found.converged,
+        convergence=certified(found.cosine, found.condition, found.rank, len(found.covariance)),
     )
+    return budgeted_by_hand(calibration, found.covariance, found.degrees_of_freedom, settings["table"])
 
 
 def _require_determined(base: NDArray[np.float64]) -> None:

@@ -16,9 +16,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import ConfigurationError
+from pipeline.estimation.bench_budget import budgeted
+from pipeline.estimation.budget import noise_contribution
 from pipeline.estimation.correction import apply_correction
 from pipeline.estimation.gyroscope.response import Response, samples_of, weights_of
-from pipeline.estimation.serial_noise import assess_noise, combine, prior_of
+from pipeline.estimation.least_squares import certified
+from pipeline.estimation.linear_map import LinearMap
+from pipeline.estimation.serial_noise import assess_noise, prior_of
+from pipeline.estimation.table_inputs import Reference
 from pipeline.estimation.turns import parts_of
 from pipeline.records import SensorCalibration, StageResult
 
@@ -27,8 +32,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.estimation.gyroscope.response import Samples
-    from pipeline.estimation.serial_noise import Prior, SerialNoise
     from pipeline.records import Recording
 
 STAGES = ("bias", "orthogonality_and_misalignment", "scale_factor")
@@ -99,18 +102,22 @@ def fit_stage(
     samples = samples_of(parts_of(recordings, "gyroscope", settings["table"], "the staged method"), recordings)
     weights = weights_of(samples.rate, as_printed=as_printed)
     theta = weights @ samples.reading
-    noise = _noise(samples, theta, prior_of("gyroscope", recordings, settings))
+    prior = prior_of("gyroscope", recordings, settings)
+    design = np.column_stack([np.ones(len(samples.rate)), samples.rate[:, samples.speed > 0]])
+    residuals = samples.reading - theta[0] - samples.rate @ theta[1:]
+    noise = assess_noise(residuals, design, samples.blocks, prior)
 
     def run(values: NDArray[np.float64]) -> Chain:
         return follow(Response(values[0], values[1:], samples.speed), names, as_printed=as_printed)
 
     chain = run(theta)
-    covariance, freedom = _propagated(theta, weights, noise, run)
+    fit = _linear_map(theta, weights, run)
+    scatter = noise_contribution(noise, fit, prior)
     after = apply_correction({"steps": chain.steps}, samples.reading)
     error = np.linalg.norm(after, axis=1) - np.linalg.norm(samples.rate, axis=1)
     result = StageResult(
         name=name,
-        parameters=_parameters(chain, covariance),
+        parameters=_parameters(chain, scatter.covariance),
         residual_rms=float(np.sqrt(np.mean(error**2))),
         correction={"steps": chain.steps},
         details={
@@ -118,18 +125,22 @@ def fit_stage(
             "samples_left_out": samples.total - len(samples.reading),
             "white_noise": noise.white.tolist(),
             "bias_wander": noise.wander.tolist(),
-            "degrees_of_freedom": freedom,
+            "degrees_of_freedom": float(scatter.degrees_of_freedom.min()),
         },
     )
     bias, matrix = chain.contract()
-    return SensorCalibration(
+    size = np.linalg.norm(design, axis=0)
+    condition = float(np.linalg.cond(np.linalg.qr(design / size, mode="r")))
+    found = SensorCalibration(
         sensor="gyroscope",
         bias=bias,
         matrix=matrix,
         stages=(*(previous.stages if previous else ()), result),
-        covariance=covariance[:12, :12],
-        degrees_of_freedom=freedom,
+        convergence=certified(0.0, condition, design.shape[1], design.shape[1]) | {"closed_form": True},
     )
+    kept, K = slice(0, 12), np.asarray(np.linalg.solve(matrix, np.eye(3)))
+    reference = Reference("gyroscope", samples.motions, fit.results(kept), K, settings["table"])
+    return budgeted(found, reference, noise, [scatter.of(kept)], settings)
 
 
 def follow(response: Response, names: Sequence[str], *, as_printed: bool) -> Chain:
@@ -162,21 +173,11 @@ def _stages_before(previous: SensorCalibration | None) -> list[str]:
     return names
 
 
-def _noise(samples: Samples, theta: NDArray[np.float64], prior: Prior) -> SerialNoise:
-    design = np.column_stack([np.ones(len(samples.rate)), samples.rate[:, samples.speed > 0]])
-    residuals = samples.reading - theta[0] - samples.rate @ theta[1:]
-    return assess_noise(residuals, design, samples.blocks, prior)
-
-
-def _propagated(
-    theta: NDArray[np.float64],
-    weights: NDArray[np.float64],
-    noise: SerialNoise,
-    run: Callable[[NDArray[np.float64]], Chain],
-) -> tuple[NDArray[np.float64], float]:
-    """Return the covariance of ``Chain.vector``, and its degrees of freedom."""
-    unit = noise.covariances(weights)
-    candidates: NDArray[np.float64] | float = 0.0
+def _linear_map(
+    theta: NDArray[np.float64], weights: NDArray[np.float64], run: Callable[[NDArray[np.float64]], Chain]
+) -> LinearMap:
+    """Return the map from readings to ``Chain.vector``, by the derivative of the chain."""
+    derivatives = []
     for channel in range(3):
         columns = []
         for row in range(4):
@@ -184,9 +185,8 @@ def _propagated(
             up[row, channel] += STEP
             down[row, channel] -= STEP
             columns.append((run(up).vector() - run(down).vector()) / (2.0 * STEP))
-        J = np.column_stack(columns)
-        candidates = candidates + J @ (noise.white_variance[:, channel, None, None] * unit) @ J.T
-    return combine(noise, np.asarray(candidates))
+        derivatives.append(np.column_stack(columns))
+    return LinearMap((weights, weights, weights), (derivatives[0], derivatives[1], derivatives[2]))
 
 
 def _parameters(chain: Chain, covariance: NDArray[np.float64]) -> dict[str, dict[str, Any]]:

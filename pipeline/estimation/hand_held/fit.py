@@ -66,6 +66,8 @@ class HandFit:
     rounds : int
     converged : bool
     condition : float
+    cosine : float
+        Largest between the whitened residual and a column, with what is believed of the parameters.
     """
 
     state: State
@@ -79,6 +81,7 @@ class HandFit:
     rounds: int
     converged: bool
     condition: float
+    cosine: float
 
 
 @dataclass(frozen=True)
@@ -92,6 +95,7 @@ class Solved:
     restricted: float
     scale: float
     rank: int
+    cosine: float
 
 
 @dataclass(frozen=True)
@@ -198,6 +202,7 @@ def _assessed(
         every[best].rank,
         *how,
         every[best].condition,
+        every[best].cosine,
     )
 
 
@@ -236,6 +241,7 @@ def solve(equations: Equations, noise: HandNoise, limits: Limits) -> Solved:
         -0.5 * (rss / k_free + spare * float(np.log(k_free)) + logarithm + inner) + noise.prior,
         k_free,
         rank,
+        float(np.max(np.abs(X.T @ r - believed * limits.values) / size)) / max(float(np.linalg.norm(r)), 1e-300),
     )
 
 

@@ -9,13 +9,14 @@ import numpy as np
 
 from pipeline.errors import NotObservableError
 from pipeline.estimation.hand_held import accelerometer, gyroscope
+from pipeline.estimation.hand_held.budget import budgeted_by_hand
 from pipeline.estimation.hand_held.equations import noises_for
 from pipeline.estimation.hand_held.fit import plausible, require_observable
 from pipeline.estimation.hand_held.model import refusal
 from pipeline.estimation.hand_held.selection import fit_configured, limits_of, select
+from pipeline.estimation.least_squares import certified
 from pipeline.model.effects import effect
 from pipeline.records import FittedEffect, SensorCalibration, StageResult
-from pipeline.records.calibration import coverage_factor
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -101,10 +102,12 @@ def fit_effects_by_hand(
             f"record at least {found.rank + 10} rests in as many orientations"
         )
     require_observable(model, found, limits)
-    return calibration_of(model, found, before)
+    return calibration_of(model, found, before, settings["table"])
 
 
-def calibration_of(model: Model, found: HandFit, before: SensorCalibration) -> SensorCalibration:
+def calibration_of(
+    model: Model, found: HandFit, before: SensorCalibration, table: Mapping[str, Any]
+) -> SensorCalibration:
     """Return a fit as a calibration with the stage ``effects``."""
     covariance = found.covariance
     count = covariance.shape[0] - model.directions.shape[1]
@@ -113,13 +116,12 @@ def calibration_of(model: Model, found: HandFit, before: SensorCalibration) -> S
     place[12:, model.directions.shape[1] :] = np.eye(count)
     covariance = place @ covariance @ place.T
     uncertainty = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
-    factor = coverage_factor(found.degrees_of_freedom)
     effects, parameters, at = [], {}, 12
     for term in found.state.terms:
         described: dict[str, dict[str, Any]] = {}
         for parameter, value in zip(term.effect.parameters(model.sensor), term.values, strict=True):
             shared = {"value": float(value), "unit": parameter.unit}
-            described[parameter.name] = {**shared, "expanded_uncertainty": float(factor * uncertainty[at])}
+            described[parameter.name] = shared
             own = {**shared, "standard_uncertainty": float(uncertainty[at])}
             parameters[f"{term.effect.name}.{parameter.name}"] = own
             at += 1
@@ -136,13 +138,13 @@ def calibration_of(model: Model, found: HandFit, before: SensorCalibration) -> S
     }
     rests = slice(0, model.rests_equations)
     rms = float(np.sqrt(np.mean((found.residual[rests] * found.error[rests]) ** 2)))
-    return replace(
+    calibration = replace(
         before,
         bias=found.state.bias,
         matrix=found.state.matrix,
         stages=(*before.stages, StageResult("effects", parameters, rms, None, details)),
         effects=tuple(effects),
-        covariance=covariance,
-        degrees_of_freedom=found.degrees_of_freedom,
         converged=found.converged,
+        convergence=certified(found.cosine, found.condition, found.rank, len(found.covariance)),
     )
+    return budgeted_by_hand(calibration, covariance, found.degrees_of_freedom, table)

@@ -1,0 +1,176 @@
+"""How often a stated 95 % interval holds the truth, over simulated calibrations of every method.
+
+    nice python benchmarks/coverage.py [--n 1000] [--seed 1] [--conditions white,wander,table] [--methods ...]
+
+A unit is drawn by the product's own simulator (MPU-6050, quantised), recorded, and calibrated by each method; then the
+truth of each parameter lies within its expanded uncertainty or not. Conditions: ``white``, white noise alone, as the
+unit's data sheet says; ``wander``, with the data sheet's bias wander; ``table``, with that and with a table whose
+errors have the sizes that its configuration states. The truth of the staged method, which is an approximation by
+design, is its own output without noise and table errors. Prints the share over all parameters and of the
+worst ones, and CPU seconds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from dataclasses import replace
+from importlib import import_module
+from typing import Any, cast
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+
+from pipeline.model.effects.base import truth
+from pipeline.model.kinematics import reference_motion
+from pipeline.records import Recording, SensorCalibration, StageResult
+from pipeline.simulation.campaign import simulate_unit
+from pipeline.simulation.description import UnitDescription, read_config
+
+COURSE = {
+    "step_deg": 15.0,
+    "dwell_s": 1.2,
+    "rates_dps": [60.0],
+    "both_directions": True,
+    "warm_up_rest_s": 10.0,
+    "static_s": 0.0,
+    "validation_s": 0.0,
+    "pause_s": 10.0,
+}
+FAULTLESS = {"angle_accuracy_deg": 0.0, "rate_error": [0.0] * 3, "direction_deg": np.zeros((3, 2)).tolist()}
+JSON = dict[str, Any]
+BENCH, HAND = "three_axis_turns", "multi_position"
+METHODS: dict[str, tuple[str, str, tuple[str, ...]]] = {  # procedure, sensor, stages
+    "reference accelerometer": (BENCH, "accelerometer", ("reference_least_squares",)),
+    "reference gyroscope": (BENCH, "gyroscope", ("reference_least_squares",)),
+    "staged accelerometer": (BENCH, "accelerometer", ("orthogonality", "misalignment", "bias", "scale_factor")),
+    "staged gyroscope": (BENCH, "gyroscope", ("bias", "orthogonality_and_misalignment", "scale_factor")),
+    "nonlinear accelerometer": (BENCH, "accelerometer", ("nonlinear_least_squares",)),
+    "cholesky gyroscope": (BENCH, "gyroscope", ("bias", "cholesky_lu")),
+    "nonlinear accelerometer by hand": (HAND, "accelerometer", ("nonlinear_least_squares",)),
+    "rests and moves gyroscope by hand": (HAND, "gyroscope", ("rests_and_moves",)),
+}
+CONDITIONS = ("white", "wander", "table")
+
+
+def settings_of(condition: str, table: str, procedure: str) -> dict[str, Any]:
+    sensor = {k: dict(v) if isinstance(v, dict) else v for k, v in read_config("sensor", "mpu6050").items()}
+    if condition == "white":
+        for name in ("accelerometer", "gyroscope"):
+            sensor[name]["bias_wander"] = 0.0
+    return {
+        "sensor": sensor,
+        "table": read_config("table", "hand" if procedure == HAND else table),
+        "procedure": {"holdout_every": 0},
+        "method": {"as_printed": False},
+    }
+
+
+def simulated(condition: str, table: str, procedure: str, seed: int, number: int) -> tuple[list[Recording], JSON]:
+    still = {"bias_wander": 0.0} if condition == "white" else {}
+    unit = UnitDescription(
+        "U",
+        table="hand" if procedure == HAND else table,
+        procedure=procedure,
+        course=COURSE if procedure == BENCH else {"static_s": 0.0},
+        accelerometer=still,
+        gyroscope=still,
+        imperfections={} if condition == "table" else FAULTLESS,
+    )
+    return simulate_unit(unit, seed, number)
+
+
+def calibrated(sensor: str, stages: tuple[str, ...], recordings: list[Recording], settings: JSON) -> SensorCalibration:
+    """Run the last stage; of the staged method it follows the ones before by itself."""
+    before = None
+    if "scale_factor" in stages:
+        before = SensorCalibration(sensor, stages=tuple(StageResult(name, {}) for name in stages[:-1]))
+        stages = stages[-1:]
+    for name in stages:
+        before = import_module(f"pipeline.estimation.{sensor}.{name}").fit(recordings, before, settings)
+    return cast("SensorCalibration", before)
+
+
+def noise_free(recordings: list[Recording], sensor: str, hidden: JSON) -> list[Recording]:
+    """Return the recordings with what the sensor would read in the commanded motion."""
+    K, out = np.linalg.solve(np.array(hidden[sensor]["matrix"]), np.eye(3)), []
+    for recording in recordings:
+        motion = reference_motion(recording)
+        if recording.role == sensor and motion is not None:
+            reading = np.array(hidden[sensor]["bias"]) + truth(sensor, motion) @ K.T
+            out.append(replace(recording, **{sensor: reading}))
+    return out
+
+
+def frame_of(matrix: np.ndarray) -> np.ndarray:
+    """Return the rotation Q of ``matrix = Q L``, L lower triangular: the frame of a fit without a table."""
+    flipped, _ = np.linalg.qr(matrix[:, ::-1])
+    Q = flipped[:, ::-1]
+    return Q * np.sign(np.diag(Q.T @ matrix))
+
+
+def true_values(method: str, recordings: list[Recording], settings: JSON, hidden: JSON) -> np.ndarray:
+    _, sensor, stages = METHODS[method]
+    matrix = np.array(hidden[sensor]["matrix"])
+    if "staged" in method:
+        found = calibrated(sensor, stages, noise_free(recordings, sensor, hidden), settings)
+        return np.concatenate([found.bias, found.matrix.ravel()])
+    if method.endswith("by hand") or "nonlinear" in method:
+        matrix = frame_of(np.array(hidden["accelerometer"]["matrix"])).T @ matrix
+    return np.concatenate([hidden[sensor]["bias"], matrix.ravel()])
+
+
+def judged(method: str, recordings: list[Recording], settings: JSON, hidden: JSON) -> np.ndarray:
+    """Return error over expanded uncertainty of each parameter; NaN where a parameter is not estimated."""
+    _, sensor, stages = METHODS[method]
+    part = calibrated(sensor, stages, recordings, settings).to_json()
+    value = np.concatenate([part["bias"], np.ravel(part["matrix"])])
+    expanded = part["expanded_uncertainty"]
+    U = np.concatenate([expanded["bias"], np.ravel(expanded["matrix"])])
+    error = value - true_values(method, recordings, settings, hidden)
+    return np.where(U > 0.0, error / np.where(U > 0.0, U, 1.0), np.nan)
+
+
+def study(methods: list[str], condition: str, n: int, seed: int, table: str) -> dict[str, np.ndarray]:
+    found: dict[str, list[np.ndarray]] = {name: [] for name in methods}
+    for number in range(n):
+        for procedure in (BENCH, HAND):
+            wanted = [name for name in methods if METHODS[name][0] == procedure]
+            if wanted and not (procedure == HAND and condition == "table"):
+                recordings, hidden = simulated(condition, table, procedure, seed, number)
+                settings = settings_of(condition, table, procedure)
+                for name in wanted:
+                    found[name].append(judged(name, recordings, settings, hidden))
+    return {name: np.array(rows) for name, rows in found.items() if rows}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--n", type=int, default=1000)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--conditions", default=",".join(CONDITIONS))
+    parser.add_argument("--methods", default="", help="words that a method's name holds, with commas; all by default")
+    parser.add_argument("--table", default="acutronic", help="table whose stated errors the condition table has")
+    arguments = parser.parse_args()
+    words = arguments.methods.split(",")
+    methods = [name for name in METHODS if any(word in name for word in words)]
+    for condition in arguments.conditions.split(","):
+        start = time.process_time()
+        found = study(methods, condition, arguments.n, arguments.seed, arguments.table)
+        print(f"{condition}, n = {arguments.n}, seed {arguments.seed}, {time.process_time() - start:.0f} s CPU")
+        for name, ratios in found.items():
+            known = ~np.all(np.isnan(ratios), axis=0)
+            inside = np.abs(ratios[:, known]) <= 1.0
+            each = 100.0 * inside.mean(axis=0)
+            units = 100.0 * inside.mean(axis=1)
+            print(
+                f"  {name:<36} pooled {each.mean():5.2f} % +- {units.std() / np.sqrt(len(units)):.2f}, "
+                f"parameters {each.min():5.1f} to {each.max():5.1f} %: {' '.join(f'{e:.1f}' for e in each)}",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()

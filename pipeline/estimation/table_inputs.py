@@ -1,0 +1,286 @@
+"""What the stated accuracies of a table do to the parameters of a fit, through its linear map.
+
+The true motion is the logged one plus an error, ``u + du``; the fit takes ``K du`` for readings. Each accuracy is the
+standard uncertainty of independent errors:
+
+    angle          each stop of the table, and in a turn between two stops e_k + (e_k+1 - e_k) (A - A_k) / (A_k+1 - A_k)
+    rate           each turn axis, relative; an accelerometer in continuous turns feels the angle that it sums up to
+    orthogonality  lean of each turn axis toward both others (``table_axis_nonorthogonality``)
+    wobble         once a turn, each axis about both others: cosine and sine of the table angle
+    levelling      tilt of the table about level x and y (``table_tilt``)
+    gravity        local gravity
+    azimuth        of level x, where Earth's rotation is in the model
+
+An attitude log has no stops: its angle errors are three constant turns of each recording, about the body axes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.estimation.budget import type_b
+from pipeline.model.effects import effect
+from pipeline.model.effects.base import truth
+from pipeline.model.kinematics import earth_rate
+from pipeline.records.budget import NORMAL
+from pipeline.signal.rests import RATE_AT_REST_DPS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.estimation.linear_map import LinearMap
+    from pipeline.records import Motion
+    from pipeline.records.budget import Contribution
+
+    Values = NDArray[np.float64]
+
+SAME_STOP_DEG = 0.02
+COUNTED_STOPS = 4  # rests of a recording from which on it stops and goes: its steps are counted, whatever their rate
+FIELDS = {
+    "table angle": ("angle_accuracy_deg", "deg"),
+    "table rate": ("rate_accuracy", "1"),
+    "orthogonality of the table's axes": ("orthogonality_deg", "deg"),
+    "wobble of the table's axes": ("wobble_deg", "deg"),
+    "levelling": ("levelling_deg", "deg"),
+    "local gravity": ("gravity_accuracy_g", "g"),
+    "Earth's rotation": ("azimuth_accuracy_deg", "deg"),
+}
+IDLE = {  # sensors whose readings an input does not change
+    "table rate": (),
+    "levelling": ("gyroscope",),
+    "local gravity": ("gyroscope",),
+    "Earth's rotation": ("accelerometer",),
+}
+
+
+ESTIMATES = {
+    "orthogonality of the table's axes": ("table_axis_nonorthogonality",),
+    "levelling": ("table_tilt",),
+    "Earth's rotation": ("earth_rotation",),
+}
+
+
+@dataclass(frozen=True)
+class Reference:
+    """The motion at the rows of a fit, recording by recording, and its linear map.
+
+    Attributes
+    ----------
+    sensor : str
+    motions : sequence of Motion
+        Their samples, one after the other, are the columns of the map's weights.
+    fit : LinearMap
+    K : (3, 3) array
+    table : mapping
+    """
+
+    sensor: str
+    motions: Sequence[Motion]
+    fit: LinearMap
+    K: Values
+    table: Mapping[str, Any]
+
+    def summed(self, change: Callable[[Motion], Values | None], inputs: int) -> Values:
+        """Return what inputs do to the parameters, each by a change of the truth: (p, inputs) array.
+
+        Parameters
+        ----------
+        change : callable
+            Motion to (n, 3, inputs), or None where they do nothing.
+        inputs : int
+        """
+        total, row = np.zeros((self.fit.parameters, inputs)), 0
+        for motion in self.motions:
+            rows = slice(row, row + len(motion.time))
+            row = rows.stop
+            du = change(motion)
+            if du is not None:
+                here = self.fit.rows(rows)
+                total += np.stack([here.of(du[:, :, j] @ self.K.T) for j in range(inputs)], axis=1)
+        return total
+
+
+def table_contributions(
+    reference: Reference, estimated: Sequence[str] = ()
+) -> tuple[list[Contribution], dict[str, str]]:
+    """Return the contribution of each stated accuracy, and why the others are not included.
+
+    Parameters
+    ----------
+    reference : Reference
+    estimated : sequence of str
+        Effects of the fit: what one of them estimates is no input any more.
+
+    Returns
+    -------
+    contributions : list of Contribution
+    not_included : dict of str to str
+    """
+    effects = {
+        "table angle": _angle,
+        "table rate": _rate,
+        "orthogonality of the table's axes": _orthogonality,
+        "wobble of the table's axes": _wobble,
+        "levelling": _levelling,
+        "local gravity": _gravity,
+        "Earth's rotation": _azimuth,
+    }
+    found, missing = [], {}
+    for source, (key, unit) in FIELDS.items():
+        if reference.sensor in IDLE.get(source, ()):
+            continue
+        u = reference.table.get(key)
+        fitted = [name for name in ESTIMATES.get(source, ()) if name in estimated]
+        reason = f"estimated by {fitted[0]}" if fitted else _without(source, key, reference.table)
+        if reason:
+            missing[source] = reason
+        elif u:
+            found.append(type_b(source, NORMAL, float(u), unit, effects[source](reference)))
+    return found, missing
+
+
+def _without(source: str, key: str, table: Mapping[str, Any]) -> str:
+    """Return why a source is not included; empty where it is, or where its accuracy is stated as 0."""
+    placed = table.get("latitude_deg") is not None and table.get("azimuth_deg") is not None
+    if source == "Earth's rotation" and not placed:
+        return "not in the model: table.latitude_deg and table.azimuth_deg are not set; up to 0.0042 deg/s"
+    return f"table.{key} is not stated" if table.get(key) is None else ""
+
+
+def _angle(reference: Reference) -> Values:
+    """Return what an error of each stop's angle does: (p, stops) array."""
+    sensor, K = reference.sensor, reference.K
+    left, right, groups, count = [], [], [], 0
+    for motion in reference.motions:
+        n = len(motion.time)
+        if motion.axis is None or motion.angle is None or motion.rate is None:
+            left.append(np.zeros((n, 3)))
+            right.append(np.zeros((n, 3)))
+            groups.append(np.full(n, count))
+            count += 1
+            continue
+        stop, share, slope, stops = _between_stops(motion.angle, motion.rate)
+        if sensor == "accelerometer":
+            turned = -np.radians(np.cross(np.eye(3)[motion.axis], motion.specific_force)) @ K.T
+            left.append(turned * (1.0 - share)[:, None])
+            right.append(turned * share[:, None])
+        else:
+            faster = (motion.rate * slope)[:, None] * K[:, motion.axis]
+            left.append(-faster)
+            right.append(faster)
+        groups.append(stop + count)
+        count += stops
+    group = np.concatenate(groups)
+    fit = reference.fit
+    at_stops = fit.of_groups(np.concatenate(left), group, count + 1)
+    at_stops += fit.of_groups(np.concatenate(right), group + 1, count + 1)
+    attitudes = [m for m in reference.motions if m.axis is None and m.level is not None]
+    if not attitudes:
+        return at_stops
+    return np.concatenate([at_stops, *(_turned(reference, motion) for motion in attitudes)], axis=1)
+
+
+def _between_stops(angle: Values, rate: Values) -> tuple[NDArray[np.intp], Values, Values, int]:
+    """Return the stop at or before each sample, its share of the way to the next, and the slope of that, 1/deg.
+
+    Where a recording does not begin or end with a rest, its first or last sample stands in for one.
+    """
+    still = np.abs(rate) <= RATE_AT_REST_DPS
+    before = np.concatenate([[False], still[:-1]])
+    jump = np.abs(np.diff(angle, prepend=angle[0])) > SAME_STOP_DEG
+    new = still & (~before | jump)
+    new[0] = True
+    stop = np.cumsum(new) - 1
+    at = np.append(angle[new], angle[-1])
+    way = at[stop + 1] - at[stop]
+    moving = ~still & (np.abs(way) > SAME_STOP_DEG)
+    safe = np.where(moving, way, 1.0)
+    return stop, np.where(moving, (angle - at[stop]) / safe, 0.0), np.where(moving, 1.0 / safe, 0.0), len(at)
+
+
+def _turned(reference: Reference, motion: Motion) -> Values:
+    """Return what a turn of one recording about each body axis does, per deg: (p, 3) array."""
+
+    def change(other: Motion) -> Values | None:
+        if other is not motion:
+            return None
+        u = truth(reference.sensor, motion)
+        return np.stack([np.radians(np.cross(u, axis)) for axis in np.eye(3)], axis=2)
+
+    return reference.summed(change, 3)
+
+
+def _rate(reference: Reference) -> Values:
+    """Return what a relative error of the rate about each axis does: (p, 3) array."""
+
+    def change(motion: Motion) -> Values | None:
+        if motion.axis is None or motion.rate is None or motion.angle is None:
+            return None
+        du = np.zeros((len(motion.time), 3, 3))
+        if reference.sensor == "gyroscope":
+            du[:, motion.axis, motion.axis] = motion.rate
+        elif _between_stops(motion.angle, motion.rate)[3] <= COUNTED_STOPS:
+            travelled = np.concatenate([[0.0], np.cumsum(np.diff(motion.angle))])[:, None]
+            du[:, :, motion.axis] = -np.radians(travelled * np.cross(np.eye(3)[motion.axis], motion.specific_force))
+        return du
+
+    return reference.summed(change, 3)
+
+
+def _orthogonality(reference: Reference) -> Values:
+    """Return what a lean of each axis, per deg, does: (p, 6) array."""
+    lean, unit = effect("table_axis_nonorthogonality"), np.eye(3)
+    nothing = np.zeros(6)
+    return reference.summed(
+        lambda m: None if m.axis is None else lean.regressors(reference.sensor, m, unit, nothing), 6
+    )
+
+
+def _wobble(reference: Reference) -> Values:
+    """Return what cosine and sine of a wobble about both other axes do, per deg: (p, 12) array."""
+
+    def change(motion: Motion) -> Values | None:
+        if motion.axis is None or motion.angle is None or motion.rate is None:
+            return None
+        a, angle = motion.axis, np.radians(motion.angle)
+        du = np.zeros((len(angle), 3, 12))
+        for j, wave in enumerate((np.cos(angle), np.sin(angle))):
+            slope = (-np.sin(angle), np.cos(angle))[j]
+            for k in (1, 2):
+                about = np.radians(1.0) * np.eye(3)[(a + k) % 3]
+                turned = np.cross(truth(reference.sensor, motion), about) * wave[:, None]
+                if reference.sensor == "gyroscope":
+                    turned = turned + about * (slope * motion.rate)[:, None]
+                du[:, :, 4 * a + 2 * j + k - 1] = turned
+        return du
+
+    return reference.summed(change, 12)
+
+
+def _levelling(reference: Reference) -> Values:
+    """Return what a tilt about level x and y, per deg, does: (p, 2) array."""
+    tilt, unit, nothing = effect("table_tilt"), np.eye(3), np.zeros(2)
+    return reference.summed(
+        lambda m: None if m.level is None else tilt.regressors(reference.sensor, m, unit, nothing), 2
+    )
+
+
+def _gravity(reference: Reference) -> Values:
+    """Return what a g more of gravity does: (p, 1) array."""
+    gravity = float(reference.table.get("gravity_g") or 1.0)
+    return reference.summed(lambda m: m.specific_force[:, :, None] / gravity, 1)
+
+
+def _azimuth(reference: Reference) -> Values:
+    """Return what a turn of the table about the vertical, per deg, does to Earth's rotation: (p, 1) array."""
+    table = reference.table
+    earth = earth_rate(float(table["latitude_deg"]), float(table["azimuth_deg"]))
+    change = np.radians(np.array([-earth[1], earth[0], 0.0]))
+    return reference.summed(
+        lambda m: None if m.level is None else np.einsum("i,nij->nj", change, m.level)[:, :, None], 1
+    )

@@ -1,0 +1,195 @@
+"""The uncertainty budget of a fit, against fits to recordings of tables that are wrong on purpose."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from table_turns import Bench, run_stages, settings, specific_force
+
+from pipeline.estimation.propagation import effective_degrees_of_freedom
+from pipeline.records.calibration import coverage_factor
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from pipeline.records import Recording, SensorCalibration
+
+K = np.eye(3) + np.array([[0.004, 0.011, -0.006], [-0.009, -0.012, 0.003], [0.007, -0.002, 0.018]])
+BIAS = [0.03, -0.02, 0.05]
+STAGES = {
+    "reference": {s: ["reference_least_squares"] for s in ("accelerometer", "gyroscope")},
+    "staged": {
+        "accelerometer": ["orthogonality", "misalignment", "bias", "scale_factor"],
+        "gyroscope": ["bias", "orthogonality_and_misalignment", "scale_factor"],
+    },
+    "cholesky": {"gyroscope": ["bias", "cholesky_lu"]},
+}
+SMALL = 1e-3  # deg, or relative: of the errors that are made on purpose
+
+
+def recordings_of(sensor: str, white: float = 0.0) -> list[Recording]:
+    bench = Bench(sensor, BIAS, K, white=white)
+    return bench.stop_and_go(45.0, 2.4) if sensor == "accelerometer" else bench.turns_at([60.0, -60.0])
+
+
+def values(found: SensorCalibration) -> np.ndarray:
+    return np.concatenate([found.bias, found.matrix.ravel()])
+
+
+def wrong(recordings: list[Recording], change: Callable[[Recording, np.ndarray], np.ndarray]) -> list[Recording]:
+    """Return the recordings of a table whose true motion is the logged one plus a change."""
+    out = []
+    for r in recordings:
+        sensor = r.role
+        u = specific_force(r.axis, r.table_angle) if sensor == "accelerometer" else np.zeros((r.samples, 3))
+        if sensor == "gyroscope":
+            u[:, "xyz".index(r.axis)] = r.table_rate
+        out.append(replace(r, **{sensor: r.reading(sensor) + (change(r, u) - u) @ K.T}))
+    return out
+
+
+def about(axis: np.ndarray, u: np.ndarray, deg: float) -> np.ndarray:
+    """Return vectors in a body that is turned about one of its axes."""
+    a = np.radians(deg)
+    across = u - np.outer(u @ axis, axis)
+    return np.outer(u @ axis, axis) + np.cos(a) * across - np.sin(a) * np.cross(axis, u)
+
+
+def one_rate_is_wrong(axis: str) -> Callable[..., Any]:
+    return lambda r, u: u * (1.0 + SMALL * (r.axis == axis))
+
+
+def one_axis_leans(axis: int, toward: int) -> Callable[..., Any]:
+    def change(r: Recording, u: np.ndarray) -> np.ndarray:
+        if "xyz".index(r.axis) != axis:
+            return u
+        e = np.eye(3)[axis] + np.radians(SMALL) * np.eye(3)[toward]
+        e /= np.linalg.norm(e)
+        if r.role == "gyroscope":
+            return np.outer(r.table_rate, e)
+        start = specific_force(r.axis, np.zeros(1))[0]
+        return np.array([about(e, start[None], a)[0] for a in r.table_angle])
+
+    return change
+
+
+def one_tilt(level: int) -> Callable[..., Any]:
+    def change(r: Recording, u: np.ndarray) -> np.ndarray:
+        del u
+        tilt = np.radians(SMALL) * np.eye(3)[level]
+        up = np.array([0.0, 0.0, 1.0]) + np.cross(np.array([0.0, 0.0, 1.0]), tilt)
+        at_zero = {"x": np.eye(3), "y": np.eye(3), "z": np.array([[0, 0, -1.0], [0, 1, 0], [1, 0, 0]])}[r.axis]
+        return np.array([about(np.eye(3)["xyz".index(r.axis)], (at_zero.T @ up)[None], a)[0] for a in r.table_angle])
+
+    return change
+
+
+def one_stop_is_wrong(axis: str, stop: int) -> Callable[..., Any]:
+    def change(r: Recording, u: np.ndarray) -> np.ndarray:
+        angle = r.table_angle.copy()
+        at = np.cumsum(np.abs(np.diff(angle, prepend=angle[0])) > 1.0)
+        angle[(at == stop) & (r.axis == axis)] += SMALL
+        return u if r.axis != axis else specific_force(r.axis, angle)
+
+    return change
+
+
+WRONG = {
+    ("gyroscope", "table rate", "rate_accuracy"): [one_rate_is_wrong(a) for a in "xyz"],
+    ("accelerometer", "local gravity", "gravity_accuracy_g"): [lambda _, u: u * (1.0 + SMALL)],
+    ("accelerometer", "levelling", "levelling_deg"): [one_tilt(0), one_tilt(1)],
+    ("accelerometer", "table angle", "angle_accuracy_deg"): [one_stop_is_wrong(a, k) for a in "xyz" for k in range(9)],
+} | {
+    (sensor, "orthogonality of the table's axes", "orthogonality_deg"): [
+        one_axis_leans(a, (a + k) % 3) for a in range(3) for k in (1, 2)
+    ]
+    for sensor in ("accelerometer", "gyroscope")
+}
+
+
+CASES = [
+    (method, sensor, source, key)
+    for method, stages in STAGES.items()
+    for sensor, source, key in WRONG
+    if sensor in stages and (method, source) != ("staged", "table angle")  # 27 fits of half a second
+]
+
+
+@pytest.mark.parametrize(("method", "sensor", "source", "key"), CASES, ids=[f"{m}-{s}-{k}" for m, s, _, k in CASES])
+def test_what_a_wrong_table_does_to_a_fit_is_what_its_budget_says(
+    method: str, sensor: str, source: str, key: str
+) -> None:
+    recordings, stages = recordings_of(sensor), STAGES[method][sensor]
+    found = run_stages(sensor, stages, recordings, settings(**{key: SMALL}))
+    lines = {line["source"]: line for line in found.budget["contributions"]}
+    stated = np.array(lines[source]["contribution"])[:12]
+    squares = np.zeros(12)
+    for change in WRONG[sensor, source, key]:
+        squares += (values(run_stages(sensor, stages, wrong(recordings, change), settings())) - values(found)) ** 2
+    # The staged accelerometer knows no cross-axis sensitivity, here up to 2 %: neither does its budget.
+    crossed = 0.02 * stated.max() if (method, sensor) == ("staged", "accelerometer") else 0.0
+    assert stated == pytest.approx(np.sqrt(squares), rel=5e-3, abs=2e-9 + crossed)
+    assert stated.max() > 1e-6
+
+
+def test_the_lines_of_a_budget_add_up_to_what_the_calibration_states() -> None:
+    found = run_stages(
+        "gyroscope", ["reference_least_squares"], recordings_of("gyroscope", 0.01), settings(rate_accuracy=1e-3)
+    )
+    document = found.to_json()
+    budget = document["uncertainty_budget"]
+    u = np.array([line["contribution"] for line in budget["contributions"]])
+    nu = np.array(
+        [[np.inf if n is None else n for n in line["degrees_of_freedom"]] for line in budget["contributions"]]
+    )
+    total = np.sqrt(np.sum(u**2, axis=0))
+    assert total == pytest.approx(np.sqrt(np.diag(document["covariance"]["values"])), rel=1e-9)
+    freedom = effective_degrees_of_freedom(u, nu)
+    assert np.array(document["effective_degrees_of_freedom"], float) == pytest.approx(freedom)
+    factors = np.concatenate([document["coverage_factor"]["bias"], np.ravel(document["coverage_factor"]["matrix"])])
+    assert factors == pytest.approx([coverage_factor(n) for n in freedom])
+    expanded = document["expanded_uncertainty"]
+    assert np.concatenate([expanded["bias"], np.ravel(expanded["matrix"])]) == pytest.approx(factors * total)
+    noise = budget["contributions"][0]
+    assert np.sum(np.square(list(noise["parts"].values())), axis=0) == pytest.approx(np.square(noise["contribution"]))
+    assert factors[[3, 7, 11]].max() < factors[0]  # the table's rate is known, the noise is not
+
+
+def test_what_nobody_has_stated_is_named_and_left_out() -> None:
+    found = run_stages("accelerometer", ["reference_least_squares"], recordings_of("accelerometer", 8e-4), settings())
+    missing = {entry["source"]: entry["reason"] for entry in found.budget["not_included"]}
+    assert missing["levelling"] == "table.levelling_deg is not stated"
+    assert {"table angle", "local gravity", "wobble of the table's axes", "repeatability", "temperature"} <= set(
+        missing
+    )
+    assert [line["source"] for line in found.budget["contributions"]] == ["noise of the readings"]
+
+
+@pytest.mark.parametrize(("counts_per_unit", "own_line"), [(16384.0, False), (200.0, True)])
+def test_rounding_is_a_part_of_the_noise_only_where_the_noise_reaches_half_a_count(
+    *, counts_per_unit: float, own_line: bool
+) -> None:
+    config = settings()
+    sheet = {**config["sensor"]["accelerometer"], "counts_per_unit": counts_per_unit}
+    config = config | {"sensor": {**config["sensor"], "accelerometer": sheet}}
+    recordings = [
+        replace(r, accelerometer=np.round(r.accelerometer * counts_per_unit) / counts_per_unit)
+        for r in recordings_of("accelerometer", 8e-4)
+    ]
+    found = run_stages("accelerometer", ["reference_least_squares"], recordings, config)
+    lines = {line["source"]: line for line in found.budget["contributions"]}
+    missing = {entry["source"]: entry["reason"] for entry in found.budget["not_included"]}
+    assert ("quantisation" in lines) == own_line
+    assert ("quantisation" in missing) != own_line
+    if own_line:
+        assert lines["quantisation"]["distribution"] == "rectangular"
+        assert lines["quantisation"]["standard_uncertainty"] == pytest.approx(1 / counts_per_unit / np.sqrt(12))
+        assert np.all(np.abs(found.bias - BIAS) < 3.0 * np.sqrt(np.diag(found.covariance)[:3]))
+
+
+def test_a_budget_survives_its_file() -> None:
+    found = run_stages("gyroscope", STAGES["cholesky"]["gyroscope"], recordings_of("gyroscope", 0.01), settings())
+    assert type(found).from_json("gyroscope", found.to_json()).to_json() == found.to_json()
