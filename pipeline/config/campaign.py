@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.config.campaign_file import as_list, read_campaign_file, split_run_settings
+from pipeline.config.comparisons import resolve_comparisons
 from pipeline.config.compose import CONFIGS, GROUPS, Composer, Problem, default_of_run, nearest, parse
 from pipeline.config.user_effects import ONLY_FROM_THE_COMMAND_LINE, PYTHON
 from pipeline.errors import ConfigurationError
@@ -50,7 +51,7 @@ class Campaign:
     chains : dict of str to dict
         Batch and sensor to the ordered stages of its fit.
     compare : list
-        Groups of units that the campaign's page puts side by side.
+        What the campaign's page compares, resolved to groups of units.
     simulation : Path or None
         The description that the run makes the recordings from; None where they are recorded.
     settings : mapping
@@ -87,6 +88,10 @@ class Campaign:
         folder: str = self.units[unit].config["procedure"]["folder"]
         return self.recorded / folder
 
+    def truth(self, unit: str) -> Path:
+        """Return where the truth behind a unit's recordings is, if they were simulated."""
+        return self.recorded / "truth" / f"{self.folder(unit).name}.json"
+
 
 def load_campaign(settings: Mapping[str, Any]) -> Campaign:
     """Load and check a campaign.
@@ -108,7 +113,7 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
         raise ConfigurationError(f"--config {unknown[0]}: unknown setting{nearest(unknown[0], valid)}")
     directory = find_campaign(str(settings.get("campaign", "demo")))
     rows = read_units(directory / "units.csv")
-    own_file = read_campaign_file(directory / "campaign.yaml", rows)
+    own_file = read_campaign_file(directory / "campaign.yaml")
     from_command = as_list(settings.get("overrides", []), "overrides")
     per_unit = unit_overrides(settings.get("unit_overrides", {}), rows)
     of_run, from_command = split_run_settings([*own_file.of_run, *from_command])
@@ -128,8 +133,9 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
         raise ConfigurationError(_one_message(problems), str(directory / "units.csv"))
     batches, chains = cut_batches(units, batch_size(of_run))
     results = Path(str(settings.get("results", "results"))) / directory.name
+    compare = resolve_comparisons(own_file.compare, units, str(directory / "campaign.yaml"))
     return Campaign(
-        directory.name, directory, results, units, batches, chains, own_file.compare, own_file.simulation, settings
+        directory.name, directory, results, units, batches, chains, compare, own_file.simulation, settings
     )
 
 

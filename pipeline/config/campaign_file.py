@@ -3,7 +3,7 @@
 For example::
 
     overrides: [filter=rc_low_pass]   # Hydra overrides of every unit, and settings of the run
-    compare: [[U1, U2]]               # units that the campaign's page puts side by side
+    compare: [[U1, U2]]               # what the campaign's page compares; see pipeline.config.comparisons
     simulate: true                    # the run makes the recordings, from simulation.yaml beside this file
 
 All of it is optional.
@@ -37,7 +37,7 @@ class CampaignFile:
     of_units, of_run : list of str
         Overrides of all units, and those that are settings of the run.
     compare : list
-        Groups of units that the campaign's page puts side by side.
+        What the campaign's page compares, as it stands there.
     simulation : Path or None
         The description that the run makes the recordings from; None where they are recorded.
     """
@@ -48,14 +48,12 @@ class CampaignFile:
     simulation: Path | None = None
 
 
-def read_campaign_file(path: Path, rows: Mapping[str, Any]) -> CampaignFile:
+def read_campaign_file(path: Path) -> CampaignFile:
     """Read ``campaign.yaml``; all of it is optional.
 
     Parameters
     ----------
     path : Path
-    rows : mapping
-        Of ``units.csv``, by unit.
 
     Raises
     ------
@@ -66,7 +64,10 @@ def read_campaign_file(path: Path, rows: Mapping[str, Any]) -> CampaignFile:
         return CampaignFile()
     content = _mapping(path)
     run, units = split_run_settings(as_list(content.get("overrides", []), f"{path}: overrides"))
-    return CampaignFile(units, run, _compare(content.get("compare") or [], rows, path), _simulation(content, path))
+    compare = content.get("compare") or []
+    if not isinstance(compare, list):
+        raise ConfigurationError(f"compare: a list of comparisons is expected, got {compare!r}", str(path))
+    return CampaignFile(units, run, compare, _simulation(content, path))
 
 
 def as_list(value: Any, where: str, what: str = "overrides KEY=VALUE") -> list[str]:  # noqa: ANN401  (the user's)
@@ -97,16 +98,6 @@ def _mapping(path: Path) -> dict[str, Any]:
     if unknown:
         raise ConfigurationError(f"{unknown[0]}: unknown key{nearest(unknown[0], KEYS)}", str(path))
     return {str(k): v for k, v in content.items()}
-
-
-def _compare(compare: Any, rows: Mapping[str, Any], path: Path) -> list[Any]:  # noqa: ANN401  (the user's)
-    groups: list[Any] = compare if isinstance(compare, list) else [compare]
-    for group in groups:
-        names = group.get("units") if isinstance(group, dict) else group
-        if not isinstance(names, list) or not all(str(n) in rows for n in names):
-            form = "a list of lists of units of units.csv, or of {title, units}"
-            raise ConfigurationError(f"compare: {form} is expected, got {group!r}", str(path))
-    return groups
 
 
 def _simulation(content: Mapping[str, Any], path: Path) -> Path | None:

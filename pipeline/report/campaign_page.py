@@ -32,9 +32,7 @@ VERDICTS = {
 }
 
 
-def render(
-    campaign: str, rows: list[JSON], failures: list[JSON], comparisons: Sequence[JSON | Sequence[str]] = ()
-) -> str:
+def render(campaign: str, rows: list[JSON], failures: list[JSON], comparisons: Sequence[JSON] = ()) -> str:
     """Return ``index.html``.
 
     Parameters
@@ -45,8 +43,7 @@ def render(
     failures : list of dict
         ``unit``, ``stage``, ``code``, ``message``, ``file`` of each failed unit.
     comparisons : sequence, optional
-        Groups of units to put side by side beyond those that share a serial: lists of units, or
-        ``{"title", "units"}``.
+        As of ``comparison_page.section``.
 
     Returns
     -------
@@ -64,13 +61,13 @@ def render(
         judged=any(row.get("pass") is not None for row in rows if row["status"] == "ok"),
         fleet=[f for s in SENSORS if (f := _fleet(s, "all units", rows))] + _lots(rows),
         groups=[
-            {"title": title, "rows": [by_unit[u] for u in units if u in by_unit]}
-            for title, units in [*_same_serial(rows), *_asked_for(comparisons)]
+            {"title": title, "rows": [by_unit[u] for u in units if u in by_unit]} for title, units in _same_serial(rows)
         ],
         figures=fleet_figures(rows),
         causes=_causes(failures),
         names=_script_data([row["unit"] for row in rows]),
         first=FIRST,
+        sections=comparisons,
         verdicts=VERDICTS,
         kept=sorted({key for row in rows for key in row} - set(COLUMNS)),
     )
@@ -160,11 +157,3 @@ def _same_serial(rows: list[JSON]) -> Iterable[tuple[str, list[str]]]:
         if row.get("serial"):
             groups.setdefault(row["serial"], []).append(row["unit"])
     return [(f"Serial {serial}", units) for serial, units in groups.items() if len(units) > 1]
-
-
-def _asked_for(comparisons: Sequence[JSON | Sequence[str]]) -> Iterable[tuple[str, list[str]]]:
-    for group in comparisons:
-        if isinstance(group, dict):
-            yield str(group.get("title") or "Side by side"), list(group.get("units") or [])
-        else:
-            yield "Side by side", list(group)

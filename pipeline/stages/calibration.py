@@ -57,10 +57,12 @@ def inputs(path: Path) -> list[dict[str, Any]]:
     return [
         {
             "recording": r.name,
+            "role": r.role,
             "file": r.source.get("file"),
             "sha256": r.source.get("sha256"),
             "rows": r.source.get("rows"),
             "rate_hz": round(1.0 / r.interval, 6) if r.interval > 0 else None,
+            "duration_s": round(float(r.time[-1] - r.time[0]), 6) if r.samples else 0.0,
             "notes": [vars(n) for n in r.notes],
         }
         for r in load_recordings(path)

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.atomic import write_atomically
 from pipeline.report.campaign_page import render
+from pipeline.report.comparison_page import section
+from pipeline.report.comparison_units import unit_figures
 from pipeline.report.summary import summary_row, write_summary
 from pipeline.stages.batch import FAILED, parse_job, read_json, write_json
 
@@ -25,7 +27,8 @@ def main(argv: Sequence[str]) -> int:
     for name in ("calibrations", "validations", "diagnoses", "reports", "exports"):
         shutil.rmtree(job.output / name, ignore_errors=True)
         (job.output / name).mkdir(parents=True)
-    rows, failures = [], []
+    compared = {u for c in job.run["compare"] for g in c["groups"] for u in g["units"]}
+    rows, failures, figures = [], [], {}
     for unit, sheet_row in job.run["rows"].items():
         batch = of_unit[unit]
         failure = _failure(batch, unit)
@@ -48,10 +51,14 @@ def main(argv: Sequence[str]) -> int:
                     publish(batch / "diagnose" / name, job.output / "diagnoses" / name)
             for file in sorted((batch / "export" / unit).iterdir()):
                 publish(file, job.output / "exports" / unit / file.name)
+        if unit in compared:
+            truth = _truth(Path(job.run["truths"][unit]))
+            figures[unit] = unit_figures(calibration, documents["validate"], documents["diagnose"], truth)
         rows.append(summary_row(unit, calibration, documents["validate"], documents["diagnose"], sheet_row))
     write_summary(job.output / "summary.csv", rows)
     write_json(job.output / "failures.json", failures)
-    write_atomically(job.output / "index.html", render(job.run["campaign"], rows, failures, job.run["compare"]))
+    sections = [section(c, figures, f"comparison-{i}") for i, c in enumerate(job.run["compare"], 1)]
+    write_atomically(job.output / "index.html", render(job.run["campaign"], rows, failures, sections))
     return 0
 
 
@@ -63,6 +70,12 @@ def publish(source: Path, target: Path) -> None:
         os.link(source, target)
     except OSError:
         shutil.copyfile(source, target)
+
+
+def _truth(path: Path) -> dict[str, Any] | None:
+    """Return the truth behind a unit's recordings, where they were simulated."""
+    document: dict[str, Any] | None = read_json(path) if path.is_file() else None
+    return document
 
 
 def _units(batch: Path) -> list[str]:

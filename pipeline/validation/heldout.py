@@ -57,7 +57,8 @@ def validate(
     -------
     dict
         ``unit, samples, noise_floor, vector_noise_floor, steps`` of the published file, and ``held_out`` (false: judged
-        on the samples of the fit), ``reason`` (why), ``noise``, ``notes``, ``limits`` and ``pass``.
+        on the samples of the fit), ``reason`` (why), ``reference_rms`` (of the reference's magnitude), ``noise``,
+        ``notes``, ``limits`` and ``pass``.
         ``vector_rms_error`` is the root of the mean squared length of the difference to the reference.
     """
     samples, reason = _choose(calibration.sensor, recordings, noise, settings)
@@ -75,10 +76,11 @@ def validate(
     }
     if part["samples"] == 0:
         nothing: dict[str, Any] = dict.fromkeys((*FIGURES, "vector_rms_error"))
-        part |= {"noise_floor": None, "vector_noise_floor": None, "notes": []}
+        part |= {"noise_floor": None, "vector_noise_floor": None, "reference_rms": None, "notes": []}
         part["steps"] = [{"name": name, **nothing} for name in ("raw", "calibrated")]
     else:
         part["noise_floor"], part["vector_noise_floor"] = noise_floors(calibration, samples)
+        part["reference_rms"] = float(np.sqrt(np.nanmean(np.concatenate([s.magnitude for s in samples]) ** 2)))
         part["steps"], part["notes"] = ladder(calibration, samples, other)
     part["limits"], part["pass"] = check_limits(
         calibration, part, (settings.get("limits") or {}).get(calibration.sensor)

@@ -146,9 +146,9 @@ def test_the_summary_has_the_columns_that_scripts_rely_on(unit: Unit, tmp_path: 
 
 def test_the_campaign_page_names_failures_and_compares_units_of_one_serial(unit: Unit) -> None:
     failure = {"unit": "U9", "stage": "ingest", "code": "bad_input", "message": "no number", "file": "a.csv:3"}
-    page = campaign_page.render("bench", rows(unit, 4), [failure], [{"title": "Mine", "units": ["U0", "U3"]}])
+    page = campaign_page.render("bench", rows(unit, 4), [failure])
     text = Text(page).text
-    for expected in ("1 unit failed", "no number", "a.csv:3", "Serial S0", "Mine", "kept in summary.csv: colour"):
+    for expected in ("1 unit failed", "no number", "a.csv:3", "Serial S0", "kept in summary.csv: colour"):
         assert expected in text
     assert not [link for link in Text(page).links if "//" in link]
 

@@ -1,0 +1,174 @@
+"""Comparisons of groups: their statistics against SciPy's tests and simulated chances, and what the page says."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from pipeline.report.campaign_page import render
+from pipeline.report.comparison import Group, compare, finding
+from pipeline.report.comparison_page import section
+from pipeline.report.comparison_statistics import Quantity, adjusted, difference, mean_of
+from pipeline.report.comparison_units import SensorFigures, unit_figures
+
+from .conftest import build_unit
+
+
+def quantities(values: list[float], prefix: str = "U") -> dict[str, Quantity]:
+    return {f"{prefix}{i}": Quantity(float(v)) for i, v in enumerate(values)}
+
+
+def test_the_difference_of_two_groups_is_that_of_welchs_test() -> None:
+    rng = np.random.default_rng(1)
+    a, b = rng.normal(3.0, 1.0, 9), rng.normal(2.0, 4.0, 5)
+    ours = difference(quantities(list(a), "A"), quantities(list(b), "B"))
+    theirs = stats.ttest_ind(a, b, equal_var=False)
+    assert ours is not None
+    assert ours.significance == pytest.approx(theirs.statistic)
+    assert ours.degrees_of_freedom == pytest.approx(theirs.df)
+    assert ours.p_value == pytest.approx(theirs.pvalue)
+    assert ours.interval == pytest.approx(theirs.confidence_interval(0.95))
+
+
+def test_units_in_pairs_are_compared_within_their_pair() -> None:
+    rng = np.random.default_rng(2)
+    device = rng.normal(10.0, 5.0, 8)
+    a, b = device + rng.normal(0.3, 0.1, 8), device + rng.normal(0.0, 0.1, 8)
+    pairs = {f"{p}{i}": str(i) for p in "AB" for i in range(8)}
+    ours = difference(quantities(list(a), "A"), quantities(list(b), "B"), pairs)
+    theirs = stats.ttest_rel(a, b)
+    assert ours is not None
+    assert ours.significance == pytest.approx(theirs.statistic)
+    assert ours.p_value == pytest.approx(theirs.pvalue)
+
+
+def test_single_units_are_told_apart_by_their_own_uncertainties() -> None:
+    ours = difference({"A": Quantity(5.0, 0.3)}, {"B": Quantity(4.0, 0.4)})
+    assert ours is not None
+    assert (ours.standard_uncertainty, ours.significance) == (pytest.approx(0.5), pytest.approx(2.0))
+    assert ours.p_value == pytest.approx(2.0 * stats.norm.sf(2.0))
+    unknown = difference({"A": Quantity(5.0)}, {"B": Quantity(4.0, 0.4)})
+    assert unknown is not None
+    assert unknown.significance is None
+    assert unknown.p_value is None
+
+
+def test_p_values_of_several_groups_are_adjusted_from_the_smallest_on() -> None:
+    # 4 x 0.005, 3 x 0.01, 2 x 0.03, and 0.04, which cannot fall below the one before it
+    assert adjusted([0.01, 0.04, None, 0.03, 0.005]) == [
+        pytest.approx(0.03), pytest.approx(0.06), None, pytest.approx(0.06), pytest.approx(0.02),
+    ]  # fmt: skip
+
+
+def test_groups_of_equal_units_are_seldom_told_apart_and_different_ones_nearly_always() -> None:
+    rng = np.random.default_rng(3)
+    wrong = found = 0
+    for _ in range(300):
+        groups = [
+            Group(
+                n,
+                "",
+                n,
+                {f"{n}{i}": SensorFigures(after=Quantity(v)) for i, v in enumerate(np.exp(rng.normal(m, 1.0, 6)))},
+                6,
+            )
+            for n, m in (("a", 0.0), ("b", 0.0), ("c", 0.0), ("d", 4.0))
+        ]
+        told = {c.group.name: (c.p_value or 1.0) < 0.05 for c in compare(groups, "after", "a", None)}
+        wrong += told["b"] or told["c"]
+        found += told["d"]
+    assert wrong / 300 < 0.05 + 3.0 * math.sqrt(0.05 * 0.95 / 300)
+    assert found / 300 > 0.9
+
+
+def test_the_uncertainty_of_a_held_out_error_is_its_scatter_over_simulated_noise() -> None:
+    rng = np.random.default_rng(4)
+    unit = build_unit(samples=300, held_out_samples=10)
+    sigma, samples = 0.003, 400
+    for left in (0.0, 0.002, 0.01):  # what the calibration leaves, beside the noise
+        errors = np.sqrt(
+            np.mean(
+                (left * np.sign(np.arange(samples) % 2 - 0.5) + sigma * rng.standard_normal((2000, samples))) ** 2,
+                axis=1,
+            )
+        )
+        held_out = {"steps": [{"rms_error": float(np.mean(errors))}], "noise_floor": sigma, "samples": samples}
+        ours = unit_figures(unit.calibration, {"accelerometer": held_out}, None)["accelerometer"].after
+        assert ours is not None
+        assert ours.standard_uncertainty == pytest.approx(np.std(errors), rel=0.08)
+
+
+def test_the_error_against_the_truth_is_that_of_readings_without_noise_in_random_directions() -> None:
+    rng = np.random.default_rng(5)
+    unit = build_unit(samples=300, held_out_samples=10)
+    part = unit.calibration["gyroscope"]
+    truth = {"bias": [1.8, -0.9, 0.35], "matrix": (np.array(part["matrix"]) + rng.normal(0.0, 3e-3, (3, 3))).tolist()}
+    direction = rng.standard_normal((200_000, 3))
+    motion = 30.0 * direction / np.linalg.norm(direction, axis=1)[:, None]
+    reading = truth["bias"] + motion @ np.linalg.solve(np.array(truth["matrix"]), np.eye(3)).T
+    left = (reading - part["bias"]) @ np.array(part["matrix"]).T - motion
+    held_out = {"steps": [{"rms_error": 1.0}], "reference_rms": 30.0}
+    ours = unit_figures(unit.calibration, {"gyroscope": held_out}, None, {"gyroscope": truth})["gyroscope"].truth
+    assert ours is not None
+    assert ours.value == pytest.approx(np.sqrt(np.mean(np.sum(left**2, axis=1))), rel=3e-3)
+
+
+def comparison(x: dict[str, object] | None = None) -> dict[str, object]:
+    groups = [
+        {"name": n, "series": "", "label": n, "units": [f"{n}{i}" for i in range(4)]}
+        for n in ("slow", "fast <b>", "gone")
+    ]
+    return {"title": "Rates <i>", "groups": groups, "against": "slow", "pairs": None, "x": x}
+
+
+def figures() -> dict[str, dict[str, SensorFigures]]:
+    out = {}
+    for name, level in (("slow", 0.010), ("fast <b>", 0.020)):
+        for i in range(4):
+            values = {
+                "before": Quantity(1.5),
+                "after": Quantity(level + 0.0005 * i),
+                "noise_floor": 0.009,
+                "table_time": 720.0,
+            }
+            parameters = {"bias x": Quantity(0.1 + level, 1e-3)}
+            out[f"{name}{i}"] = {"gyroscope": SensorFigures(**values, verdict="nothing_missing", parameters=parameters)}  # type: ignore[arg-type]
+    return out
+
+
+@pytest.mark.parametrize("x", [None, {"label": "table time, s", "values": None, "named": True}])
+def test_the_page_tells_each_group_with_its_interval_and_its_difference(x: dict[str, object] | None) -> None:
+    made = section(comparison(x), figures(), "c1")
+    (sensor,) = made["sensors"]
+    (after,) = sensor["measures"]
+    slow, fast = after["rows"]
+    assert (slow["count"], slow["value"], slow["time"], slow["verdicts"]) == ("4", "0.0107", "720", "4 nothing missing")
+    logs = {n: np.log([level + 0.0005 * i for i in range(4)]) for n, level in (("slow", 0.010), ("fast", 0.020))}
+    theirs = stats.ttest_ind(logs["fast"], logs["slow"], equal_var=False)
+    low, high = (100.0 * math.expm1(v) for v in theirs.confidence_interval(0.95))
+    change = 100.0 * math.expm1(logs["fast"].mean() - logs["slow"].mean())
+    assert (fast["difference"], fast["result"]) == (f"+{change:.1f} %", "larger")
+    assert fast["interval_of_difference"] == f"+{low:.1f} % to × {1.0 + high / 100.0:.2f}"
+    assert after["figure"].finding == "Smallest with slow: 0.0107 (0.00976 to 0.0118); all others are larger"
+    assert sensor["parameters"]["rows"][1]["cells"][0]["value"] == "0.120"
+    page = render("bench", [], [], [made])
+    assert "Rates &lt;i&gt;" in page
+    assert "fast &lt;b&gt;" in page
+    assert "<b>fast" not in page.replace("&lt;", "")
+
+
+def test_a_finding_names_the_groups_that_are_not_told_apart_from_the_best() -> None:
+    values = {"a": [1.0, 1.2, 1.1], "b": [1.1, 1.3, 1.15], "c": [5.0, 5.2, 5.1]}
+    groups = [
+        Group(n, "", n, {f"{n}{i}": SensorFigures(after=Quantity(v)) for i, v in enumerate(vs)}, 3)
+        for n, vs in values.items()
+    ]
+    assert finding(groups, "after", None) == "Smallest with a: 1.10 (0.875 to 1.38); not told apart from it: b"
+
+
+def test_a_mean_of_nothing_is_nothing_and_of_one_its_own() -> None:
+    assert mean_of([]) is None
+    alone = mean_of([Quantity(2.0, 0.1)])
+    assert alone is not None
+    assert alone.expanded_uncertainty == pytest.approx(0.1 * stats.norm.ppf(0.975))
