@@ -134,9 +134,7 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
     batches, chains = cut_batches(units, batch_size(of_run))
     results = Path(str(settings.get("results", "results"))) / directory.name
     compare = resolve_comparisons(own_file.compare, units, str(directory / "campaign.yaml"))
-    return Campaign(
-        directory.name, directory, results, units, batches, chains, compare, own_file.simulation, settings
-    )
+    return Campaign(directory.name, directory, results, units, batches, chains, compare, own_file.simulation, settings)
 
 
 def find_campaign(name: str) -> Path:
