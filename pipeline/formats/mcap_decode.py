@@ -121,7 +121,7 @@ class ChannelDecoder:
             raise IngestError(
                 f"topic {self.topic}: its message definition cannot be read ({error})", path, fault="unsupported"
             ) from error
-        self._template: Template | None = None
+        self.template: Template | None = None  # of the messages that were read last, if they were alike
 
     def read(self, rows: Rows) -> Batch:
         """Return the columns of messages.
@@ -140,13 +140,17 @@ class ChannelDecoder:
 
     def _read_alike(self, rows: Rows) -> Batch | None:
         """Return columns as views on the chunk, if its messages are alike."""
-        template = self._template
+        template = self.template
         if template is None or not template.suits(rows):
-            template = self._in_message(0, rows, self._find_template)
+            template, self.template = self.template_of(0, rows), None
             if not template.suits(rows):
                 return None
-            self._template = template
+            self.template = template
         return self._in_message(0, rows, lambda _payload: self._columns(rows, template))
+
+    def template_of(self, row: int, rows: Rows) -> Template:
+        """Return where the numbers of one ROS message lie."""
+        return self._in_message(row, rows, self._find_template)
 
     def _find_template(self, payload: bytes) -> Template:
         return find_template(short_name(self.kind), self.definitions, payload, cdr=self.ros == "cdr")

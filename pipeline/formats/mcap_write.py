@@ -67,12 +67,16 @@ class _Template:
 
     def fill(self, time_ns: NDArray[np.int64], numbers: NDArray[np.float64]) -> list[bytes]:
         """Return a message for each time and row of numbers."""
+        return [row.tobytes() for row in self.table(time_ns, numbers)]
+
+    def table(self, time_ns: NDArray[np.int64], numbers: NDArray[np.float64]) -> NDArray[np.uint8]:
+        """Return the messages as rows of bytes."""
         table = np.tile(np.frombuffer(bytes(self.data), np.uint8), (len(time_ns), 1))
         stamps = np.stack([time_ns // NANOSECONDS, time_ns % NANOSECONDS], axis=1).astype("<u4")
         table[:, 4:12] = stamps.view(np.uint8)
         for column, place in enumerate(self.places):
             table[:, place : place + 8] = np.ascontiguousarray(numbers[:, column], "<f8").view(np.uint8).reshape(-1, 8)
-        return [row.tobytes() for row in table]
+        return table
 
 
 def write_mcap(path: Path, recording: Recording) -> None:
@@ -127,21 +131,39 @@ def _streams(recording: Recording) -> dict[str, list[bytes]]:
 
 
 def _imu(recording: Recording) -> list[bytes]:
-    """Return Imu messages: orientation, angular rate, acceleration, each with nine numbers of covariance."""
-    numbers = np.zeros((recording.samples, 37))
+    table = imu_table(recording.time_ns, recording.accelerometer, recording.gyroscope)
+    return [row.tobytes() for row in table]
+
+
+def imu_table(
+    time_ns: NDArray[np.int64], accelerometer: NDArray[np.float64] | None, gyroscope: NDArray[np.float64] | None
+) -> NDArray[np.uint8]:
+    """Return Imu messages: orientation, angular rate, acceleration, each with nine numbers of covariance.
+
+    Parameters
+    ----------
+    time_ns : (n,) array of int64, ns
+    accelerometer : (n, 3) array, g, or None
+    gyroscope : (n, 3) array, deg/s, or None
+
+    Returns
+    -------
+    (n, size) array of uint8
+    """
+    numbers = np.zeros((len(time_ns), 37))
     numbers[:, 3] = 1.0  # identity, and absent:
     numbers[:, 4] = -1.0
-    if recording.gyroscope is None:
+    if gyroscope is None:
         numbers[:, 16] = -1.0
     else:
-        numbers[:, 13:16] = np.radians(recording.gyroscope)
-    if recording.accelerometer is None:
+        numbers[:, 13:16] = np.radians(gyroscope)
+    if accelerometer is None:
         numbers[:, 28] = -1.0
     else:
-        numbers[:, 25:28] = recording.accelerometer * STANDARD_GRAVITY
+        numbers[:, 25:28] = accelerometer * STANDARD_GRAVITY
     template = _Template("imu")
     template.doubles(37)
-    return template.fill(recording.time_ns, numbers)
+    return template.table(time_ns, numbers)
 
 
 def _joint(recording: Recording) -> list[bytes]:

@@ -2,7 +2,8 @@
 
     truth = matrix @ (reading - bias - sum of effects(truth))
 
-is solved by fixed point, starting without the effects; each round gains about two digits, as effects are small. Only
+is solved by fixed point, starting without the effects; each round gains about two digits, as effects are small. A
+sample that has settled is left alone, so that what it gets does not depend on the samples beside it. Only
 effects that belong to the sensor are taken off; those of a mounting, a table or one recording do not exist in another
 log. The two sensors are solved together: a gyroscope's g-sensitivity asks for the specific force, an accelerometer's
 inner lever arms for the angular rate.
@@ -10,8 +11,8 @@ inner lever arms for the angular rate.
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
@@ -20,10 +21,11 @@ from pipeline.model.effects.base import Owner
 from pipeline.model.user_effects import effect_of, owner_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
+    from pipeline.model.effects.base import Effect
     from pipeline.records import FittedEffect, Motion, SensorCalibration
 
     Truths = dict[str, NDArray[np.float64]]
@@ -31,6 +33,35 @@ if TYPE_CHECKING:
 ROUNDS = 60
 TOLERANCE = 1e-13
 OUT_OF_REACH = 1e12  # g or deg/s; the fixed point runs away
+
+
+@dataclass(frozen=True)
+class Part:
+    """What is taken off the readings of one sensor.
+
+    Attributes
+    ----------
+    calibration : SensorCalibration
+    effects : tuple of (Effect, (p,) array)
+        With their parameters.
+    K : (3, 3) array
+        Inverse of the calibration matrix.
+    """
+
+    calibration: SensorCalibration
+    effects: tuple[tuple[Effect, NDArray[np.float64]], ...]
+    K: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, calibration: SensorCalibration, effects: Iterable[FittedEffect]) -> Self:
+        """Return the part that takes off the given effects of a calibration."""
+        return cls(calibration, tuple((effect_of(e), e.values) for e in effects), inverse_of(calibration))
+
+    def take_off(self, reading: NDArray[np.float64], motion: Motion) -> NDArray[np.float64]:
+        """Return readings without what the effects add at a motion: (n, 3) array, g or deg/s."""
+        for effect, values in self.effects:
+            reading = reading - effect.reading(self.calibration.sensor, motion, self.K, values)
+        return reading
 
 
 def compensate(
@@ -61,14 +92,14 @@ def compensate(
     """
     chosen = sensor_effects(calibration) if effects is None else effects
 
-    def felt(truths: Truths) -> Motion:
+    def felt(truths: Truths, _number: int) -> Motion:
         own = truths[calibration.sensor]
         if calibration.sensor == "accelerometer":
             return replace(motion, specific_force=own)
         return replace(motion, angular_rate=own)
 
-    solved = solve({calibration.sensor: (calibration, chosen)}, {calibration.sensor: reading}, felt)
-    return solved[calibration.sensor]
+    sensor = calibration.sensor
+    return solve({sensor: Part.of(calibration, chosen)}, {sensor: reading}, felt)[sensor]
 
 
 def sensor_effects(calibration: SensorCalibration) -> list[FittedEffect]:
@@ -77,20 +108,20 @@ def sensor_effects(calibration: SensorCalibration) -> list[FittedEffect]:
 
 
 def solve(
-    parts: Mapping[str, tuple[SensorCalibration | None, Sequence[FittedEffect]]],
+    parts: Mapping[str, Part],
     readings: Truths,
-    felt: Callable[[Truths], Motion],
+    felt: Callable[[Truths, int], Motion],
 ) -> Truths:
     """Solve the measurement equation of one or both sensors.
 
     Parameters
     ----------
     parts : mapping
-        Sensor to its calibration (None: its readings are taken for the truth) and the effects to take off.
+        Sensor to what is to be taken off; the readings of a sensor without are taken for the truth.
     readings : dict
         Sensor to (n, 3) array, g or deg/s.
     felt : callable
-        The motion that given truths make.
+        The motion that given truths make, in a round counted from 0.
 
     Returns
     -------
@@ -102,34 +133,43 @@ def solve(
     ConvergenceError
         If a reading is so far out of range that the equation has no solution.
     """
-    truths = dict(readings)
-    busy: dict[str, tuple[SensorCalibration, Sequence[FittedEffect], NDArray[np.float64]]] = {}
-    for s, (calibration, effects) in parts.items():
-        if calibration is not None:
-            truths[s] = linear_truth(calibration, readings[s])
-            if effects:
-                busy[s] = (calibration, effects, inverse_of(calibration))
-    for _ in range(ROUNDS if busy else 0):
-        motion, moved = felt(truths), dict(truths)
-        for s, (calibration, effects, K) in busy.items():
-            rest = readings[s]
-            for fitted in effects:
-                rest = rest - effect_of(fitted).reading(s, motion, K, fitted.values)
-            moved[s] = linear_truth(calibration, rest)
-        change = max(_largest(moved[s] - truths[s], moved[s]) for s in busy)
-        truths = moved
-        if change <= TOLERANCE:
-            return truths
-        if change == float("inf"):
+    busy = {s: part for s, part in parts.items() if part.effects}
+    truths = {s: linear_truth(parts[s].calibration, r) if s in parts else r for s, r in readings.items()}
+    if not busy:
+        return truths
+    settled = np.zeros(len(next(iter(truths.values()))), bool)
+    for number in range(ROUNDS):
+        moved = without_effects(busy, readings, felt(truths, number))
+        if any(np.any(np.abs(moved[s]) > OUT_OF_REACH) for s in busy):
             break
-    if busy:
-        _complain(truths, readings)
+        if settled.any():
+            moved = {s: np.where(settled[:, None], truths[s], new) for s, new in moved.items()}
+        settled |= np.logical_and.reduce([_near(moved[s], truths[s]) for s in busy])
+        truths |= moved
+        if settled.all():
+            return truths
+    _complain(truths, readings)
     return truths
 
 
+def without_effects(parts: Mapping[str, Part], readings: Truths, motion: Motion) -> Truths:
+    """Return ``matrix @ (reading - bias - effects(motion))`` of each of the sensors in ``parts``."""
+    return {s: linear_truth(part.calibration, part.take_off(readings[s], motion)) for s, part in parts.items()}
+
+
 def linear_truth(calibration: SensorCalibration, reading: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return ``matrix @ (reading - bias)``: (n, 3) array."""
-    truth: NDArray[np.float64] = (reading - calibration.bias) @ calibration.matrix.T
+    """Return ``matrix @ (reading - bias)``: (n, 3) array.
+
+    Each row's terms are added in their order, so that no rounding depends on how many samples there are.
+    """
+    rest = reading - calibration.bias
+    if len(rest) == 1:  # without the cost of arrays
+        x, y, z = rest[0].tolist()
+        return np.array([[(a * x + b * y) + c * z for a, b, c in calibration.matrix.tolist()]])
+    x, y, z = rest.T
+    truth = np.empty_like(rest)
+    for c, (along_x, along_y, along_z) in enumerate(calibration.matrix.tolist()):
+        np.add(along_x * x + along_y * y, along_z * z, out=truth[:, c])
     return truth
 
 
@@ -138,11 +178,10 @@ def inverse_of(calibration: SensorCalibration) -> NDArray[np.float64]:
     return np.asarray(np.linalg.solve(calibration.matrix, np.eye(3)), np.float64)
 
 
-def _largest(change: NDArray[np.float64], value: NDArray[np.float64]) -> float:
-    relative = np.abs(change) / np.maximum(np.abs(value), 1.0)
-    known = np.logical_not(np.isnan(value))  # a missing sample stays missing
-    runaway = np.max(np.abs(value), initial=0.0, where=known) > OUT_OF_REACH
-    return float("inf") if runaway else float(np.max(relative, initial=0.0, where=known))
+def _near(new: NDArray[np.float64], old: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which samples have not moved, relative to their size; a missing one stays missing: (n,) array."""
+    far = np.abs(new - old) > TOLERANCE * np.maximum(np.abs(new), 1.0)
+    return np.logical_not(far[:, 0] | far[:, 1] | far[:, 2])
 
 
 def _complain(truths: Truths, readings: Truths) -> None:

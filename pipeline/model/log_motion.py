@@ -2,12 +2,8 @@
 
     domega/dt[n] = (omega[n] - omega[n-1]) / (t[n] - t[n-1]),    df/dt likewise; 0 at the first sample
 
-and the temperature is that of a straight line through the past, with exponentially fading weights:
-
-    T(t) = a,  (a, b) = argmin sum_i exp((t_i - t) / h) (T_i - a - b (t_i - t))^2,    t_i <= t
-
-so that a ramp passes without lag and the thermometer's noise does not reach the readings. What a block leaves to the
-next is a ``LogState``; a log cut into blocks of any size gives what it gives in one piece.
+and the temperature is ``pipeline.model.fading_line``'s. What a block leaves to the next is a ``LogEnd``, so that a log
+cut into blocks of any size gives what it gives in one piece.
 """
 
 from __future__ import annotations
@@ -43,52 +39,20 @@ SIGNALS = {
 FIELDS = tuple(f.name for f in fields(Motion))
 
 
-@dataclass
-class LineThroughThePast:
-    """The fading line of a temperature log, as weighted sums about the last sample."""
+@dataclass(frozen=True)
+class LogEnd:
+    """What a block of a log leaves to the next: its last samples that are not missing, and its last turn."""
 
-    bandwidth: float
-    last: float = float("nan")
-    sums: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
-
-    def follow(self, time: NDArray[np.float64], temperature: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the smoothed temperature; a row without one (NaN) is given the line's."""
-        out = np.empty(len(time))
-        s0, s1, s2, r0, r1 = self.sums
-        last = self.last
-        for row, (t, value) in enumerate(zip(time.tolist(), temperature.tolist(), strict=True)):
-            step = t - last if s0 else 0.0
-            fade = np.exp(-step / self.bandwidth) if step else 1.0
-            s2 = fade * (s2 - 2.0 * step * s1 + step * step * s0)
-            r1 = fade * (r1 - step * r0)
-            s1 = fade * (s1 - step * s0)
-            s0, r0, last = fade * s0, fade * r0, t
-            if value == value:  # noqa: PLR0124  (not NaN)
-                s0, r0 = s0 + 1.0, r0 + value
-            determinant = s0 * s2 - s1 * s1
-            if determinant > 1e-15 * s0 * s0 * self.bandwidth**2:
-                out[row] = (s2 * r0 - s1 * r1) / determinant
-            else:
-                out[row] = r0 / s0 if s0 else float("nan")
-        self.sums, self.last = (s0, s1, s2, r0, r1), last
-        return out
-
-
-@dataclass
-class LogState:
-    """What a block of a log leaves to the next: its last samples, the last turn and the line of the temperature."""
-
-    smoothing: LineThroughThePast
     force: Known | None = None
     rate: Known | None = None
     direction: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
 
-    def keep(self, motion: Motion) -> None:
-        """Remember the end of a block."""
-        self.force = _last_known(motion.time, motion.specific_force) or self.force
-        self.rate = _last_known(motion.time, motion.angular_rate) or self.rate
-        if motion.direction is not None:
-            self.direction = motion.direction[-1]
+    def after(self, motion: Motion, used: set[str]) -> LogEnd:
+        """Return the end of the next block; only what is used is kept."""
+        force = _last_known(motion.time, motion.specific_force) if "specific_force_rate" in used else None
+        rate = _last_known(motion.time, motion.angular_rate) if "angular_acceleration" in used else None
+        direction = self.direction if motion.direction is None else motion.direction[-1]
+        return LogEnd(force or self.force, rate or self.rate, direction)
 
 
 def _last_known(time: NDArray[np.float64], values: NDArray[np.float64]) -> Known | None:
@@ -103,7 +67,7 @@ def log_motion(
     angular_rate: NDArray[np.float64],
     temperature: NDArray[np.float64] | None,
     used: set[str],
-    state: LogState,
+    end: LogEnd,
 ) -> Motion:
     """Return the motion of a block.
 
@@ -116,12 +80,12 @@ def log_motion(
         Smoothed.
     used : set of str
         Fields of ``Motion`` that are needed; of the others only those that cost nothing are filled.
-    state : LogState
+    end : LogEnd
         Of the block before.
     """
     zeros = np.zeros_like(specific_force)
-    rate = _difference(time, specific_force, state.force) if "specific_force_rate" in used else zeros
-    turn = _difference(time, angular_rate, state.rate) if "angular_acceleration" in used else zeros
+    rate = _difference(time, specific_force, end.force) if "specific_force_rate" in used else zeros
+    turn = _difference(time, angular_rate, end.rate) if "angular_acceleration" in used else zeros
     motion = Motion(
         time=time,
         specific_force=specific_force,
@@ -138,7 +102,7 @@ def log_motion(
         return motion
     direction = turning_direction(motion)
     turned = np.any(direction != 0.0, axis=1, keepdims=True)
-    direction = np.where(turned, direction, state.direction)
+    direction = np.where(turned, direction, end.direction)
     return replace(motion, direction=direction)
 
 

@@ -23,7 +23,7 @@ import numpy as np
 from pipeline.errors import ConfigurationError, InputError
 from pipeline.model.effect_definition import OF_THE_TABLE, read_definition
 from pipeline.model.effects import effect
-from pipeline.model.effects.base import Effect, Layout, Parameter, truth
+from pipeline.model.effects.base import Effect, Layout, Parameter, length, truth
 from pipeline.records import AXES
 
 if TYPE_CHECKING:
@@ -137,7 +137,7 @@ class FormulaEffect(Effect):
         if name == "u":
             return truth(sensor, motion)[:, axis]
         if name == "speed":
-            return np.asarray(np.linalg.norm(motion.angular_rate, axis=1), np.float64)
+            return length(motion.angular_rate)
         found: NDArray[np.float64] | None = getattr(motion, FIELDS[name])
         if found is None:
             raise InputError(

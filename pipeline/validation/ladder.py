@@ -23,8 +23,8 @@ import numpy as np
 from pipeline.errors import ConfigurationError
 from pipeline.estimation.correction import apply_correction
 from pipeline.model.effects.base import truth
-from pipeline.model.inversion import inverse_of, linear_truth, solve
-from pipeline.model.log_motion import LineThroughThePast, LogState, fields_used, log_motion
+from pipeline.model.inversion import Part, inverse_of, linear_truth, solve
+from pipeline.model.log_motion import LogEnd, fields_used, log_motion
 from pipeline.model.user_effects import effect_of
 from pipeline.validation.samples import OTHER
 
@@ -142,14 +142,15 @@ def _from_own_signals(
     """Take effects off by the log's own calibrated signals."""
     sensor = calibration.sensor
     readings = {sensor: samples.reading}
-    parts: dict[str, tuple[SensorCalibration | None, Sequence[FittedEffect]]] = {sensor: (calibration, effects)}
+    parts = {sensor: Part.of(calibration, effects)}
     if samples.other is not None:
         readings[OTHER[sensor]] = samples.other
-        parts[OTHER[sensor]] = (other, ())
+        if other is not None:
+            parts[OTHER[sensor]] = Part.of(other, ())
     used = fields_used(sensor, effects)
     nothing = np.zeros_like(samples.reading)
 
-    def felt(truths: dict[str, NDArray[np.float64]]) -> Motion:
+    def felt(truths: dict[str, NDArray[np.float64]], _number: int) -> Motion:
         force, rate = truths.get("accelerometer", nothing), truths.get("gyroscope", nothing)
         if samples.resting:
             rate = nothing
@@ -159,7 +160,7 @@ def _from_own_signals(
             angular_rate=rate,
             temperature=samples.temperature,
             used=used,
-            state=LogState(LineThroughThePast(1.0)),
+            end=LogEnd(),
         )
         return replace(found, specific_force_rate=nothing, angular_acceleration=nothing) if samples.resting else found
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,10 +10,12 @@ import pytest
 import pipeline
 from pipeline.errors import ConfigurationError, ConvergenceError, InputError, MissingInputError
 from pipeline.model.compensation import Compensation, compensate, load
+from pipeline.model.compensation_stream import BLOCK
 from pipeline.model.effects import catalogue
 from pipeline.model.effects.base import Owner
-from pipeline.model.log_motion import LineThroughThePast
+from pipeline.model.fading_line import FadingLine
 from pipeline.model.measurement import predicted_reading
+from pipeline.model.user_effects import effect_from
 from pipeline.records import SENSORS, FittedEffect, Motion, SensorCalibration
 
 if TYPE_CHECKING:
@@ -102,20 +105,82 @@ def test_all_effects_of_both_sensors_are_inverted_together() -> None:
     assert np.max(np.abs(gyroscope - m.angular_rate)) < 1e-9
 
 
-@pytest.mark.parametrize("size", [1, 7, 150])
-def test_a_log_in_blocks_gives_what_it_gives_in_one_piece(size: int) -> None:
-    m, unit = motion(300), everything()
+def own_effect(sensor: str) -> FittedEffect:
+    """An effect from formulas, which the calibration carries with it."""
+    definition = {
+        "name": "own",
+        "meaning": "my own",
+        "sensors": [sensor],
+        "owner": "sensor",
+        "terms": {
+            "p": {"formula": "tanh(u / 50) * exp(-time / 100) + sqrt(speed + 1)", "unit": "1"},
+            "q": {"formula": "tanh(alphax / 500) * (temperature - 25)", "unit": "1"},
+        },
+    }
+    made = effect_from(definition, "test")
+    names = [p.name for p in made.parameters(sensor)]
+    values = np.random.default_rng(5).uniform(-1e-3, 1e-3, len(names))
+    parameters = {n: {"value": v, "unit": "1", "expanded_uncertainty": 0.0} for n, v in zip(names, values, strict=True)}
+    return FittedEffect("own", parameters, made.definition)
+
+
+def some_steady_some_moving() -> dict[str, SensorCalibration]:
+    """Effects that one round takes off: none looks at a truth that another changes."""
+    return {
+        "accelerometer": calibration("accelerometer", (fitted("bias_temperature", "accelerometer"),)),
+        "gyroscope": calibration("gyroscope", (fitted("g_sensitivity", "gyroscope"), fitted("warm_up", "gyroscope"))),
+    }
+
+
+def noisy_log(unit: dict[str, SensorCalibration], n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    m = motion(n)
     rng = np.random.default_rng(2)
-    a, g = (predicted_reading(unit[s], m) + 1e-3 * rng.standard_normal((300, 3)) for s in SENSORS)
-    temperature = m.temperature + 0.05 * rng.standard_normal(300)
-    whole = Compensation(**unit).apply(a, g, temperature, m.time)
+    a, g = (predicted_reading(unit[s], m) + 1e-3 * rng.standard_normal((n, 3)) for s in SENSORS)
+    g[100:120] = 0.0  # no turn: its last direction is kept
+    a[n // 2, 1] = g[n // 3, 0] = np.nan
+    return a, g, m.temperature + 0.05 * rng.standard_normal(n), m.time + 1e-4 * rng.uniform(size=n)
+
+
+@pytest.mark.parametrize("size", [1, 7, 150])
+@pytest.mark.parametrize("effects", ["all", "own", "one round", "none"])
+def test_samples_one_by_one_and_blocks_give_the_same_numbers_as_one_piece_to_the_last_bit(
+    size: int, effects: str
+) -> None:
+    unit = {
+        "all": everything,
+        "own": lambda: {s: calibration(s, (own_effect(s),)) for s in SENSORS},
+        "one round": some_steady_some_moving,
+        "none": lambda: {s: calibration(s) for s in SENSORS},
+    }[effects]()
+    log = noisy_log(unit, 240)
+    whole = Compensation(**unit).apply(*log)
     stream = Compensation(**unit).stream()
-    parts = [
-        stream.apply(a[i : i + size], g[i : i + size], temperature[i : i + size], m.time[i : i + size])
-        for i in range(0, 300, size)
-    ]
-    assert np.max(np.abs(np.concatenate([p.accelerometer for p in parts]) - whole.accelerometer)) < 1e-12
-    assert np.max(np.abs(np.concatenate([p.gyroscope for p in parts]) - whole.gyroscope)) < 1e-10
+    parts = [stream.apply(*(signal[i : i + size] for signal in log)) for i in range(0, 240, size)]
+    for sensor in SENSORS:
+        np.testing.assert_array_equal(np.concatenate([getattr(p, sensor) for p in parts]), getattr(whole, sensor))
+    assert np.isnan(whole.accelerometer).any(axis=1).sum() < 10
+
+
+def test_a_long_log_gives_the_numbers_of_its_samples() -> None:
+    unit = everything()
+    log = noisy_log(unit, 2 * BLOCK + 100)
+    whole = Compensation(**unit).apply(*log)
+    stream = Compensation(**unit).stream()
+    stream.apply(*(signal[: BLOCK - 50] for signal in log))
+    for i in range(BLOCK - 50, BLOCK + 50):
+        sample = stream.apply(*(signal[i] for signal in log))
+        np.testing.assert_array_equal(sample.gyroscope, whole.gyroscope[i])
+
+
+def test_samples_of_single_precision_are_not_copied_as_a_whole() -> None:
+    unit = some_steady_some_moving()
+    log = [signal.astype(np.float32) for signal in noisy_log(unit, 60 * BLOCK)]
+    tracemalloc.start()
+    found = Compensation(unit["accelerometer"], None).apply(*log)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert found.gyroscope is log[1]
+    assert peak < found.accelerometer.nbytes + 0.5 * log[0].nbytes
 
 
 def test_effects_of_the_bench_are_not_applied_to_a_field_log() -> None:
@@ -168,7 +233,7 @@ def test_the_line_through_the_past_is_the_literal_weighted_fit() -> None:
     rng = np.random.default_rng(4)
     time = np.cumsum(rng.uniform(0.05, 0.4, 80))
     temperature = 20.0 + rng.standard_normal(80)
-    found = LineThroughThePast(3.0).follow(time, temperature)
+    found = FadingLine(3.0).follow(time, temperature)
     for n in (1, 2, 10, 79):
         root = np.exp(0.5 * (time[: n + 1] - time[n]) / 3.0)
         design = np.stack([root, root * (time[: n + 1] - time[n])], 1)
@@ -181,7 +246,7 @@ def test_a_ramp_of_temperature_passes_without_lag_and_a_gap_is_bridged() -> None
     ramp = 20.0 + 0.3 * time
     broken = ramp.copy()
     broken[100:110] = np.nan
-    assert LineThroughThePast(3.0).follow(time, broken) == pytest.approx(ramp, abs=1e-7)
+    assert FadingLine(3.0).follow(time, broken) == pytest.approx(ramp, abs=1e-7)
 
 
 @pytest.mark.parametrize(

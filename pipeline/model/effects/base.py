@@ -138,9 +138,16 @@ class Effect(abc.ABC):
     ) -> NDArray[np.float64]:
         """Return what the effect adds to the reading: (n, 3) array, g or deg/s.
 
-        Linear effects have ``columns @ values``; the others override this with the exact value.
+        Linear effects have ``columns @ values``; the others override this with the exact value. The terms are added
+        in their order, sample by sample, so that no rounding depends on how many samples there are.
         """
-        added: NDArray[np.float64] = self.columns(sensor, motion, K, values) @ values
+        regressors = self.regressors(sensor, motion, K, values)
+        if self.layout == Layout.EVERY_AXIS:
+            regressors = regressors[:, None, :]
+        coefficients = values if self.layout == Layout.SHARED else values.reshape(3, -1)
+        added = regressors[:, :, 0] * coefficients[..., 0]
+        for j in range(1, regressors.shape[2]):
+            added += regressors[:, :, j] * coefficients[..., j]
         return added
 
     def moved(self, motion: Motion, values: NDArray[np.float64]) -> Motion:
@@ -205,6 +212,12 @@ def temperature_difference(motion: Motion) -> NDArray[np.float64]:
     return motion.temperature - REFERENCE_TEMPERATURE
 
 
+def length(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the length of each vector, its squares added in the order x, y, z: (n,) array."""
+    x, y, z = vectors[:, 0], vectors[:, 1], vectors[:, 2]
+    return np.asarray(np.sqrt(x * x + y * y + z * z), np.float64)
+
+
 def turning_direction(motion: Motion) -> NDArray[np.float64]:
     """Return the unit vector of the turn that goes on or, at rest, of the last one: (n, 3) array, body frame.
 
@@ -222,7 +235,7 @@ def turning_direction(motion: Motion) -> NDArray[np.float64]:
         now[:, motion.axis] = sign
         turning = sign != 0
     else:
-        magnitude = np.linalg.norm(motion.angular_rate, axis=1)
+        magnitude = length(motion.angular_rate)
         turning = magnitude > 0.25
         now = motion.angular_rate / np.where(turning, magnitude, 1.0)[:, None]
     last = np.maximum.accumulate(np.where(turning, np.arange(len(turning)), -1))

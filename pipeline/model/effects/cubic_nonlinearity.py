@@ -38,7 +38,8 @@ class CubicNonlinearity(Effect):
     ) -> NDArray[np.float64]:
         """Return u^3."""
         del K, values
-        return truth(sensor, motion)[:, :, None] ** 3
+        u = truth(sensor, motion)[:, :, None]
+        return u * u * u
 
 
 EFFECT = CubicNonlinearity()

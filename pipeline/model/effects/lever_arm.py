@@ -33,7 +33,7 @@ def lever_matrix(rate_dps: NDArray[np.float64], acceleration_dps2: NDArray[np.fl
     omega = np.radians(rate_dps)
     alpha = np.radians(acceleration_dps2)
     lever = omega[:, :, None] * omega[:, None, :]
-    lever[:, [0, 1, 2], [0, 1, 2]] -= np.sum(omega**2, axis=1, keepdims=True)
+    lever[:, [0, 1, 2], [0, 1, 2]] -= (omega[:, 0] ** 2 + omega[:, 1] ** 2 + omega[:, 2] ** 2)[:, None]
     lever[:, [2, 0, 1], [1, 2, 0]] += alpha
     lever[:, [1, 2, 0], [2, 0, 1]] -= alpha
     lever /= STANDARD_GRAVITY

@@ -10,11 +10,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from pipeline.model.effects.base import Effect, Layout, Owner, Parameter, axis_parameters
+from pipeline.model.effects.base import Effect, Layout, Owner, Parameter, axis_parameters, length
 
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
 
     from pipeline.records import Motion
@@ -41,8 +40,7 @@ class VibrationRectification(Effect):
     ) -> NDArray[np.float64]:
         """Return |omega|."""
         del sensor, K, values
-        magnitude: NDArray[np.float64] = np.linalg.norm(motion.angular_rate, axis=1, keepdims=True)
-        return magnitude
+        return length(motion.angular_rate)[:, None]
 
 
 EFFECT = VibrationRectification()

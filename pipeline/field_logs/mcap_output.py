@@ -1,0 +1,115 @@
+"""Messages with calibrated numbers in them, as the records of an MCAP file."""
+
+from __future__ import annotations
+
+import struct
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.formats.mcap_chunk import HEAD
+from pipeline.formats.mcap_kinds import VECTORS
+from pipeline.formats.mcap_records import MESSAGE, MESSAGE_HEAD, RECORD_HEAD
+from pipeline.formats.mcap_write import imu_table
+from pipeline.formats.units import STANDARD_GRAVITY, TRIADS
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pipeline.formats.mcap_chunk import Rows
+    from pipeline.formats.mcap_decode import ChannelDecoder
+    from pipeline.formats.message_template import Template
+
+    Truths = dict[str, NDArray[np.float64]]
+
+CHANNEL_AT = 9  # byte of a record where the channel's number stands
+SENSOR_OF = {channels: sensor for sensor, channels in TRIADS.items()}
+
+
+def replaced(rows: Rows, decoder: ChannelDecoder, truths: Truths, channel: int) -> NDArray[np.uint8] | list[bytes]:
+    """Return copies of Imu messages with calibrated numbers in them.
+
+    Parameters
+    ----------
+    rows : Rows
+        The messages as they are.
+    decoder : ChannelDecoder
+        That has read them last.
+    truths : dict of str to (n, 3) array, g or deg/s
+        Of the sensors whose numbers are to be replaced.
+    channel : int
+        Number of the channel of the new messages.
+
+    Returns
+    -------
+    (n, size) array of uint8, or list of bytes
+        A record for each message.
+    """
+    numbers = _numbers(truths)
+    if decoder.template is not None:
+        return _alike(rows, decoder.template, numbers, channel)
+    return [_one(row, rows, decoder.template_of(row, rows), numbers, channel) for row in range(len(rows.starts))]
+
+
+def _numbers(truths: Truths) -> dict[str, NDArray[np.float64]]:
+    """Return the numbers of Imu messages: path to column, m/s^2 and rad/s."""
+    found: dict[str, NDArray[np.float64]] = {}
+    for vector, (channels, _unit) in VECTORS.items():
+        sensor = SENSOR_OF[channels]
+        if sensor in truths:
+            values = truths[sensor]
+            scaled = values * STANDARD_GRAVITY if sensor == "accelerometer" else np.radians(values)
+            found |= {f"{vector}.{a}": scaled[:, i] for i, a in enumerate("xyz")}
+    return found
+
+
+def _alike(rows: Rows, template: Template, numbers: dict[str, NDArray[np.float64]], channel: int) -> NDArray[np.uint8]:
+    """Copy all records at once, and replace their numbers."""
+    size = HEAD.itemsize + len(template.sample)
+    places = {path: template.places[path] for path in numbers}
+    layout = np.dtype(
+        {
+            "names": ["whole", "channel", *places],
+            "formats": [f"V{size}", "<u2", *(p.code for p in places.values())],
+            "offsets": [0, CHANNEL_AT, *(HEAD.itemsize + p.offset for p in places.values())],
+            "itemsize": size,
+        }
+    )
+    table = np.empty((len(rows.starts), size), np.uint8)
+    first = int(rows.starts[0]) - HEAD.itemsize
+    if rows.stride:
+        table[:] = np.ndarray(table.shape, np.uint8, rows.data.data, first, (rows.stride, 1))
+    else:
+        np.take(rows.data, (rows.starts - HEAD.itemsize)[:, None] + np.arange(size), out=table)
+    records = table.view(layout)[:, 0]
+    records["channel"] = channel
+    for path, column in numbers.items():
+        records[path] = column
+    return table
+
+
+def _one(row: int, rows: Rows, template: Template, numbers: dict[str, NDArray[np.float64]], channel: int) -> bytes:
+    """Copy one record, and replace its numbers."""
+    start, end = int(rows.starts[row]) - HEAD.itemsize, int(rows.starts[row] + rows.sizes[row])
+    record = bytearray(rows.data[start:end].tobytes())
+    struct.pack_into("<H", record, CHANNEL_AT, channel)
+    for path, column in numbers.items():
+        place = template.places[path]
+        at = HEAD.itemsize + place.offset
+        number = np.array([column[row]], place.code).tobytes()
+        record[at : at + len(number)] = number
+    return bytes(record)
+
+
+def new_imu(rows: Rows, truths: Truths, channel: int, time_ns: NDArray[np.int64]) -> NDArray[np.uint8]:
+    """Return records of new ROS 2 Imu messages, with the heads of the originals; parameters as of ``replaced``."""
+    messages = imu_table(time_ns, truths.get("accelerometer"), truths.get("gyroscope"))
+    count, size = messages.shape
+    heads = np.zeros(count, HEAD)
+    for name in ("sequence", "log_time", "publish_time"):
+        heads[name] = rows.heads[name]
+    heads["opcode"], heads["channel"], heads["length"] = MESSAGE, channel, MESSAGE_HEAD + size
+    table = np.empty((count, RECORD_HEAD + MESSAGE_HEAD + size), np.uint8)
+    table[:, : HEAD.itemsize] = heads.view(np.uint8).reshape(count, HEAD.itemsize)
+    table[:, HEAD.itemsize :] = messages
+    return table

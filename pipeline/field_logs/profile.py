@@ -1,0 +1,55 @@
+"""How the logs of a unit are laid out, as far as compensating them asks: ingest profile and axes of the sensor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.formats.axes import axis_matrix
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+EPOCH_AFTER_S = 1e8  # 3 years: no sensor has been on for longer
+STRAIGHT = ("+x", "+y", "+z")
+
+
+def _canonical() -> dict[str, Any]:
+    names = {"time": ("time_s", "s"), "temperature": ("temperature_degc", "degC")}
+    names |= {f"accel_{a}": (f"accel_{a}_g", "g") for a in "xyz"}
+    names |= {f"gyro_{a}": (f"gyro_{a}_dps", "deg/s") for a in "xyz"}
+    return {"csv": {"columns": {channel: {"column": c, "unit": unit} for channel, (c, unit) in names.items()}}}
+
+
+@dataclass(frozen=True)
+class LogProfile:
+    """How the logs of a unit are laid out.
+
+    Attributes
+    ----------
+    ingest : mapping
+        The ingest profile, with the sections ``csv`` and ``mcap``; the canonical one by default.
+    axis_map : sequence of str
+        Body axis that each reading axis points along.
+    """
+
+    ingest: Mapping[str, Any] = field(default_factory=_canonical)
+    axis_map: Sequence[str] = STRAIGHT
+
+    @classmethod
+    def of_calibration(cls, document: Mapping[str, Any]) -> LogProfile:
+        """Return the profile with which a unit was calibrated, from ``calibrations/<unit>.json``."""
+        log = document.get("log")
+        return cls(log["ingest"], tuple(log["axis_map"])) if log else cls()
+
+    def to_body(self, readings: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return (n, 3) readings in the body's axes."""
+        if tuple(self.axis_map) == STRAIGHT:
+            return readings
+        matrix = axis_matrix(self.axis_map)
+        turned: NDArray[np.float64] = readings[:, np.argmax(np.abs(matrix), axis=1)] * matrix.sum(axis=1)
+        return turned

@@ -1,0 +1,213 @@
+"""Compensation of a log as it comes: samples one by one, or in blocks of any size.
+
+    truth = matrix @ (reading - bias - sum of effects(truth))
+
+Everything is causal and each sample is worked out by itself, so that samples one by one, blocks and a whole log give
+the same numbers to the last bit. Effects that look at the time and the temperature alone are taken off once. Where the
+others look at truths that they do not change, one round solves the equation; else it is solved by fixed point
+(``pipeline.model.inversion``), and what a sample needs of the one before it, such as the rate for an angular
+acceleration, is that one's value of the same round.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
+
+import numpy as np
+
+from pipeline.errors import InputError
+from pipeline.model.fading_line import FadingLine
+from pipeline.model.inversion import Part, linear_truth, sensor_effects, solve, without_effects
+from pipeline.model.log_motion import SIGNALS, LogEnd, fields_used, log_motion
+from pipeline.records import SENSORS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from numpy.typing import NDArray
+
+    from pipeline.model.inversion import Truths
+    from pipeline.records import Motion, SensorCalibration
+
+BLOCK = 8192  # samples that are worked on at once: their arrays stay in the cache
+OF_THE_ROOM = {"time", "temperature"}
+OF_THE_PAST = {"specific_force_rate", "angular_acceleration", "direction"}
+
+
+class Compensated(NamedTuple):
+    """Specific force, g, and angular rate, deg/s, of the body; None for a sensor that was not given."""
+
+    accelerometer: NDArray[np.float64] | None
+    gyroscope: NDArray[np.float64] | None
+
+
+@dataclass(frozen=True)
+class Steps:
+    """What is done with the readings of one sensor.
+
+    Attributes
+    ----------
+    steady : Part
+        The effects that look at the time and the temperature alone.
+    moving : Part
+        Those that look at the truth.
+    used : set of str
+        Fields of a motion at which the effects look.
+    looks_at : set of str
+        Sensors at whose truths the moving ones look.
+    signals : dict of str to set of str
+        Effect to the signals that it needs.
+    """
+
+    steady: Part
+    moving: Part
+    used: set[str]
+    looks_at: set[str]
+    signals: dict[str, set[str]]
+
+    @classmethod
+    def of(cls, calibration: SensorCalibration) -> Self:
+        """Find out what the effects of a sensor look at."""
+        effects = sensor_effects(calibration)
+        fields = {e.name: fields_used(calibration.sensor, [e]) for e in effects}
+        signals = {name: set().union(*(SIGNALS[f] for f in used)) for name, used in fields.items()}
+        moving = [e for e in effects if fields[e.name] - OF_THE_ROOM]
+        return cls(
+            steady=Part.of(calibration, [e for e in effects if e not in moving]),
+            moving=Part.of(calibration, moving),
+            used=set().union(*fields.values()),
+            looks_at=set().union(*(signals[e.name] for e in moving)) & set(SENSORS),
+            signals=signals,
+        )
+
+
+@dataclass
+class CompensationStream:
+    """Compensation of one log.
+
+    Attributes
+    ----------
+    unit : str
+    calibrations : dict of str to SensorCalibration
+        Those of the sensors that are calibrated.
+    smoothing : float, s
+        Memory of the line through the temperature's past (``pipeline.model.fading_line``); 0 takes it as it is.
+    """
+
+    unit: str
+    calibrations: dict[str, SensorCalibration]
+    smoothing: float
+    steps: dict[str, Steps] = field(init=False)
+    _line: FadingLine = field(init=False)
+    _ends: list[LogEnd] = field(init=False)  # one for each round
+
+    def __post_init__(self) -> None:
+        """Find out once what the effects need."""
+        self.steps = {s: Steps.of(c) for s, c in self.calibrations.items()}
+        self._line = FadingLine(self.smoothing or 1.0)
+        self._ends = [LogEnd()]
+
+    @property
+    def needs(self) -> set[str]:
+        """Signals that the effects need: ``accelerometer``, ``gyroscope``, ``temperature``, ``time``."""
+        return set().union(*(need for step in self.steps.values() for need in step.signals.values()))
+
+    def apply(
+        self,
+        accelerometer: Any = None,  # noqa: ANN401
+        gyroscope: Any = None,  # noqa: ANN401
+        temperature: Any = None,  # noqa: ANN401
+        time: Any = None,  # noqa: ANN401
+    ) -> Compensated:
+        """Return the calibrated readings of the next sample or block; parameters as of ``Compensation.apply``."""
+        given = {"accelerometer": accelerometer, "gyroscope": gyroscope, "temperature": temperature, "time": time}
+        arrays, single = _checked(given)
+        self._require(arrays)
+        n = len(next(iter(arrays.values())))
+        if n <= BLOCK:
+            found = self._block({name: np.asarray(a, np.float64) for name, a in arrays.items()}) if n else arrays
+        else:
+            found = {s: np.empty((n, 3)) if s in self.steps else arrays[s] for s in SENSORS if s in arrays}
+            for start in range(0, n, BLOCK):
+                cut = {name: np.asarray(a[start : start + BLOCK], np.float64) for name, a in arrays.items()}
+                for s, truth in self._block(cut).items():
+                    if s in self.steps:
+                        found[s][start : start + BLOCK] = truth
+        shaped = {s: found[s][0] if single else found[s] for s in SENSORS if s in arrays}
+        return Compensated(shaped.get("accelerometer"), shaped.get("gyroscope"))
+
+    def _block(self, arrays: Mapping[str, NDArray[np.float64]]) -> Truths:
+        """Return the truths of some samples."""
+        readings = {s: arrays[s] for s in SENSORS if s in arrays}
+        steps = {s: self.steps[s] for s in readings if s in self.steps}
+        used = set().union(*(p.used for p in steps.values()))
+        nothing = np.zeros_like(next(iter(readings.values()))) if used else np.zeros((0, 3))
+        clock, warmth = arrays.get("time", nothing[:, 0]), arrays.get("temperature")
+        if warmth is not None and "time" in arrays and "temperature" in used and self.smoothing > 0:
+            warmth = self._line.follow(clock, warmth)
+
+        def felt(truths: Truths, number: int) -> Motion:
+            force, rate = truths.get("accelerometer", nothing), truths.get("gyroscope", nothing)
+            end = self._ends[min(number, len(self._ends) - 1)]
+            return log_motion(clock, specific_force=force, angular_rate=rate, temperature=warmth, used=used, end=end)
+
+        if any(step.steady.effects for step in steps.values()):
+            room = log_motion(
+                clock, specific_force=nothing, angular_rate=nothing, temperature=warmth, used=set(), end=LogEnd()
+            )
+            readings |= {s: step.steady.take_off(readings[s], room) for s, step in steps.items()}
+        return self._solved(steps, readings, felt, used & OF_THE_PAST)
+
+    def _solved(
+        self, steps: dict[str, Steps], readings: Truths, felt: Callable[[Truths, int], Motion], past: set[str]
+    ) -> Truths:
+        """Take off the effects that look at the truth, and remember the end of the block in each round."""
+        moving = {s: step.moving for s, step in steps.items()}
+        busy = {s for s, part in moving.items() if part.effects}
+        ends: list[LogEnd] = []
+
+        def noted(truths: Truths, number: int) -> Motion:
+            motion = felt(truths, number)
+            if past:
+                ends.append(self._ends[min(number, len(self._ends) - 1)].after(motion, past))
+            return motion
+
+        if any(steps[s].looks_at & busy for s in busy):
+            truths = solve(moving, readings, noted)
+            for number in range(len(ends), max(len(ends) + 1, len(self._ends)) if past else 0):
+                noted(truths, number)
+        else:
+            truths = {s: linear_truth(moving[s].calibration, r) if s in moving else r for s, r in readings.items()}
+            if busy:
+                truths |= without_effects({s: moving[s] for s in busy}, readings, noted(truths, 0))
+        self._ends = ends or self._ends
+        return truths
+
+    def _require(self, arrays: Mapping[str, Any]) -> None:
+        """Refuse a log that lacks what an effect needs."""
+        for sensor in set(self.steps) & set(arrays):
+            for name, signals in self.steps[sensor].signals.items():
+                missing = sorted(signals - set(arrays))
+                if missing:
+                    raise InputError(
+                        f"the {sensor} of unit {self.unit} was calibrated with the effect {name}, "
+                        f"which needs {' and '.join(missing)}: give that too, or calibrate without the effect"
+                    )
+
+
+def _checked(given: dict[str, Any]) -> tuple[dict[str, NDArray[Any]], bool]:
+    """Return the signals that are given as arrays of one length, and whether it was a single sample."""
+    if given["accelerometer"] is None and given["gyroscope"] is None:
+        raise InputError("give accelerometer, gyroscope or both: there is nothing to compensate")
+    arrays = {name: np.asarray(value) for name, value in given.items() if value is not None}
+    sensor = next(s for s in SENSORS if s in arrays)
+    single = arrays[sensor].ndim == 1
+    if single:
+        arrays = {s: a[None] if s in SENSORS else np.atleast_1d(a) for s, a in arrays.items()}
+    n = len(arrays[sensor])
+    for name, array in arrays.items():
+        expected = (n, 3) if name in SENSORS else (n,)
+        if array.shape != expected:
+            raise InputError(f"{name} has the shape {array.shape}; expected {expected}, as of the {sensor}")
+    return arrays, single
