@@ -28,6 +28,7 @@ def main(argv: Sequence[str]) -> int:
         document = header(unit, part) | {
             "status": "ok",
             "error": None,
+            "log": {"ingest": part["ingest"], "axis_map": part["sensor"]["axis_map"]},
             "inputs": inputs(job.inputs["ingest"] / f"{unit}.parquet"),
             "not_calibrated": reasons,
         }
