@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
-GROUPS = ("sensor", "table", "procedure", "method", "filter", "ingest")
+GROUPS = ("sensor", "table", "procedure", "method", "filter", "ingest", "certificate")
 HEADER = "unit,serial,lot,date,sensor,procedure,overrides"
 SETTINGS = """\
 # Hydra overrides for all units of this campaign; units.csv and the command line are stronger.

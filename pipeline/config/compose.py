@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from hydra.core.override_parser.types import Override
 
-GROUPS = ("sensor", "table", "procedure", "method", "filter", "ingest")
+GROUPS = ("sensor", "table", "procedure", "method", "filter", "ingest", "certificate")
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 RUN_SETTINGS = ("batch_size",)
 

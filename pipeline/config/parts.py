@@ -79,6 +79,7 @@ READS: dict[str, tuple[str, ...]] = {
         "ingest",
         "effects",
         "limits",
+        "certificate",
         "config_sha256",
     ),
     "gather": (),
@@ -86,8 +87,8 @@ READS: dict[str, tuple[str, ...]] = {
 
 
 def config_sha256(config: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of a unit's whole configuration, as canonical JSON."""
-    return hashlib.sha256(_canonical(config)).hexdigest()
+    """Return the SHA-256 of a unit's whole configuration as canonical JSON, without what a certificate states."""
+    return hashlib.sha256(_canonical({k: v for k, v in config.items() if k != "certificate"})).hexdigest()
 
 
 def part(config: Mapping[str, Any], stage: str, sensor: str = "") -> dict[str, Any]:

@@ -144,6 +144,89 @@ class Ingest(Section):
     checks: dict[str, Any] = {}
 
 
+Text = Annotated[str, Field(min_length=1)] | None
+Date = Annotated[str, Field(pattern=r"^\d{4}-\d{2}-\d{2}$")] | None
+
+
+class Organisation(Section):
+    """A laboratory or a customer."""
+
+    name: Text = None
+    address: Text = None
+    contact: Text = None
+
+
+class Item(Section):
+    """What was calibrated."""
+
+    manufacturer: Text = None
+    description: Text = None
+    condition: Text = None
+
+
+class Performed(Section):
+    """First and last day of the calibration."""
+
+    begin: Date = None
+    end: Date = None
+
+
+class Person(Section):
+    """Who authorises a report."""
+
+    name: Text = None
+    role: Text = None
+
+
+class MethodStated(Section):
+    """The laboratory's own procedure."""
+
+    document: Text = None
+    deviations: Text = None
+
+
+class Equipment(Section):
+    """A reference that was used."""
+
+    name: str
+    identification: Text = None
+    certificate: Text = None
+    used_for: Text = None
+
+
+class Conformity(Section):
+    """What a statement of conformity is about."""
+
+    specification: Text = None
+    decision_rule: Text = None
+
+
+class Certificate(Section):
+    """What a laboratory states in its calibration report; None is not stated."""
+
+    name: str
+    number: Text = None
+    title: str = "Calibration report"
+    laboratory: Organisation = Organisation()
+    place: Text = None
+    country: Annotated[str, Field(pattern="^[A-Z]{2}$")] | None = None
+    customer: Organisation = Organisation()
+    item: Item = Item()
+    received: Date = None
+    performed: Performed = Performed()
+    issued: Date = None
+    authorised_by: Person = Person()
+    method: MethodStated = MethodStated()
+    environment: Text = None
+    equipment: list[Equipment] = []
+    traceability: Text = None
+    gravity_uncertainty: NonNegative | None = None
+    conformity: Conformity = Conformity()
+    sampling: Text = None
+    external_results: Text = None
+    opinions: Text = None
+
+
 class Unit(Section):
     """The whole configuration of one unit."""
 
@@ -156,3 +239,4 @@ class Unit(Section):
     ingest: Ingest
     effects: Effects
     limits: Limits
+    certificate: Certificate

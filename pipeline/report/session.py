@@ -56,13 +56,12 @@ def recording_rows(recordings: list[Recording], rests: dict[str, list[Rest]]) ->
 def environment(recordings: list[Recording], settings: JSON) -> list[tuple[str, str]]:
     """Return the conditions that influence the result, by name: temperature, gravity, Earth's rotation, filter."""
     table = settings.get("table") or {}
-    warm = [r.temperature for r in recordings if r.temperature is not None]
+    warm = sensor_temperature(recordings)
     latitude, azimuth = table.get("latitude_deg"), table.get("azimuth_deg")
     chosen = (settings.get("filter") or {}).get("name", "none")
-    together = np.concatenate(warm) if warm else None
     total = sum(float(r.time[-1] - r.time[0]) for r in recordings if r.samples)
     return [
-        ("temperature of the sensor", _range(together) + (" °C" if together is not None else " (not recorded)")),
+        ("temperature of the sensor", f"{warm} °C" if warm else "not recorded"),
         ("recorded", f"{number(total, 4)} s"),
         ("local gravity", f"{table.get('gravity_g') or 1.0:.7g} g"),
         (
@@ -73,6 +72,12 @@ def environment(recordings: list[Recording], settings: JSON) -> list[tuple[str, 
         ),
         ("filter", chosen.replace("_", " ")),
     ]
+
+
+def sensor_temperature(recordings: list[Recording]) -> str | None:
+    """Return the range of the sensor's temperature over all recordings, degC; None where it was not recorded."""
+    warm = [r.temperature for r in recordings if r.temperature is not None and np.isfinite(r.temperature).any()]
+    return _range(np.concatenate(warm)) if warm else None
 
 
 def segments(recordings: list[Recording], rests: dict[str, list[Rest]], calibration: JSON) -> Figure | None:

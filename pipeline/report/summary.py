@@ -27,7 +27,7 @@ SENSOR_COLUMNS = (
     "selected",
 )
 COLUMNS = (*UNIT_COLUMNS, *(f"{s}_{c}" for s in SENSORS for c in SENSOR_COLUMNS), "pass")
-SHEET_COLUMNS = ("table", "procedure", "ingest", "filter", "overrides")  # of units.csv, said elsewhere
+SHEET_COLUMNS = ("table", "procedure", "ingest", "filter", "certificate", "overrides")  # of units.csv, said elsewhere
 
 
 def summary_row(

@@ -84,7 +84,7 @@ def render(
         row={k: v for k, v in (settings.get("row") or {}).items() if v},
         command=settings.get("command"),
         settings_text=json.dumps(
-            {k: v for k, v in settings.items() if k not in ("row", "command")},
+            {k: v for k, v in settings.items() if k not in ("row", "command", "certificate")},
             indent=1,
             ensure_ascii=False,
             default=str,

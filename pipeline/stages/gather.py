@@ -24,7 +24,7 @@ def main(argv: Sequence[str]) -> int:
     """Run the stage; ``--output`` is the campaign's results, ``--batches`` the folder of the batches concerned."""
     job = parse_job("gather", argv, [], ["batches"])
     of_unit = {unit: Path(folder) for folder in job.run["batches"].split(",") for unit in _units(Path(folder))}
-    for name in ("calibrations", "validations", "diagnoses", "reports", "exports"):
+    for name in ("calibrations", "validations", "diagnoses", "reports", "certificates", "exports"):
         shutil.rmtree(job.output / name, ignore_errors=True)
         (job.output / name).mkdir(parents=True)
     compared = {u for c in job.run["compare"] for g in c["groups"] for u in g["units"]}
@@ -49,6 +49,9 @@ def main(argv: Sequence[str]) -> int:
                 if isinstance(part, dict) and part.get("suggested_file"):
                     name = part["suggested_file"]
                     publish(batch / "diagnose" / name, job.output / "diagnoses" / name)
+            for kind in ("json", "html"):
+                name = f"{unit}.{kind}"
+                publish(batch / "report" / "certificates" / name, job.output / "certificates" / name)
             for file in sorted((batch / "export" / unit).iterdir()):
                 publish(file, job.output / "exports" / unit / file.name)
         if unit in compared:

@@ -1,4 +1,4 @@
-"""Stage report: one page a unit, those that failed included."""
+"""Stage report: one page a unit, those that failed included, and the calibration report of those that did not."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ from pipeline.atomic import write_atomically
 from pipeline.diagnosis.words import in_words
 from pipeline.formats.parquet import load_recordings
 from pipeline.records import SENSORS
+from pipeline.report import certificate_page
+from pipeline.report.certificate import certificate
+from pipeline.report.session import sensor_temperature
 from pipeline.report.unit_page import render
 from pipeline.stages.batch import FAILED, parse_job, read_json, run_batch, write_json
 from pipeline.stages.calibration import header
@@ -28,7 +31,11 @@ def main(argv: Sequence[str]) -> int:
         words = {sensor: in_words(diagnosis[sensor], sensor) for sensor in SENSORS}
         page = render(calibration, validation, diagnosis, recordings, part, words=words)
         write_atomically(job.output / f"{unit}.html", page)
+        report = certificate(calibration, validation, part, sensor_temperature(recordings))
+        write_json(job.output / "certificates" / f"{unit}.json", report)
+        write_atomically(job.output / "certificates" / f"{unit}.html", certificate_page.render(unit, report))
 
+    (job.output / "certificates").mkdir(parents=True, exist_ok=True)
     status = run_batch(job, work)
     for unit, part in job.units.items():
         failed = job.output / f"{unit}{FAILED}"

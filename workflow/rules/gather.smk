@@ -17,7 +17,13 @@ rule gather:
         f"{RESULTS}/failures.json",
         [
             directory(f"{RESULTS}/{name}")
-            for name in ("calibrations", "validations", "diagnoses", "exports")
+            for name in (
+                "calibrations",
+                "validations",
+                "diagnoses",
+                "certificates",
+                "exports",
+            )
         ],
         report(
             directory(f"{RESULTS}/reports"),

@@ -1,0 +1,30 @@
+"""What a laboratory states is chosen like any group, checked, and no part of what identifies a calibration."""
+
+from pathlib import Path
+
+import pytest
+
+from pipeline.config import load_campaign
+from pipeline.config.parts import config_sha256
+from pipeline.errors import ConfigurationError
+
+
+def campaign(folder: Path, laboratory: str) -> Path:
+    (folder / "configs" / "certificate").mkdir(parents=True)
+    (folder / "configs" / "certificate" / "mine.yaml").write_text(laboratory)
+    (folder / "units.csv").write_text("unit,certificate\nU1,mine\nU2,\n")
+    return folder
+
+
+def test_a_unit_takes_the_laboratory_of_its_row_and_keeps_its_hash(tmp_path: Path) -> None:
+    loaded = load_campaign({"campaign": str(campaign(tmp_path, "laboratory: {name: Mine}\nissued: 2026-03-01\n"))})
+    mine, blank = (loaded.units[u].config for u in ("U1", "U2"))
+    assert (mine["certificate"]["laboratory"]["name"], mine["certificate"]["issued"]) == ("Mine", "2026-03-01")
+    assert blank["certificate"]["laboratory"]["name"] is None
+    assert config_sha256(mine) == config_sha256(mine | {"certificate": blank["certificate"]})
+    assert config_sha256(mine) != config_sha256(mine | {"filter": blank["filter"] | {"order": 3}})
+
+
+def test_a_date_that_is_none_is_refused_by_name(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match=r"certificate\.issued"):
+        load_campaign({"campaign": str(campaign(tmp_path, "issued: 1 March\n"))})

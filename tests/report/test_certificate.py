@@ -1,0 +1,131 @@
+"""The laboratory's report claims what was stated and measured, and names what is missing."""
+
+import copy
+from math import radians, sqrt
+from typing import Any
+
+import pytest
+
+from pipeline.config.schema import Certificate
+from pipeline.records.calibration import coverage_factor
+from pipeline.report.certificate import STAMP, certificate
+from pipeline.report.certificate_page import render
+
+from .conftest import Unit, build_unit
+
+STATED: dict[str, Any] = {
+    "name": "lab",
+    "number": "{serial}-7",
+    "laboratory": {"name": "Example Laboratory", "address": "1 Gyro Street"},
+    "place": "room 3",
+    "customer": {"name": "A Customer", "contact": "a@example.org"},
+    "item": {"description": "breadboard IMU"},
+    "issued": "2026-03-01",
+    "authorised_by": {"name": "A. Person"},
+    "method": {"deviations": "none"},
+    "equipment": [{"name": "rate table", "certificate": "K-113"}],
+    "traceability": "through K-113",
+    "gravity_uncertainty": 1e-5,
+    "conformity": {"specification": "sheet 4", "decision_rule": "simple acceptance"},
+}
+NEEDED = [
+    ("number",),
+    ("laboratory", "name"),
+    ("laboratory", "address"),
+    ("place",),
+    ("customer", "name"),
+    ("customer", "contact"),
+    ("item", "description"),
+    ("issued",),
+    ("authorised_by", "name"),
+    ("method", "deviations"),
+    ("equipment",),
+    ("traceability",),
+    ("gravity_uncertainty",),
+    ("conformity", "decision_rule"),
+]
+
+
+@pytest.fixture(scope="module")
+def unit() -> Unit:
+    return build_unit()
+
+
+def settings_of(unit: Unit, stated: dict[str, Any], **table: Any) -> dict[str, Any]:
+    accuracies = {"motion": "logged", "angle_accuracy_deg": 0.0, "rate_accuracy": 0.0, "orthogonality_deg": 0.0}
+    return unit.settings | {
+        "table": unit.settings["table"] | accuracies | table,
+        "certificate": Certificate.model_validate(stated).model_dump(),
+        "row": {"serial": "S1", "date": "2026-02-03"},
+    }
+
+
+def report_of(unit: Unit, stated: dict[str, Any], **table: Any) -> dict[str, Any]:
+    return certificate(unit.calibration, unit.validation, settings_of(unit, stated, **table), "25.0 to 29.0")
+
+
+def test_a_report_of_which_nothing_is_stated_is_no_certificate_and_claims_no_traceability(unit: Unit) -> None:
+    report = report_of(unit, {"name": "blank"})
+    assert not report["complete"]
+    assert report["stamp"].startswith(STAMP)
+    assert {"traceability", "name of the laboratory", "authorising person"} <= {m["what"] for m in report["missing"]}
+    assert report["administrativeData"]["statements"]["traceability"] is None
+    page = render("U1", report)
+    assert "NOT A CALIBRATION CERTIFICATE" in page
+    assert '<dt>Traceability</dt><dd><span class="faint">not stated</span>' in page
+
+
+def test_a_report_of_which_everything_is_stated_is_complete(unit: Unit) -> None:
+    report = report_of(unit, STATED)
+    assert report["missing"] == []
+    assert report["stamp"] is None
+    core = report["administrativeData"]["coreData"]
+    assert (core["uniqueIdentifier"], core["beginPerformanceDate"]) == ("S1-7", "2026-02-03")
+    page = render("U1", report)
+    for expected in ("Example Laboratory", "through K-113", "End of the report", "before", "simple acceptance"):
+        assert expected in page
+    assert "NOT A CALIBRATION" not in page
+
+
+@pytest.mark.parametrize("key", NEEDED, ids=".".join)
+def test_each_thing_that_the_standard_asks_for_is_missed(unit: Unit, key: tuple[str, ...]) -> None:
+    stated = copy.deepcopy(STATED)
+    inner = stated
+    for step in key[:-1]:
+        inner = inner[step]
+    del inner[key[-1]]
+    report = report_of(unit, stated)
+    assert [m["key"] for m in report["missing"]] == ["certificate." + ".".join(key)]
+
+
+def test_a_fit_without_uncertainties_makes_no_certificate(unit: Unit) -> None:
+    part = copy.deepcopy(unit.calibration["gyroscope"])
+    part["expanded_uncertainty"] = {"bias": [0.0] * 3, "matrix": [[0.0] * 3] * 3}
+    settings = settings_of(unit, STATED)
+    report = certificate(unit.calibration | {"gyroscope": part}, unit.validation, settings, None)
+    assert {m["what"] for m in report["missing"]} == {"uncertainty of the gyroscope", "conditions of influence"}
+    assert all(q["expandedUnc"] is None for q in report["measurementResults"][1]["results"])
+    assert "1.70" in render("U1", report)
+
+
+def test_the_table_and_gravity_widen_the_uncertainty_as_the_law_of_propagation_says(unit: Unit) -> None:
+    report = report_of(unit, STATED, orthogonality_deg=0.01, angle_accuracy_deg=0.02)
+    results = {q["name"]: q["expandedUnc"] for q in report["measurementResults"][0]["results"]}
+    fit, angle, square = 1e-4, radians(0.02) / sqrt(3.0), radians(0.01) / sqrt(3.0)  # the fit's covariance is 1e-8 I
+    for name, squares in (
+        ("bias x", fit**2 + angle**2),
+        ("matrix xx", fit**2 + angle**2 + 1e-10),
+        ("matrix xy", fit**2 + angle**2 + square**2),
+    ):
+        assert results[name]["standardUncertainty"] == pytest.approx(sqrt(squares), rel=1e-9)
+        freedom = 900.0 * squares**2 / fit**4
+        assert results[name]["effectiveDegreesOfFreedom"] == pytest.approx(freedom, rel=1e-9)
+        assert results[name]["uncertainty"] == pytest.approx(coverage_factor(freedom) * sqrt(squares), rel=1e-9)
+
+
+def test_what_a_laboratory_writes_is_escaped_in_the_page_and_in_its_style(unit: Unit) -> None:
+    hostile = '"; } </style><script>alert(1)</script>'
+    page = render("U1", report_of(unit, STATED | {"number": hostile, "place": hostile}))
+    assert hostile not in page
+    assert "<script" not in page
+    assert page.count("</style>") == 1
