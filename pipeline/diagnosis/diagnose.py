@@ -12,7 +12,7 @@ import numpy as np
 
 from pipeline.diagnosis.advice import next_experiment
 from pipeline.diagnosis.first_guess import select_beside, suggested_effect, unexplained
-from pipeline.diagnosis.held_out import held_out_error
+from pipeline.diagnosis.held_out import held_out_error, held_out_floor
 from pipeline.diagnosis.method_errors import method_errors
 from pipeline.diagnosis.observability import facts_of, not_observable
 from pipeline.diagnosis.pictures import pictures
@@ -40,6 +40,7 @@ ALIKE = 0.8
 MOSTLY = 0.5
 BELIEVED = 3  # effects at once; a longer chain is what the catalogue makes of physics that it does not hold
 UNKNOWN_SHARE = 0.03  # of the gain in 2 log L by what was selected, above which what is left is worth naming
+WORSE = 0.3  # of the noise's mean square, that the held-out error's must not rise by with what was selected
 CLOSE = 1.1  # mean square of a residual over that of noise, under which there is no excess to share
 
 
@@ -69,7 +70,8 @@ def diagnose(
     dict
         ``verdict, residual_over_noise, selected, ranking, not_observable, unexplained, next_experiment, override``;
         beside these ``configured, suggested_effect`` (``pipeline.diagnosis.first_guess``), ``wander``
-        (``...wander``), ``pictures`` (``...pictures``) and ``method_errors`` (``...method_errors``).
+        (``...wander``), ``held_out`` (``error_before, error_after, floor``), ``pictures`` (``...pictures``) and
+        ``method_errors`` (``...method_errors``).
     """
     sensor = calibration.sensor
     if by_hand(sensor, recordings):
@@ -109,6 +111,7 @@ def _nothing(sensor: str, configured: list[str], reason: str) -> dict[str, Any]:
         "override": "",
         "configured": configured,
         "wander": None,
+        "held_out": None,
     }
 
 
@@ -126,7 +129,8 @@ def _document(
     ladder = _ladder(selection, recordings, table)
     explained = selection.first.explained([])
     ranking = [_entry(selection, name, ladder, explained, noise) for name in _order(selection, hidden)]
-    verdict = _verdict(selection, unknown, noise)
+    held_out = _held_out(ladder, recordings, noise)
+    verdict = "unexplained" if _made_worse(held_out) else _verdict(selection, unknown, noise)
     if not ranking and verdict == "nothing_missing" and len(hidden) > 0:
         verdict = "not_enough_data"
     adds = ",".join([*configured, *selected])
@@ -147,7 +151,27 @@ def _document(
         "override": f"effects.{sensor}=[{adds}]" if selected else "",
         "configured": configured,
         "wander": fitted_wander(selection, noise),
+        "held_out": held_out,
     }
+
+
+def _held_out(
+    ladder: Sequence[tuple[Fit, float | None]], recordings: Sequence[Recording], noise: Noise | None
+) -> dict[str, float] | None:
+    """Return the held-out error without and with everything selected, beside that of noise alone."""
+    fit, after = ladder[-1]
+    before, floor = ladder[0][1], held_out_floor(fit, recordings, noise)
+    if before is None or after is None or floor is None:
+        return None
+    return {"error_before": before, "error_after": after, "floor": floor}
+
+
+def _made_worse(held_out: Mapping[str, float] | None) -> bool:
+    """Return whether what was selected does harm to motion that no fit has seen: then it is not what is missing."""
+    if held_out is None:
+        return False
+    more = held_out["error_after"] ** 2 - held_out["error_before"] ** 2
+    return more > WORSE * held_out["floor"] ** 2
 
 
 def _verdict(selection: Selection, unknown: Sequence[Any], noise: Noise | None) -> str:

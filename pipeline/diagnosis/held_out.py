@@ -2,6 +2,13 @@
 
 Where the held-out recording has a table's motion, the error is the rms length of ``matrix (reading - model)``; it sees
 rotations too. Elsewhere it is the rms of the magnitude of the calibrated reading less gravity or the table's rate.
+
+Noise alone would leave
+
+    floor = sqrt(tr(M D M^T)),      D = white^2 gain^2 + wander^2
+
+of the vector's error with the calibration matrix M, the white noise behind a filter of that gain, and the bias wander
+(``pipeline.records.Noise``); of the magnitude's, not more.
 """
 
 from __future__ import annotations
@@ -23,7 +30,7 @@ if TYPE_CHECKING:
 
     from pipeline.estimation.joint import Fit
     from pipeline.estimation.observations import Observations
-    from pipeline.records import Motion, Recording, SensorCalibration
+    from pipeline.records import Motion, Noise, Recording, SensorCalibration
 
 
 def held_out_error(
@@ -51,6 +58,24 @@ def held_out_error(
     together = np.concatenate(errors)
     together = together[np.isfinite(together)]
     return float(np.sqrt(np.mean(together))) if len(together) else None
+
+
+def held_out_floor(fit: Fit, recordings: Sequence[Recording], noise: Noise | None) -> float | None:
+    """Return the rms error that noise alone leaves on the recordings of role ``validation``, g or deg/s.
+
+    Parameters
+    ----------
+    fit : Fit
+    recordings : sequence of Recording
+    noise : Noise or None
+        None gives None.
+    """
+    held = [r for r in recordings if r.role == "validation"]
+    if noise is None or not held:
+        return None
+    gain = max(float(r.filter.get("noise_gain", 1.0)) for r in held)
+    variance = (gain * noise.white) ** 2 + noise.wander**2
+    return float(np.sqrt(np.sum(np.linalg.solve(fit.K, np.diag(np.sqrt(variance))) ** 2)))
 
 
 def _errors(

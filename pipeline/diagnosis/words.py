@@ -10,6 +10,7 @@ from pipeline.model.effects import catalogue
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+STAYS = 1.15  # times the noise of held-out motion, above which more than noise is left
 UNITS = {"accelerometer": "g", "gyroscope": "deg/s"}
 
 
@@ -38,6 +39,7 @@ def in_words(part: Mapping[str, Any] | None, sensor: str) -> list[str]:
             f"It takes {len(part['selected'])} effects together to explain this, more than a unit usually has: "
             "the true one may not be in the catalogue."
         )
+    lines += _held_out(part, sensor)
     wander = part.get("wander") or {}
     if wander.get("inflated"):
         lines.append(
@@ -53,6 +55,18 @@ def in_words(part: Mapping[str, Any] | None, sensor: str) -> list[str]:
         what = "it" if len(part["selected"]) == 1 else "them"
         lines.append(f"To add {what}, run with overrides='{part['override']}'.")
     return lines
+
+
+def _held_out(part: Mapping[str, Any], sensor: str) -> list[str]:
+    """Say where held-out motion speaks against what was selected."""
+    held = part.get("held_out")
+    if not held or held["error_after"] < STAYS * held["floor"]:
+        return []
+    ratio = held["error_after"] / held["floor"]
+    lines = [f"On held-out motion {held['error_after']:.3g} {UNITS[sensor]} stay, {ratio:.3g} times the noise."]
+    if held["error_after"] > held["error_before"]:
+        return [*lines, "That is more than without it: what was selected is not what is missing."]
+    return [*lines, "So it is not the whole of it, or one that looks like it is meant."]
 
 
 def _unknown(part: Mapping[str, Any], sensor: str) -> list[str]:
