@@ -20,8 +20,9 @@ if TYPE_CHECKING:
 @cache
 def exporters() -> tuple[ModuleType, ...]:
     """Return the modules of all formats, in alphabetical order."""
-    names = sorted(f.stem for f in Path(__file__).parent.glob("*.py") if f.stem not in ("__init__", "sensors"))
-    return tuple(import_module(f"{__name__}.{name}") for name in names)
+    names = sorted(f.stem for f in Path(__file__).parent.glob("*.py") if f.stem != "__init__")
+    modules = (import_module(f"{__name__}.{name}") for name in names)
+    return tuple(module for module in modules if hasattr(module, "FILE_NAME"))
 
 
 def export_all(

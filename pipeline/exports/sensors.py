@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 STANDARD_GRAVITY = 9.80665  # m/s^2
+STRAIGHT = ["+x", "+y", "+z"]
 
 
 def calibrations(document: dict[str, Any]) -> dict[str, SensorCalibration]:
@@ -36,6 +37,15 @@ def sensor_effects(calibration: SensorCalibration) -> dict[str, NDArray[np.float
 def bench_effects(calibration: SensorCalibration) -> list[str]:
     """Return the effects of mounting, place, recording, table and timing, which no export carries."""
     return [e.name for e in calibration.effects if owner_of(e) != Owner.SENSOR]
+
+
+def axes_of_readings(document: dict[str, Any]) -> list[str]:
+    """Return a sentence on how the sensor's axes become the body's, where they differ."""
+    axis_map = (document.get("log") or {}).get("axis_map") or STRAIGHT
+    if list(axis_map) == STRAIGHT:
+        return []
+    pairs = ", ".join(f"{a} along body {b}" for a, b in zip("xyz", axis_map, strict=True))
+    return [f"Turn the readings to body axes first: the sensor's {pairs}."]
 
 
 def forward(calibration: SensorCalibration) -> NDArray[np.float64]:

@@ -69,23 +69,22 @@ def _alike(rows: Rows, template: Template, numbers: dict[str, NDArray[np.float64
     places = {path: template.places[path] for path in numbers}
     layout = np.dtype(
         {
-            "names": ["whole", "channel", *places],
-            "formats": [f"V{size}", "<u2", *(p.code for p in places.values())],
-            "offsets": [0, CHANNEL_AT, *(HEAD.itemsize + p.offset for p in places.values())],
+            "names": ["channel", *places],
+            "formats": ["<u2", *(p.code for p in places.values())],
+            "offsets": [CHANNEL_AT, *(HEAD.itemsize + p.offset for p in places.values())],
             "itemsize": size,
         }
     )
-    table = np.empty((len(rows.starts), size), np.uint8)
-    first = int(rows.starts[0]) - HEAD.itemsize
+    starts = rows.starts - HEAD.itemsize
     if rows.stride:
-        table[:] = np.ndarray(table.shape, np.uint8, rows.data.data, first, (rows.stride, 1))
+        whole = np.ndarray(len(starts), f"V{size}", rows.data.data, int(starts[0]), (rows.stride,)).copy()
     else:
-        np.take(rows.data, (rows.starts - HEAD.itemsize)[:, None] + np.arange(size), out=table)
-    records = table.view(layout)[:, 0]
+        whole = np.ndarray(len(rows.data) - size + 1, f"V{size}", rows.data.data, 0, (1,))[starts]
+    records = whole.view(layout)
     records["channel"] = channel
     for path, column in numbers.items():
         records[path] = column
-    return table
+    return whole.view(np.uint8).reshape(len(starts), size)
 
 
 def _one(row: int, rows: Rows, template: Template, numbers: dict[str, NDArray[np.float64]], channel: int) -> bytes:

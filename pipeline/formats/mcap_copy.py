@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from pipeline.formats.mcap_chunk import Rows
     from pipeline.formats.mcap_container import Container
 
-ZSTD_LEVEL = 1
+ZSTD_LEVEL = -3  # twice as fast as 1 on calibrated messages, and as small as the recorders' 3
 
 
 class CopyingWalk(Walk):
@@ -102,7 +102,7 @@ class McapCopy:
         self.metadata: list[MetadataIndex] = []
         self._write(records.MAGIC)
 
-    def _write(self, *parts: bytes) -> None:
+    def _write(self, *parts: bytes | memoryview) -> None:
         for part in parts:
             self.out.write(part)
             self.crc = zlib.crc32(part, self.crc)
@@ -170,18 +170,19 @@ class McapCopy:
         """
         head = _bytes_of(before)
         if isinstance(table, np.ndarray):
-            body = table.tobytes()
+            body: bytes | memoryview = table.data.cast("B")
             starts = table.shape[1] * np.arange(len(table))
-            heads = np.ndarray(len(table), HEAD, body, 0, (table.shape[1],))
-            times = heads["log_time"]
+            times = np.ndarray(len(table), HEAD, table.data, 0, (table.shape[1],))["log_time"]
         else:
             body = b"".join(table)
             starts = np.cumsum([0, *map(len, table)])[:-1]
             times = np.array([np.frombuffer(part, HEAD, 1)["log_time"][0] for part in table], np.uint64)
-        self._chunk(head + body, {channel: (times, starts + len(head))})
+        self._chunk(head + body if head else body, {channel: (times, starts + len(head))})
         self._count(channel, times)
 
-    def _chunk(self, data: bytes, entries: dict[int, tuple[NDArray[np.uint64], NDArray[np.int64]]]) -> None:
+    def _chunk(
+        self, data: bytes | memoryview, entries: dict[int, tuple[NDArray[np.uint64], NDArray[np.int64]]]
+    ) -> None:
         """Write a chunk and its indexes."""
         times = np.concatenate([t for t, _ in entries.values()])
         packing = self.packing.encode()
@@ -240,7 +241,7 @@ def _bytes_of(parts: Iterable[McapRecord]) -> bytes:
     return bytes(builder.end())  # type: ignore[no-untyped-call]
 
 
-def _packed(data: bytes, packing: str) -> bytes:
+def _packed(data: bytes | memoryview, packing: str) -> bytes | memoryview:
     if packing == "zstd":
         import zstandard  # noqa: PLC0415
 

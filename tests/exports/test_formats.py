@@ -1,8 +1,5 @@
 """Every format, read back by its consumer's own formula, gives what the calibration gives."""
 
-import json
-import shutil
-import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +7,6 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline import load_calibration
 from pipeline.exports import export_all, exporters
 from pipeline.exports.kalibr import lower_times_rotation
 from pipeline.model.effects import effect
@@ -18,25 +14,6 @@ from pipeline.records import FittedEffect, SensorCalibration
 
 ACCELEROMETER = np.array([[0.994, 0.004, -0.002], [0.021, 1.007, 0.003], [-0.005, 0.012, 0.951]])
 GYROSCOPE = np.array([[1.017, 0.016, -0.019], [-0.013, 1.001, -0.005], [0.014, 0.005, 0.998]])
-SIZES = {
-    "accelerometer": {
-        "bias_temperature": 1e-3,
-        "scale_factor_temperature": 2e-4,
-        "scale_factor_asymmetry": 3e-3,
-        "quadratic_nonlinearity": 5e-3,
-        "cubic_nonlinearity": 4e-3,
-        "cross_axis_nonlinearity": 3e-3,
-        "rate_dependence": 5e-5,
-    },
-    "gyroscope": {
-        "bias_temperature_quadratic": 1e-3,
-        "scale_factor_asymmetry": 2e-3,
-        "quadratic_nonlinearity": 1e-5,
-        "cubic_nonlinearity": 1e-7,
-        "g_sensitivity": 0.1,
-        "g_squared_sensitivity": 0.02,
-    },
-}
 
 
 def fitted(name: str, sensor: str, size: float, rng: np.random.Generator) -> FittedEffect:
@@ -104,47 +81,6 @@ def test_a_factor_of_a_matrix_is_lower_triangular_times_a_rotation() -> None:
     np.testing.assert_allclose(L @ Q, ACCELEROMETER, atol=1e-15)
     assert np.linalg.det(Q) == pytest.approx(1.0)
     assert (np.diag(L) > 0).all()
-
-
-PROGRAM = """
-#include <stdio.h>
-#include "calibration.h"
-int main(void) {
-    double in[7];
-    while (scanf("%lf %lf %lf %lf %lf %lf %lf", in, in+1, in+2, in+3, in+4, in+5, in+6) == 7) {
-        imu_real f[3], w[3], rf[3], rw[3];
-        int i;
-        for (i = 0; i < 3; ++i) { rf[i] = (imu_real)in[i]; rw[i] = (imu_real)in[3 + i]; }
-        imu_compensate(rf, rw, (imu_real)in[6], f, w);
-        printf("%.17g %.17g %.17g %.17g %.17g %.17g\\n", (double)f[0], (double)f[1], (double)f[2],
-               (double)w[0], (double)w[1], (double)w[2]);
-    }
-    return 0;
-}
-"""
-
-
-@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
-@pytest.mark.parametrize(("real", "tolerance"), [("double", 1e-12), ("float", 2e-6)])
-@pytest.mark.parametrize("effects", [{}, SIZES], ids=["linear", "all effects of one sample"])
-def test_the_c_header_compensates_as_python_does(
-    tmp_path: Path, settings: dict[str, Any], effects: dict[str, dict[str, float]], real: str, tolerance: float
-) -> None:
-    made = document(effects)
-    export_all(made, settings, tmp_path)
-    (tmp_path / "main.c").write_text(PROGRAM)
-    flags = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract=off", f"-DIMU_REAL={real}"]
-    subprocess.run(["cc", *flags, "main.c", "-o", "main"], cwd=tmp_path, check=True)
-    f, w, temperature = samples()
-    text = "\n".join(" ".join(map(repr, row)) for row in np.column_stack([f, w, temperature]).tolist())
-    done = subprocess.run([tmp_path / "main"], input=text, capture_output=True, text=True, check=True)
-    out = np.array([line.split() for line in done.stdout.splitlines()], float)
-
-    (tmp_path / "U1.json").write_text(json.dumps(made))
-    expected = load_calibration(tmp_path / "U1.json").apply(f, w, temperature)
-    scale = {"accelerometer": 1.5, "gyroscope": 200.0}
-    np.testing.assert_allclose(out[:, :3], expected.accelerometer, atol=tolerance * scale["accelerometer"], rtol=0)
-    np.testing.assert_allclose(out[:, 3:], expected.gyroscope, atol=tolerance * scale["gyroscope"], rtol=0)
 
 
 def test_what_a_format_cannot_carry_is_said_in_it(tmp_path: Path, settings: dict[str, Any]) -> None:
