@@ -220,7 +220,6 @@ class Certificate(Section):
     environment: Text = None
     equipment: list[Equipment] = []
     traceability: Text = None
-    gravity_uncertainty: NonNegative | None = None
     conformity: Conformity = Conformity()
     sampling: Text = None
     external_results: Text = None

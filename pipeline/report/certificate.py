@@ -12,7 +12,7 @@ import re
 from typing import TYPE_CHECKING, Any
 
 from pipeline.records import SENSORS
-from pipeline.report.uncertainty import has_uncertainty, quantities, shares
+from pipeline.report.figure import AXES
 
 if TYPE_CHECKING:
     from pipeline.report.figure import JSON
@@ -60,7 +60,7 @@ def certificate(calibration: JSON, validation: JSON | None, settings: JSON, temp
             "command": settings.get("command"),
         },
     }
-    missing = _missing(document, calibration, stated, validation or {})
+    missing = _missing(document, stated, validation or {})
     stamp = STAMP + ", ".join(m["what"] for m in missing) if missing else None
     return {"complete": not missing, "stamp": stamp, "missing": missing, **document}
 
@@ -131,11 +131,11 @@ def _result(sensor: str, calibration: JSON, held_out: JSON, settings: JSON, temp
         "influenceConditions": {
             "temperature of the sensor, degC": temperature,
             "local gravity, g": table.get("gravity_g"),
+            "accuracy of local gravity, g": table.get("gravity_accuracy_g"),
             "laboratory": stated["environment"],
         },
-        "results": quantities(sensor, part, settings),
-        "budget": [vars(s) | {"type": "B"} for s in shares(sensor, settings)],
-        "effects": part.get("effects") or [],
+        "results": quantities(part),
+        "uncertaintyBudget": part.get("uncertainty_budget"),
         "beforeAdjustment": _errors(held_out, 0),
         "afterAdjustment": _errors(held_out, -1),
         "noiseFloor": held_out.get("noise_floor"),
@@ -147,6 +147,48 @@ def _result(sensor: str, calibration: JSON, held_out: JSON, settings: JSON, temp
     }
 
 
+def quantities(part: JSON) -> list[JSON]:
+    """Return bias, matrix and the parameters of fitted effects, each with its expanded uncertainty.
+
+    Parameters
+    ----------
+    part : dict
+        The sensor's part of the calibration.
+
+    Returns
+    -------
+    list of dict
+        ``name, value, unit, expandedUnc``; the last None for what the method does not fit, or where no budget is known.
+    """
+    budget = part.get("uncertainty_budget")
+    rows = [p for effect in part.get("effects") or [] for p in effect["parameters"].values()]
+    values = [*part["bias"], *(m for row in part["matrix"] for m in row), *(p["value"] for p in rows)]
+    if not budget:
+        names = [*(f"bias_{a}" for a in AXES), *(f"matrix_{a}{b}" for a in AXES for b in AXES)]
+        units = [part["unit"]] * 3 + ["1"] * 9
+        return [
+            {"name": n, "value": v, "unit": u, "expandedUnc": None}
+            for n, v, u in zip(names, values[:12], units, strict=True)
+        ]
+    return [
+        {"name": name, "value": value, "unit": budget["units"][j], "expandedUnc": _expanded(budget, j)}
+        for j, (name, value) in enumerate(zip(budget["parameters"], values, strict=True))
+    ]
+
+
+def _expanded(budget: JSON, j: int) -> JSON | None:
+    if not budget["standard_uncertainty"][j] > 0.0:
+        return None
+    return {
+        "uncertainty": budget["expanded_uncertainty"][j],
+        "standardUncertainty": budget["standard_uncertainty"][j],
+        "coverageFactor": budget["coverage_factor"][j],
+        "effectiveDegreesOfFreedom": budget["effective_degrees_of_freedom"][j],
+        "coverageProbability": 0.95,
+        "distribution": "t",
+    }
+
+
 def _errors(held_out: JSON, step: int) -> JSON | None:
     """Return the held-out errors of the first (0) or last (-1) step."""
     steps = held_out.get("steps") or []
@@ -154,12 +196,11 @@ def _errors(held_out: JSON, step: int) -> JSON | None:
     return {k: steps[step].get(k) for k in keys} if steps else None
 
 
-def _missing(document: JSON, calibration: JSON, stated: JSON, validation: JSON) -> list[JSON]:
+def _missing(document: JSON, stated: JSON, validation: JSON) -> list[JSON]:
     """Return what the standard asks for and nobody has stated: ``what``, its ``clause`` and the ``key`` to set."""
     core = document["administrativeData"]["coreData"]
     results = document["measurementResults"]
     judged = any(r["conformity"]["checks"] for r in results)
-    gravity = any(r["name"] == "accelerometer" for r in results)
     warm = all(r["influenceConditions"]["temperature of the sensor, degC"] is not None for r in results)
     serial = document["administrativeData"]["items"][0]["identifications"][0]["value"]
     wanted: list[tuple[str, str, str, Any]] = [
@@ -184,11 +225,12 @@ def _missing(document: JSON, calibration: JSON, stated: JSON, validation: JSON) 
         ("reference equipment", "7.8.4.1 c", "certificate.equipment", stated["equipment"]),
         ("traceability", "7.8.4.1 c", "certificate.traceability", stated["traceability"]),
     ]
-    if gravity:
-        key = "certificate.gravity_uncertainty"
-        wanted.append(("uncertainty of local gravity", "7.8.4.1 a", key, stated["gravity_uncertainty"] is not None))
+    if any(r["name"] == "accelerometer" for r in results):
+        accuracy = results[0]["influenceConditions"]["accuracy of local gravity, g"]
+        key = "table.gravity_accuracy_g"
+        wanted.append(("accuracy of local gravity", "7.8.4.1 a", key, accuracy is not None))
     for sensor in (r["name"] for r in results):
-        given = has_uncertainty(calibration[sensor])
+        given = any(q["expandedUnc"] for q in next(r["results"] for r in results if r["name"] == sensor))
         wanted.append((f"uncertainty of the {sensor}", "7.8.4.1 a", "method=reference_least_squares", given))
         errors = (validation.get(sensor) or {}).get("steps")
         wanted.append((f"results of the {sensor} before and after", "7.8.4.1 d", "a held-out recording", errors))

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from markupsafe import Markup
 
+from pipeline.report.budget_table import budget_of
 from pipeline.report.templating import template
 
 if TYPE_CHECKING:
@@ -24,7 +25,10 @@ def render(unit: str, report: JSON) -> str:
     sheet = f"{core['title']} {core['uniqueIdentifier'] or unit}"
     if report["stamp"]:
         sheet += " \N{MIDDLE DOT} NOT A CALIBRATION CERTIFICATE"
-    page: str = template("certificate.html").render(unit=unit, report=report, sheet=_css_text(sheet))
+    budgets = {
+        r["name"]: budget_of({"uncertainty_budget": r["uncertaintyBudget"]}) for r in report["measurementResults"]
+    }
+    page: str = template("certificate.html").render(unit=unit, report=report, sheet=_css_text(sheet), budgets=budgets)
     return page
 
 

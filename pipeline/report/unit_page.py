@@ -15,6 +15,7 @@ from pipeline.model.kinematics import reference_motion
 from pipeline.model.user_effects import effect_of
 from pipeline.records import SENSORS, SensorCalibration
 from pipeline.report import figures, tables
+from pipeline.report.attitude_figure import attitude_over_time
 from pipeline.report.budget_table import budget_of, convergence_of
 from pipeline.report.evidence_figures import added_variable, unexplained
 from pipeline.report.figure import UNITS, Figure
@@ -67,6 +68,7 @@ def render(
     -------
     str
     """
+    pointed = (validation or {}).get("attitude") or {}
     ok, rests = calibration.get("status") == "ok", rests_logged(recordings)
     page: str = template("unit.html").render(
         calibration=calibration,
@@ -78,6 +80,8 @@ def render(
         ]
         if ok
         else [],
+        attitude=pointed if pointed.get("curve") else None,
+        attitude_figure=attitude_over_time(pointed),
         recordings=recording_rows(recordings, rests),
         segments=segments(recordings, rests, calibration) if ok else None,
         environment=environment(recordings, settings) if recordings else [],

@@ -8,6 +8,7 @@ from pipeline.formats.parquet import load_recordings
 from pipeline.signal.noise import estimate_noise
 from pipeline.stages.batch import parse_job, run_batch, write_json
 from pipeline.stages.fits import load_fits
+from pipeline.validation.attitude import attitude
 from pipeline.validation.heldout import validate
 
 if TYPE_CHECKING:
@@ -26,6 +27,7 @@ def main(argv: Sequence[str]) -> int:
             noise = estimate_noise(sensor, recordings, part["sensor"][sensor])
             other = next(fit for s, fit in fits.items() if s != sensor)
             document[sensor] = calibration and validate(calibration, recordings, noise, part, other=other)
+        document["attitude"] = attitude(fits["accelerometer"], fits["gyroscope"], recordings)
         write_json(job.output / f"{unit}.json", document)
 
     return run_batch(job, work)

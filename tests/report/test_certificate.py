@@ -1,13 +1,11 @@
 """The laboratory's report claims what was stated and measured, and names what is missing."""
 
 import copy
-from math import radians, sqrt
 from typing import Any
 
 import pytest
 
 from pipeline.config.schema import Certificate
-from pipeline.records.calibration import coverage_factor
 from pipeline.report.certificate import STAMP, certificate
 from pipeline.report.certificate_page import render
 
@@ -25,7 +23,6 @@ STATED: dict[str, Any] = {
     "method": {"deviations": "none"},
     "equipment": [{"name": "rate table", "certificate": "K-113"}],
     "traceability": "through K-113",
-    "gravity_uncertainty": 1e-5,
     "conformity": {"specification": "sheet 4", "decision_rule": "simple acceptance"},
 }
 NEEDED = [
@@ -41,20 +38,33 @@ NEEDED = [
     ("method", "deviations"),
     ("equipment",),
     ("traceability",),
-    ("gravity_uncertainty",),
     ("conformity", "decision_rule"),
 ]
 
 
+BUDGET = {
+    "parameters": [*(f"bias_{a}" for a in "xyz"), *(f"matrix_{a}{b}" for a in "xyz" for b in "xyz")],
+    "units": ["g"] * 3 + ["1"] * 9,
+    "contributions": [],
+    "standard_uncertainty": [1e-4] * 5 + [0.0] + [1e-4] * 6,
+    "effective_degrees_of_freedom": [6.5] * 12,
+    "coverage_factor": [2.4] * 12,
+    "expanded_uncertainty": [2.4e-4] * 5 + [0.0] + [2.4e-4] * 6,
+    "not_included": [{"source": "wobble", "reason": "wobble is not stated"}],
+}
+
+
 @pytest.fixture(scope="module")
 def unit() -> Unit:
-    return build_unit()
+    made = build_unit()
+    for sensor in ("accelerometer", "gyroscope"):
+        made.calibration[sensor]["uncertainty_budget"] = BUDGET
+    return made
 
 
 def settings_of(unit: Unit, stated: dict[str, Any], **table: Any) -> dict[str, Any]:
-    accuracies = {"motion": "logged", "angle_accuracy_deg": 0.0, "rate_accuracy": 0.0, "orthogonality_deg": 0.0}
     return unit.settings | {
-        "table": unit.settings["table"] | accuracies | table,
+        "table": unit.settings["table"] | {"gravity_accuracy_g": 1e-5} | table,
         "certificate": Certificate.model_validate(stated).model_dump(),
         "row": {"serial": "S1", "date": "2026-02-03"},
     }
@@ -100,7 +110,7 @@ def test_each_thing_that_the_standard_asks_for_is_missed(unit: Unit, key: tuple[
 
 def test_a_fit_without_uncertainties_makes_no_certificate(unit: Unit) -> None:
     part = copy.deepcopy(unit.calibration["gyroscope"])
-    part["expanded_uncertainty"] = {"bias": [0.0] * 3, "matrix": [[0.0] * 3] * 3}
+    del part["uncertainty_budget"]
     settings = settings_of(unit, STATED)
     report = certificate(unit.calibration | {"gyroscope": part}, unit.validation, settings, None)
     assert {m["what"] for m in report["missing"]} == {"uncertainty of the gyroscope", "conditions of influence"}
@@ -108,19 +118,20 @@ def test_a_fit_without_uncertainties_makes_no_certificate(unit: Unit) -> None:
     assert "1.70" in render("U1", report)
 
 
-def test_the_table_and_gravity_widen_the_uncertainty_as_the_law_of_propagation_says(unit: Unit) -> None:
-    report = report_of(unit, STATED, orthogonality_deg=0.01, angle_accuracy_deg=0.02)
-    results = {q["name"]: q["expandedUnc"] for q in report["measurementResults"][0]["results"]}
-    fit, angle, square = 1e-4, radians(0.02) / sqrt(3.0), radians(0.01) / sqrt(3.0)  # the fit's covariance is 1e-8 I
-    for name, squares in (
-        ("bias x", fit**2 + angle**2),
-        ("matrix xx", fit**2 + angle**2 + 1e-10),
-        ("matrix xy", fit**2 + angle**2 + square**2),
-    ):
-        assert results[name]["standardUncertainty"] == pytest.approx(sqrt(squares), rel=1e-9)
-        freedom = 900.0 * squares**2 / fit**4
-        assert results[name]["effectiveDegreesOfFreedom"] == pytest.approx(freedom, rel=1e-9)
-        assert results[name]["uncertainty"] == pytest.approx(coverage_factor(freedom) * sqrt(squares), rel=1e-9)
+def test_each_result_carries_the_uncertainty_of_the_calibrations_budget(unit: Unit) -> None:
+    results = report_of(unit, STATED)["measurementResults"][0]["results"]
+    assert [q["name"] for q in results] == BUDGET["parameters"]
+    assert results[0]["expandedUnc"]["uncertainty"] == BUDGET["expanded_uncertainty"][0]
+    assert results[4]["value"] == unit.calibration["accelerometer"]["matrix"][0][1]
+    assert results[5]["expandedUnc"] is None  # the method does not fit it
+    page = render("U1", report_of(unit, STATED))
+    assert "0.03100 ± 0.00024" in page
+    assert "wobble is not stated" in page
+
+
+def test_the_accuracy_of_gravity_is_asked_for(unit: Unit) -> None:
+    report = report_of(unit, STATED, gravity_accuracy_g=None)
+    assert [m["key"] for m in report["missing"]] == ["table.gravity_accuracy_g"]
 
 
 def test_what_a_laboratory_writes_is_escaped_in_the_page_and_in_its_style(unit: Unit) -> None:
