@@ -23,7 +23,8 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("units", metavar="UNIT", nargs="*", help="units to explain (default: all)")
     parser.add_argument("--results", type=Path, default=Path("results"), help="where results are (default: results)")
     arguments = parser.parse_args(argv)
-    texts = [explain(_read(file)) for file in diagnoses(arguments.campaign, arguments.units, arguments.results)]
+    files = diagnoses(arguments.campaign, arguments.units, arguments.results)
+    texts = [explain(_read(file), _validation(file)) for file in files]
     sys.stdout.write("\n".join(texts))
     return 0
 
@@ -52,13 +53,32 @@ def diagnoses(campaign: str, units: Sequence[str], results: Path) -> list[Path]:
     return files
 
 
-def explain(document: dict[str, Any]) -> str:
-    """Return a unit's diagnosis as text."""
+def explain(document: dict[str, Any], validation: dict[str, Any]) -> str:
+    """Return a unit's diagnosis as text, with the error of its held-out motion where that is known."""
     lines = [f"{document.get('unit', 'unit')}"]
     for sensor in SENSORS:
         lines.append(f"  {sensor}")
-        lines += [f"    {sentence}" for sentence in in_words(document.get(sensor), sensor)]
+        verdict, *rest = in_words(document.get(sensor), sensor)
+        lines += [f"    {sentence}" for sentence in [verdict, *_held_out(validation.get(sensor)), *rest]]
     return "\n".join(lines) + "\n"
+
+
+def _held_out(part: dict[str, Any] | None) -> list[str]:
+    if not part or not part["steps"]:
+        return []
+    error, floor, unit = part["steps"][-1]["rms_error"], part["noise_floor"], part["unit"]
+    ratio = f", {error / floor:.3g} times what noise alone leaves" if floor else ""
+    return [f"As calibrated in this run, held-out motion errs by {error:.3g} {unit} rms of the magnitude{ratio}."]
+
+
+def _validation(diagnosis: Path) -> dict[str, Any]:
+    """Return ``validations/<unit>.json`` of the same results; nothing where there is none."""
+    file = diagnosis.parent.parent / "validations" / diagnosis.name
+    try:
+        found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError):
+        return {}
+    return found
 
 
 def _read(file: Path) -> dict[str, Any]:

@@ -72,3 +72,14 @@ def test_a_file_that_is_no_diagnosis_is_refused(tmp_path: Path) -> None:
     (tmp_path / "x.json").write_text("[1, 2]")
     with pytest.raises(InputError, match="is no diagnosis"):
         main([str(tmp_path / "x.json")])
+
+
+def test_the_held_out_error_of_the_run_is_told_beside_what_noise_alone_leaves(
+    results: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = results / "bench" / "validations"
+    folder.mkdir()
+    gyroscope = {"unit": "deg/s", "noise_floor": 0.011, "steps": [{"rms_error": 4.0}, {"rms_error": 0.022}]}
+    (folder / "U2.json").write_text(json.dumps({"accelerometer": None, "gyroscope": gyroscope}))
+    assert main([str(results / "bench"), "U2"]) == 0
+    assert "errs by 0.022 deg/s rms of the magnitude, 2 times what noise alone leaves" in capsys.readouterr().out

@@ -84,7 +84,7 @@ class Typed:
             stderr=subprocess.STDOUT,
             text=True,
             check=False,
-            timeout=300,
+            timeout=900,
         )
         assert done.returncode == 0, f"{commands}\n{done.stdout}"
         return done.stdout
