@@ -11,6 +11,7 @@ Each entry of the list is one comparison::
       against: stages                        # what the others are compared with; the first where it is left out
     - title: Rates
       by: [method, rate_dps]                 # a group for each value of a column, or of several
+      sensors: accelerometer                 # only this one; both where it is left out
       x: table_time                          # the error is drawn against it: a column of numbers, or table_time
     - [U1, U2]                               # or {title, units}: unit against unit
 
@@ -32,7 +33,8 @@ if TYPE_CHECKING:
     from pipeline.config.campaign import UnitRow
 
 JSON = dict[str, Any]
-KEYS = ("title", "units", "groups", "by", "where", "pairs", "against", "x")
+KEYS = ("title", "units", "groups", "by", "where", "pairs", "against", "x", "sensors")
+SENSORS = ("accelerometer", "gyroscope")
 TABLE_TIME = "table_time"
 FORM = "a list of units, or a mapping with units, groups or by"
 
@@ -52,9 +54,9 @@ def resolve_comparisons(entries: Sequence[Any], units: Mapping[str, UnitRow], fi
     Returns
     -------
     list of dict
-        ``title``; ``groups``, each ``name, series, label, units``; ``against``; ``pairs`` (unit to what it shares
-        with its pair, or None) and ``x`` (``label``; ``values`` by unit, None for the table time; ``named``: the
-        points' names are drawn beside them), or None.
+        ``title``; ``groups``, each ``name, series, label, units``; ``sensors``; ``against``; ``pairs`` (unit to what
+        it shares with its pair, or None) and ``x`` (``label``; ``values`` by unit, None for the table time; ``named``:
+        the points' names are drawn beside them), or None.
 
     Raises
     ------
@@ -107,9 +109,13 @@ class _Resolver:
         if against not in names:
             raise _Problem(f"against: no group is called {against!r}{nearest(against, names)}")
         pairs = entry.get("pairs")
+        sensors = _names(entry.get("sensors", list(SENSORS)))
+        if not set(sensors) <= set(SENSORS):
+            raise _Problem(f"sensors: {' and '.join(SENSORS)} are known, got {', '.join(sensors)}")
         return {
             "title": str(entry.get("title") or f"Comparison {number}"),
             "groups": groups,
+            "sensors": sensors,
             "against": against,
             "pairs": {u: ", ".join(self._cell(u, c) for c in _names(pairs)) for u in members} if pairs else None,
             "x": self._x(str(entry["x"]), members, _names(entry.get("by", []))) if "x" in entry else None,

@@ -12,7 +12,6 @@ from collections import Counter
 from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
-from pipeline.records import SENSORS
 from pipeline.report.comparison import Compared, Group, compare, finding, result
 from pipeline.report.comparison_chart import COLOURS, Point, curve, rows
 from pipeline.report.comparison_statistics import LEVEL, Estimate, difference, mean_of
@@ -41,7 +40,7 @@ def section(comparison: JSON, figures: Mapping[str, Mapping[str, SensorFigures]]
         Identifier that is unique on the page.
     """
     sensors = []
-    for sensor in SENSORS:
+    for sensor in comparison["sensors"]:
         groups = [_group(g, sensor, figures) for g in comparison["groups"]]
         compared = {m: c for m in MEASURES if (c := compare(groups, m, comparison["against"], comparison["pairs"]))}
         if compared:
@@ -86,7 +85,7 @@ def _rows(compared: list[Compared], measure: str) -> list[JSON]:
             "floor": number(c.group.mean("noise_floor")) if measure == "after" else NOTHING,
             "ratio": _ratio(c.mean, c.group.mean("noise_floor")) if measure == "after" else NOTHING,
             "time": number(c.group.mean("table_time")),
-            "verdicts": ", ".join(f"{n} {v}" for v, n in Counter(_verdicts(c.group)).items()),
+            "verdicts": [f"{n} {v}" for v, n in Counter(_verdicts(c.group)).items()],
             **_difference(c),
         }
         for c in compared

@@ -88,10 +88,18 @@ def write_campaign(
 
 
 def sheet_rows(description: Description) -> list[dict[str, Any]]:
-    """Return the rows of ``units.csv``: of the units, then the further ones."""
+    """Return the rows of ``units.csv``: of the units, of their variants, then the further ones."""
     named = ("unit", "sensor", "table", "procedure")
-    of_units = [{name: getattr(unit, name) for name in named} | unit.columns for unit in description.units]
-    return of_units + [{str(k): v for k, v in row.items()} for row in description.rows]
+    rows = [{name: getattr(unit, name) for name in named} | unit.columns for unit in description.units]
+    variants = [_variant(row, variant) for variant in description.variants for row in rows]
+    return rows + variants + [{str(k): v for k, v in row.items()} for row in description.rows]
+
+
+def _variant(row: dict[str, Any], variant: dict[str, Any]) -> dict[str, Any]:
+    """Return a unit's row once more, with other columns, from the same recordings."""
+    changed = {**row, **(variant.get("columns") or {}), "unit": f"{row['unit']}{variant['suffix']}"}
+    overrides = [changed.get("overrides"), f"procedure.folder=raw/{row['unit']}"]
+    return {**changed, "overrides": "; ".join(o for o in overrides if o)}
 
 
 def simulate_unit(

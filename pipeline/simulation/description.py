@@ -8,6 +8,8 @@
         table: acutronic             # configs/table
         procedure: three_axis_turns
         ...
+    variants:                        # every unit once more, from the same recordings, with other columns
+      - {suffix: -staged, columns: {method: staged, filter: rc_low_pass}}
     rows: [...]                      # further rows of units.csv, for units whose recordings another one has made
 
 What a unit leaves out is drawn at random from the sensor's data sheet. The keys of a unit are the attributes of
@@ -103,11 +105,12 @@ class UnitDescription:
 
 @dataclass(frozen=True)
 class Description:
-    """A campaign to be simulated: its seed, units, and further rows of ``units.csv``."""
+    """A campaign to be simulated: its seed, units, variants of them, and further rows of ``units.csv``."""
 
     seed: int
     units: tuple[UnitDescription, ...]
     rows: tuple[dict[str, Any], ...] = ()
+    variants: tuple[dict[str, Any], ...] = ()
 
 
 def read_description(path: Path) -> Description:
@@ -126,7 +129,7 @@ def read_description(path: Path) -> Description:
 
 def description_from(data: dict[str, Any], origin: str) -> Description:
     """Return the description that a mapping gives; ``origin`` is named in messages."""
-    _refuse_unknown(data, {"seed", "defaults", "units", "rows"}, origin)
+    _refuse_unknown(data, {"seed", "defaults", "units", "variants", "rows"}, origin)
     known = {f.name for f in fields(UnitDescription)}
     units = []
     for entry in data.get("units") or ():
@@ -138,7 +141,12 @@ def description_from(data: dict[str, Any], origin: str) -> Description:
     names = [u.unit for u in units]
     if not names or len(set(names)) < len(names):
         raise ConfigurationError(f"{origin}: there must be at least one unit, and each needs a name of its own")
-    return Description(int(data.get("seed", 0)), tuple(units), tuple(data.get("rows") or ()))
+    variants = tuple(data.get("variants") or ())
+    for variant in variants:
+        _refuse_unknown(variant, {"suffix", "columns"}, f"{origin}: variants")
+        if not variant.get("suffix"):
+            raise ConfigurationError(f"{origin}: variants: each needs a suffix for the names of its units")
+    return Description(int(data.get("seed", 0)), tuple(units), tuple(data.get("rows") or ()), variants)
 
 
 def read_yaml(path: Path) -> dict[str, Any]:

@@ -119,7 +119,7 @@ def comparison(x: dict[str, object] | None = None) -> dict[str, object]:
         {"name": n, "series": "", "label": n, "units": [f"{n}{i}" for i in range(4)]}
         for n in ("slow", "fast <b>", "gone")
     ]
-    return {"title": "Rates <i>", "groups": groups, "against": "slow", "pairs": None, "x": x}
+    return {"title": "Rates <i>", "groups": groups, "against": "slow", "pairs": None, "x": x, "sensors": ["gyroscope"]}
 
 
 def figures() -> dict[str, dict[str, SensorFigures]]:
@@ -143,7 +143,12 @@ def test_the_page_tells_each_group_with_its_interval_and_its_difference(x: dict[
     (sensor,) = made["sensors"]
     (after,) = sensor["measures"]
     slow, fast = after["rows"]
-    assert (slow["count"], slow["value"], slow["time"], slow["verdicts"]) == ("4", "0.0107", "720", "4 nothing missing")
+    assert (slow["count"], slow["value"], slow["time"], slow["verdicts"]) == (
+        "4",
+        "0.0107",
+        "720",
+        ["4 nothing missing"],
+    )
     logs = {n: np.log([level + 0.0005 * i for i in range(4)]) for n, level in (("slow", 0.010), ("fast", 0.020))}
     theirs = stats.ttest_ind(logs["fast"], logs["slow"], equal_var=False)
     low, high = (100.0 * math.expm1(v) for v in theirs.confidence_interval(0.95))
