@@ -45,7 +45,8 @@ if TYPE_CHECKING:
 DEFAULT_TIME_S = 100.0
 TIMES = (0.25, 0.5, 1.0, 2.0, 4.0)  # of the correlation time that is believed
 TIME_PRIOR = (0.1, 0.2, 0.4, 0.2, 0.1)
-RATIOS = 10.0 ** np.arange(-2.4, 0.85, 0.1)  # standard deviation of the wander over that of a white sample
+RATIOS = np.append(0.0, 10.0 ** np.arange(-2.4, 0.85, 0.1))  # of the wander's standard deviation to a white sample's
+SURE = 9.0  # odds of no wander at all where none is stated; 0 where one is
 NEGLIGIBLE = 1e-6
 AVERAGED_OUT = 1e-3
 SHEET_WIDTH = float(np.log(3.0))
@@ -71,11 +72,19 @@ class Prior:
     time: float = DEFAULT_TIME_S
     width: float = SHEET_WIDTH
 
-    def log_density(self, wander: float) -> float:
-        """Return the logarithm of what is believed of a standard deviation, but for a constant."""
-        if wander <= 0 or self.wander <= 0:
-            return 0.0
-        return -0.5 * min(abs(float(np.log(wander / self.wander))) / self.width, FARTHEST) ** 2
+    def log_belief(self, wander: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the logarithm of what is believed of standard deviations, the first of them 0, but for a constant.
+
+        Where none is stated, that there is none at all is believed ``SURE`` times as much as all others together.
+
+        Parameters
+        ----------
+        wander : (m,) array, unit of the sensor
+        """
+        if self.wander <= 0.0:
+            return np.append(np.log(SURE * (len(wander) - 1)), np.zeros(len(wander) - 1))
+        far = np.abs(np.log(wander[1:] / self.wander)) / self.width
+        return np.append(-np.inf, -0.5 * np.minimum(far, FARTHEST) ** 2)
 
 
 def prior_of(sensor: str, recordings: Sequence[Recording], settings: Mapping[str, Any]) -> Prior:
@@ -120,6 +129,8 @@ class SerialNoise:
         tau of each candidate.
     white_variance : (m, 3) array, square of the unit of the readings
         s^2 of each candidate and channel.
+    belief : (m,) array
+        Logarithm of what was believed of each candidate before the residuals were seen, but for a constant.
     spare : int
         Blocks less parameters.
     correlation : dict of float to (b, b) array
@@ -131,6 +142,7 @@ class SerialNoise:
     ratio: NDArray[np.float64]
     time: NDArray[np.float64]
     white_variance: NDArray[np.float64]
+    belief: NDArray[np.float64]
     spare: int
     correlation: dict[float, NDArray[np.float64]]
 
@@ -207,7 +219,7 @@ def assess_noise(
     Q = _complement(root * (blocks.sums(design) / blocks.count[:, None]), design)
     z = Q.T @ (blocks.sums(residuals) / root)
     white = float(np.sqrt(np.mean(residuals**2)))
-    belief = np.array([prior.log_density(ratio * white) for ratio in RATIOS])
+    belief = prior.log_belief(RATIOS * white)
     correlation = {factor * prior.time: blocks.correlation(factor * prior.time) for factor in TIMES}
     scores, variances = [], []
     for R, believed in zip(correlation.values(), TIME_PRIOR, strict=True):
@@ -222,6 +234,7 @@ def assess_noise(
         np.tile(RATIOS**2, len(TIMES))[kept],
         np.repeat(list(correlation), len(RATIOS))[kept],
         np.concatenate(variances)[kept],
+        (np.tile(belief, len(TIMES)) + np.repeat(np.log(TIME_PRIOR), len(RATIOS)))[kept],
         spare,
         correlation,
     )
@@ -242,14 +255,35 @@ def combine(noise: SerialNoise, covariances: NDArray[np.float64]) -> tuple[NDArr
     degrees_of_freedom : (p,) array
         Of each parameter; infinite where nothing is uncertain.
     """
-    mean = np.tensordot(noise.weight, covariances, 1)
+    return averaged(noise.weight, covariances, noise.spare)
+
+
+def averaged(
+    weight: NDArray[np.float64], covariances: NDArray[np.float64], spare: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Average covariances, and say by how much they differ how many degrees of freedom the average has.
+
+    Parameters
+    ----------
+    weight : (m,) array
+        They sum to 1.
+    covariances : (m, p, p) array
+    spare : float
+        Degrees of freedom of each of them.
+
+    Returns
+    -------
+    covariance : (p, p) array
+    degrees_of_freedom : (p,) array
+    """
+    mean = np.tensordot(weight, covariances, 1)
     variance = np.diagonal(covariances, axis1=1, axis2=2)
     average = np.diag(mean)
     known = average > 0
-    relative = np.where(known, noise.weight @ (variance - average) ** 2 / np.where(known, average, 1.0) ** 2, 0.0)
+    relative = np.where(known, weight @ (variance - average) ** 2 / np.where(known, average, 1.0) ** 2, 0.0)
     grid = 4.0 + 2.0 / np.maximum(relative, 1e-12)
     shrink = np.sqrt((grid - 2.0) / grid)
-    freedom = np.where(known, 1.0 / (1.0 / noise.spare + 1.0 / grid), np.inf)
+    freedom = np.where(known, 1.0 / (1.0 / spare + 1.0 / grid), np.inf)
     return mean * np.outer(shrink, shrink), freedom
 
 

@@ -8,12 +8,11 @@ orientations need not be known. See ``pipeline.estimation.accelerometer.magnitud
 
 A misalignment that the orientations do not determine, as in six positions, is left at zero, and the result says so. On
 a table the errors of the rows are correlated by the bias wander, whose covariance is that of
-``pipeline.estimation.serial_noise``; by hand each rest is independent, its scatter beyond the noise included.
+``pipeline.estimation.serial_noise``; by hand that of ``pipeline.estimation.accelerometer.rest_scatter``.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,12 +27,14 @@ from pipeline.estimation.accelerometer.magnitude import (
     fit_ellipsoid,
 )
 from pipeline.estimation.accelerometer.orientations import orientations_of, without
+from pipeline.estimation.accelerometer.rest_scatter import RestErrors, rest_scatter
 from pipeline.estimation.budget import combined, gravity_contribution, noise_contribution, scatter_contribution
 from pipeline.estimation.least_squares import certified
 from pipeline.estimation.linear_map import LinearMap
 from pipeline.estimation.sample_blocks import make_blocks
 from pipeline.estimation.scaled_columns import estimate_weights, factorise
 from pipeline.estimation.serial_noise import assess_noise, prior_of
+from pipeline.estimation.turns import Factors, table_motion
 from pipeline.records import SensorCalibration, StageResult
 from pipeline.records.calibration import coverage_factor
 
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
 
     from pipeline.estimation.accelerometer.magnitude import Ellipsoid
     from pipeline.estimation.accelerometer.orientations import Orientations
-    from pipeline.estimation.serial_noise import Prior, SerialNoise
+    from pipeline.estimation.serial_noise import Prior
     from pipeline.records import Recording
     from pipeline.records.budget import Contribution
     from pipeline.signal.rests import Rest
@@ -53,6 +54,7 @@ if TYPE_CHECKING:
 
 NAME = "nonlinear_least_squares"
 MISALIGNMENT_UNKNOWN = 0.05  # rad, standard uncertainty above which the rests do not determine a misalignment
+UNKNOWN = 0.05  # g of a bias, relative of a scale factor: beyond it nothing of them is known
 FALSE_ALARM = 1e-3  # probability of calling one of the rests of a sound recording an outlier
 SMALLEST_OUTLIER_G = 1e-6
 FEWEST_TO_JUDGE = 18  # rests, two a parameter
@@ -90,7 +92,7 @@ def fit(
     while refused := _outlier(orientations, found):
         orientations = without(orientations, refused)
         found = _fit_determined(orientations, gravity_g)
-    scatter = _scatter(orientations, found, prior_of("accelerometer", recordings, settings))
+    scatter = _scatter(orientations, found, prior_of("accelerometer", recordings, settings), settings["table"])
     result = StageResult(
         name=NAME,
         parameters=_parameters(found, scatter.covariance),
@@ -146,8 +148,21 @@ def _fit_determined(orientations: Orientations, gravity_g: float) -> Ellipsoid:
             continue
         uncertainty = np.where(MISALIGNMENT, found.standard_uncertainty, 0.0)
         if np.max(uncertainty) <= MISALIGNMENT_UNKNOWN:
-            return found
+            return _require_determined(found, orientations)
         free = free & (np.arange(9) != np.argmax(uncertainty))
+
+
+def _require_determined(found: Ellipsoid, orientations: Orientations) -> Ellipsoid:
+    """Refuse a bias or scale factor that the orientations leave as open as no sensor is."""
+    u = np.where(MISALIGNMENT, 0.0, found.standard_uncertainty)
+    weak = [name for name, one in zip(NAMES, u, strict=True) if one > UNKNOWN]
+    if weak:
+        raise NotObservableError(
+            f"the {len(orientations.mean)} orientations are nearly degenerate: they leave {', '.join(weak)} open to "
+            f"{float(u.max()):.2g} (standard uncertainty; condition {found.fit.condition:.1e} in scaled columns). "
+            "Record rests with each axis up, down and level, spread evenly, not all in one plane or direction"
+        )
+    return found
 
 
 def _left(orientations: Orientations) -> str:
@@ -179,29 +194,47 @@ def _outlier(orientations: Orientations, found: Ellipsoid) -> dict[int, str]:
     }
 
 
-def _scatter(orientations: Orientations, found: Ellipsoid, prior: Prior) -> Contribution:
+def _scatter(orientations: Orientations, found: Ellipsoid, prior: Prior, table: Mapping[str, Any]) -> Contribution:
     """Return what the readings' scatter contributes to b and L."""
     spare = found.fit.degrees_of_freedom
     if not orientations.by_hand and spare > 1:
-        return _serial_scatter(orientations, found, prior)
+        return _serial_scatter(orientations, found, prior, table)
+    place = np.eye(9)[:, found.free]
     J = derivative_of(orientations.mean, found.values)[:, found.free]
-    gain = np.eye(9)[:, found.free] @ estimate_weights(J, found.weight)
+    gain = estimate_weights(J, found.weight)
+    if spare > 1 and orientations.rests:
+        return rest_scatter(_errors(orientations, found, J), gain, prior).placed(place)
+    # Too few rests to show a scatter of their own: what is believed of the bias wander stands in.
     white = gain * orientations.variance @ gain.T
-    if found.between > 0.0:
-        covariance, freedom = gain @ np.diag(orientations.variance + found.between**2) @ gain.T, float(spare)
-        rest = "scatter of the rests"
-    else:  # the rests show no scatter of their own, or are too few to: what is believed of the bias wander stands in
-        covariance = gain * (orientations.variance + prior.wander**2) @ gain.T
-        freedom = float(3 * np.sum(orientations.count - 1))
-        rest = "bias wander"
-    parts = {"white noise": np.diag(white), rest: np.diag(covariance - white)}
-    return scatter_contribution(
-        covariance, freedom, {name: np.sqrt(np.clip(v, 0.0, None)) for name, v in parts.items()}
+    covariance = gain * (orientations.variance + prior.wander**2) @ gain.T
+    parts = {"white noise": np.sqrt(np.diag(white)), "bias wander": np.sqrt(np.diag(covariance - white))}
+    freedom = float(3 * np.sum(orientations.count - 1))
+    return scatter_contribution(covariance, freedom, parts).placed(place)
+
+
+def _errors(orientations: Orientations, found: Ellipsoid, J: Values) -> RestErrors:
+    """Return the errors of hand-held rests, with their times."""
+    truth = (orientations.mean - found.bias) @ found.matrix.T
+    edges = [(r.time[rest.start], r.time[rest.stop - 1] + r.interval) for r, rest in orientations.rests]
+    start, stop = np.array(edges).T
+    own = np.array([id(recording) for recording, _ in orientations.rests])
+    shared = all(recording.clock_shared for recording, _ in orientations.rests)
+    return RestErrors(
+        error=found.error,
+        derivative=J,
+        along=truth / np.linalg.norm(truth, axis=1, keepdims=True) @ found.matrix,
+        variance=orientations.variance,
+        between=found.between,
+        start=start,
+        length=stop - start,
+        joined=np.full((len(own), len(own)), shared) | (own[:, None] == own),
     )
 
 
-def _serial_scatter(orientations: Orientations, found: Ellipsoid, prior: Prior) -> Contribution:
-    """Return the scatter under white noise and bias wander, as the samples' own errors tell them.
+def _serial_scatter(
+    orientations: Orientations, found: Ellipsoid, prior: Prior, table: Mapping[str, Any]
+) -> Contribution:
+    """Return the scatter under white noise and bias wander, as the residuals of ``y = b + K u`` on the table tell it.
 
     The error of a sample is its noise along the direction of gravity, ``n^T L noise``, so that the estimate is linear
     in the readings of each channel c with the weights ``J^+ (n^T L)_c``.
@@ -210,29 +243,19 @@ def _serial_scatter(orientations: Orientations, found: Ellipsoid, prior: Prior) 
     truth = (y - found.bias) @ L.T
     along = (truth / np.linalg.norm(truth, axis=1, keepdims=True)) @ L
     J = derivative_of(y, found.values)[:, found.free]
-    error = found.error[row] + np.einsum("ij,ij->i", along[row], orientations.reading() - y[row])
-    noise = assess_noise(np.repeat(error[:, None], 3, axis=1), J[row], make_blocks(orientations.parts), prior)
-    noise = _counted_once(noise, prior, float(np.sqrt(np.mean(error**2))))
+    u = np.concatenate([_force(recording, table)[keep] for recording, keep in orientations.parts])
+    X, reading = np.column_stack([np.ones(len(u)), u]), orientations.reading()
+    noise = assess_noise(reading - X @ Factors.of(X).solve(reading), X, make_blocks(orientations.parts), prior)
     per_sample = (estimate_weights(J, found.weight) / orientations.count)[:, row]
-    x, y, z = (per_sample * along[row, c] for c in range(3))
+    weights_x, weights_y, weights_z = (per_sample * along[row, c] for c in range(3))
     place = np.eye(9)[:, found.free]
-    return noise_contribution(noise, LinearMap((x, y, z), (place, place, place)), prior)
+    return noise_contribution(noise, LinearMap((weights_x, weights_y, weights_z), (place, place, place)), prior)
 
 
-def _counted_once(noise: SerialNoise, prior: Prior, white: float) -> SerialNoise:
-    """Return the noise with the likelihood of one channel, where three channels were the same error.
-
-    The weight of a candidate is ``likelihood^3 x prior x spacing of the grid``.
-    """
-    ratio = np.sqrt(noise.ratio)
-    other = np.array([prior.log_density(r * white) for r in ratio])
-    for time in np.unique(noise.time):
-        group = noise.time == time
-        if group.sum() > 1:
-            other[group] += np.log(np.gradient(np.log(ratio[group])))
-    once = (np.log(noise.weight) - other) / 3.0 + other
-    weight = np.exp(once - once.max())
-    return replace(noise, weight=weight / weight.sum())
+def _force(recording: Recording, table: Mapping[str, Any]) -> Values:
+    motion = table_motion(recording, table)
+    assert motion is not None  # noqa: S101
+    return motion.specific_force
 
 
 def _parameters(found: Ellipsoid, covariance: Values) -> dict[str, dict[str, Any]]:

@@ -17,7 +17,6 @@ import numpy as np
 from pipeline.errors import ConfigurationError
 from pipeline.estimation.accelerometer.chain import follow
 from pipeline.estimation.accelerometer.extremes import (
-    OTHERS,
     Extremes,
     extremes_of_samples,
     extremes_of_sinusoids,
@@ -32,7 +31,7 @@ from pipeline.estimation.linear_map import LinearMap
 from pipeline.estimation.sample_blocks import make_blocks
 from pipeline.estimation.serial_noise import assess_noise, prior_of
 from pipeline.estimation.table_inputs import Reference
-from pipeline.estimation.turns import parts_of
+from pipeline.estimation.turns import Factors, parts_of
 from pipeline.model.effects.scale_factor_asymmetry import EFFECT
 from pipeline.records import FittedEffect, SensorCalibration, StageResult
 
@@ -81,7 +80,7 @@ def fit_stage(
     turns = turns_of(parts_of(recordings, "accelerometer", settings["table"], "the staged method"))
     sinusoids = sinusoids_of(turns)
     prior = prior_of("accelerometer", recordings, settings)
-    noise = _noise(turns, sinusoids, prior)
+    noise = _noise(turns, prior)
 
     def run(extremes: Extremes) -> Chain:
         return follow(extremes, names, gravity_g, as_printed=as_printed)
@@ -169,17 +168,16 @@ def _coefficients(sinusoids: Sequence[Sequence[Sinusoid]]) -> list[list[NDArray[
     return [[sinusoid.coefficients for sinusoid in turn] for turn in sinusoids]
 
 
-def _noise(turns: Sequence[Turn], sinusoids: Sequence[Sequence[Sinusoid]], prior: Prior) -> SerialNoise:
-    residuals = np.concatenate([np.column_stack([s.residuals for s in turn]) for turn in sinusoids])
-    design = _side_by_side([_columns(turn, axis) for axis, turn in enumerate(sinusoids)])
+def _noise(turns: Sequence[Turn], prior: Prior) -> SerialNoise:
+    """Return what all turns together say of the noise: the residuals of ``y = b + K u + C |u|``.
+
+    A sinusoid of its own for each turn and channel would take up the wander from turn to turn.
+    """
+    u = np.concatenate([motion.specific_force for turn in turns for motion in turn.motions])
+    reading = np.concatenate([turn.reading for turn in turns])
+    X = np.column_stack([np.ones(len(u)), u, np.abs(u)])
     blocks = make_blocks([used for turn in turns for used in turn.used])
-    return assess_noise(residuals, design, blocks, prior)
-
-
-def _columns(fits: Sequence[Sinusoid], axis: int) -> NDArray[np.float64]:
-    """Return the columns of all channels in a turn, each once."""
-    first, second = OTHERS[axis]
-    return np.column_stack([fits[first].columns, fits[second].columns[:, 3]])
+    return assess_noise(reading - X @ Factors.of(X).solve(reading), X, blocks, prior)
 
 
 def _side_by_side(matrices: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:

@@ -14,7 +14,7 @@ from pipeline.estimation.accelerometer.nonlinear_least_squares import fit
 from pipeline.estimation.correction import apply_correction
 from pipeline.estimation.rest_means import held_out_rests, rest_means
 from pipeline.records import Recording, SensorCalibration, StageResult
-from pipeline.records.calibration import coverage_factor
+from pipeline.records.calibration import coverage_factor, coverage_factors
 
 DATA = Path(__file__).parents[3] / "../shared/data"
 needs_data = pytest.mark.skipif(not DATA.exists(), reason="reference data not beside the repository")
@@ -140,8 +140,8 @@ def test_the_truth_lies_within_the_expanded_uncertainty_in_its_share_of_hand_hel
     for seed in range(25):
         recording = _by_hand(_spread(24), np.random.default_rng(seed), between=between)
         calibration = fit([recording], None, settings)
-        factor = coverage_factor(calibration.degrees_of_freedom)
-        inside.append(np.abs(_vector(calibration) - TRUTH) < factor * _uncertainty(calibration))
+        factors = coverage_factors(calibration.freedom[FITTED])
+        inside.append(np.abs(_vector(calibration) - TRUTH) < factors * _uncertainty(calibration))
     assert 0.90 < np.mean(inside) < 0.99
 
 

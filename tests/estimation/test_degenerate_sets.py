@@ -1,0 +1,73 @@
+"""Sets of rests that do not determine an accelerometer are refused with the reason, not answered."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline.errors import NotObservableError
+from pipeline.estimation.accelerometer.nonlinear_least_squares import fit
+from pipeline.records import Recording
+
+SETTINGS = {
+    "table": {"gravity_g": 1.0},
+    "procedure": {"holdout_every": 0},
+    "sensor": {"accelerometer": {"bias_wander": 1e-4, "wander_time_s": 100.0}},
+    "method": {"as_printed": False},
+}
+BIAS = np.array([0.05, -0.03, 0.12])
+
+
+def at_rest_in(directions: np.ndarray, seed: int = 1, noise: float = 1e-3) -> list[Recording]:
+    """Rests of 4 s with shaken moves of 1.2 s between them, at 25 Hz."""
+    rng, force = np.random.default_rng(seed), []
+    for k, direction in enumerate(directions):
+        following = directions[min(k + 1, len(directions) - 1)]
+        blend = np.linspace(0.0, 1.0, 30)[:, None]
+        shake = 0.15 * np.sin(np.arange(30))[:, None]
+        force += [np.tile(direction, (100, 1)), direction * (1 - blend) + following * blend + shake]
+    truth = np.concatenate(force)
+    reading = BIAS + truth + noise * rng.standard_normal(truth.shape)
+    return [Recording("recording", "rests", None, np.arange(len(truth)) * 40_000_000, accelerometer=reading)]
+
+
+def in_a_plane(count: int = 16, out_of_it: float = 0.0) -> np.ndarray:
+    """Directions across x, some of them so many deg out of the plane, to either side."""
+    turn = 2.0 * np.pi * np.arange(count) / count
+    lean = np.radians(out_of_it) * np.resize([1.0, -1.0, 0.0], count)
+    across = np.cos(lean)[:, None] * np.column_stack([0 * turn, np.cos(turn), np.sin(turn)])
+    return across + np.outer(np.sin(lean), [1.0, 0.0, 0.0])
+
+
+def test_rests_that_all_lie_in_one_plane_leave_the_axis_across_it_open() -> None:
+    with pytest.raises(NotObservableError, match=r"bias_x|scale_factor_x") as refused:
+        fit(at_rest_in(in_a_plane()), None, SETTINGS)
+    assert "each axis up, down and level" in str(refused.value)
+
+
+@pytest.mark.parametrize("lean", [0.5, 2.0])
+def test_rests_that_nearly_lie_in_one_plane_are_refused_too(lean: float) -> None:
+    with pytest.raises(NotObservableError, match=r"scale_factor_x"):
+        fit(at_rest_in(in_a_plane(out_of_it=lean)), None, SETTINGS)
+
+
+def test_rests_well_out_of_the_plane_are_answered_within_their_uncertainty() -> None:
+    found = fit(at_rest_in(in_a_plane(24, out_of_it=50.0)), None, SETTINGS)
+    assert np.all(np.abs(found.bias - BIAS) < 4.0 * np.sqrt(np.diag(found.covariance)[:3]))
+    assert found.convergence["rank"] == found.convergence["parameters"]
+    assert 1.0 < found.convergence["condition"] < 100.0
+    assert found.convergence["cosine"] <= found.convergence["cosine_at_minimum"]
+
+
+def test_rests_in_one_direction_alone_are_refused() -> None:
+    up = np.tile([0.0, 0.0, 1.0], (12, 1))
+    with pytest.raises(NotObservableError, match=r"alike|degenerate|determine neither"):
+        fit(at_rest_in(up), None, SETTINGS)
+
+
+def test_a_recording_without_a_rest_says_so() -> None:
+    time = np.arange(3000) * 0.04
+    wave = np.column_stack([np.sin(3.1 * time), np.cos(2.3 * time), np.sin(1.7 * time + 1.0)])
+    moving = Recording("recording", "rests", None, np.arange(3000) * 40_000_000, accelerometer=wave)
+    with pytest.raises(NotObservableError, match="0 orientations determine neither bias nor scale factors"):
+        fit([moving], None, SETTINGS)
