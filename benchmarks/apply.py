@@ -212,15 +212,47 @@ def measure(way: str, log: Path, out: Path, calibration: Path) -> dict[str, floa
     return found
 
 
+C_LOOP = """
+#include <stdio.h>
+#include <time.h>
+#include "calibration.h"
+int main(void) {
+    imu_state state = {0};
+    imu_real f[3], w[3], rf[3] = {0.1, 0.2, 1.0}, rw[3] = {10, 20, 30}, sum = 0;
+    const clock_t start = clock();
+    int i;
+    for (i = 0; i < 1000000; ++i) {
+        rw[0] = i % 100;
+        imu_update(&state, rf, rw, 30, 1e-3 * i, f, w);
+        sum += f[0] + w[0];
+    }
+    printf("%g %g\\n", (double)(clock() - start) / CLOCKS_PER_SEC, (double)sum);
+    return 0;
+}
+"""
+
+
+def in_c(folder: Path, real: str) -> float:
+    """Return the CPU time of a sample in C, us."""
+    (folder / "loop.c").write_text(C_LOOP)
+    command = ["cc", "-std=c99", "-O2", f"-DIMU_REAL={real}", "loop.c", "-o", "loop", "-lm"]
+    subprocess.run(command, cwd=folder, check=True)
+    return float(subprocess.run([folder / "loop"], capture_output=True, text=True, check=True).stdout.split()[0])
+
+
 def samples_by_themselves(folder: Path, count: int = 3000) -> None:
-    """Time a sample by itself."""
+    """Time a sample by itself, in an array, and in C."""
+    from pipeline.exports.c_header import export  # noqa: PLC0415
     from pipeline.model.compensation import load  # noqa: PLC0415
 
     generator = np.random.default_rng(0)
     force, rate = generator.normal(0, 1, (count, 3)), generator.normal(0, 50, (count, 3))
     clock, warmth = 1e-3 * np.arange(count), 25 + 1e-3 * np.arange(count)
+    many = [np.tile(force, (100, 1)), np.tile(rate, (100, 1)), np.tile(warmth, 100), 1e-3 * np.arange(100 * count)]
+    print("CPU us a sample: by itself, in an array, in C (double, float)")
     for name, effects in EFFECTS.items():
         write_calibration(folder / "U1.json", effects)
+        (folder / "calibration.h").write_text(export(json.loads((folder / "U1.json").read_text()), {}, None))
         compensation = load(folder / "U1.json")
         stream = compensation.stream()
         start = time.process_time()
@@ -228,10 +260,10 @@ def samples_by_themselves(folder: Path, count: int = 3000) -> None:
             stream.apply(force[i], rate[i], warmth[i], clock[i])
         single = time.process_time() - start
         start = time.process_time()
-        many = [np.tile(force, (100, 1)), np.tile(rate, (100, 1)), np.tile(warmth, 100), 1e-3 * np.arange(100 * count)]
         compensation.apply(*many)
         whole = time.process_time() - start
-        print(f"{name:12} {1e6 * single / count:7.1f} us by itself, {1e4 * whole / count:7.3f} us in an array")
+        c = ", ".join(f"{in_c(folder, real):.3f}" for real in ("double", "float"))
+        print(f"{name:12} {1e6 * single / count:7.1f}, {1e4 * whole / count:.3f}, {c}")
 
 
 def main() -> None:

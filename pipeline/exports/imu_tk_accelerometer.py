@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.exports.sensors import STANDARD_GRAVITY, calibrations, comment, final_errors, left_out
+from pipeline.exports.sensors import STANDARD_GRAVITY, axes_of_readings, calibrations, comment, final_errors, left_out
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -27,17 +27,20 @@ def export(calibration: dict[str, Any], settings: dict[str, Any], validation: di
     """Return the file's text, None where the accelerometer is not calibrated."""
     del settings
     found = calibrations(calibration).get("accelerometer")
-    return None if found is None else triad(calibration["unit"], found, STANDARD_GRAVITY, validation)
+    return None if found is None else triad(calibration, found, STANDARD_GRAVITY, validation)
 
 
-def triad(unit: str, calibration: SensorCalibration, factor: float, validation: dict[str, Any] | None) -> str:
+def triad(
+    document: dict[str, Any], calibration: SensorCalibration, factor: float, validation: dict[str, Any] | None
+) -> str:
     """Return T, K and B of one sensor, its bias times ``factor``, and remarks behind them."""
     sensor = calibration.sensor
     scale = np.diag(calibration.matrix)
     remarks = [
-        f"Unit {unit}, {sensor}: T (misalignment), K (scale factors), B (bias); x = T K (raw - B).",
+        f"Unit {document['unit']}, {sensor}: T (misalignment), K (scale factors), B (bias); x = T K (raw - B).",
         f"raw and x in {'m/s^2' if sensor == 'accelerometer' else 'rad/s'}, body frame x y z; T is not triangular.",
         "At rest the upward axis of the accelerometer reads + local gravity.",
+        *axes_of_readings(document),
         *left_out({sensor: calibration}),
         *(f"The {line}." for line in final_errors(validation) if sensor in line),
     ]

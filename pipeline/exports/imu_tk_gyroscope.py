@@ -16,4 +16,4 @@ def export(calibration: dict[str, Any], settings: dict[str, Any], validation: di
     """Return the file's text, None where the gyroscope is not calibrated."""
     del settings
     found = calibrations(calibration).get("gyroscope")
-    return None if found is None else triad(calibration["unit"], found, float(np.pi / 180.0), validation)
+    return None if found is None else triad(calibration, found, float(np.pi / 180.0), validation)

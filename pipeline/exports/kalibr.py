@@ -1,4 +1,4 @@
-"""Kalibr's IMU result (``imu0``), which OpenVINS reads too.
+"""Kalibr's IMU result (``imu0``).
 
     a_meas = M_a f_i + b_a,   w_meas = M_g C w_i + A C f_i + b_w
 
@@ -19,6 +19,7 @@ import numpy as np
 
 from pipeline.exports.sensors import (
     STANDARD_GRAVITY,
+    axes_of_readings,
     calibrations,
     comment,
     final_errors,
@@ -36,8 +37,7 @@ FILE_NAME = "kalibr.yaml"
 HEADER = """\
 Kalibr IMU result. Units: m/s^2, rad/s, s. Each M says measurement = M * truth + b: take off b, then apply the inverse.
 Frame i is the one that Kalibr ties to the accelerometer; T_i_b takes body vectors (the table's axes) to it.
-OpenVINS: Ta = accelerometers.M, Tw = gyroscopes.M, R_IMUtoGYRO = gyroscopes.C_gyro_i, R_IMUtoACC = identity,
-Tg = gyroscopes.A @ C_gyro_i.
+OpenVINS reads the same under other names: kalibr_imu_chain.yaml beside this file.
 Noise densities and random walks are those of the sensor's configuration; the walks stand for a bias that wanders.
 Set rostopic to your driver's; b is not read by Kalibr, subtract it yourself or let the filter find it.
 """
@@ -45,25 +45,41 @@ Set rostopic to your driver's; b is not read by Kalibr, subtract it yourself or 
 
 def export(calibration: dict[str, Any], settings: dict[str, Any], validation: dict[str, Any] | None) -> str:
     """Return the YAML text."""
+    remarks = [f"Unit {calibration['unit']}.", *HEADER.splitlines()]
+    remarks += [*axes_of_readings(calibration), *missing(calibration)]
+    remarks += [*left_out(calibrations(calibration), ("g_sensitivity",)), *final_errors(validation)]
+    return comment(remarks) + yaml_text({"imu0": entry(calibration, settings)})
+
+
+def entry(calibration: dict[str, Any], settings: dict[str, Any]) -> dict[str, Any]:
+    """Return what stands under ``imu0``."""
     found = calibrations(calibration)
-    remarks = [f"Unit {calibration['unit']}.", *HEADER.splitlines(), *missing(calibration)]
-    entry: dict[str, Any] = {"rostopic": "/imu0", "update_rate": _rate(calibration), "model": "scale-misalignment"}
-    for sensor, unit in (("accelerometer", STANDARD_GRAVITY), ("gyroscope", np.pi / 180.0)):
-        sheet = settings["sensor"][sensor]
-        entry[f"{sensor}_noise_density"] = float(sheet["noise_density"] * unit)
-        walk = sheet["bias_wander"] * np.sqrt(2.0 / sheet["wander_time_s"])
-        entry[f"{sensor}_random_walk"] = float(walk * unit)
+    imu: dict[str, Any] = {
+        "rostopic": "/imu0",
+        "update_rate": sampling_rate(calibration),
+        "model": "scale-misalignment",
+    }
+    imu |= noise(settings)
     rotation = np.eye(3)
     if "accelerometer" in found:
         lower, rotation = lower_times_rotation(forward(found["accelerometer"]))
         bias = found["accelerometer"].bias * STANDARD_GRAVITY
-        entry["accelerometers"] = {"M": lower.tolist(), "b": bias.tolist()}
+        imu["accelerometers"] = {"M": lower.tolist(), "b": bias.tolist()}
     if "gyroscope" in found:
-        entry["gyroscopes"] = _gyroscope(found["gyroscope"], rotation)
-    entry["T_i_b"] = np.block([[rotation, np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]]).tolist()
-    entry["time_offset"] = 0.0
-    remarks += [*left_out(found, ("g_sensitivity",)), *final_errors(validation)]
-    return comment(remarks) + yaml_text({"imu0": entry})
+        imu["gyroscopes"] = _gyroscope(found["gyroscope"], rotation)
+    imu["T_i_b"] = np.block([[rotation, np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]]).tolist()
+    imu["time_offset"] = 0.0
+    return imu
+
+
+def noise(settings: dict[str, Any]) -> dict[str, float]:
+    """Return Kalibr's four noise parameters, from the sensor's configuration: m/s^2, rad/s and their densities."""
+    found = {}
+    for sensor, unit in (("accelerometer", STANDARD_GRAVITY), ("gyroscope", np.pi / 180.0)):
+        sheet = settings["sensor"][sensor]
+        found[f"{sensor}_noise_density"] = float(sheet["noise_density"] * unit)
+        found[f"{sensor}_random_walk"] = float(sheet["bias_wander"] * np.sqrt(2.0 / sheet["wander_time_s"]) * unit)
+    return found
 
 
 def lower_times_rotation(K: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -81,6 +97,7 @@ def _gyroscope(calibration: Any, rotation: NDArray[np.float64]) -> dict[str, Any
     return {"M": lower.tolist(), "C_gyro_i": turn.tolist(), "A": A.tolist(), "b": bias.tolist()}
 
 
-def _rate(calibration: dict[str, Any]) -> float:
+def sampling_rate(calibration: dict[str, Any]) -> float:
+    """Return the sampling rate of the unit's recordings, Hz; 0 where none is known."""
     rates = [i["rate_hz"] for i in calibration.get("inputs", []) if i.get("rate_hz")]
     return float(rates[0]) if rates else 0.0

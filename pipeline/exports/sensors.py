@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 STANDARD_GRAVITY = 9.80665  # m/s^2
+OF_THE_BIAS = ("bias_temperature", "bias_temperature_quadratic")
+TEMPERATURES = (-40.0, 85.0)  # degC, the widest that parts of this kind are made for
 STRAIGHT = ["+x", "+y", "+z"]
 
 
@@ -63,6 +65,16 @@ def left_out(found: dict[str, SensorCalibration], carried: tuple[str, ...] = ())
     return lines
 
 
+def bias_polynomial(calibration: SensorCalibration) -> NDArray[np.float64]:
+    """Return the bias and how it changes per degC and per degC^2 from 25 degC: (3, 3) array, a row an axis."""
+    effects = sensor_effects(calibration)
+    found = np.zeros((3, 3))
+    found[:, 0] = calibration.bias
+    found[:, 1] += effects.get("bias_temperature", np.zeros(3))
+    found[:, 1:] += effects.get("bias_temperature_quadratic", np.zeros(6)).reshape(3, 2)
+    return found
+
+
 def diagonal(calibration: SensorCalibration) -> tuple[NDArray[np.float64], float]:
     """Return the scale factors that stand best for the whole matrix, and the relative error that they leave.
 
@@ -84,7 +96,9 @@ def diagonal(calibration: SensorCalibration) -> tuple[NDArray[np.float64], float
     return np.diag(K) / length, float(np.sqrt(np.sum(1.0 - np.diag(K) ** 2 / length) / 3.0))
 
 
-def axis_by_axis(document: dict[str, Any]) -> tuple[dict[str, NDArray[np.float64]], list[str]]:
+def axis_by_axis(
+    document: dict[str, Any], carried: tuple[str, ...] = ()
+) -> tuple[dict[str, NDArray[np.float64]], list[str]]:
     """Return what ``(raw - offset) * scale`` on each axis can hold, and remarks on what it cannot.
 
     Returns
@@ -95,7 +109,7 @@ def axis_by_axis(document: dict[str, Any]) -> tuple[dict[str, NDArray[np.float64
     """
     found = calibrations(document)
     values: dict[str, NDArray[np.float64]] = {}
-    remarks = [*(f"Left out: {line}." for line in missing(document)), *left_out(found)]
+    remarks = [*(f"Left out: {line}." for line in missing(document)), *left_out(found, carried)]
     if "accelerometer" in found:
         c = found["accelerometer"]
         scale, error = diagonal(c)

@@ -214,7 +214,7 @@ def _rows_only(data: bytes, settings: CsvFormat) -> bytes:
         mark = settings.comment.encode()
         data = b"".join(part for part in data.splitlines(keepends=True) if not part.lstrip().startswith(mark))
     if settings.delimiter == WHITESPACE:
-        data = single_blanks(data.replace(b"\r\n", b"\n"))
+        data = single_blanks(data.replace(b"\r\n", b"\n").rstrip(b"\n") + b"\n")
     return data
 
 

@@ -4,23 +4,27 @@ import csv
 import json
 import subprocess
 import sys
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 
 from pipeline.commands.apply import main
-from pipeline.errors import ConvergenceError, InputError, MissingInputError
+from pipeline.errors import ConfigurationError, ConvergenceError, InputError, MissingInputError
 from pipeline.field_logs.csv_log import compensate_csv
+from pipeline.field_logs.profile import LogProfile
 from pipeline.model.compensation import load
 from pipeline.records import FittedEffect, SensorCalibration
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
 HEADER = (
     "time_s,accel_x_g,accel_y_g,accel_z_g,remark,gyro_x_dps,gyro_y_dps,gyro_z_dps,temperature_degc,table_rate_dps,count"
 )
+
+VALUES = [*(f"accel_{a}_g" for a in "xyz"), *(f"gyro_{a}_dps" for a in "xyz")]
 
 
 def effect(name: str, **values: float) -> FittedEffect:
@@ -211,3 +215,135 @@ def test_a_user_error_is_one_line_and_exit_code_2(calibration: Path, log: Path) 
     run = subprocess.run(command, capture_output=True, text=True, check=False)
     assert run.returncode == 2
     assert len(run.stderr.splitlines()) == 1
+
+
+def with_profile(calibration: Path, csv_section: dict[str, Any], axis_map: Sequence[str] = ("+x", "+y", "+z")) -> Path:
+    """State in a calibration how the unit's logs are laid out, as a run does."""
+    data = json.loads(calibration.read_text(encoding="utf-8"))
+    log = {"ingest": {"csv": csv_section, "mcap": {}}, "axis_map": list(axis_map)}
+    for sensor in ("accelerometer", "gyroscope"):
+        data[sensor]["effects"] = []
+        data[sensor]["covariance"] = {"parameters": [], "values": []}
+    calibration.write_text(json.dumps({**data, "sensor": "mpu6050", "log": log}), encoding="utf-8")
+    return calibration
+
+
+def counts_profile(**more: Any) -> dict[str, Any]:
+    scales = {"accel": ("a", 16384.0), "gyro": ("g", 131.0)}
+    columns: dict[str, Any] = {"time": {"column": "time_ms", "unit": "ms"}}
+    for name, (letter, scale) in scales.items():
+        for a in "xyz":
+            columns[f"{name}_{a}"] = {
+                "column": f"{letter}{a}",
+                "unit": "counts",
+                "counts_per_unit": scale,
+                "offset": 5.0,
+            }
+    return {"columns": columns, **more}
+
+
+def raw_counts(n: int = 50) -> np.ndarray:
+    return np.random.default_rng(1).integers(-20_000, 20_000, (n, 6))
+
+
+def expected_of_counts(calibration: Path, counts: np.ndarray) -> np.ndarray:
+    found = load(calibration).apply((counts[:, :3] - 5) / 16384.0, (counts[:, 3:] - 5) / 131.0)
+    return np.column_stack([found.accelerometer, found.gyroscope])
+
+
+def test_raw_counts_are_read_as_the_units_recordings_were(calibration: Path, tmp_path: Path) -> None:
+    with_profile(calibration, counts_profile())
+    counts = raw_counts()
+    rows = [f"{10 * i},{','.join(map(str, row))},note {i}" for i, row in enumerate(counts.tolist())]
+    (tmp_path / "log.csv").write_text("time_ms,ax,ay,az,gx,gy,gz,remark\n" + "\n".join(rows) + "\n")
+    main(["--calibration", str(calibration), str(tmp_path / "log.csv"), "-o", str(tmp_path / "out.csv")])
+    after = columns(tmp_path / "out.csv")
+    assert list(after) == ["time_ms", *VALUES, "remark"]
+    found = np.array([after[name] for name in VALUES], float).T
+    np.testing.assert_allclose(found, expected_of_counts(calibration, counts), atol=1e-12, rtol=1e-13)
+    assert after["time_ms"][7] == "70"
+    assert after["remark"][7] == "note 7"
+
+
+def test_another_profile_is_named_on_the_command_line(calibration: Path, log: Path, tmp_path: Path) -> None:
+    with_profile(calibration, counts_profile())
+    arguments = ["--calibration", str(calibration), str(log), "-o", str(tmp_path / "out.csv")]
+    with pytest.raises(InputError, match=r"expected ax, ay, .*--ingest"):
+        main(arguments)
+    main([*arguments, "--ingest", "canonical_csv"])
+    before = columns(log)
+    expected = load(calibration).apply(vectors(before, "accelerometer"), vectors(before, "gyroscope"))
+    found = columns(tmp_path / "out.csv")
+    assert vectors(found, "accelerometer") == pytest.approx(expected.accelerometer, abs=2e-12)
+    with pytest.raises(ConfigurationError, match="no such ingest"):
+        main([*arguments, "--ingest", "phase_of_the_moon"])
+
+
+@pytest.mark.parametrize("block_bytes", [97, 1 << 20])
+def test_a_log_of_other_dress_keeps_it(calibration: Path, tmp_path: Path, block_bytes: int) -> None:
+    dress = {"delimiter": ";", "decimal": ",", "comment": "#", "skip_lines": 1}
+    profile = LogProfile({"csv": counts_profile(**dress)})
+    with_profile(calibration, counts_profile(**dress))
+    counts = raw_counts()
+    rows = [f"{10 * i},5;{';'.join(f'{v},0' for v in row)}" for i, row in enumerate(counts.tolist())]
+    rows.insert(20, "# a pause")
+    text = "Fs;100\n# made by hand\ntime_ms;ax;ay;az;gx;gy;gz\n" + "\n".join(rows) + "\n"
+    (tmp_path / "log.txt").write_text(text)
+    compensate_csv(load(calibration), tmp_path / "log.txt", tmp_path / "out.txt", profile, block_bytes=block_bytes)
+    lines = (tmp_path / "out.txt").read_text().splitlines()
+    assert lines[:3] == ["Fs;100", "# made by hand", ";".join(["time_ms", *VALUES])]
+    cells = [line.replace(",", ".").split(";") for line in lines[3:]]
+    np.testing.assert_allclose(
+        np.array(cells, float)[:, 1:], expected_of_counts(calibration, counts), atol=1e-12, rtol=1e-13
+    )
+    bad = text.replace("70,5;", "70,5;x", 1)
+    (tmp_path / "log.txt").write_text(bad)
+    line = 1 + next(i for i, row in enumerate(bad.splitlines()) if "x" in row and row.startswith("70"))
+    with pytest.raises(InputError, match=rf"log\.txt:{line}: ax is"):
+        compensate_csv(load(calibration), tmp_path / "log.txt", tmp_path / "out.txt", profile, block_bytes=block_bytes)
+
+
+def test_blanks_between_columns_without_names_and_a_rate_for_the_time(calibration: Path, tmp_path: Path) -> None:
+    data = json.loads(calibration.read_text(encoding="utf-8"))
+    channels = [f"{s}_{a}" for s in ("accel", "gyro") for a in "xyz"]
+    units = ["g"] * 3 + ["deg/s"] * 3
+    places = {c: {"column": i, "unit": u} for i, (c, u) in enumerate(zip(channels, units, strict=True))}
+    places["temperature"] = {"column": 6, "unit": "degC"}
+    profile = LogProfile({"csv": {"header": False, "delimiter": "whitespace", "rate_hz": 50.0, "columns": places}})
+    values = np.round(np.random.default_rng(3).normal(0, 1, (40, 7)), 4)
+    text = "\n".join("  ".join(f"{v}" for v in row) + " " for row in values.tolist())
+    (tmp_path / "log.txt").write_text(text)
+    assert "effects" in data["gyroscope"]
+    compensate_csv(load(calibration), tmp_path / "log.txt", tmp_path / "out.txt", profile)
+    found = np.loadtxt(tmp_path / "out.txt")
+    expected = load(calibration).apply(values[:, :3], values[:, 3:6], values[:, 6], np.arange(40) / 50.0)
+    np.testing.assert_allclose(found[:, :3], expected.accelerometer, atol=1e-12)
+    np.testing.assert_allclose(found[:, 3:6], expected.gyroscope, atol=1e-12)
+    np.testing.assert_array_equal(found[:, 6], values[:, 6])
+
+
+def test_the_axes_of_the_sensor_are_turned_to_the_bodys(calibration: Path, tmp_path: Path) -> None:
+    with_profile(calibration, counts_profile(), ("+y", "-x", "+z"))  # body x is minus the reading's y, body y its x
+    counts = raw_counts()
+    rows = [f"{10 * i},{','.join(map(str, row))}" for i, row in enumerate(counts.tolist())]
+    (tmp_path / "log.csv").write_text("time_ms,ax,ay,az,gx,gy,gz\n" + "\n".join(rows) + "\n")
+    main(["--calibration", str(calibration), str(tmp_path / "log.csv"), "-o", str(tmp_path / "out.csv")])
+    readings = np.column_stack([(counts[:, :3] - 5) / 16384.0, (counts[:, 3:] - 5) / 131.0])
+    turned = np.column_stack(
+        [-readings[:, 1], readings[:, 0], readings[:, 2], -readings[:, 4], readings[:, 3], readings[:, 5]]
+    )
+    expected = load(calibration).apply(turned[:, :3], turned[:, 3:])
+    after = columns(tmp_path / "out.csv")
+    found = np.array([after[name] for name in VALUES], float).T
+    np.testing.assert_allclose(found, np.column_stack(expected), atol=1e-12, rtol=1e-13)
+
+
+def test_a_profile_of_several_files_is_refused(calibration: Path, log: Path, tmp_path: Path) -> None:
+    part = counts_profile()["columns"]
+    accel = {c: v for c, v in part.items() if not c.startswith("gyro")}
+    gyro = {c: v for c, v in part.items() if not c.startswith("accel")}
+    parts = [{"file": "a.txt", "columns": accel}, {"file": "g.txt", "columns": gyro}]
+    with pytest.raises(InputError, match="joins several files"):
+        compensate_csv(
+            load(calibration), log, tmp_path / "out.csv", LogProfile({"csv": {"parts": parts, "columns": {}}})
+        )

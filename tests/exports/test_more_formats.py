@@ -21,7 +21,10 @@ MATRIX = {
 }
 SENSITIVITY = np.array([[0.1, -0.02, 0.03], [0.0, 0.08, -0.05], [0.01, 0.02, -0.09]])
 SETTINGS: dict[str, Any] = {
-    "sensor": {s: {"noise_density": 1e-3, "bias_wander": 1e-4, "wander_time_s": 100.0} for s in BIAS},
+    "sensor": {
+        s: {"noise_density": 1e-3, "bias_wander": 1e-4, "wander_time_s": 100.0, "counts_per_unit": 16384.0}
+        for s in BIAS
+    },
     "table": {"gravity_g": 1.0},
 }
 
