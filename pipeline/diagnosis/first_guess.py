@@ -34,7 +34,8 @@ if TYPE_CHECKING:
     from pipeline.estimation.selection import Selection
     from pipeline.records import Noise
 
-FAR_MORE = 0.05  # of what they gain
+FAR_MORE = 0.1  # of what they gain
+MUCH = 40.0
 OWNERS = {"harmonic": "table", "ripple": "table", "band": "table"}
 
 
@@ -94,7 +95,7 @@ def _instead(selection: Selection) -> Guess | None:
     gain = 2.0 * (selection.fit.log_likelihood - before)
     parameters = sum(len(term.values) for term in slow)
     worth = gain - parameters * float(np.log(3.0 * selection.observations.samples))
-    return guess if guess.gain.delta_bic > worth + max(2.0 * CLEARLY, FAR_MORE * gain) else None
+    return guess if guess.gain.delta_bic > worth + max(MUCH, FAR_MORE * gain) else None
 
 
 def _rank(guess: Guess) -> float:

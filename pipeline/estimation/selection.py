@@ -4,7 +4,8 @@ In each round every candidate competes at its own best noise setting. The best o
 
     delta BIC > 10   and   m p < 0.01
 
-where p is that of the likelihood ratio and m the number of candidates (Bonferroni). Beside what is selected, whose
+where p is that of the likelihood ratio and m the number of candidates (Bonferroni). A bias that follows time or
+temperature needs 16: wander of another kind than the model's looks like it. Beside what is selected, whose
 equations are of first order, it must bring 1/5000 of what that has brought, or 30. Where the residual stays above
 twice the noise, an effect must also explain 5 % of the excess: a model that misses something large is mended a little
 by anything small.
@@ -42,6 +43,8 @@ if TYPE_CHECKING:
     from pipeline.records import Noise, SensorCalibration
 
 GATE_BIC = 10.0
+SLOW_GATE_BIC = 16.0
+SLOW_BIAS = ("bias_drift", "bias_temperature", "bias_temperature_quadratic", "warm_up")
 GATE_P = 0.01
 MOST = 5
 INFLATED = 3.0
@@ -318,27 +321,30 @@ class _Search:
         name = best if best in DELAYS else tied[0]
         return next(s for s in scores if s.name == name)
 
-    def _passes(self, score: Score) -> bool:
-        """Return whether a candidate passes the gate; a lag cannot be negative, nor be told beside a delay."""
+    def _passes(self, score: Score, beside: Sequence[int] = ()) -> bool:
+        """Return whether a candidate passes the gate; a lag cannot be negative, nor be told beside a delay.
+
+        ``beside`` holds the indices of candidates that the score was made with, beside what is selected.
+        """
         if score.name in DELAYS and any(name in DELAYS for name in self.names):
             return False
         held = [*self.names, *(term.effect.name for term in self.base.terms)]
         if any(score.name in effect(name).contains or name in effect(score.name).contains for name in held):
             return False
         real = score.name != DELAYS[1] or score.values[0] > 0
-        significant = score.delta_bic > self._gate() and score.p_value * len(self.effects) < GATE_P
-        return bool(score.admissible and significant and real and self._matters(score))
+        significant = score.delta_bic > self._gate(score.name) and score.p_value * len(self.effects) < GATE_P
+        return bool(score.admissible and significant and real and self._matters(score, beside))
 
-    def _gate(self) -> float:
+    def _gate(self, name: str) -> float:
         """Return the delta BIC to pass: beside large effects, what their equations leave may not pass for another."""
         left = SECOND_ORDER * 2.0 * (self.fit.log_likelihood - self.base.log_likelihood)
-        return float(np.clip(left, GATE_BIC, HIGHEST_GATE))
+        return float(np.clip(left, SLOW_GATE_BIC if name in SLOW_BIAS else GATE_BIC, HIGHEST_GATE))
 
-    def _matters(self, score: Score) -> bool:
+    def _matters(self, score: Score, beside: Sequence[int] = ()) -> bool:
         """Return whether an effect explains a part worth naming of an excess that is far above the noise."""
         if self.noise is None:
             return True
-        selected = self._selected(self.names)
+        selected = [*self._selected(self.names), *beside]
         floor = np.sum((self.noise.white**2 + self.noise.wander**2) / self.start.scale**2) / 3.0
         residual = (self.ranking.chosen(selected)[0, -1, -1] + self.ranking.within) / self.ranking.samples
         drop = score.drop / self.ranking.samples
@@ -507,6 +513,9 @@ class _Search:
         second = self.ranking.scores([best[1]], self.limits)
         scores = [next(s for s in found if s.name == n) for found, n in zip((first, second), names, strict=True)]
         tried = len(able) * (len(able) - 1) / 2
-        if all(self._passes(s) and s.p_value * tried < GATE_P for s in scores):
+        partners = ([best[2]], [best[1]])
+        if all(
+            self._passes(s, partner) and s.p_value * tried < GATE_P for s, partner in zip(scores, partners, strict=True)
+        ):
             self.names = names
             self.steps = dict(zip(names, scores, strict=True))
