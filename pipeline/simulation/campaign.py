@@ -129,7 +129,8 @@ def simulate_unit(
     if unit.held_out:
         benches |= dict.fromkeys(("validation", "static"), _held_out_bench(unit, sheets, effects, streams, kinds))
     by_hand = table["angle_accuracy_deg"] if table["motion"] == "none" else 0.0
-    planned = [*plan(unit.procedure, course, streams["motion"], by_hand), *extra]
+    mover = streams["motion"] if unit.motion is None else Streams(seed, unit.motion)["motion"]
+    planned = [*_wanted(unit, plan(unit.procedure, course, mover, by_hand)), *extra]
     total = sum(p.trajectory.duration + course.pause_s for p in planned)
     ramp = course.thermal_ramp_degc if unit.procedure == "thermal_ramp" else 0.0
     environment = random_environment(streams["room"], ramp=ramp, ramp_period=total / 1.5)
@@ -142,6 +143,15 @@ def simulate_unit(
         "imperfections": {k: np.asarray(v).tolist() for k, v in bench.imperfections.items()},
     }
     return session.recordings(streams), truth
+
+
+def _wanted(unit: UnitDescription, planned: list[Planned]) -> list[Planned]:
+    """Return the recordings that the unit's description asks for."""
+    unknown = set(unit.recordings) - {p.name for p in planned}
+    if unknown:
+        known = ", ".join(p.name for p in planned)
+        raise ConfigurationError(f"unit {unit.unit}: recordings {', '.join(sorted(unknown))} are not made; made: {known}")
+    return [p for p in planned if not unit.recordings or p.name in unit.recordings]
 
 
 def write_recording(folder: Path, recording: Recording, kind: str, sheets: dict[str, Any]) -> None:

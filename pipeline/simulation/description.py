@@ -72,6 +72,10 @@ class UnitDescription:
         ``ambient``, ``warm_up``, ``drift`` in degC, to replace the random ones.
     copy_of : str or None
         The unit whose recordings these are once more, in another format.
+    recordings : list of str
+        Those of the procedure's recordings that are made; empty for all.
+    motion : int or None
+        Number of the random motion: units of the same number and course move alike. None: each has a motion of its own.
     """
 
     unit: str
@@ -92,6 +96,8 @@ class UnitDescription:
     held_out: dict[str, Any] = field(default_factory=dict)
     temperature: dict[str, Any] = field(default_factory=dict)
     copy_of: str | None = None
+    recordings: list[str] = field(default_factory=list)
+    motion: int | None = None
 
     def __post_init__(self) -> None:
         if self.format not in FORMATS:
