@@ -27,6 +27,7 @@ include: "workflow/rules/calibration.smk"
 include: "workflow/rules/export.smk"
 include: "workflow/rules/report.smk"
 include: "workflow/rules/gather.smk"
+include: "workflow/rules/thesis.smk"
 include: "workflow/rules/verdict.smk"
 
 

@@ -56,6 +56,8 @@ class Campaign:
         The description that the run makes the recordings from; None where they are recorded.
     settings : mapping
         What ``snakemake --config`` gave.
+    page : str or None
+        A page of its own that the campaign asks for, beside the campaign's.
     """
 
     name: str
@@ -67,6 +69,7 @@ class Campaign:
     compare: list[Any] = field(default_factory=list)
     simulation: Path | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
+    page: str | None = None
 
     @property
     def recorded(self) -> Path:
@@ -134,7 +137,18 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
     batches, chains = cut_batches(units, batch_size(of_run))
     results = Path(str(settings.get("results", "results"))) / directory.name
     compare = resolve_comparisons(own_file.compare, units, str(directory / "campaign.yaml"))
-    return Campaign(directory.name, directory, results, units, batches, chains, compare, own_file.simulation, settings)
+    return Campaign(
+        directory.name,
+        directory,
+        results,
+        units,
+        batches,
+        chains,
+        compare,
+        own_file.simulation,
+        settings,
+        own_file.page,
+    )
 
 
 def find_campaign(name: str) -> Path:

@@ -5,6 +5,7 @@ For example::
     overrides: [filter=rc_low_pass]   # Hydra overrides of every unit, and settings of the run
     compare: [[U1, U2]]               # what the campaign's page compares; see pipeline.config.comparisons
     simulate: true                    # the run makes the recordings, from simulation.yaml beside this file
+    page: thesis                      # the run makes this page too, beside the campaign's own
 
 All of it is optional.
 """
@@ -24,7 +25,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-KEYS = ("overrides", "compare", "simulate")
+KEYS = ("overrides", "compare", "simulate", "page")
+PAGES = ("thesis",)  # that a campaign may ask for: python -m pipeline PAGE page
 SIMULATION = "simulation.yaml"
 
 
@@ -40,12 +42,15 @@ class CampaignFile:
         What the campaign's page compares, as it stands there.
     simulation : Path or None
         The description that the run makes the recordings from; None where they are recorded.
+    page : str or None
+        A page of its own that the campaign asks for, of ``PAGES``.
     """
 
     of_units: list[str] = field(default_factory=list)
     of_run: list[str] = field(default_factory=list)
     compare: list[Any] = field(default_factory=list)
     simulation: Path | None = None
+    page: str | None = None
 
 
 def read_campaign_file(path: Path) -> CampaignFile:
@@ -67,7 +72,7 @@ def read_campaign_file(path: Path) -> CampaignFile:
     compare = content.get("compare") or []
     if not isinstance(compare, list):
         raise ConfigurationError(f"compare: a list of comparisons is expected, got {compare!r}", str(path))
-    return CampaignFile(units, run, compare, _simulation(content, path))
+    return CampaignFile(units, run, compare, _simulation(content, path), _page(content, path))
 
 
 def as_list(value: Any, where: str, what: str = "overrides KEY=VALUE") -> list[str]:  # noqa: ANN401  (the user's)
@@ -111,3 +116,11 @@ def _simulation(content: Mapping[str, Any], path: Path) -> Path | None:
     if not description.is_file():
         raise ConfigurationError(f"simulate: true needs {SIMULATION} beside it, which does not exist", str(path))
     return description
+
+
+def _page(content: Mapping[str, Any], path: Path) -> str | None:
+    """Return the page that the campaign asks for beside its own."""
+    page = content.get("page")
+    if page is not None and page not in PAGES:
+        raise ConfigurationError(f"page: {page!r} is not known{nearest(str(page), PAGES)}", str(path))
+    return page

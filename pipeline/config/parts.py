@@ -134,6 +134,7 @@ def write_part(campaign: Campaign, stage: str, units: Sequence[str], sensor: str
     if stage == "gather":
         content = {"campaign": campaign.name, "rows": {u: campaign.units[u].row for u in units}}
         content["compare"] = campaign.compare
+        content["page"] = campaign.page
         compared = {u for c in campaign.compare for g in c["groups"] for u in g["units"]}
         content["truths"] = {u: str(campaign.truth(u)) for u in sorted(compared)}
     text = _canonical(content)

@@ -32,7 +32,13 @@ VERDICTS = {
 }
 
 
-def render(campaign: str, rows: list[JSON], failures: list[JSON], comparisons: Sequence[JSON] = ()) -> str:
+def render(
+    campaign: str,
+    rows: list[JSON],
+    failures: list[JSON],
+    comparisons: Sequence[JSON] = (),
+    page: str | None = None,
+) -> str:
     """Return ``index.html``.
 
     Parameters
@@ -44,6 +50,8 @@ def render(campaign: str, rows: list[JSON], failures: list[JSON], comparisons: S
         ``unit``, ``stage``, ``code``, ``message``, ``file`` of each failed unit.
     comparisons : sequence, optional
         As of ``comparison_page.section``.
+    page : str, optional
+        Name of a page of its own that the campaign has beside this one.
 
     Returns
     -------
@@ -51,7 +59,7 @@ def render(campaign: str, rows: list[JSON], failures: list[JSON], comparisons: S
     """
     shown = [_cells(row) for row in rows]
     by_unit = {row["unit"]: cells for row, cells in zip(rows, shown, strict=True)}
-    page: str = template("campaign.html").render(
+    text: str = template("campaign.html").render(
         campaign=campaign,
         rows=shown,
         failures=failures,
@@ -70,8 +78,9 @@ def render(campaign: str, rows: list[JSON], failures: list[JSON], comparisons: S
         sections=comparisons,
         verdicts=VERDICTS,
         kept=sorted({key for row in rows for key in row} - set(COLUMNS)),
+        beside=page,
     )
-    return page
+    return text
 
 
 def _causes(failures: list[JSON]) -> list[tuple[str, list[str]]]:

@@ -150,7 +150,9 @@ def _wanted(unit: UnitDescription, planned: list[Planned]) -> list[Planned]:
     unknown = set(unit.recordings) - {p.name for p in planned}
     if unknown:
         known = ", ".join(p.name for p in planned)
-        raise ConfigurationError(f"unit {unit.unit}: recordings {', '.join(sorted(unknown))} are not made; made: {known}")
+        raise ConfigurationError(
+            f"unit {unit.unit}: recordings {', '.join(sorted(unknown))} are not made; made: {known}"
+        )
     return [p for p in planned if not unit.recordings or p.name in unit.recordings]
 
 

@@ -61,7 +61,7 @@ def main(argv: Sequence[str]) -> int:
     write_summary(job.output / "summary.csv", rows)
     write_json(job.output / "failures.json", failures)
     sections = [section(c, figures, f"comparison-{i}") for i, c in enumerate(job.run["compare"], 1)]
-    write_atomically(job.output / "index.html", render(job.run["campaign"], rows, failures, sections))
+    write_atomically(job.output / "index.html", render(job.run["campaign"], rows, failures, sections, job.run["page"]))
     return 0
 
 

@@ -1,10 +1,11 @@
 # The exit code of the run: fails, and names every failed unit with its cause, unless all units are calibrated.
 rule verdict:
     input:
-        f"{RESULTS}/failures.json",
+        failures=f"{RESULTS}/failures.json",
+        page=f"{RESULTS}/{CAMPAIGN.page}.html" if CAMPAIGN.page else [],
     output:
         f"{RESULTS}/complete.json",
     log:
         f"{RESULTS}/logs/verdict.log",
     shell:
-        "{RUN} verdict --failures {input:q} --output {output:q} 2> {log:q}"
+        "{RUN} verdict --failures {input.failures:q} --output {output:q} 2> {log:q}"

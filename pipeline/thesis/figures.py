@@ -1,0 +1,238 @@
+"""The figures of the thesis's chapter 5, drawn from the campaign.
+
+Error per procedure, held-out motion, error before and after for each device and table, and the comparison of methods.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.estimation.correction import apply_correction
+from pipeline.report.bars import columns
+from pipeline.report.comparison_chart import Point, curve
+from pipeline.report.figure import AXES_LEGEND, UNITS, Figure
+from pipeline.report.figures import held_out_over_time
+from pipeline.report.numbers import number
+from pipeline.report.shapes import Samples
+from pipeline.report.svg import Panel, chart
+from pipeline.thesis.conclusions import Errors
+from pipeline.thesis.recorded import CAUSES
+from pipeline.thesis.results import CONTINUOUS, DEVICES, RATES, STOPS, procedure_of
+from pipeline.thesis.tables import read_printed
+from pipeline.validation.samples import samples_of_motion
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from pipeline.records import Noise
+    from pipeline.report.shapes import Layer
+    from pipeline.thesis.results import Results
+    from pipeline.thesis.scatter import Scatter
+    from pipeline.thesis.seeds import Row
+
+PROCEDURES = {"accelerometer": (*STOPS, *CONTINUOUS), "gyroscope": RATES}
+BELOW = {
+    "accelerometer": "stop and go, rest in s; continuous, deg/s",
+    "gyroscope": "rate, deg/s",
+}
+FILTERS = {"staged": "RC low-pass", "zero-phase": "the same, zero-phase", "unfiltered": "no filter"}
+COLOURS = ("c0", "c1", "c2", "c3")
+
+
+def all_figures(
+    printed: Path, results: Results, rows: Sequence[Row], scatter: Sequence[Scatter], noise: Noise
+) -> list[Figure]:
+    """Return the figures in the order of the thesis's groups, numbered on the page.
+
+    Parameters
+    ----------
+    printed : Path
+    results : Results
+    rows : sequence of dict
+        Of the study over seeds.
+    scatter : sequence of Scatter
+    noise : Noise
+        That samples of held-out motion are given; it does not matter for what is drawn.
+    """
+    told = _printed_errors(printed)
+    out: list[Figure | None] = []
+    for sensor, shown in (("accelerometer", ("stop-10s", "continuous-1dps")), ("gyroscope", ("gyro-100dps",))):
+        for device in DEVICES:
+            out.append(_motion(results, device, sensor, shown[0]))
+            out += [_before_and_after(results, f"{device}-{p}-printed", sensor, noise) for p in shown]
+            out.append(_per_procedure(results, told, device, sensor))
+        own = "stop-1s" if sensor == "accelerometer" else "gyro-60dps"
+        out.append(_before_and_after(results, f"mpu6050-1-mark2-{own}-printed", sensor, noise))
+        out.append(_methods(results, printed, sensor))
+    out.append(_tables(results, told))
+    out.append(_speed(rows))
+    out += [_scatter(scatter, quantity) for quantity in ("O", "S")]
+    return [figure for figure in out if figure is not None]
+
+
+def _printed_errors(printed: Path) -> dict[tuple[str, str, str], float]:
+    """Return the printed mean |e| after, by device, table and procedure."""
+    rows = [r for t in read_printed(printed / "errors.csv").values() for r in t if r["metric"] == "mean_abs_error"]
+    return {(r["device"].lower(), r["rate_table"], procedure_of(r)): float(r["after"]) for r in rows}
+
+
+def _motion(results: Results, device: str, sensor: str, procedure: str) -> Figure | None:
+    """Draw what the sensor read in the held-out motion."""
+    recording = next((r for r in results.recordings(f"{device}-{procedure}-printed") if r.role == "validation"), None)
+    if recording is None:
+        return None
+    reading, x = np.asarray(recording.reading(sensor)), recording.time - recording.time[0]
+    layers: list[Layer] = [Samples(x, reading[:, i], i) for i in range(3)]
+    svg = chart(
+        f"motion-{device}-{sensor}",
+        f"{DEVICES[device]}, {sensor}: held-out motion",
+        f"{recording.samples} samples in {number(float(x[-1]))} s.",
+        [Panel(layers, f"reading, {UNITS[sensor]}", 150)],
+        "time, s",
+    )
+    caption = f"{recording.samples} samples that reached the logger, in {number(float(x[-1]))} s; no fit sees them."
+    return Figure(svg, caption, AXES_LEGEND, f"{DEVICES[device]}, {sensor}: the held-out motion")
+
+
+def _before_and_after(results: Results, unit: str, sensor: str, noise: Noise) -> Figure | None:
+    """Draw e before and after calibration over the held-out motion."""
+    recording = next((r for r in results.recordings(unit) if r.role == "validation"), None)
+    if recording is None:
+        return None
+    samples = samples_of_motion(sensor, recording, noise, {"gravity_g": 1.0})
+    if samples is None:
+        return None
+    corrected = apply_correction(results.correction(unit, sensor), samples.reading)
+    before, after = (np.linalg.norm(v, axis=1) - samples.magnitude for v in (samples.reading, corrected))
+    drawn = held_out_over_time(sensor, recording, before, after, None)
+    means = [number(float(np.mean(np.abs(e)))) for e in (before, after)]
+    name = unit.removesuffix("-printed")
+    finding = f"{name}: mean |e| goes from {means[0]} to {means[1]} {UNITS[sensor]}"
+    svg = str(drawn.svg).replace(f"{sensor}-held-out", f"held-out-{name}")
+    return replace(drawn, svg=type(drawn.svg)(svg), finding=finding, caption="Staged, as printed; below, after alone.")
+
+
+def _per_procedure(results: Results, told: dict[tuple[str, str, str], float], device: str, sensor: str) -> Figure:
+    """Draw the error after calibration by procedure: printed, and ours in both readings."""
+    groups = {}
+    for procedure in PROCEDURES[sensor]:
+        ours = [results.error(f"{device}-{procedure}-{m}", sensor) or 0.0 for m in ("printed", "staged")]
+        groups[_short(procedure)] = [told[device, "acutronic", procedure], *ours]
+    svg = columns(
+        f"procedures-{device}-{sensor}",
+        f"{DEVICES[device]}, {sensor}: held-out error by procedure",
+        "; ".join(f"{k}: {', '.join(number(v) for v in values)}" for k, values in groups.items()),
+        groups,
+        f"mean |e| after, {UNITS[sensor]}",
+        x_label=BELOW[sensor],
+    )
+    legend = tuple(zip(COLOURS, ("printed", "ours, as printed", "ours, errata corrected"), strict=False))
+    return Figure(svg, "", legend, f"{DEVICES[device]}, {sensor}: error after calibration by procedure")
+
+
+def _short(procedure: str) -> str:
+    value = procedure.partition("-")[2]
+    return value.removesuffix("dps") if value.endswith("dps") else f"{value[:-1]} s"
+
+
+def _methods(results: Results, printed: Path, sensor: str) -> Figure:
+    """Draw the change of the error by the methods of tables 5.24 and 5.26."""
+    rows = [r for t in read_printed(printed / "method_comparison.csv").values() for r in t if r["sensor"] == sensor]
+    told = {(r["device"].lower(), r["method"] == "staged"): float(r["mean_error_after"]) for r in rows}
+    other = {"accelerometer": ("stop-1s", ("printed", "staged", "least-squares")),
+             "gyroscope": ("gyro-20dps", ("staged", "cholesky-printed", "cholesky"))}  # fmt: skip
+    procedure, methods = other[sensor]
+    groups = {
+        name: [told[device, True], told[device, False]]
+        + [results.error(f"{device}-{procedure}-{m}", sensor) or 0.0 for m in methods]
+        for device, name in DEVICES.items()
+    }
+    names = {
+        "accelerometer": ("staged, as printed", "staged, errata corrected", "least squares"),
+        "gyroscope": ("staged", "Cholesky and LU, forward matrix", "Cholesky and LU, inverted"),
+    }[sensor]
+    printed_names = ("printed: staged", "printed: least squares" if sensor == "accelerometer" else "printed: Cholesky")
+    svg = columns(
+        f"methods-{sensor}",
+        f"{sensor.capitalize()}: held-out error by method",
+        "; ".join(f"{k}: {', '.join(number(v) for v in values)}" for k, values in groups.items()),
+        groups,
+        f"mean |e| after, {UNITS[sensor]}",
+        x_label="device",
+    )
+    legend = tuple((f"c{i}", text) for i, text in enumerate((*printed_names, *names)))
+    finding = (
+        "Accelerometer: least squares and the corrected stages leave the same error"
+        if sensor == "accelerometer"
+        else "Gyroscope: inverted, Cholesky and LU leave what the stages leave"
+    )
+    return Figure(svg, f"From the recordings of {procedure}.", legend, finding)
+
+
+def _tables(results: Results, told: dict[tuple[str, str, str], float]) -> Figure:
+    """Draw the error after calibration on both tables, as a share of that before."""
+    groups = {}
+    for sensor, procedure in (("accelerometer", "stop-1s"), ("gyroscope", "gyro-60dps")):
+        before = results.error(f"mpu6050-1-{procedure}-printed", sensor, "raw") or 1.0
+        printed_before = {"accelerometer": 0.069, "gyroscope": 1.724}[sensor]
+        for table, infix in (("acutronic", ""), ("mark2", "mark2-")):
+            ours = [results.error(f"mpu6050-1-{infix}{procedure}-{m}", sensor) or 0.0 for m in ("printed", "staged")]
+            share = [told["mpu6050-1", table, procedure] / printed_before, *(v / before for v in ours)]
+            groups[f"{sensor[:5]}., {'home-made' if infix else 'precise'}"] = [100.0 * v for v in share]
+    svg = columns(
+        "tables",
+        "What is left of the error on either table",
+        "; ".join(f"{k}: {', '.join(number(v) for v in values)} %" for k, values in groups.items()),
+        groups,
+        "mean |e| after, % of before",
+        x_label="sensor and table",
+    )
+    legend = tuple(zip(COLOURS, ("printed", "ours, as printed", "ours, errata corrected"), strict=False))
+    return Figure(svg, "MPU6050 (1).", legend, "The home-made table leaves more of the error")
+
+
+def _speed(rows: Sequence[Row]) -> Figure:
+    """Draw the error of continuous rotation by rate, with three filters."""
+    errors = Errors(rows)
+    points = []
+    for method, name in FILTERS.items():
+        for procedure in CONTINUOUS:
+            mean = errors.mean(f"mpu6050-2-{procedure}", method)
+            rate = float(procedure.split("-")[1].removesuffix("dps"))
+            points.append(Point(_short(procedure), mean.value, mean.interval, x=rate, series=name))
+    svg = curve(
+        "speed", "Error of continuous rotation by rate", points, "mean |e| after, g", "rate, deg/s", labelled=False
+    )
+    legend = tuple((f"c{i}", name) for i, name in enumerate(FILTERS.values()))
+    caption = (
+        "MPU6050 (2), errata corrected; means over seeds with their 95 % intervals. The filter is on the turns and on "
+    )
+    caption += (
+        "the held-out motion, so without one more noise is left there; how an error grows with the rate is its own."
+    )
+    return Figure(
+        svg,
+        caption,
+        legend,
+        "With the filter's gain the error grows at 30 deg/s, and twice as much where it runs twice",
+    )
+
+
+def _scatter(scatter: Sequence[Scatter], quantity: str) -> Figure:
+    """Draw the printed scatter beside what picking explains, cause by cause."""
+    own = [s for s in scatter if s.quantity == quantity]
+    groups = {DEVICES[s.device]: [s.printed, *s.seeds.values()] for s in own}
+    svg = columns(
+        f"scatter-{quantity}",
+        f"Scatter of {quantity}",
+        "; ".join(f"{k}: {', '.join(number(v) for v in values)}" for k, values in groups.items()),
+        groups,
+        f"root mean square deviation of {quantity}",
+        x_label="device",
+    )
+    legend = tuple((f"c{i}", text) for i, text in enumerate(("printed", *CAUSES)))
+    return Figure(svg, "", legend, f"Scatter of {quantity}: printed, and by picking single samples")

@@ -1,0 +1,31 @@
+# What the founding document printed beside the results of its campaign (page: thesis in campaign.yaml).
+if CAMPAIGN.page == "thesis":
+
+    rule thesis:
+        input:
+            rules.gather.output,
+            collect(
+                f"{CAMPAIGN.directory}/{{file}}",
+                file=[
+                    "seeds.csv",
+                    "printed/accel_parameters.csv",
+                    "printed/gyro_parameters.csv",
+                    "printed/errors.csv",
+                    "printed/method_comparison.csv",
+                    "printed/conference_paper.csv",
+                    "printed/conference_paper_six_positions.csv",
+                ],
+            ),
+        output:
+            report(
+                f"{RESULTS}/thesis.html",
+                category="Campaign",
+                labels={"page": "beside what was printed"},
+            ),
+        log:
+            f"{RESULTS}/logs/thesis.log",
+        params:
+            campaign=str(CAMPAIGN.directory),
+            code=code_digest("pipeline.thesis.page"),
+        shell:
+            "{RUN} thesis page --campaign {params.campaign:q} --results {RESULTS:q} --output {output:q} > {log:q} 2>&1"
