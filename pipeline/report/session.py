@@ -116,12 +116,10 @@ def _lane(recording: Recording, spans: Spans, x: Scale, top: float) -> str:
     name = recording.name if len(recording.name) <= 13 else recording.name[:12] + "…"
     out = text(LEFT - 5, middle + 4, name, "e")
     out += f'<path class="line c3" d="M{LEFT} {middle:g}H{end:.1f}"/>'
+    scale, low = (x.stop - x.start) / (x.high - x.low), middle - 4
     for colour in sorted({s[2] for s in spans}):
-        drawn = "".join(
-            f"M{x.pixels(a):.1f} {middle - 4:g}h{max(x.pixels(b) - x.pixels(a), 0.8):.1f}v8H{x.pixels(a):.1f}z"
-            for a, b, c in spans
-            if c == colour
-        )
+        ends = ((LEFT + scale * a, max(scale * (b - a), 0.8)) for a, b, c in spans if c == colour)
+        drawn = "".join(f"M{at:.1f} {low:g}h{wide:.1f}v8h-{wide:.1f}z" for at, wide in ends)
         out += f'<path class="bar c{colour}" d="{drawn}"/>'
     return out
 

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 MAXIMUM_DOTS = 240
+FEW = 300  # dots of their own, up to which they are drawn large
 BUCKETS = 140
 
 
@@ -80,7 +81,8 @@ def draw(layer: Layer, x: Scale, y: Scale) -> str:
         return _means(layer, x, y)
     if isinstance(layer, Dots):
         known = np.isfinite(layer.x) & np.isfinite(layer.y)
-        return f'<path class="dots c{layer.colour}" d="{dots(x.units(layer.x[known]), y.units(layer.y[known]))}"/>'
+        drawn = dots(x.units(layer.x[known]), y.units(layer.y[known]))
+        return f'<path class="dots{" large" * (len(layer.x) <= FEW)} c{layer.colour}" d="{drawn}"/>'
     if isinstance(layer, Band):
         at, low, high = x.units(layer.x), y.units(layer.low), y.units(layer.high)
         area = path(np.r_[at, at[::-1]], np.r_[high, low[::-1]])

@@ -80,7 +80,8 @@ def chart(
     names : str
         List of the page's script that names what stands at x = 1, 2, ...
     """
-    x = Scale(*span([layer.x for p in panels for layer in p.layers], 0.0), LEFT, WIDTH - RIGHT)
+    margin = 0.03 if names else 0.0
+    x = Scale(*span([layer.x for p in panels for layer in p.layers], margin), LEFT, WIDTH - RIGHT)
     x_ticks = _decades(x) if logarithmic else _x_ticks(x, angle=angle)
     parts, top = [], TOP
     for panel in panels:

@@ -1,0 +1,155 @@
+"""What the pages cost: ``python benchmarks/pages.py``.
+
+CPU time of what is made of a unit of ``data/demo`` (5,902 samples); and with a Chromium at hand the CPU time of its
+page thread until a campaign's page of 5,000 units is shown, sorted and filtered. The least of several runs each.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.diagnosis.words import in_words
+from pipeline.formats.parquet import load_recordings
+from pipeline.records import SENSORS
+from pipeline.report import campaign_page, certificate_page
+from pipeline.report.certificate import certificate
+from pipeline.report.session import sensor_temperature
+from pipeline.report.unit_page import render
+from pipeline.stages.batch import read_json
+from pipeline.stages.fits import load_fits
+from pipeline.validation.attitude import attitude
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from playwright.sync_api import CDPSession
+
+ROOT = Path(__file__).resolve().parents[1]
+UNIT = "mpu6050-2-hidden"
+SORT = "document.querySelector('#all thead tr:nth-child(2) th:nth-child(9) button').click()"
+FILTER = """(() => {
+  const box = document.querySelector("#filter");
+  box.value = box.value ? "" : "missing staged";
+  box.dispatchEvent(new Event("input"));
+})()"""
+DRAWN = "new Promise((done) => requestAnimationFrame(() => setTimeout(done, 0)))"
+
+
+def least(work: Callable[[], object], runs: int) -> float:
+    """Return the least CPU time of a call, ms."""
+    work()
+    took = []
+    for _ in range(runs):
+        start = time.process_time()
+        work()
+        took.append(time.process_time() - start)
+    return 1e3 * min(took)
+
+
+def unit_costs(results: Path, runs: int) -> dict[str, float]:
+    """Return CPU milliseconds of what is made of one unit."""
+    batch = next(results.glob(f"batches/*/report/{UNIT}.html")).parents[1]
+    parts: dict[str, Any] = {}
+    for file in results.glob("configs/report-*.json"):
+        parts |= json.loads(file.read_text())["units"]
+    part = parts[UNIT]
+    documents = [read_json(batch / stage / f"{UNIT}.json") for stage in ("calibration", "validate", "diagnose")]
+    recordings = load_recordings(batch / "filter" / f"{UNIT}.parquet")
+    last = {s: max((batch / "fit" / s).iterdir(), key=lambda f: f.stat().st_mtime) for s in SENSORS}
+    fits = load_fits(last, UNIT)
+    words = {s: in_words(documents[2][s], s) for s in SENSORS}
+
+    def report() -> str:
+        made = certificate(*documents[:2], part, sensor_temperature(recordings))
+        return json.dumps(made, indent=1) + certificate_page.render(UNIT, made)
+
+    return {
+        "page of a unit": least(lambda: render(*documents, recordings, part, words=words), runs),
+        "calibration report, JSON and page": least(report, runs),
+        "attitude": least(lambda: attitude(fits["accelerometer"], fits["gyroscope"], recordings), runs),
+    }
+
+
+def fleet(units: int) -> list[dict[str, Any]]:
+    """Return rows of a campaign; every ninth unit lacks an effect."""
+    rng = np.random.default_rng(7)
+    rows = []
+    for i in rng.permutation(units).tolist():
+        row = {"unit": f"U{i}", "serial": f"S{i}", "lot": f"L{i // 500}", "date": "2026-02-03", "status": "ok"}
+        row |= {"sensor": "mpu6050", "method": "reference_least_squares" if i % 3 else "staged", "pass": bool(i % 17)}
+        for sensor in SENSORS:
+            row |= {f"{sensor}_error_before": float(rng.uniform(0.02, 0.1)), f"{sensor}_noise_floor": 0.0008}
+            row |= {f"{sensor}_error_after": float(rng.uniform(0.0008, 0.002)) * (1 if i % 9 else 8)}
+            row |= {f"{sensor}_verdict": "nothing_missing" if i % 9 else "missing_effect"}
+            row |= {f"{sensor}_selected": None if i % 9 else "g_sensitivity"}
+        rows.append(row)
+    return rows
+
+
+def spent(devtools: CDPSession) -> float:
+    """Return the CPU time of a page's thread so far, s."""
+    metrics = devtools.send("Performance.getMetrics")["metrics"]
+    return float(next(m["value"] for m in metrics if m["name"] == "TaskDuration"))
+
+
+def browser_costs(page: str, runs: int) -> dict[str, float] | None:
+    """Return CPU milliseconds of a campaign's page in Chromium's page thread, None where there is none."""
+    from playwright.sync_api import sync_playwright  # noqa: PLC0415
+
+    program = next((p for p in map(shutil.which, ("chromium", "chromium-browser", "google-chrome")) if p), None)
+    if program is None:
+        return None
+    found: dict[str, list[float]] = {"shown": [], "sorted": [], "filtered": []}
+    with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
+        file = Path(folder) / "index.html"
+        file.write_text(page)
+        browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
+        for _ in range(runs):
+            opened = browser.new_page()
+            devtools = opened.context.new_cdp_session(opened)
+            devtools.send("Performance.enable", {"timeDomain": "threadTicks"})
+            steps = (("shown", None), ("sorted", SORT), ("filtered", FILTER), ("filtered", FILTER))
+            for name, script in steps:
+                before = spent(devtools)
+                if script is None:
+                    opened.goto(file.as_uri())
+                else:
+                    opened.evaluate(script)
+                opened.evaluate(DRAWN)
+                found[name].append(1e3 * (spent(devtools) - before))
+            opened.close()
+        browser.close()
+    return {name: min(costs) for name, costs in found.items()}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--units", type=int, default=5000, help="units of the campaign's page")
+    parser.add_argument("--runs", type=int, default=10)
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "snakemake", "--cores", "1", "-q", "all", "-s", str(ROOT / "Snakefile")]
+        subprocess.run([*command, "--config", f"results={folder}"], cwd=folder, check=True)
+        for name, cost in unit_costs(Path(folder) / "demo", arguments.runs).items():
+            print(f"{name}: {cost:.1f} ms CPU")
+    rows = fleet(arguments.units)
+    page = campaign_page.render("fleet", rows, [])
+    cost = least(lambda: campaign_page.render("fleet", rows, []), 3)
+    print(f"page of {arguments.units} units: {cost:.0f} ms CPU, {len(page.encode()) / 1e6:.2f} MB")
+    costs = browser_costs(page, max(3, arguments.runs // 2))
+    print("no Chromium here" if costs is None else ", ".join(f"{k} {v:.0f} ms CPU" for k, v in costs.items()))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
