@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pyarrow as pa
 
-from pipeline.formats.csv_fault import KIND_OF_SETTING, find_faults, refusal
+from pipeline.formats.csv_fault import KIND_OF_SETTING, find_faults, quoted_numbers, refusal
 from pipeline.formats.csv_layout import find_layout
 from pipeline.formats.csv_parse import all_finite, parse
 from pipeline.formats.csv_rows import Rows
@@ -55,7 +55,7 @@ def read_carefully(path: Path, settings: CsvFormat, checks: Checks) -> Rows:
 def _numbers(layout: Layout) -> Any:  # noqa: ANN401  (pyarrow has no types)
     """Return the wanted columns as doubles, None where a line is not as it should be."""
     wanted = sorted({index for _, index in layout.columns})
-    if b"\0" in layout.body:
+    if b"\0" in layout.body or quoted_numbers(layout, layout.body):
         return None
     try:
         types = dict.fromkeys(wanted, pa.float64())
@@ -89,10 +89,17 @@ def _without_faults(
     ):
         dropped = [f for f in others if f.kind in kinds]
         if dropped:
-            detail = f"{what}, each a gap; the first: {dropped[0].message}"
+            rows_in_a_run = _longest_run([f.row for f in dropped])
+            detail = f"{what}, each a gap; the longest run is {rows_in_a_run} long; the first: {dropped[0].message}"
             notes.append(Note(code, len(dropped), dropped[0].line, dropped[-1].line, detail))
     starts = tuple(h.row - sum(f.row < h.row for f in faults) for h in headers)
     return _without_lines(layout, faults, rows), len(others), starts
+
+
+def _longest_run(rows: list[int]) -> int:
+    """Return how many of some rows, in order, follow each other directly at most."""
+    ends = np.flatnonzero(np.diff([*rows, rows[-1] + 2]) > 1)
+    return int(np.diff(ends, prepend=-1).max())
 
 
 def over_budget(error: IngestError, touched: int, rows: int, checks: Checks) -> IngestError:

@@ -18,7 +18,7 @@ from pipeline.formats.csv_parse import all_finite, parse
 from pipeline.formats.ingest_error import IngestError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from pipeline.formats.csv_layout import Layout
 
@@ -95,8 +95,23 @@ def find_faults(layout: Layout) -> list[Fault]:
     return found
 
 
+def quoted_numbers(layout: Layout, block: bytes) -> bool:
+    """Return whether a cell that holds a number stands in quotes: then a comma in it may be of thousands."""
+    if b'"' not in block:
+        return False
+    wanted = {index for _, index in layout.columns}
+    lines = (line.decode("utf-8", "replace") for line in block.split(b"\n") if b'"' in line)
+    return any(wanted & set(_quoted(line, layout.delimiter)) for line in lines)
+
+
+def _quoted(line: str, delimiter: str) -> list[int]:
+    """Return which cells of a line stand in quotes."""
+    cells = re.findall(rf'\s*("(?:[^"]|"")*"|[^{re.escape(delimiter)}]*)\s*(?:{re.escape(delimiter)}|$)', line)
+    return [index for index, cell in enumerate(cells) if cell.startswith('"')]
+
+
 def _sound(layout: Layout, block: bytes) -> bool:
-    if b"\0" in block:
+    if b"\0" in block or quoted_numbers(layout, block):
         return False
     wanted = dict.fromkeys([index for _, index in layout.columns], pa.float64())
     try:
@@ -126,7 +141,8 @@ def _faults(layout: Layout, block: bytes, first: int) -> Iterator[Fault]:
             message = f"the line has {len(cells)} fields where {width} are expected: {text[:120]!r}"
             yield Fault(row, line, "bad_row", message, text, short=len(cells) < width)
         else:
-            bad = next((b for c in layout.columns if (b := _cell(layout, c, cells))[0]), None)
+            quoted = _quoted(text, layout.delimiter) if '"' in text else []
+            bad = next((b for c in layout.columns if (b := _cell(layout, c, cells, quoted))[0]), None)
             if bad:
                 yield Fault(row, line, *bad, text)
 
@@ -135,7 +151,7 @@ def _is_header(cells: list[str], layout: Layout) -> bool:
     return [cell.strip() for cell in cells] == layout.names
 
 
-def _cell(layout: Layout, where: tuple[object, int], cells: list[str]) -> tuple[str, str]:
+def _cell(layout: Layout, where: tuple[object, int], cells: list[str], quoted: Sequence[int] = ()) -> tuple[str, str]:
     """Return the kind of fault of a cell, empty where it is a finite number, and what is wrong with it."""
     column, index = where
     name, channel = layout.names[index], getattr(column, "channel", "")
@@ -145,6 +161,8 @@ def _cell(layout: Layout, where: tuple[object, int], cells: list[str]) -> tuple[
     if not text:
         return "not_finite", f"{label} ({channel}) is empty; a number is expected"
     if re.fullmatch(rf"[+-]?(\d+{point}?\d*|{point}\d+)([eE][+-]?\d+)?", text):
+        if index in quoted:
+            return "not_a_number", f"{label} ({channel}) is '\"{text[:40]}\"', in quotes; a number stands without them"
         if math.isfinite(float(text.replace(",", "."))):
             return "", ""
         return "not_finite", f"{label} ({channel}) is {text!r}, more than a number can hold"

@@ -16,6 +16,7 @@ import numpy as np
 from pipeline.formats.csv_columns import find_columns, refuse_twice
 from pipeline.formats.csv_settings import AUTO, COMMENTED, WHITESPACE
 from pipeline.formats.ingest_error import IngestError
+from pipeline.formats.units import TRIADS
 from pipeline.records import Note
 
 if TYPE_CHECKING:
@@ -116,16 +117,21 @@ def find_layout(text: TextFile, settings: CsvFormat) -> Layout:
     refuse_twice(names, where)
     columns = find_columns(names, settings, where, body, first)
     body, lines = without_empty_lines(body, lines)
-    notes += ignored_columns(names, columns, at if settings.header is True else 0)
+    notes += column_notes(names, columns, at if settings.header is True else 0)
     return Layout(text.path, body, lines, delimiter, settings.decimal, names, columns, tuple(notes))
 
 
-def ignored_columns(names: list[str], columns: list[tuple[Column, int]], line: int) -> list[Note]:
-    """Return a note on the columns that the profile does not ask for."""
+def column_notes(names: list[str], columns: list[tuple[Column, int]], line: int) -> list[Note]:
+    """Return notes on axes in another order than x, y, z and on columns that the profile does not ask for."""
+    place = {column.channel: index for column, index in columns if isinstance(column.column, str)}
+    turned = [t for t in TRIADS.values() if set(t) <= place.keys() and sorted(t, key=lambda c: place[c]) != list(t)]
+    listed = [names[i] for i in sorted(place[c] for t in turned for c in t)]
+    detail = f"axes stand in the order {', '.join(listed)} and were taken by their names"
+    notes = [Note("N-ORDER", len(listed), line, line, detail)] if turned else []
     used = {index for _, index in columns}
     ignored = [n for i, n in enumerate(names) if i not in used]
     detail = f"columns not used: {', '.join(ignored)}"
-    return [Note("N-IGNORED", len(ignored), line, line, detail)] if ignored else []
+    return notes + ([Note("N-IGNORED", len(ignored), line, line, detail)] if ignored else [])
 
 
 def fields(line: str, delimiter: str) -> list[str]:

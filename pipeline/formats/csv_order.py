@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.formats.csv_careful import over_budget
-from pipeline.formats.csv_time import LARGEST_DISPLACEMENT, order_of, time_error, unwrap, wrap_note
+from pipeline.formats.csv_time import LARGEST_DISPLACEMENT, order_of, unwrap, wrap_note
 from pipeline.formats.ingest_error import IngestError
+from pipeline.formats.stamps import time_error
 from pipeline.records import Note
 
 if TYPE_CHECKING:

@@ -41,7 +41,9 @@ def seconds_per_unit(unit: str) -> float:
     return UNITS["time"][unit][0] / 1e9
 
 
-def exact_times(data: bytes, dialect: tuple[str, str], width: int, index: int, unit: str) -> NDArray[np.int64]:
+def exact_times(
+    data: bytes | memoryview, dialect: tuple[str, str], width: int, index: int, unit: str
+) -> NDArray[np.int64]:
     """Return times in ns from their decimal digits: a decimal with enough places is an integer of ns.
 
     Parameters
@@ -145,21 +147,6 @@ def order_of(time_ns: NDArray[np.int64]) -> tuple[NDArray[np.intp] | None, int]:
         return None, 0
     order = np.argsort(time_ns, kind="stable")
     return order, int(np.abs(order - np.arange(len(order))).max())
-
-
-def time_error(time_ns: NDArray[np.int64], place: str, row: int) -> IngestError:
-    """Return the refusal of a time that does not increase."""
-    steps = np.diff(time_ns)
-    repeats = steps[row - 1] == 0
-    what, fault = ("repeats", "duplicate_time") if repeats else ("goes back to", "time_back")
-    count = int(np.count_nonzero(steps <= 0))
-    return IngestError(
-        f"time {what} {time_ns[row] / 1e9:.9g} s after {time_ns[row - 1] / 1e9:.9g} s ({count} such samples); time has "
-        "to increase: a log that was restarted belongs in two files",
-        place,
-        fault=fault,
-        hint="" if repeats else "or set ingest.csv.session=1, 2 .. to read one part of it",
-    )
 
 
 def wrap_note(wraps: list[tuple[int, int]], lines: list[int], tick_ns: float) -> Note:

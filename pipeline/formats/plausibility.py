@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.formats.checks import Checks
-from pipeline.formats.csv_time import time_error
 from pipeline.formats.ingest_error import IngestError
 from pipeline.formats.marks import mark_clipped, mark_gaps, mark_stuck
+from pipeline.formats.stamps import time_error
 from pipeline.formats.units import ATTITUDE, DEGREES, TRIADS
 
 if TYPE_CHECKING:

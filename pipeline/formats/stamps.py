@@ -188,3 +188,18 @@ def check_fine(topic: str, time: NDArray[np.int64], path: str) -> None:
             fault="bad_time",
             hint="log integer times",
         )
+
+
+def time_error(time_ns: NDArray[np.int64], place: str, row: int) -> IngestError:
+    """Return the refusal of a time that does not increase."""
+    steps = np.diff(time_ns)
+    repeats = steps[row - 1] == 0
+    what, fault = ("repeats", "duplicate_time") if repeats else ("goes back to", "time_back")
+    count = int(np.count_nonzero(steps <= 0))
+    return IngestError(
+        f"time {what} {time_ns[row] / 1e9:.9g} s after {time_ns[row - 1] / 1e9:.9g} s ({count} such samples); time has "
+        "to increase: a log that was restarted belongs in two files",
+        place,
+        fault=fault,
+        hint="" if repeats else "or set ingest.csv.session=1, 2 .. to read one part of it",
+    )

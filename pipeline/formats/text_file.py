@@ -163,9 +163,9 @@ def _check_utf8(data: bytes, path: str) -> None:
 
 def _uniform_line_ends(data: bytes, notes: list[Note]) -> bytes:
     pairs, returns, newlines = data.count(b"\r\n"), data.count(b"\r"), data.count(b"\n")
-    if not pairs == returns == newlines:
-        detail = f"line ends are not uniform: {pairs} CRLF, {returns - pairs} CR, {newlines - pairs} LF"
-        notes.append(Note("N-EOL", returns + newlines - pairs, 0, 0, detail))
+    found = {"CRLF": pairs, "CR": returns - pairs, "LF": newlines - pairs}
+    listed = ", ".join(f"{count} {name}" for name, count in found.items() if count)
+    notes.append(Note("N-EOL", returns + newlines - pairs, 0, 0, f"line ends other than LF alone: {listed}"))
     return data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
 
 

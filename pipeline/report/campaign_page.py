@@ -38,6 +38,7 @@ def render(
     failures: list[JSON],
     comparisons: Sequence[JSON] = (),
     page: str | None = None,
+    twins: Sequence[Sequence[str]] = (),
 ) -> str:
     """Return ``index.html``.
 
@@ -52,6 +53,8 @@ def render(
         As of ``comparison_page.section``.
     page : str, optional
         Name of a page of its own that the campaign has beside this one.
+    twins : sequence of sequence of str, optional
+        Files of several units that are the same, byte for byte, under different names.
 
     Returns
     -------
@@ -63,6 +66,7 @@ def render(
         campaign=campaign,
         rows=shown,
         failures=failures,
+        twins=twins,
         ok=sum(row["status"] == "ok" for row in rows),
         passed=sum(row.get("pass") is True for row in rows),
         not_passed=sum(row.get("pass") is False for row in rows),

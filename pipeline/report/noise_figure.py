@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from pipeline.records import Recording
 
 FEWEST, LONGEST = 60, 4096
+GAP, UNEVEN = 1.5, 0.5  # of the median interval: a gap, and a scatter that no average over equal times stands for
 PER_DECADE = 8
 SURE = 4.0  # averages of the longest time drawn; of fewer the deviation is a guess
 NEAR = 1.3  # factor between what was found and a data sheet that counts as the same
@@ -87,7 +88,7 @@ def allan(
 
 def longest_rest(sensor: str, recordings: list[Recording]) -> tuple[Recording, NDArray[np.float64]] | None:
     """Return the recording with the longest rest, a static one if there is one, and the readings in it."""
-    usable = [r for r in recordings if r.role != "validation" and r.reading(sensor) is not None]
+    usable = [r for r in recordings if r.role != "validation" and r.reading(sensor) is not None and not _uneven(r)]
     best: tuple[Recording, NDArray[np.float64]] | None = None
     for recording in sorted(usable, key=lambda r: r.role != "static"):
         if best is not None and best[0].role == "static" != recording.role:
@@ -103,6 +104,13 @@ def longest_rest(sensor: str, recordings: list[Recording]) -> tuple[Recording, N
             if len(values) >= FEWEST and (best is None or len(values) > len(best[1])):
                 best = recording, values
     return best
+
+
+def _uneven(recording: Recording) -> bool:
+    """Return whether intervals scatter too much for averages over equal times."""
+    steps = np.diff(recording.time_ns) / (1e9 * recording.interval) if recording.samples > 1 else np.ones(1)
+    within = steps[steps <= GAP]
+    return bool(np.sqrt(np.mean((within - 1.0) ** 2)) > UNEVEN)
 
 
 def deviations(values: NDArray[np.float64], interval: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

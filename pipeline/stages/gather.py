@@ -15,7 +15,7 @@ from pipeline.report.summary import summary_row, write_summary
 from pipeline.stages.batch import FAILED, parse_job, read_json, write_json
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
 PUBLISHED = {"validate": "validations", "diagnose": "diagnoses"}
 
@@ -29,6 +29,7 @@ def main(argv: Sequence[str]) -> int:
         (job.output / name).mkdir(parents=True)
     compared = {u for c in job.run["compare"] for g in c["groups"] for u in g["units"]}
     rows, failures, figures = [], [], {}
+    inputs: dict[str, list[dict[str, Any]]] = {}
     for unit, sheet_row in job.run["rows"].items():
         batch = of_unit[unit]
         failure = _failure(batch, unit)
@@ -57,12 +58,29 @@ def main(argv: Sequence[str]) -> int:
         if unit in compared:
             truth = _truth(Path(job.run["truths"][unit]))
             figures[unit] = unit_figures(calibration, documents["validate"], documents["diagnose"], truth)
+        inputs[unit] = calibration.get("inputs") or []
         rows.append(summary_row(unit, calibration, documents["validate"], documents["diagnose"], sheet_row))
     write_summary(job.output / "summary.csv", rows)
     write_json(job.output / "failures.json", failures)
     sections = [section(c, figures, f"comparison-{i}") for i, c in enumerate(job.run["compare"], 1)]
-    write_atomically(job.output / "index.html", render(job.run["campaign"], rows, failures, sections, job.run["page"]))
+    page = render(job.run["campaign"], rows, failures, sections, job.run["page"], same_files(inputs))
+    write_atomically(job.output / "index.html", page)
     return 0
+
+
+def same_files(inputs: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[list[str]]:
+    """Return the files of several units that are the same, byte for byte, under different names.
+
+    Parameters
+    ----------
+    inputs : mapping of str to sequence of mapping
+        Unit to its inputs: ``file``, ``sha256``. One file that several units are calibrated from is meant so.
+    """
+    known: dict[str, dict[str, str]] = {}
+    for unit, files in inputs.items():
+        for file in files:
+            known.setdefault(str(file["sha256"]), {}).setdefault(str(file["file"]), unit)
+    return [[f"{unit}: {file}" for file, unit in found.items()] for found in known.values() if len(found) > 1]
 
 
 def publish(source: Path, target: Path) -> None:

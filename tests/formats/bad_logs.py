@@ -113,6 +113,12 @@ CANONICAL_COLUMNS = dict(
 )
 
 
+def gcsv() -> bytes:
+    """Return the log as Gyroflow writes it, its numbers with a scale of 1 g and of 1 deg/s."""
+    head = ["GYROFLOW IMU LOG", "version,1.3", "orientation,XYZ", "tscale,1", f"gscale,{np.pi / 180!r}", "ascale,1"]
+    return text(ROWS, "\n".join([*head, "t,ax,ay,az,gx,gy,gz"]))
+
+
 def indexed() -> dict[str, Any]:
     """Return the column map of a file without header."""
     units = ["s", *["g"] * 3, *["deg/s"] * 3]
@@ -183,11 +189,17 @@ def cases() -> dict[str, Case]:
         "06 without mark": one(text().decode().encode("utf-16-le"), fault="utf16", says="UTF-16 text"),
         "07 mixed": one(whole.replace(b"\n", b"\r\n", 40), notes=("N-EOL",), kept=ALL),
         "07 CR": one(whole.replace(b"\n", b"\r"), notes=("N-EOL",), kept=ALL),
-        "07 CRLF": one(whole.replace(b"\n", b"\r\n"), notes=(), kept=ALL),
+        "07 CRLF": one(whole.replace(b"\n", b"\r\n"), notes=("N-EOL",), kept=ALL),
         "08": one(whole[:-1], notes=("N-TAIL",), kept=without(SAMPLES - 1)),
         "08 in a number": one(whole[:-5], notes=("N-TAIL",), kept=without(SAMPLES - 1)),
         "09": one(changed(SAMPLES - 1, "29.99,0.1"), notes=("N-TAIL",), kept=without(SAMPLES - 1)),
         "10 short": one(changed(5, "0.05,0.1"), fault="bad_row", says="has 2 fields where 7 are expected", line=7),
+        "10 many": one(
+            text([r if i % 100 else "x" for i, r in enumerate(ROWS)]),
+            fault="bad_row",
+            says=r"has 1 fields where 7 are expected: 'x' \(29 more such lines, up to line 2902: 102, 202, 302, 402 ",
+            line=2,
+        ),
         "10 drop": one(
             changed(5, "0.05,0.1"), notes=("N-BADROW", "N-GAP"), kept=without(5), settings=DROP, flags={5: 1}
         ),
@@ -215,6 +227,7 @@ def cases() -> dict[str, Case]:
             line=1,
         ),
         "14 profile": one(b"Fs,100\nmode,0\n" + whole, kept=ALL, settings={"csv/skip_lines": 2}),
+        "14 gcsv": Case({"log.gcsv": gcsv()}, kept=ALL),
         "15": one(b"# made by hand\n" + whole, fault="missing_column", says="found # made by hand", line=1),
         "15 profile": one(b"# made by hand\n" + whole, notes=("N-COMMENT",), kept=ALL, settings={"csv/comment": "#"}),
         "15 header": one(
@@ -248,6 +261,7 @@ def cases() -> dict[str, Case]:
                 [",".join(r.split(",")[i] for i in (6, 5, 4, 3, 2, 1, 0)) for r in ROWS],
                 ",".join(HEADER.split(",")[::-1]),
             ),
+            notes=("N-ORDER",),
             kept=ALL,
         ),
         "21": one(
@@ -265,9 +279,13 @@ def cases() -> dict[str, Case]:
         "23": one(cell(5, 2, "ERR"), fault="not_a_number", says=r"column accel_y_g \(accel_y\) is 'ERR'", line=7),
         "23 drop": one(cell(5, 2, "ERR"), notes=("N-BADROW", "N-GAP"), kept=without(5), settings=DROP),
         "24 empty": one(cell(5, 2, ""), fault="not_finite", says=r"accel_y_g \(accel_y\) is empty", line=7),
+        "24 NaN": one(cell(5, 2, "NaN"), fault="not_finite", says="is 'NaN'; a finite number is expected", line=7),
+        "24 infinite": one(cell(5, 2, "-inf"), fault="not_finite", says="is '-inf'; a finite number", line=7),
+        "24 too large": one(cell(5, 2, "1e400"), fault="not_finite", says="more than a number can hold", line=7),
         "24 gap": one(cell(5, 2, "NaN"), notes=("N-NAN", "N-GAP"), kept=without(5), settings={"csv/nan": "gap"}),
         "25 hexadecimal": one(cell(5, 2, "0x1F"), fault="not_a_number", says="is '0x1F'", line=7),
         "25 thousands": one(cell(5, 2, '"1,000.5"'), fault="not_a_number", says="is '1,000.5'", line=7),
+        "25 quotes": one(cell(5, 2, '"0.5"'), fault="not_a_number", says="is '\"0.5\"', in quotes", line=7),
         "25 minus": one(cell(5, 2, "\u22120.5"), fault="not_a_number", says="is '\u22120.5'", line=7),
         "26": one(
             whole,
@@ -315,6 +333,18 @@ def cases() -> dict[str, Case]:
         ),
         "31": one(times(unix), fault="coarse_time", says="256 ns apart", settings={"csv/columns/time/unit": "ns"}),
         "32": one(times(wrapping), notes=("N-WRAP",), kept=ALL, settings={"csv/columns/time/unit": "us"}),
+        "32 milliseconds": one(
+            times([str((2**32 - 12_345 + 10 * i) % 2**32) for i in range(SAMPLES)]),
+            notes=("N-WRAP",),
+            kept=ALL,
+            settings={"csv/columns/time/unit": "ms"},
+        ),
+        "32 of 16 bits": one(
+            times([str((2**16 - 500 + i) % 2**16) for i in range(SAMPLES)]),
+            notes=("N-WRAP",),
+            kept=ALL,
+            settings={"csv/columns/time": {"column": "time_s", "unit": "counts", "counts_per_unit": 100.0}},
+        ),
         "33": one(
             text([*ROWS[:1500], *ROWS[200:1000]]),
             fault="time_back",
@@ -338,6 +368,11 @@ def cases() -> dict[str, Case]:
         ),
         "37": one(
             times([f"{0.01 * i + 0.004 * ((i * 7) % 3 == 0):.3f}" for i in range(SAMPLES)]),
+            notes=("N-JITTER",),
+            kept=ALL,
+        ),
+        "37 too much": one(
+            times([f"{0.01 * i + 0.008 * (i % 2):.3f}" for i in range(SAMPLES)]),
             notes=("N-JITTER",),
             kept=ALL,
         ),

@@ -159,7 +159,11 @@ def test_columns_are_found_by_name_in_any_order_and_others_are_noted(tmp_path: P
     assert read.gyroscope is not None
     assert read.accelerometer[0].tolist() == [0.1, 0.2, 1.0]
     assert read.gyroscope[0].tolist() == [4.0, 5.0, 6.0]
-    assert [(n.code, n.count, n.detail) for n in read.notes] == [("N-IGNORED", 1, "columns not used: comment")]
+    order = "gyro_z_dps, gyro_y_dps, gyro_x_dps, accel_z_g, accel_y_g, accel_x_g"
+    assert [(n.code, n.count, n.detail) for n in read.notes] == [
+        ("N-ORDER", 6, f"axes stand in the order {order} and were taken by their names"),
+        ("N-IGNORED", 1, "columns not used: comment"),
+    ]
 
 
 def test_axis_map_turns_readings_and_their_counts_into_body_axes(tmp_path: Path) -> None:

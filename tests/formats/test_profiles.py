@@ -56,6 +56,15 @@ def test_file_names_need_only_the_standard_library() -> None:
     assert done.stdout.strip() == "[]"
 
 
+def test_a_log_of_messages_is_read_without_the_library_for_text() -> None:
+    code = (
+        "import sys, pipeline.formats.read, pipeline.formats.mcap;"
+        "print([m for m in ('pyarrow', 'scipy', 'yaml', 'omegaconf') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
 def parts(*files: str) -> dict[str, Any]:
     ingest = profile("xsens_mti_multi_position")
     ingest["csv"]["parts"] = [{**p, "file": f} for p, f in zip(ingest["csv"]["parts"], files, strict=True)]

@@ -145,11 +145,6 @@ def test_number_cut_at_the_end_of_the_file_never_counts(tmp_path: Path, canonica
         assert set(recording.gyroscope[:, 2]) == {0.3}
 
 
-def test_uniform_crlf_needs_no_note(tmp_path: Path, canonical: dict[str, Any]) -> None:
-    (tmp_path / "accel_x.csv").write_bytes(text(*ROWS).encode().replace(b"\n", b"\r\n"))
-    assert read(tmp_path, canonical).notes == ()
-
-
 def test_missing_files_are_named_together_with_what_was_tried(tmp_path: Path, canonical: dict[str, Any]) -> None:
     write_canonical_csv(tmp_path / "b.csv", make_recording())
     with pytest.raises(MissingInputError) as caught:
