@@ -38,6 +38,7 @@ def render(
     failures: list[JSON],
     comparisons: Sequence[JSON] = (),
     page: str | None = None,
+    *,
     twins: Sequence[Sequence[str]] = (),
 ) -> str:
     """Return ``index.html``.

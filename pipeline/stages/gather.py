@@ -63,7 +63,7 @@ def main(argv: Sequence[str]) -> int:
     write_summary(job.output / "summary.csv", rows)
     write_json(job.output / "failures.json", failures)
     sections = [section(c, figures, f"comparison-{i}") for i, c in enumerate(job.run["compare"], 1)]
-    page = render(job.run["campaign"], rows, failures, sections, job.run["page"], same_files(inputs))
+    page = render(job.run["campaign"], rows, failures, sections, job.run["page"], twins=same_files(inputs))
     write_atomically(job.output / "index.html", page)
     return 0
 
