@@ -50,7 +50,9 @@ def export(calibration: dict[str, Any], settings: dict[str, Any], validation: di
     found = calibrations(calibration)
     plans = {s: _plan(found[s]) if s in found else _Plan() for s in SENSORS}
     busy = {s for s, plan in plans.items() if plan.moving}
-    circular = any(plans[s].looks_at & busy for s in busy)
+    turns = {
+        s for s in busy if s in plans[s].looks_at or plans[s].looks_at & {o for o in busy if s in plans[o].looks_at}
+    }
     used = set().union(*(plan.used for plan in plans.values()))
     past = bool(used & OF_THE_PAST)
     of_the_time = sorted({name for plan in plans.values() for name in plan.of_the_time})
@@ -63,8 +65,10 @@ def export(calibration: dict[str, Any], settings: dict[str, Any], validation: di
             text.HEAD.format(
                 remarks=BAR + BAR.join(_safe(r) for r in _remarks(calibration, found, plans, validation)),
                 tables="\n".join(_tables(sensor, found.get(sensor)) for sensor in SENSORS),
-                rounds=ROUNDS if circular else 1,
-                ends=ROUNDS if circular and past else 1,
+                rounds=ROUNDS if turns else 1,
+                ends=ROUNDS if turns and past else 1,
+                turn_accelerometer=int("accelerometer" in turns),
+                turn_gyroscope=int("gyroscope" in turns),
                 memory=SMOOTHING_S,
             ),
             *(f"{function}\n" for function in functions),

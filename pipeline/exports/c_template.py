@@ -13,7 +13,9 @@ HEAD = """\
 #endif
 typedef IMU_REAL imu_real;
 
-#define IMU_ROUNDS {rounds} /* of the fixed point; 1 where one solves the equation */
+#define IMU_ROUNDS {rounds} /* of the fixed point; 1 where none is needed */
+#define IMU_TURN_ACCELEROMETER {turn_accelerometer} /* whether its effects look at what they change */
+#define IMU_TURN_GYROSCOPE {turn_gyroscope}
 #define IMU_ENDS {ends} /* what is kept of the sample before, for each round */
 #ifndef IMU_TEMPERATURE_MEMORY
 #define IMU_TEMPERATURE_MEMORY {memory} /* s; 0 takes the temperature as it is */
@@ -200,11 +202,33 @@ static inline double imu_smooth(imu_state *s, double temperature, double time)
 """
 
 MAIN = """\
+/* Take off the effects of the motion: of the sensors that take turns, or of the others. */
+static inline void imu_pass(const imu_motion *m, const imu_real rf[3], const imu_real rw[3], int turn,
+                            imu_real f[3], imu_real w[3])
+{{
+    imu_real af[3], aw[3];
+    int i;
+    for (i = 0; i < 3; ++i) {{
+        af[i] = rf[i];
+        aw[i] = rw[i];
+        f[i] = m->f[i];
+        w[i] = m->w[i];
+    }}
+    if (IMU_TURN_ACCELEROMETER == turn) {{
+        imu_accelerometer_moving(m, af);
+        imu_linear(imu_accelerometer_matrix, imu_accelerometer_bias, af, f);
+    }}
+    if (IMU_TURN_GYROSCOPE == turn) {{
+        imu_gyroscope_moving(m, aw);
+        imu_linear(imu_gyroscope_matrix, imu_gyroscope_bias, aw, w);
+    }}
+}}
+
 static inline void imu_solve(imu_state *state, const imu_real raw_f[3], const imu_real raw_w[3], imu_motion m,
                              double time, imu_real f[3], imu_real w[3])
 {{
     imu_real rf[3], rw[3];
-    int round, settled = 0, i;
+    int round, i, settled = !(IMU_TURN_ACCELEROMETER || IMU_TURN_GYROSCOPE);
     for (i = 0; i < 3; ++i) {{
         rf[i] = raw_f[i];
         rw[i] = raw_w[i];
@@ -214,27 +238,17 @@ static inline void imu_solve(imu_state *state, const imu_real raw_f[3], const im
     imu_linear(imu_accelerometer_matrix, imu_accelerometer_bias, rf, m.f);
     imu_linear(imu_gyroscope_matrix, imu_gyroscope_bias, rw, m.w);
     for (round = 0; round < IMU_ROUNDS; ++round) {{
-        imu_real af[3], aw[3], nf[3], nw[3];
+        imu_real nf[3], nw[3];
 {past}        if (settled)
             continue; /* what is kept for later rounds is that of the solution */
-        for (i = 0; i < 3; ++i) {{
-            af[i] = rf[i];
-            aw[i] = rw[i];
-        }}
-        imu_accelerometer_moving(&m, af);
-        imu_gyroscope_moving(&m, aw);
-        imu_linear(imu_accelerometer_matrix, imu_accelerometer_bias, af, nf);
-        imu_linear(imu_gyroscope_matrix, imu_gyroscope_bias, aw, nw);
+        imu_pass(&m, rf, rw, 1, nf, nw);
         settled = imu_near(nf, m.f) && imu_near(nw, m.w);
         for (i = 0; i < 3; ++i) {{
             m.f[i] = nf[i];
             m.w[i] = nw[i];
         }}
     }}
-    for (i = 0; i < 3; ++i) {{
-        f[i] = m.f[i];
-        w[i] = m.w[i];
-    }}
+    imu_pass(&m, rf, rw, 0, f, w);
     (void)state; (void)time;
 }}
 

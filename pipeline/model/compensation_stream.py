@@ -3,10 +3,10 @@
     truth = matrix @ (reading - bias - sum of effects(truth))
 
 Everything is causal and each sample is worked out by itself, so that samples one by one, blocks and a whole log give
-the same numbers to the last bit. Effects that look at the time and the temperature alone are taken off once. Where the
-others look at truths that they do not change, one round solves the equation; else it is solved by fixed point
-(``pipeline.model.inversion``), and what a sample needs of the one before it, such as the rate for an angular
-acceleration, is that one's value of the same round.
+the same numbers to the last bit. Effects that look at the time and the temperature alone are taken off once, first.
+Sensors whose effects look at what they change are solved by fixed point (``pipeline.model.inversion``), where what a
+sample needs of the one before it, such as the rate for an angular acceleration, is that one's value of the same round.
+The effects of a sensor that look at the other's truth alone are taken off once, last.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.model.fading_line import FadingLine
-from pipeline.model.inversion import Part, linear_truth, sensor_effects, solve, without_effects
+from pipeline.model.inversion import Part, sensor_effects, solve, without_effects
 from pipeline.model.log_motion import SIGNALS, LogEnd, fields_used, log_motion
 from pipeline.records import SENSORS
 
@@ -82,6 +82,12 @@ class Steps:
         )
 
 
+def _circular(steps: Mapping[str, Steps]) -> set[str]:
+    """Return the sensors whose effects look at what they change, by themselves or by way of the other sensor."""
+    looks_at = {s: step.looks_at & {o for o in steps if steps[o].moving.effects} for s, step in steps.items()}
+    return {s for s, seen in looks_at.items() if any(other == s or s in looks_at[other] for other in seen)}
+
+
 @dataclass
 class CompensationStream:
     """Compensation of one log.
@@ -126,15 +132,16 @@ class CompensationStream:
         self._require(arrays)
         n = len(next(iter(arrays.values())))
         if n <= BLOCK:
-            found = self._block({name: np.asarray(a, np.float64) for name, a in arrays.items()}) if n else arrays
+            found = self._block(_by_axis(arrays)) if n else arrays
         else:
             found = {s: np.empty((n, 3)) if s in self.steps else arrays[s] for s in SENSORS if s in arrays}
             for start in range(0, n, BLOCK):
-                cut = {name: np.asarray(a[start : start + BLOCK], np.float64) for name, a in arrays.items()}
+                cut = _by_axis({name: a[start : start + BLOCK] for name, a in arrays.items()})
                 for s, truth in self._block(cut).items():
                     if s in self.steps:
                         found[s][start : start + BLOCK] = truth
-        shaped = {s: found[s][0] if single else found[s] for s in SENSORS if s in arrays}
+        kept = {s: np.ascontiguousarray(found[s]) if s in self.steps else arrays[s] for s in SENSORS if s in arrays}
+        shaped = {s: value[0] if single else value for s, value in kept.items()}
         return Compensated(shaped.get("accelerometer"), shaped.get("gyroscope"))
 
     def _block(self, arrays: Mapping[str, NDArray[np.float64]]) -> Truths:
@@ -163,8 +170,9 @@ class CompensationStream:
         self, steps: dict[str, Steps], readings: Truths, felt: Callable[[Truths, int], Motion], past: set[str]
     ) -> Truths:
         """Take off the effects that look at the truth, and remember the end of the block in each round."""
-        moving = {s: step.moving for s, step in steps.items()}
-        busy = {s for s, part in moving.items() if part.effects}
+        parts = {s: step.moving for s, step in steps.items()}
+        rounds = _circular(steps)
+        once = {s: part for s, part in parts.items() if part.effects and s not in rounds}
         ends: list[LogEnd] = []
 
         def noted(truths: Truths, number: int) -> Motion:
@@ -173,14 +181,13 @@ class CompensationStream:
                 ends.append(self._ends[min(number, len(self._ends) - 1)].after(motion, past))
             return motion
 
-        if any(steps[s].looks_at & busy for s in busy):
-            truths = solve(moving, readings, noted)
-            for number in range(len(ends), max(len(ends) + 1, len(self._ends)) if past else 0):
-                noted(truths, number)
-        else:
-            truths = {s: linear_truth(moving[s].calibration, r) if s in moving else r for s, r in readings.items()}
-            if busy:
-                truths |= without_effects({s: moving[s] for s in busy}, readings, noted(truths, 0))
+        truths = solve({s: p if s in rounds else p.without() for s, p in parts.items()}, readings, noted)
+        settled = len(ends)
+        for number in range(settled, max(settled + 1, len(self._ends)) if rounds and past else settled):
+            noted(truths, number)
+        if once:
+            motion = felt(truths, len(self._ends)) if rounds else noted(truths, 0)  # beside the solution before it
+            truths |= without_effects(once, readings, motion)
         self._ends = ends or self._ends
         return truths
 
@@ -194,6 +201,11 @@ class CompensationStream:
                         f"the {sensor} of unit {self.unit} was calibrated with the effect {name}, "
                         f"which needs {' and '.join(missing)}: give that too, or calibrate without the effect"
                     )
+
+
+def _by_axis(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[np.float64]]:
+    """Return signals as doubles, axis by axis in memory: what is done with each axis then runs through without gaps."""
+    return {name: np.asarray(array, np.float64, order="F") for name, array in arrays.items()}
 
 
 def _checked(given: dict[str, Any]) -> tuple[dict[str, NDArray[Any]], bool]:

@@ -57,6 +57,10 @@ class Part:
         """Return the part that takes off the given effects of a calibration."""
         return cls(calibration, tuple((effect_of(e), e.values) for e in effects), inverse_of(calibration))
 
+    def without(self) -> Part:
+        """Return the part that takes off no effect."""
+        return replace(self, effects=())
+
     def take_off(self, reading: NDArray[np.float64], motion: Motion) -> NDArray[np.float64]:
         """Return readings without what the effects add at a motion: (n, 3) array, g or deg/s."""
         for effect, values in self.effects:

@@ -43,6 +43,8 @@ ALGEBRA = {
     },
 }
 LIBRARY = {"accelerometer": {"hysteresis": 2e-3, "warm_up": 1e-2}, "gyroscope": {"warm_up": 0.5}}
+IN_TURN = {"accelerometer": {"cubic_nonlinearity": 4e-3}, "gyroscope": {"g_sensitivity": 0.1}}
+LEVERS = {"accelerometer": {"inner_lever_arms": 5e-3}, "gyroscope": {"scale_factor_asymmetry": 2e-3}}
 ONE_ROUND = {"accelerometer": {"inner_lever_arms": 5e-3}, "gyroscope": {"bias_temperature": 0.1}}
 OWN = {
     "name": "own",
@@ -132,7 +134,11 @@ def in_python(folder: Path, made: dict[str, Any], *, alone: bool = False) -> np.
 
 
 @needs_compiler
-@pytest.mark.parametrize("effects", [{}, ONE_ROUND, ALGEBRA], ids=["linear", "one round", "algebra"])
+@pytest.mark.parametrize(
+    "effects",
+    [{}, ONE_ROUND, IN_TURN, LEVERS, ALGEBRA],
+    ids=["linear", "one round", "in turn", "levers", "algebra"],
+)
 def test_samples_in_c_are_those_of_python_to_the_last_bit(tmp_path: Path, effects: dict[str, dict[str, float]]) -> None:
     made = document(effects)
     found, expected = compiled(tmp_path, made, "double"), in_python(tmp_path, made)

@@ -132,6 +132,16 @@ def some_steady_some_moving() -> dict[str, SensorCalibration]:
     }
 
 
+def one_after_the_other() -> dict[str, SensorCalibration]:
+    """A gyroscope that is solved by fixed point, and an accelerometer that looks at what it has found."""
+    cubic = fitted("cubic_nonlinearity", "gyroscope")  # as strong as makes the number of rounds vary
+    parameters = {name: {**p, "value": 2e-6} for name, p in cubic.parameters.items()}
+    return {
+        "accelerometer": calibration("accelerometer", (fitted("inner_lever_arms", "accelerometer"),)),
+        "gyroscope": calibration("gyroscope", (FittedEffect(cubic.name, parameters),)),
+    }
+
+
 def noisy_log(unit: dict[str, SensorCalibration], n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     m = motion(n)
     rng = np.random.default_rng(2)
@@ -142,7 +152,7 @@ def noisy_log(unit: dict[str, SensorCalibration], n: int) -> tuple[np.ndarray, n
 
 
 @pytest.mark.parametrize("size", [1, 7, 150])
-@pytest.mark.parametrize("effects", ["all", "own", "one round", "none"])
+@pytest.mark.parametrize("effects", ["all", "own", "one round", "in turn", "none"])
 def test_samples_one_by_one_and_blocks_give_the_same_numbers_as_one_piece_to_the_last_bit(
     size: int, effects: str
 ) -> None:
@@ -150,6 +160,7 @@ def test_samples_one_by_one_and_blocks_give_the_same_numbers_as_one_piece_to_the
         "all": everything,
         "own": lambda: {s: calibration(s, (own_effect(s),)) for s in SENSORS},
         "one round": some_steady_some_moving,
+        "in turn": one_after_the_other,
         "none": lambda: {s: calibration(s) for s in SENSORS},
     }[effects]()
     log = noisy_log(unit, 240)
