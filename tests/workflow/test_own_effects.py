@@ -1,6 +1,7 @@
 """An effect of a user's own through the real Snakefile: hidden, found, fitted, and taken off a field log."""
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -103,7 +104,9 @@ def test_validation_words_page_and_exports_know_it(bench: Bench) -> None:
     assert "A loose part of the sensor tips over with gravity." in words
     assert "loose_part" in (bench.results / "reports" / "known.html").read_text()
     header = (bench.results / "exports" / "known" / "calibration.h").read_text()
-    assert "Left out, accelerometer: loose_part (an effect of the user's own" in header
+    taken_off = re.findall(r"r\[\d\] -= \(imu_real\)(\S+) \* \(imu_real\)tanh\(\(8\.0 \* f\[2\]\)\)", header)
+    assert len(taken_off) == 3
+    np.testing.assert_allclose(np.array(taken_off, float), 0.01, rtol=0.05)
     assert "Of the bench, not of the gyroscope: gear_mesh." in header
 
 
