@@ -85,7 +85,7 @@ def one_chart() -> str:
 def opened(browser: Browser, path: Path, **settings: Any) -> Page:
     """Open a page that fails the test at its end if it asks for anything or reports an error."""
     page = browser.new_context(**settings).new_page()
-    page.set_default_timeout(20_000)
+    page.set_default_timeout(120_000)
     page.asked, page.wrong = [], []  # type: ignore[attr-defined]
     page.on("request", lambda r: page.asked.append(r.url))  # type: ignore[attr-defined]
     page.on("console", lambda m: page.wrong.append(m.text) if m.type in ("error", "warning") else None)  # type: ignore[attr-defined]
