@@ -7,3 +7,10 @@ import os
 
 for _threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_threads, "1")  # before numpy is imported
+
+from hypothesis import settings  # noqa: E402
+
+settings.register_profile(
+    "fixed", derandomize=True
+)  # the same cases each time; ``--hypothesis-profile default`` varies
+settings.load_profile("fixed")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pyarrow as pa
 
-from pipeline.formats.csv_fault import KIND_OF_SETTING, find_faults, quoted_numbers, refusal
+from pipeline.formats.csv_fault import KIND_OF_SETTING, find_faults, quoted_numbers, refusal, with_parted_rows
 from pipeline.formats.csv_layout import find_layout
 from pipeline.formats.csv_parse import all_finite, parse
 from pipeline.formats.csv_rows import Rows
@@ -69,9 +69,10 @@ def _without_faults(
     layout: Layout, settings: CsvFormat, checks: Checks, notes: list[Note]
 ) -> tuple[Layout, int, tuple[int, ...]]:
     """Return the layout without its bad lines, how many rows were given up, and where the log was restarted."""
-    faults = find_faults(layout)
+    faults = with_parted_rows(find_faults(layout), layout)
     rows = layout.body.count(b"\n")
-    tail = [f for f in faults if f.short and f.row == rows - 1]
+    cut = {f.row for f in faults if f.short and f.row == rows - 1}
+    tail = [f for f in faults if f.row in cut or f.parted_before in cut]
     headers = [f for f in faults if f.kind == "restarted"]
     others = [f for f in faults if f not in tail and f not in headers]
     allowed = {"bad_rows": settings.bad_rows == DROP, "nan": settings.nan == GAP}

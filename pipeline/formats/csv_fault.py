@@ -32,6 +32,7 @@ HINTS = {
     "decimal_comma": "set ingest.csv.decimal=',' and a delimiter that is none",
     "restarted": "the log was restarted: set ingest.csv.session=1, 2 .. to read one part of it",
 }
+END_OF_NUMBER = re.compile(r"[\d.,eE+-]+")
 KIND_OF_SETTING = {"bad_row": "bad_rows", "nul": "bad_rows", "not_a_number": "bad_rows", "not_finite": "nan"}
 
 
@@ -52,6 +53,8 @@ class Fault:
         The line.
     short : bool
         Whether it has fewer fields than are expected.
+    parted_before : int
+        The row of the single field that may be the end of this line's last number, -1 if there is none.
     """
 
     row: int
@@ -60,6 +63,7 @@ class Fault:
     message: str
     text: str
     short: bool = False
+    parted_before: int = -1
 
 
 def refusal(layout: Layout, faults: list[Fault], reason: str) -> IngestError:
@@ -93,6 +97,26 @@ def find_faults(layout: Layout) -> list[Fault]:
             found += list(_faults(layout, block, row))
         start, row = end, row + rows
     return found
+
+
+def with_parted_rows(faults: list[Fault], layout: Layout) -> list[Fault]:
+    """Return the faults and each row before a lone field: a line break in ``-0.0394`` leaves ``-0.03`` and ``94``."""
+    known = {f.row for f in faults}
+    lines = layout.body.split(b"\n") if faults else []
+    out = []
+    for fault in faults:
+        before = fault.row - 1
+        if (
+            fault.short
+            and layout.delimiter not in fault.text
+            and END_OF_NUMBER.fullmatch(fault.text)
+            and before not in known | {-1}
+        ):
+            message = f"the line may end inside a number: the next has a single field, {fault.text[:40]!r}"
+            text = lines[before].decode("utf-8", "replace")
+            out.append(Fault(before, layout.line_of(before), "bad_row", message, text, parted_before=fault.row))
+        out.append(fault)
+    return out
 
 
 def quoted_numbers(layout: Layout, block: bytes) -> bool:

@@ -8,6 +8,7 @@ the raw bytes cost less than reading the file.
 from __future__ import annotations
 
 import hashlib
+import re
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
 
 BOM = b"\xef\xbb\xbf"
 UTF_16 = "UTF-16 text: save it as UTF-8"
+# A line, a carriage return that no newline follows, and (looked at only) the line after it.
+BETWEEN = re.compile(rb"([^\r\n]+)\r(?!\n)(?=([^\r\n]+))")
+DELIMITER = re.compile(rb"[,;\t|]| +")
 # First bytes of files that carry a wrong name, and what to do.
 FOREIGN = {
     b"\x89MCAP": "an MCAP file: give it the suffix .mcap",
@@ -118,7 +122,7 @@ def load_text(path: Path, *, keep_nul: bool = False) -> TextFile:
     data = _without_nul(data, str(path), notes, keep_nul=keep_nul)
     _check_utf8(data, str(path))
     if b"\r" in data:
-        data = _uniform_line_ends(data, notes)
+        data = _uniform_line_ends(data, str(path), notes)
     if not data.endswith(b"\n"):
         data = _without_open_line(data, notes)
     return TextFile(str(path), data, hashlib.sha256(raw).hexdigest(), tuple(notes))
@@ -161,12 +165,31 @@ def _check_utf8(data: bytes, path: str) -> None:
         ) from error
 
 
-def _uniform_line_ends(data: bytes, notes: list[Note]) -> bytes:
+def _uniform_line_ends(data: bytes, path: str, notes: list[Note]) -> bytes:
     pairs, returns, newlines = data.count(b"\r\n"), data.count(b"\r"), data.count(b"\n")
+    if newlines and returns > pairs:
+        _refuse_broken_line(data, path)
     found = {"CRLF": pairs, "CR": returns - pairs, "LF": newlines - pairs}
     listed = ", ".join(f"{count} {name}" for name, count in found.items() if count)
     notes.append(Note("N-EOL", returns + newlines - pairs, 0, 0, f"line ends other than LF alone: {listed}"))
     return data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+
+
+def _refuse_broken_line(data: bytes, path: str) -> None:
+    r"""Refuse a carriage return inside a line: ``0\r.025`` was one number, and ``0`` is another.
+
+    Beside newlines, a lone carriage return is believed to end a line where what it parts is alike.
+    """
+    for found in BETWEEN.finditer(data):
+        left, right = found.group(1), found.group(2)
+        if not left.startswith(b"#") and len(DELIMITER.findall(left)) != len(DELIMITER.findall(right)):
+            line = data.count(b"\n", 0, found.start()) + 1
+            raise IngestError(
+                "a carriage return inside a line: it parts a row, perhaps a number, in two",
+                f"{path}:{line}",
+                fault="bad_row",
+                hint="remove the byte 0x0d or the whole line; carriage returns that end lines are read",
+            )
 
 
 def _without_open_line(data: bytes, notes: list[Note]) -> bytes:

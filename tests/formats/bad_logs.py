@@ -189,6 +189,8 @@ def cases() -> dict[str, Case]:
         "06 without mark": one(text().decode().encode("utf-16-le"), fault="utf16", says="UTF-16 text"),
         "07 mixed": one(whole.replace(b"\n", b"\r\n", 40), notes=("N-EOL",), kept=ALL),
         "07 CR": one(whole.replace(b"\n", b"\r"), notes=("N-EOL",), kept=ALL),
+        "07 inside a number": one(whole.replace(b"0.", b"0\r.", 1), fault="bad_row", says="a carriage return inside"),
+        "07 some lines": one(whole.replace(b"\n", b"\r", 40), notes=("N-EOL",), kept=ALL),
         "07 CRLF": one(whole.replace(b"\n", b"\r\n"), notes=("N-EOL",), kept=ALL),
         "08": one(whole[:-1], notes=("N-TAIL",), kept=without(SAMPLES - 1)),
         "08 in a number": one(whole[:-5], notes=("N-TAIL",), kept=without(SAMPLES - 1)),
@@ -202,6 +204,12 @@ def cases() -> dict[str, Case]:
         ),
         "10 drop": one(
             changed(5, "0.05,0.1"), notes=("N-BADROW", "N-GAP"), kept=without(5), settings=DROP, flags={5: 1}
+        ),
+        "10 line break in a number": one(
+            changed(5, ROWS[5][:-2] + "\n" + ROWS[5][-2:]),
+            notes=("N-BADROW", "N-GAP"),
+            kept=without(5),
+            settings=DROP,
         ),
         "10 over budget": one(
             text([r if i % 100 else "x" for i, r in enumerate(ROWS)]),
