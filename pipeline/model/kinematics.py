@@ -78,6 +78,7 @@ def reference_motion(
     Returns
     -------
     Motion or None
+        Kept with the recording where the offset is 0: both sensors and every step ask for it. Its arrays are shared.
 
     Raises
     ------
@@ -90,6 +91,11 @@ def reference_motion(
         build = _motion_of_attitude
     else:
         return None
+    key = (gravity_g, None if earth_rate_level is None else earth_rate_level.tobytes())
+    kept = not np.any(offset)
+    if kept and key in recording.motions:
+        found: Motion = recording.motions[key]
+        return found
     if recording.samples < 6:
         raise InputError(
             f"recording {recording.name} has {recording.samples} samples; at least 6 are needed to follow the table",
@@ -98,7 +104,10 @@ def reference_motion(
     temperature = recording.temperature
     if temperature is not None:
         temperature = smooth_temperature(recording.time, temperature)
-    return replace(build(recording, gravity_g, earth_rate_level, offset, temperature), recording=recording.name)
+    motion = replace(build(recording, gravity_g, earth_rate_level, offset, temperature), recording=recording.name)
+    if kept:
+        recording.motions[key] = motion
+    return motion
 
 
 def _motion_of_turn(

@@ -129,6 +129,11 @@ class Recording:
         """Median sampling interval, s."""
         return float(np.median(np.diff(self.time_ns))) / NANOSECONDS if self.samples > 1 else float("nan")
 
+    @cached_property
+    def motions(self) -> dict[Any, Any]:
+        """Motions that ``pipeline.model.kinematics.reference_motion`` has found for it, by place and gravity."""
+        return {}
+
     def reading(self, sensor: str) -> NDArray[np.float64] | None:
         """Return the (n, 3) readings of ``accelerometer`` (g) or ``gyroscope`` (deg/s), or None."""
         return self.accelerometer if sensor == "accelerometer" else self.gyroscope

@@ -135,27 +135,31 @@ def _rests(recording: Recording, sensor: str, *, everything: bool) -> list[Rest]
         still &= resting
     if everything:  # a gap does not end a static rest: the likelihood knows the times
         return [(recording.time[still], values[still])] if still.any() else []
-    return [
-        (recording.time[a:b], values[a:b])
-        for a, b in (_settled(recording, values, *stretch) for stretch in _stretches(recording, still))
-        if b - a > 2
-    ]
+    settled = _settled(recording, values, _stretches(recording, still))
+    return [(recording.time[a:b], values[a:b]) for a, b in settled if b - a > 2]
 
 
-def _settled(recording: Recording, values: NDArray[np.float64], start: int, stop: int) -> tuple[int, int]:
-    """Return a rest without the samples at its edges that still move; the sensor's clock may be off the table's."""
-    inside = values[start:stop]
-    edge = min(int(EDGE_S / recording.interval) + 1, len(inside) // 3)
-    if len(inside) < FEWEST_TO_SETTLE or edge == 0:
-        return start, stop
-    spread = np.median(np.abs(np.diff(inside, axis=0)), axis=0) / MEDIAN_STEP
-    for side in (1, -1):
-        ordered = inside[::side]
-        off = np.abs(ordered[:edge] - np.median(ordered[edge : 3 * edge], axis=0)) > SETTLED * spread
-        moving = np.flatnonzero(np.any(off & (spread > 0), axis=1))
-        cut = int(moving[-1]) + 1 if len(moving) else 0
-        start, stop = (start + cut, stop) if side == 1 else (start, stop - cut)
-    return start, stop
+def _settled(
+    recording: Recording, values: NDArray[np.float64], stretches: list[tuple[int, int]]
+) -> list[tuple[int, int]]:
+    """Return rests without the samples at their edges that still move; the sensor's clock may be off the table's."""
+    ends = np.array(stretches, int).reshape(-1, 2)
+    lengths = ends[:, 1] - ends[:, 0]
+    for length in np.unique(lengths):
+        edge = min(int(EDGE_S / recording.interval) + 1, int(length) // 3)
+        if length < FEWEST_TO_SETTLE or edge == 0:
+            continue
+        alike = np.flatnonzero(lengths == length)
+        inside = values[ends[alike, :1] + np.arange(length)]
+        spread = np.median(np.abs(np.diff(inside, axis=1)), axis=1, keepdims=True) / MEDIAN_STEP
+        for side in (1, -1):
+            ordered = inside[:, ::side]
+            middle = np.median(ordered[:, edge : 3 * edge], axis=1, keepdims=True)
+            off = np.abs(ordered[:, :edge] - middle) > SETTLED * spread
+            moving = np.any(off & (spread > 0), axis=2)
+            cut = np.where(moving, np.arange(1, edge + 1), 0).max(axis=1)
+            ends[alike, 0 if side == 1 else 1] += side * cut
+    return [(int(a), int(b)) for a, b in ends]
 
 
 def _noise_of_rests(
