@@ -7,6 +7,7 @@ import json
 import re
 import shlex
 from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 SHIPPED = CONFIGS.parent / "data"
 UNIT_NAME = re.compile(r"[A-Za-z0-9._-]+")
 FREE_COLUMNS = ("serial", "lot", "date")
+SMALLEST_BATCH, LARGEST_BATCH = 10, 100
 
 
 @dataclass(frozen=True)
@@ -208,26 +210,29 @@ def unit_overrides(value: Any, rows: Mapping[str, Any]) -> dict[str, list[str]]:
     return {str(name): as_list(v, f"unit_overrides of {name}") for name, v in value.items()}
 
 
-def batch_size(overrides: Sequence[str]) -> int:
-    """Return the batch size that the run's overrides ask for."""
+def batch_size(overrides: Sequence[str]) -> int | None:
+    """Return the batch size that the run's overrides ask for, None for ``auto``."""
     size = default_of_run("batch_size")
     for text in overrides:
         try:
             size = parse(text).value()
         except Problem as problem:
             raise ConfigurationError(str(problem)) from problem
+    if size == "auto":
+        return None
     if not isinstance(size, int) or isinstance(size, bool) or size < 1:
-        raise ConfigurationError(f"batch_size={size}: a whole number from 1 on is expected")
+        raise ConfigurationError(f"batch_size={size}: auto or a whole number from 1 on is expected")
     return size
 
 
 def cut_batches(
-    units: Mapping[str, UnitRow], size: int
+    units: Mapping[str, UnitRow], size: int | None
 ) -> tuple[dict[str, list[str]], dict[str, dict[str, list[str]]]]:
     """Cut units of one chain of stages into batches, in the order of the sheet.
 
     Appending units touches the last batch of their chain only. Whether effects are fitted does not cut batches anew:
-    a batch has the stage if any of its units asks for it.
+    a batch has the stage if any of its units asks for it. Without a size, batches hold 10, 10, 20, 20, 40, 40, 80, 80
+    and then 100 units: a bench runs side by side, and a fleet does not spend its time on starting jobs.
     """
     by_chain: dict[str, list[str]] = {}
     for name, unit in units.items():
@@ -237,15 +242,19 @@ def cut_batches(
     batches: dict[str, list[str]] = {}
     chains: dict[str, dict[str, list[str]]] = {}
     for chain, names in by_chain.items():
-        for i in range(0, len(names), size):
-            batch = f"{chain}-{i // size + 1:04d}"
-            batches[batch] = names[i : i + size]
+        rest = names
+        for number in count():
+            now = size or min(SMALLEST_BATCH * 2 ** (number // 2), LARGEST_BATCH)
+            batch = f"{chain}-{number + 1:04d}"
+            batches[batch], rest = rest[:now], rest[now:]
             configs = [units[n].config for n in batches[batch]]
             chains[batch] = {
                 sensor: configs[0]["method"]["stages"][sensor]
                 + (["effects"] if any(c["effects"][sensor] for c in configs) else [])
                 for sensor in ("accelerometer", "gyroscope")
             }
+            if not rest:
+                break
     return batches, chains
 
 

@@ -93,10 +93,13 @@ def blocks_of(rests: list[tuple[NDArray[np.float64], NDArray[np.float64]]], shor
     if not np.any(sizes >= 2 * size):  # many rests, all short: cut each in two rather than none
         size = max(shortest, int(sizes.max()) // 2)
     pieces = np.maximum(1, sizes // size)
-    counts = np.concatenate([np.diff(np.linspace(0, n, k + 1).astype(int)) for n, k in zip(sizes, pieces, strict=True)])
+    cuts = {(n, k): np.diff(np.linspace(0, n, k + 1).astype(int)) for n, k in set(zip(sizes, pieces, strict=True))}
+    counts = np.concatenate([cuts[n, k] for n, k in zip(sizes, pieces, strict=True)])
     rest = np.repeat(np.arange(len(rests)), pieces)
     time = np.concatenate([t for t, _ in rests])
-    values = np.concatenate([v - v.mean(axis=0) for _, v in rests])
+    values = np.concatenate([v for _, v in rests])
+    means = np.add.reduceat(values, np.concatenate([[0], np.cumsum(sizes)[:-1]])) / sizes[:, None]
+    values = values - np.repeat(means, sizes, axis=0)
     first = np.concatenate([[0], np.cumsum(counts)[:-1]])
     mean = np.add.reduceat(values, first) / counts[:, None]
     scatter = np.maximum(np.sum(values * values, axis=0) - np.sum(counts[:, None] * mean * mean, axis=0), 0.0)

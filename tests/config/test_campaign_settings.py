@@ -125,6 +125,19 @@ def test_appending_units_touches_the_last_batch_of_their_chain_only(tmp_path: Pa
     }
 
 
+def test_batches_grow_along_the_sheet_and_appending_still_touches_the_last_one_only(tmp_path: Path) -> None:
+    rows = "unit\n" + "".join(f"U{i:03d}\n" for i in range(450))
+    directory = campaign(tmp_path, rows)
+    before = load(directory).batches
+    assert [len(units) for units in before.values()] == [10, 10, 20, 20, 40, 40, 80, 80, 100, 50]
+    (directory / "units.csv").write_text(rows + "".join(f"V{i}\n" for i in range(60)))
+    after = load(directory).batches
+    last, new = list(after)[-2:]
+    assert {b for b, u in after.items() if before.get(b) != u} == {last, new}
+    assert (len(after[last]), len(after[new])) == (100, 10)
+    assert [u for units in after.values() for u in units] == list(load(directory).units)
+
+
 def test_the_stage_of_effects_follows_where_a_unit_of_the_batch_asks_for_it(tmp_path: Path) -> None:
     directory = campaign(tmp_path, "unit,overrides\nA,\nB,effects.gyroscope=[g_sensitivity]\n")
     chains = load(directory).chains["reference_least_squares-0001"]
