@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from markupsafe import Markup
 
 from pipeline.records import SENSORS
-from pipeline.report.fleet_figures import fleet_figures
+from pipeline.report.fleet_figures import FAR, fleet_figures
 from pipeline.report.numbers import number
 from pipeline.report.summary import COLUMNS
 from pipeline.report.templating import template
@@ -109,12 +109,14 @@ def _cells(row: JSON) -> JSON:
     cells["sensors"] = []
     for sensor in SENSORS:
         after, floor = row.get(f"{sensor}_error_after"), row.get(f"{sensor}_noise_floor")
+        ratio = after / floor if after is not None and floor else None
         cells["sensors"].append(
             (
                 _figure(row.get(f"{sensor}_error_before")),
                 _figure(after),
                 _figure(floor),
-                _figure(after / floor if after is not None and floor else None),
+                _figure(ratio),
+                "n" if ratio is None or ratio <= FAR else "n warn-text",
                 row.get(f"{sensor}_verdict") or "",
                 (row.get(f"{sensor}_selected") or "").replace("_", " ").replace(";", ", "),
             )
