@@ -6,6 +6,7 @@ A measured value is written to two digits of its expanded uncertainty, as the GU
 from __future__ import annotations
 
 import math
+import re
 
 NOTHING = "\N{EN DASH}"
 MINUS = "\N{MINUS SIGN}"
@@ -46,3 +47,9 @@ def probability(value: object) -> str:
     if not isinstance(value, int | float):
         return NOTHING
     return "< 1e\N{MINUS SIGN}12" if value < 1e-12 else number(value, 2)
+
+
+def typeset(sentence: str) -> str:
+    """Return a sentence as a terminal prints it with the signs of print: ``±``, the minus sign, ``ΔBIC``."""
+    signs = sentence.replace("+-", "±").replace("delta BIC", "ΔBIC")
+    return re.sub(r"(?<![\w.-])-(?=\d)|(?<=\de)-(?=\d)", MINUS, signs)

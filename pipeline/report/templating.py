@@ -8,7 +8,7 @@ from pathlib import Path
 from jinja2 import Environment, FileSystemLoader, Template
 from markupsafe import Markup
 
-from pipeline.report.numbers import measured, number, percent, probability
+from pipeline.report.numbers import measured, number, percent, probability, typeset
 
 FOLDER = Path(__file__).parent / "templates"
 
@@ -23,7 +23,12 @@ def template(name: str) -> Template:
         lstrip_blocks=True,
     )
     environment.filters.update(
-        number=number, measured=measured, percent=percent, probability=probability, words=lambda s: s.replace("_", " ")
+        number=number,
+        measured=measured,
+        percent=percent,
+        probability=probability,
+        typeset=typeset,
+        words=lambda s: s.replace("_", " "),
     )
     environment.globals["asset"] = asset
     return environment.get_template(name)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.report.axes import Scale, log_ticks, span, thin, tick_label, tick_step, ticks
-from pipeline.report.numbers import measured, number
+from pipeline.report.numbers import measured, number, typeset
 
 
 @pytest.mark.parametrize(
@@ -68,3 +68,10 @@ def test_a_measured_value_has_two_digits_of_its_uncertainty() -> None:
     assert measured(-12.3456, 3.7) == "−12.3 ± 3.7"
     assert measured(0.5, None) == "0.50000"
     assert number(None) == number(float("nan")) == "–"
+
+
+def test_sentences_of_a_terminal_get_the_signs_of_print_and_keep_hyphens() -> None:
+    said = "b_x = -0.1 +- 0.02 deg/s, p = 1e-12, G_xy = -3e-05 (delta BIC -8.9), on 2019-03-12, in warm-up 3-4"
+    assert (
+        typeset(said) == "b_x = −0.1 ± 0.02 deg/s, p = 1e−12, G_xy = −3e−05 (ΔBIC −8.9), on 2019-03-12, in warm-up 3-4"
+    )
