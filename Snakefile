@@ -37,6 +37,10 @@ localrules:
     verdict,
 
 
+onstart:
+    write_parts()
+
+
 onsuccess:
     say_at_the_end(
         f"units calibrated: {len(CAMPAIGN.units)}; look at {RESULTS}/index.html\n"

@@ -25,7 +25,7 @@ from pipeline.report import campaign_page, certificate_page
 from pipeline.report.certificate import certificate
 from pipeline.report.session import sensor_temperature
 from pipeline.report.unit_page import render
-from pipeline.stages.batch import read_json
+from pipeline.stages.batch import read_json, together
 from pipeline.stages.fits import load_fits
 from pipeline.validation.attitude import attitude
 
@@ -61,7 +61,7 @@ def unit_costs(results: Path, runs: int) -> dict[str, float]:
     batch = next(results.glob(f"batches/*/report/{UNIT}.html")).parents[1]
     parts: dict[str, Any] = {}
     for file in results.glob("configs/report-*.json"):
-        parts |= json.loads(file.read_text())["units"]
+        parts |= together(json.loads(file.read_text()))["units"]
     part = parts[UNIT]
     documents = [read_json(batch / stage / f"{UNIT}.json") for stage in ("calibration", "validate", "diagnose")]
     recordings = load_recordings(batch / "filter" / f"{UNIT}.parquet")

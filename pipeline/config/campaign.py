@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
-import csv
 import json
-import re
 import shlex
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.config.campaign_file import as_list, read_campaign_file, split_run_settings
 from pipeline.config.comparisons import resolve_comparisons
-from pipeline.config.compose import CONFIGS, GROUPS, Composer, Problem, default_of_run, nearest, parse
-from pipeline.config.user_effects import ONLY_FROM_THE_COMMAND_LINE, PYTHON
+from pipeline.config.compose import CONFIGS, Composer, Problem, default_of_run, nearest, parse
+from pipeline.config.layers import Layers, check_models_and_lots, read_devices, unit_overrides
+from pipeline.config.parts import config_sha256
+from pipeline.config.sheet import read_sheet
+from pipeline.config.user_effects import PYTHON
 from pipeline.errors import ConfigurationError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
 SHIPPED = CONFIGS.parent / "data"
-UNIT_NAME = re.compile(r"[A-Za-z0-9._-]+")
 FREE_COLUMNS = ("serial", "lot", "date")
 SMALLEST_BATCH, LARGEST_BATCH = 10, 100
 
@@ -33,6 +34,11 @@ class UnitRow:
     name: str
     row: dict[str, str]
     config: dict[str, Any]
+
+    @cached_property
+    def config_sha256(self) -> str:
+        """The digest of the configuration that results carry."""
+        return config_sha256(self.config)
 
 
 @dataclass(frozen=True)
@@ -117,20 +123,14 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
     if unknown:
         raise ConfigurationError(f"--config {unknown[0]}: unknown setting{nearest(unknown[0], valid)}")
     directory = find_campaign(str(settings.get("campaign", "demo")))
-    rows = read_units(directory / "units.csv")
-    own_file = read_campaign_file(directory / "campaign.yaml")
-    from_command = as_list(settings.get("overrides", []), "overrides")
-    per_unit = unit_overrides(settings.get("unit_overrides", {}), rows)
-    of_run, from_command = split_run_settings([*own_file.of_run, *from_command])
     composer = Composer(directory, as_list(settings.get(PYTHON, []), PYTHON, "paths of Python files"))
+    layers, of_run = load_layers(directory, settings, composer)
+    own_file = layers.campaign
     units: dict[str, UnitRow] = {}
     problems: dict[str, list[str]] = {}
-    for name, row in rows.items():
-        groups = [f"{g}={row[g]}" for g in GROUPS if row.get(g)]
-        own = [o.strip() for o in row.get("overrides", "").split(";") if o.strip()]
+    for name, row in layers.sheet.rows.items():
         try:
-            config = composer.unit(name, [*own_file.of_units, *groups, *own, *from_command, *per_unit.get(name, [])])
-            units[name] = UnitRow(name, row, config)
+            units[name] = UnitRow(name, row, composer.unit(name, [text for _, text in layers.of(name)]))
         except Problem as problem:
             for line in str(problem).splitlines():
                 problems.setdefault(line, []).append(name)
@@ -153,6 +153,18 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
     )
 
 
+def load_layers(directory: Path, settings: Mapping[str, Any], composer: Composer) -> tuple[Layers, list[str]]:
+    """Return the overrides of all units, and those of the run."""
+    sheet = read_sheet(directory / "units.csv")
+    file = directory / "campaign.yaml"
+    own_file = read_campaign_file(file)
+    check_models_and_lots(own_file, sheet, composer.options["sensor"], str(file))
+    from_command = as_list(settings.get("overrides", []), "overrides")
+    per_unit = unit_overrides(settings.get("unit_overrides", {}), sheet.rows)
+    of_run, from_command = split_run_settings([*own_file.of_run, *from_command])
+    return Layers(sheet, own_file, read_devices(directory, sheet), from_command, per_unit), of_run
+
+
 def find_campaign(name: str) -> Path:
     """Return the directory of a campaign: one that ships, by name, or any directory with a ``units.csv``."""
     for directory in (SHIPPED / name, Path(name)):
@@ -164,58 +176,12 @@ def find_campaign(name: str) -> Path:
     )
 
 
-def read_units(path: Path) -> dict[str, dict[str, str]]:
-    """Read ``units.csv``: unit name to row; refuses bad names, duplicates and ragged rows, all in one message."""
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as stream:
-            reader = csv.DictReader(stream, strict=True)
-            columns = [c.strip() for c in reader.fieldnames or []]
-            reader.fieldnames = columns
-            rows = [(reader.line_num, row) for row in reader]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ConfigurationError(f"cannot be read: {error}", str(path)) from error
-    if PYTHON in columns:
-        raise ConfigurationError(f"column {PYTHON}: {ONLY_FROM_THE_COMMAND_LINE}", f"{path}:1")
-    if "unit" not in columns:
-        raise ConfigurationError(f"has no column 'unit'; its columns are {', '.join(columns) or 'none'}", f"{path}:1")
-    found: dict[str, dict[str, str]] = {}
-    problems = [f"line 1: column {c!r} stands twice" for c in sorted({c for c in columns if columns.count(c) > 1})]
-    for line, raw in rows:
-        if None in raw or any(v is None for v in raw.values()):
-            problems.append(f"line {line}: {len(columns)} columns expected, as in the header")
-            continue
-        row = {k: v.strip() for k, v in raw.items()}
-        name = row["unit"]
-        if not UNIT_NAME.fullmatch(name) or name in (".", ".."):
-            problems.append(f"line {line}: unit {name!r}: use letters, digits, '.', '_', '-'")
-        elif name in found:
-            problems.append(f"line {line}: unit {name!r} stands twice")
-        else:
-            found[name] = row
-    if not found and not problems:
-        problems.append("has no units")
-    if problems:
-        raise ConfigurationError("; ".join(problems), str(path))
-    return found
-
-
-def unit_overrides(value: Any, rows: Mapping[str, Any]) -> dict[str, list[str]]:  # noqa: ANN401
-    """Check ``unit_overrides``: unit name to a list of overrides, of units that exist."""
-    if not isinstance(value, dict):
-        form = """'unit_overrides={U1: [filter.cutoff_hz=5, "effects.gyroscope=[g_sensitivity]"]}'"""
-        raise ConfigurationError(f"unit_overrides: {form} is the form (lists within are quoted), got {value!r}")
-    for name in value:
-        if str(name) not in rows:
-            raise ConfigurationError(f"unit_overrides: no unit {name!r} in units.csv{nearest(str(name), rows)}")
-    return {str(name): as_list(v, f"unit_overrides of {name}") for name, v in value.items()}
-
-
 def batch_size(overrides: Sequence[str]) -> int | None:
     """Return the batch size that the run's overrides ask for, None for ``auto``."""
     size = default_of_run("batch_size")
     for text in overrides:
         try:
-            size = parse(text).value()
+            size = parse(text)[1]
         except Problem as problem:
             raise ConfigurationError(str(problem)) from problem
     if size == "auto":

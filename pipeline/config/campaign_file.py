@@ -3,6 +3,8 @@
 For example::
 
     overrides: [filter=rc_low_pass]   # Hydra overrides of every unit, and settings of the run
+    models: {mpu6050: [filter=none]}  # of the units of a sensor model
+    lots: {"12": [filter.order=2]}    # of the units of a production lot
     compare: [[U1, U2]]               # what the campaign's page compares; see pipeline.config.comparisons
     simulate: true                    # the run makes the recordings, from simulation.yaml beside this file
     page: thesis                      # the run makes this page too, beside the campaign's own
@@ -25,7 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-KEYS = ("overrides", "compare", "simulate", "page")
+KEYS = ("overrides", "models", "lots", "compare", "simulate", "page")
 PAGES = ("thesis",)  # that a campaign may ask for: python -m pipeline PAGE page
 SIMULATION = "simulation.yaml"
 
@@ -38,6 +40,8 @@ class CampaignFile:
     ----------
     of_units, of_run : list of str
         Overrides of all units, and those that are settings of the run.
+    models, lots : dict of str to list of str
+        Overrides by sensor model, and by production lot.
     compare : list
         What the campaign's page compares, as it stands there.
     simulation : Path or None
@@ -48,6 +52,8 @@ class CampaignFile:
 
     of_units: list[str] = field(default_factory=list)
     of_run: list[str] = field(default_factory=list)
+    models: dict[str, list[str]] = field(default_factory=dict)
+    lots: dict[str, list[str]] = field(default_factory=dict)
     compare: list[Any] = field(default_factory=list)
     simulation: Path | None = None
     page: str | None = None
@@ -72,7 +78,15 @@ def read_campaign_file(path: Path) -> CampaignFile:
     compare = content.get("compare") or []
     if not isinstance(compare, list):
         raise ConfigurationError(f"compare: a list of comparisons is expected, got {compare!r}", str(path))
-    return CampaignFile(units, run, compare, _simulation(content, path), _page(content, path))
+    models, lots = (_by_name(content, key, path) for key in ("models", "lots"))
+    return CampaignFile(units, run, models, lots, compare, _simulation(content, path), _page(content, path))
+
+
+def unknown_key(content: Mapping[Any, Any], known: Sequence[str]) -> None:
+    """Refuse a key that is not known, with the nearest that is."""
+    unknown = [str(k) for k in content if k not in known]
+    if unknown:
+        raise ConfigurationError(f"{unknown[0]}: unknown key{nearest(unknown[0], known)}")
 
 
 def as_list(value: Any, where: str, what: str = "overrides KEY=VALUE") -> list[str]:  # noqa: ANN401  (the user's)
@@ -99,10 +113,24 @@ def _mapping(path: Path) -> dict[str, Any]:
         raise ConfigurationError("must be a mapping, for example 'overrides: [filter=rc_low_pass]'", str(path))
     if PYTHON in content:
         raise ConfigurationError(f"{PYTHON}: {ONLY_FROM_THE_COMMAND_LINE}", str(path))
-    unknown = [str(k) for k in content if k not in KEYS]
-    if unknown:
-        raise ConfigurationError(f"{unknown[0]}: unknown key{nearest(unknown[0], KEYS)}", str(path))
+    try:
+        unknown_key(content, KEYS)
+    except ConfigurationError as error:
+        raise ConfigurationError(error.message, str(path)) from None
     return {str(k): v for k, v in content.items()}
+
+
+def _by_name(content: Mapping[str, Any], key: str, path: Path) -> dict[str, list[str]]:
+    """Return the overrides of each sensor model, or of each lot."""
+    named = content.get(key) or {}
+    if not isinstance(named, dict):
+        raise ConfigurationError(f"{key}: names with a list of overrides each are expected, got {named!r}", str(path))
+    found = {str(name): as_list(value, f"{path}: {key}, {name}") for name, value in named.items()}
+    for name, overrides in found.items():
+        run, _ = split_run_settings(overrides)
+        if run:
+            raise ConfigurationError(f"{key}, {name}: {run[0]} is a setting of the run, not of units", str(path))
+    return found
 
 
 def _simulation(content: Mapping[str, Any], path: Path) -> Path | None:

@@ -1,13 +1,15 @@
 """Each stage's own part of the configuration, in a file that is named after its content.
 
 A job cannot read a setting that is not in its part, and the name of the file is a parameter of its rule; so changing a
-setting reruns exactly the stages that read it.
+setting reruns exactly the stages that read it. What is the same for all units of a batch stands in it once.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from pipeline.atomic import write_atomically
@@ -15,6 +17,7 @@ from pipeline.config.user_effects import effects_for
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+    from pathlib import Path
 
     from pipeline.config.campaign import Campaign
 
@@ -82,8 +85,8 @@ READS: dict[str, tuple[str, ...]] = {
         "certificate",
         "config_sha256",
     ),
-    "gather": (),
 }
+WITH_DIGEST = [stage for stage, keys in READS.items() if "config_sha256" in keys]
 
 
 def config_sha256(config: Mapping[str, Any]) -> str:
@@ -97,52 +100,108 @@ def part(config: Mapping[str, Any], stage: str, sensor: str = "") -> dict[str, A
     Parameters
     ----------
     config : mapping
-        The unit's whole configuration.
+        The unit's whole configuration, with its digest for those stages that read it.
     stage : str
         Key of ``READS``; other names are stages of a fit.
     sensor : str
         The sensor of a stage of a fit.
     """
-    whole = {**config, "config_sha256": config_sha256(config)} if stage in ("calibration", "report") else config
     out: dict[str, Any] = {}
-    for key in READS.get(stage, FIT):
-        path = key.format(sensor=sensor).split(".")
-        source: Any = whole
+    for *branch, leaf in _paths(stage, sensor):
+        source: Any = config
         target = out
-        for step in path[:-1]:
+        for step in branch:
             source = source[step]
             target = target.setdefault(step, {})
-        target[path[-1]] = source[path[-1]]
+        target[leaf] = source[leaf]
     return out
 
 
-def write_part(campaign: Campaign, stage: str, units: Sequence[str], sensor: str = "") -> str:
-    """Write a stage's part of the configuration of some units, unless it is there; return the file's path."""
-    content: dict[str, Any] = {"units": {u: part(campaign.units[u].config, stage, sensor) for u in units}}
-    content |= effects_for(stage, sensor, [campaign.units[u].config for u in units])
+@cache
+def _paths(stage: str, sensor: str) -> list[list[str]]:
+    return [key.format(sensor=sensor).split(".") for key in READS.get(stage, FIT)]
+
+
+@dataclass(frozen=True)
+class PartFile:
+    """A stage's part of the configuration of some units, as a file that is named after its content."""
+
+    path: Path
+    content: bytes
+
+    def write(self) -> str:
+        """Write the file, unless it is there; return its path."""
+        if not self.path.is_file():
+            write_atomically(self.path, self.content)
+        return str(self.path)
+
+
+def part_file(campaign: Campaign, stage: str, units: Sequence[str], sensor: str = "") -> PartFile:
+    """Return a stage's part of the configuration of some units.
+
+    Parameters
+    ----------
+    campaign : Campaign
+    stage : str
+        Key of ``READS``; other names are stages of a fit.
+    units : sequence of str
+    sensor : str
+        The sensor of a stage of a fit.
+    """
+    if stage == "gather":
+        content = _of_gather(campaign)
+    else:
+        rows = [campaign.units[u] for u in units]
+        digests = [{"config_sha256": r.config_sha256} if stage in WITH_DIGEST else {} for r in rows]
+        parts = {r.name: part(r.config | d, stage, sensor) for r, d in zip(rows, digests, strict=True)}
+        if stage == "report":
+            for unit, each in parts.items():
+                row = campaign.units[unit].row
+                each["row"] = {c: row[c] for c in ("serial", "lot", "date") if row.get(c)}
+                each["command"] = campaign.command(unit)
+        content = dict(zip(("common", "units"), in_common(parts), strict=True))
+        content |= effects_for(stage, sensor, [r.config for r in rows])
     if stage in ("ingest", "report"):
         content["campaign"] = campaign.name
-    if stage == "report":
-        for unit in units:
-            row = campaign.units[unit].row
-            content["units"][unit] |= {
-                "row": {c: row[c] for c in ("serial", "lot", "date") if row.get(c)},
-                "command": campaign.command(unit),
-            }
     if stage == "ingest":
         content["directory"] = str(campaign.recorded)
-    if stage == "gather":
-        content = {"campaign": campaign.name, "rows": {u: campaign.units[u].row for u in units}}
-        content["compare"] = campaign.compare
-        content["page"] = campaign.page
-        compared = {u for c in campaign.compare for g in c["groups"] for u in g["units"]}
-        content["truths"] = {u: str(campaign.truth(u)) for u in sorted(compared)}
     text = _canonical(content)
     name = f"{stage}-{sensor}" if sensor else stage
     path = campaign.results / "configs" / f"{name}-{hashlib.sha256(text).hexdigest()[:16]}.json"
-    if not path.is_file():
-        write_atomically(path, text)
-    return str(path)
+    return PartFile(path, text)
+
+
+def in_common(parts: Mapping[str, dict[str, Any]]) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+    """Split the parts of units in what all of them have, and what each has beside it.
+
+    ``pipeline.stages.batch.together`` puts them together again.
+    """
+    if len(parts) < 2:
+        return {}, dict(parts)
+    first, *others = parts.values()
+    shared: dict[str, Any] = {}
+    own = {unit: dict(each) for unit, each in parts.items()}
+    for key, value in first.items():
+        if all(key in each and each[key] == value for each in others):
+            shared[key] = value
+            for each in own.values():
+                del each[key]
+        elif all(isinstance(each.get(key), dict) for each in parts.values()):
+            shared[key], below = in_common({unit: each[key] for unit, each in parts.items()})
+            for unit, each in own.items():
+                each[key] = below[unit]
+    return shared, own
+
+
+def _of_gather(campaign: Campaign) -> dict[str, Any]:
+    compared = {u for c in campaign.compare for g in c["groups"] for u in g["units"]}
+    return {
+        "campaign": campaign.name,
+        "rows": {name: unit.row for name, unit in campaign.units.items()},
+        "compare": campaign.compare,
+        "page": campaign.page,
+        "truths": {u: str(campaign.truth(u)) for u in sorted(compared)},
+    }
 
 
 def _canonical(value: Any) -> bytes:  # noqa: ANN401  (any JSON value)

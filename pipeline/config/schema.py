@@ -239,3 +239,10 @@ class Unit(Section):
     effects: Effects
     limits: Limits
     certificate: Certificate
+
+
+SECTIONS: dict[str, type[BaseModel]] = {
+    name: field.annotation
+    for name, field in Unit.model_fields.items()
+    if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel)
+}

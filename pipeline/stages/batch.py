@@ -57,14 +57,26 @@ def parse_job(stage: str, argv: Sequence[str], inputs: Sequence[str], options: S
     for name in options:
         parser.add_argument(f"--{name}", default="", help=f"{name} of this stage")
     arguments = vars(parser.parse_args(argv))
-    content = json.loads(arguments.pop("config").read_text())
+    content = together(read_json(arguments.pop("config")))
     if "user_effects" in content:
         from pipeline.model.effect_files import register_user_effects  # noqa: PLC0415  (numpy, where there are any)
 
         register_user_effects(content["user_effects"])
     run = {k: v for k, v in content.items() if k != "units"} | {name: arguments[name] for name in options}
     folders = {name: arguments[name] for name in inputs}
-    return Job(stage, content.get("units", {}), run, folders, arguments["output"])
+    return Job(stage, content["units"], run, folders, arguments["output"])
+
+
+def together(content: dict[str, Any]) -> dict[str, Any]:
+    """Put into the part of each unit what stands in the file once for all of them."""
+    content["units"] = {unit: _merged(content.get("common", {}), own) for unit, own in content.get("units", {}).items()}
+    content.pop("common", None)
+    return content
+
+
+def _merged(common: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
+    below = {k: _merged(common[k], v) for k, v in own.items() if isinstance(v, dict) and k in common}
+    return {**common, **own, **below}
 
 
 def run_batch(job: Job, work: Callable[[str, dict[str, Any]], None]) -> int:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from pipeline.config import Campaign, load_campaign
-from pipeline.config.parts import write_part
+from pipeline.config.parts import part_file
 from pipeline.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 BEND = """\
 name: bend
@@ -47,7 +49,7 @@ def load(bench: Path, **settings: object) -> Campaign:
 
 
 def carried(campaign: Campaign, stage: str, sensor: str = "") -> tuple[list[str], int]:
-    content: dict[str, Any] = json.loads(Path(write_part(campaign, stage, list(campaign.units), sensor)).read_text())
+    content: dict[str, Any] = json.loads(part_file(campaign, stage, list(campaign.units), sensor).content)
     part = content.get("user_effects", {"formulas": [], "python": []})
     return [d["name"] for d in part["formulas"]], len(part["python"])
 
@@ -86,7 +88,9 @@ def test_a_stage_is_given_the_effects_that_it_needs(bench: Path) -> None:
 def test_a_changed_formula_or_python_file_changes_the_parts_that_hold_it(bench: Path) -> None:
     def parts() -> list[str]:
         found = load(bench, overrides="effects.gyroscope=[bend]", python_effects=[str(bench.parent / "mine.py")])
-        return [write_part(found, stage, ["U1"], s) for stage, s in (("effects", "gyroscope"), ("diagnose", ""))]
+        return [
+            part_file(found, stage, ["U1"], s).path.name for stage, s in (("effects", "gyroscope"), ("diagnose", ""))
+        ]
 
     before = parts()
     (bench / "effects" / "tip.yaml").write_text(TIP.replace("u**2", "u**4"))

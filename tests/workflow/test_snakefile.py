@@ -116,6 +116,9 @@ def test_a_refused_configuration_stops_the_run_before_any_job_with_one_message(b
     assert "Traceback" not in run.output
 
 
+SIX = "overrides=batch_size=6"
+
+
 @pytest.fixture(scope="module")
 def ten(tmp_path_factory: pytest.TempPathFactory, simulated: Path) -> Bench:
     names = [f"U{i}" for i in range(10)]
@@ -128,7 +131,7 @@ def ten(tmp_path_factory: pytest.TempPathFactory, simulated: Path) -> Bench:
 
 
 def test_one_bad_unit_leaves_nine_calibrated_and_is_named_at_the_end(ten: Bench) -> None:
-    run = ten.snakemake("overrides=batch_size=5")
+    run = ten.snakemake(SIX)
     assert run.code != 0
     rows = summary(ten)
     assert [r["unit"] for r in rows if r["status"] == "ok"] == [f"U{i}" for i in range(10) if i != 3]
@@ -141,19 +144,42 @@ def test_one_bad_unit_leaves_nine_calibrated_and_is_named_at_the_end(ten: Bench)
     last = run.output.strip().splitlines()[-3:]
     assert any("U3: " in line and "gyro_y.csv:41" in line and "broken" in line for line in last), last
 
-    again = ten.snakemake("overrides=batch_size=5")
+    again = ten.snakemake(SIX)
     assert again.code != 0
     assert again.jobs == {"verdict"}
     assert any("U3: " in line and "gyro_y.csv:41" in line for line in again.output.strip().splitlines()[-3:])
 
 
 def test_a_mended_unit_reruns_its_batch_only(ten: Bench, simulated: Path) -> None:
-    ten.snakemake("overrides=batch_size=5")
+    ten.snakemake(SIX)
     shutil.copy(simulated / "gyro_y.csv", ten.campaign / "raw" / "U3" / "gyro_y.csv")
-    run = ten.snakemake("overrides=batch_size=5")
+    run = ten.snakemake(SIX)
     assert run.code == 0
     assert not [job for job in run.jobs if "-0002" in job]
-    assert "Nothing to be done" in ten.snakemake("overrides=batch_size=5").output
+    assert "Nothing to be done" in ten.snakemake(SIX).output
+
+
+def test_a_change_to_one_unit_concerns_its_batch_and_new_units_the_last(ten: Bench, simulated: Path) -> None:
+    shutil.copy(simulated / "gyro_y.csv", ten.campaign / "raw" / "U3" / "gyro_y.csv")
+    ten.snakemake(SIX)
+    sheet, device = ten.campaign / "units.csv", ten.campaign / "devices" / "U7.yaml"
+    text = sheet.read_text()
+
+    def batches() -> set[str]:
+        jobs = ten.snakemake(SIX, dry=True).jobs
+        return {found.group(1) for job in jobs if (found := re.search(r"-(\d{4})", job))}
+
+    sheet.write_text(re.sub("$", ",", text.strip(), flags=re.MULTILINE).replace("unit,", "unit,overrides")
+        .replace("U2,", "U2,limits.gyroscope.bias=9"))  # fmt: skip
+    assert batches() == {"0001"}
+    sheet.write_text(text)
+    device.parent.mkdir()
+    device.write_text("overrides: [limits.gyroscope.bias=9]")
+    assert batches() == {"0002"}
+    device.unlink()
+    sheet.write_text(text + "".join(f"V{i}\n" for i in range(10)))
+    assert batches() == {"0002", "0003", "0004"}
+    sheet.write_text(text)
 
 
 def keep_the_first_rest(file: Path) -> None:
@@ -179,3 +205,22 @@ def test_other_failures_are_named_too(
     assert [(f["unit"], f["code"]) for f in failures] == [("G2", code)]
     assert cause in failures[0]["message"]
     assert json.loads((bench.results / "calibrations" / "G1.json").read_text())["status"] == "ok"
+
+
+def test_a_dry_run_writes_nothing(tmp_path: Path) -> None:
+    (tmp_path / "bench-7").mkdir()
+    bench = lay_out(tmp_path, "unit\nG1\n", tmp_path, [])
+    assert len(bench.snakemake(dry=True).jobs) > 9
+    assert not bench.results.exists()
+
+
+def test_jobs_find_what_the_users_own_python_path_holds(
+    tmp_path: Path, simulated: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = lay_out(tmp_path, "unit\nG1\n", simulated, ["G1"])
+    (tmp_path / "own").mkdir()
+    (tmp_path / "own" / "sitecustomize.py").write_text("import sys\nprint('own path', file=sys.stderr)\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "own"))
+    bench.snakemake("--until", "ingest")
+    (log,) = bench.results.glob("logs/*/ingest.log")
+    assert "own path" in log.read_text()

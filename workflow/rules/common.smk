@@ -1,5 +1,7 @@
 # The campaign, resolved and checked before any job; and what every rule has in common.
 import atexit
+import gc
+import hashlib
 import os
 import sys
 import time
@@ -7,11 +9,12 @@ import time
 from snakemake.exceptions import WorkflowError
 
 sys.path.insert(0, workflow.basedir)
-os.environ["PYTHONPATH"] = (
-    workflow.basedir
-)  # jobs run this copy of the package, from any working directory
+# Jobs run this copy of the package, from any working directory, and find what the user's own path holds.
+os.environ["PYTHONPATH"] = os.pathsep.join(
+    filter(None, [workflow.basedir, os.environ.get("PYTHONPATH")])
+)
 
-from pipeline.config import code_digest, load_campaign, write_part
+from pipeline.config import code_digest, load_campaign, part_file
 from pipeline.errors import PipelineError
 from pipeline.formats.files import recording_files
 
@@ -19,6 +22,7 @@ try:
     CAMPAIGN = load_campaign(config)
 except PipelineError as error:
     raise WorkflowError(str(error)) from None
+gc.freeze()  # the campaign stays: looking for garbage in thousands of configurations takes seconds
 
 RUN = f"{sys.executable} -m pipeline"
 RESULTS = str(CAMPAIGN.results)
@@ -26,6 +30,8 @@ BATCH = f"{RESULTS}/batches/{{batch}}"
 LOG = f"{RESULTS}/logs/{{batch}}"
 SENSORS = ["accelerometer", "gyroscope"]
 STARTED = time.time()
+WAITING = {}  # parts of the configuration: written where jobs are run, not in a dry run
+RUNNING = not workflow.is_main_process
 
 
 wildcard_constraints:
@@ -36,9 +42,25 @@ wildcard_constraints:
 
 def part(stage):
     """Return the function of a rule's params that names the stage's part of the configuration."""
-    return lambda wildcards: write_part(
-        CAMPAIGN, stage, CAMPAIGN.batches[wildcards.batch]
-    )
+    return lambda wildcards: name_part(stage, CAMPAIGN.batches[wildcards.batch])
+
+
+def name_part(stage, units, sensor=""):
+    """Return the path of a stage's part of the configuration, which is there once jobs are run."""
+    file = part_file(CAMPAIGN, stage, units, sensor)
+    if RUNNING:
+        return file.write()
+    WAITING[file.path] = file
+    return str(file.path)
+
+
+def write_parts():
+    """Write what jobs read of the configuration."""
+    global RUNNING
+    RUNNING = True
+    for file in WAITING.values():
+        file.write()
+    WAITING.clear()
 
 
 def last_fit(sensor):

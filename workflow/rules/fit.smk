@@ -7,9 +7,7 @@ def stage_before(wildcards):
 
 def part_of_fit(wildcards):
     stage = "effects" if wildcards.stage == "effects" else f"fit-{wildcards.stage}"
-    return write_part(
-        CAMPAIGN, stage, CAMPAIGN.batches[wildcards.batch], wildcards.sensor
-    )
+    return name_part(stage, CAMPAIGN.batches[wildcards.batch], wildcards.sensor)
 
 
 def code_of_fit(wildcards):

@@ -34,7 +34,7 @@ rule gather:
     log:
         f"{RESULTS}/logs/gather.log",
     params:
-        config=lambda wildcards: write_part(CAMPAIGN, "gather", list(CAMPAIGN.units)),
+        config=lambda wildcards: name_part("gather", list(CAMPAIGN.units)),
         code=code_digest("pipeline.stages.gather"),
         batches=",".join(f"{RESULTS}/batches/{batch}" for batch in CAMPAIGN.batches),
     shell:
