@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.signal import lfilter
@@ -12,8 +13,11 @@ from pipeline.model.effects.base import truth
 from pipeline.records import AXES, Recording
 from pipeline.simulation.alterations import ALTERATIONS, alter
 from pipeline.simulation.environment import Environment
-from pipeline.simulation.procedures import Course, Planned, plan
+from pipeline.simulation.procedures import Course, plan
 from pipeline.simulation.scene import Scene
+
+if TYPE_CHECKING:
+    from pipeline.simulation.planned import Planned
 
 STOP_AND_GO = Course(step_deg=5.0, dwell_s=2.0, rates_dps=(30.0, 100.0), both_directions=True, turns=1, rest_s=5.0)
 THESIS = replace(STOP_AND_GO, step_deg=1.0, dwell_s=1.0)

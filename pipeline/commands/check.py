@@ -20,6 +20,7 @@ from pipeline.formats.checks import checks_of
 from pipeline.formats.files import FILE, candidate_files
 from pipeline.formats.ingest_error import IngestError
 from pipeline.formats.read import read_table, to_recording
+from pipeline.signal.segments import cut
 from pipeline.survey.facts import as_text, facts
 from pipeline.survey.mcap_topics import topic_lines
 from pipeline.survey.profile_text import as_yaml
@@ -191,13 +192,15 @@ def _tell(reading: Reading) -> PipelineError | None:
         table = read_table(reading.files, reading.ingest)
         checks = checks_of(reading.ingest)
         recording = to_recording(reading.files[0].stem, reading.entry, table, reading.sensor, checks)
+        parts = cut(recording, reading.entry.get("windows")) if recording.role == "session" else []
     except PipelineError as error:
         topics = topic_lines(reading.files[0], fields=kind_of(error) == "missing_topic") if _is_mcap(reading) else []
         place = "" if error.file in (None, str(reading.files[0])) else f"{error.file}: "
         print(as_text([("REFUSED", f"{place}{error.message}"), ("code", kind_of(error)), *topics]) + "\n")
         return error
     topics = topic_lines(reading.files[0], fields=False) if _is_mcap(reading) else []
-    print(as_text([*topics, *facts(recording, reading.sensor)]) + "\n")
+    segments = [("segments" if i == 0 else "", f"{p.name}: {p.notes[-1].detail}") for i, p in enumerate(parts)]
+    print(as_text([*topics, *facts(recording, reading.sensor), *segments]) + "\n")
     return None
 
 

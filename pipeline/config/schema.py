@@ -63,13 +63,45 @@ class Table(Section):
     clock_accuracy_ppm: NonNegative | None = None
 
 
+class Rest(Section):
+    """A rest in a table's program."""
+
+    rest_s: NonNegative
+
+
+class Turn(Section):
+    """A turn in a table's program, with trapezoidal rate."""
+
+    turn_deg: float
+    rate_dps: Positive
+    acceleration_dps2: Positive
+
+
+class Repeated(Section):
+    """Steps of a table's program, some times over."""
+
+    repeat: Annotated[int, Field(ge=1)]
+    steps: list[Rest | Turn]
+
+
+class Window(Section):
+    """A part of one long recording, in s from its first sample."""
+
+    role: Literal["accelerometer", "gyroscope", "validation", "static"]
+    axis: Axis | None = None
+    start_s: NonNegative
+    stop_s: Positive
+
+
 class RecordingFile(Section):
     """One recording of a procedure."""
 
     file: str
-    role: Literal["accelerometer", "gyroscope", "rests", "validation", "static"]
+    role: Literal["accelerometer", "gyroscope", "rests", "validation", "static", "session"]
     axis: Axis | None
     optional: bool
+    program: list[Rest | Turn | Repeated] | None = None
+    windows: list[Window] | None = None
 
 
 class Procedure(Section):

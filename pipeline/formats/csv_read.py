@@ -58,7 +58,7 @@ def read_csv(paths: Sequence[Path], formats: Sequence[CsvFormat], checks: Checks
     others = [t for t, layout in zip(tables, formats, strict=True) if layout.own_clock]
     joined = _joined(same)
     if others or TABLE_TIME in joined.values:
-        from pipeline.formats.table_clock import align, own_rows  # noqa: PLC0415  (few logs need it)
+        from pipeline.formats.table_align import align, own_rows  # noqa: PLC0415  (few logs need it)
 
         for log in others or [own_rows(joined)]:
             joined = align(joined, log)

@@ -20,13 +20,13 @@ from pipeline.formats.channel_table import ChannelTable
 from pipeline.formats.ingest_error import IngestError
 from pipeline.formats.mcap_kinds import ABSENT, SHORT, TABLE_UNITS, VECTORS, topic_of, wanted_by_map, wanted_of
 from pipeline.formats.mcap_series import Gatherer, Series, check_finite
-from pipeline.formats.mcap_settings import TIME
+from pipeline.formats.mcap_settings import OWN, TIME
 from pipeline.formats.mcap_walk import Walk
 from pipeline.formats.message_definition import short_name
 from pipeline.formats.record_stream import check_magic
 from pipeline.formats.ros2 import IMU, JOINT_STATE, QUATERNION_STAMPED, TEMPERATURE
 from pipeline.formats.text_file import unchanged
-from pipeline.formats.units import ACCELEROMETER, COUNTS, GYROSCOPE, decode, to_house_unit
+from pipeline.formats.units import ACCELEROMETER, COUNTS, GYROSCOPE, TABLE_CHANNELS, decode, to_house_unit
 from pipeline.records import Encoding, Note
 
 if TYPE_CHECKING:
@@ -63,6 +63,7 @@ class _Reader:
         self.gatherers: dict[str, Gatherer] = {}
         self.notes: list[Note] = []
         self.encodings: dict[str, Encoding] = {}
+        self.logs: list[ChannelTable] = []  # of a table with a clock of its own
         self.end_ns = np.iinfo(np.int64).max  # the topics of a truncated file end at different times
 
     def table(self) -> ChannelTable:
@@ -88,7 +89,13 @@ class _Reader:
         time = base.time_ns[base.time_ns <= self.end_ns]
         values = {c: v[: len(time)] for c, v in values.items()}
         source = {"file": self.path, "sha256": self.walk.found.sha256, "rows": len(time)}
-        return ChannelTable(self.path, time, values, source, lambda _row: 0, self.encodings, notes=tuple(self.notes))
+        table = ChannelTable(self.path, time, values, source, lambda _row: 0, self.encodings, notes=tuple(self.notes))
+        if self.logs:
+            from pipeline.formats.table_align import align  # noqa: PLC0415  (few logs need it)
+
+            for log in self.logs:
+                table = align(table, log)
+        return table
 
     def _gatherer(self, topic: str, schema: str) -> Gatherer | None:
         """Return what takes in the messages of a topic; None if none are wanted."""
@@ -188,6 +195,9 @@ class _Reader:
             series = base if topic == first else self.gatherers[topic].series(self.settings, self.notes)
             numbers = {c: self._in_unit(c, series.values[c], f) for c, f in fields.items() if c != TIME}
             rows = Series(topic, series.time_ns, numbers)
+            if topic != first and self.settings.table_clock == OWN and set(numbers) <= set(TABLE_CHANNELS):
+                self._keep_log(rows)
+                continue
             if topic != first:
                 numbers = (
                     self._temperature(rows, base) if set(numbers) == {"temperature"} else self._matched(rows, base)
@@ -217,8 +227,18 @@ class _Reader:
         }
 
     def _table_values(self, series: Series, base: Series) -> dict[str, NDArray[Any]]:
-        matched = self._matched(series, base)
-        return {c: to_house_unit(c, v, TABLE_UNITS[c]) if c in TABLE_UNITS else v for c, v in matched.items()}
+        own = self.settings.table_clock == OWN
+        values = series.values if own else self._matched(series, base)
+        values = {c: to_house_unit(c, v, TABLE_UNITS[c]) if c in TABLE_UNITS else v for c, v in values.items()}
+        if not own:
+            return values
+        self._keep_log(Series(series.topic, series.time_ns, values))
+        return {}
+
+    def _keep_log(self, rows: Series) -> None:
+        """Keep the log of a table with a clock of its own until the sensor's is complete."""
+        source = {"topic": rows.topic, "rows": len(rows.time_ns)}
+        self.logs.append(ChannelTable(self.path, rows.time_ns, rows.values, source, lambda _row: 0))
 
     def _matched(self, series: Series, base: Series) -> dict[str, NDArray[Any]]:
         """Return the numbers of the messages with the stamps of the Imu messages."""
@@ -232,6 +252,7 @@ class _Reader:
                 f"first at {base.time_ns[unmatched[0]] / 1e9:.9g} s; the table has to be logged with the Imu's stamps",
                 self.path,
                 fault="bad_time",
+                hint="or, where its clock is another one, set ingest.mcap.table_clock=own",
             )
         extra = len(series.time_ns) - len(index)
         if extra > 0:

@@ -23,8 +23,9 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 NAMES = ("imu_topic", "temperature_topic", "joint_topic", "attitude_topic", "joint")
-KEYS = (*NAMES, "topics", "time_source", "allow_truncated", "clock_difference_s", "reorder_s")
+KEYS = (*NAMES, "topics", "time_source", "allow_truncated", "table_clock", "clock_difference_s", "reorder_s")
 TIME_SOURCES = ("header", "log_time")
+SHARED, OWN = "shared", "own"
 FIELD_KEYS = ("field", "unit", "counts_per_unit", "offset")
 TIME = "time"
 
@@ -54,6 +55,8 @@ class McapFormat:
     time_source : str
         ``header`` or ``log_time``.
     allow_truncated : bool
+    table_clock : str
+        ``shared``: the table's messages bear the Imu's stamps; ``own``: they are aligned by the motion.
     clock_difference_s, reorder_s : float, s
         How far headers and recorder may be apart (None: any), and how late a message may stand in the file.
     """
@@ -66,6 +69,7 @@ class McapFormat:
     topics: dict[str, dict[str, MappedField]] = field(default_factory=dict)
     time_source: str = "header"
     allow_truncated: bool = False
+    table_clock: str = SHARED
     clock_difference_s: float | None = 3600.0
     reorder_s: float = 1.0
 
@@ -87,6 +91,8 @@ def mcap_format(ingest: Mapping[str, Any]) -> McapFormat:
     source, truncated = mcap.get("time_source", "header"), mcap.get("allow_truncated", False)
     if source not in TIME_SOURCES:
         raise ConfigurationError(f"ingest.mcap.time_source is {source!r}; it is {' or '.join(TIME_SOURCES)}")
+    if mcap.get("table_clock", SHARED) not in (SHARED, OWN):
+        raise ConfigurationError(f"ingest.mcap.table_clock is {mcap['table_clock']!r}; it is {SHARED} or {OWN}")
     if not isinstance(truncated, bool):
         raise ConfigurationError(f"ingest.mcap.allow_truncated is {truncated!r}; it is true or false")
     for key, may_lack in (("clock_difference_s", True), ("reorder_s", False)):

@@ -19,8 +19,10 @@ from pipeline.formats.checks import checks_of
 from pipeline.formats.files import candidate_files, recording_files
 from pipeline.formats.ingest_error import IngestError
 from pipeline.formats.plausibility import check_axis, examine
-from pipeline.formats.units import ATTITUDE, TRIADS
+from pipeline.formats.table_log import unwrapped
+from pipeline.formats.units import ATTITUDE, TABLE_CHANNELS, TRIADS
 from pipeline.records import Note, Recording
+from pipeline.records.attitude import rate_of_attitude
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -124,13 +126,18 @@ def to_recording(
     ----------
     name : str
     entry : mapping
-        What the procedure says of the recording: ``role``, ``axis``.
+        What the procedure says of the recording: ``role``, ``axis``, and its ``program`` where the table logs nothing.
     table : ChannelTable
         Its channels are taken out of it.
     sensor : mapping
         Section of the unit's configuration.
     checks : Checks
     """
+    if entry.get("program") and not set(TABLE_CHANNELS) & table.values.keys():
+        from pipeline.formats.table_program import follow_program  # noqa: PLC0415  (few tables need it)
+
+        table = follow_program(table, entry["program"])
+    table = unwrapped(table)
     flags, notes = examine(table, sensor, checks)
     axis_map = tuple(sensor.get("axis_map") or AXIS_MAP)
     stated = table.source.get("gcsv", {}).get("orientation", "XYZ")
@@ -142,6 +149,9 @@ def to_recording(
             hint="one of them has to go: write orientation,XYZ in the file, or set sensor.axis_map=[+x,+y,+z]",
         )
     table = to_body_axes(table, axis_map)
+    if entry.get("axis") is None and ATTITUDE[0] in table.values and "table_rate" not in table.values:
+        attitude = np.column_stack([table.values[c] for c in ATTITUDE])
+        table.values["table_rate"] = rate_of_attitude((table.time_ns - table.time_ns[0]) / 1e9, attitude)
     check_axis(table, entry.get("axis"))
     values = table.values
     return Recording(

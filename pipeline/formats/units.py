@@ -26,6 +26,7 @@ GYROSCOPE = ("gyro_x", "gyro_y", "gyro_z")
 ATTITUDE = ("table_qw", "table_qx", "table_qy", "table_qz")
 SCALARS = ("temperature", "table_angle", "table_rate")
 CHANNELS = (*ACCELEROMETER, *GYROSCOPE, *SCALARS, *ATTITUDE)
+TABLE_CHANNELS = ("table_angle", "table_rate", *ATTITUDE)
 TRIADS = {"accelerometer": ACCELEROMETER, "gyroscope": GYROSCOPE}
 
 # Per quantity: unit to (multiplier, divisor); two numbers, because 1001.5 mg / 1000 is exact and times 0.001 is not.

@@ -14,7 +14,8 @@ import numpy as np
 from pipeline.simulation.campaign import course_of
 from pipeline.simulation.description import read_config
 from pipeline.simulation.gimbals import Gimbals, random_gimbals
-from pipeline.simulation.procedures import TABLE_PROCEDURES, Planned, plan
+from pipeline.simulation.planned import Planned
+from pipeline.simulation.procedures import TABLE_PROCEDURES, plan
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

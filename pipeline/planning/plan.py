@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from pipeline.planning.extra import Change
     from pipeline.planning.rehearsal import Rehearsal
     from pipeline.simulation.description import UnitDescription
-    from pipeline.simulation.procedures import Planned
+    from pipeline.simulation.planned import Planned
 
 UNITS = {"accelerometer": "g", "gyroscope": "deg/s"}
 Document = dict[str, Any]

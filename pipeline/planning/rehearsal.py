@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.simulation.description import UnitDescription
-    from pipeline.simulation.procedures import Planned
+    from pipeline.simulation.planned import Planned
 
 SEED = 0
 # The middle of what is drawn at random for a simulated unit: it warms up by some degrees in a room that changes little.

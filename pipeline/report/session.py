@@ -91,34 +91,37 @@ def segments(recordings: list[Recording], rests: dict[str, list[Rest]], calibrat
     calibration : dict
         As in its file; stages that found rests by themselves tell them in ``details``.
     """
-    lanes = [(r, _spans(r, rests[r.name], calibration)) for r in recordings if r.samples > 1]
-    if not any(spans for _, spans in lanes):
+    drawn = [r for r in recordings if r.samples > 1]
+    cut = len({r.source.get("file") for r in drawn}) == 1 < len(drawn)  # out of one file: drawn where they lie in it
+    first = min((float(r.time[0]) for r in drawn), default=0.0)
+    lanes = [(r, first if cut else float(r.time[0]), _spans(r, rests[r.name], calibration)) for r in drawn]
+    if not any(spans for *_, spans in lanes):
         return None
-    longest = max(float(r.time[-1] - r.time[0]) for r, _ in lanes)
+    longest = max(float(r.time[-1]) - start for r, start, _ in lanes)
     x, bottom = Scale(0.0, longest, LEFT, WIDTH - RIGHT), TOP + ROW * len(lanes)
     at, step = ticks(0.0, longest, 6), tick_step(0.0, longest, 6)
     out = [f'<path class="grid" d="{"".join(f"M{x.pixels(t):.1f} {TOP}V{bottom}" for t in at)}"/>']
-    out += [_lane(r, spans, x, TOP + ROW * i) for i, (r, spans) in enumerate(lanes)]
+    out += [_lane(r, start, spans, x, TOP + ROW * i) for i, (r, start, spans) in enumerate(lanes)]
     out += [text(x.pixels(t), bottom + 13, tick_label(t, step), "m") for t in at]
     out.append(text((LEFT + WIDTH - RIGHT) / 2, bottom + 27, "time since the start of the recording, s", "m"))
-    count = sum(len(spans) for _, spans in lanes)
+    count = sum(len(spans) for *_, spans in lanes)
     finding = f"{count} rest{'s' if count != 1 else ''} in {len(lanes)} recordings"
-    words = "; ".join(f"{r.name}: {len(spans)}" for r, spans in lanes)
+    words = "; ".join(f"{r.name}: {len(spans)}" for r, _, spans in lanes)
     svg = frame("segments", finding, f"Rests of each recording. {words}.", bottom + 34, "".join(out))
-    kinds = {colour for _, spans in lanes for *_, colour in spans}
+    kinds = {colour for *_, spans in lanes for *_, colour in spans}
     legend = tuple((f"c{c}", f"rest, {k.replace('_', ' ')}") for k, c in FOUND if c in kinds) or (("c4", "rest"),)
     return Figure(svg, "Thick: at rest; thin: in motion.", legend, finding)
 
 
-def _lane(recording: Recording, spans: Spans, x: Scale, top: float) -> str:
+def _lane(recording: Recording, origin: float, spans: Spans, x: Scale, top: float) -> str:
     middle = top + ROW / 2
-    end = x.pixels(float(recording.time[-1] - recording.time[0]))
+    begin, end = (x.pixels(float(recording.time[k]) - origin) for k in (0, -1))
     name = recording.name if len(recording.name) <= 13 else recording.name[:12] + "…"
     out = text(LEFT - 5, middle + 4, name, "e")
-    out += f'<path class="line c3" d="M{LEFT} {middle:g}H{end:.1f}"/>'
+    out += f'<path class="line c3" d="M{begin:.1f} {middle:g}H{end:.1f}"/>'
     scale, low = (x.stop - x.start) / (x.high - x.low), middle - 4
     for colour in sorted({s[2] for s in spans}):
-        ends = ((LEFT + scale * a, max(scale * (b - a), 0.8)) for a, b, c in spans if c == colour)
+        ends = ((begin + scale * a, max(scale * (b - a), 0.8)) for a, b, c in spans if c == colour)
         drawn = "".join(f"M{at:.1f} {low:g}h{wide:.1f}v8h-{wide:.1f}z" for at, wide in ends)
         out += f'<path class="bar c{colour}" d="{drawn}"/>'
     return out

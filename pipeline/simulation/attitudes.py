@@ -27,6 +27,8 @@ def axis_and_angle(rotation: NDArray[np.float64]) -> tuple[NDArray[np.float64], 
     q = np.linalg.eigh(matrix)[1][:, -1]
     q = q if q[0] >= 0.0 else -q
     size = float(np.linalg.norm(q[1:]))
+    if size == 0.0:  # none: any axis will do
+        return np.array([1.0, 0.0, 0.0]), 0.0
     return q[1:] / size, float(np.degrees(2.0 * np.arctan2(size, q[0])))
 
 

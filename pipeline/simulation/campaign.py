@@ -24,7 +24,8 @@ from pipeline.simulation.description import read_config
 from pipeline.simulation.draw import drawn_effects, drawn_sensors
 from pipeline.simulation.environment import random_environment
 from pipeline.simulation.inline_effects import inline_effects
-from pipeline.simulation.procedures import TABLE_PROCEDURES, Course, fit_to_samples, plan
+from pipeline.simulation.layout import columns_of, programs_of, with_table_log
+from pipeline.simulation.procedures import ONE_RECORDING, TABLE_PROCEDURES, Course, fit_to_samples, plan
 from pipeline.simulation.session import (
     ANGLE_DECIMALS,
     QUATERNION_DECIMALS,
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
     from pipeline.model.effects.base import Effect
     from pipeline.records import Recording
     from pipeline.simulation.description import Description, UnitDescription
-    from pipeline.simulation.procedures import Planned
+    from pipeline.simulation.planned import Planned
     from pipeline.simulation.sensor import SimulatedSensor
 
 COLUMNS = ("unit", "serial", "lot", "date", "sensor", "table", "procedure", "method", "ingest", "filter", "overrides")
@@ -72,9 +73,15 @@ def write_campaign(
     sheet_only : bool
         Write ``units.csv`` without recordings and truth: for a campaign whose run makes them.
     """
+    programs = programs_of(description.units, [course_of(u) for u in description.units])
+    for name, text in programs.items():
+        path = directory / "configs" / "procedure" / f"{name}.yaml"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
     for number, unit in enumerate([] if sheet_only else description.units):
         origin = _origin(description, unit, number)
-        recordings, truth = simulate_unit(description.units[origin], description.seed, origin)
+        original = replace(description.units[origin], table_log=unit.table_log)
+        recordings, truth = simulate_unit(original, description.seed, origin)
         sheet = read_config("sensor", unit.sensor)
         folder = directory / "raw" / unit.unit
         folder.mkdir(parents=True, exist_ok=True)
@@ -89,8 +96,12 @@ def write_campaign(
 
 def sheet_rows(description: Description) -> list[dict[str, Any]]:
     """Return the rows of ``units.csv``: of the units, of their variants, then the further ones."""
-    named = ("unit", "sensor", "table", "procedure")
-    rows = [{name: getattr(unit, name) for name in named} | unit.columns for unit in description.units]
+    rows = [
+        {"unit": unit.unit, "sensor": unit.sensor, "table": unit.table, "procedure": unit.procedure}
+        | columns_of(unit)
+        | unit.columns
+        for unit in description.units
+    ]
     variants = [_variant(row, variant) for variant in description.variants for row in rows]
     return rows + variants + [{str(k): v for k, v in row.items()} for row in description.rows]
 
@@ -135,14 +146,16 @@ def simulate_unit(
     ramp = course.thermal_ramp_degc if unit.procedure == "thermal_ramp" else 0.0
     environment = random_environment(streams["room"], ramp=ramp, ramp_period=total / 1.5)
     environment = replace(environment, **unit.temperature)
-    session = Session(planned, benches, hidden(effects), environment, unit.interval_s, course.pause_s, unit.lost)
+    pause = unit.interval_s if unit.procedure == ONE_RECORDING else course.pause_s
+    session = Session(planned, benches, hidden(effects), environment, unit.interval_s, pause, unit.lost)
     truth = {
         "seed": [seed, number],
         **{name: getattr(unit, name) for name in ("sensor", "table", "procedure", "interval_s", "lost")},
         **{s: _truth(sensors[s], effects[s], unit.interval_s) for s in SENSORS},
         "imperfections": {k: np.asarray(v).tolist() for k, v in bench.imperfections.items()},
     }
-    return session.recordings(streams), truth
+    recordings, clock = with_table_log(unit, planned, session.recordings(streams), streams["link"])
+    return recordings, truth | ({"table_clock": clock} if clock else {})
 
 
 def _wanted(unit: UnitDescription, planned: list[Planned]) -> list[Planned]:

@@ -24,7 +24,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import ConfigurationError, MissingInputError
-from pipeline.simulation.procedures import Course
+from pipeline.simulation.procedures import ONE_RECORDING, TABLE_PROCEDURES, Course
+from pipeline.simulation.table_logs import table_log_of
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 FORMATS = ("csv", "mcap")
@@ -71,11 +72,13 @@ class UnitDescription:
     temperature : dict
         ``ambient``, ``warm_up``, ``drift`` in degC, to replace the random ones.
     copy_of : str or None
-        The unit whose recordings these are once more, in another format.
+        The unit whose recordings these are once more, in another format or with another log of the table.
     recordings : list of str
         Those of the procedure's recordings that are made; empty for all.
     motion : int or None
         Number of the random motion: units of the same number and course move alike. None: each has a motion of its own.
+    table_log : dict
+        How the table is logged: attributes of ``table_logs.TableLog``.
     """
 
     unit: str
@@ -98,6 +101,7 @@ class UnitDescription:
     copy_of: str | None = None
     recordings: list[str] = field(default_factory=list)
     motion: int | None = None
+    table_log: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.format not in FORMATS:
@@ -107,6 +111,13 @@ class UnitDescription:
         if not self.interval_s > 0.0:
             raise ConfigurationError(f"unit {self.unit}: interval_s is {self.interval_s}; it must be above 0")
         _refuse_unknown(self.course, {f.name for f in fields(Course)}, f"unit {self.unit}: course")
+        log = table_log_of(self.table_log).kind
+        if log != "rows" and self.format != "csv":
+            raise ConfigurationError(f"unit {self.unit}: a table_log of its own is written in csv only")
+        if log != "rows" and self.procedure not in TABLE_PROCEDURES:
+            raise ConfigurationError(f"unit {self.unit}: procedure {self.procedure} has no table to log")
+        if log == "program" and self.procedure == ONE_RECORDING:
+            raise ConfigurationError(f"unit {self.unit}: procedure {ONE_RECORDING} has moves that no program describes")
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from pipeline.simulation.procedures import TABLE_PROCEDURES
+from pipeline.simulation.table_logs import KINDS
 
 if TYPE_CHECKING:
     import argparse
@@ -34,6 +35,8 @@ def add_recording_options(parser: argparse.ArgumentParser) -> None:
     add("--procedure", metavar="NAME", help="configs/procedure (three_axis_turns)")
     add("--samples", type=int, metavar="N", help="about so many rows a unit: dwells, rests, held-out motion follow")
     add("--interval", dest="interval_s", type=float, metavar="S", help="sampling interval in s (0.12)")
+    add("--table-log", choices=KINDS, help="where the table is logged: in the sensor's rows (the default), in a file "
+        "with a clock of its own, or not at all: then its program is known")  # fmt: skip
     add("--lost", type=float, metavar="SHARE", help="share of the samples that the radio link loses (0)")
     _add_course(parser.add_argument_group("how the procedure is run"))
 
@@ -68,5 +71,6 @@ def described(arguments: Mapping[str, Any]) -> dict[str, Any]:
     procedure = arguments.get("procedure", "three_axis_turns")
     unit: dict[str, Any] = {"table": "acutronic" if procedure in TABLE_PROCEDURES else "hand"}
     unit |= {name: arguments[name] for name in RECORDED if name in arguments}
+    unit |= {"table_log": {"kind": arguments["table_log"]}} if "table_log" in arguments else {}
     course = {name: arguments[name] for name in COURSE if name in arguments}
     return {**unit, "course": course} if course else unit

@@ -18,7 +18,9 @@ import numpy as np
 from pipeline.errors import ConfigurationError
 from pipeline.records import AXES
 from pipeline.simulation.attitudes import axis_and_angle, orientations_24, random_attitudes, six_positions
-from pipeline.simulation.gimbals import Gimbals, random_gimbals
+from pipeline.simulation.gimbals import random_gimbals
+from pipeline.simulation.one_session import with_transits
+from pipeline.simulation.planned import Planned
 from pipeline.simulation.program import ProgramBuilder
 from pipeline.simulation.trajectory import Moves, Turn, rotation_about
 
@@ -27,7 +29,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-TABLE_PROCEDURES = ("three_axis_turns", "thermal_ramp")
+ONE_RECORDING = "one_recording"
+TABLE_PROCEDURES = ("three_axis_turns", "thermal_ramp", ONE_RECORDING)
 ABOVE_ZERO = (
     "step_deg", "dwell_s", "accelerometer_rates_dps", "rates_dps", "turns", "acceleration_dps2", "step_rate_dps",
     "validation_rate_dps",
@@ -101,16 +104,6 @@ class Course:
             )
 
 
-@dataclass(frozen=True)
-class Planned:
-    """One recording to be made: its name, role, turn axis (index or None) and trajectory."""
-
-    name: str
-    role: str
-    axis: int | None
-    trajectory: Turn | Moves | Gimbals
-
-
 def plan(procedure: str, course: Course, rng: np.random.Generator, hand_accuracy: float = 0.0) -> list[Planned]:
     """Return the recordings of a procedure, in the order in which they are made.
 
@@ -128,7 +121,10 @@ def plan(procedure: str, course: Course, rng: np.random.Generator, hand_accuracy
         If there is no such procedure.
     """
     if procedure in TABLE_PROCEDURES:
-        return _turns(course) + _heldout(course, rng)
+        planned = _turns(course) + _heldout(course, rng)
+        return (
+            with_transits(planned, course.pause_s, course.acceleration_dps2) if procedure == ONE_RECORDING else planned
+        )
     attitudes: dict[str, Callable[[], NDArray[np.float64]]] = {
         "orientations_24": orientations_24,
         "six_positions": six_positions,

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from pipeline.records import Motion
     from pipeline.simulation.environment import Environment
-    from pipeline.simulation.procedures import Planned
+    from pipeline.simulation.planned import Planned
     from pipeline.simulation.sensor import SimulatedSensor
 
 STREAMS = ("unit", "effects", "motion", "table", "accelerometer", "gyroscope", "temperature", "link", "bench", "room")

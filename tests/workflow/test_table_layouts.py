@@ -1,0 +1,100 @@
+"""The table's log in another file, a program, one long recording: each to the page, and to the same calibration."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.formats.parquet import load_recordings
+
+from .conftest import ROOT, Bench
+
+pytestmark = pytest.mark.workflow
+
+COURSE = "course: {step_deg: 15.0, validation_s: 60.0, static_s: 60.0}, motion: 1"
+DESCRIPTION = f"""\
+seed: 5
+units:
+- {{unit: rows, {COURSE}}}
+- {{unit: file, copy_of: rows, {COURSE}, table_log: {{kind: file, wrapped: true}}}}
+- {{unit: program, copy_of: rows, {COURSE}, table_log: {{kind: program}}}}
+- {{unit: one, {COURSE}, procedure: one_recording}}
+- {{unit: one_file, {COURSE}, procedure: one_recording, table_log: {{kind: file}}}}
+- {{unit: windows, {COURSE}, procedure: one_recording}}
+"""
+TIMES = {"x": [(0, 50), (240, 272)], "y": [(60, 112), (310, 345)], "z": [(140, 195), (388, 422)]}
+WINDOWS = ", ".join(
+    f"{{role: {role}, axis: {axis}, start_s: {a}, stop_s: {b}}}"
+    for axis, spans in TIMES.items()
+    for role, (a, b) in zip(("accelerometer", "gyroscope"), spans, strict=True)
+)
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory: pytest.TempPathFactory) -> tuple[Bench, str]:
+    directory = tmp_path_factory.mktemp("layouts")
+    campaign = directory / "layouts"
+    campaign.mkdir()
+    (campaign / "simulation.yaml").write_text(DESCRIPTION)
+    command = [sys.executable, "-m", "pipeline", "simulate", str(campaign)]
+    subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
+    bench = Bench(directory, campaign)
+    override = f"procedure.recordings.recording.windows=[{WINDOWS}]"
+    run = bench.snakemake(f"unit_overrides={{windows: [{json.dumps(override)}]}}")
+    return bench, run.output
+
+
+def result(bench: Bench, kind: str, unit: str) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((bench.results / kind / f"{unit}.json").read_text())
+    return found
+
+
+@pytest.mark.parametrize("unit", ["rows", "file", "program", "one", "one_file"])
+def test_each_layout_gives_the_truth_within_its_uncertainty(done: tuple[Bench, str], unit: str) -> None:
+    bench, output = done
+    found = result(bench, "calibrations", unit)
+    assert found["status"] == "ok", output
+    truth = json.loads((bench.campaign / "truth" / f"{unit}.json").read_text())
+    for sensor in ("accelerometer", "gyroscope"):
+        for key in ("bias", "matrix"):
+            off = np.array(found[sensor][key]) - truth[sensor][key]
+            assert float(np.abs(off / found[sensor]["expanded_uncertainty"][key]).max()) < 2.0
+
+
+@pytest.mark.parametrize("unit", ["file", "program"])
+def test_a_twin_differs_by_little_of_its_uncertainty(done: tuple[Bench, str], unit: str) -> None:
+    bench, _ = done
+    twin, found = result(bench, "calibrations", "rows"), result(bench, "calibrations", unit)
+    for sensor in ("accelerometer", "gyroscope"):
+        for key in ("bias", "matrix"):
+            off = np.array(found[sensor][key]) - twin[sensor][key]
+            assert float(np.abs(off / twin[sensor]["expanded_uncertainty"][key]).max()) < 0.5
+        held_out = [result(bench, "validations", u)[sensor]["steps"][-1]["rms_error"] for u in ("rows", unit)]
+        assert held_out[1] == pytest.approx(held_out[0], rel=0.05)
+
+
+def test_the_page_tells_clock_program_and_segments(done: tuple[Bench, str]) -> None:
+    bench, _ = done
+    for unit, told in (
+        ("file", "the table&#39;s clock is"),
+        ("program", "the table is followed from its program"),
+        ("one", "24 steps about x at"),
+        ("windows", "accelerometer about x, from 0.00 to 49"),
+    ):
+        assert told in (bench.results / "reports" / f"{unit}.html").read_text(), unit
+
+
+def test_windows_in_the_configuration_take_the_place_of_what_is_found(done: tuple[Bench, str]) -> None:
+    bench, _ = done
+    ingested = next(bench.results.glob("batches/*/ingest/windows.parquet"))
+    found = {r.name: float(r.time[-1] - r.time[0]) for r in load_recordings(ingested)}
+    spans = {
+        f"{s}_{axis}": b - a for axis, at in TIMES.items() for s, (a, b) in zip(("accel", "gyro"), at, strict=True)
+    }
+    assert found == pytest.approx(spans, abs=0.25)  # two samples
+    assert result(bench, "calibrations", "windows")["status"] == "ok"
