@@ -14,6 +14,9 @@ where
 and in the channel whose axis is turned about ``y = z + h cos(A - phi)`` with a small h, the misalignment. Given phi the
 rest is linear; phi is the phase of the linear fit's own first harmonic, found by a few rounds since |cos| has even
 harmonics only. So all samples of a turn say where its extremes are, not the few at its flat peaks.
+
+A filter turns phi by rate x delay and shrinks a, but only while the table turns: a rest at either end is read as it is,
+and no one sinusoid holds both.
 """
 
 from __future__ import annotations
@@ -38,6 +41,11 @@ CLIPPED_OR_STUCK = 0b110
 DISTINCT_DIRECTION_G = 0.01
 ROUNDS = 12
 SAME_PHASE = 1e-12  # rad
+SLOWEST_SHARE = 0.02  # of the largest rate, below which a turn is not called one
+CHANGE_PER_SECOND = 0.25  # of the rate, above which a turn is not steady
+EDGE_S = 0.15
+LONGEST_TAIL = 0.4  # of a steady turn
+DELAYS_TO_FOLLOW = 5.0  # after which an RC filter holds less than 1 % of a change of rate
 WEAKEST_DIRECTION = 1e-3  # smallest singular value of unit columns that still counts as determined
 
 
@@ -134,6 +142,39 @@ def stop_and_go(motion: Motion) -> bool:
 def settled(part: Part) -> NDArray[np.bool_]:
     """Return the samples of a part that an accelerometer's fit uses: its rests if it stops and goes, else all."""
     return part.keep & part.motion.still if stop_and_go(part.motion) else part.keep
+
+
+def steady_turns(part: Part, memory: float) -> NDArray[np.bool_]:
+    """Return the samples in the steady parts of a turn about one axis, less a filter's memory of what was before.
+
+    A turn that is shorter than the memory (s) keeps its middle: what the filter still lacks there is a small share of
+    the turn, where the rest beside it would lack all.
+    """
+    motion = part.motion
+    if motion.axis is None or motion.rate is None:
+        return np.zeros(len(motion.time), bool)
+    rate, change = np.abs(motion.rate), np.abs(motion.angular_acceleration[:, motion.axis])
+    steady: NDArray[np.bool_] = (rate > SLOWEST_SHARE * np.max(rate)) & (change <= CHANGE_PER_SECOND * rate)
+    steady &= ~motion.still
+    both_ways = bool(part.recording.filter.get("zero_phase"))
+    for start, stop in runs(steady):
+        time = motion.time[start:stop]
+        tail = min(memory, LONGEST_TAIL * (time[-1] - time[0]))
+        since, until = (EDGE_S + tail if start else 0.0), EDGE_S + both_ways * tail
+        steady[start:stop] = (time >= time[0] + since) & (time <= time[-1] - until)
+    return steady
+
+
+def filtered_alike(part: Part) -> NDArray[np.bool_]:
+    """Return the samples of ``settled`` that a filter changes alike.
+
+    Without a filter, and of rests, these are all. In a continuous turn behind a filter they are those in which the
+    table turns steadily and the filter follows.
+    """
+    keep, applied = settled(part), part.recording.filter
+    if applied["name"] == "none" or part.motion.rate is None or stop_and_go(part.motion):
+        return keep
+    return keep & steady_turns(part, DELAYS_TO_FOLLOW * float(applied["delay_s"]))
 
 
 @dataclass(frozen=True)

@@ -178,6 +178,29 @@ def test_a_delaying_filter_moves_both_extremes_alike_and_leaves_orthogonality_al
     assert np.allclose(np.diag(found.matrix), SCALE / gain, rtol=5e-5)  # what the filter takes passes for scale
 
 
+def test_a_rest_beside_a_turn_behind_a_delaying_filter_moves_neither_bias_nor_sides() -> None:
+    bench = Bench("accelerometer", BIAS, np.diag(1.0 / SCALE))
+    rate = np.concatenate([np.zeros(25), np.full(103, 30.0), np.zeros(25)])  # one turn and 10 deg, with its rests
+    angle = np.concatenate([[0.0], np.cumsum((rate[1:] + rate[:-1]) / 2.0 * 0.12)])
+    late = [
+        apply_filter(r, {"name": "rc_low_pass", "cutoff_hz": None, "time_constant_s": 0.12, "zero_phase": False})
+        for r in (bench.turn(axis, angle, rate) for axis in "xyz")
+    ]
+    found = calibrate(late)
+    assert np.allclose(found.bias, BIAS, atol=3e-4)  # the rests fitted with the turn move it by 0.011
+    assert np.abs(found.effects[0].values).max() < 5e-4  # and feign 0.015
+
+
+def test_what_shakes_a_moving_table_is_among_the_printed_extremes_and_not_in_fitted_rests() -> None:
+    recordings = Bench("accelerometer", [0.0, 0.0, 0.0], np.eye(3)).stop_and_go(5.0, 1.2)
+    shaken = [
+        replace(r, accelerometer=r.accelerometer + 0.05 * (r.table_rate != 0.0)[:, None] * np.sign(r.accelerometer))
+        for r in recordings
+    ]
+    assert np.allclose(np.diag(calibrate(shaken).matrix), 1.0, atol=1e-9)
+    assert np.diag(calibrate(shaken, as_printed=True).matrix) == pytest.approx(np.full(3, 0.95), abs=0.01)
+
+
 def test_stated_uncertainty_covers_the_truth() -> None:
     # 80 units, 9 parameters each, 95 % claimed; four standard deviations of 80 independent units would be 0.10.
     before = SensorCalibration("accelerometer", stages=tuple(StageResult(name, {}) for name in STAGES[:3]))

@@ -7,7 +7,8 @@ readings, its readings where it is level, and what it reads while the table turn
     a_max = mean of the largest, a_min = mean of the smallest, a_zero = mean of the level readings  (3.23-3.25)
 
 By default they are those of sinusoids fitted to the turns (``pipeline.estimation.turns``): the opposite extreme is then
-180 deg away, and all samples count. ``as_printed`` takes the largest and the smallest sample and their angles.
+180 deg away, and all samples count that a filter changes alike. ``as_printed`` takes the largest and the smallest
+sample and their angles of all there are, in motion between two rests and at rest beside a turn too.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import numpy as np
 
 from pipeline.errors import NotObservableError
 from pipeline.estimation.correction import apply_step
-from pipeline.estimation.turns import fit_sinusoid, settled, wrap
+from pipeline.estimation.turns import filtered_alike, fit_sinusoid, wrap
 from pipeline.records import AXES
 
 if TYPE_CHECKING:
@@ -119,7 +120,7 @@ class Turn:
     motions: list[Motion]
 
 
-def turns_of(parts: Sequence[Part]) -> list[Turn]:
+def turns_of(parts: Sequence[Part], *, as_printed: bool) -> list[Turn]:
     """Return the turns about x, y and z.
 
     Raises
@@ -129,7 +130,7 @@ def turns_of(parts: Sequence[Part]) -> list[Turn]:
     """
     turns = []
     for axis in range(3):
-        used = [(part, settled(part)) for part in parts if part.motion.axis == axis]
+        used = [(part, samples_of(part, as_printed=as_printed)) for part in parts if part.motion.axis == axis]
         if not any(np.any(keep) for _, keep in used):
             raise NotObservableError(
                 f"no usable sample of a turn about body axis {AXES[axis]}: the staged method needs a turn about each "
@@ -140,6 +141,11 @@ def turns_of(parts: Sequence[Part]) -> list[Turn]:
         motions = [part.motion.select(keep) for part, keep in used]
         turns.append(Turn(angle, reading, [(part.recording, keep) for part, keep in used], motions))
     return turns
+
+
+def samples_of(part: Part, *, as_printed: bool) -> NDArray[np.bool_]:
+    """Return which samples of a part are used."""
+    return part.keep if as_printed else filtered_alike(part)
 
 
 def sinusoids_of(turns: Sequence[Turn]) -> list[list[Sinusoid]]:

@@ -77,7 +77,8 @@ def fit_stage(
     names = [*_stages_before(previous), name]
     as_printed = bool(settings["method"].get("as_printed", False))
     gravity_g = float(settings["table"].get("gravity_g", 1.0))
-    turns = turns_of(parts_of(recordings, "accelerometer", settings["table"], "the staged method"))
+    parts = parts_of(recordings, "accelerometer", settings["table"], "the staged method")
+    turns = turns_of(parts, as_printed=as_printed)
     sinusoids = sinusoids_of(turns)
     prior = prior_of("accelerometer", recordings, settings)
     noise = _noise(turns, prior)

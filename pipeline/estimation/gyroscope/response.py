@@ -20,7 +20,7 @@ import numpy as np
 
 from pipeline.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.sample_blocks import make_blocks
-from pipeline.estimation.turns import usable
+from pipeline.estimation.turns import steady_turns, usable
 from pipeline.records import AXES
 from pipeline.records.motion import motion_at_rest
 from pipeline.signal.rests import runs
@@ -34,10 +34,6 @@ if TYPE_CHECKING:
     from pipeline.estimation.turns import Part
     from pipeline.records import Motion, Recording
 
-SLOWEST_SHARE = 0.02  # of the largest rate, below which a turn is not called one
-CHANGE_PER_SECOND = 0.25  # of the rate, above which a turn is not steady
-EDGE_S = 0.15
-LONGEST_TAIL = 0.4  # of a steady turn
 FORGOTTEN = 1e-5  # of a change of rate, that a filter's output may still hold where a rest or a steady turn begins
 DELAYS_TO_SETTLE = 12.0  # the same for a filter that is known by its delay alone
 
@@ -113,7 +109,7 @@ def samples_of(parts: Sequence[Part], recordings: Sequence[Recording]) -> Sample
     chosen, readings, rates, motions = [], [], [], []
     for part in parts:
         memory = _memory(part.recording)
-        steady, still = _steady(part, memory), _without_tails(part, memory)
+        steady, still = steady_turns(part, memory), _without_tails(part, memory)
         rate = np.zeros((part.recording.samples, 3))
         if part.motion.axis is not None:
             rate[steady, part.motion.axis] = np.asarray(part.motion.rate)[steady]
@@ -159,27 +155,6 @@ def _without_tails(part: Part, memory: float) -> NDArray[np.bool_]:
         if stop < len(time):
             still[start:stop] &= time[start:stop] <= time[stop - 1] - before
     return still
-
-
-def _steady(part: Part, memory: float) -> NDArray[np.bool_]:
-    """Return the samples in the steady parts of a turn about one axis.
-
-    A turn that is shorter than the filter's memory keeps its middle: what the filter still lacks there is a small share
-    of the rate, where the bias of a rest would take all of it.
-    """
-    motion = part.motion
-    if motion.axis is None or motion.rate is None:
-        return np.zeros(len(motion.time), bool)
-    rate, change = np.abs(motion.rate), np.abs(motion.angular_acceleration[:, motion.axis])
-    steady: NDArray[np.bool_] = (rate > SLOWEST_SHARE * np.max(rate)) & (change <= CHANGE_PER_SECOND * rate)
-    steady &= ~motion.still
-    both_ways = bool(part.recording.filter.get("zero_phase"))
-    for start, stop in runs(steady):
-        time = motion.time[start:stop]
-        tail = min(memory, LONGEST_TAIL * (time[-1] - time[0]))
-        since, until = (EDGE_S + tail if start else 0.0), EDGE_S + both_ways * tail
-        steady[start:stop] = (time >= time[0] + since) & (time <= time[-1] - until)
-    return steady
 
 
 def weights_of(rate: NDArray[np.float64], *, as_printed: bool) -> NDArray[np.float64]:
