@@ -20,7 +20,8 @@ from pipeline.report.shapes import Samples
 from pipeline.report.svg import Panel, chart
 from pipeline.thesis.conclusions import Errors
 from pipeline.thesis.recorded import CAUSES
-from pipeline.thesis.results import CONTINUOUS, DEVICES, RATES, STOPS, procedure_of
+from pipeline.thesis.results import CONTINUOUS, DEVICES, RATES, STOPS, in_words, procedure_of
+from pipeline.thesis.seeds import device_of
 from pipeline.thesis.tables import read_printed
 from pipeline.validation.samples import samples_of_motion
 
@@ -39,7 +40,12 @@ BELOW = {
     "accelerometer": "stop and go, rest in s; continuous, deg/s",
     "gyroscope": "rate, deg/s",
 }
-FILTERS = {"staged": "RC low-pass", "zero-phase": "the same, zero-phase", "unfiltered": "no filter"}
+FILTERS = {
+    "staged": "RC low-pass",
+    "same-gain": "the same gain without delay",
+    "zero-phase": "run both ways, the gain twice",
+    "unfiltered": "no filter",
+}
 COLOURS = ("c0", "c1", "c2", "c3")
 
 
@@ -111,9 +117,17 @@ def _before_and_after(results: Results, unit: str, sensor: str, noise: Noise) ->
     drawn = held_out_over_time(sensor, recording, before, after, None)
     means = [number(float(np.mean(np.abs(e)))) for e in (before, after)]
     name = unit.removesuffix("-printed")
-    finding = f"{name}: mean |e| goes from {means[0]} to {means[1]} {UNITS[sensor]}"
+    finding = f"{_in_words(name)}: mean |e| goes from {means[0]} to {means[1]} {UNITS[sensor]}"
     svg = str(drawn.svg).replace(f"{sensor}-held-out", f"held-out-{name}")
     return replace(drawn, svg=type(drawn.svg)(svg), finding=finding, caption="Staged, as printed; below, after alone.")
+
+
+def _in_words(name: str) -> str:
+    device = device_of(name)
+    table, procedure = "", name.removeprefix(f"{device}-")
+    if procedure.startswith("mark2-"):
+        table, procedure = ", home-made table", procedure.removeprefix("mark2-")
+    return f"{DEVICES[device]}{table}, {in_words(procedure)}"
 
 
 def _per_procedure(results: Results, told: dict[tuple[str, str, str], float], device: str, sensor: str) -> Figure:
@@ -166,7 +180,7 @@ def _methods(results: Results, printed: Path, sensor: str) -> Figure:
     )
     legend = tuple((f"c{i}", text) for i, text in enumerate((*printed_names, *names)))
     finding = (
-        "Accelerometer: least squares and the corrected stages leave the same error"
+        "Accelerometer: the corrected stages leave little more than least squares"
         if sensor == "accelerometer"
         else "Gyroscope: inverted, Cholesky and LU leave what the stages leave"
     )
@@ -182,21 +196,22 @@ def _tables(results: Results, told: dict[tuple[str, str, str], float]) -> Figure
         for table, infix in (("acutronic", ""), ("mark2", "mark2-")):
             ours = [results.error(f"mpu6050-1-{infix}{procedure}-{m}", sensor) or 0.0 for m in ("printed", "staged")]
             share = [told["mpu6050-1", table, procedure] / printed_before, *(v / before for v in ours)]
-            groups[f"{sensor[:5]}., {'home-made' if infix else 'precise'}"] = [100.0 * v for v in share]
+            short = {"accelerometer": "accel.", "gyroscope": "gyro"}[sensor]
+            groups[f"{short}{', home' if infix else ''}"] = [100.0 * v for v in share]
     svg = columns(
         "tables",
         "What is left of the error on either table",
         "; ".join(f"{k}: {', '.join(number(v) for v in values)} %" for k, values in groups.items()),
         groups,
-        "mean |e| after, % of before",
-        x_label="sensor and table",
+        "after, % of before",
+        x_label="sensor; home: on the home-made table",
     )
     legend = tuple(zip(COLOURS, ("printed", "ours, as printed", "ours, errata corrected"), strict=False))
     return Figure(svg, "MPU6050 (1).", legend, "The home-made table leaves more of the error")
 
 
 def _speed(rows: Sequence[Row]) -> Figure:
-    """Draw the error of continuous rotation by rate, with three filters."""
+    """Draw the error of continuous rotation by rate, behind each filter."""
     errors = Errors(rows)
     points = []
     for method, name in FILTERS.items():
@@ -218,7 +233,7 @@ def _speed(rows: Sequence[Row]) -> Figure:
         svg,
         caption,
         legend,
-        "With the filter's gain the error grows at 30 deg/s, and twice as much where it runs twice",
+        "With the filter's gain the error grows at 30 deg/s, and more where it runs twice",
     )
 
 
@@ -231,7 +246,7 @@ def _scatter(scatter: Sequence[Scatter], quantity: str) -> Figure:
         f"Scatter of {quantity}",
         "; ".join(f"{k}: {', '.join(number(v) for v in values)}" for k, values in groups.items()),
         groups,
-        f"root mean square deviation of {quantity}",
+        f"rms deviation of {quantity}",
         x_label="device",
     )
     legend = tuple((f"c{i}", text) for i, text in enumerate(("printed", *CAUSES)))

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pipeline.records import Noise
-from pipeline.report.numbers import MINUS, NOTHING, number
+from pipeline.report.numbers import MINUS, NOTHING, number, percent
 from pipeline.report.templating import template
-from pipeline.thesis.conclusions import KINDS, conclusions, interval_text
+from pipeline.thesis.agreement import agreements
+from pipeline.thesis.conclusions import KINDS, conclusions
 from pipeline.thesis.errata import errata
 from pipeline.thesis.explanations import EXPLANATIONS, key_of
 from pipeline.thesis.figures import all_figures
 from pipeline.thesis.method_tables import method_tables, paper_tables
-from pipeline.thesis.recorded import CAUSES
+from pipeline.thesis.recorded import CAUSES, LOST
 from pipeline.thesis.results import DEVICES, Results
 from pipeline.thesis.scatter import scatters
 from pipeline.thesis.seeds import read_rows
@@ -57,7 +59,18 @@ def render(campaign: Path, folder: Path) -> str:
         figures=all_figures(printed, results, rows, scatter, silent),
         errata=errata(printed, results, rows),
         conclusions=[_conclusion(c) for c in conclusions(rows)],
-        explanations=[e for e in EXPLANATIONS if any(e.key in t["keys"] for t in tables)],
+        agreements=[
+            {
+                "what": a.what,
+                "method": a.method,
+                "bound": number(a.bound),
+                "largest": number(a.largest),
+                "within": f"{a.within} of {a.differences.size}",
+                "kind": "good" if a.within == a.differences.size else "warn",
+            }
+            for a in agreements(printed, results)
+        ],
+        explanations=sorted((e for e in EXPLANATIONS if any(e.key in t["keys"] for t in tables)), key=lambda e: e.key),
         scatter=[
             {
                 "device": DEVICES[s.device],
@@ -65,6 +78,7 @@ def render(campaign: Path, folder: Path) -> str:
                 "printed": number(s.printed, 2),
                 "causes": [number(v, 2) for v in s.seeds.values()],
                 "unexplained": number(s.unexplained, 2),
+                "share": percent(min(1.0, (s.seeds[LOST] / s.printed) ** 2)),
             }
             for s in scatter
         ],
@@ -107,7 +121,8 @@ def _cell(cell: Cell, key: str) -> JSON:
     def text(value: float | None, *, sign: bool = False) -> str:
         if value is None:
             return NOTHING
-        return f"{value:{'+' if sign else ''}.{digits}f}".replace("-", MINUS)
+        rounded = f"{value:{'+' if sign else ''}.{digits}f}"
+        return rounded.lstrip("+-") if float(rounded) == 0.0 else rounded.replace("-", MINUS)
 
     return {
         "printed": text(cell.printed),
@@ -118,22 +133,19 @@ def _cell(cell: Cell, key: str) -> JSON:
 
 
 def _conclusion(conclusion: Conclusion) -> JSON:
-    def mean(estimate: Estimate) -> str:
-        return number(estimate.value)
-
+    scale = 1000.0 if conclusion.unit == "mg" else 1.0
     return {
         "says": conclusion.says,
-        "unit": conclusion.unit,
+        "caption": f"{conclusion.compared}, {conclusion.unit}",
         "verdict": conclusion.verdict,
         "kind": conclusion.kind,
         "remark": conclusion.remark,
         "lines": [
             {
                 "what": line.what,
-                "first": mean(line.first),
-                "second": mean(line.second),
-                "difference": number(line.difference.value, 2),
-                "interval": interval_text(line.difference),
+                "first": number(scale * line.first.value),
+                "second": number(scale * line.second.value),
+                **_difference(line.difference, scale),
                 "count": line.difference.count,
                 "verdict": line.verdict,
                 "kind": KINDS[line.verdict],
@@ -141,6 +153,18 @@ def _conclusion(conclusion: Conclusion) -> JSON:
             for line in conclusion.lines
         ],
     }
+
+
+def _difference(estimate: Estimate, scale: float) -> dict[str, str]:
+    """Return a difference and its interval, to the decimals that two digits of the interval's half need."""
+    low, high = estimate.interval
+    half = scale * (high - low) / 2.0
+    decimals = max(0, 1 - math.floor(math.log10(half))) if half > 0.0 else 3
+
+    def text(value: float) -> str:
+        return f"{scale * value:+.{decimals}f}".replace("-", MINUS)
+
+    return {"difference": text(estimate.value), "interval": f"{text(low)} to {text(high)}"}
 
 
 def unexplained(tables: Sequence[Table]) -> list[str]:

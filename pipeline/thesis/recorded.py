@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.estimation.turns import parts_of, settled
+from pipeline.estimation.turns import parts_of
 from pipeline.records import SENSORS
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import read_config
@@ -23,6 +23,7 @@ from pipeline.simulation.sensor import SimulatedSensor, bias_wander
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from pipeline.estimation.turns import Part
     from pipeline.records import Recording
     from pipeline.simulation.description import Description, UnitDescription
 
@@ -44,38 +45,47 @@ class Set:
     unit : UnitDescription
     number : int
         In the description.
+    campaign_seed : int
+        Of the campaign: the motions are those of its recordings.
     """
 
     unit: UnitDescription
     number: int
+    campaign_seed: int
 
     @classmethod
     def named(cls, description: Description, name: str) -> Set:
         """Return the set of a name."""
         number = [u.unit for u in description.units].index(name)
-        return cls(description.units[number], number)
+        return cls(description.units[number], number, description.seed)
 
-    def sheet(self, sensor: str) -> dict[str, Any]:
-        """Return the sensor's data sheet, with the noise of its whole bandwidth."""
-        sheet: dict[str, Any] = read_config("sensor", self.unit.sensor)[sensor]
-        given = getattr(self.unit, sensor)
+    @property
+    def sensor(self) -> str:
+        """The sensor that the recordings are made for; the other one's readings are left out."""
+        return "gyroscope" if "-gyro" in self.unit.unit else "accelerometer"
+
+    @property
+    def sheet(self) -> dict[str, Any]:
+        """The sensor's data sheet, with the noise of its whole bandwidth."""
+        sheet: dict[str, Any] = read_config("sensor", self.unit.sensor)[self.sensor]
+        given = getattr(self.unit, self.sensor)
         return {**sheet, **{key: given[key] for key in ("noise_density",) if key in given}}
 
     @cached_property
     def still(self) -> list[Recording]:
         """The recordings without noise or loss."""
-        return _exact(self.unit, 0, self.number)
+        return _exact(self.unit, self.campaign_seed, self.number)
 
     @cached_property
     def shaken(self) -> list[Recording]:
         """The same on a table that shakes."""
-        return _exact(replace(self.unit, imperfections={**self.unit.imperfections, **SHAKING}), 0, self.number)
+        shaking = replace(self.unit, imperfections={**self.unit.imperfections, **SHAKING})
+        return _exact(shaking, self.campaign_seed, self.number)
 
     @cached_property
-    def settled(self) -> list[tuple[NDArray[np.float64], NDArray[np.bool_]]]:
-        """Table angle (deg) of every sample of each turn of the accelerometer, and which samples a fit uses."""
-        parts = parts_of(self.still, "accelerometer", read_config("table", self.unit.table), "the study")
-        return [(np.asarray(part.motion.angle), settled(part)) for part in parts]
+    def parts(self) -> list[Part]:
+        """The recordings without noise or loss, with the table's motion."""
+        return parts_of(self.still, "accelerometer", read_config("table", self.unit.table), "the study")
 
     def recordings(self, seed: int, cause: str = LOST) -> list[Recording]:
         """Return the recordings of one seed, disturbed by a cause and those before it in ``CAUSES``."""
@@ -86,17 +96,14 @@ class Set:
         exact = self.still if self.unit.table == "acutronic" else _exact(self.unit, seed, self.number)
         if cause == SHAKEN:
             exact = self.shaken
-        rng = {name: np.random.default_rng([seed, self.number, k]) for k, name in enumerate(("link", *SENSORS))}
-        noisy: dict[str, list[NDArray[np.float64]]] = {}
-        for sensor in SENSORS:
-            sheet = read_config("sensor", self.unit.sensor)[sensor] if cause == SHEET else self.sheet(sensor)
-            noisy[sensor] = _noisy(sensor, sheet, exact, rng[sensor])
+        link, noise = (np.random.default_rng([seed, self.number, k]) for k in (0, 1 + SENSORS.index(self.sensor)))
+        sheet = read_config("sensor", self.unit.sensor)[self.sensor] if cause == SHEET else self.sheet
         out = []
-        for k, recording in enumerate(exact):
-            made = replace(recording, accelerometer=noisy["accelerometer"][k], gyroscope=noisy["gyroscope"][k])
-            kept = rng["link"].random(recording.samples) >= (self.unit.lost if cause in (LOST, SHAKEN) else 0.0)
+        for recording, reading in zip(exact, _noisy(self.sensor, sheet, exact, noise), strict=True):
+            kept = link.random(recording.samples) >= (self.unit.lost if cause in (LOST, SHAKEN) else 0.0)
             kept[[0, -1]] = True
-            out.append((made, kept))
+            own: dict[str, Any] = {s: reading if s == self.sensor else None for s in SENSORS}
+            out.append((replace(recording, **own), kept))
         return out
 
 

@@ -7,11 +7,17 @@ from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from pipeline.formats.parquet import load_recordings
+from pipeline.records import Noise
+from pipeline.validation.samples import samples_of_motion
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
+
+    from numpy.typing import NDArray
 
     from pipeline.records import Recording
 
@@ -69,6 +75,28 @@ class Results:
         """Return a unit's recordings behind its filter; none where it failed."""
         files = list(self.folder.glob(f"batches/*/filter/{unit}.parquet"))
         return load_recordings(files[0]) if files else []
+
+    def with_printed(self, name: str, sensor: str, parameters: Mapping[str, str]) -> float | None:
+        """Return the mean |e| that printed parameters leave on the held-out motion of a set of recordings.
+
+        ``S (O M a - b)`` for the accelerometer (eq. 3.2), ``(g - b) M S`` for the gyroscope (3.45).
+        """
+        held_out = next((r for r in self.recordings(f"{name}-printed") if r.role == "validation"), None)
+        if held_out is None:
+            return None
+        silent = Noise(np.zeros(3), np.zeros(3), 100.0, "none")
+        samples = samples_of_motion(sensor, held_out, silent, {"gravity_g": 1.0})
+        assert samples is not None  # noqa: S101  (the table logs its rate)
+
+        def vector(pattern: str) -> NDArray[np.float64]:
+            return np.array([float(parameters[pattern.format(axis)]) for axis in "xyz"])
+
+        if sensor == "accelerometer":
+            corrected = vector("S_{}") * (vector("O_{}") * vector("M_{}") * samples.reading - vector("b_{}_g"))
+        else:
+            matrix = np.array([[float(parameters[f"M{i}{j}"]) for j in (1, 2, 3)] for i in (1, 2, 3)])
+            corrected = (samples.reading - vector("b_{}_dps")) @ matrix * vector("S_{}")
+        return float(np.mean(np.abs(np.linalg.norm(corrected, axis=1) - samples.magnitude)))
 
 
 @cache

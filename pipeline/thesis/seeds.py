@@ -2,8 +2,14 @@
 
     error = mean |e_n| of the held-out motion (Sudsanguan 2019, eqs 5.1 to 5.4), with the noise of the same seed
 
-Beside it stand, for the accelerometer, what the stages found: O of y and z, b, and S (mean of both sides). The
-estimates are those of the methods themselves; only their uncertainties are left out, which would take most of the time.
+Beside it stand, for the accelerometer as printed, what the stages found: O of y and z, M, b, and S (mean of both
+sides). "zero-phase" runs the RC filter both ways, so its gain works twice; "same-gain" runs one with a shorter time
+constant tau both ways, so that the gain is that of the causal filter and the delay none:
+
+    |H|^2 = 1 - tau (dt + tau) omega^2,   2 tau' (dt + tau') = tau (dt + tau)      for small omega
+
+The estimates are those of the methods themselves; only their uncertainties are left out, which would take most of the
+time.
 """
 
 from __future__ import annotations
@@ -17,9 +23,18 @@ import numpy as np
 
 from pipeline.estimation.accelerometer import nonlinear_least_squares, staged
 from pipeline.estimation.accelerometer.chain import follow
-from pipeline.estimation.accelerometer.extremes import Turn, extremes_of_samples, extremes_of_sinusoids, sinusoids_of
+from pipeline.estimation.accelerometer.extremes import (
+    Turn,
+    extremes_of_samples,
+    extremes_of_sinusoids,
+    samples_of,
+    sinusoids_of,
+)
 from pipeline.estimation.correction import apply_correction
-from pipeline.estimation.gyroscope import bias, cholesky_lu, orthogonality_and_misalignment, scale_factor
+from pipeline.estimation.gyroscope import response
+from pipeline.estimation.gyroscope import staged as gyroscope
+from pipeline.estimation.gyroscope.integrated_turns import turns_of
+from pipeline.estimation.turns import parts_of
 from pipeline.model.inversion import linear_truth
 from pipeline.records import Noise
 from pipeline.signal.filters import apply_filter
@@ -37,9 +52,11 @@ if TYPE_CHECKING:
 
     Correct = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
-FOUND = ("O_y", "O_z", "b_x", "b_y", "b_z", "S_x", "S_y", "S_z")
+FOUND = ("O_y", "O_z", "M", "b_x", "b_y", "b_z", "S_x", "S_y", "S_z")
 COLUMNS = ("set", "seed", "cause", "method", *FOUND, "error")
 TIME_CONSTANT_S = 0.12  # of campaign.yaml
+INTERVAL_S = 0.12  # of simulation.yaml
+SAME_GAIN_S = (np.sqrt(INTERVAL_S**2 + 2.0 * TIME_CONSTANT_S * (INTERVAL_S + TIME_CONSTANT_S)) - INTERVAL_S) / 2.0
 Row = dict[str, Any]
 
 
@@ -66,8 +83,9 @@ class Drawn:
         """Return a recording behind the filter."""
         if self.filter == "none":
             return recording
-        wanted = {**read_config("filter", "rc_low_pass"), "time_constant_s": TIME_CONSTANT_S}
-        return apply_filter(recording, {**wanted, "zero_phase": self.filter == "zero-phase"})
+        time_constant = SAME_GAIN_S if self.filter == "same-gain" else TIME_CONSTANT_S
+        wanted = {**read_config("filter", "rc_low_pass"), "time_constant_s": float(time_constant)}
+        return apply_filter(recording, {**wanted, "zero_phase": self.filter != "rc_low_pass"})
 
     def accelerometer_error(self, correct: Correct) -> float:
         """Return the mean |e| of the held-out motion, corrected."""
@@ -76,7 +94,7 @@ class Drawn:
 
     def staged_accelerometer(self, *, as_printed: bool, judge: bool = True) -> Row:
         """Return what the stages find, and the error that they leave."""
-        turns = self._turns()
+        turns = self._turns(as_printed=as_printed)
         extremes = (
             extremes_of_samples(turns)
             if as_printed
@@ -92,6 +110,8 @@ class Drawn:
                 elif name in ("orthogonality", "scale_factor"):
                     letter = "O" if name == "orthogonality" else "S"
                     row[f"{letter}_{axis}"] = (values[f"{letter}_P_{axis}"] + values[f"{letter}_N_{axis}"]) / 2.0
+            if name == "misalignment":  # the same on all axes
+                row["M"] = (values["M_P_x"] + values["M_N_x"]) / 2.0
         if judge:
             row["error"] = self.accelerometer_error(partial(apply_correction, {"steps": chain.steps}))
         return row
@@ -102,26 +122,41 @@ class Drawn:
         fitted = nonlinear_least_squares.fit(turns, None, self._settings())
         return {"error": self.accelerometer_error(partial(linear_truth, fitted))}
 
-    def gyroscope(self, method: str) -> Row:
-        """Return the error that the staged method or Cholesky and LU leave, the latter as printed or inverted."""
-        settings = self._settings() | {"method": {"as_printed": method == "cholesky-printed"}}
+    def gyroscope(self) -> Iterator[tuple[str, Row]]:
+        """Yield method and error of the staged method, and of Cholesky and LU as printed and inverted."""
         turns = [self.filtered(r) for r in self.own.recordings(self.seed, self.cause)]
-        fitted = bias.fit(turns, None, settings)
-        for stage in (orthogonality_and_misalignment, scale_factor) if method == "staged" else (cholesky_lu,):
-            fitted = stage.fit(turns, fitted, settings)
+        table = self._settings()["table"]
+        parts = parts_of(turns, "gyroscope", table, "the study")
+        samples = response.samples_of(parts, turns)
+        theta = response.weights_of(samples.rate, as_printed=False) @ samples.reading
+        chain = gyroscope.follow(
+            response.Response(theta[0], theta[1:], samples.speed), gyroscope.STAGES, as_printed=False
+        )
+        integrated = turns_of(parts)
+        U, Y = integrated.integral(integrated.rate), integrated.integral(integrated.reading - theta[0])
+        forward = np.linalg.lstsq(U, Y, rcond=None)[0].T
+        matrices = {
+            "staged": chain.contract()[1],
+            "cholesky-printed": forward,
+            "cholesky": np.linalg.solve(forward, np.eye(3)),
+        }
         silent = Noise(np.zeros(3), np.zeros(3), 100.0, "none")
-        motion = samples_of_motion("gyroscope", self.filtered(self.held_out), silent, settings["table"])
+        motion = samples_of_motion("gyroscope", self.filtered(self.held_out), silent, table)
         assert motion is not None  # noqa: S101  (the table logs its rate)
-        error = np.linalg.norm(linear_truth(fitted, motion.reading), axis=1) - motion.magnitude
-        return {"error": float(np.mean(np.abs(error)))}
+        for method, matrix in matrices.items():
+            error = np.linalg.norm((motion.reading - theta[0]) @ matrix.T, axis=1) - motion.magnitude
+            yield method, {"error": float(np.mean(np.abs(error)))}
 
-    def _turns(self) -> list[Turn]:
+    def _turns(self, *, as_printed: bool) -> list[Turn]:
         """Return what the staged method sees of the turns; their motion is the same for every seed."""
         turns = []
         drawn = self.own.drawn(self.seed, self.cause)
-        for (angle, used), (recording, kept) in zip(self.own.settled, drawn, strict=True):
-            reading = np.asarray(self.filtered(recording.select(kept)).accelerometer)
-            turns.append(Turn(angle[kept & used], reading[used[kept]], [], []))
+        for part, (recording, kept) in zip(self.own.parts, drawn, strict=True):
+            filtered = self.filtered(recording.select(kept))
+            late = replace(part, recording=replace(part.recording, filter=filtered.filter))
+            used = samples_of(late, as_printed=as_printed)
+            reading = np.asarray(filtered.accelerometer)[used[kept]]
+            turns.append(Turn(np.asarray(part.motion.angle)[kept & used], reading, [], []))
         return turns
 
     def _settings(self) -> dict[str, Any]:
@@ -144,31 +179,34 @@ def study(campaign: Path, sets: Sequence[str], seeds: Sequence[int]) -> Iterator
     description = read_description(campaign / "simulation.yaml")
     for name in sets:
         own = Set.named(description, name)
-        sensor = "gyroscope" if "-gyro-" in name else "accelerometer"
-        held_out = Set.named(description, f"{device_of(name)}-held-out-{sensor}")
+        held_out = Set.named(description, f"{device_of(name)}-held-out-{own.sensor}")
         for seed in seeds:
             held_out_of_seed = held_out.recordings(seed)[0]
-            for cause, method, row in _rows(Drawn(own, seed, held_out_of_seed), sensor):
+            for cause, method, row in _rows(Drawn(own, seed, held_out_of_seed)):
                 yield {"set": name, "seed": seed, "cause": CAUSES.index(cause), "method": method, **row}
 
 
-def _rows(drawn: Drawn, sensor: str) -> Iterator[tuple[str, str, Row]]:
+def _rows(drawn: Drawn) -> Iterator[tuple[str, str, Row]]:
     """Yield cause, method and row of one seed."""
     name = drawn.own.unit.unit
-    if sensor == "gyroscope":
-        for method in ("staged", "cholesky-printed", "cholesky"):
-            yield LOST, method, drawn.gyroscope(method)
+    if drawn.own.sensor == "gyroscope":
+        for method, row in drawn.gyroscope():
+            yield LOST, method, row
         return
     yield LOST, "printed", drawn.staged_accelerometer(as_printed=True)
-    yield LOST, "staged", drawn.staged_accelerometer(as_printed=False)
+    yield LOST, "staged", _error_alone(drawn.staged_accelerometer(as_printed=False))
     if drawn.own.unit.table == "acutronic":
         for cause in (c for c in CAUSES if c != LOST):
             yield cause, "printed", replace(drawn, cause=cause).staged_accelerometer(as_printed=True, judge=False)
     if "-continuous-" in name:
-        for method, chosen in (("zero-phase", "zero-phase"), ("unfiltered", "none")):
-            yield LOST, method, replace(drawn, filter=chosen).staged_accelerometer(as_printed=False)
+        for method, chosen in (("zero-phase", "zero-phase"), ("same-gain", "same-gain"), ("unfiltered", "none")):
+            yield LOST, method, _error_alone(replace(drawn, filter=chosen).staged_accelerometer(as_printed=False))
     if name.endswith("-stop-1s") or name == "stim300-continuous-0.5dps":
         yield LOST, "least-squares", drawn.least_squares_accelerometer()
+
+
+def _error_alone(row: Row) -> Row:
+    return {"error": row["error"]}
 
 
 def device_of(name: str) -> str:

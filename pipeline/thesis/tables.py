@@ -29,6 +29,7 @@ METRICS = {
     "max_error": "largest e",
     "min_error": "smallest e",
 }
+APPLIED = "by the printed parameters, applied to our held-out motion"
 STEPS = {"before": "raw", "after": "last"}
 STAGES = {"O": "orthogonality", "M": "misalignment", "b": "bias", "S": "scale_factor"}
 
@@ -127,6 +128,12 @@ def parameter_tables(printed: Path, results: Results) -> list[Table]:
 def error_tables(printed: Path, results: Results) -> list[Table]:
     """Return tables 5.8 to 5.14 and 5.19 to 5.22."""
     tables = []
+    parameters = {
+        key_of_row(row): row
+        for name in ("accel_parameters.csv", "gyro_parameters.csv")
+        for rows in read_printed(printed / name).values()
+        for row in rows
+    }
     for number, rows in read_printed(printed / "errors.csv").items():
         sensor, unit = rows[0]["sensor"], rows[0]["unit"]
         by_procedure: dict[str, dict[str, dict[str, str]]] = {}
@@ -136,9 +143,22 @@ def error_tables(printed: Path, results: Results) -> list[Table]:
         for title, method in (ACCELEROMETER if sensor == "accelerometer" else GYROSCOPE).items():
             units = [f"{_set(rows[0], procedure)}-{method}" for procedure in by_procedure]
             blocks.append(Block(title, _error_rows(list(by_procedure.values()), units, sensor, unit, results)))
+        by_metric = [row["mean_abs_error"] for row in by_procedure.values()]
+        applied = [results.with_printed(_set(r, procedure_of(r)), sensor, parameters[key_of_row(r)]) for r in by_metric]
+        blocks.append(Block(APPLIED, [_applied_row(by_metric, applied, unit)]))
         columns = [in_words(p) for p in by_procedure]
         tables.append(Table(number, _title(f"{sensor.capitalize()}: held-out error", rows), columns, blocks))
     return tables
+
+
+def key_of_row(row: Mapping[str, str]) -> tuple[str, str, str]:
+    """Return device, table and procedure of a printed row."""
+    return row["device"], row["rate_table"], procedure_of(row)
+
+
+def _applied_row(rows: Sequence[dict[str, str]], ours: Sequence[float | None], unit: str) -> Row:
+    cells = [Cell(float(row["after"]), value) for row, value in zip(rows, ours, strict=True)]
+    return Row(f"mean |e|, {unit}: after", cells)
 
 
 def change(before: float | None, after: float | None) -> float | None:

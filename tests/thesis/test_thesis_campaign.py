@@ -1,0 +1,148 @@
+"""The campaign of the thesis: printed figures as published, recordings with the printed truth, methods on them."""
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.config import load_campaign
+from pipeline.estimation.accelerometer import bias as accelerometer_bias
+from pipeline.estimation.accelerometer import misalignment, orthogonality
+from pipeline.estimation.accelerometer import scale_factor as accelerometer_scale_factor
+from pipeline.estimation.gyroscope import bias, cholesky_lu, orthogonality_and_misalignment, scale_factor
+from pipeline.model.inversion import linear_truth
+from pipeline.records import Noise, Recording, SensorCalibration
+from pipeline.records.calibration import coverage_factor
+from pipeline.signal.filters import apply_filter
+from pipeline.simulation.campaign import simulate_unit
+from pipeline.simulation.description import read_description
+from pipeline.thesis.results import DEVICES, procedure_of, set_of
+from pipeline.thesis.scatter import TRUE_SCALE
+from pipeline.thesis.seeds import FOUND, read_rows, study
+from pipeline.thesis.tables import Cell, read_printed
+from pipeline.validation.samples import samples_of_motion
+
+CAMPAIGN = Path(__file__).parents[2] / "data" / "thesis"
+PRINTED = CAMPAIGN / "printed"
+ACCELEROMETER = (orthogonality, misalignment, accelerometer_bias, accelerometer_scale_factor)
+GYROSCOPE = (bias, orthogonality_and_misalignment, scale_factor)
+
+
+@cache
+def loaded() -> Any:
+    return load_campaign({"campaign": "thesis"})
+
+
+def printed_row(file: str, device: str, procedure: str) -> dict[str, str]:
+    rows = [row for table in read_printed(PRINTED / file).values() for row in table]
+    return next(
+        r for r in rows if (r["device"].lower(), r["rate_table"], procedure_of(r)) == (device, "acutronic", procedure)
+    )
+
+
+@cache
+def filtered(name: str) -> tuple[Recording, ...]:
+    """Return a set of recordings behind the campaign's filter."""
+    description = read_description(CAMPAIGN / "simulation.yaml")
+    number = [u.unit for u in description.units].index(name)
+    settings = loaded().units["mpu6050-1-stop-1s-printed"].config["filter"]
+    recordings = simulate_unit(description.units[number], description.seed, number)[0]
+    return tuple(apply_filter(r, settings) for r in recordings)
+
+
+def fitted(name: str, stages: tuple[Any, ...], method: str) -> SensorCalibration:
+    settings = loaded().units[f"{name}-{method}"].config
+    calibration = None
+    for stage in stages:
+        calibration = stage.fit(filtered(name), calibration, settings)
+    assert isinstance(calibration, SensorCalibration)
+    return calibration
+
+
+def mean_error(device: str, calibration: SensorCalibration | None) -> float:
+    """Return the mean |e| of the gyroscope's held-out motion."""
+    silent = Noise(np.zeros(3), np.zeros(3), 100.0, "none")
+    held_out = samples_of_motion("gyroscope", filtered(f"{device}-held-out-gyroscope")[0], silent, {})
+    assert held_out is not None
+    rate = held_out.reading if calibration is None else linear_truth(calibration, held_out.reading)
+    return float(np.mean(np.abs(np.linalg.norm(rate, axis=1) - held_out.magnitude)))
+
+
+def test_the_printed_figures_are_those_of_the_thesis() -> None:
+    errors = read_printed(PRINTED / "errors.csv")
+    assert [r["after"] for r in errors["5.8"] if r["metric"] == "mean_abs_error"] == ["0.006", "0.007", "0.005"]
+    assert {(r["before"], r["after"]) for r in errors["5.14"] if r["metric"] == "mean_abs_error"} == {
+        ("0.069", "0.032")
+    }
+    assert (
+        len({t for f in ("accel_parameters", "gyro_parameters", "errors") for t in read_printed(PRINTED / f"{f}.csv")})
+        == 22
+    )
+    methods = read_printed(PRINTED / "method_comparison.csv")["5.25"]
+    assert [r["change_percent"] for r in methods if r["method"] == "cholesky_lu"] == ["83.615", "78.859", "5.276"]
+
+
+def test_every_printed_row_has_a_unit_for_every_method() -> None:
+    units = loaded().units
+    for file, methods in (
+        ("accel_parameters.csv", ("printed", "staged", "least-squares", "reference")),
+        ("gyro_parameters.csv", ("printed", "staged", "cholesky-printed", "cholesky", "reference")),
+    ):
+        for row in (r for table in read_printed(PRINTED / file).values() for r in table):
+            name = set_of(row["device"], row["rate_table"], procedure_of(row))
+            assert {f"{name}-{m}" for m in methods} <= set(units)
+
+
+def test_a_difference_within_the_rounding_of_the_print_is_not_large() -> None:
+    assert not Cell(0.003, 0.004).large
+    assert Cell(0.003, 0.0045).large
+    assert not Cell(0.8, 0.99).large
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_the_accelerometer_s_stages_find_bias_and_scale_factor_of_the_truth(device: str) -> None:
+    found = fitted(f"{device}-continuous-1dps", ACCELEROMETER, "staged")
+    row = printed_row("accel_parameters.csv", device, "continuous-1dps")
+    told = [float(row[f"b_{a}_g"]) for a in "xyz"]
+    assert np.abs(found.bias - told).max() < 0.002
+    assert np.abs(np.diag(found.matrix) - TRUE_SCALE[device]).max() < 0.005
+
+
+@pytest.mark.parametrize("rate", [20, 200])
+@pytest.mark.parametrize("device", DEVICES)
+def test_the_gyroscope_s_stages_find_the_printed_bias_and_matrix(device: str, rate: int) -> None:
+    found = fitted(f"{device}-gyro-{rate}dps", GYROSCOPE, "staged")
+    row = printed_row("gyro_parameters.csv", device, f"gyro-{rate}dps")
+    assert np.abs(found.bias - [float(row[f"b_{a}_dps"]) for a in "xyz"]).max() < 0.02
+    told = np.array([[float(row[f"M{i}{j}"]) for j in (1, 2, 3)] for i in (1, 2, 3)])
+    assert np.abs(found.matrix.T - told).max() < 0.002
+
+
+@pytest.mark.parametrize(("device", "change"), [("mpu6050-1", 83.615), ("mpu6050-2", 78.859), ("stim300", 5.276)])
+def test_the_printed_advantage_over_cholesky_and_lu_is_the_missing_inversion(device: str, change: float) -> None:
+    name = f"{device}-gyro-20dps"
+    staged = fitted(name, GYROSCOPE, "staged")
+    forward, inverted = (fitted(name, (bias, cholesky_lu), m) for m in ("cholesky-printed", "cholesky"))
+    before, with_forward = mean_error(device, None), mean_error(device, forward)
+    assert abs(100.0 * (before - with_forward) / before - change) < 10.0
+    expanded = [
+        coverage_factor(c.degrees_of_freedom) * np.sqrt(np.diag(c.covariance)[3:]).reshape(3, 3)
+        for c in (staged, inverted)
+        if c.covariance is not None
+    ]
+    assert np.all(np.abs(staged.matrix - inverted.matrix) < np.hypot(*expanded))
+    assert mean_error(device, inverted) < 0.8 * with_forward
+
+
+@pytest.mark.parametrize("name", ["mpu6050-2-continuous-30dps", "stim300-gyro-200dps"])
+def test_the_study_over_seeds_comes_out_as_it_is_kept(name: str) -> None:
+    kept = [row for row in read_rows(CAMPAIGN / "seeds.csv") if row["set"] == name and row["seed"] == 7]
+    again = list(study(CAMPAIGN, [name], [7]))
+    assert len(kept) == len(again) > 0
+    for one, other in zip(kept, again, strict=True):
+        assert one["method"] == other["method"]
+        found = {name: other[name] for name in (*FOUND, "error") if name in other}
+        assert found
+        assert {name: one[name] for name in found} == pytest.approx(found, rel=1e-4)

@@ -1,0 +1,108 @@
+"""The page of the thesis, rendered from the kept study and a run of which nothing or little is known."""
+
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.records import Recording
+from pipeline.signal.filters import apply_filter
+from pipeline.thesis.agreement import agreements
+from pipeline.thesis.conclusions import CONFIRMED, REFUTED, conclusions, gain_of_filter
+from pipeline.thesis.explanations import EXPLANATIONS, key_of
+from pipeline.thesis.page import all_tables, render
+from pipeline.thesis.results import Results
+from pipeline.thesis.scatter import scatters
+from pipeline.thesis.seeds import INTERVAL_S, TIME_CONSTANT_S, read_rows, sets_of
+
+CAMPAIGN = Path(__file__).parents[2] / "data" / "thesis"
+ROWS = read_rows(CAMPAIGN / "seeds.csv")
+
+
+class Text(HTMLParser):
+    """Collects the text of a page and the targets within it."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.text, self.ids, self.links = "", set[str](), set[str]()
+        self.feed(page)
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        own = dict(attrs)
+        self.ids.add(own.get("id") or "")
+        if tag == "a" and (own.get("href") or "").startswith("#"):
+            self.links.add(str(own["href"])[1:])
+
+
+def test_the_page_holds_every_table_and_stands_without_a_run(tmp_path: Path) -> None:
+    page = Text(render(CAMPAIGN, tmp_path))
+    for number in (*(f"5.{k}" for k in range(1, 27)), "paper 1", "paper 2", "paper 3", "paper 4"):
+        assert f"Table {number}\n" in page.text
+    assert page.links <= page.ids
+    assert "nan" not in page.text.lower().replace("nan.", "")
+
+
+def test_the_cells_of_all_tables_are_the_printed_ones(tmp_path: Path) -> None:
+    tables = {t.number: t for t in all_tables(CAMPAIGN / "printed", Results(tmp_path))}
+    assert len(tables) == 30
+    first = {row.label: [c.printed for c in row.cells] for row in tables["5.1"].blocks[0].rows}
+    assert first["Sz"] == [0.945, 0.962, 0.975]
+    errors = {row.label: [c.printed for c in row.cells] for row in tables["5.20"].blocks[0].rows}
+    assert errors["largest e: change, %"] == [447.08, 444.624, 439.385, 439.666, 445.08]
+
+
+def test_the_study_has_fifty_seeds_of_every_set() -> None:
+    seeds = {name: {r["seed"] for r in ROWS if r["set"] == name} for name in sets_of(CAMPAIGN)}
+    assert {len(s) for s in seeds.values()} == {50}
+
+
+@pytest.mark.parametrize(
+    ("words", "verdict"),
+    [
+        ("Speed hurts because the filter is late", REFUTED),
+        ("The staged method beats nonlinear least squares", REFUTED),
+        ("The home-made table calibrates the gyroscope worse", CONFIRMED),
+    ],
+)
+def test_a_conclusion_is_judged_by_its_interval_over_seeds(words: str, verdict: str) -> None:
+    found = next(c for c in conclusions(ROWS) if c.says.startswith(words))
+    judged = [line for line in found.lines if line.verdict == verdict]
+    assert judged
+    for line in judged:
+        low, high = line.difference.interval
+        assert line.difference.count == 50
+        assert (low > 0.0) if verdict == CONFIRMED else (high < 0.0)
+
+
+def test_the_campaign_s_filter_takes_of_a_turn_what_the_page_says() -> None:
+    time = np.arange(0.0, 120.0, INTERVAL_S)
+    turn = np.radians(30.0) * time
+    settings = {"name": "rc_low_pass", "cutoff_hz": None, "time_constant_s": TIME_CONSTANT_S, "zero_phase": False}
+    reading = np.column_stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)])
+    turning = Recording("x", "accelerometer", "x", np.round(time * 1e9).astype(np.int64), accelerometer=reading)
+    left = np.linalg.norm(np.asarray(apply_filter(turning, settings).accelerometer)[100:], axis=1)
+    assert left == pytest.approx(gain_of_filter(30.0), rel=1e-9)
+    assert 1.0 - gain_of_filter(30.0) == pytest.approx(0.0039, abs=1e-4)
+
+
+def test_without_a_run_no_parameter_is_said_to_agree(tmp_path: Path) -> None:
+    found = agreements(CAMPAIGN / "printed", Results(tmp_path))
+    assert len(found) == 9
+    assert all(a.largest is None and a.within == 0 for a in found)
+
+
+def test_picked_peaks_explain_the_scatter_of_o_on_the_first_device_and_not_on_the_tactical_one() -> None:
+    found = {(s.device, s.quantity): s for s in scatters(CAMPAIGN / "printed", ROWS)}
+    assert found["mpu6050-1", "O"].unexplained < 0.3 * found["mpu6050-1", "O"].printed
+    assert found["stim300", "O"].unexplained > 0.9 * found["stim300", "O"].printed
+
+
+def test_every_explanation_has_a_key_of_its_own_and_is_found() -> None:
+    assert len({e.key for e in EXPLANATIONS}) == len(EXPLANATIONS)
+    assert key_of("5.1", "as printed: the largest and smallest samples", "bx, g", "stop 1 s") == "b"
+    assert key_of("5.25", "inverted: Cholesky and LU's matrix", "R12", "STIM300, Cholesky and LU") == "a"
+    assert key_of("5.26", "as printed", "mean |e|, deg/s: after", "STIM300, staged") == "l"
