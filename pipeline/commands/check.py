@@ -195,13 +195,21 @@ def _tell(reading: Reading) -> PipelineError | None:
         parts = cut(recording, reading.entry.get("windows")) if recording.role == "session" else []
     except PipelineError as error:
         topics = topic_lines(reading.files[0], fields=kind_of(error) == "missing_topic") if _is_mcap(reading) else []
-        place = "" if error.file in (None, str(reading.files[0])) else f"{error.file}: "
+        place = _place(error.file, reading.files)
         print(as_text([("REFUSED", f"{place}{error.message}"), ("code", kind_of(error)), *topics]) + "\n")
         return error
     topics = topic_lines(reading.files[0], fields=False) if _is_mcap(reading) else []
     segments = [("segments" if i == 0 else "", f"{p.name}: {p.notes[-1].detail}") for i, p in enumerate(parts)]
     print(as_text([*topics, *facts(recording, reading.sensor), *segments]) + "\n")
     return None
+
+
+def _place(file: str | None, files: Sequence[Path]) -> str:
+    """Return where a refusal lies, without the name of the only file."""
+    if file is None or [file] == [str(f) for f in files]:
+        return ""
+    line = file.removeprefix(f"{files[0]}:") if len(files) == 1 else file
+    return f"line {line}: " if line.isdigit() else f"{file}: "
 
 
 def _is_mcap(reading: Reading) -> bool:
@@ -219,7 +227,7 @@ def _shapes(reading: Reading, error: PipelineError) -> list[Shape]:
         try:
             found.append(find_shape(data, str(file)))
         except IngestError as none:
-            print(f"{file}: {none.message}")
+            print(f"{file}: {none.message}\n")
     return found
 
 

@@ -121,7 +121,7 @@ def _table(recording: Recording) -> list[Line]:
             if abs(alike[axis]) > 0.9:
                 slope = float(np.polyfit(rate, recording.gyroscope[:, axis], 1)[0])
                 text += f" (the gyroscope's {AXES[axis]} reads {slope:.3f} of it, correlation {alike[axis]:.4f})"
-        found.append(text)
+        found.append(text if np.any(rate) else "at rest throughout")
     if recording.table_attitude is not None:
         found.append("attitude")
     clock = recording.source.get("table_clock")

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 LOOKED_AT = 400  # lines that tell the shape
 MOST_ROWS = 200_000
+FEWEST_ROWS = 3
 FEWEST_COLUMNS = 3
 SEPARATORS = (",", ";", "\t", "|", " ")
 POINT = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
@@ -84,12 +85,12 @@ def find_shape(data: bytes, path: str) -> Shape:
     lines = data.decode("utf-8", "replace").splitlines()
     tried = [_cut(lines[:LOOKED_AT], separator, decimal) for separator in SEPARATORS for decimal in ".,"]
     width, start, separator, decimal = max(tried, key=lambda t: (t[0], -t[1]))
-    if width < FEWEST_COLUMNS:
-        first = " / ".join(lines[:3])[:150]
-        raise IngestError(f"no table of numbers was found in it; it starts with {first!r}", path, fault="no_table")
     names, skip, comment = _names(lines, start, separator)
     kept = lines[start : start + MOST_ROWS]
     rows = [cells for cells in rows_of(kept, separator) if len(cells) == len(names)]
+    if width < FEWEST_COLUMNS or len(rows) < FEWEST_ROWS:
+        first = " / ".join(lines[:3])[:150]
+        raise IngestError(f"no table of numbers was found in it; it starts with {first!r}", path, fault="no_table")
     rate_hz, rate_line = _stated_rate(lines[:start])
     return Shape(
         path, separator, decimal, skip, names != _numbered(len(names)), comment, names, _numbers(rows, decimal),

@@ -14,6 +14,8 @@ from pipeline.__main__ import main
 from pipeline.formats.csv_write import write_canonical_csv
 from pipeline.formats.mcap_write import write_mcap
 from pipeline.records import Recording
+from pipeline.simulation.campaign import write_campaign
+from pipeline.simulation.description import description_from
 
 REPOSITORY = Path(__file__).parents[2]
 REFERENCE = REPOSITORY.parent / "shared" / "data"
@@ -58,7 +60,7 @@ def test_a_refused_log_gives_exit_code_2_its_line_and_code(log: Path, capsys: py
     log.write_text("\n".join(lines) + "\n")
     checked = Checked(capsys, log)
     assert checked.code == 2
-    assert f"REFUSED {log}:7: column accel_x_g (accel_x) is 'ERR" in checked.words
+    assert "REFUSED line 7: column accel_x_g (accel_x) is 'ERR" in checked.words
     assert "code not_a_number" in checked.words
     assert checked.err == f"python -m pipeline check: {log}:7: refused (not_a_number)\n"
     assert "PROPOSED" not in checked.out
@@ -182,3 +184,24 @@ def test_published_logs_are_read_with_their_profile(file: str, capsys: pytest.Ca
 def test_an_unknown_profile_is_refused_with_those_that_are_known(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check", str(log), "--ingest", "canonical"]) == 2
     assert "canonical_csv" in capsys.readouterr().err
+
+
+def test_prose_is_no_table_of_numbers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    prose = tmp_path / "notes.txt"
+    prose.write_text(
+        "\n".join(f"In {2000 + k} we mounted 3 sensors , 20 cm apart , on 2 plates" for k in range(2)) + "\n"
+    )
+    checked = Checked(capsys, prose)
+    assert checked.code == 2
+    assert "no table of numbers was found in it" in checked.words
+    assert "PROPOSED" not in checked.out
+
+
+def test_one_long_recording_is_told_with_its_segments(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    course = {"step_deg": 30.0, "validation_s": 30.0, "static_s": 90.0}
+    unit = {"unit": "U", "procedure": "one_recording", "course": course}
+    write_campaign(description_from({"units": [unit]}, "test"), tmp_path)
+    checked = Checked(capsys, tmp_path / "raw" / "U" / "recording.csv")
+    assert checked.code == 0
+    assert "segments accel_x: 12 steps about x at" in checked.words
+    assert "static: a long rest, from" in checked.words

@@ -22,6 +22,18 @@ if TYPE_CHECKING:
     from pipeline.records import Recording
 
 CASES = cases()
+PAGE = Path(__file__).parents[2] / "docs" / "bad_inputs.md"
+
+
+@pytest.mark.parametrize("number", CASES)
+def test_the_page_tells_the_codes_of_each_bad_input(number: str) -> None:
+    rows = dict(re.findall(r"^\| (\d+) (\|.*)$", PAGE.read_text(), re.MULTILINE))
+    assert len(rows) == 44
+    told = rows[number.split(maxsplit=1)[0].lstrip("0")]
+    told += rows["10"] if "as 10" in told else ""
+    case = CASES[number]
+    codes = {case.fault} if case.fault else set(case.notes) - {"N-IGNORED"}  # of row 19: a column that is not used
+    assert codes <= set(re.findall(r"`([\w-]+)`", told))
 
 
 def write(folder: Path, case: Case, number: str) -> None:
