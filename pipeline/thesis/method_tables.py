@@ -21,8 +21,8 @@ PAPER = "gy-521"
 SEGMENT_DEG = 45.0  # the paper turns in steps of 45 deg
 READINGS = {
     "accelerometer": {
-        "the staged method as printed": {"staged": "printed", "nonlinear_least_squares": "least-squares"},
-        "the staged method with its errata corrected": {
+        "by the staged method as printed": {"staged": "printed", "nonlinear_least_squares": "least-squares"},
+        "by the staged method with its errata corrected": {
             "staged": "staged",
             "nonlinear_least_squares": "least-squares",
         },
