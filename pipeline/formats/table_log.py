@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     Values = NDArray[np.float64]
 
-FINEST_S = 0.0025
+FINEST_S, FINEST_OF_ATTITUDE_S = 0.0025, 0.01  # only the rate of one axis is known to bend
 BENT = 8.0
 MOST_POINTS = 1 << 18
 RESTING_DPS = 0.5
@@ -110,10 +110,10 @@ def signals_of(log: ChannelTable) -> Signals:
         If the log holds neither rate, angle nor attitude.
     """
     own = seconds_of(log)
-    step = max(FINEST_S, own[-1] / MOST_POINTS)
+    found = interpolators(log)
+    step = max(FINEST_OF_ATTITUDE_S if ATTITUDE[0] in found else FINEST_S, own[-1] / MOST_POINTS)
     grid = step * np.arange(int(own[-1] / step) + 1)
     interval = float(np.median(np.diff(own)))
-    found = interpolators(log)
     if ATTITUDE[0] in found:
         q = np.column_stack([found[c](grid) for c in ATTITUDE])
         rates = body_rates(q, step)

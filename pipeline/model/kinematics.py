@@ -29,6 +29,7 @@ from pipeline.errors import InputError
 from pipeline.model.rotation import attitude_matrix, conjugate_product, turn_about_axis
 from pipeline.model.turn_log import TurnLog
 from pipeline.records import AXES, Motion
+from pipeline.records.attitude import continuous
 from pipeline.signal.rests import RATE_AT_REST_DPS, still_samples
 from pipeline.signal.temperature import smooth_temperature
 
@@ -186,9 +187,7 @@ def _motion_of_attitude(
 
     assert recording.table_attitude is not None  # noqa: S101
     time = recording.time
-    q = recording.table_attitude / np.linalg.norm(recording.table_attitude, axis=1, keepdims=True)
-    flips = np.where(np.sum(q[1:] * q[:-1], axis=1) < 0, -1.0, 1.0)
-    q = q * np.concatenate([[1.0], np.cumprod(flips)])[:, None]  # q and -q are one attitude: make it continuous
+    q = continuous(recording.table_attitude)
     spline = make_interp_spline(time, q, k=5)
     at = time + offset
     q = spline(at) if np.any(offset) else q

@@ -35,3 +35,14 @@ def as_table(recording: Recording) -> ChannelTable:
         if getattr(recording, name) is not None:
             values[name] = getattr(recording, name)
     return ChannelTable(recording.name, recording.time_ns, values, {}, lambda row: row)
+
+
+def clock_errors(
+    aligned: ChannelTable | Recording, recording: Recording, truth: dict[str, Any]
+) -> tuple[float, float, float, float]:
+    """Return offset (s) and drift (ppm) found minus hidden, each with its standard uncertainty."""
+    clock, hidden = aligned.source["table_clock"], truth["table_clock"]
+    at = float(recording.time[0]) + clock["at_s"]
+    offset = clock["offset_s"] - (hidden["offset_s"] + 1e-6 * hidden["drift_ppm"] * at)
+    drift = clock["drift_ppm"] - hidden["drift_ppm"]
+    return offset, clock["offset_uncertainty_s"], drift, clock["drift_uncertainty_ppm"]
