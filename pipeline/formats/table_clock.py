@@ -23,7 +23,7 @@ which is where the clocks are seen. So the covariance is taken from what blocks 
 
 where J are the projected derivatives and e the residuals, enlarged where few blocks say it all; of blocks of 1 s and
 of 4 s those count that say less, for slow errors are alike in neighbouring blocks. It is never below what white noise
-alone would leave, nor below 0.3 % of the table's interval, within which the motion is interpolated.
+alone would leave, nor below 0.5 % of the table's interval, within which the motion is interpolated.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ AMBIGUOUS = 1.1
 SHARED = 0.5  # of what two logs could share at most
 STEPS, ROUNDING_S = 20, 1e-9
 FEWEST_BLOCKS = 3.0
-RESOLVED = 0.003  # of the table's interval: between its samples the motion is interpolated
+RESOLVED = 0.005  # of the table's interval: between its samples the motion is interpolated
 
 
 @dataclass(frozen=True)
