@@ -38,7 +38,7 @@ localrules:
 
 
 onstart:
-    write_parts()
+    begin_run()
 
 
 onsuccess:

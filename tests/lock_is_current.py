@@ -20,7 +20,8 @@ def pinned(path: Path) -> dict[str, set[str]]:
 def main() -> int:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     wanted = {"requirements.lock": project["dependencies"]}
-    wanted["requirements-dev.lock"] = project["dependencies"] + project["optional-dependencies"]["dev"]
+    for extra in ("dev", "slurm"):
+        wanted[f"requirements-{extra}.lock"] = project["dependencies"] + project["optional-dependencies"][extra]
     wrong = []
     for file, requirements in wanted.items():
         lock = pinned(ROOT / file)

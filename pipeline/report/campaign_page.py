@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 JSON = dict[str, Any]
 FIRST = 100  # rows that a browser shows at once; it shows the others when asked
+FEWEST_UNITS, FAR_SHOWN = 3, 30  # units, below which a distribution says nothing; units far from their siblings
 UNITS = {"accelerometer": "g", "gyroscope": "deg/s"}
 VERDICTS = {
     "nothing_missing": ("nothing missing", "good"),
@@ -40,6 +41,7 @@ def render(
     page: str | None = None,
     *,
     twins: Sequence[Sequence[str]] = (),
+    statistics: JSON | None = None,
 ) -> str:
     """Return ``index.html``.
 
@@ -56,6 +58,8 @@ def render(
         Name of a page of its own that the campaign has beside this one.
     twins : sequence of sequence of str, optional
         Files of several units that are the same, byte for byte, under different names.
+    statistics : dict, optional
+        As of ``fleet_statistics.fleet_statistics``.
 
     Returns
     -------
@@ -72,11 +76,14 @@ def render(
         passed=sum(row.get("pass") is True for row in rows),
         not_passed=sum(row.get("pass") is False for row in rows),
         judged=any(row.get("pass") is not None for row in rows if row["status"] == "ok"),
-        fleet=[f for s in SENSORS if (f := _fleet(s, "all units", rows))] + _lots(rows),
+        fleet=[f for s in SENSORS if (f := _fleet(s, "all units", rows))],
+        lots=_lots(rows),
         groups=[
             {"title": title, "rows": [by_unit[u] for u in units if u in by_unit]} for title, units in _same_serial(rows)
         ],
         figures=fleet_figures(rows),
+        statistics=statistics if statistics and len(rows) >= FEWEST_UNITS else None,
+        far_shown=FAR_SHOWN,
         causes=_causes(failures),
         names=_script_data([row["unit"] for row in rows]),
         first=FIRST,

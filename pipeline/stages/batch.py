@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.atomic import write_atomically
 from pipeline.errors import PipelineError
+from pipeline.locks import hold_as_job
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -57,7 +58,9 @@ def parse_job(stage: str, argv: Sequence[str], inputs: Sequence[str], options: S
     for name in options:
         parser.add_argument(f"--{name}", default="", help=f"{name} of this stage")
     arguments = vars(parser.parse_args(argv))
-    content = together(read_json(arguments.pop("config")))
+    config = arguments.pop("config")
+    hold_as_job(config.parent.parent)
+    content = together(read_json(config))
     if "user_effects" in content:
         from pipeline.model.effect_files import register_user_effects  # noqa: PLC0415  (numpy, where there are any)
 

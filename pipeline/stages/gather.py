@@ -11,6 +11,8 @@ from pipeline.atomic import write_atomically
 from pipeline.report.campaign_page import render
 from pipeline.report.comparison_page import section
 from pipeline.report.comparison_units import unit_figures
+from pipeline.report.fleet_statistics import fleet_statistics, parameters
+from pipeline.report.fleet_table import write_parameters
 from pipeline.report.summary import summary_row, write_summary
 from pipeline.stages.batch import FAILED, parse_job, read_json, write_json
 
@@ -30,6 +32,7 @@ def main(argv: Sequence[str]) -> int:
     compared = {u for c in job.run["compare"] for g in c["groups"] for u in g["units"]}
     rows, failures, figures = [], [], {}
     inputs: dict[str, list[dict[str, Any]]] = {}
+    fitted: dict[str, dict[str, tuple[float, float | None, str]]] = {}
     for unit, sheet_row in job.run["rows"].items():
         batch = of_unit[unit]
         failure = _failure(batch, unit)
@@ -59,11 +62,17 @@ def main(argv: Sequence[str]) -> int:
             truth = _truth(Path(job.run["truths"][unit]))
             figures[unit] = unit_figures(calibration, documents["validate"], documents["diagnose"], truth)
         inputs[unit] = calibration.get("inputs") or []
+        fitted[unit] = parameters(calibration)
         rows.append(summary_row(unit, calibration, documents["validate"], documents["diagnose"], sheet_row))
     write_summary(job.output / "summary.csv", rows)
     write_json(job.output / "failures.json", failures)
+    write_parameters(job.output / "parameters.parquet", rows, fitted)
+    statistics = fleet_statistics(rows, fitted)
+    write_json(job.output / "fleet.json", statistics)
     sections = [section(c, figures, f"comparison-{i}") for i, c in enumerate(job.run["compare"], 1)]
-    page = render(job.run["campaign"], rows, failures, sections, job.run["page"], twins=same_files(inputs))
+    page = render(
+        job.run["campaign"], rows, failures, sections, job.run["page"], twins=same_files(inputs), statistics=statistics
+    )
     write_atomically(job.output / "index.html", page)
     return 0
 

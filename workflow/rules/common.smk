@@ -7,6 +7,7 @@ import sys
 import time
 
 from snakemake.exceptions import WorkflowError
+from snakemake.settings.types import Quietness
 
 sys.path.insert(0, workflow.basedir)
 # Jobs run this copy of the package, from any working directory, and find what the user's own path holds.
@@ -17,6 +18,7 @@ os.environ["PYTHONPATH"] = os.pathsep.join(
 from pipeline.config import code_digest, load_campaign, part_file
 from pipeline.errors import PipelineError
 from pipeline.formats.files import recording_files
+from pipeline.run_watch import Watch
 
 try:
     CAMPAIGN = load_campaign(config)
@@ -32,6 +34,10 @@ SENSORS = ["accelerometer", "gyroscope"]
 STARTED = time.time()
 WAITING = {}  # parts of the configuration: written where jobs are run, not in a dry run
 RUNNING = not workflow.is_main_process
+if not RUNNING:
+    WATCH = Watch(
+        RESULTS, {batch: len(units) for batch, units in CAMPAIGN.batches.items()}
+    )
 
 
 wildcard_constraints:
@@ -54,12 +60,25 @@ def name_part(stage, units, sensor=""):
     return str(file.path)
 
 
-def write_parts():
-    """Write what jobs read of the configuration."""
+def begin_run():
+    """Hold the results, begin to tell how far the run is, and write what jobs read of the configuration."""
     global RUNNING
-    RUNNING = True
-    for file in WAITING.values():
-        file.write()
+    if RUNNING:
+        return
+    told = workflow.output_settings
+    silent = {Quietness.ALL, Quietness.PROGRESS} & set(told.quiet or ())
+    try:
+        WATCH.begin(
+            quiet=bool(silent),
+            plain=told.verbose or told.printshellcmds,
+        )
+        RUNNING = True
+        for file in WAITING.values():
+            file.write()
+    except PipelineError as error:
+        raise WorkflowError(str(error)) from None
+    except OSError as error:
+        raise WorkflowError(f"{RESULTS} cannot be written: {error}") from None
     WAITING.clear()
 
 
@@ -77,6 +96,7 @@ def of_batches(stage):
 
 def say_at_the_end(text):
     """Print after Snakemake's own last words."""
+    WATCH.ended.set()
     atexit.register(print, f"\n{text}", file=sys.stderr, end="")
 
 

@@ -15,6 +15,8 @@ rule gather:
             labels={"page": "one row a unit"},
         ),
         f"{RESULTS}/failures.json",
+        f"{RESULTS}/parameters.parquet",
+        f"{RESULTS}/fleet.json",
         [
             directory(f"{RESULTS}/{name}")
             for name in (

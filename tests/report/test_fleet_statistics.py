@@ -1,0 +1,122 @@
+"""Statistics of a fleet against fleets whose truth is known."""
+
+from __future__ import annotations
+
+from datetime import date, timedelta
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from scipy import stats
+
+from pipeline.report.fleet_statistics import fleet_statistics, missing_effects, parameters
+from pipeline.report.fleet_table import write_parameters
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+DAY = date(2026, 1, 1)
+
+
+def fleet(values: NDArray[np.float64], model: str = "mpu6050", lots: int = 5) -> tuple[list[dict[str, Any]], Any]:
+    rows: list[dict[str, Any]] = [
+        {
+            "unit": f"U{i}", "serial": f"S{i}", "lot": f"L{i % lots}", "date": str(DAY + timedelta(days=i)),
+            "sensor": model, "method": "reference_least_squares",
+        }
+        for i in range(len(values))
+    ]  # fmt: skip
+    found = {row["unit"]: {"gyroscope_bias_x": (float(v), 0.1, "deg/s")} for row, v in zip(rows, values, strict=True)}
+    return rows, found
+
+
+def test_a_unit_far_from_its_siblings_is_named_and_no_other() -> None:
+    values = np.random.default_rng(1).normal(3.0, 0.5, 400)
+    values[17] = 9.0
+    rows, found = fleet(values)
+    told = fleet_statistics(rows, found)
+    assert [(f["name"], f["parameter"]) for f in told["far"]] == [("U17", "gyroscope_bias_x")]
+    expected = (9.0 - np.median(values)) / stats.median_abs_deviation(values, scale="normal")
+    assert told["far"][0]["z"] == pytest.approx(expected, rel=1e-3)
+    (only,) = told["distributions"]
+    assert only["robust_standard_deviation"] == pytest.approx(0.5, rel=0.15)
+    assert (told["drift"], told["lots"], told["repeatability"]) == ([], [], [])
+
+
+def test_units_of_another_model_are_no_siblings() -> None:
+    rng = np.random.default_rng(2)
+    one, two = fleet(rng.normal(0.0, 1.0, 30)), fleet(rng.normal(100.0, 1.0, 30), "stim300")
+    for row in two[0]:
+        row["unit"] = "V" + row["unit"]
+    told = fleet_statistics([*one[0], *two[0]], one[1] | {"V" + k: v for k, v in two[1].items()})
+    assert told["far"] == []
+    assert [d["sensor"] for d in told["distributions"]] == ["mpu6050", "stim300"]
+
+
+def test_few_fleets_in_which_nothing_is_wrong_are_said_to_have_something() -> None:
+    rng = np.random.default_rng(3)
+    told = [fleet_statistics(*fleet(rng.normal(0.0, 1.0, 25))) for _ in range(300)]
+    assert sum(bool(t["far"]) for t in told) <= 9
+    assert sum(bool(t["drift"] or t["lots"]) for t in told) <= 3
+
+
+def test_a_drift_over_the_date_is_found_with_its_size() -> None:
+    rng = np.random.default_rng(4)
+    values = rng.normal(0.0, 0.1, 200) + 0.002 * np.arange(200)
+    (drift,) = fleet_statistics(*fleet(values))["drift"]
+    assert drift["per_year"] == pytest.approx(0.002 * 365.25, rel=0.1)
+    assert drift["p_value"] < 1e-9
+
+
+def test_a_lot_that_differs_is_named() -> None:
+    values = np.random.default_rng(5).normal(0.0, 0.1, 100)
+    values[3::5] += 0.3
+    (found,) = fleet_statistics(*fleet(values))["lots"]
+    assert found["lot"] == "L3"
+    assert found["lot_median"] == pytest.approx(0.3, abs=0.1)
+
+
+def test_repeatability_is_the_spread_within_devices_not_between_them() -> None:
+    rng = np.random.default_rng(6)
+    values = np.repeat(rng.normal(0.0, 5.0, 300), 2) + rng.normal(0.0, 0.2, 600)
+    rows, found = fleet(values)
+    for i, row in enumerate(rows):
+        row["serial"] = f"S{i // 2}"
+    (told,) = fleet_statistics(rows, found)["repeatability"]
+    assert (told["devices"], told["calibrations"]) == (300, 600)
+    assert told["standard_deviation"] == pytest.approx(0.2, rel=0.1)
+
+
+def test_missing_effects_are_counted_with_the_lot_that_they_come_from() -> None:
+    rows: list[dict[str, Any]] = [
+        {"unit": f"U{i}", "lot": f"{i // 10}", "gyroscope_verdict": "nothing_missing"} for i in range(100)
+    ]
+    for i in range(70, 77):
+        rows[i]["gyroscope_selected"] = "g_sensitivity"
+    for i in (1, 21, 31, 32, 33, 34):
+        rows[i]["gyroscope_selected"] = "warm_up;bias_drift"
+    assert missing_effects(rows) == [
+        "7 of 100 miss g_sensitivity (gyroscope), all from lot 7 (7 of its 10)",
+        "6 of 100 miss warm_up (gyroscope), 4 of them from lot 3 (4 of its 10)",
+        "6 of 100 miss bias_drift (gyroscope), 4 of them from lot 3 (4 of its 10)",
+    ]
+
+
+def test_the_table_holds_every_parameter_with_its_uncertainty_and_unit(tmp_path: Path) -> None:
+    fit = {"unit": "g", "bias": [1.0, 2.0, 3.0], "matrix": np.eye(3).tolist()}
+    fit |= {"expanded_uncertainty": {"bias": [0.1, 0.2, 0.3], "matrix": np.full((3, 3), 0.01).tolist()}}
+    p = {"b_x": {"value": 0.5, "unit": "g/degC", "expanded_uncertainty": 0.05}}
+    document = {"accelerometer": fit | {"effects": [{"name": "bias_temperature", "parameters": p}]}, "gyroscope": None}
+    rows = [{"unit": "U1", "lot": None, "pass": True, "accelerometer_error_after": 0.5}, {"unit": "U2"}]
+    write_parameters(tmp_path / "p.parquet", rows, {"U1": parameters(document), "U2": {}})
+    table = pq.read_table(tmp_path / "p.parquet")
+    first, second = table.to_pylist()
+    assert first["accelerometer_bias_y"] == 2.0
+    assert first["accelerometer_matrix_xy_expanded_uncertainty"] == 0.01
+    assert first["accelerometer_bias_temperature_b_x"] == 0.5
+    assert second["accelerometer_bias_y"] is None
+    assert table.schema.field("accelerometer_bias_temperature_b_x").metadata == {b"unit": b"g/degC"}
+    assert table.num_columns == 4 + 2 * 13

@@ -1,0 +1,76 @@
+"""What a person is told of a run: units done, the unit at work, the time left, one run at a time."""
+
+import time
+from pathlib import Path
+
+import pytest
+
+from pipeline import locks
+from pipeline.locks import BusyError, hold_as_job, jobs_at_work, take_run
+from pipeline.progress import Progress, duration
+from pipeline.run_watch import _cause
+
+
+def test_the_line_names_the_unit_at_work_the_units_done_and_the_time_left(tmp_path: Path) -> None:
+    progress = Progress({"a": 4, "b": 4})
+    progress.wanted = {"ingest": 2, "report": 2, "gather": 1}
+    log = tmp_path / "report.log"
+    for number, rule in ((1, "ingest"), (2, "ingest"), (3, "report")):
+        progress.start(number, rule, {"batch": "a"}, log)
+        progress.running[number].since -= 40.0  # as if it had been started 40 s ago
+        progress.finish(number)
+    progress.started -= 120.0
+    progress.start(4, "report", {"batch": "b"}, log)
+    log.write_text("report: U5 (1 of 4)\nreport: U6 (2 of 4)\n")
+    # 3 units of 10 s are left, one job at a time; and gather, of which 10 s are assumed by the ratio to the others.
+    assert progress.text() == "3 of 5 jobs | 4 of 8 units done | report: U6 (2 of 4) | about 35 s left"
+
+
+def test_a_fit_is_named_by_sensor_and_stage(tmp_path: Path) -> None:
+    progress = Progress({"a": 1})
+    progress.wanted = {"fit": 1}
+    progress.start(1, "fit", {"batch": "a", "sensor": "gyroscope", "stage": "scale_factor"}, tmp_path / "log")
+    (tmp_path / "log").write_text("fit: U1 (1 of 1)\n")
+    assert "fit gyroscope scale factor: U1 (1 of 1)" in progress.text()
+
+
+def test_the_log_of_an_earlier_run_is_not_taken_for_this_one(tmp_path: Path) -> None:
+    progress = Progress({"a": 1})
+    (tmp_path / "log").write_text("ingest: U1 (1 of 1)\n")
+    progress.start(1, "ingest", {"batch": "a"}, tmp_path / "log")
+    progress.running[1].since = time.time() + 60.0
+    assert "U1" not in progress.text()
+
+
+@pytest.mark.parametrize(("seconds", "text"), [(3, "5 s"), (62, "60 s"), (600, "10 min"), (7200, "2.0 h")])
+def test_durations_are_said_as_people_say_them(seconds: float, text: str) -> None:
+    assert duration(seconds) == text
+
+
+@pytest.mark.parametrize(
+    ("log", "cause"),
+    [
+        ("", "killed, or could not be started"),
+        ("report: U1 (1 of 2)\nreport: U2 (2 of 2)\n", "killed at unit U2"),
+        ("report: U1 (1 of 2)\nOSError: [Errno 28] No space left\n", "OSError: [Errno 28] No space left"),
+    ],
+)
+def test_the_cause_of_a_broken_job_is_the_end_of_its_log(tmp_path: Path, log: str, cause: str) -> None:
+    (tmp_path / "log").write_text(log)
+    assert _cause(tmp_path / "log") == cause
+
+
+def test_results_are_held_by_one_run_and_jobs_are_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(locks, "HELD", [])
+    take_run(tmp_path)
+    with pytest.raises(BusyError, match=r"another run works on these results \(process [0-9]+ on"):
+        take_run(tmp_path)
+    assert not jobs_at_work(tmp_path)
+    hold_as_job(tmp_path)
+    assert jobs_at_work(tmp_path)
+    for stream in locks.HELD:
+        stream.close()
+    assert not jobs_at_work(tmp_path)
+    locks.HELD.clear()
+    take_run(tmp_path)
+    locks.HELD[0].close()

@@ -1,0 +1,200 @@
+"""The table of faults in docs/fleet.md, row by row: what a run that is disturbed leaves, what it says, what recovers.
+
+After recovery every file of the results has the bytes of a run that nothing disturbed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator  # noqa: TC003  (pytest looks at annotations)
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+pytestmark = pytest.mark.workflow
+
+# Found by jobs before anything else: disturbs the report of the first batch when it flushes its first file.
+DISTURB = """
+import os, signal, sys, time
+
+def snakemake():
+    pid = os.getppid()
+    while b"snakemake" not in open(f"/proc/{pid}/cmdline", "rb").read():
+        pid = int(open(f"/proc/{pid}/stat").read().rsplit(")", 1)[1].split()[1])
+    return pid
+
+def disturbed(descriptor, flush=os.fsync):
+    fault = os.environ["FAULT"]
+    os.fsync = flush
+    if fault == "kill job":
+        os.kill(os.getpid(), signal.SIGKILL)
+    if fault == "kill snakemake":
+        os.kill(snakemake(), signal.SIGKILL)
+        time.sleep(3)
+    if fault == "hold":
+        open("held", "w").close()
+        while os.path.exists("held"):
+            time.sleep(0.1)
+    flush(descriptor)
+
+if "FAULT" in os.environ and "report" in sys.orig_argv and any("-0001/report" in a for a in sys.orig_argv):
+    os.fsync = disturbed
+"""
+
+
+@dataclass
+class Disk:
+    """A working directory on a small disk of its own, with a campaign of two batches in it."""
+
+    directory: Path
+    mounted: bool
+    trees: dict[str, dict[str, str]]
+    place: str = "There"  # of the results as they are
+
+    def turn(self) -> str:
+        """Return a setting other than the one that the results are made with: reports are made again."""
+        self.place = {"Here": "There", "There": "Here"}[self.place]
+        return self.place
+
+    def start(self, place: str, *config: str, fault: str = "", cwd: str = ".") -> subprocess.Popen[str]:
+        command = [sys.executable, "-m", "snakemake", "--cores", "2", "-s", str(ROOT / "Snakefile"), "--config"]
+        command += [
+            f"campaign={self.directory / 'pair'}",
+            f"overrides=[batch_size=1, certificate.place={place}]",
+            *config,
+        ]
+        return self.popen(command, fault, cwd)
+
+    def popen(self, command: list[str], fault: str = "", cwd: str = ".") -> subprocess.Popen[str]:
+        environment = os.environ | {"PYTHONPATH": str(self.directory / "own"), "PYTHONWARNINGS": ""}
+        environment |= {"FAULT": fault} if fault else {}
+        (self.directory / cwd).mkdir(exist_ok=True)
+        pipe = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+        return subprocess.Popen(command, cwd=self.directory / cwd, env=environment, text=True, **pipe)  # type: ignore[call-overload,no-any-return]
+
+    def run(self, place: str, *config: str, fault: str = "", cwd: str = ".") -> tuple[int, str]:
+        process = self.start(place, *config, fault=fault, cwd=cwd)
+        return process.communicate(timeout=300)[0], process.returncode
+
+    def recover(self, told: str) -> str:
+        """Run the last command that was printed, as a person would."""
+        line = told.strip().splitlines()[-1].strip()
+        assert line.startswith("snakemake "), told
+        said = ""
+        for part in line.split(" && "):
+            process = self.popen([sys.executable, "-m", *shlex.split(part)])
+            said += process.communicate(timeout=300)[0]
+            assert process.returncode == 0, said
+        return said
+
+    def tree(self) -> dict[str, str]:
+        """Return the digest of every file of the results but logs, locks and parts of configurations."""
+        results = self.directory / "results" / "pair"
+        files = [f for f in sorted(results.rglob("*")) if f.is_file()]
+        named = {str(f.relative_to(results)): f for f in files}
+        left_out = ("logs/", "configs/", ".run.lock", ".jobs.lock")
+        return {n: hashlib.sha256(f.read_bytes()).hexdigest() for n, f in named.items() if not n.startswith(left_out)}
+
+    def remount(self, how: str) -> None:
+        subprocess.run(["mount", "-o", f"remount,{how}", str(self.directory)], check=True)
+
+
+@pytest.fixture(scope="module")
+def disk(tmp_path_factory: pytest.TempPathFactory, simulated: Path) -> Iterator[Disk]:
+    directory = tmp_path_factory.mktemp("disk")
+    mount = ["mount", "-t", "tmpfs", "-o", "size=64m", "none", str(directory)]
+    mounted = subprocess.run(mount, check=False, capture_output=True).returncode == 0
+    for unit in ("U1", "U2"):
+        shutil.copytree(simulated, directory / "pair" / "raw" / unit)
+    (directory / "pair" / "units.csv").write_text("unit\nU1\nU2\n")
+    (directory / "own").mkdir()
+    (directory / "own" / "sitecustomize.py").write_text(DISTURB)
+    made = Disk(directory, mounted, {})
+    for place in ("Here", "There"):
+        said, code = made.run(place)
+        assert code == 0, said
+        made.trees[place] = made.tree()
+    yield made
+    if mounted:
+        subprocess.run(["umount", "--lazy", str(directory)], check=False)
+
+
+def test_a_job_that_is_killed_is_done_again(disk: Disk) -> None:
+    assert disk.trees["Here"] != disk.trees["There"]
+    said, code = disk.run(disk.turn(), fault="kill job")
+    assert code != 0
+    assert "report: killed at unit U1" in said
+    batches = disk.directory / "results" / "pair" / "batches"
+    assert [d.parent.name[-4:] for d in batches.glob("*/report")] == ["0002"]
+    assert disk.recover(said).count("rule report:") == 1
+    assert disk.tree() == disk.trees[disk.place]
+
+
+def test_snakemake_that_is_killed_leaves_a_lock_and_jobs_that_end_by_themselves(disk: Disk) -> None:
+    said, code = disk.run(disk.turn(), fault="kill snakemake")
+    assert code == -9
+    said, code = disk.run(disk.place)
+    assert code != 0
+    assert "or one was killed here" in said
+    assert "snakemake --unlock" in said
+    disk.recover(said)
+    assert disk.tree() == disk.trees[disk.place]
+
+
+def test_two_runs_at_once_do_not_touch_each_other(disk: Disk) -> None:
+    first = disk.start(disk.turn(), fault="hold")
+    for _ in range(600):
+        if (disk.directory / "held").exists():
+            break
+        time.sleep(0.1)
+    beside, code = disk.run(disk.place)
+    assert code != 0
+    assert "Another run works in this directory" in beside
+    elsewhere, code = disk.run(disk.place, f"results={disk.directory / 'results'}", cwd="elsewhere")
+    assert code != 0
+    assert f"another run works on these results (process {first.pid} on" in elsewhere
+    (disk.directory / "held").unlink()
+    said = first.communicate(timeout=300)[0]
+    assert first.returncode == 0, said
+    assert disk.tree() == disk.trees[disk.place]
+
+
+def test_a_full_disk_stops_the_run_and_the_same_command_goes_on_when_there_is_room(disk: Disk) -> None:
+    if not disk.mounted:
+        pytest.skip("a small disk cannot be mounted here: not root")
+    filler = disk.directory / "filler"
+    room = shutil.disk_usage(disk.directory).free
+    filler.write_bytes(bytes(room))
+    said, code = disk.run(disk.turn())
+    assert code != 0
+    assert "No space left on device" in said
+    filler.unlink()
+    again, code = disk.run(disk.place)
+    if code:
+        disk.recover(again)
+    assert disk.tree() == disk.trees[disk.place]
+
+
+def test_results_that_cannot_be_written_are_refused_before_any_job(disk: Disk) -> None:
+    if not disk.mounted:
+        pytest.skip("a small disk cannot be mounted here: not root")
+    results = f"results={disk.directory / 'results'}"
+    disk.remount("ro")
+    try:
+        command = [sys.executable, "-m", "snakemake", "--cores", "2", "-s", str(ROOT / "Snakefile")]
+        command += ["--forcerun", "gather", "--config", f"campaign={disk.directory / 'pair'}", results]
+        done = subprocess.run(command, cwd=disk.directory.parent, capture_output=True, text=True, check=False)
+    finally:
+        disk.remount("rw")
+    assert done.returncode != 0
+    assert "results/pair cannot be written; make it writable, and then:\n  snakemake --cores 2" in done.stderr
+    assert "rule ingest:" not in done.stderr
+    assert disk.tree() == disk.trees[disk.place]
