@@ -5,16 +5,13 @@ stage, diagnosis and page. CPU seconds are those of Snakemake and all its jobs, 
 the largest process. In the same run stands the floor, which is what no tool can save: one process reads the same files
 with pyarrow and solves one linear least squares problem for each sensor of each unit. How fast the machine is at the
 moment, by a loop of five million additions, stands beside it: CPU seconds of a shared machine vary twofold.
-
-``--stages`` runs the jobs one after the other instead and prints the CPU seconds of each stage.
 """
 
 from __future__ import annotations
 
 import argparse
-import re
+import os
 import resource
-import shlex
 import subprocess
 import sys
 import tempfile
@@ -39,12 +36,24 @@ print(time.process_time() - start)
 """
 
 
+# Every process of the run tells on its way out what it was, and what it has used.
+TELL = """
+import atexit, os, resource, sys
+def _tell():
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    words = sys.orig_argv
+    name = words[words.index("pipeline") + 1] if "pipeline" in words else "snakemake"
+    with open(os.environ["FLEET_TOLD"], "a") as stream:
+        print(name, used.ru_utime + used.ru_stime, used.ru_maxrss, file=stream)
+atexit.register(_tell)
+"""
+
+
 def main() -> int:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--units", type=int, default=100)
     parser.add_argument("--cores", type=int, default=2)
-    parser.add_argument("--stages", action="store_true", help="CPU seconds of each stage, its jobs one after the other")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         made = ["simulate", "fleet", "--units", str(arguments.units), "--samples", "10000", "--quiet", "--seed", "1"]
@@ -56,54 +65,44 @@ def main() -> int:
             [sys.executable, "-c", FLOOR, "fleet/raw"], cwd=folder, check=True, capture_output=True, text=True
         )
         least = float(floor.stdout) / arguments.units
-        found = (_stages if arguments.stages else _run)(folder, arguments.cores) / arguments.units
+        found = _run(folder, arguments.cores) / arguments.units
         print(f"floor: {1000 * least:.1f} ms a unit; ratio to it: {found / least:.1f}")
         print(f"five million additions: {speed:.2f} s before, {_speed():.2f} s after")
     return 0
 
 
-def _snakemake(*options: str) -> list[str]:
-    return [
-        sys.executable, "-m", "snakemake", "-s", str(ROOT / "Snakefile"), *options, "--config", "campaign=fleet"
-    ]  # fmt: skip
-
-
 def _run(folder: str, cores: int) -> float:
+    told = Path(folder, "told")
+    Path(folder, "sitecustomize.py").write_text(TELL, encoding="utf-8")
+    paths = [folder, *filter(None, [os.environ.get("PYTHONPATH")])]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths), "FLEET_TOLD": str(told)}
+    command = [sys.executable, "-m", "snakemake", "-s", str(ROOT / "Snakefile"), "--cores", str(cores)]
     before, start = _cpu(), time.perf_counter()
-    subprocess.run(_snakemake("--cores", str(cores)), cwd=folder, check=True, capture_output=True)
+    done = subprocess.run(  # noqa: PLW1510  (its own words are shown below)
+        [*command, "--config", "campaign=fleet"], cwd=folder, env=environment, capture_output=True, text=True
+    )
+    if done.returncode:
+        raise SystemExit(done.stderr[-4000:])
     used, wall = _cpu() - before, time.perf_counter() - start
-    print(f"all stages: {used:.1f} CPU s, {wall:.1f} s on {cores} cores; {_largest():.0f} MB at most")
-    units = len(list(Path(folder, "results/fleet/reports").glob("*.html")))
-    print(f"{units} pages; {1000 * used / units:.0f} ms CPU a unit")
-    return used
-
-
-def _stages(folder: str, cores: int) -> float:
-    del cores
-    dry = subprocess.run(_snakemake("--cores", "1", "-n", "-p"), cwd=folder, check=True, capture_output=True, text=True)
-    jobs = dict.fromkeys(re.findall(r"\S+ -m pipeline .*", dry.stdout + dry.stderr))
     spent: dict[str, float] = defaultdict(float)
-    for job in jobs:
-        words = shlex.split(job)
-        for name in re.findall(r"(?:--output|2?>) (\S+)", job):
-            Path(folder, name.strip("'")).parent.mkdir(parents=True, exist_ok=True)
-        before = _cpu()
-        subprocess.run(job, cwd=folder, shell=True, check=True)  # noqa: S602  (Snakemake's own commands)
-        spent[" ".join([words[3], *(words[i + 1] for i, w in enumerate(words) if w == "--sensor")])] += _cpu() - before
+    jobs: dict[str, int] = defaultdict(int)
+    largest = 0.0
+    for line in told.read_text(encoding="utf-8").splitlines():
+        name, seconds, kilobytes = line.split()
+        spent[name] += float(seconds)
+        jobs[name] += 1
+        largest = max(largest, float(kilobytes) / 1024)
     units = len(list(Path(folder, "results/fleet/reports").glob("*.html")))
-    for stage, seconds in spent.items():
-        print(f"{stage:20s} {1000 * seconds / units:7.1f} ms a unit")
-    print(f"{'all':20s} {1000 * sum(spent.values()) / units:7.1f} ms a unit, without Snakemake itself")
-    return sum(spent.values())
+    for name, seconds in spent.items():
+        print(f"{name:12s} {jobs[name]:4d} processes {1000 * seconds / units:7.1f} ms a unit")
+    print(f"all stages, {units} pages: {1000 * used / units:.0f} ms CPU a unit, {used:.0f} s in all")
+    print(f"{wall:.0f} s on {cores} cores; {largest:.0f} MB in the largest process")
+    return used
 
 
 def _cpu() -> float:
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
-
-
-def _largest() -> float:
-    return resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
 
 
 def _speed() -> float:
