@@ -88,8 +88,8 @@ def _run(folder: str, cores: int) -> float:
     jobs: dict[str, int] = defaultdict(int)
     largest = 0.0
     for line in told.read_text(encoding="utf-8").splitlines():
-        name, seconds, kilobytes = line.split()
-        spent[name] += float(seconds)
+        name, used_s, kilobytes = line.split()
+        spent[name] += float(used_s)
         jobs[name] += 1
         largest = max(largest, float(kilobytes) / 1024)
     units = len(list(Path(folder, "results/fleet/reports").glob("*.html")))
