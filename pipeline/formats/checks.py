@@ -22,12 +22,15 @@ class Checks:
         Largest share of a file's rows that may be dropped or put in order; each is noted, more are refused.
     missing_time : float
         Largest share of a recording's duration that may lie in gaps.
+    disturbed_rows : float
+        Largest share of a recording's samples that are left out as glitches and knocks; 0 keeps all.
     rate_hz : float or None, Hz
         Rate that the time stamps have to keep within a fifth; None where it is not known.
     """
 
     repaired_rows: float = 1e-3
     missing_time: float = 1e-2
+    disturbed_rows: float = 2e-2
     rate_hz: float | None = None
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from pipeline.errors import MissingInputError
 from pipeline.formats.axes import to_body_axes
 from pipeline.formats.checks import checks_of
+from pipeline.formats.disturbances import leave_out_disturbances
 from pipeline.formats.files import candidate_files, recording_files
 from pipeline.formats.ingest_error import IngestError
 from pipeline.formats.plausibility import check_axis, examine
@@ -154,7 +155,7 @@ def to_recording(
         table.values["table_rate"] = rate_of_attitude((table.time_ns - table.time_ns[0]) / 1e9, attitude)
     check_axis(table, entry.get("axis"))
     values = table.values
-    return Recording(
+    recording = Recording(
         name=name,
         role=entry["role"],
         axis=entry.get("axis"),
@@ -170,6 +171,7 @@ def to_recording(
         notes=(*table.notes, *notes),
         encodings=table.encodings,
     )
+    return leave_out_disturbances(recording, table.note, checks.disturbed_rows)
 
 
 def _stack(values: dict[str, NDArray[np.float64]], channels: Sequence[str]) -> NDArray[np.float64] | None:
