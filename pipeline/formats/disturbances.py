@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.formats.marks import GAP, UNIT_NAMES
+from pipeline.formats.marks import CLIPPED, GAP, STUCK, UNIT_NAMES
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
+MARKED = CLIPPED | STUCK
 BEYOND, ALLOWED, JUMP = 10.0, 1.5, 7.0
 MEDIAN_STEP, MEDIAN_SIZE = 0.9539, 1.4826
 AROUND_S, FEWEST_AROUND = 0.5, 6  # on either side
@@ -61,6 +62,8 @@ def leave_out_disturbances(
     if largest_share == 0 or recording.samples < 4 * FEWEST_AROUND:
         return recording
     excess, where = disturbed(recording)
+    if recording.flags is not None:
+        excess[(recording.flags & MARKED) != 0] = 0.0  # no fit looks at them
     rows = np.flatnonzero(np.any(excess > 0, axis=1))
     if not rows.size:
         return recording
