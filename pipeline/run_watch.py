@@ -82,8 +82,8 @@ class Watch(logging.Handler):
             print("Waiting for jobs that a killed run has left at work ...", file=self.stream, flush=True)
             time.sleep(2)
         terminal = self.stream.isatty() and not plain
-        if terminal:
-            self._calm_snakemake()
+        if terminal or quiet:
+            self._calm_snakemake(CLEAR if terminal and not quiet else "")
         if not quiet:
             threading.Thread(target=self._tell, kwargs={"terminal": terminal}, daemon=True).start()
 
@@ -107,13 +107,13 @@ class Watch(logging.Handler):
             lines += ["Mend the cause, then run the same command again:", f"  {command}"]
             print("\n".join(lines), file=self.stream)
 
-    def _calm_snakemake(self) -> None:
+    def _calm_snakemake(self, clear: str) -> None:
         """Leave out Snakemake's blocks on each job, and clear our line before what it prints else."""
 
         def pass_on(record: logging.LogRecord) -> bool:
             if _event(record) in BLOCKS or str(record.msg).startswith(CHATTER):
                 return False
-            self.stream.write(CLEAR)
+            self.stream.write(clear)
             return True
 
         for handler in logging.getLogger("snakemake.logging").handlers:
