@@ -5,8 +5,14 @@ biased at the ends of a file. So the temperature is smoothed by a locally linear
 
     T(t) = a,  (a, b) = argmin sum_i exp(-(t_i - t)^2 / (2 h^2)) (T_i - a - b (t_i - t))^2
 
-where h is the bandwidth; a straight ramp passes it unchanged, at the ends of a file too.
-Source: Fan & Gijbels, Local Polynomial Modelling and Its Applications, 1996, section 3.2.
+where h is the bandwidth; a straight ramp passes it unchanged, at the ends of a file too. A corner of a ramp does not:
+it is rounded by 0.4 h times the change of slope. So h is halved as long as half of it gives another temperature, by
+more than the thermometer's noise s allows:
+
+    max_t |T_h(t) - T_{h/2}(t)| > 6 s sqrt(5 dt / (sqrt(pi) h))
+
+Sources: Fan & Gijbels, Local Polynomial Modelling and Its Applications, 1996, section 3.2; the choice of h after
+Lepski, Theory of Probability and Its Applications 35, 1991.
 """
 
 from __future__ import annotations
@@ -19,6 +25,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 BLOCK = 256
+NARROWEST_S = 0.5
+ROUNDING = 1e-12
+DISTINCT, AT_ENDS = 6.0, 5.0  # standard deviations; by how much the variance is larger at the ends of a file
+MEDIAN_STEP = 0.9539  # median of |w[n+1] - w[n]| of white noise of standard deviation 1
 
 
 def smooth_temperature(
@@ -31,12 +41,32 @@ def smooth_temperature(
     time : (n,) array, s, increasing
     temperature : (n,) array, degC
     bandwidth : float, s
-        Standard deviation of the kernel; 10 s averages over about 30 s.
+        Largest standard deviation of the kernel; 10 s averages over about 30 s.
 
     Returns
     -------
     (n,) array, degC
     """
+    if len(time) < 3 or time[-1] == time[0]:
+        return _local_line(time, temperature, bandwidth)
+    step = np.abs(np.diff(temperature))
+    noise, least = float(np.median(step)) / MEDIAN_STEP, ROUNDING * float(np.abs(temperature).max())
+    if noise == 0.0 and step.any():  # coarse: half of a count says nothing
+        noise = float(step[step > 0].min())
+        least += 0.5 * noise
+    interval = (time[-1] - time[0]) / (len(time) - 1)
+    smooth = _local_line(time, temperature, bandwidth)
+    while bandwidth > max(NARROWEST_S, 4.0 * interval):
+        finer = _local_line(time, temperature, bandwidth / 2.0)
+        allowed = max(DISTINCT * noise * float(np.sqrt(AT_ENDS * interval / (np.sqrt(np.pi) * bandwidth))), least)
+        if float(np.abs(smooth - finer).max()) <= allowed:
+            break
+        smooth, bandwidth = finer, bandwidth / 2.0
+    return smooth
+
+
+def _local_line(time: NDArray[np.float64], temperature: NDArray[np.float64], bandwidth: float) -> NDArray[np.float64]:
+    """Return the value of the local line at each time: (n,) array, degC."""
     cell = np.floor((time - time[0]) / (bandwidth / 5.0)).astype(np.int64)
     _, cell = np.unique(cell, return_inverse=True)
     count = np.bincount(cell)
