@@ -59,7 +59,8 @@ def leave_out_disturbances(
     largest_share : float
         Of the samples. Where more would have to go, all are kept, and that is noted: it is how the bench behaves.
     """
-    if largest_share == 0 or recording.samples < 4 * FEWEST_AROUND:
+    silent = recording.accelerometer is None and recording.gyroscope is None
+    if silent or largest_share == 0 or recording.samples < 4 * FEWEST_AROUND:
         return recording
     excess, where = disturbed(recording)
     if recording.flags is not None:
