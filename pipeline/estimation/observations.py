@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from pipeline.records import Motion, Noise, Recording
 
 ROLES = ("accelerometer", "gyroscope", "static")
-UNSOUND = 0b0110  # flags of clipped and stuck samples
 MEAN_S = 1.0
 FORGOTTEN, FORGOTTEN_DPS = 1e-5, 1e-4  # share of the largest rate that a filter may still hold of a doubtful one
 LONGEST_RESPONSE = 400  # samples
@@ -264,9 +263,7 @@ def _part(sensor: str, recording: Recording, gravity: float, earth: NDArray[np.f
     if filtered:
         sure = remembered(motion, recording) if sensor == "gyroscope" else followed(motion)
         motion = replace(through_filter(motion, recording), followed=sure)
-    sound: NDArray[np.bool_] = np.all(np.isfinite(reading), axis=1)
-    if recording.flags is not None:
-        sound = np.logical_and(sound, (recording.flags & UNSOUND) == 0)
+    sound = np.logical_and(np.all(np.isfinite(reading), axis=1), recording.sound)
     rows = rows_of(motion, sound, together=not filtered).settled(reading)
     if len(rows.first) == 0:
         return None

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.signal.rests import CLIPPED_OR_STUCK, find_rests, rests_from_table
+from pipeline.signal.rests import find_rests, rests_from_table
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -134,5 +134,4 @@ def sound_samples(recording: Recording, sensor: str) -> NDArray[np.bool_]:
     reading = recording.reading(sensor)
     if reading is None:
         return np.zeros(recording.samples, bool)
-    good = np.asarray(np.isfinite(reading).all(axis=1))
-    return good if recording.flags is None else good & ((recording.flags & CLIPPED_OR_STUCK) == 0)
+    return np.asarray(np.isfinite(reading).all(axis=1) & recording.sound)

@@ -37,7 +37,6 @@ if TYPE_CHECKING:
 
     from pipeline.records import Motion, Recording
 
-CLIPPED_OR_STUCK = 0b110
 DISTINCT_DIRECTION_G = 0.01
 ROUNDS = 12
 SAME_PHASE = 1e-12  # rad
@@ -85,14 +84,6 @@ def table_motion(recording: Recording, table: Mapping[str, Any]) -> Motion | Non
     return reference_motion(recording, float(table.get("gravity_g", 1.0)), earth)
 
 
-def usable(recording: Recording) -> NDArray[np.bool_]:
-    """Return which samples ingest did not flag as clipped or stuck; one after a gap is as good as any other."""
-    if recording.flags is None:
-        return np.ones(recording.samples, bool)
-    good: NDArray[np.bool_] = (recording.flags & CLIPPED_OR_STUCK) == 0
-    return good
-
-
 def parts_of(recordings: Sequence[Recording], sensor: str, table: Mapping[str, Any], method: str) -> list[Part]:
     """Return the recordings made for a sensor that hold its readings and the table's motion, without bad samples.
 
@@ -118,7 +109,7 @@ def parts_of(recordings: Sequence[Recording], sensor: str, table: Mapping[str, A
     for recording in own:
         motion = table_motion(recording, table)
         if motion is not None:
-            parts.append(Part(recording, motion, usable(recording)))
+            parts.append(Part(recording, motion, recording.sound))
     if not parts:
         lack = "none of them logs the table's angle" if own else f"no recording of role {sensor} holds its readings"
         raise CannotCalibrateError(

@@ -101,7 +101,7 @@ def find_faults(layout: Layout) -> list[Fault]:
 
 def with_parted_rows(faults: list[Fault], layout: Layout) -> list[Fault]:
     """Return the faults and each row before a lone field: a line break in ``-0.0394`` leaves ``-0.03`` and ``94``."""
-    known = {f.row for f in faults}
+    known = {-1, *(f.row for f in faults)}
     lines = layout.body.split(b"\n") if faults else []
     out = []
     for fault in faults:
@@ -110,7 +110,7 @@ def with_parted_rows(faults: list[Fault], layout: Layout) -> list[Fault]:
             fault.short
             and layout.delimiter not in fault.text
             and END_OF_NUMBER.fullmatch(fault.text)
-            and before not in known | {-1}
+            and before not in known
         ):
             message = f"the line may end inside a number: the next has a single field, {fault.text[:40]!r}"
             text = lines[before].decode("utf-8", "replace")

@@ -22,7 +22,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.formats.marks import CLIPPED, GAP, STUCK, UNIT_NAMES
+from pipeline.formats.marks import GAP, UNIT_NAMES
+from pipeline.records.attitude import conjugate_product, continuous, level_in_body
+from pipeline.records.neighbours import noise_of_steps
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -33,9 +35,8 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-MARKED = CLIPPED | STUCK
 BEYOND, ALLOWED, JUMP = 10.0, 1.5, 7.0
-MEDIAN_STEP, MEDIAN_SIZE = 0.9539, 1.4826
+MEDIAN_SIZE = 1.4826
 AROUND_S, FEWEST_AROUND = 0.5, 6  # on either side
 REST_S, FEWEST_OF_REST = 2.0, 40
 LATE_S = 0.1
@@ -63,8 +64,7 @@ def leave_out_disturbances(
     if silent or largest_share == 0 or recording.samples < 4 * FEWEST_AROUND:
         return recording
     excess, where = disturbed(recording)
-    if recording.flags is not None:
-        excess[(recording.flags & MARKED) != 0] = 0.0  # no fit looks at them
+    excess[~recording.sound] = 0.0  # no fit looks at them
     rows = np.flatnonzero(np.any(excess > 0, axis=1))
     if not rows.size:
         return recording
@@ -103,17 +103,18 @@ def disturbed(recording: Recording) -> tuple[Array, list[tuple[str, str]]]:
     excess = np.zeros_like(raw)
     if not np.isfinite(raw).all():
         return excess, where
-    noise = _noise(raw)
-    if not np.any(np.abs(np.diff(raw, axis=0)) > JUMP * noise):
+    step = np.abs(np.diff(raw, axis=0))
+    if not np.any(step > JUMP * _noise(step)):
         return excess, where
     motion = _Motion(recording)
     values = np.concatenate([motion.unexplained(s, r) for s, r in found], axis=1)
     change = {sensor: motion.change(sensor) for sensor, _ in found}
-    noise = _noise(values)
-    step = np.abs(np.diff(values, axis=0)) - JUMP * noise
-    for column in np.flatnonzero((step > 0).any(axis=0)):
+    step = np.abs(np.diff(values, axis=0))
+    noise = _noise(step)
+    jump = step - JUMP * noise
+    for column in np.flatnonzero((jump > 0).any(axis=0)):
         allowed = change[where[column][0]]
-        jumps = np.flatnonzero(step[:, column] > np.minimum(allowed[:-1], allowed[1:]))
+        jumps = np.flatnonzero(jump[:, column] > np.minimum(allowed[:-1], allowed[1:]))
         usual = motion.scatter_of_rests(values[:, column]) if jumps.size else None
         for n in _beside(jumps, recording.samples):
             window, resting = motion.around(n)
@@ -126,12 +127,11 @@ def disturbed(recording: Recording) -> tuple[Array, list[tuple[str, str]]]:
     return _widened(excess), where
 
 
-def _noise(values: Array) -> Array:
+def _noise(step: Array) -> Array:
     """Return the noise by the differences of neighbours; where most are equal, one count: (c,) array."""
-    step = np.abs(np.diff(values, axis=0))
-    noise = np.median(step, axis=0) / MEDIAN_STEP
+    noise = noise_of_steps(step)
     if np.all(noise > 0):
-        return np.asarray(noise)
+        return noise
     return np.where(noise > 0, noise, np.where(step > 0, step, np.inf).min(axis=0))
 
 
@@ -186,11 +186,8 @@ class _Motion:
         """Return the rate: (n, 1) or (n, 3) array, deg/s; None where nothing tells it."""
         r = self.recording
         if r.table_attitude is not None and np.isfinite(r.table_attitude).all():
-            (w, *v), (a, *b) = r.table_attitude[:-1].T, r.table_attitude[1:].T
-            p, q = np.stack(v, 1), np.stack(b, 1)
-            turn = w[:, None] * q - a[:, None] * p - np.cross(p, q)
-            turn *= np.where(w * a + np.sum(p * q, axis=1) < 0, -2.0, 2.0)[:, None]
-            rate = np.degrees(turn) / np.diff(r.time)[:, None]
+            q = continuous(r.table_attitude)
+            rate = np.degrees(2.0 * conjugate_product(q[:-1], q[1:])) / np.diff(r.time)[:, None]
             return np.concatenate([rate, rate[-1:]])
         if r.table_rate is not None:
             return r.table_rate[:, None]
@@ -207,8 +204,7 @@ class _Motion:
         if sensor == "gyroscope":
             columns += [] if self.by_hand or self.unknown else [self.rate]
         elif r.table_attitude is not None and np.isfinite(r.table_attitude).all():
-            w, x, y, z = r.table_attitude.T
-            columns.append(np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], 1))
+            columns.append(level_in_body(r.table_attitude))
         elif r.table_angle is not None:
             angle = np.radians(r.table_angle)[:, None]
             columns += [np.cos(angle), np.sin(angle)]

@@ -17,7 +17,7 @@ import numpy as np
 
 from pipeline.formats.ingest_error import IngestError
 from pipeline.formats.units import ATTITUDE
-from pipeline.records.attitude import continuous
+from pipeline.records.attitude import conjugate_product, continuous, level_in_body
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -196,15 +196,5 @@ def _cubic(own: Values, value: Values, slope: Values, tau: Values) -> Values:
 
 def body_rates(q: Values, step: float) -> Values:
     """Return ``omega = 2 vec(conj(q) dq/dt)`` of attitudes on a regular grid: (n, 3) array, deg/s."""
-    w, v = q[:, :1], q[:, 1:]
-    dq = np.gradient(q, step, axis=0)
-    omega = 2.0 * (w * dq[:, 1:] - dq[:, :1] * v - np.cross(v, dq[:, 1:]))
-    rates: Values = np.degrees(omega)
+    rates: Values = np.degrees(2.0 * conjugate_product(q, np.gradient(q, step, axis=0)))
     return rates
-
-
-def level_in_body(q: Values) -> Values:
-    """Return the vertical in the body frame, ``R(q)^T e_z``: (n, 3) array."""
-    w, x, y, z = q.T
-    up: Values = np.column_stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)])
-    return up

@@ -26,10 +26,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.errors import InputError
-from pipeline.model.rotation import attitude_matrix, conjugate_product, turn_about_axis
+from pipeline.model.rotation import attitude_matrix, turn_about_axis
 from pipeline.model.turn_log import TurnLog
 from pipeline.records import AXES, Motion
-from pipeline.records.attitude import continuous
+from pipeline.records.attitude import conjugate_product, continuous
 from pipeline.signal.rests import RATE_AT_REST_DPS, still_samples
 from pipeline.signal.temperature import smooth_temperature
 

@@ -45,8 +45,3 @@ def attitude_matrix(q: NDArray[np.float64]) -> NDArray[np.float64]:
         ],
         1,
     )
-
-
-def conjugate_product(p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the vector part of ``conj(p) q`` for quaternions of shape (n, 4): (n, 3)."""
-    return p[:, :1] * q[:, 1:] - q[:, :1] * p[:, 1:] - np.cross(p[:, 1:], q[:, 1:])

@@ -1,4 +1,4 @@
-"""The angular rate that attitudes over time imply.
+"""Attitudes as quaternions (w, x, y, z), body to level with z up, and the angular rate that they imply over time.
 
     omega = 2 vec(conj(q) dq/dt)
 
@@ -22,6 +22,18 @@ def continuous(attitude: NDArray[np.float64]) -> NDArray[np.float64]:
     flips = np.where(np.sum(q[1:] * q[:-1], axis=1) < 0, -1.0, 1.0)
     found: NDArray[np.float64] = q * np.concatenate([[1.0], np.cumprod(flips)])[:, None]
     return found
+
+
+def conjugate_product(p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the vector part of ``conj(p) q`` for quaternions of shape (n, 4): (n, 3)."""
+    return p[:, :1] * q[:, 1:] - q[:, :1] * p[:, 1:] - np.cross(p[:, 1:], q[:, 1:])
+
+
+def level_in_body(q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the vertical in the body frame, ``R(q)^T e_z``: (n, 3) array."""
+    w, x, y, z = q.T
+    up: NDArray[np.float64] = np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], 1)
+    return up
 
 
 def rate_of_attitude(time: NDArray[np.float64], attitude: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 AXES = ("x", "y", "z")
 SENSORS = ("accelerometer", "gyroscope")
 NANOSECONDS = 1_000_000_000
+CLIPPED_OR_STUCK = 0b110  # bits of the flags
 
 
 @dataclass(frozen=True)
@@ -133,6 +134,13 @@ class Recording:
     def motions(self) -> dict[Any, Any]:
         """Motions that ``pipeline.model.kinematics.reference_motion`` has found for it, by place and gravity."""
         return {}
+
+    @property
+    def sound(self) -> NDArray[np.bool_]:
+        """Which samples ingest did not mark as clipped or stuck (one after a gap is as good as any): (n,) array."""
+        if self.flags is None:
+            return np.ones(self.samples, bool)
+        return np.asarray((self.flags & CLIPPED_OR_STUCK) == 0)
 
     def reading(self, sensor: str) -> NDArray[np.float64] | None:
         """Return the (n, 3) readings of ``accelerometer`` (g) or ``gyroscope`` (deg/s), or None."""

@@ -27,9 +27,10 @@ import numpy as np
 
 from pipeline.errors import ConfigurationError
 from pipeline.records import Noise, Recording
+from pipeline.records.neighbours import noise_of_steps
 from pipeline.signal.allan import allan_deviation
 from pipeline.signal.filters import apply_filter
-from pipeline.signal.rests import CLIPPED_OR_STUCK, find_rests, rests_from_table, runs
+from pipeline.signal.rests import find_rests, rests_from_table, runs
 from pipeline.signal.temperature import smooth_temperature
 from pipeline.signal.wander import RATIOS, Blocks, Likelihood, blocks_of, likelihood, variance_of_mean, with_scatter
 
@@ -50,7 +51,6 @@ WINDOW, WINDOW_DEGREE, WINDOW_ARC_DEG = 16, 4, 60.0
 WARM_UP_S = (60.0, 180.0, 500.0)
 SMALLEST_WHITE = 1e-9  # keeps the weights of a noise-free recording finite
 EDGE_S, FEWEST_TO_SETTLE, SETTLED = 0.5, 6, 8.0
-MEDIAN_STEP = 0.9539  # median of |w[n+1] - w[n]| of white noise of standard deviation 1
 SEEN, AGREES = 6.0, 4.0  # twice the gain in log-likelihood
 
 
@@ -111,10 +111,7 @@ def _stretches(recording: Recording, mask: NDArray[np.bool_]) -> list[tuple[int,
 
 
 def _usable(recording: Recording, values: NDArray[np.float64]) -> NDArray[np.bool_]:
-    mask = np.asarray(np.isfinite(values).all(axis=1))
-    if recording.flags is not None:
-        mask[(recording.flags & CLIPPED_OR_STUCK) != 0] = False
-    return mask
+    return np.asarray(np.isfinite(values).all(axis=1) & recording.sound)
 
 
 def _rests(recording: Recording, sensor: str, *, everything: bool) -> list[Rest]:
@@ -151,7 +148,7 @@ def _settled(
             continue
         alike = np.flatnonzero(lengths == length)
         inside = values[ends[alike, :1] + np.arange(length)]
-        spread = np.median(np.abs(np.diff(inside, axis=1)), axis=1, keepdims=True) / MEDIAN_STEP
+        spread = noise_of_steps(np.abs(np.diff(inside, axis=1)), axis=1, keepdims=True)
         for side in (1, -1):
             ordered = inside[:, ::side]
             middle = np.median(ordered[:, edge : 3 * edge], axis=1, keepdims=True)

@@ -37,7 +37,6 @@ WINDOW_S = 0.5
 SHORTEST_REST_S = 1.0
 MULTIPLES = np.geomspace(4.0, 1000.0, 25)
 SMALLEST_VARIANCE = 1e-12  # g^2, keeps the multiple of a noise-free recording above rounding
-CLIPPED_OR_STUCK = 0b110
 NEIGHBOURS = 5
 # Limits of a rest that is averaged. Beside the data: a hand-held rest of a consumer gyroscope differs by its
 # g-sensitivity (0.1 deg/s/g) and tremor (0.3 deg/s over some seconds) from its neighbours.
@@ -187,8 +186,7 @@ def _spoilt(recording: Recording, size: int) -> NDArray[np.bool_]:
     """Return the windows with a clipped, stuck or missing reading, or over a gap as long as a window."""
     assert recording.accelerometer is not None  # noqa: S101
     bad = np.logical_not(np.all(np.isfinite(recording.accelerometer), axis=1))
-    if recording.flags is not None:
-        bad |= (recording.flags & CLIPPED_OR_STUCK) != 0
+    bad |= ~recording.sound
     bad[1:] |= np.diff(recording.time_ns) > size * recording.interval * 1e9
     total = np.concatenate([[0], np.cumsum(bad)])
     return total[size:] > total[:-size]

@@ -21,6 +21,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.records.neighbours import noise_of_steps
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -28,7 +30,6 @@ BLOCK = 256
 NARROWEST_S = 0.5
 ROUNDING = 1e-12
 DISTINCT, AT_ENDS = 6.0, 5.0  # standard deviations; by how much the variance is larger at the ends of a file
-MEDIAN_STEP = 0.9539  # median of |w[n+1] - w[n]| of white noise of standard deviation 1
 
 
 def smooth_temperature(
@@ -50,7 +51,7 @@ def smooth_temperature(
     if len(time) < 3 or time[-1] == time[0]:
         return _local_line(time, temperature, bandwidth)
     step = np.abs(np.diff(temperature))
-    noise, least = float(np.median(step)) / MEDIAN_STEP, ROUNDING * float(np.abs(temperature).max())
+    noise, least = float(noise_of_steps(step)), ROUNDING * float(np.abs(temperature).max())
     if noise == 0.0 and step.any():  # coarse: half of a count says nothing
         noise = float(step[step > 0].min())
         least += 0.5 * noise

@@ -139,7 +139,7 @@ def _per_procedure(results: Results, told: dict[tuple[str, str, str], float], de
     svg = columns(
         f"procedures-{device}-{sensor}",
         f"{DEVICES[device]}, {sensor}: held-out error by procedure",
-        "; ".join(f"{k}: {', '.join(number(v) for v in values)}" for k, values in groups.items()),
+        _told(groups),
         groups,
         f"mean |e| after, {UNITS[sensor]}",
         x_label=BELOW[sensor],
@@ -173,7 +173,7 @@ def _methods(results: Results, printed: Path, sensor: str) -> Figure:
     svg = columns(
         f"methods-{sensor}",
         f"{sensor.capitalize()}: held-out error by method",
-        "; ".join(f"{k}: {', '.join(number(v) for v in values)}" for k, values in groups.items()),
+        _told(groups),
         groups,
         f"mean |e| after, {UNITS[sensor]}",
         x_label="device",
@@ -201,7 +201,7 @@ def _tables(results: Results, told: dict[tuple[str, str, str], float]) -> Figure
     svg = columns(
         "tables",
         "What is left of the error on either table",
-        "; ".join(f"{k}: {', '.join(number(v) for v in values)} %" for k, values in groups.items()),
+        _told(groups, " %"),
         groups,
         "after, % of before",
         x_label="sensor; home: on the home-made table",
@@ -244,10 +244,15 @@ def _scatter(scatter: Sequence[Scatter], quantity: str) -> Figure:
     svg = columns(
         f"scatter-{quantity}",
         f"Scatter of {quantity}",
-        "; ".join(f"{k}: {', '.join(number(v) for v in values)}" for k, values in groups.items()),
+        _told(groups),
         groups,
         f"rms deviation of {quantity}",
         x_label="device",
     )
     legend = tuple((f"c{i}", text) for i, text in enumerate(("printed", *CAUSES)))
     return Figure(svg, "", legend, f"Scatter of {quantity}: printed, and by picking single samples")
+
+
+def _told(groups: dict[str, list[float]], unit: str = "") -> str:
+    """Return the values of a chart of groups in words, for those who do not see it."""
+    return "; ".join(f"{name}: {', '.join(number(v) for v in values)}{unit}" for name, values in groups.items())

@@ -27,6 +27,7 @@ import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.model.compensation import Compensation
+from pipeline.records.attitude import level_in_body
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -198,7 +199,7 @@ def rotation_vector(q: Array) -> Array:
 
 def tilt_between(p: Array, q: Array) -> Array:
     """Return the angle between the verticals of two attitudes: (n,) array, deg."""
-    up, other = _vertical(p), _vertical(q)
+    up, other = level_in_body(p), level_in_body(q)
     across = np.linalg.norm(np.cross(up, other), axis=1)
     angle: NDArray[np.float64] = np.degrees(np.arctan2(across, np.einsum("ij,ij->i", up, other)))
     return angle
@@ -222,12 +223,6 @@ def conjugate(q: Array) -> Array:
     """Return the inverse rotations: (n, 4) array."""
     inverse: NDArray[np.float64] = q * np.array([1.0, -1.0, -1.0, -1.0])
     return inverse
-
-
-def _vertical(q: Array) -> Array:
-    """Return the level frame's z axis in the body: (n, 3) array."""
-    w, x, y, z = q.T
-    return np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], 1)
 
 
 def _beside_table(recording: Recording) -> tuple[Recording, Array]:
