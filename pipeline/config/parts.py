@@ -32,6 +32,7 @@ ACCURACIES = (
     "azimuth_accuracy_deg",
     "clock_accuracy_ppm",
 )
+NOISE = ("noise_density", "bias_wander", "wander_time_s")
 FIT = (
     "table.motion",
     "table.gravity_g",
@@ -43,9 +44,7 @@ FIT = (
     "method.as_printed",
     "sensor.{sensor}.full_scale",
     "sensor.{sensor}.counts_per_unit",
-    "sensor.{sensor}.noise_density",
-    "sensor.{sensor}.bias_wander",
-    "sensor.{sensor}.wander_time_s",
+    *(f"sensor.{{sensor}}.{key}" for key in NOISE),
 )
 SENSORS_AND_TABLE = ("sensor", "table", "procedure.holdout_every")
 READS: dict[str, tuple[str, ...]] = {
@@ -57,7 +56,7 @@ READS: dict[str, tuple[str, ...]] = {
         "sensor.accelerometer.full_scale",
         "sensor.gyroscope.full_scale",
     ),
-    "filter": ("filter",),
+    "filter": ("filter", *(f"sensor.{sensor}.{key}" for sensor in ("accelerometer", "gyroscope") for key in NOISE)),
     "fit": FIT,
     "effects": (*FIT, "effects.{sensor}", "sensor.{sensor}.effects"),
     "calibration": (

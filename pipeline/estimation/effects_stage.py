@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from pipeline.errors import ConfigurationError, InputError
 from pipeline.estimation.hand_held.rests import by_hand
 from pipeline.estimation.joint import fit_joint
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import select
 from pipeline.records import SensorCalibration
-from pipeline.signal.noise import estimate_noise
+from pipeline.signal.noise import noise_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.records import Noise, Recording
+    from pipeline.records import Recording
 
 AUTO = "auto"
 
@@ -43,7 +42,7 @@ def fit_effects(
     before = previous or SensorCalibration(sensor)
     if not wanted:
         return before
-    noise = noise_of(sensor, recordings, settings["sensor"][sensor])
+    noise = noise_of(sensor, recordings, settings)
     if by_hand(sensor, recordings):
         from pipeline.estimation.hand_held.result import fit_effects_by_hand  # noqa: PLC0415  (recordings by hand alone)
 
@@ -57,11 +56,3 @@ def fit_effects(
     if not names:
         return before
     return fit_joint(sensor, recordings, names, noise, settings, before)
-
-
-def noise_of(sensor: str, recordings: Sequence[Recording], sheet: Mapping[str, Any]) -> Noise | None:
-    """Return the noise that the recordings and the data sheet tell, or None where they tell nothing."""
-    try:
-        return estimate_noise(sensor, list(recordings), dict(sheet))
-    except (ConfigurationError, InputError):
-        return None

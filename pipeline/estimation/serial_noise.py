@@ -33,6 +33,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import NotObservableError
+from pipeline.signal.noise import noise_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -104,12 +105,9 @@ def prior_of(sensor: str, recordings: Sequence[Recording], settings: Mapping[str
     """
     sheet = settings.get("sensor", {}).get(sensor) or {}
     static = [r for r in recordings if r.role == "static" and r.reading(sensor) is not None and r.samples > 1]
-    if static and sheet:
-        from pipeline.signal.noise import estimate_noise  # noqa: PLC0415  (only a static recording needs it)
-
-        found = estimate_noise(sensor, static, sheet)
-        length = sum(float(r.time[-1] - r.time[0]) for r in static)
-        width = float(np.clip(np.sqrt(found.correlation_time / length), SHARPEST_WIDTH, SHEET_WIDTH))
+    found = noise_of(sensor, recordings, settings) if static and sheet else None
+    if found and found.source == "static":
+        width = float(np.clip(np.sqrt(found.correlation_time / found.length), SHARPEST_WIDTH, SHEET_WIDTH))
         return Prior(float(np.sqrt(np.mean(found.wander**2))), found.correlation_time, width)
     return Prior(float(sheet.get("bias_wander") or 0.0), float(sheet.get("wander_time_s") or DEFAULT_TIME_S))
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
 
@@ -37,3 +38,12 @@ class Noise:
     correlation_time: float
     source: str
     length: float = 0.0
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the noise as JSON values."""
+        return {**vars(self), "white": self.white.tolist(), "wander": self.wander.tolist()}
+
+    @classmethod
+    def from_json(cls, data: dict[str, Any]) -> Self:
+        """Read back what ``to_json`` wrote."""
+        return cls(**{**data, "white": np.array(data["white"]), "wander": np.array(data["wander"])})

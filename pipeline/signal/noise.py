@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.errors import ConfigurationError
+from pipeline.errors import ConfigurationError, InputError
 from pipeline.records import Noise, Recording
 from pipeline.records.neighbours import noise_of_steps
 from pipeline.signal.allan import allan_deviation
@@ -35,11 +35,13 @@ from pipeline.signal.temperature import smooth_temperature
 from pipeline.signal.wander import RATIOS, Blocks, Likelihood, blocks_of, likelihood, variance_of_mean, with_scatter
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
     from numpy.typing import NDArray
 
     Rest = tuple[NDArray[np.float64], NDArray[np.float64]]
 
-__all__ = ["allan_deviation", "estimate_noise", "filter_autocovariance"]
+__all__ = ["allan_deviation", "estimate_noise", "filter_autocovariance", "noise_of"]
 
 GAP = 1.5
 WANDER_TIME_S = 100.0  # where the data sheet gives none
@@ -82,6 +84,25 @@ def estimate_noise(sensor: str, recordings: list[Recording], data_sheet: dict[st
             return replace(noise, length=length)
     white = _white_of_turns(usable, sensor)
     return _with_sheet_wander(white, data_sheet, "residual") if white is not None else _of_sheet(usable, data_sheet)
+
+
+def noise_of(sensor: str, recordings: Sequence[Recording], settings: Mapping[str, Any]) -> Noise | None:
+    """Return the noise that a stage before has found, else the estimate; None where nothing tells it.
+
+    Parameters
+    ----------
+    sensor : str
+    recordings : sequence of Recording
+    settings : mapping
+        ``noise`` by sensor, where a stage before has found it; ``sensor``, the data sheet.
+    """
+    if "noise" in settings:
+        known: Noise | None = settings["noise"][sensor]
+        return known
+    try:
+        return estimate_noise(sensor, list(recordings), dict(settings.get("sensor", {}).get(sensor) or {}))
+    except (ConfigurationError, InputError):
+        return None
 
 
 def filter_autocovariance(recording: Recording) -> NDArray[np.float64]:

@@ -11,6 +11,7 @@ from pipeline.formats.parquet import load_recordings
 from pipeline.signal.noise import estimate_noise
 from pipeline.stages.batch import parse_job, run_batch, write_json
 from pipeline.stages.fits import load_fits
+from pipeline.stages.noises import load_noises
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -24,8 +25,9 @@ def main(argv: Sequence[str]) -> int:
         recordings = load_recordings(job.inputs["filter"] / f"{unit}.parquet")
         document: dict[str, Any] = {"schema_version": 1, "unit": unit}
         fits = load_fits(job.inputs, unit)
+        noises = load_noises(job.inputs["filter"], unit)
         for sensor, calibration in fits.items():
-            noise = estimate_noise(sensor, recordings, part["sensor"][sensor])
+            noise = noises[sensor] or estimate_noise(sensor, recordings, part["sensor"][sensor])
             document[sensor] = found = calibration and diagnose(
                 calibration, recordings, noise, part, fits["accelerometer"]
             )

@@ -14,6 +14,7 @@ from pipeline.errors import CannotCalibrateError
 from pipeline.formats.parquet import load_recordings
 from pipeline.records import SensorCalibration
 from pipeline.stages.batch import parse_job, read_json, run_batch, write_json
+from pipeline.stages.noises import load_noises
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -35,8 +36,9 @@ def main(argv: Sequence[str]) -> int:
             return
         previous = SensorCalibration.from_json(sensor, before) if before else None
         recordings = load_recordings(job.inputs["filter"] / f"{unit}.parquet")
+        noises = load_noises(job.inputs["filter"], unit)
         try:
-            write_json(target, module.fit(recordings, previous, part).to_json())
+            write_json(target, module.fit(recordings, previous, part | {"noise": noises}).to_json())
         except CannotCalibrateError as reason:
             write_json(target, {"not_calibrated": reason.message})
 

@@ -8,6 +8,7 @@ from pipeline.formats.parquet import load_recordings
 from pipeline.signal.noise import estimate_noise
 from pipeline.stages.batch import parse_job, run_batch, write_json
 from pipeline.stages.fits import load_fits
+from pipeline.stages.noises import load_noises
 from pipeline.validation.attitude import attitude
 from pipeline.validation.heldout import validate
 
@@ -23,8 +24,9 @@ def main(argv: Sequence[str]) -> int:
         recordings = load_recordings(job.inputs["filter"] / f"{unit}.parquet")
         document: dict[str, Any] = {"schema_version": 1, "unit": unit}
         fits = load_fits(job.inputs, unit)
+        noises = load_noises(job.inputs["filter"], unit)
         for sensor, calibration in fits.items():
-            noise = estimate_noise(sensor, recordings, part["sensor"][sensor])
+            noise = noises[sensor] or estimate_noise(sensor, recordings, part["sensor"][sensor])
             other = next(fit for s, fit in fits.items() if s != sensor)
             document[sensor] = calibration and validate(calibration, recordings, noise, part, other=other)
         document["attitude"] = attitude(fits["accelerometer"], fits["gyroscope"], recordings)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.errors import CannotCalibrateError, ConfigurationError, InputError, NotObservableError
+from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.hand_held.budget import budgeted_by_hand
 from pipeline.estimation.hand_held.equations import noises_for
 from pipeline.estimation.hand_held.fit import fit as fit_by_hand
@@ -21,7 +21,7 @@ from pipeline.estimation.hand_held.model import State
 from pipeline.estimation.hand_held.rests import by_hand
 from pipeline.estimation.least_squares import certified
 from pipeline.records import AXES, SensorCalibration, StageResult
-from pipeline.signal.noise import estimate_noise
+from pipeline.signal.noise import noise_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -61,10 +61,7 @@ def fit(
     """
     if not by_hand("gyroscope", recordings):
         raise CannotCalibrateError(f"rests and moves need a recording by hand with the gyroscope's readings: {ADVICE}")
-    try:
-        noise = estimate_noise("gyroscope", list(recordings), settings["sensor"]["gyroscope"])
-    except (ConfigurationError, InputError):
-        noise = None
+    noise = noise_of("gyroscope", recordings, settings)
     model = model_of(recordings, None, noise, settings)
     if model is None or model.moves is None:
         raise NotObservableError(
