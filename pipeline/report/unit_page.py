@@ -82,6 +82,7 @@ def render(
         else [],
         attitude=pointed if pointed.get("curve") else None,
         attitude_figure=attitude_over_time(pointed),
+        moves=turned if (turned := (validation or {}).get("gravity_direction") or {}).get("moves") else None,
         recordings=recording_rows(recordings, rests),
         segments=segments(recordings, rests, calibration) if ok else None,
         environment=environment(recordings, settings) if recordings else [],

@@ -10,6 +10,7 @@ from pipeline.stages.batch import parse_job, run_batch, write_json
 from pipeline.stages.fits import load_fits
 from pipeline.stages.noises import load_noises
 from pipeline.validation.attitude import attitude
+from pipeline.validation.gravity_direction import gravity_direction
 from pipeline.validation.heldout import validate
 
 if TYPE_CHECKING:
@@ -30,6 +31,7 @@ def main(argv: Sequence[str]) -> int:
             other = next(fit for s, fit in fits.items() if s != sensor)
             document[sensor] = calibration and validate(calibration, recordings, noise, part, other=other)
         document["attitude"] = attitude(fits["accelerometer"], fits["gyroscope"], recordings)
+        document["gravity_direction"] = gravity_direction(**fits, recordings=recordings, noise=noise, settings=part)
         write_json(job.output / f"{unit}.json", document)
 
     return run_batch(job, work)

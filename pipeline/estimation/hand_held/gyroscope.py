@@ -12,7 +12,9 @@ where
               leave there
 
 The errors of u are those of the rests' means, which two moves share, and those of the accelerometer's calibration,
-which all share: ``du = (1 - u u^T) (M_a dy - M_a db_a + dM_a v_a) / G``.
+which all share: ``du = (1 - u u^T) (M_a dy - M_a db_a + dM_a v_a) / G``. A unit that still settles or is let go turns
+by some tenths of a degree within a rest: then u is not of the rest's mean but of its half second next to the move
+(``pipeline.estimation.hand_held.gravity``).
 
 Source of the moves: Tedaldi, Pretto & Menegatti, ICRA 2014, eq. 12. A turn about the vertical says nothing in one move,
 but in another move it does, as the vertical is elsewhere in the body. The frame is that of the accelerometer's matrix.
@@ -28,11 +30,10 @@ from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.hand_held.accelerometer import SMALLEST_NOISE, white_of
 from pipeline.estimation.hand_held.equations import Equations
+from pipeline.estimation.hand_held.gravity import gravity_of
 from pipeline.estimation.hand_held.model import State, added, motion_of
 from pipeline.estimation.hand_held.moves import moves_of, skew, tangents, to_the_end
-from pipeline.estimation.hand_held.rests import rests_of
-from pipeline.model.effects import effect
-from pipeline.model.inversion import compensate
+from pipeline.estimation.hand_held.rests import ROLE, rests_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.estimation.design import Term
+    from pipeline.estimation.hand_held.gravity import Gravity
     from pipeline.estimation.hand_held.moves import Moves
     from pipeline.estimation.hand_held.rests import Rests
     from pipeline.records import Motion, Noise, Recording, SensorCalibration
@@ -59,34 +61,33 @@ class HandHeldGyroscope:
     rests : Rests
         All, also those held out: a move may begin at one.
     moves : Moves or None
-    force : (m, 3) array, g
-        Specific force of each rest by the accelerometer.
-    spread : (m,) array, g
-        Standard deviation of each by the scatter of the accelerometer's rests.
-    shared : (m, 3, 12) array, g
-        What the errors of the accelerometer's calibration, each of its standard uncertainty, do to the force.
+    gravity : Gravity
+        At each rest, by the accelerometer.
     noise : Noise or None
+    fewest : int
+        Moves, below which none is looked at.
     """
 
     sensor = "gyroscope"
 
-    def __init__(  # noqa: PLR0917  (they are the observations)
-        self, rests: Rests, moves: Moves | None, force: Values, spread: Values, shared: Values, noise: Noise | None
+    def __init__(
+        self, rests: Rests, moves: Moves | None, gravity: Gravity, noise: Noise | None, fewest: int = FEWEST_MOVES
     ) -> None:
+        force = gravity.force
         self.white = np.maximum(white_of(rests, noise), SMALLEST_NOISE)
         self.rests, self.force = rests.select(~rests.held_out), force[~rests.held_out]
         self.held, self.held_force = rests.select(rests.held_out), force[rests.held_out]
-        self.moves = moves if moves is not None and moves.count >= FEWEST_MOVES else None
+        self.moves = moves if moves is not None and moves.count >= fewest else None
         self.kinds = 1 if self.moves is None else 2
         self.directions = np.eye(12)[:, : 3 if self.moves is None else 12]
         self.rests_equations = 3 * len(self.rests.time)
         self.gravity = float(np.median(np.linalg.norm(force, axis=1)))
         if self.moves is not None:
+            self.before, self.after = gravity.at_end[self.moves.before], gravity.at_start[self.moves.after]
             u = force / np.linalg.norm(force, axis=1, keepdims=True)
-            self.before, self.after = u[self.moves.before], u[self.moves.after]
             across = np.eye(3) - u[:, :, None] * u[:, None, :]
-            self.spread = np.degrees(spread / self.gravity)[:, None, None] * across
-            self.shared = np.degrees(across @ shared / self.gravity)
+            self.spread = np.degrees(gravity.spread / self.gravity)[:, None, None] * across
+            self.shared = np.degrees(across @ gravity.shared / self.gravity)
             self.every = rests
 
     def equations(self, state: State, candidates: Sequence[Term] = ()) -> Equations:
@@ -136,6 +137,24 @@ class HandHeldGyroscope:
         motion = motion_of(self.held.time, self.held_force, nothing, self.held.temperature, still=True)
         left = self.held.reading - state.bias - added(self.sensor, state.terms, motion, state.K)
         return float(np.sqrt(np.mean(np.sum((left @ state.matrix.T) ** 2, axis=1))))
+
+    def missed(self, state: State) -> tuple[Values, Values]:
+        """Return by how much each move misses the direction of gravity after it, and what noise alone gives, deg.
+
+        Returns
+        -------
+        error : (k,) array
+            Angle between the integrated and the felt direction.
+        noise : (k,) array
+            Mean of that angle under white noise of both sensors, and the scatter of the accelerometer's rests.
+        """
+        assert self.moves is not None  # noqa: S101
+        A = self._turned(state)[2]
+        predicted = np.einsum("kij,kj->ki", A[:, 0], self.before)
+        across = np.linalg.norm(np.cross(predicted, self.after), axis=1)
+        error = np.degrees(np.arctan2(across, np.einsum("ki,ki->k", predicted, self.after)))
+        own = self._of_moves(state, ())["error"].reshape(-1, 2)
+        return error, np.sqrt(0.25 * np.pi * np.sum(own**2, axis=1))
 
     def _at_rest(self, state: State, candidates: Sequence[Term]) -> dict[str, Any]:
         rests, K = self.rests, state.K
@@ -293,33 +312,24 @@ def model_of(
             raise CannotCalibrateError(
                 f"the gyroscope by hand needs the direction of gravity by a calibrated accelerometer: {lack.message}"
             ) from lack
-    felt = rests_of("accelerometer", recordings, settings, accelerometer)
-    turned = rests_of("gyroscope", recordings, settings, accelerometer)
+    observed = observed_rests(recordings, accelerometer, settings)
+    if observed is None:
+        return None
+    rests, gravity = observed
+    return HandHeldGyroscope(rests, moves_of(recordings, rests), gravity, noise)
+
+
+def observed_rests(
+    recordings: Sequence[Recording], accelerometer: SensorCalibration, settings: Mapping[str, Any], role: str = ROLE
+) -> tuple[Rests, Gravity] | None:
+    """Return the gyroscope's rests and gravity at them, or None where the recordings of a role hold none."""
+    felt = rests_of("accelerometer", recordings, settings, accelerometer, role)
+    turned = rests_of("gyroscope", recordings, settings, accelerometer, role)
     if felt is None or turned is None:
         return None
-    keys = [set(zip(r.recording.tolist(), r.span[:, 0].tolist(), strict=True)) for r in (felt, turned)]
-    both = keys[0] & keys[1]
-    felt, turned = (
-        r.select(np.array([key in both for key in zip(r.recording.tolist(), r.span[:, 0].tolist(), strict=True)]))
-        for r in (felt, turned)
-    )
+    keys = [list(zip(r.recording.tolist(), r.span[:, 0].tolist(), strict=True)) for r in (felt, turned)]
+    both = set(keys[0]) & set(keys[1])
+    felt, turned = (r.select(np.array([key in both for key in k])) for r, k in zip((felt, turned), keys, strict=True))
     if len(turned.time) == 0:
         return None
-    motion = motion_of(felt.time, felt.reading, np.zeros_like(felt.reading), felt.temperature, still=True)
-    known = [e for e in accelerometer.effects if not effect(e.name).moves]
-    force = compensate(accelerometer, felt.reading, motion, known)
-    between = [float(stage.details.get("scatter_between_rests") or 0.0) for stage in accelerometer.stages]
-    spread = np.sqrt(felt.share * float(np.mean(felt.white**2)) + max(between, default=0.0) ** 2)
-    shared = _of_calibration(accelerometer, felt.reading)
-    return HandHeldGyroscope(turned, moves_of(recordings, turned), force, spread, shared, noise)
-
-
-def _of_calibration(accelerometer: SensorCalibration, reading: Values) -> Values:
-    """Return what errors of one standard uncertainty, independent of each other, do to the force: (m, 3, 12) array."""
-    if accelerometer.covariance is None:
-        return np.zeros((len(reading), 3, 12))
-    values, vectors = np.linalg.eigh(accelerometer.covariance[:12, :12])
-    root = vectors * np.sqrt(np.clip(values, 0.0, None))
-    v = reading - accelerometer.bias
-    change: Values = -accelerometer.matrix @ root[:3] + np.einsum("mj,ijp->mip", v, root[3:].reshape(3, 3, -1))
-    return change
+    return turned, gravity_of(recordings, felt, accelerometer)
