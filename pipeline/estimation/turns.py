@@ -21,7 +21,7 @@ and no one sinusoid holds both.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -107,7 +107,7 @@ def parts_of(recordings: Sequence[Recording], sensor: str, table: Mapping[str, A
     own = [r for r in recordings if r.role == sensor and r.reading(sensor) is not None]
     parts = []
     for recording in own:
-        motion = table_motion(recording, table)
+        motion = table_motion(replace(recording, temperature=None), table)  # bias and matrix do not ask for it
         if motion is not None:
             parts.append(Part(recording, motion, recording.sound))
     if not parts:

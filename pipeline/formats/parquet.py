@@ -1,4 +1,4 @@
-"""Recordings to Parquet and back, one file a unit, one row group a recording.
+"""Recordings to Parquet and back, one file a unit, its recordings one after the other.
 
 Columns that came as counts stay integers, ``value = (count - offset) * scale`` on loading; those that would not come
 back to the last bit are stored as doubles. Page checksums guard the data; a CRC-32 of every recording's columns and one
@@ -7,7 +7,7 @@ again gives the same bytes.
 
     +------------+---------------------------------------------------------------------------------+
     | time_ns    | int64                                                                           |
-    | accel_x .. | double or int32/int64 counts; null in row groups of recordings without it       |
+    | accel_x .. | double or int32/int64 counts; null in the rows of recordings without it         |
     | flags      | uint16                                                                          |
     +------------+---------------------------------------------------------------------------------+
 """
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 SCHEMA_VERSION = 1
+ROW_GROUP = 1_000_000  # samples
 KEY, KEY_CRC = b"recordings", b"recordings_crc32"
 BLOCKS = {"accelerometer": ACCELEROMETER, "gyroscope": GYROSCOPE, "table_attitude": ATTITUDE}
 SINGLES = ("temperature", "table_angle", "table_rate", "flags")
@@ -70,12 +71,14 @@ def save_recordings(path: Path, recordings: Sequence[Recording]) -> None:
         write_statistics=False,
         write_page_checksum=True,
     ) as writer:
-        for recording, columns in zip(recordings, stored, strict=True):
-            arrays = [
-                pa.array(columns[n]) if n in columns else pa.nulls(recording.samples, schema.field(n).type)
-                for n in names
-            ]
-            writer.write_table(pa.Table.from_arrays(arrays, schema=schema), row_group_size=max(recording.samples, 1))
+        tables = [
+            pa.Table.from_arrays(
+                [pa.array(columns[n]) if n in columns else pa.nulls(r.samples, schema.field(n).type) for n in names],
+                schema=schema,
+            )
+            for r, columns in zip(recordings, stored, strict=True)
+        ]
+        writer.write_table(pa.concat_tables(tables) if tables else schema.empty_table(), row_group_size=ROW_GROUP)
     temporary.replace(path)
 
 
@@ -199,7 +202,7 @@ def _checked_metadata(metadata: dict[bytes, bytes], path: str) -> dict[str, Any]
 
 
 def _recording(entry: dict[str, Any], table: Any, path: str) -> Recording:  # noqa: ANN401  (pyarrow has no types)
-    missing = [n for n in entry["columns"] if n not in table.column_names]
+    missing = sorted(set(entry["columns"]) - set(table.column_names))
     if missing or table.num_rows != entry["rows"]:
         raise _damaged(f"columns {missing} missing, or {table.num_rows} rows of {entry['rows']}", path)
     columns = {n: table.column(n).to_numpy() for n in entry["columns"]}

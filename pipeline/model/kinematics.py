@@ -31,7 +31,7 @@ from pipeline.model.turn_log import TurnLog
 from pipeline.records import AXES, Motion
 from pipeline.records.attitude import conjugate_product, continuous
 from pipeline.signal.rests import RATE_AT_REST_DPS, still_samples
-from pipeline.signal.temperature import smooth_temperature
+from pipeline.signal.temperature import temperature_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -94,20 +94,19 @@ def reference_motion(
         return None
     key = (gravity_g, None if earth_rate_level is None else earth_rate_level.tobytes())
     kept = not np.any(offset)
-    if kept and key in recording.motions:
-        found: Motion = recording.motions[key]
+    if kept and key in recording.kept:
+        found: Motion = recording.kept[key]
         return found
     if recording.samples < 6:
         raise InputError(
             f"recording {recording.name} has {recording.samples} samples; at least 6 are needed to follow the table",
             recording.source.get("file"),
         )
-    temperature = recording.temperature
-    if temperature is not None:
-        temperature = smooth_temperature(recording.time, temperature)
-    motion = replace(build(recording, gravity_g, earth_rate_level, offset, temperature), recording=recording.name)
+    temperature = None if recording.temperature is None else temperature_of(recording)
+    motion = build(recording, gravity_g, earth_rate_level, offset, temperature)
+    motion = replace(motion, recording=recording.name)
     if kept:
-        recording.motions[key] = motion
+        recording.kept[key] = motion
     return motion
 
 

@@ -208,13 +208,12 @@ def nearest_slope(time: Values, values: Values) -> Values:
     values : (n,) array
     """
     n = len(time)
-    window = np.clip(np.arange(n)[:, None] - 2, 0, n - 5) + np.arange(5)
-    t, v = time[window] - time[:, None], values[window]
+    window = np.clip(np.arange(n) - 2, 0, n - 5) + np.arange(5)[:, None]
+    t, v = time[window] - time, values[window]
     slope = np.zeros(n)
     for j in range(5):
-        others = [m for m in range(5) if m != j]
-        spread = np.prod([t[:, j] - t[:, m] for m in others], axis=0)
-        # derivative at 0 of prod (x - t_m): the sum of its products that leave one factor out
-        terms = sum(np.prod([-t[:, m] for m in others if m != skip], axis=0) for skip in others)
-        slope += v[:, j] * terms / spread
+        a, b, c, d = (t[m] for m in range(5) if m != j)
+        spread = (t[j] - a) * (t[j] - b) * (t[j] - c) * (t[j] - d)
+        # derivative at 0 of (x - a) (x - b) (x - c) (x - d): the sum of its products that leave one factor out
+        slope -= v[j] * (a * b * (c + d) + c * d * (a + b)) / spread
     return slope

@@ -131,8 +131,8 @@ class Recording:
         return float(np.median(np.diff(self.time_ns))) / NANOSECONDS if self.samples > 1 else float("nan")
 
     @cached_property
-    def motions(self) -> dict[Any, Any]:
-        """Motions that ``pipeline.model.kinematics.reference_motion`` has found for it, by place and gravity."""
+    def kept(self) -> dict[Any, Any]:
+        """What was worked out of it once, for both sensors and all steps: its smoothed temperature, its motions."""
         return {}
 
     @property

@@ -31,7 +31,7 @@ from pipeline.records.neighbours import noise_of_steps
 from pipeline.signal.allan import allan_deviation
 from pipeline.signal.filters import apply_filter
 from pipeline.signal.rests import find_rests, rests_from_table, runs
-from pipeline.signal.temperature import smooth_temperature
+from pipeline.signal.temperature import temperature_of
 from pipeline.signal.wander import RATIOS, Blocks, Likelihood, blocks_of, likelihood, variance_of_mean, with_scatter
 
 if TYPE_CHECKING:
@@ -206,7 +206,7 @@ def _nuisance(blocks: Blocks, chosen: list[Recording], source: str) -> NDArray[n
     columns += [np.exp(-(centre - centre.min()) / tau) for tau in WARM_UP_S if centre.min() < 4.0 * tau]
     for recording in chosen:
         if recording.temperature is not None and np.isfinite(recording.temperature).all():
-            smooth = np.interp(centre, recording.time, smooth_temperature(recording.time, recording.temperature))
+            smooth = np.interp(centre, recording.time, temperature_of(recording))
             if np.ptp(smooth) > 0.1:
                 columns.append(smooth - smooth.mean())
     return np.stack(columns, axis=1)

@@ -26,6 +26,8 @@ from pipeline.records.neighbours import noise_of_steps
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from pipeline.records import Recording
+
 BLOCK = 256
 NARROWEST_S = 0.5
 ROUNDING = 1e-12
@@ -64,6 +66,15 @@ def smooth_temperature(
             break
         smooth, bandwidth = finer, bandwidth / 2.0
     return smooth
+
+
+def temperature_of(recording: Recording) -> NDArray[np.float64]:
+    """Return the smoothed temperature of a recording that logs it: (n,) array, degC; shared."""
+    assert recording.temperature is not None  # noqa: S101
+    if "temperature" not in recording.kept:
+        recording.kept["temperature"] = smooth_temperature(recording.time, recording.temperature)
+    found: NDArray[np.float64] = recording.kept["temperature"]
+    return found
 
 
 def _local_line(time: NDArray[np.float64], temperature: NDArray[np.float64], bandwidth: float) -> NDArray[np.float64]:

@@ -23,6 +23,7 @@ Sources: Patterson & Thompson, Biometrika 58, 1971; for the block averages, IEEE
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -202,15 +203,13 @@ def likelihood(
     correlated = covariance[0] ** 2 / (covariance[0] ** 2 + 2.0 * np.sum(covariance[1:] ** 2))
     nu = max(float(np.sum(blocks.count - 1)) * correlated, 1e-9)
     root = np.sqrt(v[blocks.cut])
-    Q = complement(design / root[:, None])
+    places = np.stack([blocks.start[blocks.cut], blocks.length[blocks.cut], root, *design.T])
+    Q, spectra = _spectra(places.tobytes(), len(places), correlation_times.tobytes())
     z = Q.T @ (blocks.mean[blocks.cut] / root[:, None])
-    start, length = blocks.start[blocks.cut], blocks.length[blocks.cut]
     squares = RATIOS**2
     shape = (len(correlation_times), len(RATIOS), 3)
     log_likelihood, white = np.empty(shape), np.empty(shape)
-    for row, tau in enumerate(correlation_times):
-        B = block_covariance(start, length, tau)
-        e, U = np.linalg.eigh(Q.T @ (B / root[:, None] / root) @ Q)
+    for row, (tau, (e, U)) in enumerate(zip(correlation_times.tolist(), spectra, strict=True)):
         weight = 1.0 / (1.0 + np.outer(squares, np.clip(e, 0.0, None)))
         inner = np.sum(blocks.count * (1.0 - variance_of_average(blocks.length, tau)))
         expected = within + squares * inner
@@ -220,3 +219,23 @@ def likelihood(
         penalty = -np.sum(np.log(weight), axis=1) + nu * np.log(expected)
         log_likelihood[row] = -0.5 * (penalty[:, None] + (len(e) + nu) * np.log(variance))
     return Likelihood(log_likelihood, white)
+
+
+@lru_cache(maxsize=1)  # accelerometer and gyroscope of a unit rest at the same times
+def _spectra(
+    places: bytes, rows: int, correlation_times: bytes
+) -> tuple[NDArray[np.float64], list[tuple[NDArray[np.float64], NDArray[np.float64]]]]:
+    """Return the complement Q of the design, and eigenvalues and -vectors of the projected B for each tau.
+
+    Parameters
+    ----------
+    places : bytes of a (3 + p, c) array
+        Start, length and ``sqrt(v)`` of each block, and the design.
+    rows : int
+        3 + p.
+    correlation_times : bytes of a (t,) array
+    """
+    start, length, root, *design = np.frombuffer(places).reshape(rows, -1)
+    Q = complement(np.stack(design, axis=1) / root[:, None])
+    covariances = (block_covariance(start, length, tau) for tau in np.frombuffer(correlation_times).tolist())
+    return Q, [np.linalg.eigh(Q.T @ (B / root[:, None] / root) @ Q) for B in covariances]

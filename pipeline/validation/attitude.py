@@ -159,10 +159,11 @@ def fuse(time: Array, force: Array, alone: Array) -> tuple[NDArray[np.int64], Ar
     fusion = imufusion.Ahrs().set_settings(settings).skip_startup().set_quaternion(alone[0])
     q = np.empty((len(at), 4))
     q[0] = alone[0]
-    for n, interval in enumerate(intervals.tolist()):
+    # The filter holds the force against the attitude before its step.
+    for n, (interval, rate, felt) in enumerate(zip(intervals.tolist(), rates, force[at[:-1]], strict=True), 1):
         fusion.set_sample_period(interval)
-        fusion.update_no_magnetometer(rates[n], force[at[n]])  # it holds the force against the attitude before its step
-        q[n + 1] = fusion.get_quaternion()
+        fusion.update_no_magnetometer(rate, felt)
+        q[n] = fusion.get_quaternion()
     return at, q
 
 

@@ -42,8 +42,11 @@ def squared_norm_errors(
     variance : (n, 3) array
         Of the noise of each sample, per reading axis.
     """
-    kinds, which = np.unique(variance, axis=0, return_inverse=True)
-    which = which.reshape(-1)
+    if np.all(variance == variance[:1]):  # of samples, not of means over rests
+        kinds, which = variance[:1], np.zeros(len(truth), int)
+    else:
+        kinds, which = np.unique(variance, axis=0, return_inverse=True)
+        which = which.reshape(-1)
     size = np.linalg.norm(truth, axis=1)
     out = np.empty(len(truth))
     for kind, var in enumerate(kinds):
