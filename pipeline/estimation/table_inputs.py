@@ -25,6 +25,7 @@ from pipeline.estimation.budget import type_b
 from pipeline.model.effects import effect
 from pipeline.model.effects.base import truth
 from pipeline.model.kinematics import earth_rate
+from pipeline.model.rotation import ABOUT
 from pipeline.records.budget import NORMAL
 from pipeline.signal.rests import RATE_AT_REST_DPS
 
@@ -166,7 +167,7 @@ def _angle(reference: Reference) -> Values:
             continue
         stop, share, slope, stops = _between_stops(motion.angle, motion.rate)
         if sensor == "accelerometer":
-            turned = -np.radians(np.cross(np.eye(3)[motion.axis], motion.specific_force)) @ K.T
+            turned = motion.specific_force @ (-np.radians(1.0) * K @ ABOUT[motion.axis]).T
             left.append(turned * (1.0 - share)[:, None])
             right.append(turned * share[:, None])
         else:
@@ -210,7 +211,7 @@ def _turned(reference: Reference, motion: Motion) -> Values:
         if other is not motion:
             return None
         u = truth(reference.sensor, motion)
-        return np.stack([np.radians(np.cross(u, axis)) for axis in np.eye(3)], axis=2)
+        return np.stack([-np.radians(u @ about.T) for about in ABOUT], axis=2)
 
     return reference.summed(change, 3)
 
@@ -226,7 +227,7 @@ def _rate(reference: Reference) -> Values:
             du[:, motion.axis, motion.axis] = motion.rate
         elif _between_stops(motion.angle, motion.rate)[3] <= COUNTED_STOPS:
             travelled = np.concatenate([[0.0], np.cumsum(np.diff(motion.angle))])[:, None]
-            du[:, :, motion.axis] = -np.radians(travelled * np.cross(np.eye(3)[motion.axis], motion.specific_force))
+            du[:, :, motion.axis] = -np.radians(travelled * (motion.specific_force @ ABOUT[motion.axis].T))
         return du
 
     return reference.summed(change, 3)

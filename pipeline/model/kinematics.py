@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.errors import InputError
-from pipeline.model.rotation import attitude_matrix, turn_about_axis
+from pipeline.model.rotation import ABOUT, attitude_matrix, turn_about_axis
 from pipeline.model.turn_log import TurnLog
 from pipeline.records import AXES, Motion
 from pipeline.records.attitude import conjugate_product, continuous
@@ -149,7 +149,7 @@ def _turn(  # noqa: PLR0917  (bound one by one for the motion at an offset)
     force = gravity_g * level[:, 2, :]
     omega, alpha = np.zeros_like(force), np.zeros_like(force)
     omega[:, axis], alpha[:, axis] = rate, acceleration
-    force_rate = -np.cross(np.radians(omega), force)
+    force_rate = -np.radians(rate)[:, None] * (force @ ABOUT[axis].T)
     if earth is not None:
         omega = omega + np.einsum("i,nij->nj", earth, level)
     return Motion(
@@ -172,7 +172,7 @@ def _turn(  # noqa: PLR0917  (bound one by one for the motion at an offset)
 
 def _level(axis: int, angle: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the level axes in the body frame, as rows: (n, 3, 3) array."""
-    return np.stack([turn_about_axis(row, axis, -angle) for row in LEVEL_AT_ZERO[axis]], axis=1)
+    return turn_about_axis(LEVEL_AT_ZERO[axis], axis, -angle)
 
 
 def _motion_of_attitude(

@@ -10,27 +10,31 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
+# ABOUT[a] @ u = e_a x u
+ABOUT = np.stack([np.cross(axis, np.eye(3)).T for axis in np.eye(3)])
+
+
 def turn_about_axis(vector: NDArray[np.float64], axis: int, angle_deg: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Turn one vector about a coordinate axis by each of several angles (right-handed).
+    """Turn vectors about a coordinate axis by each of several angles (right-handed).
 
     Parameters
     ----------
-    vector : (3,) array
+    vector : (..., 3) array
     axis : int
         0, 1, 2 for x, y, z.
     angle_deg : (n,) array, deg
 
     Returns
     -------
-    (n, 3) array
+    (n, ..., 3) array
     """
     j, k = (axis + 1) % 3, (axis + 2) % 3
-    angle = np.radians(angle_deg)
+    angle = np.radians(angle_deg).reshape(-1, *[1] * (vector.ndim - 1))
     c, s = np.cos(angle), np.sin(angle)
-    out = np.empty((len(angle), 3))
-    out[:, axis] = vector[axis]
-    out[:, j] = c * vector[j] - s * vector[k]
-    out[:, k] = s * vector[j] + c * vector[k]
+    out = np.empty((len(angle), *vector.shape))
+    out[..., axis] = vector[..., axis]
+    out[..., j] = c * vector[..., j] - s * vector[..., k]
+    out[..., k] = s * vector[..., j] + c * vector[..., k]
     return out
 
 

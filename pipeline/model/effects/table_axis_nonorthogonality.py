@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.model.effects.base import Effect, Layout, Owner, Parameter
+from pipeline.model.effects.base import Effect, Layout, Owner, Parameter, length
 from pipeline.model.kinematics import UP_AT_ZERO
-from pipeline.model.rotation import turn_about_axis
+from pipeline.model.rotation import ABOUT, turn_about_axis
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -59,16 +59,16 @@ class TableAxisNonorthogonality(Effect):
         if motion.axis is None or motion.angle is None or motion.rate is None:
             return out
         axis, f = motion.axis, motion.specific_force
-        gravity = np.linalg.norm(f, axis=1)[:, None]
+        gravity = length(f)[:, None] if sensor == "accelerometer" else None
         for step in (1, 2):
             lean = np.zeros(3)
             lean[(axis + step) % 3] = np.radians(1.0)
-            theta = np.cross(np.eye(3)[axis], lean)
-            home = turn_about_axis(np.cross(theta, UP_AT_ZERO[axis]), axis, -motion.angle)
-            change = np.cross(theta, f) - gravity * home
-            if sensor == "gyroscope":
-                change = lean * motion.rate[:, None]
-            out[:, :, 2 * axis + step - 1] = change @ K.T
+            if gravity is None:
+                out[:, :, 2 * axis + step - 1] = motion.rate[:, None] * (K @ lean)
+                continue
+            across = np.tensordot(ABOUT[axis] @ lean, ABOUT, 1)  # across @ u = theta x u
+            home = turn_about_axis(across @ UP_AT_ZERO[axis], axis, -motion.angle)
+            out[:, :, 2 * axis + step - 1] = (f @ across.T - gravity * home) @ K.T
         return out
 
 

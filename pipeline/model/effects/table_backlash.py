@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from pipeline.model.effects.base import Effect, Layout, Owner, Parameter, turning_direction
+from pipeline.model.rotation import ABOUT
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -47,7 +48,7 @@ class TableBacklash(Effect):
         del values
         out = np.zeros((len(motion.time), 3, 3))
         if sensor == "accelerometer" and motion.axis is not None:
-            slope = np.radians(1.0) * np.cross(np.eye(3)[motion.axis], motion.specific_force) @ K.T
+            slope = motion.specific_force @ (np.radians(1.0) * K @ ABOUT[motion.axis]).T
             out[:, :, motion.axis] = slope * turning_direction(motion)[:, motion.axis, None]
         return out
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.model.effects.base import Effect, Layout, Owner, Parameter
+from pipeline.model.rotation import ABOUT
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -56,7 +57,7 @@ class TableEncoderError(Effect):
             slope = np.radians(motion.rate)[:, None] * K[:, motion.axis]
             columns[:, :, 0], columns[:, :, 1] = -slope * sine, slope * cosine
         else:
-            slope = -np.radians(1.0) * np.cross(np.eye(3)[motion.axis], motion.specific_force) @ K.T
+            slope = motion.specific_force @ (-np.radians(1.0) * K @ ABOUT[motion.axis]).T
             columns[:, :, 0], columns[:, :, 1] = slope * cosine, slope * sine
         return out
 

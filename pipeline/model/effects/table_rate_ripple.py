@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.model.effects.base import Effect, Layout, Owner, Parameter
+from pipeline.model.rotation import ABOUT
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -55,7 +56,7 @@ class TableRateRipple(Effect):
             slope = motion.rate[:, None] * K[:, motion.axis]
             columns[:, :, 0], columns[:, :, 1] = slope * cosine, slope * sine
         else:
-            slope = -np.cross(np.eye(3)[motion.axis], motion.specific_force) @ K.T
+            slope = motion.specific_force @ (-K @ ABOUT[motion.axis]).T
             columns[:, :, 0], columns[:, :, 1] = slope * sine, slope * (1.0 - cosine)
         return out
 
