@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 SHIPPED = CONFIGS.parent / "data"
 FREE_COLUMNS = ("serial", "lot", "date")
-SMALLEST_BATCH, LARGEST_BATCH = 10, 100
+SMALLEST_BATCH, LARGEST_BATCH = 10, 160
 
 
 @dataclass(frozen=True)
@@ -197,8 +197,8 @@ def cut_batches(
     """Cut units of one chain of stages into batches, in the order of the sheet.
 
     Appending units touches the last batch of their chain only. Whether effects are fitted does not cut batches anew:
-    a batch has the stage if any of its units asks for it. Without a size, batches hold 10, 10, 20, 20, 40, 40, 80, 80
-    and then 100 units: a bench runs side by side, and a fleet does not spend its time on starting jobs.
+    a batch has the stage if any of its units asks for it. Without a size, a batch is as large as all before it, from 10
+    to 160 units: a bench runs side by side, and a fleet does not spend its time on starting jobs.
     """
     by_chain: dict[str, list[str]] = {}
     for name, unit in units.items():
@@ -210,7 +210,7 @@ def cut_batches(
     for chain, names in by_chain.items():
         rest = names
         for number in count():
-            now = size or min(SMALLEST_BATCH * 2 ** (number // 2), LARGEST_BATCH)
+            now = size or min(max(SMALLEST_BATCH, len(names) - len(rest)), LARGEST_BATCH)
             batch = f"{chain}-{number + 1:04d}"
             batches[batch], rest = rest[:now], rest[now:]
             configs = [units[n].config for n in batches[batch]]

@@ -24,7 +24,7 @@ import numpy as np
 
 from pipeline.estimation.design import Term, motions_of
 from pipeline.estimation.ranking import WHITE, without
-from pipeline.estimation.wandering import Whitened, cells_of
+from pipeline.estimation.wandering import Whitened
 from pipeline.model.effects.base import Layout, truth
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ class Leftover:
         A, known, own = _columns(selection, curves, beside)
         weight = observations.weight
         self.size = np.sqrt(np.einsum("i,ij,ij->j", weight, A, A))[own[0]]
-        whitened = Whitened(cells_of(observations), weight, A)
+        whitened = Whitened(observations.cells, weight, A)
         self.settings = list(selection.settings)
         stacked, logarithms = zip(*(whitened.products(s) for s in (WHITE, *self.settings)), strict=True)
         priors = np.array([setting.prior for setting in self.settings])

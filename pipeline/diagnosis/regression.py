@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.estimation.design import BASE, Term, motions_of
-from pipeline.estimation.wandering import Whitened, cells_of
+from pipeline.estimation.wandering import Whitened
 from pipeline.model.effects.base import Layout, truth
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ class Regression:
         pieces = [_of_part(selection, part, terms) for part in observations.parts]
         base, effects, residual = (np.concatenate([piece[k] for piece in pieces]) for k in range(3))
         columns = [np.concatenate([base, effects[:, c]], axis=1) for c in range(3)]
-        return cls(columns, residual, observations, cells_of(observations), observations.weight)
+        return cls(columns, residual, observations, observations.cells, observations.weight)
 
     def products(self, columns: Values, setting: Setting) -> Values:
         """Return ``A^T C^-1 A`` of columns, with the white noise as unit."""

@@ -19,7 +19,7 @@ import numpy as np
 
 from pipeline.errors import NotObservableError
 from pipeline.estimation.linear_map import LinearMap
-from pipeline.estimation.wandering import Whitened, cells_of
+from pipeline.estimation.wandering import Whitened
 from pipeline.model.effects.base import Layout, truth
 
 if TYPE_CHECKING:
@@ -199,7 +199,7 @@ class Design:
             Q, R = np.linalg.qr(root * A[:, :4])
             inner = Q.T @ (root * A[:, 4:])
             A[:, 4:] -= A[:, :4] @ np.linalg.solve(R, inner)
-        self.whitened = Whitened(cells_of(observations), weight, A)
+        self.whitened = Whitened(observations.cells, weight, A)
 
     def _place(self, sensor: str, terms: Sequence[Term]) -> None:
         """Lay out the columns: where each lies in A, and which of all parameters it belongs to, for each axis."""
@@ -272,5 +272,5 @@ class Design:
         """Return the norm of each parameter's column before the base was taken out: (p + 1,) array."""
         squares = np.zeros(self.count + 1)
         for c in range(3):
-            np.add.at(squares, self._total[c], (self.size[self._local[c]] / self.scale[c]) ** 2)
+            squares[self._total[c]] += (self.size[self._local[c]] / self.scale[c]) ** 2  # each index once
         return np.sqrt(squares)

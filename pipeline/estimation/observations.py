@@ -14,12 +14,12 @@ the filter still holds rates that a log without them does not tell.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.estimation.wandering import information
+from pipeline.estimation.wandering import Cells, cells_of, information
 from pipeline.model.effects.base import turning_direction
 from pipeline.model.kinematics import earth_rate, reference_motion
 from pipeline.signal.filters import apply_filter
@@ -183,17 +183,17 @@ class Observations:
     parts: tuple[Part, ...]
     earth: bool
 
-    @property
+    @cached_property
     def reading(self) -> NDArray[np.float64]:
         """All readings: (n, 3) array."""
         return np.concatenate([part.reading for part in self.parts])
 
-    @property
+    @cached_property
     def weight(self) -> NDArray[np.float64]:
         """All weights: (n,) array."""
         return np.concatenate([part.weight for part in self.parts])
 
-    @property
+    @cached_property
     def scatter(self) -> NDArray[np.float64]:
         """Sum of squares within the rows: (3,) array."""
         total = np.zeros(3)
@@ -201,10 +201,15 @@ class Observations:
             total += part.scatter
         return total
 
-    @property
+    @cached_property
     def samples(self) -> float:
         """Number of samples, as far as they are independent."""
         return float(sum(part.weight.sum() for part in self.parts))
+
+    @cached_property
+    def cells(self) -> Cells:
+        """Short stretches of time in which the bias wander is taken as constant."""
+        return cells_of(self.parts)
 
     @property
     def clock_shared(self) -> bool:

@@ -177,17 +177,18 @@ class Ranking:
         from scipy.special import chdtrc  # noqa: PLC0415  (0.1 s that only rankings pay)
 
         place, term = self.places[j], self.candidates[j]
-        inner, cross = products[:, place[:, None], place], products[:, place, -1]
-        ridge = RIDGE * np.einsum("tii->ti", self.products[:, place[:, None], place])
+        at = slice(place[0], place[-1] + 1)
+        inner, cross = products[:, at, at], products[:, at, -1]
+        ridge = RIDGE * np.einsum("tii->ti", self.products[:, at, at])
         solved = np.linalg.solve(inner + ridge[:, :, None] * np.eye(len(place)), cross[:, :, None])[:, :, 0]
         rss = products[:, -1, -1] - np.sum(cross * solved, axis=1)
         found = self.log_likelihood(rss)[1:]
-        at = int(np.argmax(found)) + 1
+        best = int(np.argmax(found)) + 1
         nonlinear = 0 if term.effect.moves else len(term.effect.nonlinear)
         k = len(place) + nonlinear
-        gain = max(2.0 * (float(found[at - 1]) - before), 0.0)
+        gain = max(2.0 * (float(found[best - 1]) - before), 0.0)
         admissible = bool(np.linalg.eigvalsh(inner[0])[0] > NEW)
-        values, uncertainty = self._estimate(j, solved[at], inner[at] + np.diag(ridge[at]), rss[at])
+        values, uncertainty = self._estimate(j, solved[best], inner[best] + np.diag(ridge[best]), rss[best])
         plausible = limits is None or bool(np.all(np.abs(values) - 2.0 * uncertainty <= limits))
         return Score(
             term.effect.name,
@@ -196,11 +197,11 @@ class Ranking:
             k,
             values,
             uncertainty,
-            float(found[at - 1]),
-            at,
+            float(found[best - 1]),
+            best,
             admissible,
             plausible,
-            float(2.0 * solved[at] @ cross[0] - solved[at] @ inner[0] @ solved[at]),
+            float(2.0 * solved[best] @ cross[0] - solved[best] @ inner[0] @ solved[best]),
         )
 
     def _estimate(

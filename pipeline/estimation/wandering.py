@@ -21,7 +21,7 @@ in which ``R^-1`` is tridiagonal, as the wander is a Markov process. So any nois
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,7 +31,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.estimation.observations import Observations
+    Factor = tuple[NDArray[np.float64], NDArray[np.float64], float]
+
+    from pipeline.estimation.observations import Part
     from pipeline.records import Noise
 
 CELLS = 600
@@ -64,15 +66,23 @@ class Cells:
         Whether the time from each to the next is known.
     weight : (m,) array
         Sum of the weights of its rows.
+    factors : dict
+        Those that were asked for, by setting: the candidates, the fit and what it leaves ask for the same.
     """
 
     first: NDArray[np.intp]
     time: NDArray[np.float64]
     joined: NDArray[np.bool_]
     weight: NDArray[np.float64]
+    factors: dict[Setting, Factor] = field(default_factory=dict, compare=False, repr=False)
 
-    def factor(self, setting: Setting) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    def factor(self, setting: Setting) -> Factor:
         """Return the tridiagonal factor of ``R^-1/q + W^T w W`` and log det C, up to that of the weights."""
+        if setting not in self.factors:
+            self.factors[setting] = self._factor(setting)
+        return self.factors[setting]
+
+    def _factor(self, setting: Setting) -> Factor:
         from scipy.linalg.lapack import dpttrf  # noqa: PLC0415  (0.1 s that only fits pay)
 
         q = setting.ratio**2
@@ -87,13 +97,13 @@ class Cells:
         return d, e, logarithm
 
 
-def cells_of(observations: Observations) -> Cells:
-    """Cut the rows into cells, a new one for each recording."""
-    span = sum(float(np.ptp(part.motion.time)) for part in observations.parts)
+def cells_of(parts: Sequence[Part]) -> Cells:
+    """Cut the rows of recordings into cells, a new one for each recording."""
+    span = sum(float(np.ptp(part.motion.time)) for part in parts)
     length = max(SHORTEST_CELL_S, span / CELLS)
     first, times, weights, joined, row = [], [], [], [], 0
     known = False
-    for part in observations.parts:
+    for part in parts:
         cell = np.floor((part.motion.time - part.motion.time[0]) / length)
         start = np.flatnonzero(np.concatenate([[True], np.diff(cell) != 0]))
         weight = np.add.reduceat(part.weight, start)

@@ -36,7 +36,7 @@ import numpy as np
 
 from pipeline.estimation.ranking import RIDGE
 from pipeline.estimation.selection import DELAYS, GATE_BIC, GATE_P
-from pipeline.estimation.wandering import Setting, cells_of
+from pipeline.estimation.wandering import Setting
 from pipeline.planning.detection import ALIKE, ALMOST_SURE, PARTLY, Detection, limits_or_none, smallest
 
 if TYPE_CHECKING:
@@ -90,7 +90,7 @@ class Expectation:
         kinds = [term.effect for term in self.ranking.candidates]
         self.limits = limits_or_none(kinds, selection.observations.sensor, selection.limits)
         true = Setting(float(np.sqrt(np.mean((noise.wander / noise.white) ** 2))), noise.correlation_time)
-        cells, samples = cells_of(selection.observations), selection.observations.samples
+        cells, samples = selection.observations.cells, selection.observations.samples
         self.noise_sum = 3.0 * noise_sums(cells, samples, self.ranking.settings, true)
         self._solved: dict[int, NDArray[np.float64]] = {}
         self.names = list(dict.fromkeys(term.effect.name for term in self.ranking.candidates))

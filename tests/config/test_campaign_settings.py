@@ -129,12 +129,12 @@ def test_batches_grow_along_the_sheet_and_appending_still_touches_the_last_one_o
     rows = "unit\n" + "".join(f"U{i:03d}\n" for i in range(450))
     directory = campaign(tmp_path, rows)
     before = load(directory).batches
-    assert [len(units) for units in before.values()] == [10, 10, 20, 20, 40, 40, 80, 80, 100, 50]
+    assert [len(units) for units in before.values()] == [10, 10, 20, 40, 80, 160, 130]
     (directory / "units.csv").write_text(rows + "".join(f"V{i}\n" for i in range(60)))
     after = load(directory).batches
     last, new = list(after)[-2:]
     assert {b for b, u in after.items() if before.get(b) != u} == {last, new}
-    assert (len(after[last]), len(after[new])) == (100, 10)
+    assert (len(after[last]), len(after[new])) == (160, 30)
     assert [u for units in after.values() for u in units] == list(load(directory).units)
 
 

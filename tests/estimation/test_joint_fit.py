@@ -14,7 +14,7 @@ from pipeline.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.accelerometer import effects as accelerometer_stage
 from pipeline.estimation.joint import fit_joint
 from pipeline.estimation.observations import observe
-from pipeline.estimation.wandering import Setting, Whitened, cells_of
+from pipeline.estimation.wandering import Setting, Whitened
 from pipeline.model.effects import effect
 from pipeline.records import SensorCalibration
 from pipeline.signal.filters import apply_filter
@@ -124,7 +124,7 @@ def test_a_list_that_makes_no_sense_is_refused(names: list[str], message: str) -
 
 def test_products_under_wander_are_those_of_the_whole_covariance() -> None:
     observations = observe("gyroscope", record(Session(6)), TABLE)
-    cells, weight = cells_of(observations), observations.weight
+    cells, weight = observations.cells, observations.weight
     rng, setting = np.random.default_rng(0), Setting(0.4, 80.0)
     columns = rng.standard_normal((len(weight), 4))
     ends = np.append(cells.first[1:], len(weight))
