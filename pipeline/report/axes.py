@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -40,6 +41,7 @@ def ticks(low: float, high: float, count: int = 5, *, angle: bool = False) -> li
     return [n * step for n in range(first, last + 1)]
 
 
+@lru_cache(maxsize=16)
 def tick_step(low: float, high: float, count: int = 5, *, angle: bool = False) -> float:
     """Return the distance of neighbouring ticks."""
     coarse = (high - low) / max(count, 1)
@@ -94,18 +96,24 @@ class Scale:
     def units(self, values: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return where values stand, in whole drawing units; values outside of the scale stay at its edge."""
         slope = SUBDIVISION * (self.stop - self.start) / (self.high - self.low)
-        inside = np.minimum(np.maximum(values, self.low), self.high)
-        units: NDArray[np.int64] = np.rint((inside - self.low) * slope + SUBDIVISION * self.start).astype(np.int64)
+        place = np.maximum(values, self.low)
+        np.minimum(place, self.high, out=place)
+        place -= self.low
+        place *= slope
+        place += SUBDIVISION * self.start
+        units: NDArray[np.int64] = np.rint(place, out=place).astype(np.int64)
         return units
 
 
 def span(arrays: list[NDArray[np.float64]], margin: float = 0.04) -> tuple[float, float]:
     """Return the range of all finite values, widened by ``margin`` of it on both sides; 0 to 1 where there is none."""
-    finite = [a[np.isfinite(a)] for a in arrays]
-    finite = [a for a in finite if a.size]
-    if not finite:
+    ends = [e for a in arrays if a.size for e in (float(a.min()), float(a.max()))]
+    if not all(map(math.isfinite, ends)):
+        finite = [a[np.isfinite(a)] for a in arrays]
+        ends = [e for a in finite if a.size for e in (float(a.min()), float(a.max()))]
+    if not ends:
         return 0.0, 1.0
-    low, high = min(float(a.min()) for a in finite), max(float(a.max()) for a in finite)
+    low, high = min(ends), max(ends)
     if high - low <= 1e-12 * max(abs(low), abs(high), 1e-300):
         half = 0.5 * abs(low) or 0.5
         return low - half, high + half

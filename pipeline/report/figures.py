@@ -41,9 +41,10 @@ def measurement_and_model(sensor: str, residual: Residual, sigma: NDArray[np.flo
     x = motion.angle if angle and motion.angle is not None else motion.time
     source = "" if sigma is not None else " Its σ is taken from the sample-to-sample scatter."
     sigma = white_noise(residual.error) if sigma is None else sigma
-    layers: list[Layer] = [Samples(x, residual.reading[:, i], i) for i in range(3)]
+    layers: list[Layer] = [Samples(x, residual.reading)]
     every = slice(None, None, -(-len(x) // MODEL_POINTS))  # the model has no noise whose extremes could be lost
-    layers += [Line(x[every], residual.predicted[every, i], 5, "model") for i in range(3)]
+    few = x[every]
+    layers += [Line(few, residual.predicted[every, i], 5, "model") for i in range(3)]
     ends = np.array([x.min(), x.max()])
     top = max(float(np.abs(residual.error).max()), 2.2 * float(sigma.max()))
     panels = [Panel(layers, f"reading, {unit}")]

@@ -20,7 +20,8 @@ def number(value: object, digits: int = 3) -> str:
         return "0"
     if 1e-4 <= abs(value) < 1e5:
         decimals = max(0, digits - 1 - math.floor(math.log10(abs(value))))
-        return f"{value:.{decimals}f}".replace("-", MINUS)
+        text = f"{value:.{decimals}f}"
+        return text if value > 0 else text.replace("-", MINUS)
     return f"{value:.{digits - 1}e}".replace("-", MINUS).replace("e+", "e")
 
 

@@ -12,6 +12,7 @@ noise, ``s / sqrt(n)``. A covariate that matters pulls the means out of that ban
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -47,7 +48,7 @@ class Residual:
     reading: NDArray[np.float64]
     predicted: NDArray[np.float64]
 
-    @property
+    @cached_property
     def error(self) -> NDArray[np.float64]:
         """Reading minus prediction: (n, 3) array, g or deg/s."""
         return self.reading - self.predicted
@@ -136,9 +137,8 @@ def binned_mean(covariate: NDArray[np.float64], error: NDArray[np.float64], bins
     error : (n, 3) array
     bins : int
     """
-    known = np.isfinite(covariate)
-    known &= np.isfinite(error.sum(axis=1))
-    if not known.all():
+    if not (np.isfinite(covariate).all() and np.isfinite(error).all()):
+        known = np.isfinite(covariate) & np.isfinite(error).all(axis=1)
         covariate, error = covariate[known], error[known]
     low, high = (float(covariate.min()), float(covariate.max())) if len(covariate) else (0.0, 0.0)
     if not high - low > 1e-9 * max(1.0, abs(low)):

@@ -11,13 +11,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from html import escape
 
 import numpy as np
 from markupsafe import Markup
 
 from pipeline.report.axes import SUBDIVISION, Scale, log_ticks, span, tick_label, tick_step, ticks
-from pipeline.report.shapes import Band, Layer, Means, draw
+from pipeline.report.shapes import REACH, Band, Layer, Means, draw
 
 WIDTH = 420
 LEFT, RIGHT, TOP, BOTTOM, GAP = 64, 14, 8, 36, 14
@@ -81,12 +82,16 @@ def chart(
         List of the page's script that names what stands at x = 1, 2, ...
     """
     margin = 0.03 if names else 0.0
-    x = Scale(*span([layer.x for p in panels for layer in p.layers], margin), LEFT, WIDTH - RIGHT)
+    places = {id(layer.x): layer.x for p in panels for layer in p.layers}  # most layers share theirs
+    x = Scale(*span(list(places.values()), margin), LEFT, WIDTH - RIGHT)
     x_ticks = _decades(x) if logarithmic else _x_ticks(x, angle=angle)
+    marks = [f"M{x.pixels(at):.1f} " for at, _ in x_ticks]
     parts, top = [], TOP
     for panel in panels:
-        parts.append(_panel(panel, x, x_ticks, top))
+        parts.append(_panel(panel, x, marks, top))
         top += panel.height + GAP
+    if top * SUBDIVISION > REACH:
+        raise ValueError(f"chart {name} is {top} px high, more than {REACH // SUBDIVISION}")
     labels = "".join(text(x.pixels(at), top - GAP + 13, label, "m") for at, label in x_ticks)
     parts.append(f'<g class="ticks">{labels}</g>')
     parts.append(text((LEFT + WIDTH - RIGHT) / 2, top - GAP + 28, x_label, "m"))
@@ -109,12 +114,13 @@ def text(x: float, y: float, content: str, kind: str = "") -> str:
     return f'<text x="{x:.4g}" y="{y:.4g}" class="{kind}">{escape(content)}</text>'
 
 
-def _panel(panel: Panel, x: Scale, x_ticks: list[Tick], top: float) -> str:
+def _panel(panel: Panel, x: Scale, marks: list[str], top: float) -> str:
     bottom = top + panel.height
     y = Scale(*_limits(panel), bottom, top)
-    values = _decades(y) if panel.logarithmic else _y_ticks(y, panel.height)
-    grid = "".join(f"M{LEFT} {y.pixels(v):.1f}H{WIDTH - RIGHT}" for v, _ in values)
-    grid += "".join(f"M{x.pixels(v):.1f} {top:g}V{bottom:g}" for v, _ in x_ticks)
+    values = _decades(y) if panel.logarithmic else _y_ticks(y.low, y.high, panel.height)
+    grid = "".join([f"M{LEFT} {y.pixels(v):.1f}H{WIDTH - RIGHT}" for v, _ in values])
+    height = f"{top:g}V{bottom:g}"
+    grid += "".join([mark + height for mark in marks])
     out = [
         f'<g class="panel"{_scale(y, panel.label, "log" if panel.logarithmic else "")}><path class="grid" d="{grid}"/>'
     ]
@@ -145,14 +151,15 @@ def _x_ticks(x: Scale, *, angle: bool) -> list[Tick]:
     return [(v, tick_label(v, step)) for v in ticks(x.low, x.high, 6, angle=angle)]
 
 
-def _y_ticks(y: Scale, height: int) -> list[Tick]:
-    """Return as many ticks as fit, and at least two."""
+@lru_cache(maxsize=16)
+def _y_ticks(low: float, high: float, height: int) -> list[Tick]:
+    """Return as many ticks as fit, and at least two; panels of one chart have them in common."""
     count = max(3, height // 28)
-    values = ticks(y.low, y.high, count)
+    values = ticks(low, high, count)
     if len(values) < 2:
         count += 2
-        values = ticks(y.low, y.high, count)
-    step = tick_step(y.low, y.high, count)
+        values = ticks(low, high, count)
+    step = tick_step(low, high, count)
     return [(v, tick_label(v, step)) for v in values]
 
 

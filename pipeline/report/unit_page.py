@@ -5,11 +5,11 @@ One file that opens offline: style, script and charts are inline, and its conten
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.json_text import json_text
 from pipeline.model.inversion import compensate, linear_truth, sensor_effects
 from pipeline.model.kinematics import reference_motion
 from pipeline.model.user_effects import effect_of
@@ -88,11 +88,8 @@ def render(
         environment=environment(recordings, settings) if recordings else [],
         row={k: v for k, v in (settings.get("row") or {}).items() if v},
         command=settings.get("command"),
-        settings_text=json.dumps(
+        settings_text=json_text(
             {k: v for k, v in settings.items() if k not in ("row", "command", "certificate")},
-            indent=1,
-            ensure_ascii=False,
-            default=str,
         ),
     )
     return page

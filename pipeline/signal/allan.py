@@ -42,9 +42,12 @@ def allan_deviation(
         return np.empty(0), np.empty((0, *values.shape[1:]))
     count = 1 + int(points_per_decade * np.log10(longest))
     lengths = np.unique(np.geomspace(1, longest, count).astype(np.int64))
-    theta = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values - values.mean(axis=0), axis=0)])
-    deviation = np.empty((len(lengths), *values.shape[1:]))
+    theta = np.zeros((values[0].size, n + 1))
+    np.cumsum((values - values.mean(axis=0)).reshape(n, -1).T, axis=1, out=theta[:, 1:])
+    twice = 2.0 * theta
+    deviation = np.empty((len(lengths), len(theta)))
     for row, m in enumerate(lengths):
-        second = theta[2 * m :] - 2.0 * theta[m:-m] + theta[: -2 * m]
-        deviation[row] = np.sqrt(np.mean(second * second, axis=0) / 2.0) / m
-    return lengths.astype(np.float64) * interval, deviation
+        second = theta[:, 2 * m :] - twice[:, m:-m]
+        second += theta[:, : -2 * m]
+        deviation[row] = np.sqrt(np.einsum("ij,ij->i", second, second) / (2.0 * second.shape[1])) / m
+    return lengths.astype(np.float64) * interval, deviation.reshape(-1, *values.shape[1:])

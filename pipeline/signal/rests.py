@@ -69,8 +69,16 @@ class Rest:
 
 def runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Return the (start, stop) index pairs of the runs of True in a mask."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
-    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    starts, stops = _edges(mask)
+    return list(zip(starts.tolist(), stops.tolist(), strict=True))
+
+
+def _edges(mask: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return where the runs of True in a mask start and stop."""
+    padded = np.zeros(len(mask) + 2, bool)
+    padded[1:-1] = mask
+    edges = np.flatnonzero(padded[1:] != padded[:-1])
+    return edges[::2], edges[1::2]
 
 
 def still_samples(
@@ -92,9 +100,11 @@ def still_samples(
     (n,) array of bool
     """
     still = np.abs(rate) < RATE_AT_REST_DPS
-    for start, stop in runs(still):
-        if start > 0:
-            still[start:stop] &= time[start:stop] >= time[start] + settling
+    starts, stops = _edges(still)
+    settled = np.repeat(time[starts] + settling, stops - starts)
+    if still[:1].any():
+        settled[: stops[0]] = -np.inf
+    still[still] = time[still] >= settled
     return still
 
 

@@ -80,7 +80,7 @@ def temperature_of(recording: Recording) -> NDArray[np.float64]:
 def _local_line(time: NDArray[np.float64], temperature: NDArray[np.float64], bandwidth: float) -> NDArray[np.float64]:
     """Return the value of the local line at each time: (n,) array, degC."""
     cell = np.floor((time - time[0]) / (bandwidth / 5.0)).astype(np.int64)
-    _, cell = np.unique(cell, return_inverse=True)
+    cell = np.concatenate([[0], np.cumsum(cell[1:] != cell[:-1])])  # without empty ones, as times increase
     count = np.bincount(cell)
     t = np.bincount(cell, time) / count
     value = np.bincount(cell, temperature) / count
@@ -90,8 +90,9 @@ def _local_line(time: NDArray[np.float64], temperature: NDArray[np.float64], ban
         near = slice(*np.searchsorted(t, [t[block][0] - 5 * bandwidth, t[block][-1] + 5 * bandwidth]))
         d = t[near][None, :] - t[block][:, None]
         w = np.exp(-0.5 * (d / bandwidth) ** 2) * count[near]
-        s0, s1, s2 = w.sum(1), (w * d).sum(1), (w * d * d).sum(1)
-        r0, r1 = (w * value[near]).sum(1), (w * d * value[near]).sum(1)
+        wd = w * d
+        s0, s1, s2 = w.sum(1), wd.sum(1), (wd * d).sum(1)
+        r0, r1 = (w * value[near]).sum(1), (wd * value[near]).sum(1)
         determinant = s0 * s2 - s1 * s1
         alone = determinant <= 1e-12 * s0 * s0 * bandwidth**2
         level[block] = np.where(alone, r0 / s0, (s2 * r0 - s1 * r1) / np.where(alone, 1.0, determinant))

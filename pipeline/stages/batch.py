@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.atomic import write_atomically
 from pipeline.errors import PipelineError
+from pipeline.json_text import json_text
 from pipeline.locks import hold_as_job
 
 if TYPE_CHECKING:
@@ -128,4 +129,4 @@ def read_json(path: Path) -> Any:  # noqa: ANN401  (any JSON value)
 
 def write_json(path: Path, value: Any) -> None:  # noqa: ANN401
     """Write a JSON file; numbers that JSON cannot hold are refused, not written."""
-    write_atomically(path, json.dumps(value, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+    write_atomically(path, json_text(value) + "\n")
