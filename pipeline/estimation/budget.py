@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.estimation.averaged_covariance import averaged
 from pipeline.estimation.propagation import effective_degrees_of_freedom
-from pipeline.estimation.serial_noise import combine
 from pipeline.records.budget import NORMAL, RECTANGULAR, Contribution, finite
 from pipeline.records.calibration import coverage_factors
 
@@ -85,7 +85,7 @@ def noise_contribution(noise: SerialNoise, fit: LinearMap, prior: Prior) -> Cont
         candidates += own[:, None, None] * (J @ every @ J.T)
         white += s**2 * np.einsum("pi,ij,pj->p", J, alone, J)
         wander += prior.wander**2 * np.einsum("pi,ij,pj->p", J, slow, J)
-    covariance, freedom = combine(noise, candidates)
+    covariance, freedom = averaged(noise.weight, candidates, noise.spare)
     return Contribution(
         NOISE, "A", "Student's t", covariance, freedom, parts=_parts(np.diag(covariance), white, wander)
     )

@@ -18,9 +18,8 @@ An estimate that is linear in the readings, ``beta = A y``, then has the covaria
 
 where ``a`` holds the columns of A summed over each block. One run of recordings does not determine q and tau well, so
 they are not picked: each point of a grid is weighted by its restricted likelihood (Patterson & Thompson, Biometrika 58,
-1971) times a prior about the data sheet or, sharper, about what a static recording says, and C is averaged. How much C
-varies over the grid gives its degrees of freedom: a variance with a scaled inverse chi-square distribution of nu
-degrees has ``var / mean^2 = 2 / (nu - 4)`` and ``mean = scale nu / (nu - 2)``.
+1971) times a prior about the data sheet or, sharper, about what a static recording says, and C is averaged
+(``pipeline.estimation.averaged_covariance``).
 
 One eigendecomposition of R, projected on what the fit cannot reach, gives the likelihood of a tau at every q.
 """
@@ -236,53 +235,6 @@ def assess_noise(
         spare,
         correlation,
     )
-
-
-def combine(noise: SerialNoise, covariances: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Average the covariances of an estimate over the candidates.
-
-    Parameters
-    ----------
-    noise : SerialNoise
-    covariances : (m, p, p) array
-        Under each candidate.
-
-    Returns
-    -------
-    covariance : (p, p) array
-    degrees_of_freedom : (p,) array
-        Of each parameter; infinite where nothing is uncertain.
-    """
-    return averaged(noise.weight, covariances, noise.spare)
-
-
-def averaged(
-    weight: NDArray[np.float64], covariances: NDArray[np.float64], spare: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Average covariances, and say by how much they differ how many degrees of freedom the average has.
-
-    Parameters
-    ----------
-    weight : (m,) array
-        They sum to 1.
-    covariances : (m, p, p) array
-    spare : float
-        Degrees of freedom of each of them.
-
-    Returns
-    -------
-    covariance : (p, p) array
-    degrees_of_freedom : (p,) array
-    """
-    mean = np.tensordot(weight, covariances, 1)
-    variance = np.diagonal(covariances, axis1=1, axis2=2)
-    average = np.diag(mean)
-    known = average > 0
-    relative = np.where(known, weight @ (variance - average) ** 2 / np.where(known, average, 1.0) ** 2, 0.0)
-    grid = 4.0 + 2.0 / np.maximum(relative, 1e-12)
-    shrink = np.sqrt((grid - 2.0) / grid)
-    freedom = np.where(known, 1.0 / (1.0 / spare + 1.0 / grid), np.inf)
-    return mean * np.outer(shrink, shrink), freedom
 
 
 def _complement(means: NDArray[np.float64], design: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -23,8 +23,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.estimation.averaged_covariance import averaged
 from pipeline.estimation.budget import scatter_contribution
-from pipeline.estimation.serial_noise import averaged
+from pipeline.estimation.serial_noise import SURE
 from pipeline.signal.wander import block_covariance
 
 if TYPE_CHECKING:
@@ -91,8 +92,8 @@ def rest_scatter(rests: RestErrors, gain: Values, prior: Prior) -> Contribution:
         B = np.where(rests.joined, block_covariance(rests.start, rests.length, time * prior.time), 0.0)
         B = B * (rests.along @ rests.along.T)
         slow = gain @ B @ gain.T
-        for s in tremors:  # none at all is believed as much as any
-            none = 0.0 if s > 0.0 else float(np.log(len(TREMORS)))
+        for s in tremors:  # as nobody states a tremor, none at all is believed before any
+            none = 0.0 if s > 0.0 else float(np.log(SURE * len(TREMORS)))
             own = rests.variance + s**2
             scores.append(_restricted_likelihood(z, Q.T @ (own[:, None] * Q), Q.T @ B @ Q, wanders**2) + belief + none)
             covariances.append(gain * own @ gain.T + (wanders**2)[:, None, None] * slow)

@@ -13,13 +13,14 @@ import numpy as np
 
 from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.hand_held.budget import budgeted_by_hand
-from pipeline.estimation.hand_held.equations import noises_for
+from pipeline.estimation.hand_held.equations import noises_about
 from pipeline.estimation.hand_held.fit import fit as fit_by_hand
 from pipeline.estimation.hand_held.gyroscope import FEWEST_MOVES, model_of
 from pipeline.estimation.hand_held.likelihood import NEW
 from pipeline.estimation.hand_held.model import State
 from pipeline.estimation.hand_held.rests import by_hand
 from pipeline.estimation.least_squares import certified
+from pipeline.estimation.serial_noise import prior_of
 from pipeline.records import AXES, SensorCalibration, StageResult
 from pipeline.signal.noise import noise_of
 
@@ -70,7 +71,8 @@ def fit(
         )
     start = State(np.average(model.rests.reading, axis=0, weights=model.rests.count), np.eye(3))
     _require_determined(model.equations(start).base)
-    found = fit_by_hand(model, start, noises_for(noise, model.kinds), {})
+    prior = prior_of("gyroscope", recordings, settings)
+    found = fit_by_hand(model, start, noises_about(prior, float(np.mean(model.white)), model.kinds), {})
     names = [f"bias_{a}" for a in AXES] + [f"matrix_{a}{b}" for a in AXES for b in AXES]
     values = np.concatenate([found.state.bias, found.state.matrix.ravel()])
     uncertainty = np.sqrt(np.diag(found.covariance))
@@ -87,7 +89,7 @@ def fit(
         "scatter_of_rests": found.noise.scatter[0],
         "scatter_of_moves": found.noise.scatter[1],
         "condition": found.condition,
-        "degrees_of_freedom": found.degrees_of_freedom,
+        "degrees_of_freedom": float(found.degrees_of_freedom.min()),
     }
     correction = {"steps": [{"subtract": found.state.bias.tolist()}, {"matrix": found.state.matrix.tolist()}]}
     result = StageResult(NAME, parameters, float(np.sqrt(np.mean(at_rest**2))), correction, details)

@@ -31,7 +31,7 @@ NOT_INCLUDED = {
 def budgeted_by_hand(
     calibration: SensorCalibration,
     covariance: NDArray[np.float64],
-    degrees_of_freedom: float,
+    degrees_of_freedom: NDArray[np.float64],
     table: Mapping[str, Any],
 ) -> SensorCalibration:
     """Return a calibration by hand with its uncertainty budget.
@@ -41,12 +41,13 @@ def budgeted_by_hand(
     calibration : SensorCalibration
     covariance : (p, p) array
         Of all parameters, as the residuals tell it.
-    degrees_of_freedom : float
+    degrees_of_freedom : (p,) array
     table : mapping
         ``gravity_g``, ``gravity_accuracy_g``, ``clock_accuracy_ppm``.
     """
     sensor, size = calibration.sensor, len(calibration.parameter_names())
-    lines = [scatter_contribution(covariance, degrees_of_freedom, remark=REMARK[sensor])]
+    scatter = scatter_contribution(covariance, np.inf, remark=REMARK[sensor])
+    lines = [scatter.with_freedom(degrees_of_freedom)]
     missing = dict(NOT_INCLUDED)
     if sensor == "accelerometer":
         gravity = gravity_contribution(sensor, calibration.matrix, table, size)

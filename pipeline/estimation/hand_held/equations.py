@@ -33,11 +33,15 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from pipeline.estimation.serial_noise import Prior
     from pipeline.records import Noise
 
     Values = NDArray[np.float64]
 
 UNLIKELY = -4.0
+FACTORS = 3.0 ** np.arange(-2.0, 3.0)  # of the wander that is believed
+RATIOS = (0.1, 0.3, 1.0)  # of wander to white noise, where nothing is believed of it
+FINE = (0.0, 1.0, 3.0, 9.0, 27.0)  # of rests, and of moves, where noises are not compared for many models
 LEVELS = ((0.0, 2.0, 6.0, 20.0), (0.0, 4.0, 16.0))  # of rests, and of moves
 
 
@@ -152,3 +156,22 @@ def noises_for(noise: Noise | None, kinds: int) -> list[HandNoise]:
         wanders = [s for s in wanders if s.prior > UNLIKELY]
     levels: Sequence[tuple[float, ...]] = list(product(*LEVELS[:kinds]))
     return [HandNoise(s.ratio, s.time, level, s.prior) for s in wanders for level in levels]
+
+
+def noises_about(prior: Prior, white: float, kinds: int) -> list[HandNoise]:
+    """Return the noises over which a covariance is averaged: wanders about the one that is believed.
+
+    Parameters
+    ----------
+    prior : Prior
+        What a static recording or a data sheet says of the wander.
+    white : float, unit of the sensor
+        White noise of a sample.
+    kinds : int
+    """
+    known = prior.wander > 0.0
+    wander = np.append(0.0, prior.wander * FACTORS if known else white * np.array(RATIOS))
+    pairs = zip((wander / white).tolist(), prior.log_belief(wander).tolist(), strict=True)
+    believed = [(ratio, belief) for ratio, belief in pairs if np.isfinite(belief)]
+    levels = list(product(FINE, repeat=kinds))
+    return [HandNoise(ratio, prior.time, level, belief) for ratio, belief in believed for level in levels]

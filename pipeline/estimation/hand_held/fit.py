@@ -1,8 +1,9 @@
 """Base and effects fitted to rests and moves, by generalised least squares in Gauss-Newton rounds.
 
-    step = (N + k P)^-1 (X^T C^-1 r - k P p),    covariance = sum over noises of weight k (N + k P)^-1,   N = X^T C^-1 X
+    step = (N + k P)^-1 (X^T C^-1 r - k P p),    covariance = k (N + k P)^-1,   N = X^T C^-1 X
 
-The step is taken at the most likely noise; the covariance is averaged over the noises by their restricted likelihood,
+The step is taken at the most likely noise; the covariance is averaged over the noises by their restricted likelihood
+(``pipeline.estimation.averaged_covariance``),
 
     -2 log L_R = rss / k + nu log k + log det C + log det(N + k P),    k = max(1, rss / nu),   nu = n - p
 
@@ -21,6 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.errors import NotObservableError
+from pipeline.estimation.averaged_covariance import averaged
 from pipeline.estimation.hand_held.likelihood import NEW, beside
 from pipeline.estimation.hand_held.model import stepped
 from pipeline.estimation.joint import parameter_names
@@ -56,7 +58,8 @@ class HandFit:
     log_likelihood : float
     noise : HandNoise
         The most likely one.
-    degrees_of_freedom : float
+    degrees_of_freedom : (b + p,) array
+        Of each of these parameters.
     residual : (n,) array
         Over the white noise of each equation.
     error : (n,) array
@@ -74,7 +77,7 @@ class HandFit:
     covariance: Values
     log_likelihood: float
     noise: HandNoise
-    degrees_of_freedom: float
+    degrees_of_freedom: Values
     residual: Values
     error: Values
     rank: int
@@ -188,15 +191,14 @@ def _assessed(
     restricted = np.array([s.restricted for s in every])
     weight = np.exp(restricted - restricted.max())
     weight /= weight.sum()
-    covariances = np.array([s.covariance for s in every])
-    covariance: Values = np.tensordot(weight, covariances, 1)
     spare = max(len(equations.residual) - every[best].rank, 1)
+    covariance, freedom = averaged(weight, np.array([s.covariance for s in every]), spare)
     return HandFit(
         state,
         covariance,
         every[best].log_likelihood,
         noises[best],
-        _freedom(covariances, covariance, weight, spare),
+        freedom,
         equations.residual,
         equations.error,
         every[best].rank,
@@ -204,13 +206,6 @@ def _assessed(
         every[best].condition,
         every[best].cosine,
     )
-
-
-def _freedom(covariances: Values, mean: Values, weight: Values, spare: float) -> float:
-    """Return the degrees of freedom of an average of covariances: ``var / mean^2 = 2 / (nu - 4)`` of a variance."""
-    own = np.diagonal(covariances, axis1=1, axis2=2) / np.maximum(np.diag(mean), 1e-300)
-    spread = float(np.max(weight @ (own - 1.0) ** 2))
-    return float(1.0 / (1.0 / spare + (0.0 if spread < 1e-12 else 1.0 / (4.0 + 2.0 / spread))))
 
 
 def solve(equations: Equations, noise: HandNoise, limits: Limits) -> Solved:

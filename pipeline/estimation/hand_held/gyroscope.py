@@ -8,8 +8,8 @@ where
     y, b, M : reading and bias, deg/s, and matrix
     z, p    : effects and their parameters, with the specific force of the accelerometer, at rest and as it is turned on
     u       : direction of gravity by the calibrated accelerometer; A_0 as in ``pipeline.estimation.hand_held.moves``
-    E       : two directions across u_after; W whitens what noise of the gyroscope, integrated, and of the accelerometer
-              leave there
+    E       : two directions across u_after; W whitens what noise of the gyroscope, integrated, what it turned between
+              its samples, and noise of the accelerometer leave there
 
 The errors of u are those of the rests' means, which two moves share, and those of the accelerometer's calibration,
 which all share: ``du = (1 - u u^T) (M_a dy - M_a db_a + dM_a v_a) / G``. A unit that still settles or is let go turns
@@ -190,12 +190,12 @@ class HandHeldGyroscope:
         motion, v, A = self._turned(state)
         predicted = np.einsum("kij,kj->ki", A[:, 0], self.before)
         E = tangents(self.after)
-        P = moves.weight[:, :, None, None] * (
-            (E @ skew(predicted))[:, None] @ A
-        )  # of a rate at a sample, deg per deg/s
+        G = (E @ skew(predicted))[:, None] @ A
+        P = moves.weight[:, :, None, None] * G  # of a rate at a sample, deg per deg/s
         PM = P @ state.matrix
         directions = self._directions(E, A[:, 0])
-        own = np.einsum("ksij,j,kslj->kil", PM, self.white**2, PM)
+        untold = np.einsum("ksij,ksj->ksi", G @ state.matrix, moves.doubt)
+        own = np.einsum("ksij,j,kslj->kil", PM, self.white**2, PM) + np.einsum("ksi,ksj->kij", untold, untold)
         means = np.einsum("kimc,mcd->kimd", directions, self.spread)
         variance = own + np.einsum("kimd,klmd->kil", means, means)
         W = np.asarray(np.linalg.solve(np.linalg.cholesky(variance), np.eye(2)), np.float64)

@@ -9,6 +9,16 @@ where
     u     : unit vector along the specific force, in the body frame
     A_k   : takes vectors from the body at sample k to the body at the end of the move
     w_k   : weight of sample k in an integral by the trapezoidal rule, s
+
+Sampled slowly, a hand's accelerations begin and end between two samples. Where the rate bends there by s (deg/s^2), a
+share p of an interval behind the sample before, the second differences at both are ``d = (1 - p) s dt`` and
+``d' = p s dt``, and the rule is off by
+
+    s dt^2 p (1 - p) / 2 = dt d d' / (d + d') / 2
+
+which is taken off the readings where both stand out of the noise. For a smooth rate, where ``d = d'``, it adds up to
+nothing from rest to rest. Where two bends the same way share a sample, they cannot be told apart, and a second
+difference d is left over: then the rule is off by 0.12 d dt more (rms, both places anywhere).
 """
 
 from __future__ import annotations
@@ -37,6 +47,8 @@ FEWEST_STEPS = 100
 EQUAL_S = 2e-9
 MOSTLY = 0.9  # share of equal steps
 ROUNDED = 0.1  # of a step
+UNTOLD = 0.12
+BENT = 8.0  # second difference over white noise, 2.4 of which is the noise's own
 
 
 @dataclass(frozen=True)
@@ -48,12 +60,14 @@ class Moves:
     before, after : (k,) array of int
         Rests between which each move lies.
     reading : (k, s, 3) array, deg/s
-        The last sample is repeated.
+        Less what the trapezoidal rule is off by bends between samples; the last sample is repeated.
     time : (k, s) array, s
     temperature : (k, s) array, degC
         As of the rests before and after, in between by straight line; NaN where none was recorded.
     weight : (k, s) array, s
         0 beyond a move's end.
+    doubt : (k, s, 3) array, deg
+        Standard uncertainty, along one direction each, of the angle in the readings' axes: bends that share a sample.
     """
 
     before: NDArray[np.intp]
@@ -62,6 +76,7 @@ class Moves:
     time: Values
     temperature: Values
     weight: Values
+    doubt: Values
 
     @property
     def count(self) -> int:
@@ -104,11 +119,48 @@ def moves_of(recordings: Sequence[Recording], rests: Rests) -> Moves | None:
         step = np.diff(clock[span])
         weight[row, : n - 1] += step / 2.0
         weight[row, 1:n] += step / 2.0
+    taken, doubt = _bends(reading, weight, BENT * float(np.linalg.norm(rests.white)))
     before, after = np.array([[i, j] for i, j, _ in found]).T
     share = (time - rests.time[before][:, None]) / (rests.time[after] - rests.time[before])[:, None]
     warm = rests.temperature[before][:, None]
     temperature = warm + share * (rests.temperature[after][:, None] - warm)
-    return Moves(before, after, reading, time, temperature, weight)
+    return Moves(before, after, reading - taken, time, temperature, weight, doubt)
+
+
+def _bends(reading: Values, weight: Values, least: float) -> tuple[Values, Values]:
+    """Return what bends between samples make the trapezoidal rule take too much, and what stays in doubt.
+
+    Parameters
+    ----------
+    reading : (k, s, 3) array, deg/s
+    weight : (k, s) array, s
+    least : float, deg/s
+        Smaller second differences are none.
+
+    Returns
+    -------
+    taken : (k, s, 3) array, deg/s
+        As rates.
+    doubt : (k, s, 3) array, deg
+    """
+    second = np.diff(np.pad(reading, ((0, 0), (1, 1), (0, 0)), mode="edge"), n=2, axis=1)
+    second[np.linalg.norm(second, axis=2) < least] = 0.0
+    both = second[:, :-1] + second[:, 1:]
+    product = np.sum(second[:, :-1] * second[:, 1:], axis=2)
+    bend = product > 0.0
+    left = np.zeros(weight.shape, bool)
+    for j in range(1, bend.shape[1]):  # a second difference belongs to one bend
+        left[:, j + 1] = bend[:, j] & bend[:, j - 1]
+        bend[:, j] &= ~bend[:, j - 1]
+    left[:, :-1] &= ~bend
+    interval = np.max(weight, axis=1)[:, None]
+    shared = np.maximum(weight[:, :-1] + weight[:, 1:], 0.5 * interval)  # by the two samples that it is taken off
+    share = np.where(bend, 0.5 * interval * product / shared, 0.0) / np.maximum(np.sum(both**2, axis=2), 1e-300)
+    rate = share[:, :, None] * both
+    taken = np.zeros_like(reading)
+    taken[:, :-1] += rate
+    taken[:, 1:] += rate
+    return taken, UNTOLD * interval[:, :, None] * np.where(left[:, :, None], second, 0.0)
 
 
 def regular_time(time: Values) -> Values:

@@ -115,6 +115,7 @@ def calibration_of(
     place[:12, : model.directions.shape[1]] = model.directions
     place[12:, model.directions.shape[1] :] = np.eye(count)
     covariance = place @ covariance @ place.T
+    freedom = np.min(np.where(place != 0.0, found.degrees_of_freedom, np.inf), axis=1)
     uncertainty = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
     effects, parameters, at = [], {}, 12
     for term in found.state.terms:
@@ -147,4 +148,4 @@ def calibration_of(
         converged=found.converged,
         convergence=certified(found.cosine, found.condition, found.rank, len(found.covariance)),
     )
-    return budgeted_by_hand(calibration, covariance, found.degrees_of_freedom, table)
+    return budgeted_by_hand(calibration, covariance, freedom, table)

@@ -57,14 +57,6 @@ def test_bias_and_matrix_are_found_within_their_uncertainty() -> None:
         assert np.abs(value - true)[3:].max() < 1e-3
 
 
-def test_the_steps_of_sparse_samples_count_as_scatter_of_the_moves() -> None:
-    unit = hand_held("stim300", 3)
-    details = unit.calibrated("gyroscope").stages[-1].details
-    assert details["direction_error_rms_deg"] > 0.05
-    assert details["scatter_of_moves"] > 0.0
-    assert details["scatter_of_rests"] == 0.0
-
-
 def test_derivatives_of_the_moves_are_those_of_their_residuals() -> None:
     unit = hand_held("mpu6050", 4)
     model = model_of(unit.recordings, None, None, unit.settings)
