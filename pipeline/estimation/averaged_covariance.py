@@ -72,7 +72,7 @@ def _within(weight: Values, sigma: Values, probability: float) -> Values:
 
     quantile = float(ndtri(0.5 + probability / 2.0))
     sigma = np.maximum(sigma, 1e-9)
-    x = quantile * sigma.min(axis=0)
+    x: Values = quantile * sigma.min(axis=0)
     for _ in range(STEPS):
         ratio = x / sigma
         density = weight @ (np.exp(-0.5 * ratio**2) / sigma) * np.sqrt(2.0 / np.pi)
@@ -100,4 +100,4 @@ def _quantiles() -> tuple[Values, Values, Values]:
         np.append(ndtri(upper), stdtrit(1.0 / inverse[1:], upper))
         for upper in (0.5 + ONE_SIGMA / 2.0, 0.5 + COVERED / 2.0)
     )
-    return inverse, outer / inner, outer
+    return inverse, np.asarray(outer / inner, np.float64), np.asarray(outer, np.float64)

@@ -16,9 +16,9 @@ share p of an interval behind the sample before, the second differences at both 
 
     s dt^2 p (1 - p) / 2 = dt d d' / (d + d') / 2
 
-which is taken off the readings where both stand out of the noise. For a smooth rate, where ``d = d'``, it adds up to
-nothing from rest to rest. Where two bends the same way share a sample, they cannot be told apart, and a second
-difference d is left over: then the rule is off by 0.12 d dt more (rms, both places anywhere).
+which is taken off the readings where both stand out of the noise. Two bends the same way make four such differences in
+a row; or three, where they share a sample and cannot be told apart: then the rule is off by 0.12 d dt more (rms, both
+places anywhere) with d that is left over. More than four in a row are a rate that bends smoothly, and nothing is done.
 """
 
 from __future__ import annotations
@@ -47,6 +47,7 @@ FEWEST_STEPS = 100
 EQUAL_S = 2e-9
 MOSTLY = 0.9  # share of equal steps
 ROUNDED = 0.1  # of a step
+SMOOTH = 4
 UNTOLD = 0.12
 BENT = 8.0  # second difference over white noise, 2.4 of which is the noise's own
 
@@ -147,12 +148,15 @@ def _bends(reading: Values, weight: Values, least: float) -> tuple[Values, Value
     second[np.linalg.norm(second, axis=2) < least] = 0.0
     both = second[:, :-1] + second[:, 1:]
     product = np.sum(second[:, :-1] * second[:, 1:], axis=2)
-    bend = product > 0.0
-    left = np.zeros(weight.shape, bool)
-    for j in range(1, bend.shape[1]):  # a second difference belongs to one bend
-        left[:, j + 1] = bend[:, j] & bend[:, j - 1]
-        bend[:, j] &= ~bend[:, j - 1]
-    left[:, :-1] &= ~bend
+    same = product > 0.0
+    place = np.zeros(weight.shape, np.intp)  # of each second difference among those the same way in a row
+    for j in range(1, weight.shape[1]):
+        place[:, j] = np.where(same[:, j - 1], place[:, j - 1] + 1, 0)
+    last = place.copy()
+    for j in range(weight.shape[1] - 2, -1, -1):
+        last[:, j] = np.where(same[:, j], last[:, j + 1], place[:, j])
+    bend = same & (place[:, :-1] % 2 == 0) & (last[:, :-1] < SMOOTH)
+    left = (place == 2) & (last == 2)  # the third of three
     interval = np.max(weight, axis=1)[:, None]
     shared = np.maximum(weight[:, :-1] + weight[:, 1:], 0.5 * interval)  # by the two samples that it is taken off
     share = np.where(bend, 0.5 * interval * product / shared, 0.0) / np.maximum(np.sum(both**2, axis=2), 1e-300)

@@ -57,7 +57,7 @@ def test_a_smooth_rate_is_integrated_as_before() -> None:
     rate = (RATE_DPS * np.sin(np.pi * np.clip((time - starts[:, None]) / MOVE_S, 0.0, 1.0)) ** 4).sum(axis=0)
     found, raw = _angles(_recording(2, rate, np.cumsum(rate) * INTERVAL_S))
     assert raw == pytest.approx(RATE_DPS * MOVE_S * 3.0 / 8.0, abs=2e-3)
-    assert np.abs(found - raw).max() < 0.1
+    assert np.abs(found - raw).max() < 0.02
 
 
 def test_sparse_samples_cost_the_matrix_nothing_beside_noise() -> None:
