@@ -272,6 +272,7 @@ def _part(sensor: str, recording: Recording, gravity: float, earth: NDArray[np.f
     rows = rows_of(motion, sound, together=not filtered).settled(reading)
     if len(rows.first) == 0:
         return None
+    felt = rows.motion(motion) if filtered else _shared(recording, motion, rows)
     information = min(float(recording.filter.get("noise_gain", 1.0)) ** 2, 1.0)
     means = rows.means(reading)
     kept = reading[rows.kept]
@@ -279,13 +280,22 @@ def _part(sensor: str, recording: Recording, gravity: float, earth: NDArray[np.f
     return Part(
         recording.name,
         recording.role,
-        rows.motion(motion),
+        felt,
         means,
         rows.count * information,
         within * information,
         recording.clock_shared,
         recording.interval,
     )
+
+
+def _shared(recording: Recording, motion: Motion, rows: Rows) -> Motion:
+    """Return the motion at the rows; both sensors of a recording mostly have the same."""
+    key = "rows", id(motion.specific_force), rows.kept.tobytes(), rows.first.tobytes()  # it is kept as well
+    if key not in recording.kept:
+        recording.kept[key] = rows.motion(motion)
+    found: Motion = recording.kept[key]
+    return found
 
 
 def through_filter(motion: Motion, recording: Recording) -> Motion:

@@ -18,7 +18,7 @@ from pipeline.estimation.design import BASE, Design, Term
 from pipeline.estimation.wandering import Setting
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -163,46 +163,61 @@ class Ranking:
         products = self.chosen(selected)
         before = float(self.log_likelihood(products[:, -1, -1])[1:].max())
         names = {self.candidates[j].effect.name for j in selected}
-        best: dict[str, Score] = {}
+        alike: dict[int, list[int]] = {}  # candidates with as many directions are solved together
         for j, term in enumerate(self.candidates):
-            if len(self.places[j]) == 0 or term.effect.name in names:
-                continue
-            score = self._score(j, products, before, limits.get(term.effect.name))
+            if len(self.places[j]) and term.effect.name not in names:
+                alike.setdefault(len(self.places[j]), []).append(j)
+        found = {j: score for members in alike.values() for j, score in self._scored(members, products, before, limits)}
+        best: dict[str, Score] = {}
+        for _, score in sorted(found.items()):
             held = best.get(score.name)
             if held is None or score.delta_bic > held.delta_bic:
                 best[score.name] = score
         return sorted(best.values(), key=lambda s: -s.delta_bic)
 
-    def _score(self, j: int, products: NDArray[np.float64], before: float, limits: NDArray[np.float64] | None) -> Score:
+    def _scored(
+        self,
+        members: Sequence[int],
+        products: NDArray[np.float64],
+        before: float,
+        limits: dict[str, NDArray[np.float64]],
+    ) -> Iterator[tuple[int, Score]]:
+        """Yield the scores of candidates that have as many directions."""
         from scipy.special import chdtrc  # noqa: PLC0415  (0.1 s that only rankings pay)
 
-        place, term = self.places[j], self.candidates[j]
-        at = slice(place[0], place[-1] + 1)
-        inner, cross = products[:, at, at], products[:, at, -1]
-        ridge = RIDGE * np.einsum("tii->ti", self.products[:, at, at])
-        solved = np.linalg.solve(inner + ridge[:, :, None] * np.eye(len(place)), cross[:, :, None])[:, :, 0]
-        rss = products[:, -1, -1] - np.sum(cross * solved, axis=1)
-        found = self.log_likelihood(rss)[1:]
-        best = int(np.argmax(found)) + 1
-        nonlinear = 0 if term.effect.moves else len(term.effect.nonlinear)
-        k = len(place) + nonlinear
-        gain = max(2.0 * (float(found[best - 1]) - before), 0.0)
-        admissible = bool(np.linalg.eigvalsh(inner[0])[0] > NEW)
-        values, uncertainty = self._estimate(j, solved[best], inner[best] + np.diag(ridge[best]), rss[best])
-        plausible = limits is None or bool(np.all(np.abs(values) - 2.0 * uncertainty <= limits))
-        return Score(
-            term.effect.name,
-            gain - k * float(np.log(self.samples)),
-            float(chdtrc(k, gain)),
-            k,
-            values,
-            uncertainty,
-            float(found[best - 1]),
-            best,
-            admissible,
-            plausible,
-            float(2.0 * solved[best] @ cross[0] - solved[best] @ inner[0] @ solved[best]),
-        )
+        places = [slice(self.places[j][0], self.places[j][-1] + 1) for j in members]
+        inner = np.stack([products[:, at, at] for at in places])
+        cross = np.stack([products[:, at, -1] for at in places])
+        own = np.einsum("tii->ti", self.products)
+        definite = inner + RIDGE * np.stack([own[:, at] for at in places])[..., None] * np.eye(inner.shape[-1])
+        solved = np.linalg.solve(definite, cross[..., None])[..., 0]
+        rss = products[:, -1, -1] - np.sum(cross * solved, axis=2)
+        likelihood = self.log_likelihood(rss)
+        weakest = np.linalg.eigvalsh(inner[:, 0])[:, 0]
+        for i, j in enumerate(members):
+            this = self.candidates[j].effect
+            best = int(np.argmax(likelihood[i, 1:])) + 1
+            k = inner.shape[-1] + (0 if this.moves else len(this.nonlinear))
+            gain = max(2.0 * (float(likelihood[i, best]) - before), 0.0)
+            values, uncertainty = self._estimate(j, solved[i, best], definite[i, best], rss[i, best])
+            limit = limits.get(this.name)
+            signal = solved[i, best]
+            yield (
+                j,
+                Score(
+                    this.name,
+                    gain - k * float(np.log(self.samples)),
+                    float(chdtrc(k, gain)),
+                    k,
+                    values,
+                    uncertainty,
+                    float(likelihood[i, best]),
+                    best,
+                    bool(weakest[i] > NEW),
+                    limit is None or bool(np.all(np.abs(values) - 2.0 * uncertainty <= limit)),
+                    float(2.0 * signal @ cross[i, 0] - signal @ inner[i, 0] @ signal),
+                ),
+            )
 
     def _estimate(
         self, j: int, solved: NDArray[np.float64], inner: NDArray[np.float64], rss: float

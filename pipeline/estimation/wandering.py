@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     from pipeline.estimation.observations import Part
     from pipeline.records import Noise
 
-CELLS = 600
-SHORTEST_CELL_S = 2.0
+CELLS = 300
+SHORTEST_CELL_S = 4.0
 FAST_S = 25.0
 WALK = 8.0  # times the correlation time seen, with the same variance of short differences
 STATIC_WIDTH = (0.35, 1.1)  # least and most of the logarithm of the ratio that a static rest gives
