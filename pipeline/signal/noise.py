@@ -124,6 +124,8 @@ def filter_autocovariance(recording: Recording) -> NDArray[np.float64]:
 def _stretches(recording: Recording, mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Return the runs of a mask, cut at gaps in time."""
     cuts = np.flatnonzero(np.diff(recording.time_ns) > GAP * recording.interval * 1e9) + 1
+    if len(cuts) == 0:
+        return runs(mask)
     pieces: list[tuple[int, int]] = []
     for start, stop in runs(mask):
         edges = [start, *cuts[(cuts > start) & (cuts < stop)].tolist(), stop]
@@ -163,21 +165,20 @@ def _settled(
     """Return rests without the samples at their edges that still move; the sensor's clock may be off the table's."""
     ends = np.array(stretches, int).reshape(-1, 2)
     lengths = ends[:, 1] - ends[:, 0]
-    for length in np.unique(lengths):
-        edge = min(int(EDGE_S / recording.interval) + 1, int(length) // 3)
-        if length < FEWEST_TO_SETTLE or edge == 0:
-            continue
-        alike = np.flatnonzero(lengths == length)
+    edges = np.minimum(int(EDGE_S / recording.interval) + 1, lengths // 3)
+    for edge in np.unique(edges[lengths >= FEWEST_TO_SETTLE]).tolist():
+        alike = np.flatnonzero((edges == edge) & (lengths >= FEWEST_TO_SETTLE))
+        length = int(lengths[alike].min())
         inside = values[ends[alike, :1] + np.arange(length)]
         spread = noise_of_steps(np.abs(np.diff(inside, axis=1)), axis=1, keepdims=True)
         for side in (1, -1):
-            ordered = inside[:, ::side]
+            ordered = inside if side == 1 else values[ends[alike, 1:] - 1 - np.arange(3 * edge)]
             middle = np.median(ordered[:, edge : 3 * edge], axis=1, keepdims=True)
             off = np.abs(ordered[:, :edge] - middle) > SETTLED * spread
             moving = np.any(off & (spread > 0), axis=2)
             cut = np.where(moving, np.arange(1, edge + 1), 0).max(axis=1)
             ends[alike, 0 if side == 1 else 1] += side * cut
-    return [(int(a), int(b)) for a, b in ends]
+    return [(a, b) for a, b in ends.tolist()]
 
 
 def _noise_of_rests(
