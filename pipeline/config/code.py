@@ -10,6 +10,10 @@ import ast
 import hashlib
 from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 PACKAGE = Path(__file__).resolve().parents[1]
 
@@ -48,9 +52,11 @@ def _closure(module: str) -> frozenset[Path]:
 def _imports(file: Path) -> tuple[Path, ...]:
     if file.suffix != ".py":
         return ()
-    tree = ast.parse(file.read_bytes())
+    source = file.read_bytes()
     found: list[Path | None] = []
-    for node in ast.walk(tree):
+    if file.name == "__init__.py" and b"import_module(" in source:
+        found += [f for f in file.parent.rglob("*") if f.is_file() and f.suffix != ".pyc"]
+    for node in _statements(ast.parse(source).body):
         if isinstance(node, ast.Import):
             found += [_file_of(alias.name) for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
@@ -58,15 +64,20 @@ def _imports(file: Path) -> tuple[Path, ...]:
             if node.module == "jinja2":
                 found += (file.parent / "templates").glob("*")
             found += [_file_of(f"{node.module}.{alias.name}") for alias in node.names]
-        elif (
-            file.name == "__init__.py"
-            and isinstance(node, ast.Call)
-            and getattr(node.func, "id", "") == "import_module"
-        ):
-            found += [f for f in file.parent.rglob("*") if f.is_file() and f.suffix != ".pyc"]
     return tuple(f for f in found if f)
 
 
+def _statements(body: list[ast.stmt]) -> Iterator[ast.stmt]:
+    """Yield statements and those within them; expressions, which are most of a tree, hold no import."""
+    for node in body:
+        yield node
+        for field in ("body", "orelse", "finalbody"):
+            yield from _statements(getattr(node, field, []))
+        for part in (*getattr(node, "handlers", []), *getattr(node, "cases", [])):
+            yield from _statements(part.body)
+
+
+@cache
 def _file_of(module: str) -> Path | None:
     if module != "pipeline" and not module.startswith("pipeline."):
         return None
