@@ -45,6 +45,7 @@ FIT = (
     "sensor.{sensor}.full_scale",
     "sensor.{sensor}.counts_per_unit",
     *(f"sensor.{{sensor}}.{key}" for key in NOISE),
+    "uncertainty.monte_carlo",
 )
 SENSORS_AND_TABLE = ("sensor", "table", "procedure.holdout_every")
 READS: dict[str, tuple[str, ...]] = {

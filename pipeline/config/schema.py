@@ -150,6 +150,12 @@ class Effects(Section):
     gyroscope: list[str] | Literal["auto"]
 
 
+class Uncertainty(Section):
+    """How uncertainties are found."""
+
+    monte_carlo: Annotated[int, Field(ge=0, le=10_000_000)]
+
+
 class SensorLimits(Section):
     """What a unit must keep to pass; None is not checked."""
 
@@ -269,6 +275,7 @@ class Unit(Section):
     filter: Filter
     ingest: Ingest
     effects: Effects
+    uncertainty: Uncertainty
     limits: Limits
     certificate: Certificate
 

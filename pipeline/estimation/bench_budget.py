@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from pipeline.estimation.budget import combined, quantisation
+import numpy as np
+
+from pipeline.estimation.budget import candidate_covariances, combined, quantisation
 from pipeline.estimation.table_inputs import table_contributions
+from pipeline.estimation.trials import Errors, beside_trials, trials_of
 from pipeline.records.calibration import UNITS
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
+
+    from numpy.typing import NDArray
 
     from pipeline.estimation.serial_noise import SerialNoise
     from pipeline.estimation.table_inputs import Reference
     from pipeline.records import SensorCalibration
     from pipeline.records.budget import Contribution
+
+    Values = NDArray[np.float64]
 
 TEMPERATURE = "the parameters hold at the temperature of these recordings; no accuracy of the thermometer is stated"
 TIME_BASE = "the table logs angle and rate itself, so that a wrong clock changes neither"
@@ -26,8 +34,9 @@ def budgeted(
     noise: SerialNoise,
     contributions: Sequence[Contribution],
     settings: Mapping[str, Any],
+    results: Callable[[Values], Values],
 ) -> SensorCalibration:
-    """Return a calibration with its uncertainty budget.
+    """Return a calibration with its uncertainty budget, and a Monte Carlo run beside it where that is asked for.
 
     Parameters
     ----------
@@ -37,7 +46,9 @@ def budgeted(
     contributions : sequence of Contribution
         Those of the readings' scatter.
     settings : mapping
-        Section ``sensor``, for the size of a count.
+        Sections ``sensor``, for the size of a count, and ``uncertainty``.
+    results : callable
+        (t, q) values of what the fit's map makes of the channels, one after the other, to (t, p) parameters.
     """
     sensor = calibration.sensor
     lines, missing = list(contributions), {"temperature": TEMPERATURE, "time base": TIME_BASE}
@@ -48,4 +59,13 @@ def budgeted(
     else:
         lines.append(rounded)
     found, absent = table_contributions(reference)
-    return combined(calibration, [*lines, *found], {**absent, **missing})
+    complete = combined(calibration, [*lines, *found], {**absent, **missing})
+    trials = trials_of(settings)
+    if not trials:
+        return complete
+    first = reference.fit.first()
+    stated = table_contributions(replace(reference, fit=first))[0]
+    again = quantisation(noise, first, sheet.get("counts_per_unit"), UNITS[sensor])
+    stated += [] if isinstance(again, str) else [again]
+    errors = Errors(noise.weight, candidate_covariances(noise, first), noise.spare, stated)
+    return beside_trials(complete, errors.through(results), trials, contributions[1:])

@@ -91,6 +91,17 @@ def noise_contribution(noise: SerialNoise, fit: LinearMap, prior: Prior) -> Cont
     )
 
 
+def candidate_covariances(noise: SerialNoise, fit: LinearMap) -> Values:
+    """Return the covariance of a fit's results under each candidate of the noise: (k, p, p) array."""
+    unit: dict[int, Values] = {}
+    total = np.zeros((len(noise.weight), fit.parameters, fit.parameters))
+    for A, J, own in zip(fit.weights, fit.derivative, noise.white_variance.T, strict=True):
+        if id(A) not in unit:
+            unit[id(A)] = noise.covariances(A)
+        total += own[:, None, None] * (J @ unit[id(A)] @ J.T)
+    return total
+
+
 def _parts(total: Values, white: Values, wander: Values) -> dict[str, Values]:
     """Return the standard uncertainties of white noise, expected wander and lack of fit; their squares sum up."""
     white = np.minimum(white, total)

@@ -28,6 +28,7 @@ from pipeline.estimation.design import BASE, BASE_NAMES, Design, Start, Term, mo
 from pipeline.estimation.least_squares import certified
 from pipeline.estimation.observations import observe, weighted
 from pipeline.estimation.table_inputs import Reference, table_contributions
+from pipeline.estimation.trials import Errors, beside_trials, trials_of
 from pipeline.estimation.wandering import Setting, settings_for
 from pipeline.model.effects import effect
 from pipeline.model.effects.base import Layout, truth
@@ -422,7 +423,7 @@ def fit_joint(  # noqa: PLR0917  (the interface that the stages and the diagnosi
     grid = settings_for(noise, RATIOS, TIMES)
     fit = fit_best(observations, combinations, base, grid)
     require_observable(observations, fit, base.scale)
-    return calibration_of(sensor, fit, observations, start, settings["table"])
+    return calibration_of(sensor, fit, observations, start, settings)
 
 
 def calibration_of(
@@ -430,11 +431,12 @@ def calibration_of(
     fit: Fit,
     observations: Observations,
     before: SensorCalibration | None,
-    table: Mapping[str, Any] | None = None,
+    settings: Mapping[str, Any] | None = None,
 ) -> SensorCalibration:
     """Return a fit as a calibration: ``matrix = K^-1``, with ``d matrix = -matrix dK matrix``.
 
-    With a ``table``, its accuracies are in the uncertainties, but for those that an effect of the fit estimates.
+    With ``settings``, the accuracies of their table are in the uncertainties, but for those that an effect of the fit
+    estimates.
     """
     matrix = np.asarray(np.linalg.solve(fit.K, np.eye(3)), np.float64)
     change = np.eye(len(fit.covariance))
@@ -471,10 +473,25 @@ def calibration_of(
         convergence=certified(fit.cosine, fit.condition, fit.rank, len(covariance)),
     )
     lines, missing = [scatter_contribution(covariance, fit.degrees_of_freedom, remark=SCATTER)], dict(NOT_INCLUDED)
-    if table is not None:
-        design = _at(observations, fit.terms, fit.bias, fit.K, np.maximum(fit.scale, 1e-300))
-        motions = [part.motion for part in observations.parts]
-        reference = Reference(sensor, motions, design.linear_map(fit.setting).then(change), fit.K, table)
-        stated, absent = table_contributions(reference, [term.effect.name for term in fit.terms])
-        lines, missing = [*lines, *stated], {**absent, **missing}
-    return combined(found, lines, missing)
+    if settings is None:
+        return combined(found, lines, missing)
+    design = _at(observations, fit.terms, fit.bias, fit.K, np.maximum(fit.scale, 1e-300))
+    motions, estimated = [part.motion for part in observations.parts], [term.effect.name for term in fit.terms]
+    first = design.linear_map(fit.setting)
+    reference = Reference(sensor, motions, first.then(change), fit.K, settings["table"])
+    stated, absent = table_contributions(reference, estimated)
+    complete = combined(found, [*lines, *stated], {**absent, **missing})
+    trials = trials_of(settings)
+    if not trials:
+        return complete
+    values = np.concatenate([fit.bias, fit.K.ravel(), *(term.values for term in fit.terms)])
+    stated, _ = table_contributions(replace(reference, fit=first), estimated)
+    errors = Errors(np.ones(1), fit.covariance[None], fit.degrees_of_freedom, stated)
+    return beside_trials(complete, errors.through(lambda e: _with_matrix(values + e)), trials)
+
+
+def _with_matrix(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (t, 12 + p) parameters with the matrix in place of K."""
+    K = values[:, 3:BASE].reshape(-1, 3, 3)
+    matrix = np.linalg.solve(K, np.broadcast_to(np.eye(3), K.shape)).reshape(-1, 9)
+    return np.concatenate([values[:, :3], matrix, values[:, BASE:]], axis=1)

@@ -48,6 +48,13 @@ class LinearMap:
         x, y, z = (change @ J for J in self.derivative)
         return LinearMap(self.weights, (x, y, z))
 
+    def first(self) -> LinearMap:
+        """Return the map to what is fitted of the channels, one after the other, without what follows."""
+        sizes = [len(A) for A in self.weights]
+        place = np.eye(sum(sizes))
+        x, y, z = np.split(place, np.cumsum(sizes)[:-1], axis=1)
+        return LinearMap(self.weights, (x, y, z))
+
     def results(self, kept: slice) -> LinearMap:
         """Return the map to some of the parameters."""
         x, y, z = (J[kept] for J in self.derivative)

@@ -122,7 +122,20 @@ def fit_reference(
         convergence=certificate(X, residuals, condition, rank),
     )
     motions = [part.motion.select(part.keep) for part in parts]
-    return budgeted(found, Reference(sensor, motions, fit, K, settings["table"]), noise, contributions, settings)
+    reference = Reference(sensor, motions, fit, K, settings["table"])
+
+    def results(errors: NDArray[np.float64]) -> NDArray[np.float64]:
+        return inverted(beta.T.ravel() + errors)
+
+    return budgeted(found, reference, noise, contributions, settings, results)
+
+
+def inverted(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return bias and matrix, (t, 12), of bias and row of K of each channel, (t, 12)."""
+    channels = values.reshape(len(values), 3, 4)
+    matrix = np.linalg.solve(channels[:, :, 1:], np.broadcast_to(np.eye(3), (len(values), 3, 3)))
+    found: NDArray[np.float64] = np.concatenate([channels[:, :, 0], matrix.reshape(-1, 9)], axis=1)
+    return found
 
 
 def _select(sensor: str, part: Part) -> Part:

@@ -20,7 +20,8 @@ def budget_of(part: JSON) -> JSON | None:
     Returns
     -------
     dict or None
-        ``sources``: a row each; ``parameters``: a row each, with one cell for every source; ``not_included``.
+        ``sources``: a row each; ``parameters``: a row each, with one cell for every source; ``not_included``;
+        ``trials``: the Monte Carlo run beside it, or None.
     """
     budget = part.get("uncertainty_budget")
     if not budget:
@@ -41,6 +42,7 @@ def budget_of(part: JSON) -> JSON | None:
             for j, (name, unit) in enumerate(zip(budget["parameters"], budget["units"], strict=True))
         ],
         "not_included": budget["not_included"],
+        "trials": _trials(budget),
     }
 
 
@@ -60,6 +62,31 @@ def convergence_of(part: JSON) -> str:
         f"The fit did not converge: {cosine}, {rank}. Its values are where it stopped; do not use them. Record more, "
         "or fit fewer effects."
     )
+
+
+def _trials(budget: JSON) -> JSON | None:
+    """Return the Monte Carlo run as a sentence and a row for each uncertain parameter, or None where there is none."""
+    run = budget.get("monte_carlo")
+    if not run:
+        return None
+    if not run["trials"]:
+        return {"finding": f"No Monte Carlo run: {run['reason']}.", "rows": []}
+    values, rows = run["estimate"], []
+    for j, name in enumerate(budget["parameters"]):
+        U = budget["expanded_uncertainty"][j]
+        if U > 0.0:
+            row = {"name": name.replace("_", " ").replace(".", ": "), "validated": run["validated"][j]}
+            ends = {"low": run["low"][j] - values[j], "high": run["high"][j] - values[j]}
+            row |= {"U": number(U, 2), **{k: f"{'+' if v > 0 else ''}{number(v, 2)}" for k, v in ends.items()}}
+            rows.append(row | {key: number(run[key][j], 2) for key in ("d_low", "d_high", "tolerance")})
+    borne = sum(row["validated"] for row in rows)
+    finding = (
+        f"Monte Carlo, {run['trials']:,} trials: the interval of {borne} of {len(rows)} parameters agrees with the "
+        f"budget's to half a unit of the {'second' if run['digits'] == 2 else 'first'} digit of u."
+    )
+    if borne < len(rows):
+        finding += " Where it does not, take the Monte Carlo interval."
+    return {"finding": finding, "rows": rows}
 
 
 def _source(line: JSON) -> JSON:

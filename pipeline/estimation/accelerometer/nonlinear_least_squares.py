@@ -27,25 +27,32 @@ from pipeline.estimation.accelerometer.magnitude import (
     fit_ellipsoid,
 )
 from pipeline.estimation.accelerometer.orientations import orientations_of, without
-from pipeline.estimation.accelerometer.rest_scatter import RestErrors, rest_scatter
-from pipeline.estimation.budget import combined, gravity_contribution, noise_contribution, scatter_contribution
+from pipeline.estimation.accelerometer.rest_scatter import RestErrors, rest_candidates, rest_scatter
+from pipeline.estimation.budget import (
+    candidate_covariances,
+    combined,
+    gravity_contribution,
+    noise_contribution,
+    scatter_contribution,
+)
 from pipeline.estimation.least_squares import certified
 from pipeline.estimation.linear_map import LinearMap
 from pipeline.estimation.sample_blocks import make_blocks
 from pipeline.estimation.scaled_columns import estimate_weights, factorise
 from pipeline.estimation.serial_noise import assess_noise, prior_of
+from pipeline.estimation.trials import Errors, beside_trials, quadratic_results, trials_of, without_trials
 from pipeline.estimation.turns import Factors, table_motion
 from pipeline.records import SensorCalibration, StageResult
 from pipeline.records.calibration import coverage_factor
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
     from pipeline.estimation.accelerometer.magnitude import Ellipsoid
     from pipeline.estimation.accelerometer.orientations import Orientations
-    from pipeline.estimation.serial_noise import Prior
+    from pipeline.estimation.serial_noise import Prior, SerialNoise
     from pipeline.records import Recording
     from pipeline.records.budget import Contribution
     from pipeline.signal.rests import Rest
@@ -59,6 +66,7 @@ FALSE_ALARM = 1e-3  # probability of calling one of the rests of a sound recordi
 SMALLEST_OUTLIER_G = 1e-6
 FEWEST_TO_JUDGE = 18  # rests, two a parameter
 OUTLIER_SHARE = 0.2
+MOST_ROWS = 600  # of which a covariance is drawn
 
 
 def fit(
@@ -92,7 +100,8 @@ def fit(
     while refused := _outlier(orientations, found):
         orientations = without(orientations, refused)
         found = _fit_determined(orientations, gravity_g)
-    scatter = _scatter(orientations, found, prior_of("accelerometer", recordings, settings), settings["table"])
+    prior = prior_of("accelerometer", recordings, settings)
+    scatter = _scatter(orientations, found, prior, settings["table"])
     result = StageResult(
         name=NAME,
         parameters=_parameters(found, scatter.covariance),
@@ -112,7 +121,48 @@ def fit(
     )
     gravity = gravity_contribution("accelerometer", found.matrix, settings["table"], 12)
     lines = [scatter.placed(place), *([gravity] if gravity else [])]
-    return combined(calibration, lines, _not_included(gravity))
+    complete = combined(calibration, lines, _not_included(gravity))
+    trials = trials_of(settings)
+    if not trials:
+        return complete
+    errors = _row_errors(orientations, found, prior, settings["table"])
+    steps = _second_order(orientations, found)
+
+    def results(drawn: Values) -> Values:
+        values = np.tile(np.concatenate([found.bias, found.matrix.ravel()]), (len(drawn), 1))
+        return np.asarray(values + steps(drawn) @ place[:, found.free].T)
+
+    if isinstance(errors, str):
+        return without_trials(complete, errors)
+    return beside_trials(complete, errors.through(results), trials, lines[1:])
+
+
+def _row_errors(orientations: Orientations, found: Ellipsoid, prior: Prior, table: Mapping[str, Any]) -> Errors | str:
+    """Return the distribution of the rows' errors, or why there is none."""
+    rows, every = len(orientations.mean), np.eye(len(orientations.mean))
+    spare = found.fit.degrees_of_freedom
+    if rows > MOST_ROWS:
+        return f"{rows} readings of a continuous turn are too many equations to draw; it is made for rests"
+    if spare <= 1:
+        variance = orientations.variance + prior.wander**2
+        return Errors(np.ones(1), np.diag(variance)[None], float(3 * np.sum(orientations.count - 1)))
+    if orientations.by_hand and orientations.rests:
+        J = derivative_of(orientations.mean, found.values)[:, found.free]
+        weight, candidates = rest_candidates(_errors(orientations, found, J), every, prior)
+        return Errors(weight, candidates, np.inf)
+    noise, along = _table_noise(orientations, found, prior, table)
+    per_sample = np.where(np.arange(rows)[:, None] == orientations.row, 1.0 / orientations.count[orientations.row], 0.0)
+    x, y, z = (per_sample * along[orientations.row, c] for c in range(3))
+    return Errors(noise.weight, candidate_covariances(noise, LinearMap((x, y, z), (every, every, every))), noise.spare)
+
+
+def _second_order(orientations: Orientations, found: Ellipsoid) -> Callable[[Values], Values]:
+    """Return how errors of the rows move the fitted values."""
+    y, values, step = orientations.mean, found.values, 1e-5
+    moved = step * np.eye(9)[found.free]
+    slopes = [derivative_of(y, values + d)[:, found.free] - derivative_of(y, values - d)[:, found.free] for d in moved]
+    H = np.stack(slopes, axis=2) / (2.0 * step)
+    return quadratic_results(derivative_of(y, values)[:, found.free], H, np.diag(found.weight**2))
 
 
 def _not_included(gravity: Contribution | None) -> dict[str, str]:
@@ -239,17 +289,25 @@ def _serial_scatter(
     The error of a sample is its noise along the direction of gravity, ``n^T L noise``, so that the estimate is linear
     in the readings of each channel c with the weights ``J^+ (n^T L)_c``.
     """
-    row, y, L = orientations.row, orientations.mean, found.matrix
-    truth = (y - found.bias) @ L.T
-    along = (truth / np.linalg.norm(truth, axis=1, keepdims=True)) @ L
-    J = derivative_of(y, found.values)[:, found.free]
-    u = np.concatenate([_force(recording, table)[keep] for recording, keep in orientations.parts])
-    X, reading = np.column_stack([np.ones(len(u)), u]), orientations.reading()
-    noise = assess_noise(reading - X @ Factors.of(X).solve(reading), X, make_blocks(orientations.parts), prior)
+    row = orientations.row
+    J = derivative_of(orientations.mean, found.values)[:, found.free]
+    noise, along = _table_noise(orientations, found, prior, table)
     per_sample = (estimate_weights(J, found.weight) / orientations.count)[:, row]
     weights_x, weights_y, weights_z = (per_sample * along[row, c] for c in range(3))
     place = np.eye(9)[:, found.free]
     return noise_contribution(noise, LinearMap((weights_x, weights_y, weights_z), (place, place, place)), prior)
+
+
+def _table_noise(
+    orientations: Orientations, found: Ellipsoid, prior: Prior, table: Mapping[str, Any]
+) -> tuple[SerialNoise, Values]:
+    """Return the noise on the table, and ``n^T L`` of each row: (m, 3) array."""
+    L = found.matrix
+    truth = (orientations.mean - found.bias) @ L.T
+    along = (truth / np.linalg.norm(truth, axis=1, keepdims=True)) @ L
+    u = np.concatenate([_force(recording, table)[keep] for recording, keep in orientations.parts])
+    X, reading = np.column_stack([np.ones(len(u)), u]), orientations.reading()
+    return assess_noise(reading - X @ Factors.of(X).solve(reading), X, make_blocks(orientations.parts), prior), along
 
 
 def _force(recording: Recording, table: Mapping[str, Any]) -> Values:

@@ -82,6 +82,18 @@ def rest_scatter(rests: RestErrors, gain: Values, prior: Prior) -> Contribution:
         Of the bias wander.
     """
     spare = len(rests.error) - rests.derivative.shape[1]
+    weight, covariances = rest_candidates(rests, gain, prior)
+    covariance, freedom = averaged(weight, covariances, float("inf"))
+    parts = {
+        "white noise": np.sqrt(np.minimum(np.diag(gain * rests.variance @ gain.T), np.diag(covariance))),
+    }
+    parts["bias wander and scatter of the rests"] = np.sqrt(np.diag(covariance) - parts["white noise"] ** 2)
+    whole = scatter_contribution(covariance, float(spare), parts)
+    return whole.with_freedom(freedom)
+
+
+def rest_candidates(rests: RestErrors, gain: Values, prior: Prior) -> tuple[Values, Values]:
+    """Return the weight of each candidate of the noise, (k,), and the covariance of ``gain @ errors``, (k, p, p)."""
     Q = np.linalg.qr(rests.derivative, mode="complete")[0][:, rests.derivative.shape[1] :]
     z = Q.T @ rests.error
     tremors = np.append(0.0, max(rests.between, 0.3 * float(np.sqrt(np.median(rests.variance)))) * TREMORS)
@@ -98,13 +110,7 @@ def rest_scatter(rests: RestErrors, gain: Values, prior: Prior) -> Contribution:
             scores.append(_restricted_likelihood(z, Q.T @ (own[:, None] * Q), Q.T @ B @ Q, wanders**2) + belief + none)
             covariances.append(gain * own @ gain.T + (wanders**2)[:, None, None] * slow)
     weight = np.exp(np.concatenate(scores) - np.max(scores))
-    covariance, freedom = averaged(weight / weight.sum(), np.concatenate(covariances), float("inf"))
-    parts = {
-        "white noise": np.sqrt(np.minimum(np.diag(gain * rests.variance @ gain.T), np.diag(covariance))),
-    }
-    parts["bias wander and scatter of the rests"] = np.sqrt(np.diag(covariance) - parts["white noise"] ** 2)
-    whole = scatter_contribution(covariance, float(spare), parts)
-    return whole.with_freedom(freedom)
+    return weight / weight.sum(), np.concatenate(covariances)
 
 
 def _restricted_likelihood(z: Values, D: Values, E: Values, variances: Values) -> Values:

@@ -111,7 +111,11 @@ def fit_stage(
         return combined(found, [scatter.of(kept)], {"everything but noise": AS_PRINTED})
     motions = [motion for turn in turns for motion in turn.motions]
     reference = Reference("accelerometer", motions, fit.results(kept), np.diag(chain.k), settings["table"])
-    return budgeted(found, reference, noise, [scatter.of(kept)], settings)
+
+    def results(errors: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.array([run(extremes_of_sinusoids(_moved(sinusoids, e))).vector()[kept] for e in errors])
+
+    return budgeted(found, reference, noise, [scatter.of(kept)], settings, results)
 
 
 def _parameters(chain: Chain, covariance: NDArray[np.float64]) -> dict[str, dict[str, Any]]:
@@ -167,6 +171,17 @@ def _stages_before(previous: SensorCalibration | None) -> list[str]:
 
 def _coefficients(sinusoids: Sequence[Sequence[Sinusoid]]) -> list[list[NDArray[np.float64]]]:
     return [[sinusoid.coefficients for sinusoid in turn] for turn in sinusoids]
+
+
+def _moved(sinusoids: Sequence[Sequence[Sinusoid]], errors: NDArray[np.float64]) -> list[list[NDArray[np.float64]]]:
+    """Return the coefficients with errors, which come channel by channel and in these turn by turn."""
+    moved, at = [[s.coefficients.copy() for s in turn] for turn in sinusoids], 0
+    for channel in range(3):
+        for turn in moved:
+            size = len(turn[channel])
+            turn[channel] += errors[at : at + size]
+            at += size
+    return moved
 
 
 def _noise(turns: Sequence[Turn], prior: Prior) -> SerialNoise:

@@ -36,6 +36,7 @@ from pipeline.estimation.budget import noise_contribution, scatter_contribution
 from pipeline.estimation.gyroscope.integrated_turns import require_turns, turns_of
 from pipeline.estimation.least_squares import certified, solve_linear
 from pipeline.estimation.linear_map import LinearMap
+from pipeline.estimation.reference import inverted
 from pipeline.estimation.sample_blocks import make_blocks
 from pipeline.estimation.serial_noise import assess_noise, prior_of
 from pipeline.estimation.table_inputs import Reference
@@ -140,7 +141,15 @@ def fit(
     if np.any(given):
         before = np.inf if previous.freedom is None else float(previous.freedom[:3].min())
         lines.append(replace(scatter_contribution(given[kept, kept], before), source="bias of the stage before"))
-    return budgeted(found, reference, noise, lines, settings)
+    theta = np.column_stack([previous.bias, A])
+
+    def results(errors: Values) -> Values:
+        values = theta.ravel() + errors
+        channels = values.reshape(len(values), 3, 4)
+        plain = np.concatenate([channels[:, :, 0], channels[:, :, 1:].reshape(-1, 9)], axis=1)
+        return plain if as_printed else inverted(values)
+
+    return budgeted(found, reference, noise, lines, settings, results)
 
 
 def factorise(A: Values) -> Factors:

@@ -101,7 +101,7 @@ def fit(
         converged=found.converged,
         convergence=certified(found.cosine, found.condition, found.rank, len(found.covariance)),
     )
-    return budgeted_by_hand(calibration, found.covariance, found.degrees_of_freedom, settings["table"])
+    return budgeted_by_hand(calibration, found.covariance, found.degrees_of_freedom, model, found, settings)
 
 
 def _require_determined(base: NDArray[np.float64]) -> None:

@@ -140,7 +140,11 @@ def fit_stage(
     )
     kept, K = slice(0, 12), np.asarray(np.linalg.solve(matrix, np.eye(3)))
     reference = Reference("gyroscope", samples.motions, fit.results(kept), K, settings["table"])
-    return budgeted(found, reference, noise, [scatter.of(kept)], settings)
+
+    def results(errors: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.array([run(theta + e.reshape(3, 4).T).vector()[kept] for e in errors])
+
+    return budgeted(found, reference, noise, [scatter.of(kept)], settings, results)
 
 
 def follow(response: Response, names: Sequence[str], *, as_printed: bool) -> Chain:

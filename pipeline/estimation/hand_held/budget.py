@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.estimation.budget import combined, gravity_contribution, scatter_contribution, type_b
+from pipeline.estimation.hand_held.trials import tried_by_hand
+from pipeline.estimation.trials import trials_of
 from pipeline.records.budget import NORMAL
 
 if TYPE_CHECKING:
@@ -14,6 +16,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from pipeline.estimation.hand_held.fit import HandFit
+    from pipeline.estimation.hand_held.model import Model
     from pipeline.records import SensorCalibration
 
 REMARK = {
@@ -28,11 +32,13 @@ NOT_INCLUDED = {
 }
 
 
-def budgeted_by_hand(
+def budgeted_by_hand(  # noqa: PLR0917  (what a fit by hand is)
     calibration: SensorCalibration,
     covariance: NDArray[np.float64],
     degrees_of_freedom: NDArray[np.float64],
-    table: Mapping[str, Any],
+    model: Model,
+    found: HandFit,
+    settings: Mapping[str, Any],
 ) -> SensorCalibration:
     """Return a calibration by hand with its uncertainty budget.
 
@@ -42,10 +48,12 @@ def budgeted_by_hand(
     covariance : (p, p) array
         Of all parameters, as the residuals tell it.
     degrees_of_freedom : (p,) array
-    table : mapping
-        ``gravity_g``, ``gravity_accuracy_g``, ``clock_accuracy_ppm``.
+    model : Model
+    found : HandFit
+    settings : mapping
+        Sections ``table`` (``gravity_g``, ``gravity_accuracy_g``, ``clock_accuracy_ppm``) and ``uncertainty``.
     """
-    sensor, size = calibration.sensor, len(calibration.parameter_names())
+    sensor, size, table = calibration.sensor, len(calibration.parameter_names()), settings["table"]
     scatter = scatter_contribution(covariance, np.inf, remark=REMARK[sensor])
     lines = [scatter.with_freedom(degrees_of_freedom)]
     missing = dict(NOT_INCLUDED)
@@ -61,4 +69,5 @@ def budgeted_by_hand(
         lines.append(type_b("time base", NORMAL, float(table["clock_accuracy_ppm"]), "ppm", effect))
     if sensor == "gyroscope":
         missing["Earth's rotation"] = "not in the model: by hand nobody knows the heading; up to 0.0042 deg/s of bias"
-    return combined(calibration, lines, missing)
+    complete, trials = combined(calibration, lines, missing), trials_of(settings)
+    return tried_by_hand(complete, model, found, trials, lines[1:]) if trials else complete

@@ -71,6 +71,10 @@ class HandFit:
     condition : float
     cosine : float
         Largest between the whitened residual and a column, with what is believed of the parameters.
+    candidates : tuple of (HandNoise, float, float)
+        Every noise that is believed, its weight, and its k.
+    precision : (b + p,) array
+        P.
     """
 
     state: State
@@ -85,6 +89,8 @@ class HandFit:
     converged: bool
     condition: float
     cosine: float
+    candidates: tuple[tuple[HandNoise, float, float], ...]
+    precision: Values
 
 
 @dataclass(frozen=True)
@@ -205,6 +211,8 @@ def _assessed(
         *how,
         every[best].condition,
         every[best].cosine,
+        tuple((noise, float(w), s.scale) for noise, w, s in zip(noises, weight, every, strict=True)),
+        limits.precision,
     )
 
 

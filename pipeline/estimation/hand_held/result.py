@@ -102,11 +102,11 @@ def fit_effects_by_hand(
             f"record at least {found.rank + 10} rests in as many orientations"
         )
     require_observable(model, found, limits)
-    return calibration_of(model, found, before, settings["table"])
+    return calibration_of(model, found, before, settings)
 
 
 def calibration_of(
-    model: Model, found: HandFit, before: SensorCalibration, table: Mapping[str, Any]
+    model: Model, found: HandFit, before: SensorCalibration, settings: Mapping[str, Any]
 ) -> SensorCalibration:
     """Return a fit as a calibration with the stage ``effects``."""
     covariance = found.covariance
@@ -148,4 +148,4 @@ def calibration_of(
         converged=found.converged,
         convergence=certified(found.cosine, found.condition, found.rank, len(found.covariance)),
     )
-    return budgeted_by_hand(calibration, covariance, freedom, table)
+    return budgeted_by_hand(calibration, covariance, freedom, model, found, settings)
