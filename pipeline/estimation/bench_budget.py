@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from pipeline.estimation.budget import candidate_covariances, combined, quantisation
 from pipeline.estimation.table_inputs import table_contributions
 from pipeline.estimation.trials import Errors, beside_trials, trials_of
@@ -15,6 +13,7 @@ from pipeline.records.calibration import UNITS
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
+    import numpy as np
     from numpy.typing import NDArray
 
     from pipeline.estimation.serial_noise import SerialNoise
@@ -28,7 +27,7 @@ TEMPERATURE = "the parameters hold at the temperature of these recordings; no ac
 TIME_BASE = "the table logs angle and rate itself, so that a wrong clock changes neither"
 
 
-def budgeted(
+def budgeted(  # noqa: PLR0917  (what a fit on a table is)
     calibration: SensorCalibration,
     reference: Reference,
     noise: SerialNoise,

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.estimation.design import Term
-from pipeline.estimation.hand_held.model import State
 from pipeline.estimation.trials import beside_trials, normal, quadratic_results
 
 if TYPE_CHECKING:
@@ -22,7 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.estimation.hand_held.fit import HandFit
-    from pipeline.estimation.hand_held.model import Model
+    from pipeline.estimation.hand_held.model import Model, State
     from pipeline.records import SensorCalibration
     from pipeline.records.budget import Contribution
 
@@ -57,7 +56,7 @@ def tried_by_hand(
     candidates = [np.eye(len(X)) for _ in found.candidates]
     for covariance, (noise, _, scale) in zip(candidates, found.candidates, strict=True):
         covariance[:n, :n] = scale * equations.covariance(noise)
-    solvers = [quadratic_results(X, H, np.linalg.pinv(covariance, hermitian=True)) for covariance in candidates]
+    solvers = [quadratic_results(X, H, np.asarray(np.linalg.pinv(c, hermitian=True), float)) for c in candidates]
     weight = np.array([w for _, w, _ in found.candidates])
     place = np.zeros((12 + p - base, p))
     place[:12, :base], place[12:, base:] = model.directions, np.eye(p - base)
