@@ -39,6 +39,10 @@ localrules:
 
 onstart:
     begin_run()
+    if workflow.local_exec:
+        # Snakemake's limit of jobs a second wakes its scheduler once a second for every job that has run: in a fleet,
+        # a hundred times a second (snakemake/snakemake, issue 2967).
+        workflow.scheduler.job_rate_limiter = None
 
 
 onsuccess:
