@@ -36,7 +36,7 @@ from pipeline.estimation.least_squares import certificate
 from pipeline.estimation.linear_map import LinearMap
 from pipeline.estimation.sample_blocks import make_blocks
 from pipeline.estimation.serial_noise import assess_noise, prior_of
-from pipeline.estimation.table_inputs import Reference
+from pipeline.estimation.table_inputs import Reference, disturbance
 from pipeline.estimation.turns import Factors, parts_of, settled
 from pipeline.model.effects.base import truth
 from pipeline.records import AXES, SensorCalibration, StageResult
@@ -95,10 +95,12 @@ def fit_reference(
     residuals = y - X @ beta
     blocks = make_blocks([(part.recording, part.keep) for part in parts])
     prior = prior_of(sensor, recordings, settings)
-    noise = assess_noise(residuals, X, blocks, prior)
     bias, K = beta[0], beta[1:].T
     matrix = np.asarray(np.linalg.solve(K, np.eye(3)), float)
     fit = _linear_map(factors.weights(), matrix)
+    motions = [part.motion.select(part.keep) for part in parts]
+    reference = Reference(sensor, motions, fit, K, settings["table"])
+    noise = assess_noise(residuals, X, blocks, prior, disturbance(reference, residuals, blocks))
     contributions = [noise_contribution(noise, fit, prior)]
     result = StageResult(
         name=NAME,
@@ -121,8 +123,6 @@ def fit_reference(
         stages=(*(previous.stages if previous else ()), result),
         convergence=certificate(X, residuals, condition, rank),
     )
-    motions = [part.motion.select(part.keep) for part in parts]
-    reference = Reference(sensor, motions, fit, K, settings["table"])
 
     def results(errors: NDArray[np.float64]) -> NDArray[np.float64]:
         return inverted(beta.T.ravel() + errors)

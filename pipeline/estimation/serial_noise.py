@@ -21,6 +21,9 @@ they are not picked: each point of a grid is weighted by its restricted likeliho
 1971) times a prior about the data sheet or, sharper, about what a static recording says, and C is averaged
 (``pipeline.estimation.averaged_covariance``).
 
+On a table whose stated accuracies are worse than the noise, the residuals show its errors, which have lines of their
+own in the budget. So the directions in which they exceed white noise are taken out of all channels together before.
+
 One eigendecomposition of R, projected on what the fit cannot reach, gives the likelihood of a tau at every q.
 """
 
@@ -32,6 +35,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import NotObservableError
+from pipeline.records.neighbours import noise_of_steps
 from pipeline.signal.noise import noise_of
 
 if TYPE_CHECKING:
@@ -185,7 +189,11 @@ class SerialNoise:
 
 
 def assess_noise(
-    residuals: NDArray[np.float64], design: NDArray[np.float64], blocks: Blocks, prior: Prior
+    residuals: NDArray[np.float64],
+    design: NDArray[np.float64],
+    blocks: Blocks,
+    prior: Prior,
+    disturbance: NDArray[np.float64] | None = None,
 ) -> SerialNoise:
     """Weight candidate noises by the residuals of a fit.
 
@@ -196,6 +204,8 @@ def assess_noise(
         Columns that were fitted; those of one channel may be more than its own.
     blocks : Blocks
     prior : Prior
+    disturbance : (3 b, m) array, optional
+        What the table's stated errors do to the sums over the blocks, channel by channel.
 
     Returns
     -------
@@ -215,12 +225,22 @@ def assess_noise(
     root = np.sqrt(blocks.count)[:, None]
     Q = _complement(root * (blocks.sums(design) / blocks.count[:, None]), design)
     z = Q.T @ (blocks.sums(residuals) / root)
-    white = float(np.sqrt(np.mean(residuals**2)))
-    belief = prior.log_belief(RATIOS * white)
+    size, seen = np.sqrt(np.mean(residuals**2, axis=0)), None
+    if disturbance is not None:
+        size = noise_of_steps(np.abs(np.diff(residuals, axis=0)))
+        seen = _undisturbed(Q, disturbance.reshape(3, len(root), -1) / (size[:, None, None] * root))
+        z = seen.T @ (z / size).T.reshape(-1, 1)
+        spare = len(z)
+    belief = prior.log_belief(RATIOS * float(np.sqrt(np.mean(size**2))))
     correlation = {factor * prior.time: blocks.correlation(factor * prior.time) for factor in TIMES}
     scores, variances = [], []
     for R, believed in zip(correlation.values(), TIME_PRIOR, strict=True):
-        score, variance = _restricted_likelihood(z, Q.T @ (root * R * root.T) @ Q)
+        E = Q.T @ (root * R * root.T) @ Q
+        if seen is None:
+            score, variance = _restricted_likelihood(z, E)
+        else:
+            score, variance = _restricted_likelihood(z, seen.T @ np.kron(np.eye(3), E) @ seen)
+            variance = variance * size**2
         scores.append(score + belief + np.log(believed))
         variances.append(variance)
     weight = np.exp(np.concatenate(scores) - np.max(scores))
@@ -245,6 +265,25 @@ def _complement(means: NDArray[np.float64], design: NDArray[np.float64]) -> NDAr
     size = np.sqrt(np.mean(design**2, axis=0))
     U, s, _ = np.linalg.svd(means / np.where(size > 0, size, 1.0), full_matrices=True)
     return U[:, int(np.sum(s > AVERAGED_OUT * s[0])) :]
+
+
+def _undisturbed(Q: NDArray[np.float64], disturbance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return an orthonormal basis of all channels' block means in which a table's errors are below white noise.
+
+    Parameters
+    ----------
+    Q : (b, k) array
+        Basis of what the fit does not reach in one channel.
+    disturbance : (3, b, m) array
+        Over white noise.
+
+    Returns
+    -------
+    (3 k, r) array
+    """
+    U, s, _ = np.linalg.svd(np.concatenate([Q.T @ channel for channel in disturbance]), full_matrices=True)
+    hidden = min(int(np.sum(s > 1.0)), len(U) - 1)
+    return np.asarray(U[:, hidden:])
 
 
 def _restricted_likelihood(

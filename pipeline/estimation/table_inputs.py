@@ -16,17 +16,19 @@ An attitude log has no stops: its angle errors are three constant turns of each 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pipeline.estimation.budget import type_b
+from pipeline.estimation.linear_map import LinearMap
 from pipeline.model.effects import effect
 from pipeline.model.effects.base import truth
 from pipeline.model.kinematics import earth_rate
 from pipeline.model.rotation import ABOUT
 from pipeline.records.budget import NORMAL
+from pipeline.records.neighbours import noise_of_steps
 from pipeline.signal.rests import RATE_AT_REST_DPS
 
 if TYPE_CHECKING:
@@ -34,7 +36,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.estimation.linear_map import LinearMap
+    from pipeline.estimation.sample_blocks import Blocks
     from pipeline.records import Motion
     from pipeline.records.budget import Contribution
 
@@ -51,6 +53,8 @@ FIELDS = {
     "local gravity": ("gravity_accuracy_g", "g"),
     "Earth's rotation": ("azimuth_accuracy_deg", "deg"),
 }
+TILTS = ("angle_accuracy_deg", "orthogonality_deg", "wobble_deg", "levelling_deg")
+ROUNDING = 1e-9
 IDLE = {  # sensors whose readings an input does not change
     "table rate": (),
     "levelling": ("gyroscope",),
@@ -143,6 +147,43 @@ def table_contributions(
         elif u:
             found.append(type_b(source, NORMAL, float(u), unit, effects[source](reference)))
     return found, missing
+
+
+def disturbance(reference: Reference, residuals: Values, blocks: Blocks) -> Values | None:
+    """Return what the stated accuracies do to the sums over blocks: (3 b, m) array; None where noise hides it.
+
+    Parameters
+    ----------
+    reference : Reference
+        Its linear map is not looked at.
+    residuals : (n, 3) array
+    blocks : Blocks
+    """
+    white = float(noise_of_steps(np.abs(np.diff(residuals, axis=0))).min())
+    if not 0.0 < white < _largest(reference) * np.sqrt(blocks.count.max()):
+        return None
+    sums = np.zeros((len(blocks.count), len(residuals)))
+    sums[blocks.label, np.arange(len(residuals))] = 1.0
+    x, y, z = np.eye(3 * len(sums)).reshape(3, len(sums), -1).transpose(0, 2, 1)
+    contributions, _ = table_contributions(replace(reference, fit=LinearMap((sums, sums, sums), (x, y, z))))
+    e, U = np.linalg.eigh(np.sum([c.covariance for c in contributions], axis=0))
+    kept = e > ROUNDING * e[-1]
+    columns: Values = U[:, kept] * np.sqrt(e[kept])
+    return columns
+
+
+def _largest(reference: Reference) -> float:
+    """Return about the largest error of the truth that the stated accuracies make, g or deg/s."""
+    table, size = reference.table, 0.0
+    tilt = np.radians(max(float(table.get(key) or 0.0) for key in TILTS))
+    for motion in reference.motions:
+        u = truth(reference.sensor, motion)
+        size = max(size, tilt * float(np.abs(u).max()))
+        if reference.sensor == "gyroscope" and motion.angle is not None and motion.rate is not None:
+            slope = float(np.abs(motion.rate * _between_stops(motion.angle, motion.rate)[2]).max())
+            size = max(size, slope * float(table.get("angle_accuracy_deg") or 0.0))
+            size = max(size, float(np.abs(motion.rate).max()) * float(table.get("rate_accuracy") or 0.0))
+    return size
 
 
 def _without(source: str, key: str, table: Mapping[str, Any]) -> str:

@@ -40,6 +40,7 @@ from pipeline.estimation.linear_map import LinearMap
 from pipeline.estimation.sample_blocks import make_blocks
 from pipeline.estimation.scaled_columns import estimate_weights, factorise
 from pipeline.estimation.serial_noise import assess_noise, prior_of
+from pipeline.estimation.table_inputs import Reference, disturbance
 from pipeline.estimation.trials import Errors, beside_trials, quadratic_results, trials_of, without_trials
 from pipeline.estimation.turns import Factors, table_motion
 from pipeline.records import SensorCalibration, StageResult
@@ -53,7 +54,7 @@ if TYPE_CHECKING:
     from pipeline.estimation.accelerometer.magnitude import Ellipsoid
     from pipeline.estimation.accelerometer.orientations import Orientations
     from pipeline.estimation.serial_noise import Prior, SerialNoise
-    from pipeline.records import Recording
+    from pipeline.records import Motion, Recording
     from pipeline.records.budget import Contribution
     from pipeline.signal.rests import Rest
 
@@ -305,15 +306,20 @@ def _table_noise(
     L = found.matrix
     truth = (orientations.mean - found.bias) @ L.T
     along = (truth / np.linalg.norm(truth, axis=1, keepdims=True)) @ L
-    u = np.concatenate([_force(recording, table)[keep] for recording, keep in orientations.parts])
+    motions = [_motion(recording, table).select(keep) for recording, keep in orientations.parts]
+    u = np.concatenate([motion.specific_force for motion in motions])
     X, reading = np.column_stack([np.ones(len(u)), u]), orientations.reading()
-    return assess_noise(reading - X @ Factors.of(X).solve(reading), X, make_blocks(orientations.parts), prior), along
+    factors, blocks = Factors.of(X), make_blocks(orientations.parts)
+    beta, A, every = factors.solve(reading), factors.weights(), np.eye(4)
+    residuals = reading - X @ beta
+    reference = Reference("accelerometer", motions, LinearMap((A, A, A), (every, every, every)), beta[1:].T, table)
+    return assess_noise(residuals, X, blocks, prior, disturbance(reference, residuals, blocks)), along
 
 
-def _force(recording: Recording, table: Mapping[str, Any]) -> Values:
+def _motion(recording: Recording, table: Mapping[str, Any]) -> Motion:
     motion = table_motion(recording, table)
     assert motion is not None  # noqa: S101
-    return motion.specific_force
+    return motion
 
 
 def _parameters(found: Ellipsoid, covariance: Values) -> dict[str, dict[str, Any]]:

@@ -30,7 +30,7 @@ from pipeline.estimation.least_squares import certificate, certified
 from pipeline.estimation.linear_map import LinearMap
 from pipeline.estimation.sample_blocks import make_blocks
 from pipeline.estimation.serial_noise import assess_noise, prior_of
-from pipeline.estimation.table_inputs import Reference
+from pipeline.estimation.table_inputs import Reference, disturbance
 from pipeline.estimation.turns import Factors, parts_of
 from pipeline.model.effects.scale_factor_asymmetry import EFFECT
 from pipeline.records import FittedEffect, SensorCalibration, StageResult
@@ -81,13 +81,13 @@ def fit_stage(
     turns = turns_of(parts, as_printed=as_printed)
     sinusoids = sinusoids_of(turns)
     prior = prior_of("accelerometer", recordings, settings)
-    noise = _noise(turns, prior)
 
     def run(extremes: Extremes) -> Chain:
         return follow(extremes, names, gravity_g, as_printed=as_printed)
 
     chain = run(extremes_of_samples(turns) if as_printed else extremes_of_sinusoids(_coefficients(sinusoids)))
     fit = _linear_map(sinusoids, run)
+    noise = _noise(turns, fit, prior, settings["table"])
     scatter = _resampled(turns, sinusoids, noise, run) if as_printed else noise_contribution(noise, fit, prior)
     after = apply_correction({"steps": chain.steps}, np.concatenate([turn.reading for turn in turns]))
     result = StageResult(
@@ -184,16 +184,20 @@ def _moved(sinusoids: Sequence[Sequence[Sinusoid]], errors: NDArray[np.float64])
     return moved
 
 
-def _noise(turns: Sequence[Turn], prior: Prior) -> SerialNoise:
+def _noise(turns: Sequence[Turn], fit: LinearMap, prior: Prior, table: Mapping[str, Any]) -> SerialNoise:
     """Return what all turns together say of the noise: the residuals of ``y = b + K u + C |u|``.
 
     A sinusoid of its own for each turn and channel would take up the wander from turn to turn.
     """
-    u = np.concatenate([motion.specific_force for turn in turns for motion in turn.motions])
+    motions = [motion for turn in turns for motion in turn.motions]
+    u = np.concatenate([motion.specific_force for motion in motions])
     reading = np.concatenate([turn.reading for turn in turns])
     X = np.column_stack([np.ones(len(u)), u, np.abs(u)])
     blocks = make_blocks([used for turn in turns for used in turn.used])
-    return assess_noise(reading - X @ Factors.of(X).solve(reading), X, blocks, prior)
+    beta = Factors.of(X).solve(reading)
+    residuals = reading - X @ beta
+    disturbed = disturbance(Reference("accelerometer", motions, fit, beta[1:4].T, table), residuals, blocks)
+    return assess_noise(residuals, X, blocks, prior, disturbed)
 
 
 def _side_by_side(matrices: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:

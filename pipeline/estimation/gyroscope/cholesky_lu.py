@@ -39,7 +39,7 @@ from pipeline.estimation.linear_map import LinearMap
 from pipeline.estimation.reference import inverted
 from pipeline.estimation.sample_blocks import make_blocks
 from pipeline.estimation.serial_noise import assess_noise, prior_of
-from pipeline.estimation.table_inputs import Reference
+from pipeline.estimation.table_inputs import Reference, disturbance
 from pipeline.estimation.turns import parts_of
 from pipeline.records import AXES, SensorCalibration, StageResult
 
@@ -107,8 +107,9 @@ def fit(
     residuals = turns.reading - previous.bias - turns.rate @ A.T
     design = np.column_stack([np.ones(len(turns.rate)), turns.rate])
     prior = prior_of("gyroscope", recordings, settings)
-    noise = assess_noise(residuals, design, make_blocks(turns.parts), prior)
     fit, given = _linear_map(turns, A, previous, as_printed=as_printed)
+    reference, blocks = Reference("gyroscope", turns.motions, fit, A, settings["table"]), make_blocks(turns.parts)
+    noise = assess_noise(residuals, design, blocks, prior, disturbance(reference, residuals, blocks))
     scatter = noise_contribution(noise, fit, prior)
     matrix = _matrix(A, as_printed=as_printed)
     result = StageResult(

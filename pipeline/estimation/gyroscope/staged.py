@@ -23,7 +23,7 @@ from pipeline.estimation.gyroscope.response import Response, samples_of, weights
 from pipeline.estimation.least_squares import certified
 from pipeline.estimation.linear_map import LinearMap
 from pipeline.estimation.serial_noise import assess_noise, prior_of
-from pipeline.estimation.table_inputs import Reference
+from pipeline.estimation.table_inputs import Reference, disturbance
 from pipeline.estimation.turns import parts_of
 from pipeline.records import SensorCalibration, StageResult
 
@@ -105,13 +105,15 @@ def fit_stage(
     prior = prior_of("gyroscope", recordings, settings)
     design = np.column_stack([np.ones(len(samples.rate)), samples.rate[:, samples.speed > 0]])
     residuals = samples.reading - theta[0] - samples.rate @ theta[1:]
-    noise = assess_noise(residuals, design, samples.blocks, prior)
 
     def run(values: NDArray[np.float64]) -> Chain:
         return follow(Response(values[0], values[1:], samples.speed), names, as_printed=as_printed)
 
     chain = run(theta)
     fit = _linear_map(theta, weights, run)
+    reference = Reference("gyroscope", samples.motions, fit, theta[1:].T, settings["table"])
+    disturbed = disturbance(reference, residuals, samples.blocks)
+    noise = assess_noise(residuals, design, samples.blocks, prior, disturbed)
     scatter = noise_contribution(noise, fit, prior)
     after = apply_correction({"steps": chain.steps}, samples.reading)
     error = np.linalg.norm(after, axis=1) - np.linalg.norm(samples.rate, axis=1)

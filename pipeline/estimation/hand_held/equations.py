@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.estimation.serial_noise import SURE
 from pipeline.estimation.wandering import settings_for
 from pipeline.signal.wander import block_covariance
 
@@ -173,5 +174,6 @@ def noises_about(prior: Prior, white: float, kinds: int) -> list[HandNoise]:
     wander = np.append(0.0, prior.wander * FACTORS if known else white * np.array(RATIOS))
     pairs = zip((wander / white).tolist(), prior.log_belief(wander).tolist(), strict=True)
     believed = [(ratio, belief) for ratio, belief in pairs if np.isfinite(belief)]
-    levels = list(product(FINE, repeat=kinds))
-    return [HandNoise(ratio, prior.time, level, belief) for ratio, belief in believed for level in levels]
+    none = float(np.log(SURE * (len(FINE) - 1)))  # as nobody states a scatter, none at all is believed before any
+    levels = [(level, none * level.count(0.0)) for level in product(FINE, repeat=kinds)]
+    return [HandNoise(ratio, prior.time, level, belief + b) for ratio, belief in believed for level, b in levels]

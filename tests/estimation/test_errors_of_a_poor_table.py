@@ -1,0 +1,66 @@
+"""A table whose stated errors are many times the noise: its errors count once, against simulated truth."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from pipeline.estimation.accelerometer import nonlinear_least_squares
+from pipeline.estimation.reference import fit_reference
+from pipeline.simulation.campaign import simulate_unit
+from pipeline.simulation.description import UnitDescription, read_config
+
+if TYPE_CHECKING:
+    from pipeline.records import Recording, SensorCalibration
+
+UNITS = 10
+COURSE = {"dwell_s": 1.2, "rates_dps": [60.0], "static_s": 0.0, "validation_s": 0.0}
+SETTINGS = {
+    "sensor": read_config("sensor", "mpu6050"),
+    "table": read_config("table", "mark2"),
+    "procedure": {"holdout_every": 0},
+}
+
+
+@cache
+def _unit(number: int) -> tuple[list[Recording], dict[str, Any]]:
+    unit = UnitDescription("U", table="mark2", procedure="three_axis_turns", course=COURSE)
+    return simulate_unit(unit, 8, number)
+
+
+def _ratios(found: list[SensorCalibration], true: list[np.ndarray]) -> np.ndarray:
+    """Return stated uncertainty over the errors' size for each parameter, over all units."""
+    errors = [np.append(f.bias, f.matrix) - t for f, t in zip(found, true, strict=True)]
+    stated = [np.diag(f.covariance) for f in found if f.covariance is not None]
+    size = np.mean(np.square(errors), axis=0)
+    return np.sqrt(np.mean(stated, axis=0)[size > 0.0] / size[size > 0.0])
+
+
+@pytest.mark.parametrize(("sensor", "shown"), [("accelerometer", 3.0), ("gyroscope", 1.0)])
+def test_the_noise_of_the_readings_is_the_sensor_s_and_not_the_table_s(sensor: str, shown: float) -> None:
+    found = [fit_reference(sensor, _unit(n)[0], None, SETTINGS) for n in range(UNITS)]
+    white = np.array([f.stages[-1].details["white_noise"] for f in found])
+    true = _unit(0)[1][sensor]["noise"]["white"]
+    residual = np.array([f.stages[-1].details["residual_rms"] for f in found])
+    assert residual.mean() > shown * true
+    assert white.mean() == pytest.approx(true, rel=0.1)
+    truths = [_unit(n)[1][sensor] for n in range(UNITS)]
+    ratios = _ratios(found, [np.append(t["bias"], t["matrix"]) for t in truths])
+    assert ratios.max() < 2.2
+    assert np.median(ratios) == pytest.approx(1.0, abs=0.3)
+
+
+def test_the_length_of_gravity_is_not_charged_with_errors_of_the_attitude() -> None:
+    found = [nonlinear_least_squares.fit(_unit(n)[0], None, SETTINGS) for n in range(UNITS)]
+    true = []
+    for n in range(UNITS):
+        hidden = _unit(n)[1]["accelerometer"]
+        flipped, _ = np.linalg.qr(np.array(hidden["matrix"])[:, ::-1])
+        frame = flipped[:, ::-1] * np.sign(np.diag(flipped[:, ::-1].T @ np.array(hidden["matrix"])))
+        true.append(np.append(hidden["bias"], np.tril(frame.T @ np.array(hidden["matrix"]))))
+    ratios = _ratios(found, true)
+    assert ratios.max() < 2.2
+    assert np.median(ratios) == pytest.approx(1.0, abs=0.3)
