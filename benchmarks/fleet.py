@@ -76,6 +76,7 @@ def _run(folder: str, cores: int) -> float:
     Path(folder, "sitecustomize.py").write_text(TELL, encoding="utf-8")
     paths = [folder, *filter(None, [os.environ.get("PYTHONPATH")])]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths), "FLEET_TOLD": str(told)}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)  # an installed package is not compiled at each start
     command = [sys.executable, "-m", "snakemake", "-s", str(ROOT / "Snakefile"), "--cores", str(cores)]
     before, start = _cpu(), time.perf_counter()
     done = subprocess.run(  # noqa: PLW1510  (its own words are shown below)

@@ -83,7 +83,7 @@ class _Blocks:
 
     def __init__(self, stream: BufferedReader, size: int, seen: Callable[[memoryview], None]) -> None:
         self.stream, self.size, self.seen = stream, size, seen
-        self.buffer = bytearray(2 * BLOCK_BYTES)
+        self.buffer = bytearray(min(2 * BLOCK_BYTES, size))
         self.rest = 0  # bytes of a line that is not complete yet, at the buffer's beginning
 
     def __iter__(self) -> Iterator[memoryview]:

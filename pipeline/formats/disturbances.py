@@ -24,6 +24,7 @@ import numpy as np
 
 from pipeline.formats.marks import GAP, UNIT_NAMES
 from pipeline.records.attitude import conjugate_product, continuous, level_in_body
+from pipeline.records.median import median
 from pipeline.records.neighbours import noise_of_steps
 
 if TYPE_CHECKING:
@@ -119,7 +120,7 @@ def disturbed(recording: Recording) -> tuple[Array, list[tuple[str, str]]]:
         for n in _beside(jumps, recording.samples):
             window, resting = motion.around(n)
             around = values[window, column]
-            middle = float(np.median(around))
+            middle = float(median(around))
             scatter = usual if resting and usual is not None else _scatter(around)
             scatter = max(float(noise[column]), scatter)
             off = abs(float(values[n, column]) - middle) - BEYOND * scatter - ALLOWED * float(allowed[n])
@@ -136,7 +137,7 @@ def _noise(step: Array) -> Array:
 
 
 def _scatter(values: Array) -> float:
-    return MEDIAN_SIZE * float(np.median(np.abs(values - np.median(values))))
+    return MEDIAN_SIZE * float(median(np.abs(values - median(values))))
 
 
 def _beside(jumps: NDArray[np.intp], samples: int) -> NDArray[np.intp]:
@@ -196,7 +197,7 @@ class _Motion:
             return np.append(rate, rate[-1])[:, None]
         if self._static():
             return np.zeros((r.samples, 1))
-        return None if r.gyroscope is None else r.gyroscope - np.median(r.gyroscope, axis=0)
+        return None if r.gyroscope is None else r.gyroscope - median(r.gyroscope)
 
     def unexplained(self, sensor: str, reading: Array) -> Array:
         """Return what the log does not explain of a sensor's readings: (n, 3) array."""

@@ -17,6 +17,7 @@ import numpy as np
 
 from pipeline.formats.ingest_error import IngestError
 from pipeline.formats.units import TRIADS
+from pipeline.records.median import median
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -48,16 +49,16 @@ def mark_gaps(table: ChannelTable, flags: NDArray[np.uint16], checks: Checks) ->
         If more time is missing than ``checks.missing_time`` allows.
     """
     steps = np.diff(table.time_ns)
-    median = float(np.median(steps))
-    limit = GAP_INTERVALS * median
+    usual = float(median(steps))
+    limit = GAP_INTERVALS * usual
     if int(steps.max()) <= limit:
-        return _irregular(table, steps, median)
+        return _irregular(table, steps, usual)
     rows = np.flatnonzero(steps > limit) + 1
     flags[rows] |= GAP
     lengths = steps[rows - 1]
-    lost = float(np.sum(lengths - median)) / float(table.time_ns[-1] - table.time_ns[0])
+    lost = float(np.sum(lengths - usual)) / float(table.time_ns[-1] - table.time_ns[0])
     detail = (
-        f"gaps longer than {GAP_INTERVALS} times the median interval of {median / 1e6:.6g} ms; "
+        f"gaps longer than {GAP_INTERVALS} times the median interval of {usual / 1e6:.6g} ms; "
         f"the longest lasts {lengths.max() / 1e9:.6g} s, {lost:.3%} of the time is missing"
     )
     if lost > checks.missing_time:
@@ -67,16 +68,16 @@ def mark_gaps(table: ChannelTable, flags: NDArray[np.uint16], checks: Checks) ->
             fault="missing_time",
             hint=f"ingest.checks.missing_time allows a share of {checks.missing_time:g}",
         )
-    return [table.note("N-GAP", rows, detail), *_irregular(table, steps[steps <= limit], median)]
+    return [table.note("N-GAP", rows, detail), *_irregular(table, steps[steps <= limit], usual)]
 
 
-def _irregular(table: ChannelTable, steps: NDArray[np.int64], median: float) -> list[Note]:
-    if not steps.size or int(steps.max()) - int(steps.min()) <= JITTER_NOTED * median:
+def _irregular(table: ChannelTable, steps: NDArray[np.int64], usual: float) -> list[Note]:
+    if not steps.size or int(steps.max()) - int(steps.min()) <= JITTER_NOTED * usual:
         return []
-    jitter = float(np.sqrt(np.mean((steps / median - 1.0) ** 2)))
+    jitter = float(np.sqrt(np.mean((steps / usual - 1.0) ** 2)))
     if jitter <= JITTER_NOTED:
         return []
-    detail = f"intervals scatter by {jitter:.0%} rms of their median of {median / 1e6:.6g} ms"
+    detail = f"intervals scatter by {jitter:.0%} rms of their median of {usual / 1e6:.6g} ms"
     if jitter > JITTER_TOO_LARGE:
         detail += ": too irregular for spectra and Allan deviations"
     return [table.note("N-JITTER", np.array([0, len(table.time_ns) - 1]), detail)]
@@ -139,18 +140,13 @@ def mark_stuck(table: ChannelTable, sensor: str, flags: NDArray[np.uint16]) -> l
     IngestError
         If an axis never changes while the others of its sensor do.
     """
-    channels = [c for c in TRIADS[sensor] if c in table.values]
-    noisy = {}
-    for channel in channels:
-        values = table.values[channel]
-        same = values[1:] == values[:-1]
-        noisy[channel] = (same, None if not same.any() else equal_share(same))
+    neighbours = {c: v[1:] == v[:-1] for c in TRIADS[sensor] if (v := table.values.get(c)) is not None}
     notes = []
-    for channel in channels:
-        same, share = noisy[channel]
-        if share is None:
+    for channel, same in neighbours.items():
+        if not _in_a_row(same, SHORTEST_RUN - 1):
             continue
-        others = [s is None or s <= QUIET for c, (_, s) in noisy.items() if c != channel]
+        share = equal_share(same)
+        others = [not s.any() or equal_share(s) <= QUIET for c, s in neighbours.items() if c != channel]
         if same.all() and len(same) >= DEAD_ROWS and others and all(others):
             raise IngestError(
                 f"{channel} is {table.values[channel][0] + 0.0:.6g} {UNIT_NAMES[sensor]} in all {len(same) + 1} rows, "
@@ -176,7 +172,7 @@ def equal_share(same: NDArray[np.bool_]) -> float:
     whole = len(same) // WINDOW * WINDOW
     if whole == 0:
         return 1.0
-    shares = same[:whole].reshape(-1, WINDOW).mean(axis=1)
+    shares = np.bincount(np.flatnonzero(same[:whole]) // WINDOW, minlength=whole // WINDOW) / WINDOW
     partial = shares[shares < 1.0]
     if not partial.size:
         return 1.0
@@ -190,9 +186,15 @@ def stuck_rows(same: NDArray[np.bool_], share: float) -> NDArray[np.intp]:
         return np.zeros(0, np.intp)
     p = max(share, 1.0 / WINDOW)
     longest = max(SHORTEST_RUN, int(np.ceil(np.log(BY_CHANCE / len(same)) / np.log(p))) + 1)
+    if not _in_a_row(same, longest - 1):
+        return np.zeros(0, np.intp)
     edges = np.flatnonzero(np.diff(same, prepend=False, append=False))
     starts, stops = edges[::2], edges[1::2]
     long = stops - starts + 1 >= longest
-    if not long.any():
-        return np.zeros(0, np.intp)
     return np.concatenate([np.arange(a, b + 1) for a, b in zip(starts[long], stops[long], strict=True)])
+
+
+def _in_a_row(same: NDArray[np.bool_], count: int) -> bool:
+    """Return whether so many neighbours in a row are equal."""
+    places, further = np.flatnonzero(same), count - 1
+    return bool(np.any(places[further:] - places[: max(len(places) - further, 0)] == further))

@@ -18,6 +18,7 @@ from pipeline.formats.ingest_error import IngestError
 from pipeline.formats.marks import mark_clipped, mark_gaps, mark_stuck
 from pipeline.formats.stamps import time_error
 from pipeline.formats.units import ATTITUDE, DEGREES, TRIADS
+from pipeline.records.median import median
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -101,7 +102,7 @@ def _check_times(table: ChannelTable) -> None:
 def _check_rate(table: ChannelTable, checks: Checks) -> None:
     if checks.rate_hz is None:
         return
-    interval_us = float(np.median(np.diff(table.time_ns))) / 1e3
+    interval_us = float(median(np.diff(table.time_ns))) / 1e3
     ratio = interval_us * checks.rate_hz / 1e6
     if abs(ratio - 1.0) <= RATE_TOLERANCE:
         return
@@ -128,19 +129,19 @@ def _check_force(table: ChannelTable) -> None:
     if "accel_x" not in table.values:
         return
     stride = -(-len(table.time_ns) // ENOUGH)
-    squares = sum(table.values[c][::stride] ** 2 for c in TRIADS["accelerometer"])
-    median = float(np.sqrt(np.median(squares)))
+    squares = np.asarray(sum(table.values[c][::stride] ** 2 for c in TRIADS["accelerometer"]))
+    usual = float(np.sqrt(median(squares)))
     low, high = FORCE_RANGE_G
-    if low <= median <= high:
+    if low <= usual <= high:
         return
     hint = "is the unit or the scale right?"
     for factor, unit in ((9.80665, "m/s^2"), (1000.0, "mg"), (1 / 9.80665, "g that were declared as m/s^2")):
-        if 0.7 < median / factor < 1.4:
+        if 0.7 < usual / factor < 1.4:
             hint = f"the numbers look like {unit}"
-    if median > 1500.0:
+    if usual > 1500.0:
         hint = "the numbers look like raw counts, which need counts_per_unit"
     raise IngestError(
-        f"median specific force is {median:.4g} g, and a log of rests and turns has about 1 g (allowed {low} to "
+        f"median specific force is {usual:.4g} g, and a log of rests and turns has about 1 g (allowed {low} to "
         f"{high}): {hint}; correct the units in ingest.csv.columns",
         table.path,
         fault="implausible_force",
@@ -173,7 +174,7 @@ def _check_turn_rate(table: ChannelTable) -> None:
         if turning.sum() < 20:
             return
         size = np.sqrt(sum(table.values[c][::stride][turning] ** 2 for c in TRIADS["gyroscope"]))
-        ratio = float(np.median(size / rate[turning]))
+        ratio = float(median(size / rate[turning]))
         seen = f"while the table turns the angular rate is {ratio:.3g} times the table's"
     else:
         from pipeline.formats.turn_evidence import declared_scale  # noqa: PLC0415  (imported where there is no table)

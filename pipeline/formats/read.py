@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,13 +27,14 @@ from pipeline.records import Note, Recording
 from pipeline.records.attitude import rate_of_attitude
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
 
     from pipeline.formats.channel_table import ChannelTable
     from pipeline.formats.checks import Checks
+    from pipeline.formats.csv_settings import CsvFormat
 
 AXIS_MAP = ("+x", "+y", "+z")
 EPOCH_AFTER_NS = 100_000_000 * 1_000_000_000  # 3 years: no sensor has been on for longer
@@ -67,10 +69,10 @@ def read_recordings(
     files = recording_files(procedure, ingest, folder)
     wanted = candidate_files(procedure, ingest)
     _check_complete(procedure, files, wanted, folder)
-    checks = checks_of(ingest)
+    checks, read = checks_of(ingest), table_reader(ingest)
     recordings = []
     for name, paths in files.items():
-        table = read_table(paths, ingest)
+        table = read(paths)
         other = [f for c in wanted[name] for f in c if folder / f not in paths and (folder / f).exists()]
         recording = to_recording(name, procedure["recordings"][name], table, sensor, checks)
         if other:
@@ -83,19 +85,33 @@ def read_recordings(
 
 def read_table(paths: Sequence[Path], ingest: Mapping[str, Any]) -> ChannelTable:
     """Read the file or files of one recording, by their suffix."""
-    if paths[0].suffix == ".mcap":
-        from pipeline.formats.mcap import read_mcap  # noqa: PLC0415  (the decoder costs what a text log need not pay)
-        from pipeline.formats.mcap_settings import mcap_format  # noqa: PLC0415
+    return table_reader(ingest)(paths)
 
-        return read_mcap(paths[0], mcap_format(ingest))
-    if paths[0].suffix == ".gcsv":
-        from pipeline.formats.gcsv import read_gcsv  # noqa: PLC0415
 
-        return read_gcsv(paths[0], checks_of(ingest))
-    from pipeline.formats.csv_read import read_csv  # noqa: PLC0415
-    from pipeline.formats.csv_settings import csv_formats  # noqa: PLC0415
+def table_reader(ingest: Mapping[str, Any]) -> Callable[[Sequence[Path]], ChannelTable]:
+    """Return ``read_table`` for files of one profile, which is checked once, when the first of its kind is read."""
 
-    return read_csv(paths, csv_formats(ingest), checks_of(ingest))
+    @cache
+    def csv_layouts() -> list[CsvFormat]:
+        from pipeline.formats.csv_settings import csv_formats  # noqa: PLC0415
+
+        return csv_formats(ingest)
+
+    def read(paths: Sequence[Path]) -> ChannelTable:
+        if paths[0].suffix == ".mcap":
+            from pipeline.formats.mcap import read_mcap  # noqa: PLC0415  (the decoder costs what a text log need not pay)
+            from pipeline.formats.mcap_settings import mcap_format  # noqa: PLC0415
+
+            return read_mcap(paths[0], mcap_format(ingest))
+        if paths[0].suffix == ".gcsv":
+            from pipeline.formats.gcsv import read_gcsv  # noqa: PLC0415
+
+            return read_gcsv(paths[0], checks_of(ingest))
+        from pipeline.formats.csv_read import read_csv  # noqa: PLC0415
+
+        return read_csv(paths, csv_layouts(), checks_of(ingest))
+
+    return read
 
 
 def _check_complete(

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.records.median import median
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -23,4 +25,4 @@ def noise_of_steps(step: NDArray[np.float64], axis: int = 0, *, keepdims: bool =
     keepdims : bool
         As of ``numpy.median``.
     """
-    return np.asarray(np.median(step, axis=axis, keepdims=keepdims) / MEDIAN_STEP)
+    return np.asarray(median(step, axis, keepdims=keepdims) / MEDIAN_STEP)

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
+from pipeline.records.median import median
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -128,7 +130,7 @@ class Recording:
     @cached_property
     def interval(self) -> float:
         """Median sampling interval, s."""
-        return float(np.median(np.diff(self.time_ns))) / NANOSECONDS if self.samples > 1 else float("nan")
+        return float(median(np.diff(self.time_ns))) / NANOSECONDS if self.samples > 1 else float("nan")
 
     @cached_property
     def kept(self) -> dict[Any, Any]:

@@ -1,7 +1,7 @@
 """What every stage has in common: a batch of units, handled one after the other, each guarded by itself.
 
 A unit that fails leaves ``<unit>.failed.json`` in the stage's folder; the stages after it pass it on, and the last rule
-turns it into the exit code. Files are written to a temporary name, flushed and renamed.
+turns it into the exit code. Files are written to a temporary name and renamed; all are on the disk when the job ends.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.atomic import write_atomically
+from pipeline.atomic import flushed_together, write_atomically
 from pipeline.errors import PipelineError
 from pipeline.json_text import json_text
 from pipeline.locks import hold_as_job
@@ -92,24 +92,29 @@ def run_batch(job: Job, work: Callable[[str, dict[str, Any]], None]) -> int:
         0: the job itself has succeeded; failures are in its output.
     """
     job.output.mkdir(parents=True, exist_ok=True)
-    for number, (unit, part) in enumerate(job.units.items(), 1):
-        print(f"{job.stage}: {unit} ({number} of {len(job.units)})", file=sys.stderr, flush=True)
-        earlier = [f for f in (folder / f"{unit}{FAILED}" for folder in job.inputs.values()) if f.is_file()]
-        if earlier:
-            shutil.copyfile(earlier[0], job.output / f"{unit}{FAILED}")
-            continue
-        try:
-            work(unit, part)
-        except PipelineError as error:
-            _record_failure(job, unit, error.code, error.message, error.file)
-        except OSError as error:
-            if error.filename is None or Path(str(error.filename)).is_relative_to(job.output):
-                raise  # a full disk or a folder that cannot be written is the run's trouble, not the unit's
-            _record_failure(job, unit, "bad_input", error.strerror or str(error), str(error.filename))
-        except Exception as error:  # noqa: BLE001  (one unit's bug never stops the others; its traceback is kept)
-            traceback.print_exc()
-            _record_failure(job, unit, "internal_error", f"{type(error).__name__}: {error} (a bug; see the log)", None)
+    with flushed_together(job.output):
+        for number, (unit, part) in enumerate(job.units.items(), 1):
+            print(f"{job.stage}: {unit} ({number} of {len(job.units)})", file=sys.stderr, flush=True)
+            earlier = [f for f in (folder / f"{unit}{FAILED}" for folder in job.inputs.values()) if f.is_file()]
+            if earlier:
+                shutil.copyfile(earlier[0], job.output / f"{unit}{FAILED}")
+            else:
+                _run_unit(job, unit, part, work)
     return 0
+
+
+def _run_unit(job: Job, unit: str, part: dict[str, Any], work: Callable[[str, dict[str, Any]], None]) -> None:
+    try:
+        work(unit, part)
+    except PipelineError as error:
+        _record_failure(job, unit, error.code, error.message, error.file)
+    except OSError as error:
+        if error.filename is None or Path(str(error.filename)).is_relative_to(job.output):
+            raise  # a full disk or a folder that cannot be written is the run's trouble, not the unit's
+        _record_failure(job, unit, "bad_input", error.strerror or str(error), str(error.filename))
+    except Exception as error:  # noqa: BLE001  (one unit's bug never stops the others; its traceback is kept)
+        traceback.print_exc()
+        _record_failure(job, unit, "internal_error", f"{type(error).__name__}: {error} (a bug; see the log)", None)
 
 
 def _record_failure(job: Job, unit: str, code: str, message: str, file: str | None) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+from functools import cache
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
@@ -48,9 +49,15 @@ def header(unit: str, part: dict[str, Any]) -> dict[str, Any]:
         **{group: part[group]["name"] for group in ("sensor", "table", "procedure", "method")},
         "methods": {sensor: part["method"][sensor] for sensor in SENSORS},
         "config_sha256": part["config_sha256"],
-        "software": {"imu-calibration": __version__, "python": platform.python_version()}
-        | {library: version(library) for library in LIBRARIES},
+        "software": dict(_software()),
     }
+
+
+@cache
+def _software() -> dict[str, str]:
+    """Return the versions that run; looking for one reads the package's files."""
+    libraries = {library: version(library) for library in LIBRARIES}
+    return {"imu-calibration": __version__, "python": platform.python_version(), **libraries}
 
 
 def inputs(path: Path) -> list[dict[str, Any]]:
@@ -66,5 +73,5 @@ def inputs(path: Path) -> list[dict[str, Any]]:
             "duration_s": round(float(r.time[-1] - r.time[0]), 6) if r.samples else 0.0,
             "notes": [vars(n) for n in r.notes],
         }
-        for r in load_recordings(path)
+        for r in load_recordings(path, times_alone=True)
     ]

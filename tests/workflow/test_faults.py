@@ -21,7 +21,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 pytestmark = pytest.mark.workflow
 
-# Found by jobs before anything else: disturbs the report of the first batch when it flushes its first file.
+# Found by jobs before anything else: disturbs the report of the first batch before it renames its first file.
 DISTURB = """
 import os, signal, sys, time
 
@@ -31,9 +31,9 @@ def snakemake():
         pid = int(open(f"/proc/{pid}/stat").read().rsplit(")", 1)[1].split()[1])
     return pid
 
-def disturbed(descriptor, flush=os.fsync):
+def disturbed(source, target, replace=os.replace):
     fault = os.environ["FAULT"]
-    os.fsync = flush
+    os.replace = replace
     if fault == "kill job":
         os.kill(os.getpid(), signal.SIGKILL)
     if fault == "kill snakemake":
@@ -43,10 +43,10 @@ def disturbed(descriptor, flush=os.fsync):
         open("held", "w").close()
         while os.path.exists("held"):
             time.sleep(0.1)
-    flush(descriptor)
+    replace(source, target)
 
 if "FAULT" in os.environ and "report" in sys.orig_argv and any("-0001/report" in a for a in sys.orig_argv):
-    os.fsync = disturbed
+    os.replace = disturbed
 """
 
 
