@@ -182,7 +182,7 @@ def covariates(found: list[Residual], wander: NDArray[np.float64] | None = None)
     """
     out: dict[str, BinnedMean] = {}
     errors = [r.error for r in found]
-    everything = np.concatenate(errors) if errors else np.zeros((0, 3))
+    everything = np.asfortranarray(np.concatenate(errors)) if errors else np.zeros((0, 3))  # read axis by axis
     for label, value in COVARIATES.items():
         values = [value(r) for r in found]
         pairs = [(v, e) for v, e in zip(values, errors, strict=True) if v is not None]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, Template
 from markupsafe import Markup
@@ -13,10 +14,20 @@ from pipeline.report.numbers import measured, number, percent, probability, type
 FOLDER = Path(__file__).parent / "templates"
 
 
+class Pages(Environment):
+    """Templates whose values are dicts for the most part: ``row.name`` does not look for an attribute first."""
+
+    def getattr(self, obj: Any, attribute: str) -> Any:  # noqa: ANN401  (as of the base class)
+        """Return a key of a dict, or what the base class finds."""
+        if type(obj) is dict and attribute in obj and not hasattr(dict, attribute):
+            return obj[attribute]
+        return super().getattr(obj, attribute)
+
+
 @cache
 def template(name: str) -> Template:
     """Return a template by its file name."""
-    environment = Environment(
+    environment = Pages(
         loader=FileSystemLoader(FOLDER),
         autoescape=True,
         trim_blocks=True,
