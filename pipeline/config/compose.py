@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 GROUPS = ("sensor", "table", "procedure", "method", "filter", "ingest", "certificate")
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 RUN_SETTINGS = ("batch_size",)
+OF_A_SETUP = ("mounting", "bias")  # effects that exist as one setup's own alone (pipeline.model.setups)
 NUMBER = re.compile(r"([a-z_][a-z_0-9]*(?:\.[A-Za-z_][A-Za-z_0-9]*)*)=(-?(?:0|[1-9][0-9]*)(\.[0-9]+)?)")
 
 
@@ -223,7 +224,12 @@ class Composer:
 
     def _check_meaning(self, config: dict[str, Any], texts: dict[str, str]) -> None:
         for sensor, names in config["effects"].items():
-            for name in [] if names == "auto" else names:
+            for whole in [] if names == "auto" else names:
+                name, separator, setup = whole.partition("@")
+                if separator:
+                    _check_setup(whole, setup, config["procedure"])
+                if separator and name in OF_A_SETUP:
+                    continue
                 if name not in self.effects:
                     raise Problem(f"effects.{sensor}: no effect is called {name!r}{nearest(name, self.effects)}")
                 own = self.user_effects.effects.get(name)
@@ -242,6 +248,16 @@ class Composer:
             raise Problem(
                 "table.latitude_deg and table.azimuth_deg: set both (Earth's rotation is modelled) or neither (null)"
             )
+
+
+def _check_setup(name: str, setup: str, procedure: dict[str, Any]) -> None:
+    """Refuse an effect of a setup in which no recording of the procedure is made."""
+    known = {entry.get("setup") for entry in procedure["recordings"].values()} - {None}
+    if setup not in known:
+        raise Problem(
+            f"{name}: no recording of procedure {procedure['name']} has setup: {setup}"
+            f"{nearest(setup, known) if known else '; name the setup of each recording in the procedure config'}"
+        )
 
 
 @lru_cache(maxsize=100_000)

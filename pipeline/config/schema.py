@@ -100,6 +100,7 @@ class RecordingFile(Section):
     role: Literal["accelerometer", "gyroscope", "rests", "validation", "static", "session"]
     axis: Axis | None
     optional: bool
+    setup: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")] | None = None
     program: list[Rest | Turn | Repeated] | None = None
     windows: list[Window] | None = None
 

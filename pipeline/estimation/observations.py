@@ -252,8 +252,14 @@ def observe(sensor: str, recordings: Sequence[Recording], table: Mapping[str, An
             part = _part(sensor, recording, float(table.get("gravity_g") or 1.0), earth)
             if part is not None:
                 parts.append(part)
-    parts.sort(key=lambda part: (not part.clock_shared, part.motion.time[0] if part.clock_shared else 0.0))
+    parts.sort(key=_in_time)
     return Observations(sensor, tuple(parts), earth is not None)
+
+
+def _in_time(part: Part) -> tuple[bool, str, float]:
+    """Return what orders recordings in time, as far as that is known: in all, else in their setup."""
+    setup = "" if part.clock_shared else part.motion.setup
+    return not part.clock_shared, setup, float(part.motion.time[0]) if part.clock_shared or setup else 0.0
 
 
 def _part(sensor: str, recording: Recording, gravity: float, earth: NDArray[np.float64] | None) -> Part | None:

@@ -57,6 +57,14 @@ class Blocks:
         return covariance
 
 
+def _clock(recording: Recording, number: int, known: dict[str, tuple[int, float]]) -> int:
+    """Return the clock of a recording: its own, or that of its setup's recording before; ``known`` holds those."""
+    before, end = known.get(recording.setup, (number, np.inf))
+    clock = before if recording.setup and recording.time[0] > end else number
+    known[recording.setup] = clock, float(recording.time[-1])
+    return clock
+
+
 def make_blocks(parts: Sequence[tuple[Recording, NDArray[np.bool_]]]) -> Blocks:
     """Cut the chosen samples of some recordings into blocks.
 
@@ -72,6 +80,7 @@ def make_blocks(parts: Sequence[tuple[Recording, NDArray[np.bool_]]]) -> Blocks:
     used = [int(keep.sum()) for _, keep in parts]
     size = max(1, -(-sum(used) // BLOCKS))
     labels, starts, lengths, clocks, blocks = [], [], [], [], 0
+    known: dict[str, tuple[int, float]] = {}
     for number, ((recording, keep), samples) in enumerate(zip(parts, used, strict=True), start=1):
         if samples == 0:
             continue
@@ -82,7 +91,7 @@ def make_blocks(parts: Sequence[tuple[Recording, NDArray[np.bool_]]]) -> Blocks:
         labels.append(label + blocks)
         starts.append(time[first])
         lengths.append(time[last] - time[first] + recording.interval)
-        clocks.append(np.full(len(first), 0 if recording.clock_shared else number))
+        clocks.append(np.full(len(first), 0 if recording.clock_shared else _clock(recording, number, known)))
         blocks += len(first)
     label = np.concatenate(labels)
     count = np.bincount(label).astype(float)

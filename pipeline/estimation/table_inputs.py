@@ -140,7 +140,7 @@ def table_contributions(
         if reference.sensor in IDLE.get(source, ()):
             continue
         u = reference.table.get(key)
-        fitted = [name for name in ESTIMATES.get(source, ()) if name in estimated]
+        fitted = [name for name in ESTIMATES.get(source, ()) if _everywhere(name, estimated, reference.motions)]
         reason = f"estimated by {fitted[0]}" if fitted else _without(source, key, reference.table)
         if reason:
             missing[source] = reason
@@ -184,6 +184,11 @@ def _largest(reference: Reference) -> float:
             size = max(size, slope * float(table.get("angle_accuracy_deg") or 0.0))
             size = max(size, float(np.abs(motion.rate).max()) * float(table.get("rate_accuracy") or 0.0))
     return size
+
+
+def _everywhere(name: str, estimated: Sequence[str], motions: Sequence[Motion]) -> bool:
+    """Return whether an effect is estimated, for all recordings or in each of their setups."""
+    return name in estimated or all(f"{name}@{motion.setup}" in estimated for motion in motions)
 
 
 def _without(source: str, key: str, table: Mapping[str, Any]) -> str:

@@ -98,22 +98,31 @@ class Cells:
 
 
 def cells_of(parts: Sequence[Part]) -> Cells:
-    """Cut the rows of recordings into cells, a new one for each recording."""
+    """Cut the rows of recordings into cells, a new one for each recording.
+
+    The time between two recordings is known where all share a clock, or both are of one setup and do not overlap.
+    """
     span = sum(float(np.ptp(part.motion.time)) for part in parts)
     length = max(SHORTEST_CELL_S, span / CELLS)
     first, times, weights, joined, row = [], [], [], [], 0
-    known = False
-    for part in parts:
+    for before, part in zip([None, *parts], parts, strict=False):
         cell = np.floor((part.motion.time - part.motion.time[0]) / length)
         start = np.flatnonzero(np.concatenate([[True], np.diff(cell) != 0]))
         weight = np.add.reduceat(part.weight, start)
         first.append(start + row)
         times.append(np.add.reduceat(part.weight * part.motion.time, start) / weight)
         weights.append(weight)
-        joined.append(np.concatenate([[known and part.clock_shared], np.ones(len(start) - 1, bool)]))
+        joined.append(np.concatenate([[_follows(before, part)], np.ones(len(start) - 1, bool)]))
         row += len(part.motion.time)
-        known = part.clock_shared
     return Cells(np.concatenate(first), np.concatenate(times), np.concatenate(joined)[1:], np.concatenate(weights))
+
+
+def _follows(before: Part | None, part: Part) -> bool:
+    """Return whether the time from the recording before is known."""
+    if before is None or (before.clock_shared and part.clock_shared):
+        return before is not None
+    one = before.motion.setup == part.motion.setup != ""
+    return one and bool(before.motion.time[-1] < part.motion.time[0])
 
 
 def wanders_fast(noise: Noise | None) -> bool:

@@ -175,6 +175,7 @@ def to_recording(
         name=name,
         role=entry["role"],
         axis=entry.get("axis"),
+        setup=entry.get("setup") or "",
         time_ns=table.time_ns,
         accelerometer=_stack(values, TRIADS["accelerometer"]),
         gyroscope=_stack(values, TRIADS["gyroscope"]),

@@ -2,7 +2,8 @@
 
 ``effects`` of a sensor's configuration names a limit for each effect. Where the parameters of an effect differ in unit,
 ``<effect>_<parameter>`` (the parameter's name or its part before the axis) goes before it: ``warm_up_time_constant``.
-An effect of the user's own brings its limits itself; the sensor's configuration goes before them.
+What is one setup's own has the limits of the effect. An effect of the user's own brings its limits itself; the sensor's
+configuration goes before them.
 """
 
 from __future__ import annotations
@@ -29,11 +30,11 @@ def parameter_limits(effect: Effect, sensor: str, limits: Mapping[str, float]) -
     limits : mapping of str to float
         ``effects`` of the sensor's configuration.
     """
-    found = []
-    if effect.name not in limits:
+    found, own = [], effect.name.partition("@")[0]
+    if own not in limits:
         limits = {**effect.limits(sensor), **limits}
     for parameter in effect.parameters(sensor):
         symbol = parameter.name.rpartition("_")[0]
-        names = (f"{effect.name}_{parameter.name}", f"{effect.name}_{symbol}", effect.name)
+        names = (f"{own}_{parameter.name}", f"{own}_{symbol}", own)
         found.append(next((float(limits[name]) for name in names if name in limits), np.inf))
     return np.array(found)

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -34,6 +34,8 @@ from pipeline.signal.rests import RATE_AT_REST_DPS, still_samples
 from pipeline.signal.temperature import temperature_of
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     from pipeline.records import Recording
@@ -104,10 +106,27 @@ def reference_motion(
         )
     temperature = None if recording.temperature is None else temperature_of(recording)
     motion = build(recording, gravity_g, earth_rate_level, offset, temperature)
-    motion = replace(motion, recording=recording.name)
+    motion = _labelled(recording, motion)
     if kept:
         recording.kept[key] = motion
     return motion
+
+
+def _labelled(recording: Recording, motion: Motion) -> Motion:
+    """Return a motion that says, also at another time, which recording and setup it is of."""
+    motion = replace(motion, recording=recording.name, setup=recording.setup)
+    if not recording.setup:
+        return motion
+
+    def later(move: Callable[..., Motion | None] | None) -> Callable[..., Motion | None] | None:
+        return move and partial(_moved, recording, move)
+
+    return replace(motion, at_offset=later(motion.at_offset), at_lag=later(motion.at_lag))
+
+
+def _moved(recording: Recording, move: Callable[..., Motion | None], **how: Any) -> Motion | None:  # noqa: ANN401
+    found = move(**how)
+    return found and _labelled(recording, found)
 
 
 def _motion_of_turn(

@@ -47,6 +47,8 @@ class Motion:
         Samples beside which the log is fine enough to know the trajectory between the samples.
     recording : str
         Name of the recording, for messages; empty where there is none.
+    setup : str
+        Its table, mounting or session; empty where there is one alone.
     """
 
     time: NDArray[np.float64]
@@ -65,6 +67,7 @@ class Motion:
     direction: NDArray[np.float64] | None = None
     followed: NDArray[np.bool_] | None = None
     recording: str = ""
+    setup: str = ""
 
     def select(self, index: NDArray[Any]) -> Motion:
         """Return the motion at some samples (a mask or integers); the trajectory between samples is left behind."""

@@ -95,6 +95,8 @@ class Recording:
         (0 where it is zero-phase), and ``noise_gain``, the factor on the standard deviation of white noise.
     encodings : dict of str to Encoding
         Columns that came as integers.
+    setup : str
+        Which of several tables, mountings or sessions it was made in; empty where there is one alone.
     clock_shared : bool
         Whether the time between this recording and the unit's others is known (their times do not overlap).
     """
@@ -115,6 +117,7 @@ class Recording:
     filter: dict[str, Any] = field(default_factory=lambda: {"name": "none", "delay_s": 0.0, "noise_gain": 1.0})
     encodings: dict[str, Encoding] = field(default_factory=dict)
     clock_shared: bool = True
+    setup: str = ""
 
     @cached_property
     def time(self) -> NDArray[np.float64]:

@@ -73,15 +73,26 @@ def forget_registered() -> None:
     _registered.clear()
 
 
+@cache
+def _in_setup(name: str) -> Effect | None:
+    """Return ``<effect>@<setup>``, or None where the name is no such thing."""
+    base, separator, setup = name.partition("@")
+    if not separator or not setup:
+        return None
+    from pipeline.model.setups import OWN, in_setup  # noqa: PLC0415  (it needs this module's own)
+
+    return in_setup(name, OWN.get(base) or effect(base))
+
+
 def effect(name: str) -> Effect:
-    """Return one effect by name.
+    """Return one effect by name; ``<effect>@<setup>`` is that of one setup (``pipeline.model.setups``).
 
     Raises
     ------
     ConfigurationError
         If there is none of that name.
     """
-    found = _registered.get(name) or built_in().get(name)
+    found = _registered.get(name) or built_in().get(name) or _in_setup(name)
     if found is None:
         raise ConfigurationError(f"no effect is called {name!r}; known: {', '.join(catalogue())}")
     return found

@@ -1,0 +1,136 @@
+"""Effects of one setup: of a table, of a mounting or of a switching-on that a part of the recordings has to itself.
+
+    z = z_effect where the recording was made in that setup, 0 elsewhere
+
+A procedure names the setup of each recording; ``<effect>@<setup>`` is the effect there. So recordings on several tables
+or in several sessions are one estimate of one sensor, with what is each table's own beside it. Two more exist in a
+setup alone, as in a single one they are the matrix and the bias:
+
+    mounting : z = K (exp([theta]x)^T - 1) u: the unit is turned by the vector theta, deg, against where it was
+    bias     : z = db: the bias is another one, as after switching off and on
+
+One setup is without them, the reference of the others. The leans of a table's axes contain the mounting.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.errors import ConfigurationError
+from pipeline.model.effects.base import Effect, Layout, Owner, Parameter, truth, unit_of
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pipeline.records import Motion
+
+    Values = NDArray[np.float64]
+
+SEPARATOR = "@"
+STEP_DEG = 1e-3
+EXPERIMENT = "the same turns in another setup"
+
+
+class _Mounting(Effect):
+    """How a setup holds the unit, against the others."""
+
+    name = "mounting"
+    owner = Owner.MOUNTING
+    layout = Layout.SHARED
+    meaning = "The unit sits turned in this setup, against the others."
+    excitation = "turns about all three axes in this setup, and in another one that has no mounting of its own"
+    experiment = EXPERIMENT
+    source = "rotation of the body frame"
+
+    def parameters(self, sensor: str) -> tuple[Parameter, ...]:
+        """Return theta."""
+        del sensor
+        return tuple(Parameter(f"theta_{a}", "deg", f"turn of the unit, its part about body {a}") for a in "xyz")
+
+    def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
+        """Return the derivative by differences that are exact to 1e-8."""
+        steps = STEP_DEG * np.eye(3)
+        slopes = [(_turn(values + step) - _turn(values - step)) / (2.0 * STEP_DEG) for step in steps]
+        u = truth(sensor, motion)
+        return np.stack([u @ (K @ slope.T).T for slope in slopes], axis=2)
+
+    def reading(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
+        """Return what the turn adds, however large it is."""
+        return np.asarray(truth(sensor, motion) @ (K @ (_turn(values).T - np.eye(3))).T)
+
+
+def _turn(theta: Values) -> Values:
+    """Return the rotation by a vector, deg: (3, 3) array."""
+    angle = float(np.radians(np.linalg.norm(theta)))
+    x, y, z = np.radians(theta)
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    half = np.sinc(angle / (2.0 * np.pi))
+    turn: Values = np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * half**2 * (cross @ cross)
+    return turn
+
+
+class _Bias(Effect):
+    """The difference of a setup's bias to that of the others."""
+
+    name = "bias"
+    owner = Owner.MOUNTING
+    layout = Layout.EVERY_AXIS
+    meaning = "The bias in this setup is another one, as after switching off and on."
+    excitation = "another setup that has no bias of its own"
+    experiment = EXPERIMENT
+    source = "IEEE Std 1554-2005, turn-on to turn-on repeatability"
+
+    def parameters(self, sensor: str) -> tuple[Parameter, ...]:
+        """Return db."""
+        return tuple(Parameter(f"db_{a}", unit_of(sensor), f"difference of the bias of {a}") for a in "xyz")
+
+    def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
+        """Return ones."""
+        del sensor, K, values
+        return np.ones((len(motion.time), 1))
+
+
+OWN: dict[str, Effect] = {effect.name: effect for effect in (_Mounting(), _Bias())}
+
+
+class InSetup(Effect):
+    """An effect in one setup."""
+
+    base: Effect
+    setup: str
+
+    def parameters(self, sensor: str) -> tuple[Parameter, ...]:
+        """Return those of the effect."""
+        return self.base.parameters(sensor)
+
+    def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
+        """Return those of the effect in its setup, zeros elsewhere."""
+        found = self.base.regressors(sensor, motion, K, values)
+        return found if motion.setup == self.setup else np.zeros_like(found)
+
+    def reading(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
+        """Return what the effect adds in its setup, zeros elsewhere."""
+        if motion.setup == self.setup:
+            return self.base.reading(sensor, motion, K, values)
+        return np.zeros((len(motion.time), 3))
+
+
+def in_setup(name: str, base: Effect) -> Effect:
+    """Return the effect ``<base>@<setup>``.
+
+    Raises
+    ------
+    ConfigurationError
+        If the effect moves the motion in time, or is not linear in its parameters.
+    """
+    if base.moves or base.nonlinear:
+        raise ConfigurationError(
+            f"effect {name}: {base.name} cannot be one setup's own, as the fit is not linear in it; name {base.name}"
+        )
+    fields = ("owner", "layout", "sensors", "needs", "needs_clock", "unseen", "meaning", "excitation", "experiment")
+    contents = {field: getattr(base, field) for field in (*fields, "source")}
+    setup = name.partition(SEPARATOR)[2]
+    found: Effect = type("InSetup", (InSetup,), contents | {"name": name, "base": base, "setup": setup})()
+    return found
