@@ -222,20 +222,25 @@ class Composer:
             stages[sensor] = list(own[sensor])
         return {**method, "stages": stages}
 
+    def _check_effect(self, sensor: str, whole: str, procedure: dict[str, Any]) -> None:
+        name, separator, setup = whole.partition("@")
+        if separator:
+            _check_setup(whole, setup, procedure)
+        if separator and name in OF_A_SETUP:
+            return
+        if name not in self.effects:
+            raise Problem(f"effects.{sensor}: no effect is called {name!r}{nearest(name, self.effects)}")
+        own = self.user_effects.effects.get(name)
+        if own and separator:
+            raise Problem(f"effects.{sensor}: {whole}: an effect of your own cannot be one setup's own")
+        applies = own.sensors if own else read_option("effect", name, ()).get("sensors", [sensor])
+        if sensor not in applies:
+            raise Problem(f"effects.{sensor}: {name} applies to the {' and '.join(applies)} only")
+
     def _check_meaning(self, config: dict[str, Any], texts: dict[str, str]) -> None:
         for sensor, names in config["effects"].items():
-            for whole in [] if names == "auto" else names:
-                name, separator, setup = whole.partition("@")
-                if separator:
-                    _check_setup(whole, setup, config["procedure"])
-                if separator and name in OF_A_SETUP:
-                    continue
-                if name not in self.effects:
-                    raise Problem(f"effects.{sensor}: no effect is called {name!r}{nearest(name, self.effects)}")
-                own = self.user_effects.effects.get(name)
-                applies = own.sensors if own else read_option("effect", name, ()).get("sensors", [sensor])
-                if sensor not in applies:
-                    raise Problem(f"effects.{sensor}: {name} applies to the {' and '.join(applies)} only")
+            for name in [] if names == "auto" else names:
+                self._check_effect(sensor, name, config["procedure"])
         reading = texts["ingest"] + texts["procedure"]
         if reading not in self._ingest_in_order:
             try:

@@ -45,6 +45,8 @@ FIT = (
     "sensor.{sensor}.full_scale",
     "sensor.{sensor}.counts_per_unit",
     *(f"sensor.{{sensor}}.{key}" for key in NOISE),
+    *(f"sensor.{{sensor}}.{key}" for key in ("effects", "repeatability_bias", "repeatability_scale_factor")),
+    "sensor.temperature_accuracy_degc",
     "uncertainty.monte_carlo",
 )
 SENSORS_AND_TABLE = ("sensor", "table", "procedure.holdout_every")
@@ -59,7 +61,7 @@ READS: dict[str, tuple[str, ...]] = {
     ),
     "filter": ("filter", *(f"sensor.{sensor}.{key}" for sensor in ("accelerometer", "gyroscope") for key in NOISE)),
     "fit": FIT,
-    "effects": (*FIT, "effects.{sensor}", "sensor.{sensor}.effects"),
+    "effects": (*FIT, "effects.{sensor}"),
     "calibration": (
         "sensor.name",
         "sensor.axis_map",

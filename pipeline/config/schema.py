@@ -34,6 +34,8 @@ class DataSheet(Section):
     scale_factor: Positive
     cross_axis: Positive
     effects: dict[str, Positive]
+    repeatability_bias: NonNegative | None = None
+    repeatability_scale_factor: NonNegative | None = None
 
 
 class Sensor(Section):
@@ -41,6 +43,7 @@ class Sensor(Section):
 
     name: str
     axis_map: Annotated[list[SignedAxis], Field(min_length=3, max_length=3)]
+    temperature_accuracy_degc: NonNegative | None = None
     accelerometer: DataSheet
     gyroscope: DataSheet
 

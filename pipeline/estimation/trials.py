@@ -135,6 +135,7 @@ def _compared(calibration: SensorCalibration, drawn: Values) -> dict[str, Any]:
         "seed": SEED,
         "digits": digits,
         "estimate": estimate.tolist(),
+        "expanded_uncertainty": expanded.tolist(),
         "mean": found.estimate.tolist(),
         "standard_uncertainty": found.standard_uncertainty.tolist(),
         "low": found.symmetric[:, 0].tolist(),

@@ -73,7 +73,7 @@ def _trials(budget: JSON) -> JSON | None:
         return {"finding": f"No Monte Carlo run: {run['reason']}.", "rows": []}
     values, rows = run["estimate"], []
     for j, name in enumerate(budget["parameters"]):
-        U = budget["expanded_uncertainty"][j]
+        U = run["expanded_uncertainty"][j]
         if U > 0.0:
             row = {"name": name.replace("_", " ").replace(".", ": "), "validated": run["validated"][j]}
             ends = {"low": run["low"][j] - values[j], "high": run["high"][j] - values[j]}

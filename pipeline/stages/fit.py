@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import CannotCalibrateError
+from pipeline.estimation.stated import with_stated
 from pipeline.formats.parquet import load_recordings
 from pipeline.records import SensorCalibration
 from pipeline.stages.batch import parse_job, read_json, run_batch, write_json
@@ -38,7 +39,8 @@ def main(argv: Sequence[str]) -> int:
         recordings = load_recordings(job.inputs["filter"] / f"{unit}.parquet")
         noises = load_noises(job.inputs["filter"], unit)
         try:
-            write_json(target, module.fit(recordings, previous, part | {"noise": noises}).to_json())
+            found = module.fit(recordings, previous, part | {"noise": noises})
+            write_json(target, with_stated(found, recordings, part).to_json())
         except CannotCalibrateError as reason:
             write_json(target, {"not_calibrated": reason.message})
 

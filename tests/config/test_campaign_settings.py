@@ -180,3 +180,21 @@ def test_a_campaign_whose_run_makes_the_recordings_reads_them_among_the_results(
     directory.joinpath("campaign.yaml").write_text("simulate: yes please\n")
     with pytest.raises(ConfigurationError, match="true or false is expected"):
         load(directory)
+
+
+def test_an_effect_of_one_setup_needs_a_recording_that_is_made_there(tmp_path: Path) -> None:
+    own = campaign(
+        tmp_path, 'unit,procedure,overrides\nA,two,"effects.accelerometer=[table_tilt@home,mounting@home]"\n'
+    )
+    (own / "configs" / "procedure").mkdir(parents=True)
+    entry = "{file: accel_x, role: accelerometer, axis: x, optional: false, setup: home}"
+    text = f"table: acutronic\nfolder: raw/{{unit}}\nrecordings:\n  accel_x: {entry}\nholdout_every: 3\n"
+    (own / "configs" / "procedure" / "two.yaml").write_text(text)
+    names = load(own).units["A"].config["effects"]["accelerometer"]
+    assert names == ["table_tilt@home", "mounting@home"]
+    with pytest.raises(
+        ConfigurationError, match="bias@hom: no recording of procedure two has setup: hom; nearest: home"
+    ):
+        load(own, overrides="effects.accelerometer=[bias@hom]")
+    with pytest.raises(ConfigurationError, match="no effect is called 'bias'"):
+        load(own, overrides="effects.accelerometer=[bias]")
