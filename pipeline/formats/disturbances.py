@@ -84,13 +84,18 @@ def leave_out_disturbances(
             f"or the log run on another clock? {worst}"
         )
         return replace(recording, notes=(*recording.notes, note("N-RESTLESS", rows, detail)))
+    detail = f"{places} left out as glitches or knocks; {worst}"
+    return without_rows(recording, rows, note("N-DISTURBED", rows, detail))
+
+
+def without_rows(recording: Recording, rows: NDArray[np.intp], note: Note) -> Recording:
+    """Return a recording without some samples, a gap before what follows them, and with the note that says so."""
     sound = np.ones(recording.samples, bool)
     sound[rows] = False
     flags = np.zeros(recording.samples, np.uint16) if recording.flags is None else recording.flags.copy()
     flags[np.minimum(rows + 1, recording.samples - 1)] |= GAP
-    detail = f"{places} left out as glitches or knocks; {worst}"
     kept = replace(recording, flags=flags).select(sound)
-    return replace(kept, notes=(*kept.notes, note("N-DISTURBED", rows, detail)))
+    return replace(kept, notes=(*kept.notes, note))
 
 
 def disturbed(recording: Recording) -> tuple[Array, list[tuple[str, str]]]:

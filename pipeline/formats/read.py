@@ -21,6 +21,7 @@ from pipeline.formats.disturbances import leave_out_disturbances
 from pipeline.formats.files import candidate_files, recording_files
 from pipeline.formats.ingest_error import IngestError
 from pipeline.formats.plausibility import check_axis, examine
+from pipeline.formats.shaken_rests import leave_out_shaken_rests
 from pipeline.formats.table_log import unwrapped
 from pipeline.formats.units import ATTITUDE, TABLE_CHANNELS, TRIADS
 from pipeline.records import Note, Recording
@@ -188,6 +189,8 @@ def to_recording(
         notes=(*table.notes, *notes),
         encodings=table.encodings,
     )
+    if checks.disturbed_rows:
+        recording = leave_out_shaken_rests(recording, table.note)
     return leave_out_disturbances(recording, table.note, checks.disturbed_rows)
 
 
