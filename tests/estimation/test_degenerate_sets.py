@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.errors import NotObservableError
+from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.accelerometer.nonlinear_least_squares import fit
+from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.records import Recording
 
 SETTINGS = {
@@ -15,6 +16,7 @@ SETTINGS = {
     "sensor": {"accelerometer": {"bias_wander": 1e-4, "wander_time_s": 100.0}},
     "method": {"as_printed": False},
 }
+BOTH = {**SETTINGS, "sensor": {**SETTINGS["sensor"], "gyroscope": {"bias_wander": 3e-3, "wander_time_s": 100.0}}}
 BIAS = np.array([0.05, -0.03, 0.12])
 
 
@@ -61,7 +63,9 @@ def test_rests_well_out_of_the_plane_are_answered_within_their_uncertainty() -> 
 
 def test_rests_in_one_direction_alone_are_refused() -> None:
     up = np.tile([0.0, 0.0, 1.0], (12, 1))
-    with pytest.raises(NotObservableError, match=r"alike|degenerate|determine neither"):
+    with pytest.raises(
+        NotObservableError, match=r"bias_z, .*scale_factor_z.*each axis up, down and level, spread evenly"
+    ):
         fit(at_rest_in(up), None, SETTINGS)
 
 
@@ -69,5 +73,43 @@ def test_a_recording_without_a_rest_says_so() -> None:
     time = np.arange(3000) * 0.04
     wave = np.column_stack([np.sin(3.1 * time), np.cos(2.3 * time), np.sin(1.7 * time + 1.0)])
     moving = Recording("recording", "rests", None, np.arange(3000) * 40_000_000, accelerometer=wave)
-    with pytest.raises(NotObservableError, match="0 orientations determine neither bias nor scale factors"):
+    with pytest.raises(NotObservableError, match="0 orientations determine neither bias nor scale factors") as refused:
         fit([moving], None, SETTINGS)
+    assert "better in 24 that are spread evenly" in str(refused.value)
+
+
+def turned_by_hand(axes: str, lost: str = "", seed: int = 1) -> list[Recording]:
+    """Rests of 4 s between moves of 72 deg about body axes in turn, at 25 Hz; readings of some moves are lost."""
+    rng, step, rate, gone = np.random.default_rng(seed), 0.04, [], []
+    for k in range(24):
+        move = np.zeros((40, 3))
+        move[:, "xyz".index(axes[k % len(axes)])] = 90.0 * np.sin(np.pi * np.arange(40) / 40) ** 2
+        rate += [np.zeros((100, 3)), move]
+        gone += [np.zeros(100, bool), np.full(40, axes[k % len(axes)] in lost)]
+    omega, up = np.concatenate(rate), np.array([0.0, 0.6, 0.8])
+    force = np.empty_like(omega)
+    for n, turn in enumerate(np.radians(omega) * step):
+        force[n] = up
+        up = up - np.cross(turn, up)
+        up /= np.linalg.norm(up)
+    gyroscope = omega + 1.0 + 0.05 * rng.standard_normal(omega.shape)
+    gyroscope[np.concatenate(gone)] = np.nan
+    accelerometer = force + 1e-3 * rng.standard_normal(force.shape)
+    time = np.arange(len(omega)) * 40_000_000
+    return [Recording("recording", "rests", None, time, accelerometer=accelerometer, gyroscope=gyroscope)]
+
+
+def test_moves_about_one_axis_alone_leave_the_gyroscope_without_a_vertical_that_is_known() -> None:
+    with pytest.raises(CannotCalibrateError, match=r"direction of gravity.*nearly degenerate.*each axis up, down"):
+        rests_and_moves.fit(turned_by_hand("x"), None, BOTH)
+
+
+def test_moves_of_which_only_those_about_one_axis_are_whole_are_refused() -> None:
+    with pytest.raises(NotObservableError, match=r"all were about one axis: record some 24 rests.*changing axes"):
+        rests_and_moves.fit(turned_by_hand("xyz", lost="yz"), None, BOTH)
+
+
+def test_moves_about_all_axes_are_answered() -> None:
+    found = rests_and_moves.fit(turned_by_hand("xyz"), None, BOTH)
+    assert found.convergence["rank"] == found.convergence["parameters"] == 12
+    assert np.abs(found.matrix - np.eye(3)).max() < 0.01

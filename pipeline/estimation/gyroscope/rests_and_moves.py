@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from pipeline.records import Recording
 
 NAME = "rests_and_moves"
+UNKNOWN = 0.05  # of an element of the matrix: beyond it nothing of it is known
 ADVICE = "record some 24 rests, each in another orientation, with moves about changing axes between them"
 
 
@@ -74,6 +75,7 @@ def fit(
     prior = prior_of("gyroscope", recordings, settings)
     found = fit_by_hand(model, start, noises_about(prior, float(np.mean(model.white)), model.kinds), {})
     names = [f"bias_{a}" for a in AXES] + [f"matrix_{a}{b}" for a in AXES for b in AXES]
+    _require_known(names, np.sqrt(np.diag(found.covariance)), model.moves.count)
     values = np.concatenate([found.state.bias, found.state.matrix.ravel()])
     uncertainty = np.sqrt(np.diag(found.covariance))
     parameters = {
@@ -102,6 +104,16 @@ def fit(
         convergence=certified(found.cosine, found.condition, found.rank, len(found.covariance)),
     )
     return budgeted_by_hand(calibration, found.covariance, found.degrees_of_freedom, model, found, settings)
+
+
+def _require_known(names: list[str], u: NDArray[np.float64], moves: int) -> None:
+    """Refuse a matrix of which only the noise of the readings says something: no sensor is so far off."""
+    weak = [name for name, one in zip(names[3:], u[3:], strict=True) if one > UNKNOWN]
+    if weak:
+        raise NotObservableError(
+            f"the {moves} moves are nearly degenerate: they leave {', '.join(weak)} open to {float(u[3:].max()):.2g} "
+            f"(standard uncertainty), as if all were about one axis: {ADVICE}"
+        )
 
 
 def _require_determined(base: NDArray[np.float64]) -> None:
