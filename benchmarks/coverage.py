@@ -11,7 +11,7 @@ truth of each parameter lies within its expanded uncertainty or not. Conditions:
 
 The truth of the staged method, which is an approximation by design, is its own output without noise and table errors.
 Prints the share over all parameters with its standard error over units, that of the worst and best parameter, and CPU
-seconds.
+seconds. A study of some hours is cut into several of ``--n`` units each, from unit ``--first`` on.
 """
 
 from __future__ import annotations
@@ -58,6 +58,7 @@ METHODS: dict[str, tuple[str, str, tuple[str, ...]]] = {  # procedure, sensor, s
 }
 ACCURACIES = ("angle_accuracy_deg", "rate_accuracy", "orthogonality_deg", "levelling_deg")
 CONDITIONS = ("white", "wander", "table")
+APPROXIMATIONS: dict[tuple[Any, ...], np.ndarray] = {}
 
 
 def settings_of(condition: str, table: str, procedure: str) -> dict[str, Any]:
@@ -123,8 +124,11 @@ def true_values(method: str, recordings: list[Recording], settings: JSON, hidden
     _, sensor, stages = METHODS[method]
     matrix = np.array(hidden[sensor]["matrix"])
     if "staged" in method:
-        found = calibrated(sensor, stages, noise_free(recordings, sensor, hidden), settings)
-        return np.concatenate([found.bias, found.matrix.ravel()])
+        unit = (method, *hidden["seed"])  # the same in every condition
+        if unit not in APPROXIMATIONS:
+            found = calibrated(sensor, stages, noise_free(recordings, sensor, hidden), settings)
+            APPROXIMATIONS[unit] = np.concatenate([found.bias, found.matrix.ravel()])
+        return APPROXIMATIONS[unit]
     if method.endswith("by hand") or "nonlinear" in method:
         matrix = frame_of(np.array(hidden["accelerometer"]["matrix"])).T @ matrix
     return np.concatenate([hidden[sensor]["bias"], matrix.ravel()])
@@ -141,9 +145,9 @@ def judged(method: str, recordings: list[Recording], settings: JSON, hidden: JSO
     return np.where(U > 0.0, error / np.where(U > 0.0, U, 1.0), np.nan)
 
 
-def study(methods: list[str], condition: str, n: int, seed: int, table: str) -> dict[str, np.ndarray]:
+def study(methods: list[str], condition: str, units: range, seed: int, table: str) -> dict[str, np.ndarray]:
     found: dict[str, list[np.ndarray]] = {name: [] for name in methods}
-    for number in range(n):
+    for number in units:
         for procedure in (BENCH, HAND):
             wanted = [name for name in methods if METHODS[name][0] == procedure]
             if wanted and not (procedure == HAND and condition == "table"):
@@ -157,6 +161,7 @@ def study(methods: list[str], condition: str, n: int, seed: int, table: str) -> 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--n", type=int, default=1000)
+    parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--conditions", default=",".join(CONDITIONS))
     parser.add_argument("--methods", default="", help="words that a method's name holds, with commas; all by default")
@@ -166,7 +171,8 @@ def main() -> None:
     methods = [name for name in METHODS if any(word in name for word in words)]
     for condition in arguments.conditions.split(","):
         start = time.process_time()
-        found = study(methods, condition, arguments.n, arguments.seed, arguments.table)
+        units = range(arguments.first, arguments.first + arguments.n)
+        found = study(methods, condition, units, arguments.seed, arguments.table)
         print(f"{condition}, n = {arguments.n}, seed {arguments.seed}, {time.process_time() - start:.0f} s CPU")
         for name, ratios in found.items():
             known = ~np.all(np.isnan(ratios), axis=0)
