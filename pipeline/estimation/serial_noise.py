@@ -204,8 +204,8 @@ def assess_noise(
         Columns that were fitted; those of one channel may be more than its own.
     blocks : Blocks
     prior : Prior
-    disturbance : (3 b, m) array, optional
-        What the table's stated errors do to the sums over the blocks, channel by channel.
+    disturbance : (3 b, 3 b) array, optional
+        Covariance that the table's stated errors give the sums over the blocks, channel by channel.
 
     Returns
     -------
@@ -228,7 +228,9 @@ def assess_noise(
     size, seen = np.sqrt(np.mean(residuals**2, axis=0)), None
     if disturbance is not None:
         size = noise_of_steps(np.abs(np.diff(residuals, axis=0)))
-        seen = _undisturbed(Q, disturbance.reshape(3, len(root), -1) / (size[:, None, None] * root))
+        scale = np.outer(size, root).ravel()
+        every = np.asarray(np.kron(np.eye(3), Q), np.float64)
+        seen = _undisturbed(every, disturbance / np.outer(scale, scale))
         z = seen.T @ (z / size).T.reshape(-1, 1)
         spare = len(z)
     belief = prior.log_belief(RATIOS * float(np.sqrt(np.mean(size**2))))
@@ -272,18 +274,17 @@ def _undisturbed(Q: NDArray[np.float64], disturbance: NDArray[np.float64]) -> ND
 
     Parameters
     ----------
-    Q : (b, k) array
-        Basis of what the fit does not reach in one channel.
-    disturbance : (3, b, m) array
-        Over white noise.
+    Q : (3 b, 3 k) array
+        Basis of what the fit does not reach.
+    disturbance : (3 b, 3 b) array
+        Their covariance, over the variance of white noise.
 
     Returns
     -------
     (3 k, r) array
     """
-    U, s, _ = np.linalg.svd(np.concatenate([Q.T @ channel for channel in disturbance]), full_matrices=True)
-    hidden = min(int(np.sum(s > 1.0)), len(U) - 1)
-    return np.asarray(U[:, hidden:])
+    variance, directions = np.linalg.eigh(Q.T @ disturbance @ Q)
+    return np.asarray(directions[:, : max(int(np.sum(variance <= 1.0)), 1)])
 
 
 def _restricted_likelihood(

@@ -54,7 +54,6 @@ FIELDS = {
     "Earth's rotation": ("azimuth_accuracy_deg", "deg"),
 }
 TILTS = ("angle_accuracy_deg", "orthogonality_deg", "wobble_deg", "levelling_deg")
-ROUNDING = 1e-9
 IDLE = {  # sensors whose readings an input does not change
     "table rate": (),
     "levelling": ("gyroscope",),
@@ -150,7 +149,7 @@ def table_contributions(
 
 
 def disturbance(reference: Reference, residuals: Values, blocks: Blocks) -> Values | None:
-    """Return what the stated accuracies do to the sums over blocks: (3 b, m) array; None where noise hides it.
+    """Return the covariance that the stated accuracies give the sums over blocks, or None where noise hides it.
 
     Parameters
     ----------
@@ -158,6 +157,11 @@ def disturbance(reference: Reference, residuals: Values, blocks: Blocks) -> Valu
         Its linear map is not looked at.
     residuals : (n, 3) array
     blocks : Blocks
+
+    Returns
+    -------
+    (3 b, 3 b) array
+        Channel by channel.
     """
     white = float(noise_of_steps(np.abs(np.diff(residuals, axis=0))).min())
     if not 0.0 < white < _largest(reference) * np.sqrt(blocks.count.max()):
@@ -166,10 +170,7 @@ def disturbance(reference: Reference, residuals: Values, blocks: Blocks) -> Valu
     sums[blocks.label, np.arange(len(residuals))] = 1.0
     x, y, z = np.eye(3 * len(sums)).reshape(3, len(sums), -1).transpose(0, 2, 1)
     contributions, _ = table_contributions(replace(reference, fit=LinearMap((sums, sums, sums), (x, y, z))))
-    e, U = np.linalg.eigh(np.sum([c.covariance for c in contributions], axis=0))
-    kept = e > ROUNDING * e[-1]
-    columns: Values = U[:, kept] * np.sqrt(e[kept])
-    return columns
+    return np.sum([c.covariance for c in contributions], axis=0) if contributions else None
 
 
 def _largest(reference: Reference) -> float:

@@ -64,3 +64,10 @@ def test_the_length_of_gravity_is_not_charged_with_errors_of_the_attitude() -> N
     ratios = _ratios(found, true)
     assert ratios.max() < 2.2
     assert np.median(ratios) == pytest.approx(1.0, abs=0.3)
+
+
+def test_an_accuracy_that_does_not_touch_the_gyroscope_changes_nothing() -> None:
+    plain = {**SETTINGS, "table": {"gravity_g": 1.0}}
+    level = {**SETTINGS, "table": {"gravity_g": 1.0, "levelling_deg": 5.0}}
+    first, second = (fit_reference("gyroscope", _unit(0)[0], None, settings) for settings in (plain, level))
+    np.testing.assert_array_equal(np.asarray(first.covariance), np.asarray(second.covariance))
