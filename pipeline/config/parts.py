@@ -45,7 +45,8 @@ FIT = (
     "sensor.{sensor}.full_scale",
     "sensor.{sensor}.counts_per_unit",
     *(f"sensor.{{sensor}}.{key}" for key in NOISE),
-    *(f"sensor.{{sensor}}.{key}" for key in ("effects", "repeatability_bias", "repeatability_scale_factor")),
+    *(f"sensor.{{sensor}}.effects.{key}" for key in ("bias_temperature", "scale_factor_temperature")),
+    *(f"sensor.{{sensor}}.{key}" for key in ("repeatability_bias", "repeatability_scale_factor")),
     "sensor.temperature_accuracy_degc",
     "uncertainty.monte_carlo",
 )
@@ -61,7 +62,7 @@ READS: dict[str, tuple[str, ...]] = {
     ),
     "filter": ("filter", *(f"sensor.{sensor}.{key}" for sensor in ("accelerometer", "gyroscope") for key in NOISE)),
     "fit": FIT,
-    "effects": (*FIT, "effects.{sensor}"),
+    "effects": (*FIT, "effects.{sensor}", "sensor.{sensor}.effects"),
     "calibration": (
         "sensor.name",
         "sensor.axis_map",
@@ -115,7 +116,8 @@ def part(config: Mapping[str, Any], stage: str, sensor: str = "") -> dict[str, A
         for step in branch:
             source = source[step]
             target = target.setdefault(step, {})
-        target[leaf] = source[leaf]
+        if leaf in source or branch[-1:] != ["effects"]:  # a data sheet need not limit every effect
+            target[leaf] = source[leaf]
     return out
 
 

@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import ConfigurationError, NotObservableError
-from pipeline.estimation.averaged_covariance import averaged
 from pipeline.estimation.bench_budget import TEMPERATURE, TIME_BASE
 from pipeline.estimation.budget import combined, scatter_contribution
 from pipeline.estimation.design import BASE, BASE_NAMES, Design, Start, Term, motions_of, ordinary_base
@@ -75,7 +74,7 @@ class Fit:
         Under the best noise setting, up to a constant of the readings.
     setting : Setting
         That noise setting.
-    degrees_of_freedom : (12 + p,) array
+    degrees_of_freedom : float
     residual_rms : float
         Of single samples, unit of the sensor.
     rounds : int
@@ -96,7 +95,7 @@ class Fit:
     covariance: NDArray[np.float64]
     log_likelihood: float
     setting: Setting
-    degrees_of_freedom: NDArray[np.float64]
+    degrees_of_freedom: float
     residual_rms: float
     rounds: int
     converged: bool
@@ -214,7 +213,7 @@ class _Solved:
     covariance: NDArray[np.float64]
     log_likelihood: float
     setting: Setting
-    degrees_of_freedom: NDArray[np.float64]
+    degrees_of_freedom: float
     condition: float
     cosine: float
     left: float
@@ -228,7 +227,7 @@ def _solve(design: Design, observations: Observations, settings: Sequence[Settin
     size = design.sizes()[:-1]
     size = np.where(size > 0, size, 1.0)
     spare = max(n - design.count, 1.0)
-    scores, restricted, steps, covariances, conditions, cosines = [], [], [], [], [], []
+    scores, steps, covariances, conditions, cosines = [], [], [], [], []
     for setting in settings:
         products, logarithm = design.products(setting)
         gram, rhs = products[:-1, :-1] / np.outer(size, size), products[:-1, -1] / size
@@ -242,14 +241,12 @@ def _solve(design: Design, observations: Observations, settings: Sequence[Settin
         rss = max(products[-1, -1] - float(step @ rhs), 0.0) + within
         rss = max(rss, 1e-300)
         scores.append(-0.5 * n * np.log(rss / n) - 0.5 * logarithm + setting.prior)
-        inner = float(np.sum(np.log(values[kept]))) + 2.0 * float(np.sum(np.log(unit * size)))
-        restricted.append(-0.5 * (spare * np.log(rss / spare) + logarithm + inner) + setting.prior)
         steps.append(step / size)
         covariances.append(half @ half.T / np.outer(size, size) * rss / spare)
         conditions.append(float(np.sqrt(values[-1] / max(values[0], 1e-300))))
     best = int(np.argmax(scores))
-    weight = np.exp(np.array(restricted) - max(restricted))
-    covariance, freedom = averaged(weight / weight.sum(), np.array(covariances), spare)
+    weight = np.exp(np.array(scores) - scores[best])
+    covariance, freedom = _averaged(np.array(covariances), weight / weight.sum(), spare)
     cosine, left, rank = cosines[best]
     return _Solved(
         steps[best],
@@ -262,6 +259,22 @@ def _solve(design: Design, observations: Observations, settings: Sequence[Settin
         left,
         int(rank),
     )
+
+
+def _averaged(
+    covariances: NDArray[np.float64], weight: NDArray[np.float64], spare: float
+) -> tuple[NDArray[np.float64], float]:
+    """Average covariances over the noises; their spread says how many degrees of freedom the average has.
+
+    A variance with a scaled inverse chi-square distribution of nu degrees has ``var / mean^2 = 2 / (nu - 4)``.
+    """
+    mean: NDArray[np.float64] = np.tensordot(weight, covariances, 1)
+    diagonal = np.diagonal(covariances, axis1=1, axis2=2)
+    average = np.maximum(np.diag(mean), 1e-300)
+    spread = float(np.max(weight @ (diagonal / average - 1.0) ** 2))
+    freedom = 4.0 + 2.0 / spread if spread > 1e-12 else np.inf
+    shrink = (freedom - 2.0) / freedom if np.isfinite(freedom) else 1.0
+    return mean * shrink, float(1.0 / (1.0 / spare + 1.0 / freedom))
 
 
 def starts_of(names: Sequence[str], sensor: str, known: SensorCalibration | None = None) -> list[list[Term]]:
@@ -468,8 +481,7 @@ def calibration_of(
         converged=fit.converged,
         convergence=certified(fit.cosine, fit.condition, fit.rank, len(covariance)),
     )
-    scatter = scatter_contribution(covariance, np.inf, remark=SCATTER)
-    lines, missing = [scatter.with_freedom(fit.degrees_of_freedom)], dict(NOT_INCLUDED)
+    lines, missing = [scatter_contribution(covariance, fit.degrees_of_freedom, remark=SCATTER)], dict(NOT_INCLUDED)
     if settings is None:
         return combined(found, lines, missing)
     design = _at(observations, fit.terms, fit.bias, fit.K, np.maximum(fit.scale, 1e-300))
@@ -483,7 +495,7 @@ def calibration_of(
         return complete
     values = np.concatenate([fit.bias, fit.K.ravel(), *(term.values for term in fit.terms)])
     stated, _ = table_contributions(replace(reference, fit=first), estimated)
-    errors = Errors(np.ones(1), fit.covariance[None], float(fit.degrees_of_freedom.min()), stated)
+    errors = Errors(np.ones(1), fit.covariance[None], fit.degrees_of_freedom, stated)
     return beside_trials(complete, errors.through(lambda e: _with_matrix(values + e)), trials)
 
 
