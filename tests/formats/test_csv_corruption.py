@@ -32,7 +32,9 @@ COUNT = 150
 SOUND = text(ROWS[:COUNT])
 LINES = SOUND.split(b"\n")[:-1]
 PROFILES = ({}, {"bad_rows": "drop"}, {"nan": "gap"}, {"bad_rows": "drop", "nan": "gap"}, {"delimiter": "auto"})
-ALONE = settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+ALONE = settings(
+    max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+)
 
 
 def read(folder: Path, content: bytes, changes: dict[str, Any], share: float) -> Recording | None:

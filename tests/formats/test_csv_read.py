@@ -35,7 +35,9 @@ def test_canonical_csv_comes_back_bit_for_bit(tmp_path: Path, canonical: dict[st
     assert_same_bits(read_back(tmp_path, canonical), written)
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+)
 @given(
     values=hnp.arrays(np.float64, (5, 6), elements=st.floats(-1.9, 1.9)),
     start=st.integers(0, 10**15),

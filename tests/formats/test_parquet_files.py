@@ -55,7 +55,9 @@ def test_every_recording_comes_back_whole(tmp_path: Path) -> None:
             assert getattr(one, name) == getattr(other, name), name
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+)
 @given(
     values=hnp.arrays(np.float64, (4, 3), elements=st.floats(allow_nan=True, allow_infinity=True)),
     times=hnp.arrays(np.int64, 4),
