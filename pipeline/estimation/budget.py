@@ -73,19 +73,16 @@ def noise_contribution(noise: SerialNoise, fit: LinearMap, prior: Prior) -> Cont
     prior : Prior
         The bias wander that was expected.
     """
-    unit: dict[int, tuple[Values, Values, Values]] = {}
-    p = fit.parameters
-    candidates = np.zeros((len(noise.weight), p, p))
-    white, wander = np.zeros(p), np.zeros(p)
-    for A, J, own, s in zip(fit.weights, fit.derivative, noise.white_variance.T, noise.white, strict=True):
+    unit: dict[int, tuple[Values, Values]] = {}
+    white, wander = np.zeros(fit.parameters), np.zeros(fit.parameters)
+    for A, J, s in zip(fit.weights, fit.derivative, noise.white, strict=True):
         if id(A) not in unit:
             a = noise.blocks.sums(A.T)
-            unit[id(A)] = noise.covariances(A), A @ A.T, a.T @ noise.expected_correlation(prior) @ a
-        every, alone, slow = unit[id(A)]
-        candidates += own[:, None, None] * (J @ every @ J.T)
+            unit[id(A)] = A @ A.T, a.T @ noise.expected_correlation(prior) @ a
+        alone, slow = unit[id(A)]
         white += s**2 * np.einsum("pi,ij,pj->p", J, alone, J)
         wander += prior.wander**2 * np.einsum("pi,ij,pj->p", J, slow, J)
-    covariance, freedom = averaged(noise.weight, candidates, noise.spare)
+    covariance, freedom = averaged(noise.weight, candidate_covariances(noise, fit), noise.spare)
     return Contribution(
         NOISE, "A", "Student's t", covariance, freedom, parts=_parts(np.diag(covariance), white, wander)
     )
@@ -174,27 +171,51 @@ def combined(
     not_included : mapping of str to str
         Source to the reason why it is not among them.
     """
-    names = calibration.parameter_names()
     covariance = np.sum([c.covariance for c in contributions], axis=0)
-    u = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
     freedom = effective_degrees_of_freedom(
         np.array([c.standard_uncertainty for c in contributions]),
         np.array([c.degrees_of_freedom for c in contributions]),
     )
+    head = {
+        "parameters": calibration.parameter_names(),
+        "units": _units(calibration),
+        "contributions": [c.to_json() for c in contributions],
+    }
+    reasons = {**not_included, "repeatability": REPEATABILITY}
+    left = [{"source": source, "reason": reason} for source, reason in reasons.items()]
+    return with_uncertainty(calibration, covariance, freedom, head, left)
+
+
+def with_uncertainty(
+    calibration: SensorCalibration,
+    covariance: Values,
+    freedom: Values,
+    budget: Mapping[str, Any],
+    not_included: Sequence[Mapping[str, str]],
+) -> SensorCalibration:
+    """Return a calibration with a covariance, and all that follows from it: of its effects and its budget, too.
+
+    Parameters
+    ----------
+    calibration : SensorCalibration
+    covariance : (p, p) array
+    freedom : (p,) array
+        Effective degrees of freedom of each parameter.
+    budget : mapping
+        What else the budget's document holds.
+    not_included : sequence of mapping
+        ``source`` and ``reason``.
+    """
+    u = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
     factors = coverage_factors(freedom)
     known = freedom[u > 0.0]
     document = {
-        "parameters": names,
-        "units": _units(calibration),
-        "contributions": [c.to_json() for c in contributions],
+        **budget,
         "standard_uncertainty": u.tolist(),
         "effective_degrees_of_freedom": finite(freedom),
         "coverage_factor": factors.tolist(),
         "expanded_uncertainty": (factors * u).tolist(),
-        "not_included": [
-            {"source": source, "reason": reason}
-            for source, reason in {**not_included, "repeatability": REPEATABILITY}.items()
-        ],
+        "not_included": list(not_included),
     }
     effects, at = [], 12
     for effect in calibration.effects:

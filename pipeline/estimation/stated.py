@@ -17,14 +17,13 @@ Both are added after a fit, as they depend on no method. What is not stated is n
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.estimation.budget import type_b
-from pipeline.records.budget import NORMAL, RECTANGULAR, finite
-from pipeline.records.calibration import UNITS, coverage_factors
+from pipeline.estimation.budget import type_b, with_uncertainty
+from pipeline.records.budget import NORMAL, RECTANGULAR
+from pipeline.records.calibration import UNITS
 from pipeline.signal.temperature import temperature_of
 
 if TYPE_CHECKING:
@@ -136,33 +135,8 @@ def _with_lines(
     assert before is not None  # noqa: S101
     assert budget is not None  # noqa: S101
     covariance = before + np.sum([line.covariance for line in lines], axis=0) if lines else before
-    u = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
     old = np.array([np.inf if v is None else v for v in budget["effective_degrees_of_freedom"]])
-    share = np.divide(np.diag(covariance), np.diag(before), out=np.ones(len(u)), where=np.diag(before) > 0.0)
+    share = np.divide(np.diag(covariance), np.diag(before), out=np.ones(len(before)), where=np.diag(before) > 0.0)
     freedom = np.where(np.diag(before) > 0.0, old * share**2, np.inf)
-    factors = coverage_factors(freedom)
-    document = {
-        **budget,
-        "contributions": [*budget["contributions"], *(line.to_json() for line in lines)],
-        "standard_uncertainty": u.tolist(),
-        "effective_degrees_of_freedom": finite(freedom),
-        "coverage_factor": factors.tolist(),
-        "expanded_uncertainty": (factors * u).tolist(),
-        "not_included": list(not_included),
-    }
-    known = freedom[u > 0.0]
-    effects, at = [], 12
-    for effect in calibration.effects:
-        new = {}
-        for name, parameter in effect.parameters.items():
-            new[name] = {**parameter, "expanded_uncertainty": float(factors[at] * u[at])}
-            at += 1
-        effects.append(replace(effect, parameters=new))
-    return replace(
-        calibration,
-        effects=tuple(effects),
-        covariance=covariance,
-        degrees_of_freedom=float(known.min()) if len(known) else np.inf,
-        freedom=freedom,
-        budget=document,
-    )
+    contributions = [*budget["contributions"], *(line.to_json() for line in lines)]
+    return with_uncertainty(calibration, covariance, freedom, {**budget, "contributions": contributions}, not_included)

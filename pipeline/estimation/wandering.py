@@ -31,10 +31,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    Factor = tuple[NDArray[np.float64], NDArray[np.float64], float]
-
     from pipeline.estimation.observations import Part
     from pipeline.records import Noise
+
+    Factor = tuple[NDArray[np.float64], NDArray[np.float64], float]
 
 CELLS = 300
 SHORTEST_CELL_S = 4.0
@@ -119,8 +119,10 @@ def cells_of(parts: Sequence[Part]) -> Cells:
 
 def _follows(before: Part | None, part: Part) -> bool:
     """Return whether the time from the recording before is known."""
-    if before is None or (before.clock_shared and part.clock_shared):
-        return before is not None
+    if before is None:
+        return False
+    if before.clock_shared and part.clock_shared:
+        return True
     one = before.motion.setup == part.motion.setup != ""
     return one and bool(before.motion.time[-1] < part.motion.time[0])
 

@@ -10,10 +10,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-# ABOUT[a] @ u = e_a x u
-ABOUT = np.stack([np.cross(axis, np.eye(3)).T for axis in np.eye(3)])
-
-
 def turn_about_axis(vector: NDArray[np.float64], axis: int, angle_deg: NDArray[np.float64]) -> NDArray[np.float64]:
     """Turn vectors about a coordinate axis by each of several angles (right-handed).
 
@@ -38,6 +34,26 @@ def turn_about_axis(vector: NDArray[np.float64], axis: int, angle_deg: NDArray[n
     return out
 
 
+def turn_by_vector(phi: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the rotations by vectors, ``exp [phi]x`` (Rodrigues): (..., 3) array, rad, to (..., 3, 3)."""
+    angle = np.linalg.norm(phi, axis=-1)
+    small = angle < 1e-6
+    safe = np.where(small, 1.0, angle)
+    s = np.where(small, 1.0, np.sin(safe) / safe)
+    c = np.where(small, 0.5, (1.0 - np.cos(safe)) / safe**2)
+    cross = skew(phi)
+    out: NDArray[np.float64] = np.eye(3) + s[..., None, None] * cross + c[..., None, None] * (cross @ cross)
+    return out
+
+
+def skew(v: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return ``[v]x``, with ``[v]x u = v x u``: (..., 3) array to (..., 3, 3)."""
+    out = np.zeros((*v.shape, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
+    return out
+
+
 def attitude_matrix(q: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the rotation matrices of unit quaternions: (n, 4) to (n, 3, 3), body vectors to level vectors."""
     w, x, y, z = q.T
@@ -49,3 +65,6 @@ def attitude_matrix(q: NDArray[np.float64]) -> NDArray[np.float64]:
         ],
         1,
     )
+
+
+ABOUT = skew(np.eye(3))  # ABOUT[a] @ u = e_a x u

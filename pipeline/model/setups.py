@@ -20,6 +20,7 @@ import numpy as np
 
 from pipeline.errors import ConfigurationError
 from pipeline.model.effects.base import Effect, Layout, Owner, Parameter, truth, unit_of
+from pipeline.model.rotation import turn_by_vector
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -52,23 +53,13 @@ class _Mounting(Effect):
     def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
         """Return the derivative by differences that are exact to 1e-8."""
         steps = STEP_DEG * np.eye(3)
-        slopes = [(_turn(values + step) - _turn(values - step)) / (2.0 * STEP_DEG) for step in steps]
-        u = truth(sensor, motion)
+        change = turn_by_vector(np.radians(values + steps)) - turn_by_vector(np.radians(values - steps))
+        slopes, u = change / (2.0 * STEP_DEG), truth(sensor, motion)
         return np.stack([u @ (K @ slope.T).T for slope in slopes], axis=2)
 
     def reading(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
         """Return what the turn adds, however large it is."""
-        return np.asarray(truth(sensor, motion) @ (K @ (_turn(values).T - np.eye(3))).T)
-
-
-def _turn(theta: Values) -> Values:
-    """Return the rotation by a vector, deg: (3, 3) array."""
-    angle = float(np.radians(np.linalg.norm(theta)))
-    x, y, z = np.radians(theta)
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    half = np.sinc(angle / (2.0 * np.pi))
-    turn: Values = np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * half**2 * (cross @ cross)
-    return turn
+        return np.asarray(truth(sensor, motion) @ (K @ (turn_by_vector(np.radians(values)).T - np.eye(3))).T)
 
 
 class _Bias(Effect):

@@ -8,10 +8,9 @@ from pipeline.atomic import write_atomically
 from pipeline.diagnosis.diagnose import diagnose
 from pipeline.diagnosis.guess_words import effect_file
 from pipeline.formats.parquet import load_recordings
-from pipeline.signal.noise import estimate_noise
 from pipeline.stages.batch import parse_job, run_batch, write_json
 from pipeline.stages.fits import load_fits
-from pipeline.stages.noises import load_noises
+from pipeline.stages.noises import require_noises
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -25,11 +24,10 @@ def main(argv: Sequence[str]) -> int:
         recordings = load_recordings(job.inputs["filter"] / f"{unit}.parquet")
         document: dict[str, Any] = {"schema_version": 1, "unit": unit}
         fits = load_fits(job.inputs, unit)
-        noises = load_noises(job.inputs["filter"], unit)
+        noises = require_noises(job.inputs["filter"], unit, recordings, part["sensor"])
         for sensor, calibration in fits.items():
-            noise = noises[sensor] or estimate_noise(sensor, recordings, part["sensor"][sensor])
             document[sensor] = found = calibration and diagnose(
-                calibration, recordings, noise, part, fits["accelerometer"]
+                calibration, recordings, noises[sensor], part, fits["accelerometer"]
             )
             if found and found.get("suggested_effect"):
                 found["suggested_file"] = suggested_file(unit, sensor)

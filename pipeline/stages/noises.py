@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from pipeline.records import SENSORS, Noise
-from pipeline.signal.noise import noise_of
+from pipeline.signal.noise import estimate_noise, noise_of
 from pipeline.stages.batch import read_json, write_json
 
 if TYPE_CHECKING:
@@ -21,6 +21,20 @@ def save_noises(folder: Path, unit: str, recordings: list[Recording], settings: 
 
 
 def load_noises(folder: Path, unit: str) -> dict[str, Noise | None]:
-    """Return the noise of each sensor, None where nothing tells it."""
+    """Read the noise of each sensor, None where nothing tells it."""
     found = read_json(folder / f"{unit}.noise.json")
     return {sensor: data and Noise.from_json(data) for sensor, data in found.items()}
+
+
+def require_noises(
+    folder: Path, unit: str, recordings: list[Recording], sheets: dict[str, dict[str, Any]]
+) -> dict[str, Noise]:
+    """Read the noise of each sensor.
+
+    Raises
+    ------
+    ConfigurationError
+        If nothing tells it; what is lacking is found by looking once more.
+    """
+    found = load_noises(folder, unit)
+    return {sensor: noise or estimate_noise(sensor, recordings, sheets[sensor]) for sensor, noise in found.items()}

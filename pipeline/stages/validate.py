@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from pipeline.formats.parquet import load_recordings
-from pipeline.signal.noise import estimate_noise
 from pipeline.stages.batch import parse_job, run_batch, write_json
 from pipeline.stages.fits import load_fits
-from pipeline.stages.noises import load_noises
+from pipeline.stages.noises import require_noises
 from pipeline.validation.attitude import attitude
 from pipeline.validation.gravity_direction import gravity_direction
 from pipeline.validation.heldout import validate
@@ -25,13 +24,14 @@ def main(argv: Sequence[str]) -> int:
         recordings = load_recordings(job.inputs["filter"] / f"{unit}.parquet")
         document: dict[str, Any] = {"schema_version": 1, "unit": unit}
         fits = load_fits(job.inputs, unit)
-        noises = load_noises(job.inputs["filter"], unit)
+        noises = require_noises(job.inputs["filter"], unit, recordings, part["sensor"])
         for sensor, calibration in fits.items():
-            noise = noises[sensor] or estimate_noise(sensor, recordings, part["sensor"][sensor])
             other = next(fit for s, fit in fits.items() if s != sensor)
-            document[sensor] = calibration and validate(calibration, recordings, noise, part, other=other)
+            document[sensor] = calibration and validate(calibration, recordings, noises[sensor], part, other=other)
         document["attitude"] = attitude(fits["accelerometer"], fits["gyroscope"], recordings)
-        document["gravity_direction"] = gravity_direction(**fits, recordings=recordings, noise=noise, settings=part)
+        document["gravity_direction"] = gravity_direction(
+            **fits, recordings=recordings, noise=noises["gyroscope"], settings=part
+        )
         write_json(job.output / f"{unit}.json", document)
 
     return run_batch(job, work)

@@ -32,8 +32,9 @@ from pipeline.estimation.hand_held.accelerometer import SMALLEST_NOISE, white_of
 from pipeline.estimation.hand_held.equations import Equations
 from pipeline.estimation.hand_held.gravity import gravity_of
 from pipeline.estimation.hand_held.model import State, added, motion_of
-from pipeline.estimation.hand_held.moves import moves_of, skew, tangents, to_the_end
+from pipeline.estimation.hand_held.moves import moves_of, tangents, to_the_end
 from pipeline.estimation.hand_held.rests import ROLE, rests_of
+from pipeline.model.rotation import skew
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

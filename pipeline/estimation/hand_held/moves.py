@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.estimation.rest_means import sound_samples
+from pipeline.model.rotation import turn_by_vector
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -198,32 +199,12 @@ def to_the_end(rate: Values, time: Values) -> Values:
     """
     omega, dt = np.radians(rate), np.diff(time, axis=1)[:, :, None]
     phi = 0.5 * (omega[:, 1:] + omega[:, :-1]) * dt + np.cross(omega[:, :-1], omega[:, 1:]) * dt**2 / 12.0
-    back = _exponential(-phi)
+    back = turn_by_vector(-phi)
     A = np.empty((*rate.shape[:2], 3, 3))
     A[:, -1] = np.eye(3)
     for k in range(rate.shape[1] - 2, -1, -1):
         np.matmul(A[:, k + 1], back[:, k], out=A[:, k])
     return A
-
-
-def _exponential(phi: Values) -> Values:
-    """Return ``exp [phi]x``: (..., 3, 3) array."""
-    angle = np.linalg.norm(phi, axis=-1)
-    small = angle < 1e-6
-    safe = np.where(small, 1.0, angle)
-    s = np.where(small, 1.0, np.sin(safe) / safe)
-    c = np.where(small, 0.5, (1.0 - np.cos(safe)) / safe**2)
-    cross = skew(phi)
-    out: Values = np.eye(3) + s[..., None, None] * cross + c[..., None, None] * (cross @ cross)
-    return out
-
-
-def skew(v: Values) -> Values:
-    """Return ``[v]x``: (..., 3, 3) array."""
-    out = np.zeros((*v.shape, 3))
-    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
-    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
-    return out
 
 
 def tangents(u: Values) -> Values:

@@ -7,12 +7,11 @@ own, ``sqrt(P) p = 0 +- 1``.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.estimation.design import Term
+from pipeline.estimation.hand_held.model import stepped
 from pipeline.estimation.trials import beside_trials, normal, quadratic_results
 
 if TYPE_CHECKING:
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.estimation.hand_held.fit import HandFit
-    from pipeline.estimation.hand_held.model import Model, State
+    from pipeline.estimation.hand_held.model import Model
     from pipeline.records import SensorCalibration
     from pipeline.records.budget import Contribution
 
@@ -79,17 +78,8 @@ def _curvature(model: Model, found: HandFit, parameters: int) -> Values:
     for j, u in enumerate(np.sqrt(np.diag(found.covariance))):
         step = np.zeros(parameters)
         step[j] = STEP * u
-        up, down = (model.equations(_moved(model, found.state, sign * step)).columns for sign in (1.0, -1.0))
-        slopes.append((up - down) / (2.0 * step[j]) if step[j] > 0.0 else np.zeros_like(up))
+        (up, more), (down, less) = (stepped(model, found.state, sign * step) for sign in (1.0, -1.0))
+        change = model.equations(up).columns - model.equations(down).columns
+        slopes.append(change / (more[j] - less[j]) if step[j] > 0.0 else np.zeros_like(change))
     H = np.stack(slopes, axis=2)
     return np.asarray(0.5 * (H + H.transpose(0, 2, 1)))
-
-
-def _moved(model: Model, state: State, step: Values) -> State:
-    base = model.directions.shape[1]
-    change, terms, at = model.directions @ step[:base], [], base
-    for term in state.terms:
-        terms.append(Term(term.effect, term.values + step[at : at + len(term.values)]))
-        at += len(term.values)
-    bias, matrix = state.bias + change[:3], state.matrix + change[3:].reshape(3, 3)
-    return replace(state, bias=bias, matrix=matrix, terms=tuple(terms))

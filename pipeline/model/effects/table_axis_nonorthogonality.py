@@ -16,7 +16,7 @@ import numpy as np
 
 from pipeline.model.effects.base import Effect, Layout, Owner, Parameter, length
 from pipeline.model.kinematics import UP_AT_ZERO
-from pipeline.model.rotation import ABOUT, turn_about_axis
+from pipeline.model.rotation import ABOUT, skew, turn_about_axis
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -66,7 +66,7 @@ class TableAxisNonorthogonality(Effect):
             if gravity is None:
                 out[:, :, 2 * axis + step - 1] = motion.rate[:, None] * (K @ lean)
                 continue
-            across = np.tensordot(ABOUT[axis] @ lean, ABOUT, 1)  # across @ u = theta x u
+            across = skew(ABOUT[axis] @ lean)  # across @ u = theta x u
             home = turn_about_axis(across @ UP_AT_ZERO[axis], axis, -motion.angle)
             out[:, :, 2 * axis + step - 1] = (f @ across.T - gravity * home) @ K.T
         return out
