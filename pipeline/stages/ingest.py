@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.formats.parquet import save_recordings
 from pipeline.formats.read import read_recordings
+from pipeline.preprocessing.checks import check_recordings
 from pipeline.signal.segments import cut
 from pipeline.stages.batch import parse_job, run_batch
 
@@ -25,6 +26,7 @@ def main(argv: Sequence[str]) -> int:
         read = read_recordings(part["procedure"], part["ingest"], part["sensor"], folder)
         entries = part["procedure"]["recordings"]
         recordings = [s for r in read for s in ([r] if r.role != "session" else cut(r, entries[r.name].get("windows")))]
+        recordings = check_recordings(recordings, part)
         named = [replace(r, source=r.source | {"file": below(directory, r.source["file"])}) for r in recordings]
         save_recordings(job.output / f"{unit}.parquet", named)
 

