@@ -11,8 +11,18 @@ where
     W    : (q, r) weights: which combinations of the curves make up a shape
     drop : by how much they lower the whitened sum of squares
 
-so that any number of shapes is judged from products formed once. The coefficients of effects that the axes share are
-left free in each axis: it decouples the axes and takes a little more from the curves than it must, never less.
+so that any number of shapes is judged from products formed once.
+
+Products of columns are differences of larger numbers: what white noise alone would leave, less what a wander takes.
+Their rounding errors are at most ``u sqrt(n) |a| |a'|`` (Higham and Mary 2019, doi:10.1137/18M1226312, n rows, |a| the
+norm of a column under white noise), so a curve z from which others are taken with coefficients x leaves a sum of
+squares that is known to
+
+    e^2 = u sqrt(n) (|z| + sum |x_k| |a_k|)^2
+
+A curve that leaves less than this cannot be told from the others: it explains nothing. The coefficients of effects that
+the axes share are left free in each axis: it decouples the axes and takes a little more from the curves than it must,
+never less.
 """
 
 from __future__ import annotations
@@ -23,7 +33,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.estimation.design import Term, motions_of
-from pipeline.estimation.ranking import WHITE, without
+from pipeline.estimation.ranking import WHITE, projection
 from pipeline.estimation.wandering import Whitened
 from pipeline.model.effects.base import Layout, truth
 
@@ -39,7 +49,7 @@ if TYPE_CHECKING:
     Values = NDArray[np.float64]
 
 NEW = 1e-3  # share of a curve's norm that base and effects leave, below which it says nothing new
-RIDGE = 1e-11
+ROUNDING = float(np.finfo(np.float64).eps) / 2.0  # u
 
 
 @dataclass(frozen=True)
@@ -101,21 +111,27 @@ class Leftover:
         q = len(own[0])
         readings = products.shape[1] - 3 + np.arange(3)
         alike = all(np.array_equal(a, b) for a, b in ((known[0], known[2]), (own[0], own[2])))
-        inner, cross, left = [], [], []
+        white = np.sqrt(np.maximum(np.einsum("ii->i", products[0]), 0.0))
+        unit = (ROUNDING * np.sqrt(self.samples / 3.0)) ** 0.5
+        inner, cross, left, error = [], [], [], []
         for c in range(3):
             if c == 0 or not alike:
                 index = np.concatenate([known[c], own[c], readings if alike else readings[c : c + 1]])
-                rest = without(products[:, index[:, None], index], np.arange(len(known[c])))
-                rest = rest[:, len(known[c]) :, len(known[c]) :]
+                among, k = products[:, index[:, None], index], len(known[c])
+                taken = projection(among, np.arange(k))[:, :, k:]
+                rest = among[:, k:, k:] - among[:, :k, k:].transpose(0, 2, 1) @ taken
+                size = white[own[c]] + white[known[c]] @ np.abs(taken[:, :, :q])
             at = q + (c if alike else 0)
             inner.append(rest[:, :q, :q])
             cross.append(rest[:, :q, at])
             left.append(rest[:, at, at])
+            error.append(unit * size)
         over = self.scale[None, :] ** -2
         self.white: Values = np.mean([axis[0] for axis in inner], axis=0)
         self.inner: Values = np.stack(inner, axis=1)[1:] * over[:, :, None, None]
         self.cross: Values = np.stack(cross, axis=1)[1:] * over[:, :, None]
         self.left: Values = np.stack(left, axis=1)[1:] * over
+        self.error: Values = np.stack(error, axis=1)[1:] / self.scale[:, None]
         self.before = float(self._log_likelihood(self.left.sum(axis=1)).max())
 
     def _log_likelihood(self, rss: Values) -> Values:
@@ -145,15 +161,30 @@ class Leftover:
         cross = self.cross @ weights
         left = np.einsum("qm,qm->m", weights, self.white @ weights)
         new = left > NEW**2 * np.sum((self.size[:, None] * weights) ** 2, axis=0)
+        new = new & (inner > (self.error @ np.abs(weights)) ** 2)
         return np.where(new, cross**2 / np.where(new, inner, 1.0), 0.0)
 
     def drop(self, index: Sequence[int]) -> Values:
         """Return what several curves explain together, by the number of them from the first on: (t, 3, r) array."""
-        inner, cross = self.inner[:, :, index][:, :, :, index], self.cross[:, :, index]
-        factor = np.linalg.cholesky(inner + self._ridge(index))
-        each = np.linalg.solve(factor, cross[..., None])[..., 0]
-        together: Values = np.cumsum(each**2, axis=2)
+        each, _ = self._each(index)
+        together: Values = np.cumsum(each, axis=2)
         return together
+
+    def _each(self, index: Sequence[int]) -> tuple[Values, NDArray[np.bool_]]:
+        """Return what each curve explains beside those before it, and whether it can be told from them: (t, 3, r)."""
+        inner, cross = self.inner[:, :, index][:, :, :, index], self.cross[:, :, index].copy()
+        error = self.error[:, :, index].copy()
+        explained, told = np.zeros_like(cross), np.zeros(cross.shape, bool)
+        for j in range(len(index)):
+            pivot = inner[:, :, j, j]
+            told[:, :, j] = pivot > error[:, :, j] ** 2
+            over = np.where(told[:, :, j], 1.0 / np.where(told[:, :, j], pivot, 1.0), 0.0)
+            explained[:, :, j] = cross[:, :, j] ** 2 * over
+            taken = inner[:, :, j] * over[:, :, None]
+            cross -= taken * cross[:, :, j : j + 1]
+            inner = inner - taken[:, :, :, None] * inner[:, :, j, None, :]
+            error += np.abs(taken) * error[:, :, j : j + 1]
+        return explained, told
 
     def gains(self, drops: Values, parameters: int | NDArray[np.intp]) -> Values:
         """Return delta BIC of shapes on all three axes: (m,) array.
@@ -198,16 +229,14 @@ class Leftover:
         assert best is not None  # noqa: S101
         return best
 
-    def _ridge(self, index: Sequence[int]) -> Values:
-        """Return what keeps products of curves definite that the noise nearly swallows: (3, r, r) array."""
-        squares = (self.size[index] / self.scale[:, None]) ** 2
-        ridge: Values = RIDGE * squares[:, :, None] * np.eye(len(index))
-        return ridge
-
     def coefficients(self, index: Sequence[int], setting: int) -> Values:
-        """Return the estimates of some curves under one noise: (3, r) array, unit of the sensor."""
+        """Return the estimates of some curves under one noise: (3, r) array, unit of the sensor.
+
+        Those of a curve that cannot be told from the others are 0.
+        """
         inner, cross = self.inner[setting][:, index][:, :, index], self.cross[setting][:, index]
-        found: Values = np.linalg.solve(inner + self._ridge(index), cross[..., None])[..., 0]
+        both = np.einsum("cr,cs->crs", told := self._each(index)[1][setting], told)
+        found: Values = np.linalg.solve(np.where(both, inner, np.eye(len(index))), (cross * told)[..., None])[..., 0]
         return found
 
 

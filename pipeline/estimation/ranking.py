@@ -299,9 +299,20 @@ def without(products: NDArray[np.float64], index: NDArray[np.intp]) -> NDArray[n
     """
     if len(index) == 0:
         return products
+    rest: NDArray[np.float64] = products - products[:, index, :].transpose(0, 2, 1) @ projection(products, index)
+    return rest
+
+
+def projection(products: NDArray[np.float64], index: NDArray[np.intp]) -> NDArray[np.float64]:
+    """Return the coefficients by which some of the columns come closest to each column: (t, q, p) array.
+
+    Parameters
+    ----------
+    products : (t, p, p) array
+    index : (q,) array of int
+    """
     inner, cross = products[:, index[:, None], index], products[:, index, :]
     size = np.sqrt(np.maximum(np.einsum("tii->ti", inner), 1e-300))
     scaled = inner / (size[:, :, None] * size[:, None, :]) + RIDGE * np.eye(len(index))
-    solved = np.linalg.solve(scaled, cross / size[:, :, None]) / size[:, :, None]
-    rest: NDArray[np.float64] = products - cross.transpose(0, 2, 1) @ solved
-    return rest
+    found: NDArray[np.float64] = np.linalg.solve(scaled, cross / size[:, :, None]) / size[:, :, None]
+    return found

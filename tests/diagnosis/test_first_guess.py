@@ -23,11 +23,14 @@ from pipeline.estimation.design import Term
 from pipeline.estimation.joint import fit_terms
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import Selection, select
+from pipeline.estimation.wandering import Setting
 from pipeline.model.effects import forget_registered, register
 from pipeline.model.user_effects import effect_from
 from pipeline.records import Recording, SensorCalibration
 from pipeline.signal.noise import estimate_noise
 from pipeline.signal.temperature import smooth_temperature
+from pipeline.study.cases import draw
+from pipeline.study.judge import judge
 
 SHEET = yaml.safe_load((Path(__file__).parents[2] / "configs/sensor/mpu6050.yaml").read_text(encoding="utf-8"))
 TABLE = {"gravity_g": 1.0, "latitude_deg": None, "azimuth_deg": None}
@@ -193,6 +196,23 @@ def test_a_power_that_the_base_holds_already_says_nothing_new() -> None:
     )
     assert leftover.independent([0, 1, 2]) == [1]
     assert leftover.drops(np.eye(4))[:, :, 0].max() == 0.0
+
+
+def test_a_curve_that_rounding_hides_explains_nothing() -> None:
+    selection = replace(selection_of("gyroscope", record(Session(2, SHORT))), settings=[Setting(4.4, 800.0)])
+    formulas = ["time", "exp(-time / 30000)", "time ** 2", "time + 1e-5 * time ** 2"]
+    leftover = Leftover(selection, columns_of(formulas, "gyroscope"))
+    explained = leftover.drop(range(4))
+    assert np.all(explained[:, :, 1] > explained[:, :, 0])
+    assert np.all(explained[:, :, 1:] == explained[:, :, 1:2])
+    assert np.all(leftover.coefficients(range(4), 0)[:, 2:] == 0.0)
+
+
+def test_slow_effects_that_a_slow_wander_nearly_hides_are_judged() -> None:
+    """A selected warm-up and a wander of 800 s leave 3e-8 of the curve "time": less than rounding lets one know."""
+    (found,) = judge(draw("removed", 18, 931))
+    assert found["verdict"] == "missing_effect"
+    assert found["whole"]["selected"] == ["bias_drift"]
 
 
 def test_names_that_are_taken_are_not_given_again() -> None:
