@@ -1,0 +1,152 @@
+"""Add effects to units in <campaign>/devices/<unit>.yaml, and run the campaign."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import subprocess
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import yaml
+
+from pipeline.atomic import write_atomically
+from pipeline.command_lines import run_command
+from pipeline.config.campaign import find_campaign, load_layers
+from pipeline.config.campaign_file import as_list
+from pipeline.config.compose import CONFIGS, Composer
+from pipeline.config.devices import edit_effects, sensor_and_effect
+from pipeline.config.user_effects import PYTHON
+from pipeline.errors import ConfigurationError, MissingInputError
+from pipeline.records import SENSORS
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.config.devices import Edit
+
+EPILOG = """\
+examples:
+  python -m pipeline add demo mpu6050-2-hidden gyroscope.g_sensitivity
+  python -m pipeline add my_bench U1 gyroscope.g_sensitivity accelerometer.lever_arm --no-run
+  python -m pipeline add my_fleet --missing                 each unit gets what its own diagnosis found to be missing
+  python -m pipeline add my_fleet --missing g_sensitivity   only this effect, in the units that miss it
+  python -m pipeline remove demo mpu6050-2-hidden gyroscope.g_sensitivity
+
+The effects of units.csv and of the command line are stronger than the file: they are refused with the place to edit.
+"""
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run ``python -m pipeline add CAMPAIGN UNIT SENSOR.EFFECT ...``."""
+    parser = parser_of("add", __doc__)
+    parser.add_argument(
+        "--missing",
+        nargs="?",
+        const="",
+        metavar="EFFECT",
+        help="add to every unit what the results of the last run say is missing (or only EFFECT of it)",
+    )
+    return change(parser.parse_args(argv), remove=False)
+
+
+def change(arguments: argparse.Namespace, *, remove: bool) -> int:
+    """Edit the device files and run the campaign; the exit code is that of the run."""
+    given = _settings(arguments.config)
+    directory = find_campaign(arguments.campaign)
+    composer = Composer(directory, as_list(given.get(PYTHON, []), PYTHON, "paths of Python files"))
+    layers, _ = load_layers(directory, given, composer)
+    wanted = _wanted(arguments, directory.name)
+    edits = [
+        edit_effects(directory, unit, effects, layers, composer, remove=remove) for unit, effects in wanted.items()
+    ]
+    for edit in edits:
+        _apply(edit)
+    settings = {"campaign": arguments.campaign, **given}
+    if arguments.results != Path("results"):
+        settings["results"] = str(arguments.results)
+    command = run_command(settings).replace("--cores 2", f"--cores {arguments.cores}", 1)
+    if arguments.no_run:
+        print(f"then: {command}")
+        return 0
+    print(f"runs: {command}", flush=True)
+    words = [f"campaign={arguments.campaign}", *arguments.config]
+    words += [f"results={arguments.results}"] * ("results" in settings)
+    rules = ["--cores", arguments.cores, "--snakefile", str(CONFIGS.parent / "Snakefile"), "--config", *words]
+    return subprocess.run([sys.executable, "-m", "snakemake", *rules], check=False).returncode  # noqa: S603  (the user's own run)
+
+
+def parser_of(command: str, description: str | None) -> argparse.ArgumentParser:
+    """Return the options that add and remove have in common."""
+    parser = argparse.ArgumentParser(
+        prog=f"python -m pipeline {command}",
+        description=description,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("campaign", metavar="CAMPAIGN", help="a campaign's name or directory")
+    parser.add_argument("unit", metavar="UNIT", nargs="?", help="a unit of units.csv")
+    parser.add_argument("effects", metavar="SENSOR.EFFECT", nargs="*", help="for example gyroscope.g_sensitivity")
+    parser.add_argument("--cores", default="2", metavar="N", help="of the run (2)")
+    parser.add_argument("--no-run", action="store_true", help="write the files only")
+    parser.add_argument("--results", type=Path, default=Path("results"), metavar="DIR", help="of the run (results)")
+    parser.add_argument(
+        "--config", nargs="+", default=[], metavar="KEY=VALUE", help="further settings of the run, as for snakemake"
+    )
+    return parser
+
+
+def _wanted(arguments: argparse.Namespace, campaign: str) -> dict[str, list[tuple[str, str]]]:
+    """Return unit to its effects, each as sensor and name."""
+    missing = getattr(arguments, "missing", None)
+    if missing is None:
+        if not arguments.unit or not arguments.effects:
+            raise ConfigurationError("a unit and at least one SENSOR.EFFECT are expected; --help shows examples")
+        return {arguments.unit: [sensor_and_effect(text) for text in arguments.effects]}
+    if arguments.unit:
+        raise ConfigurationError("--missing takes its units from the results of the last run: leave out the unit")
+    file = arguments.results / campaign / "summary.csv"
+    if not file.is_file():
+        raise MissingInputError("does not exist: run the campaign first", str(file))
+    with file.open(encoding="utf-8", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    found = {row["unit"]: _missing(row, missing) for row in rows}
+    found = {unit: effects for unit, effects in found.items() if effects}
+    if not found:
+        raise ConfigurationError(f"no unit misses {missing or 'an effect'}", str(file))
+    return found
+
+
+def _missing(row: Mapping[str, str], only: str) -> list[tuple[str, str]]:
+    """Return what the diagnosis of a unit found to be missing."""
+    effects = [
+        (sensor, name)
+        for sensor in SENSORS
+        if row.get(f"{sensor}_verdict") == "missing_effect"
+        for name in row[f"{sensor}_selected"].split(";")
+    ]
+    return [(sensor, name) for sensor, name in effects if not only or name == only]
+
+
+def _settings(words: Sequence[str]) -> dict[str, Any]:
+    """Return what ``--config`` gives, read as Snakemake reads it."""
+    found = {}
+    for word in words:
+        key, equal, value = word.partition("=")
+        if not equal or key in ("campaign", "results"):
+            raise ConfigurationError(f"--config {word}: KEY=VALUE of the run is expected, not of campaign or results")
+        found[key] = yaml.load(value, yaml.BaseLoader)  # noqa: S506  (texts, lists and mappings only)
+    return found
+
+
+def _apply(edit: Edit) -> None:
+    try:
+        if edit.text is None:
+            edit.file.unlink(missing_ok=True)
+        else:
+            write_atomically(edit.file, edit.text)
+    except OSError as error:
+        raise ConfigurationError(f"cannot be written: {error.strerror}", str(edit.file)) from error
+    end = "removed" if edit.text is None else "written"
+    print("\n".join([*edit.said, f"  {edit.file} {end}"]))
