@@ -203,7 +203,8 @@ def cut_batches(
     by_chain: dict[str, list[str]] = {}
     for name, unit in units.items():
         method = unit.config["method"]
-        parts = dict.fromkeys([method["name"], method["accelerometer"], method["gyroscope"]])
+        named = [method["name"], *(method[sensor] or f"no_{sensor}" for sensor in ("accelerometer", "gyroscope"))]
+        parts = dict.fromkeys(named)
         by_chain.setdefault("+".join(parts), []).append(name)
     batches: dict[str, list[str]] = {}
     chains: dict[str, dict[str, list[str]]] = {}

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 GROUPS = ("sensor", "table", "procedure", "method", "filter", "ingest", "certificate")
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 RUN_SETTINGS = ("batch_size",)
+NOT_WANTED = "not_wanted"  # stage of a sensor whose method is null
 OF_A_SETUP = ("mounting", "bias")  # effects that exist as one setup's own alone (pipeline.model.setups)
 NUMBER = re.compile(r"([a-z_][a-z_0-9]*(?:\.[A-Za-z_][A-Za-z_0-9]*)*)=(-?(?:0|[1-9][0-9]*)(\.[0-9]+)?)")
 
@@ -145,6 +146,7 @@ class Composer:
             texts = {section: repr(content) for section, content in merged.items()}
         checked = self._checked(merged, texts)
         checked["method"] = self._with_stages(checked["method"])
+        checked["procedure"] = _without_need(checked["procedure"], checked["method"])
         self._check_meaning(checked, texts)
         return checked | self.user_effects.section()
 
@@ -211,8 +213,14 @@ class Composer:
     def _with_stages(self, method: dict[str, Any]) -> dict[str, Any]:
         """Return a method with the stages of the method chosen for each sensor."""
         stages: dict[str, list[str]] = {}
-        for sensor in ("accelerometer", "gyroscope"):
+        sensors = ("accelerometer", "gyroscope")
+        if all(method[sensor] is None for sensor in sensors):
+            raise Problem("method.accelerometer and method.gyroscope are both null: nothing is left to calibrate")
+        for sensor in sensors:
             name = method[sensor]
+            if name is None:
+                stages[sensor] = [NOT_WANTED]
+                continue
             if name not in self.options["method"]:
                 raise Problem(f"method.{sensor}={name}: no such method{nearest(name, self.options['method'])}")
             own = method["stages"] if name == method["name"] else self._read("method", name)["stages"]
@@ -253,6 +261,14 @@ class Composer:
             raise Problem(
                 "table.latitude_deg and table.azimuth_deg: set both (Earth's rotation is modelled) or neither (null)"
             )
+
+
+def _without_need(procedure: dict[str, Any], method: dict[str, Any]) -> dict[str, Any]:
+    """Return the procedure, with recordings for a sensor that is not calibrated made optional."""
+    unused = {sensor for sensor in ("accelerometer", "gyroscope") if method[sensor] is None}
+    entries = procedure["recordings"].items()
+    recordings = {name: {**e, "optional": True} if e["role"] in unused else e for name, e in entries}
+    return {**procedure, "recordings": recordings} if unused else procedure
 
 
 def _check_setup(name: str, setup: str, procedure: dict[str, Any]) -> None:

@@ -129,8 +129,8 @@ class Method(Section):
     """How each sensor is fitted."""
 
     name: str
-    accelerometer: str
-    gyroscope: str
+    accelerometer: str | None
+    gyroscope: str | None
     as_printed: bool
     stages: Stages
 

@@ -7,7 +7,7 @@ import re
 from typing import TYPE_CHECKING
 
 from pipeline.formats.ingest_error import IngestError
-from pipeline.formats.units import UNITS
+from pipeline.formats.units import TRIADS, UNITS
 
 if TYPE_CHECKING:
     from pipeline.formats.csv_settings import Column, CsvFormat
@@ -35,6 +35,9 @@ def find_columns(
 ) -> list[tuple[Column, int]]:
     """Return the channels that a file holds and the index of their column.
 
+    All three columns of one sensor may be missing where those of the other are there and fewer than three columns are
+    left over that could be them under other names: the log is of one sensor.
+
     Parameters
     ----------
     names : list of str
@@ -51,14 +54,17 @@ def find_columns(
     IngestError
         If a column that is needed is missing, or its name states another unit than the profile.
     """
-    found, missing = [], []
+    found: list[tuple[Column, int]] = []
+    lacking: list[Column] = []
     for column in settings.columns:
         index = column.column if isinstance(column.column, int) else _index(names, column.column)
         if 0 <= index < len(names):
             _check_unit(column, names[index], where)
             found.append((column, index))
         elif not column.optional:
-            missing.append(str(column.column))
+            lacking.append(column)
+    absent = _of_absent_sensor(lacking, found, len(names))
+    missing = [str(column.column) for column in lacking if column.channel not in absent]
     if missing:
         numbers = bool(first) and all(NUMBER.fullmatch(c) for c in re.split(rb"[,;\t| ]+", first.strip()))
         raise IngestError(
@@ -68,6 +74,14 @@ def find_columns(
             hint=_what_to_do(missing, names, settings, body, numbers=numbers),
         )
     return found
+
+
+def _of_absent_sensor(missing: list[Column], found: list[tuple[Column, int]], columns: int) -> tuple[str, ...]:
+    """Return the channels of the sensor that a log of the other one does not hold; none where it may hold them."""
+    lacking, known = {c.channel for c in missing}, {c.channel for c, _ in found}
+    absent = [triad for triad in TRIADS.values() if set(triad) <= lacking]
+    other = any(set(triad) <= known for triad in TRIADS.values())
+    return absent[0] if absent and other and columns - len(found) < len(absent[0]) else ()
 
 
 def refuse_twice(names: list[str], where: str) -> None:
@@ -106,7 +120,7 @@ def _missing_message(missing: list[str], names: list[str]) -> str:
 
 def _what_to_do(missing: list[str], names: list[str], settings: CsvFormat, body: bytes, *, numbers: bool) -> str:
     """Return what would make the columns be found."""
-    lines = body[:10_000].split(b"\n")[:60]
+    lines = body[:10_000].rstrip(b"\n").split(b"\n")[:60]
     wanted = [m.encode() for m in missing]
     for offset, line in enumerate(lines):
         if all(w in line for w in wanted):
@@ -116,4 +130,12 @@ def _what_to_do(missing: list[str], names: list[str], settings: CsvFormat, body:
     if lines and len(names) != lines[min(len(lines) - 1, 12)].count(settings.delimiter.encode()[:1]) + 1:
         start = b" / ".join(lines[:3]).decode("utf-8", "replace")[:150]
         return f"the next lines are {start!r}; lines before the header are skipped by ingest.csv.skip_lines"
-    return "describe the file's columns in ingest.csv.columns"
+    advice = "describe the file's columns in ingest.csv.columns"
+    absent = [
+        s
+        for s, triad in TRIADS.items()
+        if {str(c.column) for c in settings.columns if c.channel in triad} <= set(missing)
+    ]
+    if len(absent) == 1:
+        advice += f"; of a log without {absent[0]}, set {', '.join(TRIADS[absent[0]])} to null there"
+    return advice

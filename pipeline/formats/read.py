@@ -132,7 +132,18 @@ def _check_complete(
         missing += [f"{name} ({f})" for f in taken if folder / f not in files[name]]
     if missing:
         reason = "" if folder.is_dir() else "; the folder does not exist"
-        raise MissingInputError(f"missing recordings: {'; '.join(missing)}{reason}", str(folder))
+        raise MissingInputError(
+            f"missing recordings: {'; '.join(missing)}{reason}{_of_one_sensor(procedure, files)}", str(folder)
+        )
+
+
+def _of_one_sensor(procedure: Mapping[str, Any], files: Mapping[str, list[Path]]) -> str:
+    """Return how a unit with one sensor is described, where all recordings of one sensor are missing."""
+    entries = procedure["recordings"].items()
+    there = {sensor: [n in files for n, e in entries if e["role"] == sensor] for sensor in TRIADS}
+    lacking = [sensor for sensor, found in there.items() if found and not any(found)]
+    others = any(any(found) for found in there.values())
+    return f"; of a unit without {lacking[0]}, set method.{lacking[0]}=null" if len(lacking) == 1 and others else ""
 
 
 def to_recording(
@@ -172,6 +183,7 @@ def to_recording(
         table.values["table_rate"] = rate_of_attitude((table.time_ns - table.time_ns[0]) / 1e9, attitude)
     check_axis(table, entry.get("axis"))
     values = table.values
+    notes = [*notes, *(_absent(sensor_name, table) for sensor_name in TRIADS if TRIADS[sensor_name][0] not in values)]
     recording = Recording(
         name=name,
         role=entry["role"],
@@ -192,6 +204,11 @@ def to_recording(
     if checks.disturbed_rows:
         recording = leave_out_shaken_rests(recording, table.note)
     return leave_out_disturbances(recording, table.note, checks.disturbed_rows)
+
+
+def _absent(sensor: str, table: ChannelTable) -> Note:
+    rows = len(table.time_ns)
+    return Note("N-ABSENT", rows, 0, 0, f"the file holds no readings of the {sensor}: it cannot calibrate this sensor")
 
 
 def _stack(values: dict[str, NDArray[np.float64]], channels: Sequence[str]) -> NDArray[np.float64] | None:

@@ -24,7 +24,7 @@ def main(argv: Sequence[str]) -> int:
         recordings = load_recordings(job.inputs["filter"] / f"{unit}.parquet")
         document: dict[str, Any] = {"schema_version": 1, "unit": unit}
         fits = load_fits(job.inputs, unit)
-        noises = require_noises(job.inputs["filter"], unit, recordings, part["sensor"])
+        noises = require_noises(job.inputs["filter"], unit, recordings, part["sensor"], fits)
         for sensor, calibration in fits.items():
             document[sensor] = found = calibration and diagnose(
                 calibration, recordings, noises[sensor], part, fits["accelerometer"]

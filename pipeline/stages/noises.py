@@ -9,9 +9,10 @@ from pipeline.signal.noise import estimate_noise, noise_of
 from pipeline.stages.batch import read_json, write_json
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
-    from pipeline.records import Recording
+    from pipeline.records import Recording, SensorCalibration
 
 
 def save_noises(folder: Path, unit: str, recordings: list[Recording], settings: dict[str, Any]) -> None:
@@ -27,9 +28,13 @@ def load_noises(folder: Path, unit: str) -> dict[str, Noise | None]:
 
 
 def require_noises(
-    folder: Path, unit: str, recordings: list[Recording], sheets: dict[str, dict[str, Any]]
+    folder: Path,
+    unit: str,
+    recordings: list[Recording],
+    sheets: dict[str, dict[str, Any]],
+    fits: Mapping[str, SensorCalibration | None],
 ) -> dict[str, Noise]:
-    """Read the noise of each sensor.
+    """Read the noise of each sensor that is calibrated.
 
     Raises
     ------
@@ -37,4 +42,4 @@ def require_noises(
         If nothing tells it; what is lacking is found by looking once more.
     """
     found = load_noises(folder, unit)
-    return {sensor: noise or estimate_noise(sensor, recordings, sheets[sensor]) for sensor, noise in found.items()}
+    return {s: found[s] or estimate_noise(s, recordings, sheets[s]) for s, fit in fits.items() if fit is not None}

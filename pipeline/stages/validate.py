@@ -24,13 +24,13 @@ def main(argv: Sequence[str]) -> int:
         recordings = load_recordings(job.inputs["filter"] / f"{unit}.parquet")
         document: dict[str, Any] = {"schema_version": 1, "unit": unit}
         fits = load_fits(job.inputs, unit)
-        noises = require_noises(job.inputs["filter"], unit, recordings, part["sensor"])
+        noises = require_noises(job.inputs["filter"], unit, recordings, part["sensor"], fits)
         for sensor, calibration in fits.items():
             other = next(fit for s, fit in fits.items() if s != sensor)
             document[sensor] = calibration and validate(calibration, recordings, noises[sensor], part, other=other)
         document["attitude"] = attitude(fits["accelerometer"], fits["gyroscope"], recordings)
         document["gravity_direction"] = gravity_direction(
-            **fits, recordings=recordings, noise=noises["gyroscope"], settings=part
+            **fits, recordings=recordings, noise=noises.get("gyroscope"), settings=part
         )
         write_json(job.output / f"{unit}.json", document)
 

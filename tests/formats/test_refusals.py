@@ -57,6 +57,11 @@ REFUSED: dict[str, tuple[bytes | str, str, int]] = {
         r"column gyro_z_dps \(nearest: gyro_z_dsp\) missing; found time_s, accel_x_g",
         1,
     ),
+    "a whole sensor under other names": (
+        text(*ROWS).replace("gyro_", "angular_"),
+        "gyro_z_dps.* missing; .*of a log without gyroscope, set gyro_x, gyro_y, gyro_z to null",
+        1,
+    ),
     "no header": (text(*ROWS[1:], header=ROWS[0]), "column time_s, accel_x_g, .* missing; found 0.00, 0.01", 1),
     "semicolons": (text(*ROWS).replace(",", ";"), "is the separator ';'", 1),
     "name twice": (text(*ROWS).replace("gyro_y_dps", "gyro_x_dps"), "gyro_x_dps stands more than once", 1),

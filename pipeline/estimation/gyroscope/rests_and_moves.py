@@ -18,7 +18,7 @@ from pipeline.estimation.hand_held.fit import fit as fit_by_hand
 from pipeline.estimation.hand_held.gyroscope import FEWEST_MOVES, model_of
 from pipeline.estimation.hand_held.likelihood import NEW
 from pipeline.estimation.hand_held.model import State
-from pipeline.estimation.hand_held.rests import by_hand
+from pipeline.estimation.hand_held.rests import ROLE, by_hand
 from pipeline.estimation.least_squares import certified
 from pipeline.estimation.serial_noise import prior_of
 from pipeline.records import AXES, SensorCalibration, StageResult
@@ -63,6 +63,11 @@ def fit(
     """
     if not by_hand("gyroscope", recordings):
         raise CannotCalibrateError(f"rests and moves need a recording by hand with the gyroscope's readings: {ADVICE}")
+    if not any(r.role == ROLE and r.accelerometer is not None for r in recordings):
+        raise CannotCalibrateError(
+            "rests and moves need the accelerometer's readings beside the gyroscope's: gravity before and after each "
+            "move tells by how much the unit turned. A gyroscope alone needs a rate table"
+        )
     noise = noise_of("gyroscope", recordings, settings)
     model = model_of(recordings, None, noise, settings)
     if model is None or model.moves is None:

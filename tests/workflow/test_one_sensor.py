@@ -1,0 +1,120 @@
+"""Units with one sensor: the other is null with the reason, everything else is made of them as of any unit."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from html import unescape
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from pipeline.formats.mcap_write import write_mcap
+from pipeline.formats.parquet import load_recordings
+
+from .conftest import ROOT, Bench
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+pytestmark = pytest.mark.workflow
+
+UNITS = """unit,procedure,method,overrides
+whole,multi_position,rests_and_moves,
+csv,multi_position,rests_and_moves,
+mcap,multi_position,rests_and_moves,
+null,multi_position,rests_and_moves,method.gyroscope=null
+table,three_axis_turns,,method.accelerometer=null
+"""
+
+
+def without(source: Path, target: Path, sensor: str) -> None:
+    """Copy a recording without the columns of a sensor."""
+    rows = [line.split(",") for line in source.read_text().splitlines()]
+    kept = [i for i, name in enumerate(rows[0]) if not name.startswith(sensor)]
+    target.parent.mkdir(parents=True, exist_ok=True)
+    target.write_text("".join(",".join(row[i] for i in kept) + "\n" for row in rows))
+
+
+def simulate(directory: Path, *options: str) -> Path:
+    command = [sys.executable, "-m", "pipeline", "simulate", str(directory), "--sensor", "mpu6050", "--quiet", *options]
+    subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
+    return next((directory / "raw").iterdir())
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory: pytest.TempPathFactory) -> Bench:
+    directory = tmp_path_factory.mktemp("one_sensor")
+    hand = simulate(directory / "hand", "--procedure", "multi_position", "--table", "hand", "--positions", "24",
+                    "--static", "0", "--validation", "0")  # fmt: skip
+    table = simulate(directory / "table", "--step", "15", "--static", "0", "--validation", "30")
+    campaign = directory / "units"
+    for unit in ("whole", "null"):
+        shutil.copytree(hand, campaign / "raw" / unit)
+    without(hand / "recording.csv", campaign / "raw" / "csv" / "recording.csv", "gyro")
+    for name in ("gyro_x", "gyro_y", "gyro_z", "validation"):  # no recording of the accelerometer's turns at all
+        without(table / f"{name}.csv", campaign / "raw" / "table" / f"{name}.csv", "accel")
+    (campaign / "units.csv").write_text("".join(r for r in UNITS.splitlines(keepends=True) if not r.startswith("mcap")))
+    bench = Bench(directory, campaign)
+    assert bench.snakemake().code == 0
+    # the same readings as MCAP, its gyroscope marked as absent by the covariance -1
+    folder = campaign / "raw" / "mcap"
+    folder.mkdir()
+    (recording,) = load_recordings(next((bench.results / "batches").glob("*/ingest/csv.parquet")))
+    write_mcap(folder / "recording.mcap", recording)
+    (campaign / "units.csv").write_text(UNITS)
+    run = bench.snakemake()
+    assert run.code == 0, run.output
+    return bench
+
+
+def document(bench: Bench, kind: str, unit: str) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((bench.results / kind / f"{unit}.json").read_text())
+    return found
+
+
+@pytest.mark.parametrize("unit", ["csv", "mcap", "null", "table"])
+def test_the_absent_sensor_is_null_with_the_reason_and_all_files_are_made(done: Bench, unit: str) -> None:
+    there, absent = sorted(
+        ("accelerometer", "gyroscope"), key=lambda sensor: (sensor == "gyroscope") != (unit == "table")
+    )
+    found = document(done, "calibrations", unit)
+    assert found["status"] == "ok"
+    assert found[absent] is None
+    assert absent in found["not_calibrated"][absent]
+    assert found[there]["converged"]
+    for kind in ("validations", "diagnoses"):
+        assert document(done, kind, unit)[absent] is None
+        assert document(done, kind, unit)[there] is not None
+    notes = {note["code"] for file in found["inputs"] for note in file["notes"]}
+    assert ("N-ABSENT" in notes) == (unit != "null")
+    page = unescape((done.results / "reports" / f"{unit}.html").read_text())
+    assert found["not_calibrated"][absent].split(":")[0] in page
+    assert (done.results / "exports" / unit / "calibration.h").is_file()
+
+
+@pytest.mark.parametrize("unit", ["csv", "mcap", "null"])
+def test_one_sensor_gets_the_same_numbers_as_beside_the_other(done: Bench, unit: str) -> None:
+    alone, beside = (document(done, "calibrations", u)["accelerometer"] for u in (unit, "whole"))
+    for part in ("bias", "matrix"):
+        uncertainty = np.array(beside["expanded_uncertainty"][part])
+        assert np.abs(np.subtract(alone[part], beside[part])).max() <= 0.5 * uncertainty.max()
+
+
+def test_a_log_of_one_sensor_is_compensated(done: Bench) -> None:
+    log, out = done.campaign / "raw" / "csv" / "recording.csv", done.directory / "out.csv"
+    calibration = done.results / "calibrations" / "csv.json"
+    command = [sys.executable, "-m", "pipeline", "apply", "--calibration", str(calibration), str(log), "-o", str(out)]
+    subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
+    header, first = out.read_text().splitlines()[:2]
+    assert header == log.read_text().splitlines()[0]
+    assert first != log.read_text().splitlines()[1]
+
+
+def test_a_method_without_any_sensor_is_refused(done: Bench) -> None:
+    run = done.snakemake("overrides=[method.accelerometer=null, method.gyroscope=null]", dry=True)
+    assert run.code != 0
+    assert "nothing is left to calibrate" in run.output
