@@ -95,6 +95,43 @@ def held_out_rests(recordings: Sequence[Recording], settings: Mapping[str, Any])
     return {r.name: list(split_rests(r, every).held_out) for r in recordings if r.role == "rests"}
 
 
+def rests_by_use(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> dict[str, list[dict[str, Any]]]:
+    """Return the rests of the recordings of role ``rests``: which a fit would use, and which not, with the reason.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+    settings : mapping
+        Section ``procedure``: ``holdout_every``.
+
+    Returns
+    -------
+    dict of str to list of dict
+        ``rests_used``, ``rests_held_out``, ``rests_left_out``, each as of ``describe_rests``; what a fit itself leaves
+        out counts as used here.
+    """
+    every = holdout_interval(recordings, settings)
+    found: dict[str, list[dict[str, Any]]] = {"rests_used": [], "rests_held_out": [], "rests_left_out": []}
+    for recording in (r for r in recordings if r.role == "rests"):
+        split = split_rests(recording, every)
+        for use, rests in zip(found, (split.used, split.held_out, split.left_out), strict=True):
+            found[use] += describe_rests([(recording, rest) for rest in rests])
+    return found
+
+
+def describe_rests(pairs: Sequence[tuple[Recording, Rest]]) -> list[dict[str, Any]]:
+    """Return each rest's recording, start and duration in s, and why it is refused (empty where it is not)."""
+    return [
+        {
+            "recording": recording.name,
+            "time_s": float(recording.time[rest.start]),
+            "duration_s": float(recording.time[rest.stop - 1] - recording.time[rest.start]),
+            "reason": rest.reason,
+        }
+        for recording, rest in pairs
+    ]
+
+
 def rest_means(
     recording: Recording, rests: Sequence[Rest], sensor: str = "accelerometer"
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:

@@ -11,6 +11,7 @@ from pipeline.report.axes import Scale, tick_label, tick_step, ticks
 from pipeline.report.figure import JSON, Figure
 from pipeline.report.numbers import NOTHING, number
 from pipeline.report.svg import WIDTH, frame, text
+from pipeline.report.tables import rest_rows
 from pipeline.signal.rests import rests_from_table
 
 if TYPE_CHECKING:
@@ -89,7 +90,7 @@ def segments(recordings: list[Recording], rests: dict[str, list[Rest]], calibrat
     rests : dict of str to list of Rest
         Of ``rests_logged``.
     calibration : dict
-        As in its file; stages that found rests by themselves tell them in ``details``.
+        As in its file; ``rests``, or stages in ``details``, tell those that were found without a table.
     """
     drawn = [r for r in recordings if r.samples > 1]
     cut = len({r.source.get("file") for r in drawn}) == 1 < len(drawn)  # out of one file: drawn where they lie in it
@@ -131,12 +132,11 @@ def _spans(recording: Recording, logged: list[Rest], calibration: JSON) -> Spans
     """Return start, end (s since the recording's start) and colour of each rest."""
     start = float(recording.time[0])
     found: Spans = []
-    for part in (calibration.get(s) or {} for s in SENSORS):
-        for stage in part.get("stages") or []:
-            for kind, colour in FOUND:
-                rests = (stage.get("details") or {}).get(f"rests_{kind}") or []
-                chosen = [r for r in rests if r["recording"] == recording.name]
-                found += [(r["time_s"] - start, r["time_s"] - start + r["duration_s"], colour) for r in chosen]
+    colours = {kind.replace("_", " "): colour for kind, colour in FOUND}
+    for part in (calibration, *(calibration.get(s) or {} for s in SENSORS)):
+        for r in rest_rows(part):
+            if r["recording"] == recording.name:
+                found.append((r["time_s"] - start, r["time_s"] - start + r["duration_s"], colours[r["use"]]))
     if found:
         return sorted(set(found))
     time = recording.time - start

@@ -187,11 +187,18 @@ def _detail(value: object) -> str:
 
 
 def rest_rows(part: JSON) -> list[JSON]:
-    """Return the rests that a fit found by itself, in order of time: used, held out or left out, and why."""
+    """Return the rests that were found without a table, in order of time: used, held out or left out, and why.
+
+    Parameters
+    ----------
+    part : dict
+        With ``rests``, or with the stages of a fit that tell them in ``details``.
+    """
+    told = [part.get("rests") or {}, *(stage.get("details") or {} for stage in part.get("stages") or [])]
     rows = [
         {**rest, "use": kind.replace("_", " ")}
-        for stage in part.get("stages") or []
+        for found in told
         for kind in ("used", "held_out", "left_out")
-        for rest in (stage.get("details") or {}).get(f"rests_{kind}") or []
+        for rest in found.get(f"rests_{kind}") or []
     ]
     return sorted(rows, key=lambda row: (row["recording"], row["time_s"]))

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.atomic import write_atomically
 from pipeline.diagnosis.words import in_words
+from pipeline.estimation.rest_means import rests_by_use
 from pipeline.formats.parquet import load_recordings
 from pipeline.records import SENSORS
 from pipeline.report import certificate_page
@@ -13,10 +14,13 @@ from pipeline.report.certificate import certificate
 from pipeline.report.session import sensor_temperature
 from pipeline.report.unit_page import render
 from pipeline.stages.batch import FAILED, parse_job, read_json, run_batch, write_json
-from pipeline.stages.calibration import header
+from pipeline.stages.calibration import header, inputs
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from pathlib import Path
+
+    from pipeline.records import Recording
 
 STAGES = ("calibration", "validate", "diagnose")
 
@@ -42,6 +46,15 @@ def main(argv: Sequence[str]) -> int:
         if failed.is_file():
             document = header(unit, part) | {"status": "failed", "error": read_json(failed), "inputs": []}
             document |= {"accelerometer": None, "gyroscope": None, "not_calibrated": {}}
+            recordings = _ingested(job.inputs["filter"] / f"{unit}.parquet")
+            if recordings:
+                document["inputs"] = inputs(job.inputs["filter"] / f"{unit}.parquet")
+                document["rests"] = rests_by_use(recordings, part)
             write_json(job.output / f"{unit}.calibration.json", document)
-            write_atomically(job.output / f"{unit}.html", render(document, None, None, [], part))
+            write_atomically(job.output / f"{unit}.html", render(document, None, None, recordings, part))
     return status
+
+
+def _ingested(path: Path) -> list[Recording]:
+    """Return the recordings of a unit that failed after them; none where it failed before."""
+    return load_recordings(path) if path.is_file() else []

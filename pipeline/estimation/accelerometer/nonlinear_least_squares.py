@@ -37,6 +37,7 @@ from pipeline.estimation.budget import (
 )
 from pipeline.estimation.least_squares import certified
 from pipeline.estimation.linear_map import LinearMap
+from pipeline.estimation.rest_means import describe_rests
 from pipeline.estimation.sample_blocks import make_blocks
 from pipeline.estimation.scaled_columns import estimate_weights, factorise
 from pipeline.estimation.serial_noise import assess_noise, prior_of
@@ -56,7 +57,6 @@ if TYPE_CHECKING:
     from pipeline.estimation.serial_noise import Prior, SerialNoise
     from pipeline.records import Motion, Recording
     from pipeline.records.budget import Contribution
-    from pipeline.signal.rests import Rest
 
     Values = NDArray[np.float64]
 
@@ -342,9 +342,9 @@ def _details(orientations: Orientations, found: Ellipsoid, freedom: float) -> di
     return {
         "orientations_used": len(orientations.mean),
         "samples_used": int(orientations.count.sum()),
-        "rests_used": _described(orientations.rests),
-        "rests_left_out": _described(orientations.left_out),
-        "rests_held_out": _described(orientations.held_out),
+        "rests_used": describe_rests(orientations.rests),
+        "rests_left_out": describe_rests(orientations.left_out),
+        "rests_held_out": describe_rests(orientations.held_out),
         "fixed": [name for name, is_free in zip(NAMES, found.free, strict=True) if not is_free],
         "white_noise": orientations.white,
         "scatter_between_rests": found.between,
@@ -354,15 +354,3 @@ def _details(orientations: Orientations, found: Ellipsoid, freedom: float) -> di
         "evaluations": found.fit.evaluations,
         "degrees_of_freedom": freedom,
     }
-
-
-def _described(pairs: Sequence[tuple[Recording, Rest]]) -> list[dict[str, Any]]:
-    return [
-        {
-            "recording": recording.name,
-            "time_s": float(recording.time[rest.start]),
-            "duration_s": float(recording.time[rest.stop - 1] - recording.time[rest.start]),
-            "reason": rest.reason,
-        }
-        for recording, rest in pairs
-    ]
