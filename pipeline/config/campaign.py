@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shlex
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
 SHIPPED = CONFIGS.parent / "data"
-FREE_COLUMNS = ("serial", "lot", "date")
 SMALLEST_BATCH, LARGEST_BATCH = 10, 160
 
 
@@ -168,7 +168,7 @@ def load_layers(directory: Path, settings: Mapping[str, Any], composer: Composer
 def find_campaign(name: str) -> Path:
     """Return the directory of a campaign: one that ships, by name, or any directory with a ``units.csv``."""
     for directory in (SHIPPED / name, Path(name)):
-        if (directory / "units.csv").is_file():
+        if os.path.lexists(directory / "units.csv"):
             return directory.resolve()
     shipped = [d.parent.name for d in SHIPPED.glob("*/units.csv")]
     raise ConfigurationError(

@@ -14,14 +14,15 @@ All of it is optional.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
-
-from omegaconf import OmegaConf
 
 from pipeline.config.compose import RUN_SETTINGS, nearest
 from pipeline.config.user_effects import ONLY_FROM_THE_COMMAND_LINE, PYTHON
 from pipeline.errors import ConfigurationError
+from pipeline.formats.regular import not_regular
+from pipeline.formats.yaml_file import read_yaml
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -71,7 +72,7 @@ def read_campaign_file(path: Path) -> CampaignFile:
     ConfigurationError
         If it is not as it should be.
     """
-    if not path.is_file():
+    if not os.path.lexists(path):
         return CampaignFile()
     content = _mapping(path)
     run, units = split_run_settings(as_list(content.get("overrides", []), f"{path}: overrides"))
@@ -105,10 +106,7 @@ def split_run_settings(overrides: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def _mapping(path: Path) -> dict[str, Any]:
-    try:
-        content = OmegaConf.to_container(OmegaConf.load(path)) or {}
-    except Exception as error:
-        raise ConfigurationError(f"is not YAML: {' '.join(str(error).split())}", str(path)) from error
+    content = read_yaml(path) or {}
     if not isinstance(content, dict):
         raise ConfigurationError("must be a mapping, for example 'overrides: [filter=rc_low_pass]'", str(path))
     if PYTHON in content:
@@ -141,8 +139,11 @@ def _simulation(content: Mapping[str, Any], path: Path) -> Path | None:
     if not asked:
         return None
     description = path.with_name(SIMULATION)
-    if not description.is_file():
+    if not os.path.lexists(description):
         raise ConfigurationError(f"simulate: true needs {SIMULATION} beside it, which does not exist", str(path))
+    other = not_regular(description)
+    if other:
+        raise ConfigurationError(other, str(description))
     return description
 
 

@@ -7,7 +7,6 @@ group defaults, then the layers of ``pipeline.config.layers``. Hydra composes on
 
 from __future__ import annotations
 
-import copy
 import difflib
 import json
 import re
@@ -23,10 +22,12 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from pydantic import ValidationError
 
+from pipeline.config.references import check_references, with_references
 from pipeline.config.schema import SECTIONS, Unit
 from pipeline.config.user_effects import ONLY_FROM_THE_COMMAND_LINE, PYTHON, UserEffects, load_user_effects
 from pipeline.errors import ConfigurationError
 from pipeline.formats.settings import check_ingest
+from pipeline.formats.yaml_file import read_yaml
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -35,6 +36,7 @@ GROUPS = ("sensor", "table", "procedure", "method", "filter", "ingest", "certifi
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 RUN_SETTINGS = ("batch_size",)
 NOT_WANTED = "not_wanted"  # stage of a sensor whose method is null
+LARGEST_CONFIG = 10_000  # values of a group's option; the largest that ships has 160, and Hydra takes 0.1 ms for each
 OF_A_SETUP = ("mounting", "bias")  # effects that exist as one setup's own alone (pipeline.model.setups)
 NUMBER = re.compile(r"([a-z_][a-z_0-9]*(?:\.[A-Za-z_][A-Za-z_0-9]*)*)=(-?(?:0|[1-9][0-9]*)(\.[0-9]+)?)")
 
@@ -70,6 +72,8 @@ class Composer:
     def __init__(self, campaign: Path, python_effects: Sequence[str] = ()) -> None:
         own = campaign / "configs"
         self.searchpath = [own.resolve()] if own.is_dir() else []
+        for file in sorted(own.rglob("*.yaml")):  # before Hydra opens any of them
+            _mapping_of(file)
         self.options = {
             group: {f.stem for root in (CONFIGS, *self.searchpath) for f in (root / group).glob("*.yaml")}
             for group in GROUPS
@@ -138,11 +142,10 @@ class Composer:
             _set(merged, key.split("."), value)
         texts = texts | {s: repr(content) for s, content in merged.items() if content is not base.get(s)}
         if any("${" in text for text in texts.values()):
-            merged = copy.deepcopy(merged)
             try:
-                resolve_references(merged, merged)
-            except OmegaConfBaseException as error:
-                raise Problem(str(error).splitlines()[0]) from error
+                merged = with_references(merged, merged)
+            except ConfigurationError as error:
+                raise Problem(error.message) from error
             texts = {section: repr(content) for section, content in merged.items()}
         checked = self._checked(merged, texts)
         checked["method"] = self._with_stages(checked["method"])
@@ -191,7 +194,7 @@ class Composer:
         if key not in self._bases:
             overrides = [f"{g}={o}" for g, o in key]
             if self.searchpath:
-                overrides.append(f"hydra.searchpath=[{','.join(f'file://{p}' for p in self.searchpath)}]")
+                overrides.append(f"hydra.searchpath=[{','.join(map(_quoted, self.searchpath))}]")
             GlobalHydra.instance().clear()
             try:
                 with initialize_config_dir(str(CONFIGS), version_base="1.3"):
@@ -281,6 +284,11 @@ def _check_setup(name: str, setup: str, procedure: dict[str, Any]) -> None:
         )
 
 
+def _quoted(folder: Path) -> str:
+    """Return a folder as a text of Hydra's grammar, which gives commas, braces and quotes meanings of their own."""
+    return "'" + re.sub(r"(\\*)('|$)", lambda m: m[1] * 2 + "\\'" * bool(m[2]), f"file://{folder}") + "'"
+
+
 @lru_cache(maxsize=100_000)
 def parse(text: str) -> tuple[str, Any]:
     """Parse one Hydra override to its key and value.
@@ -323,16 +331,22 @@ def read_option(group: str, option: str, searchpath: tuple[Path, ...]) -> dict[s
     for root in (*searchpath, CONFIGS):
         file = root / group / f"{option}.yaml"
         if file.is_file():
-            content = OmegaConf.to_container(OmegaConf.load(file), resolve=False)
-            assert isinstance(content, dict)  # noqa: S101
-            return {str(k): v for k, v in content.items()}
+            return {str(k): v for k, v in _mapping_of(file).items()}
     return {}
+
+
+def _mapping_of(file: Path) -> dict[Any, Any]:
+    content = read_yaml(file, LARGEST_CONFIG)
+    if not isinstance(content, dict):
+        raise ConfigurationError("a mapping of settings is expected", str(file))
+    check_references(content, str(file))
+    return content
 
 
 @cache
 def default_option(group: str) -> str:
     """Return the option of a group where nothing chooses one."""
-    for entry in OmegaConf.load(CONFIGS / "config.yaml").defaults:
+    for entry in _mapping_of(CONFIGS / "config.yaml")["defaults"]:
         if not isinstance(entry, str) and group in entry:
             return str(entry[group])
     raise KeyError(group)
@@ -340,22 +354,7 @@ def default_option(group: str) -> str:
 
 def default_of_run(name: str) -> Any:  # noqa: ANN401  (a setting's type is its own)
     """Return the default of a setting of the run."""
-    settings = OmegaConf.to_container(OmegaConf.load(CONFIGS / "config.yaml"))
-    assert isinstance(settings, dict)  # noqa: S101
-    return settings[name]
-
-
-def resolve_references(node: Any, root: dict[str, Any]) -> None:  # noqa: ANN401  (dict or list)
-    """Replace each ``${...}`` below a node, in place, by what it refers to.
-
-    OmegaConf resolves it, on the few branches that it names: building the whole tree in OmegaConf costs 18 ms a unit.
-    """
-    for key, value in node.items() if isinstance(node, dict) else enumerate(node):
-        if isinstance(value, (dict, list)):
-            resolve_references(value, root)
-        elif isinstance(value, str) and "${" in value:
-            branches = {name: root[name] for name in GROUPS if f"{name}." in value}
-            node[key] = OmegaConf.create({**branches, "reference": value})["reference"]
+    return _mapping_of(CONFIGS / "config.yaml")[name]
 
 
 def _set(tree: dict[str, Any], path: list[str], value: Any) -> None:  # noqa: ANN401

@@ -15,11 +15,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import yaml
-
 from pipeline.config.campaign_file import as_list, split_run_settings, unknown_key
 from pipeline.config.compose import GROUPS, Problem, default_option, nearest, parse
 from pipeline.errors import ConfigurationError
+from pipeline.formats.yaml_file import read_yaml
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -105,8 +104,8 @@ def read_devices(directory: Path, sheet: Sheet) -> dict[str, list[str]]:
     for file in files:
         try:
             found[file.stem] = _device(file, known)
-        except (ConfigurationError, OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-            problems.append(f"{file}: {' '.join(str(error).split())}")
+        except ConfigurationError as error:
+            problems.append(f"{error.file or file}: {error.message}")
     if problems:
         more = [f"and {len(problems) - 5} more files"] * (len(problems) > 5)
         raise ConfigurationError("the configuration is refused:\n  " + "\n  ".join([*problems[:5], *more]))
@@ -155,7 +154,7 @@ def _key(text: str) -> str:
 def _device(file: Path, known: set[str]) -> list[str]:
     if file.stem not in known:
         raise ConfigurationError(f"no unit or serial {file.stem!r} in units.csv{nearest(file.stem, known)}")
-    content = yaml.load(file.read_text(encoding="utf-8"), yaml.CSafeLoader) or {}
+    content = read_yaml(file) or {}
     if not isinstance(content, dict):
         raise ConfigurationError("a mapping is expected, for example 'overrides: [filter.cutoff_hz=5]'")
     unknown_key(content, ("overrides",))

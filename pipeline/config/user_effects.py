@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import ConfigurationError, PipelineError
+from pipeline.formats.regular import not_regular
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -123,6 +124,9 @@ def effects_for(stage: str, sensor: str, configs: Iterable[Mapping[str, Any]]) -
 
 def _holds(file: Path, what: str) -> bool:
     try:
+        other = not_regular(file)
+        if other:
+            raise ConfigurationError(other, str(file))
         return re.search(what, file.read_text(encoding="utf-8", errors="replace"), re.MULTILINE) is not None
     except OSError as error:
         raise ConfigurationError(f"cannot be read: {error}", str(file)) from None

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from pipeline.formats.ingest_error import IngestError
+from pipeline.formats.regular import not_regular
 from pipeline.records import Note
 
 if TYPE_CHECKING:
@@ -66,10 +67,13 @@ class TextFile:
 
 @contextmanager
 def unchanged(path: Path) -> Iterator[None]:
-    """Refuse a file that cannot be opened, is empty, or is written to while it is read."""
+    """Refuse what is no regular file, cannot be opened, is empty, or is written to while it is read."""
     try:
+        other = not_regular(path)
+        if other:
+            raise IngestError(other, str(path), fault="unreadable")
         before = path.stat()
-        if before.st_size == 0 and path.is_file():
+        if before.st_size == 0:
             raise IngestError("the file is empty (0 bytes)", str(path), fault="empty")
         yield
         after = path.stat()

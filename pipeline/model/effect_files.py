@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from pipeline.errors import ConfigurationError, MissingInputError, PipelineError
+from pipeline.formats.regular import not_regular
 from pipeline.model.effects import built_in, register
 from pipeline.model.effects.base import Effect
 from pipeline.model.user_effects import FormulaEffect, effect_from
@@ -146,12 +147,16 @@ def _checked(found: Any, file: Path, digest: str) -> Effect:  # noqa: ANN401  (w
 
 def _text_of(file: Path) -> str:
     try:
-        content = file.read_bytes()
+        other = not_regular(file)
+        if other:
+            raise ConfigurationError(other, str(file))
+        with file.open("rb") as stream:
+            content = stream.read(LARGEST_BYTES + 1)
         text = content.decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigurationError(f"cannot be read: {error}", str(file)) from None
     if len(content) > LARGEST_BYTES:
-        raise ConfigurationError(f"has {len(content)} bytes; an effect takes at most {LARGEST_BYTES}", str(file))
+        raise ConfigurationError(f"has more than {LARGEST_BYTES} bytes, the limit for an effect", str(file))
     return text
 
 

@@ -18,12 +18,15 @@ What a unit leaves out is drawn at random from the sensor's data sheet. The keys
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field, fields
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 from pipeline.errors import ConfigurationError, MissingInputError
+from pipeline.formats.unit_name import wrong_name
+from pipeline.formats.yaml_file import read_yaml
 from pipeline.simulation.procedures import ONE_RECORDING, TABLE_PROCEDURES, Course
 from pipeline.simulation.table_logs import table_log_of
 
@@ -104,6 +107,9 @@ class UnitDescription:
     table_log: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        wrong = wrong_name(self.unit)
+        if wrong:
+            raise ConfigurationError(f"unit {self.unit[:60]!r}: {wrong}")
         if self.format not in FORMATS:
             raise ConfigurationError(f"unit {self.unit}: format {self.format!r} is not known; use csv or mcap")
         if not 0.0 <= self.lost < 0.9:
@@ -140,7 +146,7 @@ def read_description(path: Path) -> Description:
     ConfigurationError
         If it holds what is not known.
     """
-    data = read_yaml(path)
+    data = read_mapping(path)
     return description_from(data, str(path))
 
 
@@ -166,16 +172,11 @@ def description_from(data: dict[str, Any], origin: str) -> Description:
     return Description(int(data.get("seed", 0)), tuple(units), tuple(data.get("rows") or ()), variants)
 
 
-def read_yaml(path: Path) -> dict[str, Any]:
+def read_mapping(path: Path) -> dict[str, Any]:
     """Read a YAML file that holds a mapping."""
-    import yaml  # noqa: PLC0415  (read once a campaign)
-
-    if not path.is_file():
+    if not os.path.lexists(path):
         raise MissingInputError("this file does not exist", str(path))
-    try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except yaml.YAMLError as error:
-        raise ConfigurationError(f"this is no YAML: {' '.join(str(error).split())}", str(path)) from None
+    data = read_yaml(path)
     if not isinstance(data, dict):
         raise ConfigurationError("expected a mapping of settings", str(path))
     return data
@@ -194,7 +195,7 @@ def read_config(group: str, name: str) -> dict[str, Any]:
     if not path.is_file():
         known = ", ".join(sorted(p.stem for p in path.parent.glob("*.yaml")))
         raise ConfigurationError(f"no {group} is called {name!r}; known: {known}")
-    return read_yaml(path)
+    return read_mapping(path)
 
 
 def _counted(entry: dict[str, Any]) -> list[UnitDescription]:

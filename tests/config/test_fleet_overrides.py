@@ -88,7 +88,7 @@ def test_the_model_is_the_one_that_a_unit_ends_up_with(fleet: Path) -> None:
         ("devices/S1.yaml", "- filter=none", "S1.yaml: a mapping is expected"),
         ("devices/S1.yaml", "overrides: [batch_size=3]", "batch_size=3: is a setting of the run, not of a device"),
         ("devices/S1.yaml", "overrides: [filter.cutof_hz=3]", "unit U1: filter.cutof_hz=3: unknown key"),
-        ("devices/S1.yaml", "overrides: {", "S1.yaml: while parsing"),
+        ("devices/S1.yaml", "overrides: {", "S1.yaml:2: is not YAML"),
     ],
 )
 def test_overrides_that_concern_nobody_or_are_no_overrides_are_refused(

@@ -176,7 +176,7 @@ def cases() -> dict[str, Case]:
     wrapping = [str((micro + 10_000 * i) % 2**32) for i in range(SAMPLES)]
     unix = [f"{1.7e18 + 5000.0 * i:.17g}" for i in range(SAMPLES)]
     out = {
-        "01": Case({}, "unreadable", "Is a directory"),
+        "01": Case({}, "unreadable", "is a directory"),
         "01 missing": Case({}, "missing_file", "missing recordings: log"),
         "02": one(b"", fault="empty", says=r"the file is empty \(0 bytes\)"),
         "03": one(text([]), fault="no_rows", says="header on line 1, 0 data rows"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import os
 import re
 from typing import TYPE_CHECKING, Any
 
@@ -187,10 +188,20 @@ def test_fixed_parts_need_one_required_recording(tmp_path: Path) -> None:
         recording_files(procedure("a", "b"), profile("xsens_mti_multi_position"), tmp_path)
 
 
-def test_directory_in_place_of_a_file_is_refused(tmp_path: Path, canonical: dict[str, Any]) -> None:
-    (tmp_path / "accel_x.csv").mkdir()
-    with pytest.raises(InputError, match="cannot be read: Is a directory"):
-        read(tmp_path, canonical)
+@pytest.mark.parametrize("suffix", [".csv", ".gcsv", ".mcap"])
+def test_what_is_no_regular_file_is_refused_and_never_waited_for(
+    tmp_path: Path, canonical: dict[str, Any], suffix: str
+) -> None:
+    path = tmp_path / f"accel_x{suffix}"
+    for make, what in (
+        (path.mkdir, "is a directory"),
+        (lambda: os.mkfifo(path), "is a FIFO"),
+        (lambda: path.symlink_to("/dev/zero"), "is a device"),
+    ):
+        make()
+        with pytest.raises(InputError, match=f"{what}; a regular file, or a symbolic link to one, is expected"):
+            read(tmp_path, canonical)
+        path.rmdir() if path.is_dir() else path.unlink()
 
 
 def test_one_file_under_two_names_is_refused(tmp_path: Path, canonical: dict[str, Any]) -> None:

@@ -239,7 +239,7 @@ def test_descriptions_are_refused_where_they_are_wrong(tmp_path: Path) -> None:
     with pytest.raises(MissingInputError, match="does not exist"):
         read_description(tmp_path / "none.yaml")
     (tmp_path / "bad.yaml").write_text("units: [")
-    with pytest.raises(ConfigurationError, match="no YAML"):
+    with pytest.raises(ConfigurationError, match="is not YAML"):
         read_description(tmp_path / "bad.yaml")
     (tmp_path / "list.yaml").write_text("[1]")
     with pytest.raises(ConfigurationError, match="expected a mapping"):
