@@ -46,10 +46,8 @@ onstart:
 
 
 onsuccess:
-    say_at_the_end(
-        f"units calibrated: {len(CAMPAIGN.units)}; look at {RESULTS}/index.html\n"
-    )
+    say_outcome()
 
 
 onerror:
-    repeat_verdict()
+    say_verdict()

@@ -35,6 +35,8 @@ def main(argv: list[str]) -> int:
     if not argv or argv[0] in ("-h", "--help"):
         print("usage: python -m pipeline COMMAND ... (COMMAND --help says more)\n")
         for name, module in known.items():
+            if name == STAGES[0]:
+                print("\nstages, which the rules of the workflow call:\n")
             print(f"  {name:<12} {summary(module)}")
         return 0
     if argv[0] not in known:

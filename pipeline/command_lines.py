@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_.=/+-]*")  # texts that YAML reads as they stand, within brackets too
 NOT_TEXT = {"true", "false", "yes", "no", "on", "off", "null", "y", "n"}  # words that YAML reads as another type
+EFFECTS = re.compile(r"effects\.(accelerometer|gyroscope)=\[(.*)\]")
 CORES = "--cores 2"
 RESULTS = "results"  # the default folder of results
 
@@ -34,6 +35,8 @@ def run_command(settings: Mapping[str, Any]) -> str:
 def add_command(settings: Mapping[str, Any], unit: str, effects: Sequence[str], results: str = RESULTS) -> str:
     """Return the command that adds effects to a unit's own settings and runs the campaign.
 
+    Effects that ``unit_overrides`` gave the unit for one run are added with them, or the override would be stronger.
+
     Parameters
     ----------
     settings : mapping
@@ -44,7 +47,18 @@ def add_command(settings: Mapping[str, Any], unit: str, effects: Sequence[str], 
     results : str
         Folder of the results of all campaigns.
     """
-    return _pipeline("add", settings, [unit, *effects], results)
+    of_units = dict(settings.get("unit_overrides") or {})
+    kept, given = [], []
+    for override in of_units.pop(unit, []):
+        found = EFFECTS.fullmatch(override)
+        if found:
+            given += [f"{found[1]}.{name.strip()}" for name in found[2].split(",") if name.strip()]
+        else:
+            kept.append(override)
+    rest = {k: v for k, v in settings.items() if k != "unit_overrides"}
+    of_units |= {unit: kept} if kept else {}
+    rest |= {"unit_overrides": of_units} if of_units else {}
+    return _pipeline("add", rest, [unit, *dict.fromkeys([*given, *effects])], results)
 
 
 def add_missing_command(settings: Mapping[str, Any], results: str = RESULTS) -> str:
@@ -57,11 +71,14 @@ def explain_command(settings: Mapping[str, Any], results: str = RESULTS) -> str:
     return _pipeline("explain", {"campaign": settings.get("campaign", "demo")}, [], results)
 
 
-def once_command(settings: Mapping[str, Any], unit: str, override: str) -> str:
+def once_command(settings: Mapping[str, Any], unit: str, override: str, results: str = RESULTS) -> str:
     """Return the command that runs the campaign with one more override of a unit, for this run only."""
     given = dict(settings)
     own = {**given.pop("unit_overrides", {})}
-    return run_command(given | {"unit_overrides": own | {unit: [*own.get(unit, []), override]}})
+    key = override.partition("=")[0]
+    kept = [text for text in own.get(unit, []) if text.partition("=")[0] != key]
+    given |= {"unit_overrides": own | {unit: [*kept, override]}}
+    return run_command(given | ({"results": results} if results != RESULTS else {}))
 
 
 def _pipeline(command: str, settings: Mapping[str, Any], words: Sequence[str], results: str) -> str:

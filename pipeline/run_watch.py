@@ -21,7 +21,7 @@ from pipeline.locks import jobs_at_work, take_run
 from pipeline.progress import AT_UNIT, Progress
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
 EVERY = {True: 1.0, False: 30.0}  # s between lines, by whether it is a terminal
 BLOCKS = ("JOB_INFO", "JOB_STARTED", "JOB_FINISHED", "PROGRESS", "SHELLCMD", "RUN_INFO", "RESOURCES_INFO", "GROUP_INFO")
@@ -48,6 +48,7 @@ class Watch(logging.Handler):
         self.broken: list[tuple[str, Path]] = []
         self.refused = ""
         self.ended = threading.Event()
+        self.idle: Callable[[], None] = lambda: None  # called where there is nothing to be done
         self.stream: TextIO = sys.stderr
         logging.getLogger("snakemake.logging").addHandler(self)
         atexit.register(self.last_words)
@@ -66,6 +67,8 @@ class Watch(logging.Handler):
             self.progress.finish(told.get("jobid", -1), failed=True)
             if told.get("rule_name") != "verdict":
                 self.broken.append((str(told.get("rule_name")), Path((told.get("log") or [os.devnull])[0])))
+        elif str(record.msg).startswith("Nothing to be done"):
+            self.idle()
         elif record.levelno >= logging.ERROR:
             self.refused = next((name for name in REFUSALS if name in str(record.msg)), self.refused)
 

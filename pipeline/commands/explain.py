@@ -5,15 +5,43 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.diagnosis.words import in_words
 from pipeline.errors import InputError, MissingInputError
+from pipeline.history import read_history
+from pipeline.outcome import Finding, commands_of, next_commands, read_summary, verdict_lines
 from pipeline.records import SENSORS
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
+
+JSON = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Told:
+    """What is to be explained.
+
+    Attributes
+    ----------
+    files : dict of str to Path
+        Unit to its diagnosis.
+    failures : dict of str to dict
+        Unit that failed to its entry of ``failures.json``.
+    settings : dict
+        Of the last run.
+    results : str
+        Folder of the results of all campaigns.
+    """
+
+    files: dict[str, Path]
+    failures: dict[str, JSON]
+    settings: JSON
+    results: str
 
 
 def main(argv: Sequence[str]) -> int:
@@ -23,14 +51,18 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("units", metavar="UNIT", nargs="*", help="units to explain (default: all)")
     parser.add_argument("--results", type=Path, default=Path("results"), help="where results are (default: results)")
     arguments = parser.parse_args(argv)
-    files = diagnoses(arguments.campaign, arguments.units, arguments.results)
-    texts = [explain(_read(file), _validation(file)) for file in files]
+    told = find(arguments.campaign, arguments.units, arguments.results)
+    documents = {unit: _read(file) for unit, file in told.files.items()}
+    texts = [explain(unit, document, _validation(told.files[unit]), told) for unit, document in documents.items()]
+    texts += [_failed(unit, failure) for unit, failure in told.failures.items()]
+    if len(texts) > 1:
+        texts.insert(0, "\n".join(_summary(documents, told)) + "\n")
     sys.stdout.write("\n".join(texts))
     return 0
 
 
-def diagnoses(campaign: str, units: Sequence[str], results: Path) -> list[Path]:
-    """Return the diagnosis files meant.
+def find(campaign: str, units: Sequence[str], results: Path) -> Told:
+    """Return the diagnoses and failures meant.
 
     Raises
     ------
@@ -39,31 +71,94 @@ def diagnoses(campaign: str, units: Sequence[str], results: Path) -> list[Path]:
     """
     given = Path(campaign)
     if given.is_file():
-        return [given]
-    folders = [folder for folder in (given / "diagnoses", results / given.name / "diagnoses") if folder.is_dir()]
+        return _told({given.stem: given}, {}, given.parent.parent)
+    folders = [folder for folder in (given, results / given.name) if (folder / "diagnoses").is_dir()]
     if not folders:
         raise MissingInputError(f"no diagnoses in {given} or {results / given.name}; run the campaign first")
-    files = [folders[0] / f"{u}.json" for u in units] if units else sorted(folders[0].glob("*.json"))
-    absent = [f.stem for f in files if not f.is_file()]
+    files = {file.stem: file for file in _in_order(folders[0])}
+    failures = {failure["unit"]: failure for failure in _failures(folders[0])}
+    absent = [unit for unit in units if unit not in files and unit not in failures]
     if absent:
-        known = ", ".join(sorted(f.stem for f in folders[0].glob("*.json"))[:12])
+        known = ", ".join(sorted([*files, *failures])[:12])
         raise MissingInputError(
-            f"no diagnosis of unit {', '.join(absent)}; there are those of {known}", str(folders[0])
+            f"no diagnosis of unit {', '.join(absent)}; there are those of {known}", str(folders[0] / "diagnoses")
         )
-    return files
+    chosen = set(units) or {*files, *failures}
+    return _told(
+        {unit: file for unit, file in files.items() if unit in chosen and unit not in failures},
+        {unit: failure for unit, failure in failures.items() if unit in chosen},
+        folders[0],
+    )
 
 
-def explain(document: dict[str, Any], validation: dict[str, Any]) -> str:
-    """Return a unit's diagnosis as text, with the error of its held-out motion where that is known."""
-    lines = [f"{document.get('unit', 'unit')}"]
+def _in_order(folder: Path) -> list[Path]:
+    """Return the diagnoses of a campaign in the order of its sheet."""
+    files = {file.stem: file for file in sorted((folder / "diagnoses").glob("*.json"))}
+    order = [row["unit"] for row in read_summary(folder)] if (folder / "summary.csv").is_file() else []
+    return [files[unit] for unit in dict.fromkeys([*order, *files]) if unit in files]
+
+
+def explain(unit: str, document: JSON, validation: JSON, told: Told) -> str:
+    """Return a unit's diagnosis as text, with the error of its held-out motion and the commands that add effects."""
+    unit = document.get("unit", unit)
+    lines = [unit]
     for sensor in SENSORS:
+        part = document.get(sensor)
         lines.append(f"  {sensor}")
-        verdict, *rest = in_words(document.get(sensor), sensor)
+        verdict, *rest = in_words(part, sensor)
         lines += [f"    {sentence}" for sentence in [verdict, *_held_out(validation.get(sensor)), *rest]]
+        commands = commands_of(part or {}, sensor, unit, told.settings, told.results)
+        if commands:
+            what = "it" if part and len(part["selected"]) == 1 else "them"
+            lines += [f"    To add {what}:", f"      {commands['add']}"]
+            lines += [f"    To add {what} for one run only:", f"      {commands['once']}"]
     return "\n".join(lines) + "\n"
 
 
-def _held_out(part: dict[str, Any] | None) -> list[str]:
+def _told(files: dict[str, Path], failures: dict[str, JSON], folder: Path) -> Told:
+    entries = read_history(folder)
+    settings = entries[-1].get("settings") if entries else None
+    return Told(files, failures, settings or {"campaign": folder.name}, str(folder.parent))
+
+
+def _summary(documents: Mapping[str, JSON], told: Told) -> list[str]:
+    """Return the verdicts by sensor and effect, and how to continue."""
+    findings = [
+        Finding(unit, sensor, document[sensor]["verdict"], document[sensor]["selected"])
+        for unit, document in documents.items()
+        for sensor in SENSORS
+        if document.get(sensor)
+    ]
+    counts = Counter(finding.verdict.replace("_", " ") for finding in findings).most_common()
+    counted = ", ".join(f"{count} {verdict}" for verdict, count in counts)
+    lines = [f"{len(findings)} sensors of {len(documents)} units: {counted}", *verdict_lines(findings)]
+    if told.failures:
+        lines.append(f"failed: {', '.join(told.failures)}")
+    return [*lines, *[line for line in next_commands(findings, told.settings, told.results) if " explain " not in line]]
+
+
+def _failed(unit: str, failure: Mapping[str, Any]) -> str:
+    """Return why a unit failed."""
+    where = f"{failure['file']}: " if failure.get("file") else ""
+    return (
+        f"{unit}\n  failed in stage {failure.get('stage')} ({failure.get('code')}), so there is no diagnosis:\n"
+        f"    {where}{failure.get('message')}\n"
+        "  Correct the file or the setting, then run the same command again.\n"
+    )
+
+
+def _failures(folder: Path) -> list[JSON]:
+    file = folder / "failures.json"
+    try:
+        found: list[JSON] = json.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return []
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise InputError(f"is no list of failures: {error}", str(file)) from error
+    return found
+
+
+def _held_out(part: JSON | None) -> list[str]:
     if not part or not part["steps"]:
         return []
     error, floor, unit = part["steps"][-1]["rms_error"], part["noise_floor"], part["unit"]
@@ -71,17 +166,17 @@ def _held_out(part: dict[str, Any] | None) -> list[str]:
     return [f"As calibrated in this run, held-out motion errs by {error:.3g} {unit} rms of the magnitude{ratio}."]
 
 
-def _validation(diagnosis: Path) -> dict[str, Any]:
+def _validation(diagnosis: Path) -> JSON:
     """Return ``validations/<unit>.json`` of the same results; nothing where there is none."""
     file = diagnosis.parent.parent / "validations" / diagnosis.name
     try:
-        found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+        found: JSON = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, json.JSONDecodeError):
         return {}
     return found
 
 
-def _read(file: Path) -> dict[str, Any]:
+def _read(file: Path) -> JSON:
     try:
         document = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import os
-import shlex
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import count
@@ -29,11 +27,12 @@ SMALLEST_BATCH, LARGEST_BATCH = 10, 160
 
 @dataclass(frozen=True)
 class UnitRow:
-    """One unit: its row of ``units.csv`` and its configuration."""
+    """One unit: its row of ``units.csv``, its configuration, and the key and value of what overrides its settings."""
 
     name: str
     row: dict[str, str]
     config: dict[str, Any]
+    overrides: dict[str, str] = field(default_factory=dict)
 
     @cached_property
     def config_sha256(self) -> str:
@@ -84,15 +83,18 @@ class Campaign:
         """Where the recordings are: in the campaign's directory, or among the results of the run that makes them."""
         return self.directory if self.simulation is None else self.results.absolute() / "simulated"
 
-    def command(self, unit: str) -> str:
-        """Return the command that makes a unit's results again, with the settings of this run that concern it."""
-        given = {k: v for k, v in self.settings.items() if k != "results" and v}
-        own = given.get("unit_overrides", {}).get(unit)
-        given = {k: v for k, v in given.items() if k != "unit_overrides"} | (
-            {"unit_overrides": {unit: own}} if own else {}
-        )
-        words = [shlex.quote(f"{k}={v if isinstance(v, str) else json.dumps(v)}") for k, v in given.items()]
-        return " ".join(["snakemake --cores 2", *(["--config"] * bool(words)), *words])
+    def run_settings(self, unit: str | None = None) -> dict[str, Any]:
+        """Return what ``--config`` gave but for the place of the results; of ``unit_overrides`` those of one unit.
+
+        A campaign that ships is named, however it was given, so that the same run has the same settings.
+        """
+        ships = self.directory.parent == SHIPPED.resolve()
+        given: dict[str, Any] = {"campaign": self.name if ships else str(self.settings.get("campaign", self.name))}
+        given |= {k: v for k, v in self.settings.items() if k not in ("campaign", "results") and v}
+        if unit is not None and "unit_overrides" in given:
+            own = given.pop("unit_overrides").get(unit)
+            given |= {"unit_overrides": {unit: own}} if own else {}
+        return given
 
     def folder(self, unit: str) -> Path:
         """Return where a unit's recordings lie."""
@@ -130,7 +132,9 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
     problems: dict[str, list[str]] = {}
     for name, row in layers.sheet.rows.items():
         try:
-            units[name] = UnitRow(name, row, composer.unit(name, [text for _, text in layers.of(name)]))
+            texts = [text for _, text in layers.of(name)]
+            overrides = {text.partition("=")[0].strip(): text.partition("=")[2].strip() for text in texts}
+            units[name] = UnitRow(name, row, composer.unit(name, texts), overrides)
         except Problem as problem:
             for line in str(problem).splitlines():
                 problems.setdefault(line, []).append(name)

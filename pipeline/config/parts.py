@@ -162,7 +162,7 @@ def part_file(campaign: Campaign, stage: str, units: Sequence[str], sensor: str 
             for unit, each in parts.items():
                 row = campaign.units[unit].row
                 each["row"] = {c: row[c] for c in ("serial", "lot", "date") if row.get(c)}
-                each["command"] = campaign.command(unit)
+                each["run"] = campaign.run_settings(unit)
         content = dict(zip(("common", "units"), in_common(parts), strict=True))
         content |= effects_for(stage, sensor, [r.config for r in rows])
     if stage in ("ingest", "report"):
@@ -201,7 +201,9 @@ def _of_gather(campaign: Campaign) -> dict[str, Any]:
     compared = {u for c in campaign.compare for g in c["groups"] for u in g["units"]}
     return {
         "campaign": campaign.name,
-        "rows": {name: unit.row for name, unit in campaign.units.items()},
+        "rows": [unit.row for unit in campaign.units.values()],
+        "overrides": {name: unit.overrides for name, unit in campaign.units.items() if unit.overrides},
+        "run": campaign.run_settings(),
         "compare": campaign.compare,
         "page": campaign.page,
         "truths": {u: str(campaign.truth(u)) for u in sorted(compared)},

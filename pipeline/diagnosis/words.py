@@ -51,9 +51,6 @@ def in_words(part: Mapping[str, Any] | None, sensor: str) -> list[str]:
         lines.append(_hidden(part))
     if part["next_experiment"]:
         lines.append(f"Next experiment: {part['next_experiment']}.")
-    if part["override"]:
-        what = "it" if len(part["selected"]) == 1 else "them"
-        lines.append(f"To add {what}, run with overrides='{part['override']}'.")
     return lines
 
 
@@ -81,11 +78,10 @@ def _unknown(part: Mapping[str, Any], sensor: str) -> list[str]:
         lines.append(f"The residual depends on {plain(found['covariate'])} ({p}){beyond}{shape}.")
     effect = part.get("suggested_effect")
     if effect:
-        names = [*part["configured"], *part["selected"], effect["name"]]
         file = part.get("suggested_file", f"<unit>_{sensor}_unknown.yaml")
         lines.append(
             f"To try that shape, copy diagnoses/{file} from the results to effects/{effect['name']}.yaml in the "
-            f"campaign's directory and run with overrides='effects.{sensor}=[{','.join(names)}]'."
+            f"campaign's directory, and add {sensor}.{effect['name']}."
         )
     return lines
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING, Any
 
+from pipeline.command_lines import run_command
 from pipeline.records import SENSORS
 from pipeline.report.figure import AXES
 
@@ -57,7 +58,7 @@ def certificate(calibration: JSON, validation: JSON | None, settings: JSON, temp
             "calibration": f"calibrations/{calibration['unit']}.json",
             "config_sha256": calibration.get("config_sha256"),
             "inputs": [{k: i.get(k) for k in ("file", "sha256", "rows")} for i in calibration.get("inputs") or []],
-            "command": settings.get("command"),
+            "command": run_command(settings["run"]) if settings.get("run") else None,
         },
     }
     missing = _missing(document, stated, validation or {})

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.command_lines import run_command
 from pipeline.json_text import json_text
 from pipeline.model.inversion import compensate, linear_truth, sensor_effects
 from pipeline.model.kinematics import reference_motion
@@ -88,9 +89,9 @@ def render(
         rests=tables.rest_rows(calibration),
         environment=environment(recordings, settings) if recordings else [],
         row={k: v for k, v in (settings.get("row") or {}).items() if v},
-        command=settings.get("command"),
+        command=run_command(settings["run"]) if settings.get("run") else None,
         settings_text=json_text(
-            {k: v for k, v in settings.items() if k not in ("row", "command", "certificate")},
+            {k: v for k, v in settings.items() if k not in ("row", "run", "certificate")},
         ),
     )
     return page

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.atomic import write_atomically
+from pipeline.history import record, unit_state
 from pipeline.report.campaign_page import render
 from pipeline.report.comparison_page import section
 from pipeline.report.comparison_units import unit_figures
@@ -33,7 +34,9 @@ def main(argv: Sequence[str]) -> int:
     rows, failures, figures = [], [], {}
     inputs: dict[str, list[dict[str, Any]]] = {}
     fitted: dict[str, dict[str, tuple[float, float | None, str]]] = {}
-    for unit, sheet_row in job.run["rows"].items():
+    states: dict[str, dict[str, Any]] = {}
+    for sheet_row in job.run["rows"]:
+        unit = sheet_row["unit"]
         batch = of_unit[unit]
         failure = _failure(batch, unit)
         publish(batch / "report" / f"{unit}.html", job.output / "reports" / f"{unit}.html")
@@ -61,12 +64,15 @@ def main(argv: Sequence[str]) -> int:
         if unit in compared:
             truth = _truth(Path(job.run["truths"][unit]))
             figures[unit] = unit_figures(calibration, documents["validate"], documents["diagnose"], truth)
+        overrides = job.run["overrides"].get(unit, {})
+        states[unit] = unit_state(calibration, documents["validate"], documents["diagnose"], overrides)
         inputs[unit] = calibration.get("inputs") or []
         fitted[unit] = parameters(calibration)
         rows.append(summary_row(unit, calibration, documents["validate"], documents["diagnose"], sheet_row))
     write_summary(job.output / "summary.csv", rows)
     write_json(job.output / "failures.json", failures)
     write_parameters(job.output / "parameters.parquet", rows, fitted)
+    record(job.output, states, job.run["run"])
     statistics = fleet_statistics(rows, fitted)
     write_json(job.output / "fleet.json", statistics)
     sections = [section(c, figures, f"comparison-{i}") for i, c in enumerate(job.run["compare"], 1)]

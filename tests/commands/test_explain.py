@@ -9,6 +9,8 @@ import pytest
 from pipeline.commands.explain import main
 from pipeline.errors import InputError, MissingInputError
 
+OVERRIDE = "effects.gyroscope=[g_sensitivity]"
+
 
 def part(selected: list[str]) -> dict[str, Any]:
     entry = {
@@ -30,7 +32,7 @@ def part(selected: list[str]) -> dict[str, Any]:
         "not_observable": [],
         "unexplained": [],
         "next_experiment": "",
-        "override": "effects.gyroscope=[g_sensitivity]" if selected else "",
+        "override": OVERRIDE if selected else "",
     }
 
 
@@ -44,23 +46,42 @@ def results(tmp_path: Path) -> Path:
     return tmp_path / "results"
 
 
-def test_the_missing_effect_is_named_with_its_size_and_its_override(
+def test_the_missing_effect_is_named_with_its_size_and_the_commands_that_add_it(
     results: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main([str(results / "bench"), "U2"]) == 0
     said = capsys.readouterr().out
     assert said.startswith("U2\n")
-    for expected in ("misses g sensitivity", "9.1 times the noise", "0.101", "effects.gyroscope=[g_sensitivity]"):
+    lines = [line.strip() for line in said.splitlines()]
+    where = f"--results {results}"
+    assert lines[lines.index("To add it:") + 1] == f"python -m pipeline add bench U2 gyroscope.g_sensitivity {where}"
+    once = f"""snakemake --cores 2 --config campaign=bench 'unit_overrides={{U2: ["{OVERRIDE}"]}}' results={results}"""
+    assert lines[lines.index("To add it for one run only:") + 1] == once
+    for expected in ("misses g sensitivity", "9.1 times the noise", "0.101"):
         assert expected in said
     assert "The accelerometer was not calibrated" in said
 
 
-def test_a_campaign_is_found_by_its_name_and_told_unit_by_unit(
+def test_a_campaign_begins_with_its_verdicts_by_effect_and_tells_failed_units_with_their_cause(
     results: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    failure = {"unit": "U3", "stage": "ingest", "code": "bad_input", "message": "no number", "file": "raw/U3/a.csv:9"}
+    (results / "bench" / "failures.json").write_text(json.dumps([failure]))
     assert main(["bench", "--results", str(results)]) == 0
     said = capsys.readouterr().out
-    assert said.index("U1\n") < said.index("U2\n")
+    head, *units = said.split("\n\n")
+    assert head.splitlines() == [
+        "2 sensors of 2 units: 1 nothing missing, 1 missing effect",
+        "gyroscope, g_sensitivity missing: U2",
+        "failed: U3",
+        f"to add what is missing: python -m pipeline add bench U2 gyroscope.g_sensitivity --results {results}",
+    ]
+    assert [text.splitlines()[0] for text in units] == ["U1", "U2", "U3"]
+    assert main(["bench", "U3", "--results", str(results)]) == 0
+    told = capsys.readouterr().out
+    assert told == units[2]
+    assert "failed in stage ingest (bad_input)" in told
+    assert "raw/U3/a.csv:9: no number" in told
 
 
 def test_a_unit_that_is_not_there_is_refused_with_those_that_are(results: Path) -> None:

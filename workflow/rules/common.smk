@@ -5,6 +5,7 @@ import hashlib
 import os
 import sys
 import time
+from glob import glob
 
 from snakemake.exceptions import WorkflowError
 from snakemake.settings.types import Quietness
@@ -18,6 +19,7 @@ os.environ["PYTHONPATH"] = os.pathsep.join(
 from pipeline.config import code_digest, load_campaign, part_file
 from pipeline.errors import PipelineError
 from pipeline.formats.files import recording_files
+from pipeline.outcome import outcome
 from pipeline.run_watch import Watch
 
 try:
@@ -100,9 +102,34 @@ def say_at_the_end(text):
     atexit.register(print, f"\n{text}", file=sys.stderr, end="")
 
 
-def repeat_verdict():
-    """Say at the very end of the terminal output which units have failed, and why."""
+def written_in_this_run(path):
+    """Return whether a file was written since the run began."""
+    return os.path.exists(path) and os.path.getmtime(path) >= STARTED - 1
+
+
+def say_outcome(failures=""):
+    """Say at the very end of the terminal output what was found, how to continue, and which units have failed."""
+    if not os.path.exists(f"{RESULTS}/summary.csv"):
+        return
+    try:
+        recorded = max(glob(f"{RESULTS}/history/*.json"), default="")
+        told = outcome(
+            CAMPAIGN.results,
+            CAMPAIGN.run_settings(),
+            of_this_run=written_in_this_run(recorded),
+        )
+    except (OSError, PipelineError) as error:
+        told = f"the results cannot be summed up: {error}\n"
+    say_at_the_end(told + failures)
+
+
+def say_verdict():
+    """Say what was found where units have failed; a run that broke before its end has no outcome."""
     log = f"{RESULTS}/logs/verdict.log"
-    if os.path.exists(log) and os.path.getmtime(log) >= STARTED - 1:
+    if written_in_this_run(log):
         with open(log) as stream:
-            say_at_the_end(stream.read())
+            say_outcome(stream.read())
+
+
+if not RUNNING:
+    WATCH.idle = say_outcome  # where there is nothing to be done, Snakemake calls no handler

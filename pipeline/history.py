@@ -1,0 +1,196 @@
+"""What each run of a campaign changed: ``results/<campaign>/history/<number>.json``.
+
+The first file holds every unit, each later file the units whose configuration, recordings or results differ from those
+before, so that a fleet's history grows with what changes. A run that changes nothing writes no file.
+
+A unit's state is::
+
+    {"status", "error", "config_sha256", "recordings", "overrides": {key: value},
+     "accelerometer": {"effects", "error", "floor", "verdict", "selected"} or null, "gyroscope": likewise}
+
+where ``error`` is the held-out rms error of the last step and ``floor`` its noise floor, in g or deg/s, and
+``recordings`` is a digest of the digests of the files that were read.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+from pipeline.atomic import write_atomically
+from pipeline.errors import InputError
+from pipeline.json_text import json_text
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+JSON = dict[str, Any]
+FOLDER = "history"
+SENSORS = ("accelerometer", "gyroscope")
+
+
+@dataclass(frozen=True)
+class Change:
+    """What differs between two states of a unit.
+
+    Attributes
+    ----------
+    added, removed : dict of str to list of str
+        Effects of each sensor.
+    settings : list of str
+        Other settings, each as ``key: before -> after``.
+    other : list of str
+        What else differs: recordings, configuration, whether the unit was calibrated.
+    """
+
+    added: dict[str, list[str]]
+    removed: dict[str, list[str]]
+    settings: list[str]
+    other: list[str]
+
+    def words(self, sensor: str | None = None) -> list[str]:
+        """Return the change as a list of texts, of the effects of one sensor or of both."""
+        sensors = SENSORS if sensor is None else (sensor,)
+        told = []
+        for s in sensors:
+            name = f"{s}." if sensor is None else ""
+            told += [f"+ {name}{effect}" for effect in self.added[s]]
+            told += [f"\N{MINUS SIGN} {name}{effect}" for effect in self.removed[s]]
+        return [*told, *self.settings, *self.other]
+
+
+def unit_state(
+    calibration: JSON, validation: JSON | None, diagnosis: JSON | None, overrides: Mapping[str, str]
+) -> JSON:
+    """Return the state of a unit.
+
+    Parameters
+    ----------
+    calibration, validation, diagnosis : dict
+        As in their files; the last two may be None.
+    overrides : mapping of str to str
+        Key to value of what overrides the unit's settings.
+    """
+    files = "".join(str(f.get("sha256")) for f in calibration.get("inputs") or [])
+    state = {
+        "status": calibration.get("status"),
+        "error": (calibration.get("error") or {}).get("code"),
+        "config_sha256": calibration.get("config_sha256"),
+        "recordings": hashlib.sha256(files.encode()).hexdigest()[:16] if files else None,
+        "overrides": dict(overrides),
+    }
+    for sensor in SENSORS:
+        fitted = calibration.get(sensor)
+        held_out, found = (validation or {}).get(sensor) or {}, (diagnosis or {}).get(sensor) or {}
+        last = (held_out.get("steps") or [{}])[-1]
+        state[sensor] = fitted and {
+            "effects": [effect["name"] for effect in fitted.get("effects") or []],
+            "error": last.get("rms_error"),
+            "floor": held_out.get("noise_floor"),
+            "verdict": found.get("verdict"),
+            "selected": found.get("selected") or [],
+        }
+    return state
+
+
+def read_history(results: Path) -> list[JSON]:
+    """Return the entries of a campaign's results, the oldest first.
+
+    Raises
+    ------
+    InputError
+        If a file of it is not what a run wrote.
+    """
+    entries = []
+    for file in sorted((results / FOLDER).glob("[0-9]*.json")):
+        try:
+            entry = json.loads(file.read_text(encoding="utf-8"))
+            known = isinstance(entry["run"], int) and isinstance(entry["units"], dict)
+        except (OSError, ValueError, KeyError, TypeError):
+            known = False
+        if not known:
+            raise InputError("is no history of runs: remove it, or the whole folder to begin anew", str(file))
+        entries.append(entry)
+    return sorted(entries, key=lambda e: int(e["run"]))
+
+
+def record(results: Path, units: Mapping[str, JSON], settings: Mapping[str, Any]) -> list[JSON]:
+    """Append the state of all units to the history, where it differs from the last one; return all entries.
+
+    Parameters
+    ----------
+    results : Path
+        Of the campaign.
+    units : mapping of str to dict
+        Unit to its state.
+    settings : mapping
+        Of the run.
+
+    Raises
+    ------
+    InputError
+        If the history cannot be read.
+    """
+    entries = read_history(results)
+    before = {unit: states[-1][1] for unit, states in of_units(entries).items()}
+    changed = {unit: state for unit, state in units.items() if before.get(unit) != state}
+    gone = [unit for unit, state in before.items() if unit not in units and state]
+    if changed or gone:
+        number = entries[-1]["run"] + 1 if entries else 1
+        now = datetime.now(UTC).isoformat(timespec="seconds")
+        entry = {"run": number, "time": now, "settings": dict(settings), "units": changed, "gone": gone}
+        write_atomically(results / FOLDER / f"{number:04d}.json", json_text(entry) + "\n")
+        entries.append(entry)
+    return entries
+
+
+def of_units(entries: Sequence[JSON]) -> dict[str, list[tuple[int, JSON]]]:
+    """Return the states of each unit with the run that brought them; ``{}`` stands for a unit that has gone."""
+    found: dict[str, list[tuple[int, JSON]]] = {}
+    for entry in entries:
+        for unit, state in entry["units"].items():
+            found.setdefault(unit, []).append((entry["run"], state))
+        for unit in entry.get("gone") or []:
+            found.setdefault(unit, []).append((entry["run"], {}))
+    return found
+
+
+def difference(before: JSON, after: JSON) -> Change:
+    """Return what differs in the configuration and the recordings of a unit."""
+    fitted = [{s: (state.get(s) or {}).get("effects") or [] for s in SENSORS} for state in (before, after)]
+    calibrated = [state.get("status") == "ok" for state in (before, after)]
+    added = {s: [e for e in fitted[1][s] if e not in fitted[0][s]] for s in SENSORS}
+    removed = {s: [e for e in fitted[0][s] if e not in fitted[1][s]] if all(calibrated) else [] for s in SENSORS}
+    old, new = (state.get("overrides") or {} for state in (before, after))
+    keys = [k for k in dict.fromkeys([*old, *new]) if old.get(k) != new.get(k) and not k.startswith("effects")]
+    settings = [f"{k}: {old.get(k, 'default')} \N{RIGHTWARDS ARROW} {new.get(k, 'default')}" for k in keys]
+    other = []
+    if before and calibrated == [True, False]:
+        other.append(f"not calibrated: {after.get('error') or 'no longer in units.csv'}")
+    elif before and calibrated == [False, True]:
+        other.append("calibrated again")
+    if all(calibrated) and before.get("recordings") != after.get("recordings"):
+        other.append("other recordings")
+    same = not (settings or other or any(added.values()) or any(removed.values()))
+    if before and same:
+        moved = before.get("config_sha256") != after.get("config_sha256")
+        other.append("other values in the files of the configuration" if moved else "computed anew")
+    return Change(added, removed, settings, other)
+
+
+def dropped(entries: Sequence[JSON]) -> list[tuple[str, str, str, int]]:
+    """Return which effects the last run no longer has: unit, sensor, effect, and the run before that had it."""
+    if not entries:
+        return []
+    found = []
+    states = of_units(entries)
+    for unit in entries[-1]["units"]:
+        if len(states[unit]) > 1:
+            (run, before), (_, after) = states[unit][-2:]
+            removed = difference(before, after).removed
+            found += [(unit, sensor, effect, run) for sensor in SENSORS for effect in removed[sensor]]
+    return found

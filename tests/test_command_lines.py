@@ -1,0 +1,57 @@
+"""Commands that a user pastes: bash hands over what was meant, and Snakemake reads it so."""
+
+import shlex
+import subprocess
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from snakemake.cli import parse_config
+
+from pipeline.command_lines import add_command, once_command, run_command
+
+TEXT = st.text(
+    st.characters(codec="utf-8", exclude_characters="\0\n\r\x85\u2028\u2029", exclude_categories=("Cc", "Cs"))
+)
+
+
+def words(command: str) -> list[str]:
+    """Return what a program gets that bash starts by a command."""
+    script = 'python() { printf "%s\\0" "$@"; }; snakemake() { python "$@"; }; ' + command
+    out = subprocess.run(["bash", "-c", script], check=True, capture_output=True).stdout.decode()
+    return out.split("\0")[:-1]
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"campaign": "demo"},
+        {"campaign": "my bench's $HOME"},
+        {"campaign": "c", "overrides": ["filter=rc_low_pass", "effects.gyroscope=[a,b]"], "python_effects": ["x y.py"]},
+        {"campaign": "c", "unit_overrides": {"001": ["filter.order=1"], "on": ["a.b='x, y'"]}},
+    ],
+)
+def test_bash_and_snakemake_read_the_settings_that_were_written(settings: dict[str, object]) -> None:
+    command = words(run_command(settings))
+    assert command[:3] == ["--cores", "2", "--config"]
+    assert parse_config(command[3:]) == settings
+
+
+@given(st.lists(TEXT, min_size=1, max_size=3))
+def test_any_override_survives_the_quoting(overrides: list[str]) -> None:
+    command = run_command({"campaign": "c", "overrides": overrides})
+    (*_, last) = shlex.split(command)
+    assert parse_config([last]) == {"overrides": overrides}
+
+
+def test_effects_that_one_run_had_are_kept_by_the_command_that_adds_more() -> None:
+    settings = {
+        "campaign": "my bench",
+        "unit_overrides": {"U1": ["filter.order=1", "effects.gyroscope=[a,b]"], "U2": ["filter.order=3"]},
+    }
+    command = words(add_command(settings, "U1", ["gyroscope.c"], "/out"))
+    assert command[:8] == ["-m", "pipeline", "add", "my bench", "U1", "gyroscope.a", "gyroscope.b", "gyroscope.c"]
+    assert command[8:11] == ["--results", "/out", "--config"]
+    assert parse_config(command[11:]) == {"unit_overrides": {"U2": ["filter.order=3"], "U1": ["filter.order=1"]}}
+    once = words(once_command(settings, "U1", "effects.gyroscope=[a,b,c]"))
+    assert parse_config(once[3:])["unit_overrides"]["U1"] == ["filter.order=1", "effects.gyroscope=[a,b,c]"]

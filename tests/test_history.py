@@ -1,0 +1,84 @@
+"""The history of runs: it grows with what changes, and with nothing else."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.errors import InputError
+from pipeline.history import difference, dropped, of_units, read_history, record, unit_state
+from pipeline.outcome import outcome
+
+SETTINGS = {"campaign": "bench"}
+
+
+def state(effects: list[str], error: float, **overrides: str) -> dict[str, Any]:
+    """Return the state of a unit whose gyroscope is calibrated."""
+    calibration = {
+        "status": "ok",
+        "config_sha256": json.dumps([effects, overrides]),
+        "inputs": [{"sha256": "ab"}],
+        "accelerometer": None,
+        "gyroscope": {"effects": [{"name": name} for name in effects]},
+    }
+    validation = {"gyroscope": {"noise_floor": 0.01, "steps": [{"rms_error": 3.0}, {"rms_error": error}]}}
+    return unit_state(calibration, validation, {"gyroscope": {"verdict": "unexplained"}}, overrides)
+
+
+def test_a_run_is_recorded_with_the_units_that_it_changed_and_only_then(tmp_path: Path) -> None:
+    units = {f"U{i}": state([], 0.12) for i in range(3)}
+    assert [e["run"] for e in record(tmp_path, units, SETTINGS)] == [1]
+    assert [e["run"] for e in record(tmp_path, units, SETTINGS)] == [1]
+    units["U1"] = state(["g_sensitivity"], 0.011)
+    record(tmp_path, units, SETTINGS)
+    del units["U2"]
+    record(tmp_path, units, SETTINGS)
+    record(tmp_path, units, SETTINGS)
+    entries = read_history(tmp_path)
+    assert [sorted(e["units"]) for e in entries] == [["U0", "U1", "U2"], ["U1"], []]
+    assert [e["gone"] for e in entries] == [[], [], ["U2"]]
+    assert [(run, s["gyroscope"]["error"]) for run, s in of_units(entries)["U1"]] == [(1, 0.12), (2, 0.011)]
+    assert sorted(f.name for f in (tmp_path / "history").iterdir()) == ["0001.json", "0002.json", "0003.json"]
+
+
+def test_what_differs_is_told_in_words() -> None:
+    before, after = state(["a"], 0.1, **{"filter.order": "1"}), state(["a", "b"], 0.1, **{"filter.order": "2"})
+    assert difference(before, after).words("gyroscope") == ["+ b", "filter.order: 1 → 2"]
+    assert difference(after, before).words() == ["− gyroscope.b", "filter.order: 2 → 1"]
+    assert difference(before, before | {"recordings": "cd"}).words() == ["other recordings"]
+    failed = unit_state({"status": "failed", "error": {"code": "bad_input"}}, None, None, {"filter.order": "1"})
+    assert difference(before, failed).words() == ["not calibrated: bad_input"]
+    assert difference(failed, before).words()[-1] == "calibrated again"
+    assert difference(before, before | {"config_sha256": "x"}).words() == [
+        "other values in the files of the configuration"
+    ]
+
+
+def test_a_run_that_drops_an_effect_is_told_with_what_it_cost_and_how_to_keep_it(tmp_path: Path) -> None:
+    results = tmp_path / "bench"
+    for units in (state([], 0.12), state(["g_sensitivity"], 0.011), state([], 0.12)):
+        entries = record(results, {"U1": units}, SETTINGS)
+    assert dropped(entries) == [("U1", "gyroscope", "g_sensitivity", 2)]
+    columns = "unit,status,accelerometer_verdict,accelerometer_selected,gyroscope_verdict,gyroscope_selected"
+    (results / "summary.csv").write_text(f"{columns}\nU1,ok,,,missing_effect,g_sensitivity\nU2,failed,,,,\n")
+    add = f"python -m pipeline add bench U1 gyroscope.g_sensitivity --results {tmp_path}"
+    told = outcome(results, SETTINGS, of_this_run=True).splitlines()
+    assert told[:2] == [
+        f"units calibrated: 1, failed: 1; look at {results}/index.html",
+        "gyroscope, g_sensitivity missing: U1",
+    ]
+    assert told[2] == (
+        "U1: this run no longer has gyroscope.g_sensitivity, which run 2 had; its held-out error: 0.011 -> 0.12 deg/s; "
+        f"to have it in every run: {add}"
+    )
+    assert told[3] == f"to add what is missing: {add}"
+    assert len(outcome(results, SETTINGS, of_this_run=False).splitlines()) == len(told) - 1
+
+
+@pytest.mark.parametrize("content", ["", "[]", '{"run": "one", "units": {}}'])
+def test_a_file_that_is_no_history_is_refused_by_name(tmp_path: Path, content: str) -> None:
+    (tmp_path / "history").mkdir()
+    (tmp_path / "history" / "0001.json").write_text(content)
+    with pytest.raises(InputError, match=r"0001\.json: is no history of runs: remove it"):
+        read_history(tmp_path)
