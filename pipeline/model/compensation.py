@@ -8,22 +8,20 @@ same log in blocks and the samples of a running sensor one by one give the same 
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from pipeline.errors import ConfigurationError, InputError, MissingInputError
+from pipeline.model.calibration_file import read_calibration, sensor_of
 from pipeline.model.compensation_stream import Compensated, CompensationStream
 from pipeline.model.effects import register
-from pipeline.model.inversion import compensate, sensor_effects
-from pipeline.model.user_effects import effect_of
-from pipeline.records import SENSORS, SensorCalibration
+from pipeline.model.inversion import compensate
+from pipeline.records import SENSORS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+    from pipeline.records import SensorCalibration
 
 __all__ = ["Compensated", "Compensation", "CompensationStream", "compensate", "load"]
 
@@ -102,9 +100,10 @@ def load(path: str | Path, python_effects: Sequence[str | Path] = ()) -> Compens
     Raises
     ------
     InputError
-        If the file does not exist, is no calibration, or is the record of a failed unit.
+        If the file does not exist, is no calibration, or is the record of a failed unit; it names file, key and what
+        was expected (``pipeline.model.calibration_file``).
     ConfigurationError
-        If a sensor's effect is one in Python whose file is not given.
+        If an effect is not known, or is one in Python whose file is not given.
     """
     if python_effects:
         from pipeline.model.effect_files import load_python_effect  # noqa: PLC0415  (only where there are any)
@@ -112,32 +111,6 @@ def load(path: str | Path, python_effects: Sequence[str | Path] = ()) -> Compens
         for python_file in python_effects:
             register(load_python_effect(python_file))
     file = Path(path)
-    try:
-        data = json.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise MissingInputError("there is no such calibration", str(file)) from None
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise InputError(f"this is no calibration of a unit: {error}", str(file)) from None
-    if not isinstance(data, dict) or "status" not in data:
-        raise InputError("this is no calibration of a unit: it has no status", str(file))
-    if data["status"] != "ok":
-        cause = (data.get("error") or {}).get("message", "unknown")
-        raise InputError(f"unit {data.get('unit')} failed and has no calibration; cause: {cause}", str(file))
-    try:
-        parts = {s: None if data.get(s) is None else SensorCalibration.from_json(s, data[s]) for s in SENSORS}
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"this is no calibration of a unit: {error!r}", str(file)) from None
-    for c in filter(None, parts.values()):
-        _check_calibration(c, str(file))
-    return Compensation(parts["accelerometer"], parts["gyroscope"], str(data.get("unit", "")))
-
-
-def _check_calibration(c: SensorCalibration, file: str) -> None:
-    """Refuse numbers that are none, and an effect that is not at hand."""
-    if c.bias.shape != (3,) or c.matrix.shape != (3, 3) or not np.isfinite([*c.bias, *c.matrix.flat]).all():
-        raise InputError(f"the {c.sensor}'s bias is not 3 or its matrix not 3 x 3 finite numbers", file)
-    for fitted in sensor_effects(c):
-        try:
-            effect_of(fitted)
-        except ConfigurationError as error:
-            raise ConfigurationError(error.message, file) from None
+    document = read_calibration(file)
+    accelerometer, gyroscope = (sensor_of(document, sensor, file) for sensor in SENSORS)
+    return Compensation(accelerometer, gyroscope, str(document.get("unit", "")))

@@ -44,14 +44,16 @@ def calibration(tmp_path: Path) -> Path:
     gyroscope = SensorCalibration(
         "gyroscope", np.array([1.0, -2.0, 0.5]), np.eye(3) + 0.01,
         effects=(
-            effect("bias_temperature", beta_x=0.1, beta_y=0.2, beta_z=-0.1),
+            effect("bias_temperature", b_T_x=0.1, b_T_y=0.2, b_T_z=-0.1),
             effect("g_sensitivity", **nine("G", 0.05)),
             effect("warm_up", A_x=0.3, A_y=0.2, A_z=0.1, time_constant=60.0),
         ),
     )  # fmt: skip
     file = tmp_path / "U1.json"
     parts = {"accelerometer": accelerometer.to_json(), "gyroscope": gyroscope.to_json()}
-    file.write_text(json.dumps({"unit": "U1", "status": "ok", "error": None, **parts}), encoding="utf-8")
+    file.write_text(
+        json.dumps({"unit": "U1", "schema_version": 1, "status": "ok", "error": None, **parts}), encoding="utf-8"
+    )
     return file
 
 
@@ -201,10 +203,12 @@ def test_a_missing_log_is_refused(calibration: Path, tmp_path: Path) -> None:
 
 
 def test_a_reading_out_of_reach_is_refused_with_its_line(log: Path, tmp_path: Path) -> None:
-    cubic = SensorCalibration("accelerometer", effects=(effect("cubic_nonlinearity", a=5e-3, b=5e-3, c=5e-3),))
+    cubic = SensorCalibration("accelerometer", effects=(effect("cubic_nonlinearity", K3_x=5e-3, K3_y=5e-3, K3_z=5e-3),))
     file = tmp_path / "U2.json"
     part = {"accelerometer": cubic.to_json(), "gyroscope": None}
-    file.write_text(json.dumps({"unit": "U2", "status": "ok", "error": None, **part}), encoding="utf-8")
+    file.write_text(
+        json.dumps({"unit": "U2", "schema_version": 1, "status": "ok", "error": None, **part}), encoding="utf-8"
+    )
     log.write_text("accel_x_g,accel_y_g,accel_z_g\n0,0,1\n0,0,900\n", encoding="utf-8")
     with pytest.raises(ConvergenceError, match=r"log\.csv:2: .*reading of 900"):
         main(["--calibration", str(file), str(log), "-o", str(tmp_path / "out.csv")])

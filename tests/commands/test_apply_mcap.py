@@ -41,11 +41,13 @@ def calibration(tmp_path: Path) -> Path:
     )
     gyroscope = SensorCalibration(
         "gyroscope", np.array([1.0, -2.0, 0.5]), np.eye(3) + 0.01,
-        effects=(effect("bias_temperature", beta_x=0.1, beta_y=0.2, beta_z=-0.1),),
+        effects=(effect("bias_temperature", b_T_x=0.1, b_T_y=0.2, b_T_z=-0.1),),
     )  # fmt: skip
     file = tmp_path / "U1.json"
     parts = {"accelerometer": accelerometer.to_json(), "gyroscope": gyroscope.to_json()}
-    file.write_text(json.dumps({"unit": "U1", "status": "ok", "error": None, **parts}), encoding="utf-8")
+    file.write_text(
+        json.dumps({"unit": "U1", "schema_version": 1, "status": "ok", "error": None, **parts}), encoding="utf-8"
+    )
     return file
 
 

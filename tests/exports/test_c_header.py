@@ -98,7 +98,7 @@ def fitted(name: str, sensor: str, size: float, rng: np.random.Generator) -> Fit
 
 def document(effects: dict[str, dict[str, float]]) -> dict[str, Any]:
     rng = np.random.default_rng(3)
-    out: dict[str, Any] = {"unit": "U1 */", "status": "ok", "sensor": "mpu6050", "inputs": []}
+    out: dict[str, Any] = {"unit": "U1 */", "schema_version": 1, "status": "ok", "sensor": "mpu6050", "inputs": []}
     for sensor in SENSORS:
         chosen = tuple(fitted(n, sensor, size, rng) for n, size in effects.get(sensor, {}).items())
         out[sensor] = SensorCalibration(sensor, BIAS[sensor], MATRIX[sensor], effects=chosen).to_json()

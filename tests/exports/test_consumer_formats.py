@@ -43,8 +43,8 @@ SENSITIVE = effect(
         )
     ),
 )
-WARM = effect("bias_temperature", beta_x=1e-3, beta_y=-2e-3, beta_z=5e-4)
-WARMER = effect("bias_temperature_quadratic", **{f"b{i}_{a}": v for a, i, v in [
+WARM = effect("bias_temperature", b_T_x=1e-3, b_T_y=-2e-3, b_T_z=5e-4)
+WARMER = effect("bias_temperature_quadratic", **{f"b_T{i}_{a}": v for a, i, v in [
     ("x", 1, 0.01), ("x", 2, 2e-4), ("y", 1, -0.02), ("y", 2, 1e-4), ("z", 1, 0.03), ("z", 2, -3e-4)]})  # fmt: skip
 SCALED = effect("scale_factor_temperature", k_T_x=2e-4, k_T_y=-1e-4, k_T_z=1.5e-4)
 
@@ -55,6 +55,7 @@ class Unit:
     def __init__(self, folder: Path, **effects: tuple[FittedEffect, ...]) -> None:
         self.document: dict[str, Any] = {
             "unit": "U1",
+            "schema_version": 1,
             "status": "ok",
             "sensor": "mpu6050",
             "inputs": [{"rate_hz": 100.0}],
@@ -237,7 +238,7 @@ def test_axes_of_the_sensor_that_are_not_the_bodys_are_stated_in_each_format(tmp
 
 
 def test_every_format_says_what_it_leaves_out(tmp_path: Path) -> None:
-    quadratic = effect("quadratic_nonlinearity", a=1e-3, b=1e-3, c=1e-3)
+    quadratic = effect("quadratic_nonlinearity", K2_x=1e-3, K2_y=1e-3, K2_z=1e-3)
     Unit(tmp_path, accelerometer=(quadratic,))
     silent = {"kalibr_imu.yaml", "imu_tk_gyro.calib", "calibration.h", "U1.json"}
     for path in tmp_path.iterdir():

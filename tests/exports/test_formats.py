@@ -28,7 +28,13 @@ def document(effects: dict[str, dict[str, float]], seed: int = 3) -> dict[str, A
         "accelerometer": (np.array([0.031, -0.022, 0.067]), ACCELEROMETER),
         "gyroscope": (np.array([1.7, -0.9, 0.4]), GYROSCOPE),
     }
-    out: dict[str, Any] = {"unit": "U1 */", "status": "ok", "sensor": "mpu6050", "inputs": [{"rate_hz": 100.0}]}
+    out: dict[str, Any] = {
+        "unit": "U1 */",
+        "schema_version": 1,
+        "status": "ok",
+        "sensor": "mpu6050",
+        "inputs": [{"rate_hz": 100.0}],
+    }
     for sensor, (bias, matrix) in parts.items():
         chosen = tuple(fitted(n, sensor, size, rng) for n, size in effects.get(sensor, {}).items())
         out[sensor] = SensorCalibration(sensor, bias, matrix, effects=chosen).to_json()

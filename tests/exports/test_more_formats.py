@@ -33,7 +33,7 @@ def document(*, sensitive: bool = False) -> dict[str, Any]:
     names = [f"G_{a}{b}" for a in "xyz" for b in "xyz"]
     named = zip(names, SENSITIVITY.ravel(), strict=True)
     g_sensitivity = FittedEffect("g_sensitivity", {n: {"value": float(v), "unit": "deg/s/g"} for n, v in named})
-    out: dict[str, Any] = {"unit": "U1\nreboot", "status": "ok", "sensor": "mpu6050", "inputs": []}
+    out: dict[str, Any] = {"unit": "U1\nreboot", "schema_version": 1, "status": "ok", "sensor": "mpu6050", "inputs": []}
     for sensor, bias in BIAS.items():
         effects = (g_sensitivity,) if sensitive and sensor == "gyroscope" else ()
         out[sensor] = SensorCalibration(sensor, bias, MATRIX[sensor], effects=effects).to_json()

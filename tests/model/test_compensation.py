@@ -1,14 +1,15 @@
 from __future__ import annotations
 
 import json
+import os
 import tracemalloc
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import pipeline
-from pipeline.errors import ConfigurationError, ConvergenceError, InputError, MissingInputError
+from pipeline.errors import ConfigurationError, ConvergenceError, InputError, MissingInputError, PipelineError
 from pipeline.model.compensation import Compensation, compensate, load
 from pipeline.model.compensation_stream import BLOCK
 from pipeline.model.effects import catalogue
@@ -17,9 +18,6 @@ from pipeline.model.fading_line import FadingLine
 from pipeline.model.measurement import predicted_reading
 from pipeline.model.user_effects import effect_from
 from pipeline.records import SENSORS, FittedEffect, Motion, SensorCalibration
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 SIZE = {"accelerometer": 2e-3, "gyroscope": 1e-5}
 EFFECTS = [(s, e.name) for s in SENSORS for e in catalogue().values() if e.owner == Owner.SENSOR and s in e.sensors]
@@ -304,7 +302,14 @@ def test_an_effect_without_an_implementation_is_named() -> None:
 
 def write(path: Path, **changes: object) -> Path:
     unit = everything()
-    document = {"unit": "U1", "status": "ok", "error": None, **{s: unit[s].to_json() for s in SENSORS}, **changes}
+    document = {
+        "unit": "U1",
+        "schema_version": 1,
+        "status": "ok",
+        "error": None,
+        **{s: unit[s].to_json() for s in SENSORS},
+        **changes,
+    }
     path.write_text(json.dumps(document), encoding="utf-8")
     return path
 
@@ -327,15 +332,74 @@ def test_a_failed_unit_is_refused_with_its_cause(tmp_path: Path) -> None:
         load(write(tmp_path / "U1.json", **failed))
 
 
-@pytest.mark.parametrize("text", ["{", "[]", "{}", '{"status": "ok", "gyroscope": {"bias": [0, 0, 0]}}'])
-def test_a_file_that_is_no_calibration_is_refused(tmp_path: Path, text: str) -> None:
+def test_a_file_that_is_no_calibration_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "U1.json"
+    for text in ("{", "[]", "{}", "[" * 100_000):
+        file.write_text(text, encoding="utf-8")
+        with pytest.raises(InputError, match="no calibration"):
+            load(file)
+    os.mkfifo(tmp_path / "pipe")
+    for path, kind in ((tmp_path, "a directory"), (tmp_path / "pipe", "a pipe"), (Path("/dev/null"), "a device")):
+        with pytest.raises(InputError, match=f"this is .*{kind}"):
+            load(path)
+
+
+Change = tuple[str, str, str]
+MATRIX = '"matrix": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]'
+FAULTS: list[Change] = [
+    ('"schema_version": 1, ', "", "schema_version is missing; this version reads 1"),
+    ('"schema_version": 1, ', '"schema_version": 2, ', "schema_version is 2; this version reads 1"),
+    ('"status": "ok"', '"status": "fine"', 'status is .fine.; expected "ok" or "failed"'),
+    ('"status": "ok"', '"status": "ok", "status": "ok"', 'the key "status" stands twice'),
+    ('"bias": [0.0, 0.0, 0.0], "m', '"bias": [0.0, 0.0], "m', r"gyroscope.bias is \[0.0, 0.0\]; expected 3 finite"),
+    ('"bias": [0.0, 0.0, 0.0], "m', '"bias": [0.0, NaN, 0.0], "m', "holds the number NaN"),
+    ('"bias": [0.0, 0.0, 0.0], "m', '"bias": [0.0, 1e999, 0.0], "m', r"gyroscope.bias is .*; expected 3 finite"),
+    ('"bias": [0.0, 0.0, 0.0], "m', '"bias": ["0", 0.0, 0.0], "m', r"gyroscope.bias is .*; expected 3 finite"),
+    ('"bias": [0.0, 0.0, 0.0], "m', '"bias": [true, 0.0, 0.0], "m', r"gyroscope.bias is .*; expected 3 finite"),
+    (MATRIX, '"matrix": [[1.0, 0.0], [0.0, 1.0]]', "gyroscope.matrix is .*; expected 3 x 3 finite numbers"),
+    (MATRIX, MATRIX.replace("[[1.0", "[[0.0"), "gyroscope.matrix is singular or nearly so"),
+    (MATRIX, MATRIX.replace("1.0", "16384.0"), "gyroscope.matrix multiplies readings by 1.64e.04 to 1.64e.04"),
+    ('"unit": "deg/s", "bias"', '"unit": "rad/s", "bias"', "gyroscope.unit is .rad/s.; expected 'deg/s'"),
+    ('"accelerometer": null, ', "", "accelerometer is missing; expected an object, or null"),
+    ('"covariance": {', '"covariance": 3, "x": {', "gyroscope.covariance is 3; expected an object"),
+    ('"converged": true, ', "", "gyroscope.converged is missing"),
+    ('"name": "g_sensitivity"', '"name": "moon"', r"gyroscope.effects\[0\]: .*moon"),
+    (
+        '"name": "g_sensitivity"',
+        '"nam": "g_sensitivity"',
+        r"gyroscope.effects\[0\] is .*; expected an object with name",
+    ),
+    ('"name": "g_sensitivity"', '"name": "hysteresis"', "no effect of the gyroscope"),
+    (
+        '"G_xx": {"value": 0.05',
+        '"G_xx": {"value": "0.05"',
+        r"parameters.G_xx.value \(g_sensitivity\) is .*; expected a f",
+    ),
+    ('"G_xx": {', '"G_q": {', r"parameters \(g_sensitivity\) are G_q, .*; expected G_xx"),
+    ('"unit": "deg/s/g"', '"unit": "rad/s/g"', r"G_xx.unit \(g_sensitivity\) is .rad/s/g.; expected 'deg/s/g'"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "message"), FAULTS)
+def test_a_fault_in_a_calibration_is_named(tmp_path: Path, old: str, new: str, message: str) -> None:
+    entries = {f"G_{a}{b}": {"value": 0.05, "unit": "deg/s/g"} for a in "xyz" for b in "xyz"}
+    part = SensorCalibration("gyroscope", effects=(FittedEffect("g_sensitivity", entries),)).to_json()
+    head = {"schema_version": 1, "unit": "U1", "status": "ok", "error": None}
+    text = json.dumps({**head, "accelerometer": None, "gyroscope": part})
     file = tmp_path / "U1.json"
     file.write_text(text, encoding="utf-8")
-    with pytest.raises(InputError, match="no calibration"):
+    assert load(file).accelerometer is None
+    assert old in text
+    file.write_text(text.replace(old, new, 1), encoding="utf-8")
+    with pytest.raises(PipelineError, match=message) as caught:
         load(file)
+    assert caught.value.file == str(file)
 
 
-def test_a_calibration_of_the_wrong_shape_is_refused(tmp_path: Path) -> None:
-    part = {**calibration("gyroscope").to_json(), "bias": [0.0, 1.0]}
-    with pytest.raises(InputError, match="bias is not 3"):
-        load(write(tmp_path / "U1.json", gyroscope=part))
+def test_an_effect_named_twice_and_no_calibrated_sensor_are_refused(tmp_path: Path) -> None:
+    part = calibration("gyroscope").to_json()
+    twice = {"name": "scale_factor_asymmetry", "parameters": {f"c_{a}": {"value": 0.0, "unit": "1"} for a in "xyz"}}
+    with pytest.raises(InputError, match=r"gyroscope.effects\[1\] is scale_factor_asymmetry a second time"):
+        load(write(tmp_path / "U1.json", gyroscope={**part, "effects": [twice, twice]}))
+    with pytest.raises(InputError, match="are null: there is nothing to apply; reason: no turns"):
+        load(write(tmp_path / "U1.json", accelerometer=None, gyroscope=None, not_calibrated={"gyroscope": "no turns"}))

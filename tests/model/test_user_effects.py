@@ -275,7 +275,7 @@ def test_registered_effects_stand_beside_the_built_in_ones_and_never_for_one() -
 def calibration(definition: dict[str, Any]) -> SensorCalibration:
     values = {"d_x": 0.01, "d_y": -0.02, "d_z": 0.015}
     fitted = FittedEffect(
-        "loose_part", {n: {"value": v, "unit": "g", "expanded_uncertainty": 0.0} for n, v in values.items()}, definition
+        "loose_part", {n: {"value": v, "unit": "", "expanded_uncertainty": 0.0} for n, v in values.items()}, definition
     )
     matrix = np.linalg.inv(K["accelerometer"])
     return SensorCalibration("accelerometer", np.array([0.1, 0.2, -0.1]), matrix, effects=(fitted,))
@@ -283,7 +283,7 @@ def calibration(definition: dict[str, Any]) -> SensorCalibration:
 
 def written(directory: Path, found: SensorCalibration) -> Path:
     file = directory / "U1.json"
-    document = {"unit": "U1", "status": "ok", "accelerometer": found.to_json(), "gyroscope": None}
+    document = {"unit": "U1", "schema_version": 1, "status": "ok", "accelerometer": found.to_json(), "gyroscope": None}
     file.write_text(json.dumps(document))
     return file
 
