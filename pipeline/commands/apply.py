@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.errors import ConfigurationError
-from pipeline.field_logs.output import Progress
+from pipeline.errors import ConfigurationError, InputError
+from pipeline.field_logs.doubts import Doubts
+from pipeline.field_logs.output import Progress, require_apart
 from pipeline.field_logs.profile import LogProfile
+from pipeline.model.calibration_file import read_calibration
 from pipeline.model.compensation import SMOOTHING_S, load
 
 if TYPE_CHECKING:
@@ -37,14 +38,19 @@ def main(argv: Sequence[str]) -> int:
     if arguments.smoothing < 0:
         raise ConfigurationError(f"--temperature-smoothing is {arguments.smoothing:g} s; it cannot be negative")
     compensation = load(arguments.calibration, arguments.python_effects)
+    require_apart(arguments.log, arguments.output)
+    if arguments.output.exists() and arguments.output.samefile(arguments.calibration):
+        raise InputError(
+            "the output would overwrite the calibration; choose another file for -o", str(arguments.output)
+        )
     profile = _profile(arguments.calibration, arguments.ingest)
-    progress = Progress(arguments.log)
+    progress, doubts = Progress(arguments.log), Doubts()
     if arguments.log.suffix.lower() == ".mcap":
         from pipeline.field_logs.mcap_log import compensate_mcap  # noqa: PLC0415  (each log needs one of the two)
 
         done = compensate_mcap(
             compensation, arguments.log, arguments.output, profile,
-            topic=arguments.topic, smoothing=arguments.smoothing, progress=progress,
+            topic=arguments.topic, smoothing=arguments.smoothing, progress=progress, doubts=doubts,
         )  # fmt: skip
         rows, sensors, what = done.messages, done.sensors, f"messages compensated on {done.topic}"
         notes = done.notes
@@ -52,13 +58,16 @@ def main(argv: Sequence[str]) -> int:
         from pipeline.field_logs.csv_log import compensate_csv  # noqa: PLC0415
 
         rows, sensors = compensate_csv(
-            compensation, arguments.log, arguments.output, profile, smoothing=arguments.smoothing, progress=progress
-        )
+            compensation, arguments.log, arguments.output, profile,
+            smoothing=arguments.smoothing, progress=progress, doubts=doubts,
+        )  # fmt: skip
         what, notes = "rows compensated", []
     progress.end()
     for sensor in sensors:
         if compensation.calibration(sensor) is None:
             notes = [*notes, f"{arguments.calibration} holds no {sensor}; its readings are unchanged"]
+    for doubt in doubts.said({s for s in sensors if compensation.calibration(s) is not None}):
+        print(f"warning: {doubt}", file=sys.stderr)
     for note in notes:
         print(f"note: {note}", file=sys.stderr)
     print(f"{rows} {what} with unit {compensation.unit}: {arguments.output}", file=sys.stderr)
@@ -75,7 +84,7 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("log", type=Path, metavar="LOG", help="the log: .mcap, or text")
     add("--calibration", type=Path, required=True, metavar="C.json", help="calibrations/<unit>.json")
-    add("-o", "--output", type=Path, required=True, metavar="OUT", help="file to write, of the same kind")
+    add("-o", "--output", type=Path, required=True, metavar="OUT", help="file to write, of the same kind; - for stdout")
     add("--ingest", metavar="NAME", help="ingest profile of the log, for example canonical_csv (that of the unit)")
     add("--topic", metavar="TOPIC", help="topic of the calibrated messages (that of the readings + _calibrated)")
     add(
@@ -91,8 +100,8 @@ def _parser() -> argparse.ArgumentParser:
 
 def _profile(calibration: Path, ingest: str | None) -> LogProfile:
     """Return how the log is laid out: as the unit's recordings, or as a named profile says."""
-    document = json.loads(calibration.read_text(encoding="utf-8"))
-    profile = LogProfile.of_calibration(document)
+    document = read_calibration(calibration)
+    profile = LogProfile.of_calibration(document, str(calibration))
     if ingest is None:
         return profile
     from pipeline.config.compose import Composer, Problem  # noqa: PLC0415  (0.3 s that few logs need)

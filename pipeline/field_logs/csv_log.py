@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from pipeline.field_logs.doubts import Doubts
     from pipeline.formats.csv_settings import Column
     from pipeline.formats.text_log import TextBlock
     from pipeline.model.compensation import Compensation
@@ -46,6 +47,7 @@ def compensate_csv(
     smoothing: float = SMOOTHING_S,
     block_bytes: int = BLOCK_BYTES,
     progress: Callable[[int, int], None] | None = None,
+    doubts: Doubts | None = None,
 ) -> tuple[int, list[str]]:
     """Compensate a text log.
 
@@ -61,6 +63,8 @@ def compensate_csv(
         Size of the blocks that are read.
     progress : callable, optional
         Called with the rows done and the bytes read.
+    doubts : Doubts, optional
+        Takes in what speaks against compensating this log.
 
     Returns
     -------
@@ -88,6 +92,11 @@ def compensate_csv(
                     found = stream.apply(**signals)
                 except PipelineError as error:
                     raise type(error)(error.message, f"{source}:{block.line_of(0)}") from None
+                if doubts is not None:
+                    if rows == 0:
+                        doubts.look_at([block.columns[i] for i in log.readings], log.settings.decimal)
+                    after = {s: getattr(found, s) for s in SENSORS if s in signals}
+                    doubts.take({s: signals[s] for s in after}, after, signals.get("time"), rows)
                 for sensor in (s for s in SENSORS if s in signals):
                     log.replace(block.columns, sensor, getattr(found, sensor), signals[sensor])
                 out.write(lines_of(block.columns, head.delimiter, quoted=block.quoted))
@@ -131,12 +140,16 @@ class _Log:
             if present:
                 self.places[signal] = [i for c in present if (i := _index(c, names)) is not None]
         if not any(sensor in self.places for sensor in SENSORS):
+            told = "--ingest names the profile that describes this log"
+            if set(CANONICAL.values()) & set(names):
+                told = f"these are the columns that this command writes: the log is compensated already, else {told}"
             expected = ", ".join(str(self.columns[c].column) for s in SENSORS for c in TRIADS[s] if c in self.columns)
-            raise InputError(
-                f"no column of a sensor; expected {expected}, got {', '.join(names)[:200]}; "
-                "--ingest names the profile that describes this log",
-                where,
-            )
+            raise InputError(f"no column of a sensor; expected {expected}, got {', '.join(names)[:200]}; {told}", where)
+
+    @property
+    def readings(self) -> list[int]:
+        """Columns of the readings."""
+        return [i for sensor in SENSORS for i in self.places.get(sensor, [])]
 
     def new_names(self, names: list[str]) -> list[str]:
         """Return the names of the columns of the output."""

@@ -11,9 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from mcap.records import Channel, Schema
+from mcap.records import Channel, Metadata, Schema
 
 from pipeline.errors import InputError, PipelineError
+from pipeline.field_logs.doubts import Doubts
 from pipeline.field_logs.mcap_input import Readings, Temperatures
 from pipeline.field_logs.mcap_output import new_imu, replaced
 from pipeline.field_logs.output import replacing, require_apart
@@ -33,10 +34,12 @@ if TYPE_CHECKING:
 
     from pipeline.field_logs.mcap_input import Batch
     from pipeline.formats.mcap_chunk import Rows
+    from pipeline.formats.mcap_container import Container
     from pipeline.model.compensation import Compensation
 
 LAST_ID = 0xFFFF  # ids of added definitions count down from here, those of recorders up from 0
 SUFFIX = "_calibrated"
+METADATA = "imu_calibration"
 NANOSECONDS = 1e9
 
 
@@ -59,6 +62,7 @@ def compensate_mcap(
     topic: str | None = None,
     smoothing: float = SMOOTHING_S,
     progress: Callable[[int, int], None] | None = None,
+    doubts: Doubts | None = None,
 ) -> Done:
     """Add calibrated messages to a log.
 
@@ -74,6 +78,8 @@ def compensate_mcap(
         Memory of the line through the temperature's past; 0 takes the last one as it is.
     progress : callable, optional
         Called with the messages done and the bytes read.
+    doubts : Doubts, optional
+        Takes in what speaks against compensating this log; the output's metadata ``imu_calibration`` says it.
 
     Raises
     ------
@@ -84,7 +90,7 @@ def compensate_mcap(
     profile = profile or LogProfile()
     with source.open("rb") as stream, replacing(target) as out:
         check_magic(stream.read(64), str(source))
-        work = _Work(compensation, source, profile, smoothing, topic)
+        work = _Work(compensation, source, profile, smoothing, topic, doubts or Doubts())
         work.walk = CopyingWalk(
             stream, str(source), McapCopy(out), work.take, allow_truncated=mcap_format(profile.ingest).allow_truncated
         )
@@ -100,9 +106,16 @@ class _Work:
 
     walk: CopyingWalk
 
-    def __init__(
-        self, compensation: Compensation, source: Path, profile: LogProfile, smoothing: float, topic: str | None
+    def __init__(  # noqa: PLR0917  (they are the task)
+        self,
+        compensation: Compensation,
+        source: Path,
+        profile: LogProfile,
+        smoothing: float,
+        topic: str | None,
+        doubts: Doubts,
     ) -> None:
+        self.doubts = doubts
         settings = mcap_format(profile.ingest)
         self.source, self.profile, self.topic = source, profile, topic
         self.compensation, self.stream = compensation, compensation.stream(0.0)
@@ -139,6 +152,7 @@ class _Work:
         except PipelineError as error:
             raise type(error)(f"{error.message} ({rows.run.name})", str(self.source)) from None
         truths = {s: v for s in SENSORS if (v := getattr(found, s)) is not None}
+        self.doubts.take(given, truths, time, self.done.messages)
         channel, before = self._channel(rows.channel)
         changed = {s: v for s, v in truths.items() if self.compensation.calibration(s) or v is not batch.values[s]}
         decoder = self.readings.decoders[rows.channel]
@@ -185,8 +199,22 @@ class _Work:
         taken = own | {c.id for c in added} & set(found.channels)
         if taken:
             raise InputError(f"the log uses the id {min(taken)} itself, which the added topic needs", str(self.source))
+        self._say(found)
         self.walk.copy.finish(schemas, [*found.channels.values(), *added])
         if found.truncated:
             self.done.notes.append(f"{found.truncated}; the output holds these")
         if self.temperatures is not None:
             self.done.notes += self.temperatures.notes()
+
+    def _say(self, found: Container) -> None:
+        """Write what was compensated with what, and what speaks against it, into the output's metadata."""
+        made = {m.metadata.get("topic"): m.metadata.get("unit") for m in found.metadata if m.name == METADATA}
+        topic = self.readings.topic or ""
+        if topic in made:
+            self.doubts.compensated = f"topic {topic} was made by this command with unit {made[topic]}"
+        elif topic.endswith(SUFFIX):
+            self.doubts.compensated = f"topic {topic} has the name of one that this command makes"
+        held = {s for s in SENSORS if self.compensation.calibration(s) is not None}
+        said = "\n".join(self.doubts.said(held))
+        entries = {"unit": self.compensation.unit, "topic": self.done.topic, "readings": topic, "warnings": said}
+        self.walk.copy.note(Metadata(name=METADATA, metadata=entries))

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import re
+import shutil
+import stat
 import sys
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import IO, TYPE_CHECKING
 
 from pipeline.errors import InputError, MissingInputError
@@ -13,31 +17,126 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
+DESCRIPTOR = re.compile(r"-|/dev/stdout|(?:/dev/fd|/proc/self/fd)/(\d+)")  # files that the caller has opened already
+KINDS = {".mcap": "MCAP", ".csv": "text", ".txt": "text"}
+
 
 def require_apart(source: Path, target: Path) -> None:
-    """Refuse a log that does not exist and an output that cannot be, or would overwrite the log."""
-    if not source.is_file():
+    """Refuse a log that is no file, and an output that cannot be made or would overwrite the log.
+
+    Parameters
+    ----------
+    source : Path
+    target : Path
+        ``-`` is standard output.
+
+    Raises
+    ------
+    MissingInputError
+        If there is no such log.
+    InputError
+    """
+    if not source.exists():
         raise MissingInputError("there is no such log", str(source))
+    mode = source.stat().st_mode
+    if not stat.S_ISREG(mode):
+        kind = "a directory" if stat.S_ISDIR(mode) else "a pipe or a device"
+        raise InputError(f"this is {kind}; expected a file: save the log, then name that file", str(source))
+    if (descriptor := _descriptor(target)) is not None:
+        if _is_open(descriptor) and os.path.samestat(os.fstat(descriptor), source.stat()):
+            raise InputError("the output would overwrite the log; choose another file", str(target))
+        return
+    if target.is_dir():
+        raise InputError("the output is a directory; name a file for -o", str(target))
     if target.exists() and target.samefile(source):
         raise InputError("the output would overwrite the log; choose another file for -o", str(target))
-    if not target.parent.is_dir():
+    if not target.resolve().parent.is_dir():
         raise InputError("the directory of the output does not exist; make it first", str(target))
+    kinds = [KINDS.get(file.suffix.lower(), "text" if file is source else None) for file in (source, target)]
+    if kinds[1] is not None and kinds[0] != kinds[1]:
+        raise InputError(
+            f"the log is {kinds[0]}, and so is the output, but its name ends in {target.suffix}: choose another name",
+            str(target),
+        )
+
+
+def _descriptor(target: Path) -> int | None:
+    """Return the number of the open file that a target names; None for a path."""
+    found = DESCRIPTOR.fullmatch(str(target))
+    return int(found[1] or 1) if found else None
+
+
+def _is_open(descriptor: int) -> bool:
+    try:
+        os.fstat(descriptor)
+    except OSError:
+        return False
+    return True
+
+
+class Output:
+    """What is written to: an ``OSError`` becomes a message that names the output."""
+
+    def __init__(self, stream: IO[bytes], target: Path) -> None:
+        self.stream, self.target = stream, target
+
+    def write(self, data: bytes | memoryview) -> None:
+        """Write all of it."""
+        with _told(self.target):
+            self.stream.write(data)
 
 
 @contextmanager
-def replacing(target: Path) -> Iterator[IO[bytes]]:
-    """Open a file that takes its name only when it is complete."""
-    if target.exists() and not target.is_file():  # a pipe or device
-        with target.open("wb") as out:
-            yield out
-        return
-    part = target.with_name(f".{target.name}.part")
+def replacing(target: Path) -> Iterator[Output]:
+    """Open a file that takes its name only when it is complete.
+
+    A symbolic link stays, and the file to which it points is replaced, with its permissions kept. Standard output,
+    pipes and devices are written to as they are.
+
+    Parameters
+    ----------
+    target : Path
+        ``-`` is standard output.
+
+    Raises
+    ------
+    InputError
+        If the output cannot be written; what stood there before is left.
+    """
+    descriptor, part = _descriptor(target), None
+    file = target if descriptor is not None else target.resolve()
+    with _told(target):
+        if descriptor is not None:
+            sys.stdout.flush()
+            stream = os.fdopen(os.dup(descriptor), "wb")
+        elif file.exists() and not file.is_file():
+            stream = file.open("wb")
+        else:
+            part = file.with_name(f".apply.{os.getpid()}.part")
+            stream = part.open("wb")
     try:
-        with part.open("wb") as out:
-            yield out
-        part.replace(target)
+        yield Output(stream, target)
+        with _told(target):
+            stream.close()
+            if part is not None:
+                if file.exists():
+                    shutil.copymode(file, part)
+                part.replace(file)
     finally:
-        part.unlink(missing_ok=True)
+        with suppress(OSError):
+            stream.close()
+        if part is not None:
+            part.unlink(missing_ok=True)
+
+
+@contextmanager
+def _told(target: Path) -> Iterator[None]:
+    try:
+        yield
+    except BrokenPipeError:
+        raise InputError("the output was closed before it was complete", str(target)) from None
+    except OSError as error:
+        raise InputError(f"the output cannot be written: {error.strerror}", str(target)) from None
 
 
 class Progress:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.errors import ConfigurationError, InputError
 from pipeline.formats.axes import axis_matrix
 
 if TYPE_CHECKING:
@@ -41,10 +42,24 @@ class LogProfile:
     axis_map: Sequence[str] = STRAIGHT
 
     @classmethod
-    def of_calibration(cls, document: Mapping[str, Any]) -> LogProfile:
-        """Return the profile with which a unit was calibrated, from ``calibrations/<unit>.json``."""
+    def of_calibration(cls, document: Mapping[str, Any], file: str) -> LogProfile:
+        """Return the profile with which a unit was calibrated, from ``calibrations/<unit>.json``.
+
+        Raises
+        ------
+        InputError
+            If ``log`` is not what a run writes there.
+        """
         log = document.get("log")
-        return cls(log["ingest"], tuple(log["axis_map"])) if log else cls()
+        if log is None:
+            return cls()
+        try:
+            axis_matrix(log["axis_map"])
+            found = cls({**log["ingest"]}, tuple(log["axis_map"]))
+        except (KeyError, TypeError, ConfigurationError) as error:
+            told = "log is not what a run writes; expected ingest, an object, and axis_map, for example [+x, +y, +z]"
+            raise InputError(f"{told}; got {error}", file) from None
+        return found
 
     def to_body(self, readings: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return (n, 3) readings in the body's axes."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import struct
 import zlib
 from collections import Counter
-from typing import IO, TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from mcap.data_stream import RecordBuilder
@@ -24,13 +24,20 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
     from typing import BinaryIO
 
-    from mcap.records import Channel, McapRecord, Schema
+    from mcap.records import Channel, McapRecord, Metadata, Schema
     from numpy.typing import NDArray
 
     from pipeline.formats.mcap_chunk import Rows
     from pipeline.formats.mcap_container import Container
 
 ZSTD_LEVEL = -3  # twice as fast as 1 on calibrated messages, and as small as the recorders' 3
+
+
+class Sink(Protocol):
+    """What bytes are written to."""
+
+    def write(self, data: bytes | memoryview, /) -> object:
+        """Write all of them."""
 
 
 class CopyingWalk(Walk):
@@ -87,11 +94,11 @@ class McapCopy:
 
     Parameters
     ----------
-    out : binary file
-        Empty.
+    out : file
+        Empty; bytes are written to it in order.
     """
 
-    def __init__(self, out: IO[bytes]) -> None:
+    def __init__(self, out: Sink) -> None:
         self.out = out
         self.position = self.crc = 0
         self.packing = ""  # of the last chunk
@@ -199,6 +206,12 @@ class McapCopy:
             body = struct.pack("<HI", channel, len(table)) + table
             self._write(struct.pack("<BQ", records.MESSAGE_INDEX, len(body)), body)
             index.message_index_length += records.RECORD_HEAD + len(body)
+
+    def note(self, metadata: Metadata) -> None:
+        """Add a record of metadata."""
+        data = _bytes_of([metadata])
+        self.metadata.append(MetadataIndex(offset=self.position, length=len(data), name=metadata.name))
+        self._write(data)
 
     def finish(self, schemas: Iterable[Schema], channels: Iterable[Channel]) -> None:
         """Close the data and write the summary."""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import struct
+import subprocess
+import sys
 from collections import defaultdict
 from typing import TYPE_CHECKING, Any
 
@@ -154,7 +156,8 @@ def test_every_message_is_kept_and_a_topic_of_calibrated_ones_is_added(
         assert summary is not None
         assert summary.statistics.message_count == sum(map(len, before.values())) + COUNT
         assert [a.name for a in reader.iter_attachments()] == ["plan.txt"]
-        assert [m.metadata for m in reader.iter_metadata()] == [{"driver": "somebody"}]
+        made = {"unit": "U1", "topic": "/imu/data_calibrated", "readings": "/imu/data", "warnings": ""}
+        assert [m.metadata for m in reader.iter_metadata()] == [{"driver": "somebody"}, made]
         by_topic = {c.topic: c for c in summary.channels.values()}
     assert by_topic["/imu/data_calibrated"].schema_id == by_topic["/imu/data"].schema_id
     assert by_topic["/imu/data_calibrated"].metadata == {"offered_qos_profiles": "some"}
@@ -227,6 +230,39 @@ def test_a_log_that_is_calibrated_already_is_not_calibrated_again(calibration: P
     compensate_mcap(load(calibration), log, out)
     with pytest.raises(InputError, match=r"topics are of type|has a topic /imu/data_calibrated already"):
         compensate_mcap(load(calibration), out, tmp_path / "twice.mcap")
+
+
+def test_a_topic_that_this_command_made_is_known_again(calibration: Path, tmp_path: Path) -> None:
+    log, out, twice = write_log(tmp_path / "log.mcap"), tmp_path / "out.mcap", tmp_path / "twice.mcap"
+    for topic, reason in (("/imu/clean", "was made by this command with unit U1"), (None, "has the name of one")):
+        compensate_mcap(load(calibration), log, out, topic=topic)
+        chosen = topic or "/imu/data_calibrated"
+        profile = LogProfile({"mcap": {"imu_topic": chosen}})
+        source = out
+        if topic is None:
+            source = tmp_path / "bare.mcap"  # without the metadata: another program copied the messages
+            with source.open("wb") as stream:
+                writer = Writer(stream)
+                writer.start()
+                schema = writer.register_schema(IMU, "ros2msg", DEFINITIONS[IMU].encode())
+                channel = writer.register_channel(chosen, "cdr", schema)
+                for log_time, publish_time, sequence, data in messages(out)[chosen]:
+                    writer.add_message(channel, log_time, data, publish_time, sequence)
+                writer.finish()
+            calibration.write_text(calibration.read_text().replace('"effects": [{', '"effects": [], "x": [{'))
+        compensate_mcap(load(calibration), source, twice, profile, topic="/imu/twice")
+        with twice.open("rb") as stream:
+            made = [m.metadata for m in make_reader(stream).iter_metadata() if m.name == "imu_calibration"]
+        assert (made[-1]["readings"], made[-1]["topic"]) == (chosen, "/imu/twice")
+        assert f"topic {chosen} {reason}" in made[-1]["warnings"]
+
+
+def test_an_mcap_log_goes_to_a_pipe_as_to_a_file(calibration: Path, tmp_path: Path) -> None:
+    log, out, piped = write_log(tmp_path / "log.mcap"), tmp_path / "out.mcap", tmp_path / "piped.mcap"
+    main(["--calibration", str(calibration), str(log), "-o", str(out)])
+    command = [sys.executable, "-m", "pipeline", "apply", "--calibration", str(calibration), str(log), "-o", "-"]
+    piped.write_bytes(subprocess.run(command, capture_output=True, check=True).stdout)
+    assert piped.read_bytes() == out.read_bytes()
 
 
 def test_a_truncated_log_is_compensated_where_the_profile_allows_it(calibration: Path, tmp_path: Path) -> None:

@@ -1,0 +1,225 @@
+"""What speaks against compensating a log with a calibration: said beside the result, which is written all the same.
+
+    rest  : a window of 100 samples whose scatter is at most twice that of the quietest tenth of the windows, and
+            twice that which successive differences have: nothing moves slowly either
+    error : ||a| - 1 g| or |w| of a rest's mean reading, before and after compensation
+
+A calibration that fits brings rests nearer to 1 g and to zero rate. Where it takes them away from there, the log was
+compensated already, is of another unit or sensor, or is read with other axes or units; or the sensor has changed.
+
+Between two rests gravity turns in the body by at most the integral of the rate's size. A gyroscope that integrates to
+less than half of that is not read in deg/s.
+
+``apply`` writes numbers rounded to 12 decimals, without zeros at their ends: 9 of 10 cells have 12 decimals. Fewer
+digits come from sensors, more from programs that write doubles.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.formats.text_log import DECIMALS
+from pipeline.records import SENSORS
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    import pyarrow as pa
+    from numpy.typing import NDArray
+
+    Values = NDArray[np.float64]
+
+WINDOW = 100
+MOST_WINDOWS = 20_000  # 2 million samples, 6 MB: the memory stays bounded
+QUIET, QUIETEST = 2.0, 0.1
+FEWEST_RESTS = 3
+# Error after over error before. Where errors of both kinds are alike, by chance: a drift as large as the bias, three
+# components each, P(F(3, 3) < 1/9) = 4 %. An accelerometer is judged in three directions or more, and where the
+# correction is at least half of the error after it.
+WORSE = {"accelerometer": 1.2, "gyroscope": 3.0}
+KNOWN = 5.0  # standard errors of a rest's mean that the error after is above
+APART_DEG = 30.0  # orientations that count as different; the least turn of gravity that is compared with the rate
+GRAVITY_UNITS = {"m/s^2": 9.80665, "mg": 1000.0}
+NEAR = 0.15  # a median |a| this near to a unit's factor is read in that unit
+STRANGE_G = (0.5, 2.0)  # median |a| of a log; walking, driving and flying stay within
+CELLS, LEAST_CELLS, SHARE = 200, 10, 0.6  # of a column; the share of cells with 12 decimals, 0.9 expected
+WHOLE = 10  # different whole numbers that are no chance
+
+
+class Doubts:
+    """Statistics of a log on its way, in bounded memory."""
+
+    def __init__(self) -> None:
+        self.samples = self.reversed = self.repeated = 0
+        self.first_reversed = ""
+        self.last_time = -np.inf
+        self.windows: list[dict[str, Values]] = []
+        self.whole: dict[str, bool] = {}
+        self.compensated = ""
+
+    def look_at(self, columns: Sequence[pa.Array], decimal: str) -> None:
+        """Look at how the readings of a text log are written."""
+        cells = [str(cell) for column in columns for cell in column[:CELLS].to_pylist()]
+        decimals = [cell.partition(decimal)[2] for cell in cells if "e" not in cell.lower()]
+        full = sum(len(text) == DECIMALS for text in decimals)
+        if (
+            len(decimals) >= LEAST_CELLS
+            and full > SHARE * len(decimals)
+            and not any(len(text) > DECIMALS or (len(text) == DECIMALS and text[-1] == "0") for text in decimals)
+        ):
+            self.compensated = f"the readings have {DECIMALS} decimals, as this command writes them"
+
+    def take(
+        self, raw: Mapping[str, Values], calibrated: Mapping[str, Values], time: Values | None, first_row: int
+    ) -> None:
+        """Take in a block.
+
+        Parameters
+        ----------
+        raw, calibrated : mapping of sensor to (n, 3) array, g or deg/s
+        time : (n,) array, s, or None
+        first_row : int
+            Samples of the log before it.
+        """
+        if time is not None and len(time):
+            step = np.diff(time, prepend=self.last_time)
+            back = np.flatnonzero(step < 0)
+            if len(back) and not self.reversed:
+                self.first_reversed = f"sample {first_row + int(back[0]) + 1}, {time[back[0]]:.9g} s"
+            self.reversed += len(back)
+            self.repeated += int(np.count_nonzero(step == 0))
+            self.last_time = float(time[-1])
+        self.samples += len(next(iter(raw.values()), ()))
+        for sensor, values in raw.items():
+            known = values[np.isfinite(values)]
+            if self.whole.get(sensor, True) and len(known):
+                self.whole[sensor] = bool(np.all(known[:WINDOW] == np.round(known[:WINDOW]))) and (
+                    sensor in self.whole or len(np.unique(known[: 10 * WINDOW])) >= WHOLE
+                )
+        self._cut(raw, calibrated, time)
+
+    def _cut(self, raw: Mapping[str, Values], calibrated: Mapping[str, Values], time: Values | None) -> None:
+        """Cut a block into windows, and keep their means and scatter."""
+        count = min(len(next(iter(raw.values()), ())) // WINDOW, MOST_WINDOWS - sum(map(_count, self.windows)))
+        if count <= 0:
+            return
+        part: dict[str, Values] = {}
+        for sensor, values in raw.items():
+            cut = values[: count * WINDOW].reshape(count, WINDOW, 3)
+            part[sensor] = cut.mean(axis=1)
+            part[f"{sensor} scatter"] = np.sqrt(np.sum(cut.var(axis=1), axis=1))
+            part[f"{sensor} noise"] = np.sqrt(np.sum(np.diff(cut, axis=1) ** 2, axis=2).mean(axis=1) / 2.0)
+            part[f"{sensor} size"] = np.sqrt(np.sum(cut**2, axis=2)).mean(axis=1)
+            part[f"{sensor} after"] = calibrated[sensor][: count * WINDOW].reshape(count, WINDOW, 3).mean(axis=1)
+        if time is not None:
+            part["time"] = time[: count * WINDOW].reshape(count, WINDOW).mean(axis=1)
+        self.windows.append(part)
+
+    def said(self, calibrated: set[str]) -> list[str]:
+        """Return what speaks against it, in words; empty where nothing does.
+
+        Parameters
+        ----------
+        calibrated : set of str
+            Sensors that the calibration holds.
+        """
+        found = [f"{self.compensated}: the log is compensated already"] if self.compensated else []
+        if self.reversed:
+            found.append(
+                f"the time runs backwards at {self.reversed} of {self.samples} samples, first at "
+                f"{self.first_reversed}: effects of the time and the smoothing of the temperature are wrong there; "
+                "sort the log by its time"
+            )
+        if self.repeated:
+            found.append(f"the time of {self.repeated} of {self.samples} samples is that of the sample before")
+        found += [
+            f"all readings of the {sensor} are whole numbers: they look like raw counts, and are read in "
+            f"{'g' if sensor == 'accelerometer' else 'deg/s'}; --ingest names a profile with unit: counts"
+            for sensor in SENSORS
+            if self.whole.get(sensor)
+        ]
+        if self.windows:
+            table = {k: np.concatenate([w[k] for w in self.windows]) for k in self.windows[0]}
+            kept = np.all([np.isfinite(v.reshape(len(v), -1)).all(axis=1) for v in table.values()], axis=0)
+            table = {k: v[kept] for k, v in table.items()}
+            if kept.any():
+                found += self._units(table) + self._rests(table, calibrated)
+        return found
+
+    def _units(self, table: Mapping[str, Values]) -> list[str]:
+        """Return what the size of gravity says of the accelerometer's unit."""
+        if "accelerometer" not in table or self.whole.get("accelerometer"):
+            return []
+        size = float(np.median(table["accelerometer size"]))
+        if STRANGE_G[0] <= size <= STRANGE_G[1]:
+            return []
+        alike = [unit for unit, factor in GRAVITY_UNITS.items() if abs(size / factor - 1.0) < NEAR]
+        cause = f"the readings look like {alike[0]}" if alike else "another unit, another range, or no rest in the log"
+        told = f"half of the log has |a| above {size:.3g} g, expected about 1 g: {cause}"
+        return [f"{told}; --ingest names a profile with the unit of each column"]
+
+    def _rests(self, table: Mapping[str, Values], calibrated: set[str]) -> list[str]:
+        """Return what the rests say."""
+        present = [s for s in SENSORS if s in table]
+        still = np.ones(len(table[present[0]]), bool)
+        for sensor in present:
+            scatter = table[f"{sensor} scatter"]
+            still &= scatter <= QUIET * np.minimum(np.quantile(scatter, QUIETEST), table[f"{sensor} noise"])
+        if np.count_nonzero(still) < FEWEST_RESTS:
+            return []
+        found, worse = [], []
+        for sensor in (s for s in present if s in calibrated):
+            raw, done = table[sensor][still], table[f"{sensor} after"][still]
+            before, after = _error(sensor, raw), _error(sensor, done)
+            known = float(np.median(table[f"{sensor} scatter"][still])) / np.sqrt(WINDOW)
+            change = np.linalg.norm(done, axis=1) - np.linalg.norm(raw, axis=1)
+            enough = len(_directions(raw)) >= FEWEST_RESTS and np.sqrt(np.mean(change**2)) > after / 2.0
+            if (sensor == "gyroscope" or enough) and after > max(WORSE[sensor] * before, KNOWN * known):
+                unit = "g from 1 g" if sensor == "accelerometer" else "deg/s from zero"
+                worse.append(f"the {sensor} is {before:.2g} {unit} before and {after:.2g} after")
+        if worse:
+            found.append(
+                f"compensation takes the {np.count_nonzero(still)} quietest windows away from rest: "
+                f"{'; '.join(worse)}. The log is compensated already, or of another unit or sensor, or read with "
+                "other axes or units; or the sensor has changed since it was calibrated"
+            )
+        return found + self._turned(table, still)
+
+    @staticmethod
+    def _turned(table: Mapping[str, Values], still: NDArray[np.bool_]) -> list[str]:
+        """Return what the turns of gravity between rests say of the gyroscope's unit."""
+        if not {"accelerometer", "gyroscope", "time"} <= set(table):
+            return []
+        at = np.flatnonzero(still)
+        up = table["accelerometer"][at] / np.linalg.norm(table["accelerometer"][at], axis=1)[:, None]
+        angle = np.degrees(np.arccos(np.clip(np.sum(up[1:] * up[:-1], axis=1), -1.0, 1.0)))
+        step = np.diff(table["time"], prepend=table["time"][0])
+        path = np.cumsum(table["gyroscope size"] * np.clip(step, 0.0, None))[at]
+        moved = angle > APART_DEG
+        turned, integral = float(angle[moved].sum()), float(np.diff(path)[moved].sum())
+        if turned == 0.0 or integral > turned / 2.0:
+            return []
+        cause = "rad/s" if abs(np.degrees(integral) / turned - 1.0) < 1.0 else "another unit or range"
+        told = f"gravity turns by {turned:.3g} deg between rests, over which the gyroscope integrates to {integral:.3g}"
+        return [f"{told} deg: its readings look like {cause}; --ingest names a profile with the unit of each column"]
+
+
+def _count(window: Mapping[str, Values]) -> int:
+    return len(next(iter(window.values())))
+
+
+def _error(sensor: str, means: Values) -> float:
+    """Return the rms distance of rests from 1 g or from zero rate."""
+    size = np.linalg.norm(means, axis=1)
+    return float(np.sqrt(np.mean((size - 1.0 if sensor == "accelerometer" else size) ** 2)))
+
+
+def _directions(means: Values) -> list[Values]:
+    """Return directions of the means that are apart from each other."""
+    found: list[Values] = []
+    for mean in means / np.linalg.norm(means, axis=1)[:, None]:
+        if all(mean @ other < np.cos(np.radians(APART_DEG)) for other in found):
+            found.append(mean)
+    return found
