@@ -181,8 +181,9 @@ class _Work:
                 self.schema = Schema(id=LAST_ID, name=IMU, encoding="ros2msg", data=DEFINITIONS[IMU].encode())
                 before.append(self.schema)
             schema_id = self.schema.id
+        used = {*self.walk.found.channels, *(c.id for c in self.channels.values())}
         channel = Channel(
-            id=LAST_ID - len(self.channels), topic=topic, message_encoding=encoding, schema_id=schema_id,
+            id=next(i for i in range(LAST_ID, 0, -1) if i not in used), topic=topic, message_encoding=encoding, schema_id=schema_id,
             metadata=dict(known.metadata) if not self.readings.mapped else {},
         )  # fmt: skip
         self.channels[source] = channel
