@@ -183,7 +183,8 @@ class _Work:
             schema_id = self.schema.id
         used = {*self.walk.found.channels, *(c.id for c in self.channels.values())}
         channel = Channel(
-            id=next(i for i in range(LAST_ID, 0, -1) if i not in used), topic=topic, message_encoding=encoding, schema_id=schema_id,
+            id=next(i for i in range(LAST_ID, 0, -1) if i not in used), topic=topic,
+            message_encoding=encoding, schema_id=schema_id,
             metadata=dict(known.metadata) if not self.readings.mapped else {},
         )  # fmt: skip
         self.channels[source] = channel
