@@ -11,9 +11,11 @@ where
     v_0 : the noise: the 5th percentile of v, so that no part of the recording has to be known to rest
     m   : the multiple, from the widest range over which the number of rests stays the same
 
-A rest is trimmed by W at both ends. One in which the sensor still turned or shook would spoil a mean, and is refused:
-its angular rate stands off that of the neighbouring rests, its direction moves, or it scatters beyond the noise. A turn
-by an angle theta shortens the mean of a vector by theta^2 / 24, for 2 deg by 5e-5: 0.05 mg.
+A rest is trimmed by W at its start. Where there is a gyroscope, it has to be quiet, too
+(``pipeline.signal.quiet_rates``): a turn about the vertical leaves the specific force as it is. A rest in which the
+sensor still turned or shook would spoil a mean, and is refused: its angular rate stands off that of the neighbouring
+rests, its direction moves, or it scatters beyond the noise. A turn by an angle theta shortens the mean of a vector by
+theta^2 / 24, for 2 deg by 5e-5: 0.05 mg.
 """
 
 from __future__ import annotations
@@ -22,6 +24,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+
+from pipeline.signal.quiet_rates import RATE_LIMIT_DPS, quiet_pieces
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -34,13 +38,13 @@ RATE_AT_REST_DPS = 0.02
 SETTLING_S = 0.3
 
 WINDOW_S = 0.5
+GAP_S = 1.0
 SHORTEST_REST_S = 1.0
 MULTIPLES = np.geomspace(4.0, 1000.0, 25)
 SMALLEST_VARIANCE = 1e-12  # g^2, keeps the multiple of a noise-free recording above rounding
 NEIGHBOURS = 5
-# Limits of a rest that is averaged. Beside the data: a hand-held rest of a consumer gyroscope differs by its
-# g-sensitivity (0.1 deg/s/g) and tremor (0.3 deg/s over some seconds) from its neighbours.
-RATE_LIMIT_DPS = 0.7
+# Limits of a rest that is averaged. That of its rate, 0.7 deg/s off its neighbours, stands beside the data: a hand-held
+# rest of a consumer gyroscope differs by its g-sensitivity (0.1 deg/s/g) and tremor (0.3 deg/s over some seconds).
 TURN_LIMIT_DEG = 2.0
 SCATTER_LIMIT = 3.0
 SMALLEST_SCATTER_G2 = 3e-6  # 1 mg on each axis, so that a quiet sensor may settle by 0.1 deg
@@ -144,14 +148,26 @@ def find_rests(recording: Recording) -> list[Rest]:
         In order of time, at least 1 s long; those that moved are refused, with the reason.
     """
     force = recording.accelerometer
-    size = max(5, round(WINDOW_S / recording.interval)) if recording.samples > 1 else 5
+    size = max(5, round(WINDOW_S / _interval(recording))) if recording.samples > 1 else 5
     if force is None or recording.samples < 2 * size:
         return []
     variance = _windowed_variance(force, size)
     noise = max(float(np.percentile(variance, 5.0)), SMALLEST_VARIANCE)
     variance[_spoilt(recording, size)] = np.inf
     found = [_below(variance, multiple * noise, recording, size) for multiple in MULTIPLES]
-    return assess_rests(recording, found[_plateau([len(rests) for rests in found])], noise)
+    quiet = found[_plateau([len(rests) for rests in found])]
+    rate = recording.gyroscope
+    if rate is not None and quiet:
+        interval = _interval(recording)
+        quiet = quiet_pieces(rate, quiet, interval, max(size, round(SHORTEST_REST_S / interval)))
+    return assess_rests(recording, quiet, noise)
+
+
+def _interval(recording: Recording) -> float:
+    """Return the mean time between samples, s, without gaps; of stamps that come in bursts the median is none."""
+    steps = np.diff(recording.time_ns)
+    short = steps[steps < GAP_S * 1e9]
+    return float(short.mean()) / 1e9 if short.size else recording.interval
 
 
 def assess_rests(recording: Recording, intervals: Sequence[tuple[int, int]], noise_variance: float) -> list[Rest]:
@@ -197,15 +213,18 @@ def _spoilt(recording: Recording, size: int) -> NDArray[np.bool_]:
     assert recording.accelerometer is not None  # noqa: S101
     bad = np.logical_not(np.all(np.isfinite(recording.accelerometer), axis=1))
     bad |= ~recording.sound
-    bad[1:] |= np.diff(recording.time_ns) > size * recording.interval * 1e9
+    if recording.gyroscope is not None:
+        bad |= np.logical_not(np.all(np.isfinite(recording.gyroscope), axis=1))
+    bad[1:] |= np.diff(recording.time_ns) > size * _interval(recording) * 1e9
     total = np.concatenate([[0], np.cumsum(bad)])
     return total[size:] > total[:-size]
 
 
 def _below(variance: NDArray[np.float64], threshold: float, recording: Recording, size: int) -> list[tuple[int, int]]:
     """Return the trimmed stretches whose windows stay under a threshold, if long enough."""
-    lag = int(np.ceil(5.0 * float(recording.filter.get("delay_s", 0.0)) / recording.interval))
-    shortest = max(size, round(SHORTEST_REST_S / recording.interval))
+    interval = _interval(recording)
+    lag = int(np.ceil(5.0 * float(recording.filter.get("delay_s", 0.0)) / interval))
+    shortest = max(size, round(SHORTEST_REST_S / interval))
     trimmed = ((start + size + lag, stop - 1) for start, stop in runs(variance < threshold))
     return [(start, stop) for start, stop in trimmed if stop - start >= shortest]
 

@@ -1,0 +1,134 @@
+"""Where the gyroscope turns although the accelerometer is quiet: turns about the vertical, and the ends of moves.
+
+Gravity in the body does not change in a turn about the vertical, and little in the last 0.3 s of a move. With the mean
+rate m and the variance v of a short window about each sample, the unit turns where
+
+    max_c |m_c - r_c| > max(q s_c / sqrt(n), q d_c)    or    sum_c v_c > q^2 V
+
+where
+
+    n   : samples of the window, 0.2 s and at least 3
+    r   : median of m in the stretch that the accelerometer calls quiet, so that bias, g-sensitivity and a steady creep
+          drop out; where it is off the median of the stretches around it by more than the limit of a rest's rate, the
+          stretch is mostly a turn, and that median stands for it
+    s_c : white noise of a sample, by the differences of successive samples: median |y[i+1] - y[i]| / (0.6745 sqrt 2)
+    d_c : 1.4826 times the median of |m_c - r_c| in the stretch, which is the standard deviation of m where the unit
+          rests for more than half of it, with the tremor of a hand in it; no more than the limit of a rest's rate
+    V   : median of sum_c v_c in the stretch: noise and tremor
+    q   : 6: of 10^5 windows of three axes, noise alone takes 6e-4 for a turn
+
+Of a stretch that is mostly a turn, d and V are the medians of all stretches.
+
+A stretch is cut where the unit turns. Pieces between which it turned by less than the limit of a rest are one rest, of
+which the longest is kept.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    Values = NDArray[np.float64]
+    Spans = list[tuple[int, int]]
+
+WINDOW_S, FEWEST = 0.2, 3
+SIGNIFICANT = 6.0
+NEIGHBOURS = 5
+RATE_LIMIT_DPS = 0.7  # of a stretch against those around it: hand-held rests differ by g-sensitivity and creep
+SAME_DEG = 2.0
+NORMAL = 1.4826  # standard deviation over median absolute deviation of a normal distribution
+
+
+def quiet_pieces(rate: Values, stretches: Sequence[tuple[int, int]], interval: float, shortest: int) -> Spans:
+    """Cut stretches in which the accelerometer is quiet where the gyroscope turns.
+
+    Parameters
+    ----------
+    rate : (n, 3) array, deg/s
+        Finite in the stretches.
+    stretches : sequence of (int, int)
+        Start and stop of each, in order.
+    interval : float, s
+        Mean time between samples.
+    shortest : int
+        Samples of the shortest piece that is a rest.
+
+    Returns
+    -------
+    list of (int, int)
+    """
+    size = max(FEWEST, round(WINDOW_S / interval))
+    if not stretches or min(stop - start for start, stop in stretches) < size:
+        return list(stretches)
+    parts = [rate[start:stop] for start, stop in stretches]
+    windows = [_windows(part, size) for part in parts]
+    medians = np.array([np.median(mean, axis=0) for mean, _ in windows])
+    reference, resting = _references(medians)
+    off = [np.abs(mean - r) for (mean, _), r in zip(windows, reference, strict=True)]
+    differences = np.concatenate([np.abs(np.diff(part, axis=0)) for part in parts])
+    white = NORMAL * np.median(differences, axis=0) / np.sqrt(2.0 * size)
+    spread = NORMAL * np.array([np.median(own, axis=0) for own in off])
+    noise = np.array([np.median(variance) for _, variance in windows])
+    spread = np.minimum(np.where(resting[:, None], spread, np.median(spread, axis=0)), RATE_LIMIT_DPS)
+    limit = SIGNIFICANT * np.maximum(white, spread)
+    loud = SIGNIFICANT**2 * np.where(resting, noise, np.median(noise))
+    pieces: Spans = []
+    for i, (start, stop) in enumerate(stretches):
+        turns = np.any(off[i] > limit[i], axis=1) | (windows[i][1] > loud[i])
+        quiet = ~_widened(turns, size // 2, stop - start)
+        turned = np.vstack([np.zeros(3), np.cumsum((parts[i] - reference[i]) * interval, axis=0)])
+        found = _rests(quiet, turned, shortest)
+        if not (found or resting[i]):
+            found = [(0, stop - start)]  # for the caller to refuse, with the reason
+        pieces += [(start + a, start + b) for a, b in found]
+    return pieces
+
+
+def _windows(part: Values, size: int) -> tuple[Values, Values]:
+    """Return the mean of each window, (m, 3), and its variance summed over the axes, (m,)."""
+    centred = part - np.median(part, axis=0)
+    sums = np.concatenate([np.zeros((1, 3)), np.cumsum(centred, axis=0)])
+    squares = np.concatenate([np.zeros((1, 3)), np.cumsum(centred**2, axis=0)])
+    total, power = sums[size:] - sums[:-size], squares[size:] - squares[:-size]
+    variance = np.maximum(power - total**2 / size, 0.0).sum(axis=1) / (size - 1)
+    return total / size + np.median(part, axis=0), variance
+
+
+def _references(medians: Values) -> tuple[Values, NDArray[np.bool_]]:
+    """Return each stretch's own median, or of one that is mostly a turn that of those around it; and which rest."""
+    out, resting = medians.copy(), np.ones(len(medians), bool)
+    for i, own in enumerate(medians):
+        first = int(np.clip(i - NEIGHBOURS // 2, 0, max(len(medians) - NEIGHBOURS, 0)))
+        around = np.median(medians[first : first + NEIGHBOURS], axis=0)
+        if len(medians) > 2 and np.abs(own - around).max() > RATE_LIMIT_DPS:
+            out[i], resting[i] = around, False
+    return out, resting
+
+
+def _widened(turns: NDArray[np.bool_], half: int, samples: int) -> NDArray[np.bool_]:
+    """Return which samples lie within half a window of the middle of a window in which the unit turns."""
+    reach = np.zeros(samples + 1, np.intp)
+    middle = np.flatnonzero(turns) + half
+    np.add.at(reach, np.maximum(middle - half, 0), 1)
+    np.add.at(reach, np.minimum(middle + half + 1, samples), -1)
+    return np.asarray(np.cumsum(reach[:-1]) > 0)
+
+
+def _rests(quiet: NDArray[np.bool_], turned: Values, shortest: int) -> Spans:
+    """Return the quiet runs, of those between which the unit did not turn the longest alone."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], quiet, [False]]).astype(np.int8)))
+    found = [(a, b) for a, b in edges.reshape(-1, 2).tolist() if b - a >= shortest]
+    out: Spans = []
+    for a, b in found:
+        if out and np.linalg.norm(turned[a] - turned[out[-1][1]]) < SAME_DEG:
+            if b - a > out[-1][1] - out[-1][0]:
+                out[-1] = (a, b)
+        else:
+            out.append((a, b))
+    return out

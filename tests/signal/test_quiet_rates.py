@@ -1,0 +1,48 @@
+"""Rests in which the gyroscope turns although the specific force is quiet: vertical turns, and the ends of moves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hand_simulator import Drawn, Hand, draw
+
+from pipeline.signal.rests import Rest, find_rests
+
+
+def moving_rate(drawn: Drawn, rests: list[Rest]) -> float:
+    """Return the largest true-rate error of a rest's mean, deg/s: what its moving samples add to it."""
+    gyroscope = drawn.recording.gyroscope
+    assert gyroscope is not None
+    means = []
+    for rest in rests:
+        inside = np.arange(rest.start, rest.stop)
+        resting = inside[drawn.still[inside]]
+        means.append(gyroscope[inside].mean(axis=0) - gyroscope[resting].mean(axis=0))
+    return float(np.abs(means).max())
+
+
+@pytest.mark.parametrize(
+    "hand",
+    [Hand(vertical=0.4), Hand(tail_dps=(0.7, 3.0)), Hand(vertical=0.3, tail_dps=(0.7, 3.0), creep_dps=0.1, jitter=0.3)],
+    ids=["vertical", "tails", "all"],
+)
+def test_no_rest_holds_a_vertical_turn_or_the_end_of_a_move(hand: Hand) -> None:
+    for seed in range(3):
+        drawn = draw(hand, seed)
+        rests = [rest for rest in find_rests(drawn.recording) if rest.accepted]
+        assert len(rests) == hand.rests
+        noise = 0.035 / np.sqrt(400)
+        assert moving_rate(drawn, rests) < 3.0 * noise
+        without = replace(drawn.recording, gyroscope=None)  # by the accelerometer alone they do
+        assert moving_rate(drawn, [r for r in find_rests(without) if r.accepted]) > 10.0 * noise
+
+
+def test_stamps_in_bursts_do_not_shorten_the_windows() -> None:
+    drawn = draw(Hand(rests=12), 2)
+    time = drawn.recording.time_ns
+    number = np.minimum(np.arange(len(time)) // 5 * 5 + 4, len(time) - 1)
+    late = time[number] + (np.arange(len(time)) % 5) * 200_000  # five samples arrive together, 0.2 ms apart
+    found, burst = (find_rests(replace(drawn.recording, time_ns=t)) for t in (time, late))
+    assert [(r.start, r.stop) for r in burst] == [(r.start, r.stop) for r in found]
