@@ -75,6 +75,30 @@ def _near_zero(truth: NDArray[np.float64], size: NDArray[np.float64], S: NDArray
     return squared
 
 
+def norm_weight(truth: NDArray[np.float64], covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return g with ``E(|t + x| - |t|)^2 = tr(W S)``, ``W = u u^T + g (1 - u u^T)``: 0 far from zero, 1 at rest.
+
+    Parameters
+    ----------
+    truth : (n, 3) array, g or deg/s
+    covariance : (3, 3) array
+        S, of the error x.
+
+    Returns
+    -------
+    (n,) array
+    """
+    size, total = np.linalg.norm(truth, axis=1), float(np.trace(covariance))
+    near = size <= FAR * np.sqrt(total)
+    g = np.zeros(len(truth))
+    if total > 0.0 and near.any():
+        u = truth[near] / np.where(size[near] > 0.0, size[near], 1.0)[:, None]
+        along = np.einsum("ni,ij,nj->n", u, covariance, u)
+        squares = _near_zero(truth[near], size[near], covariance)
+        g[near] = np.clip((squares - along) / np.maximum(total - along, 1e-12 * total), 0.0, 1.0)
+    return g
+
+
 def squared_vector_errors(matrix: NDArray[np.float64], variance: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return ``tr(M D M^T)`` for each sample: (n,) array; parameters as of ``squared_norm_errors``."""
     errors: NDArray[np.float64] = variance @ np.sum(matrix**2, axis=0)

@@ -1,6 +1,7 @@
 """Held-out errors: what a calibration leaves on samples that no fit has seen, beside what noise alone would leave.
 
-See ``pipeline.validation.ladder`` for the errors, ``pipeline.validation.floor`` for the floor. Held out are the
+See ``pipeline.validation.ladder`` for the errors, ``pipeline.validation.floor`` for the floor and
+``pipeline.validation.expected`` for the interval in which the last error should lie. Held out are the
 recordings of role ``validation``; without one, every third rest (``procedure.holdout_every``) of a recording of rests.
 Where nothing is held out, the samples of the fit are judged, and the result says so.
 """
@@ -14,10 +15,13 @@ import numpy as np
 from pipeline.estimation.rest_means import held_out_rests, split_rests
 from pipeline.model.effects.base import truth, unit_of
 from pipeline.model.inversion import linear_truth
+from pipeline.model.kinematics import EARTH_RATE_DPS
+from pipeline.validation.expected import expected_rms_error
 from pipeline.validation.floor import squared_norm_errors, squared_vector_errors
 from pipeline.validation.ladder import ladder
 from pipeline.validation.limits import check_limits
 from pipeline.validation.samples import samples_of_motion, samples_of_rests
+from pipeline.validation.sensitivity import judged
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -48,7 +52,7 @@ def validate(
         All of the unit, filtered as for the fit.
     noise : Noise
     settings : mapping
-        Sections ``table``, ``procedure`` and ``limits``.
+        Sections ``table``, ``procedure``, ``limits`` and, for the expected error, ``sensor``.
     other : SensorCalibration, optional
         Of the unit's other sensor. Only where no attitude is logged: effects that look at the other sensor's signal
         then take it calibrated; without it, as it was read.
@@ -56,9 +60,9 @@ def validate(
     Returns
     -------
     dict
-        ``unit, samples, noise_floor, vector_noise_floor, steps`` of the published file, and ``held_out`` (false: judged
-        on the samples of the fit), ``reason`` (why), ``reference_rms`` (of the reference's magnitude), ``noise``,
-        ``notes``, ``limits`` and ``pass``.
+        ``unit, samples, expected_rms_error`` (None where an effect is left out), ``noise_floor, vector_noise_floor,
+        steps`` of the published file, and ``held_out`` (false: judged on the samples of the fit), ``reason`` (why),
+        ``reference_rms`` (of the reference's magnitude), ``noise``, ``notes``, ``limits`` and ``pass``.
         ``vector_rms_error`` is the root of the mean squared length of the difference to the reference.
     """
     samples, reason = _choose(calibration.sensor, recordings, noise, settings)
@@ -66,7 +70,7 @@ def validate(
         "unit": unit_of(calibration.sensor),
         "held_out": reason is None,
         "reason": reason,
-        "samples": int(sum(np.isfinite(s.reading).all(axis=1).sum() for s in samples)),
+        "samples": int(sum(s.known.sum() for s in samples)),
         "noise": {
             "white": noise.white.tolist(),
             "wander": noise.wander.tolist(),
@@ -76,12 +80,15 @@ def validate(
     }
     if part["samples"] == 0:
         nothing: dict[str, Any] = dict.fromkeys((*FIGURES, "vector_rms_error"))
-        part |= {"noise_floor": None, "vector_noise_floor": None, "reference_rms": None, "notes": []}
+        part |= {"expected_rms_error": None, "noise_floor": None, "vector_noise_floor": None}
+        part |= {"reference_rms": None, "notes": []}
         part["steps"] = [{"name": name, **nothing} for name in ("raw", "calibrated")]
     else:
         part["noise_floor"], part["vector_noise_floor"] = noise_floors(calibration, samples)
         part["reference_rms"] = float(np.sqrt(np.nanmean(np.concatenate([s.magnitude for s in samples]) ** 2)))
         part["steps"], part["notes"] = ladder(calibration, samples, other)
+        part["expected_rms_error"], lack = _expected(calibration, samples, noise, settings, other)
+        part["notes"] += lack
     part["limits"], part["pass"] = check_limits(
         calibration, part, (settings.get("limits") or {}).get(calibration.sensor)
     )
@@ -114,6 +121,31 @@ def final_error(part: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
+def _expected(
+    calibration: SensorCalibration,
+    samples: Sequence[Samples],
+    noise: Noise,
+    settings: Mapping[str, Any],
+    other: SensorCalibration | None,
+) -> tuple[list[float] | None, list[str]]:
+    """Return the interval of the last step's rms error (None where an effect is left out), and notes on it.
+
+    Earth's rotation, where it is left out of a magnitude, changes the rms error by its rate at most.
+    """
+    parts = [judged(calibration, s, _truth(calibration, s), other) for s in samples if s.known.any()]
+    known = [p for p in parts if p is not None]
+    if len(known) < len(parts):
+        return None, []
+    low, high = expected_rms_error(calibration, known, noise, settings)
+    if not any(s.earth_left_out for s in samples):
+        return [low, high], []
+    note = (
+        "the held-out recording logs no attitude: Earth's rotation is left out of its reference, and the expected "
+        f"error allows for its {EARTH_RATE_DPS:.2g} deg/s"
+    )
+    return [max(low - EARTH_RATE_DPS, 0.0), high + EARTH_RATE_DPS], [note]
+
+
 def noise_floors(calibration: SensorCalibration, samples: Sequence[Samples]) -> tuple[float, float | None]:
     """Return the rms error, and where an attitude is known the vector rms error, that noise alone would give.
 
@@ -122,18 +154,23 @@ def noise_floors(calibration: SensorCalibration, samples: Sequence[Samples]) -> 
     calibration : SensorCalibration
     samples : sequence of Samples
     """
-    squares = [squared_norm_errors(_truth(calibration, s), calibration.matrix, s.variance) for s in samples]
-    floor = float(np.sqrt(np.nanmean(np.concatenate(squares))))
+    squares = [
+        squared_norm_errors(_truth(calibration, s)[s.known], calibration.matrix, s.variance[s.known]) for s in samples
+    ]
+    floor = float(np.sqrt(np.mean(np.concatenate(squares))))
     if any(s.motion is None for s in samples):
         return floor, None
-    vectors = np.concatenate([squared_vector_errors(calibration.matrix, s.variance) for s in samples])
+    vectors = np.concatenate([squared_vector_errors(calibration.matrix, s.variance[s.known]) for s in samples])
     return floor, float(np.sqrt(np.mean(vectors)))
 
 
 def _truth(calibration: SensorCalibration, samples: Samples) -> NDArray[np.float64]:
     """Return the reference's magnitude along its direction, or along that of the calibrated reading: (n, 3) array."""
     reading = linear_truth(calibration, samples.reading)
-    direction = reading if samples.motion is None else truth(samples.sensor, samples.motion)
+    direction = reading
+    if samples.motion is not None:
+        known = truth(samples.sensor, samples.motion)
+        direction = np.where(np.isfinite(known).all(axis=1, keepdims=True), known, reading)
     size = np.linalg.norm(direction, axis=1, keepdims=True)
     unit = np.where(size > 0, direction / np.where(size > 0, size, 1.0), [1.0, 0.0, 0.0])
     along: NDArray[np.float64] = samples.magnitude[:, None] * unit

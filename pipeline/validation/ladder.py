@@ -75,6 +75,22 @@ def ladder(
     return figures, notes
 
 
+def last_step(calibration: SensorCalibration, samples: Samples, other: SensorCalibration | None) -> Corrected | None:
+    """Return calibrated readings, magnitude and vector of the reference with all effects; None where one is left out.
+
+    Parameters
+    ----------
+    calibration : SensorCalibration
+    samples : Samples
+    other : SensorCalibration or None
+    """
+    if any(_lack(calibration, fitted, samples) for fitted in calibration.effects):
+        return None
+    if not calibration.effects:
+        return _with(partial(linear_truth, calibration), samples)
+    return _with_effects(calibration, calibration.effects, other, samples)
+
+
 def _with(correct: Callable[[NDArray[np.float64]], NDArray[np.float64]], samples: Samples) -> Corrected:
     known = None if samples.motion is None else truth(samples.sensor, samples.motion)
     return correct(samples.reading), samples.magnitude, known

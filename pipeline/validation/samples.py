@@ -10,7 +10,7 @@ changed by ``|omega + Omega| - |omega|``, which the gyroscope sees too.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -44,8 +44,8 @@ class Samples:
     reading : (n, 3) array, g or deg/s
     magnitude : (n,) array, same unit
         What the norm should be.
-    variance : (n, 3) array, unit squared
-        Of white noise and wander, per reading axis.
+    white, wander : (n, 3) arrays, unit squared
+        Variances of white noise behind the filter and of wander, per reading axis.
     motion : Motion or None
         By the reference, where the attitude is known.
     other : (n, 3) array or None
@@ -53,17 +53,48 @@ class Samples:
     temperature : (n,) array, degC, or None
     resting : bool
         Whether each sample is the mean of a rest.
+    alike : float
+        How many samples share one value of the white noise, by the filter: ``sum_l r_l^2 / r_0^2`` over all lags.
+    earth_left_out : bool
+        Whether Earth's rotation is configured and missing in the magnitude, as no attitude is known.
     """
 
     sensor: str
     time: NDArray[np.float64]
     reading: NDArray[np.float64]
     magnitude: NDArray[np.float64]
-    variance: NDArray[np.float64]
+    white: NDArray[np.float64]
+    wander: NDArray[np.float64]
     motion: Motion | None
     other: NDArray[np.float64] | None
     temperature: NDArray[np.float64] | None
     resting: bool = False
+    alike: float = 1.0
+    earth_left_out: bool = False
+
+    @property
+    def variance(self) -> NDArray[np.float64]:
+        """Of the noise of each sample, per reading axis: (n, 3) array, unit squared."""
+        return self.white + self.wander
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Whether reading and reference of each sample are there: (n,) array."""
+        return np.asarray(np.isfinite(self.reading).all(axis=1) & np.isfinite(self.magnitude))
+
+    def select(self, index: NDArray[np.int64]) -> Samples:
+        """Return some of the samples, without motion, temperature and the other sensor."""
+        return replace(
+            self,
+            time=self.time[index],
+            reading=self.reading[index],
+            magnitude=self.magnitude[index],
+            white=self.white[index],
+            wander=self.wander[index],
+            motion=None,
+            other=None,
+            temperature=None,
+        )
 
 
 def samples_of_motion(sensor: str, recording: Recording, noise: Noise, table: Mapping[str, Any]) -> Samples | None:
@@ -93,7 +124,6 @@ def samples_of_motion(sensor: str, recording: Recording, noise: Noise, table: Ma
         if known is None:
             return None
         magnitude = known
-    variance = white_variance(recording, noise) + wander_share(recording) * noise.wander**2
     temperature = recording.temperature if motion is None else motion.temperature
     n = recording.samples
     return Samples(
@@ -101,10 +131,13 @@ def samples_of_motion(sensor: str, recording: Recording, noise: Noise, table: Ma
         recording.time,
         reading,
         magnitude,
-        np.broadcast_to(variance, (n, 3)),
+        np.broadcast_to(white_variance(recording, noise), (n, 3)),
+        np.broadcast_to(wander_share(recording) * noise.wander**2, (n, 3)),
         motion,
         recording.reading(OTHER[sensor]),
         temperature,
+        alike=_alike(recording),
+        earth_left_out=sensor == "gyroscope" and earth is not None and motion is None,
     )
 
 
@@ -142,7 +175,8 @@ def samples_of_rests(
         time,
         reading,
         np.full(len(rests), gravity),
-        share[:, None] * noise.white**2 + averaged[:, None] * wander,
+        share[:, None] * noise.white**2,
+        averaged[:, None] * wander,
         None,
         other if len(other) else None,
         means(recording.temperature),
@@ -160,6 +194,12 @@ def wander_share(recording: Recording) -> float:
     """Return how much of the variance of a slow wander passes the filter: 1, or 0 of a high-pass."""
     covariance = filter_autocovariance(recording)
     return float(np.clip(2.0 * covariance.sum() - covariance[0], 0.0, 1.0))
+
+
+def _alike(recording: Recording) -> float:
+    """Return ``sum_l r_l^2 / r_0^2`` of the filter's autocovariance r, over all lags."""
+    covariance = filter_autocovariance(recording) ** 2
+    return float((2.0 * covariance.sum() - covariance[0]) / covariance[0])
 
 
 def _rate(

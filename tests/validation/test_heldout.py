@@ -366,3 +366,27 @@ def test_final_error_is_the_first_and_the_last_step() -> None:
     assert (found["before"], found["after"]) == (part["steps"][0]["rms_error"], part["steps"][-1]["rms_error"])
     assert found["step"] == "calibrated"
     assert found["noise_floor"] == part["noise_floor"]
+
+
+def test_missing_readings_are_not_in_the_floor() -> None:
+    c = calibration("gyroscope")
+    whole = read(held_out(1500), 1.0, gyroscope=c)
+    assert whole.gyroscope is not None
+    assert whole.table_rate is not None
+    fast = np.abs(whole.table_rate) > np.median(np.abs(whole.table_rate))
+    holed = replace(whole, gyroscope=np.where(fast[:, None], np.nan, whole.gyroscope))
+    part, slow = (validate(c, [r], noise_of("gyroscope"), SETTINGS) for r in (holed, whole.select(~fast)))
+    assert part["samples"] == slow["samples"] == np.count_nonzero(~fast)
+    for figure in ("noise_floor", "vector_noise_floor"):
+        assert part[figure] == pytest.approx(slow[figure], rel=1e-3)
+    assert np.all(np.isfinite(part["expected_rms_error"]))
+
+
+def test_earths_rotation_without_attitude_is_told_and_allowed_for() -> None:
+    c = calibration("gyroscope")
+    log = replace(read(held_out(1500), 1.0, gyroscope=c), table_attitude=None)
+    placed = {**SETTINGS, "table": {**SETTINGS["table"], "latitude_deg": 50.0, "azimuth_deg": 0.0}}
+    plain, part = (validate(c, [log], noise_of("gyroscope"), s) for s in (SETTINGS, placed))
+    assert plain["notes"] == []
+    assert "Earth's rotation is left out" in part["notes"][0]
+    assert part["expected_rms_error"][1] == pytest.approx(plain["expected_rms_error"][1] + 15.041 / 3600.0, rel=1e-4)

@@ -1,0 +1,76 @@
+"""The interval of the expected error, against many simulated units whose noise and calibration errors are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.records import Noise, SensorCalibration
+from pipeline.validation.expected import Judged, expected_rms_error
+from pipeline.validation.samples import Samples
+
+UNITS, SAMPLES, INTERVAL = 2000, 300, 0.2
+WHITE, TAU = 0.01, 20.0
+
+
+def truth_of(size: float) -> np.ndarray:
+    turning = np.random.default_rng(3).standard_normal((30, 3)).repeat(SAMPLES // 30, axis=0)
+    return size * turning / np.linalg.norm(turning, axis=1, keepdims=True)
+
+
+def wander_of(rng: np.random.Generator, size: float) -> np.ndarray:
+    """Return Gauss-Markov paths: (units, n, 3) array."""
+    decay = np.exp(-INTERVAL / TAU)
+    drive = rng.standard_normal((UNITS, SAMPLES, 3))
+    out = np.empty_like(drive)
+    out[:, 0] = drive[:, 0]
+    for n in range(1, SAMPLES):
+        out[:, n] = decay * out[:, n - 1] + np.sqrt(1.0 - decay**2) * drive[:, n]
+    return size * out
+
+
+@pytest.mark.parametrize(
+    ("size", "wander", "bias"),
+    [(1.0, 0.0, 0.0), (1.0, 0.01, 0.0), (1.0, 0.002, 0.015), (0.0, 0.0, 0.003), (0.012, 0.004, 0.0)],
+    ids=["white", "wander", "bias", "at rest", "near rest"],
+)
+def test_the_interval_holds_99_percent_of_units_whose_noise_is_known(size: float, wander: float, bias: float) -> None:
+    rng = np.random.default_rng(5)
+    truth = truth_of(size)
+    error = WHITE * rng.standard_normal((UNITS, SAMPLES, 3)) + wander_of(rng, wander)
+    error += bias * rng.standard_normal((UNITS, 1, 3))
+    rms = np.sqrt(np.mean((np.linalg.norm(truth + error, axis=2) - np.linalg.norm(truth, axis=1)) ** 2, axis=1))
+    low, high = interval(truth, Noise(np.full(3, WHITE), np.full(3, wander), TAU, "static", 1e9), bias)
+    assert np.mean(rms > high) < 0.01
+    assert np.mean(rms < low) < 0.01
+    assert high < 1.35 * np.quantile(rms, 0.995)  # what is known needs no wide interval
+
+
+def interval(truth: np.ndarray, noise: Noise, bias: float, freedom: float = np.inf) -> tuple[float, float]:
+    covariance = np.zeros((12, 12))
+    covariance[:3, :3] = bias**2 * np.eye(3)
+    found = SensorCalibration("gyroscope", covariance=covariance, degrees_of_freedom=freedom)
+    J = np.zeros((SAMPLES, 3, 12))
+    J[:, :, :3] = -np.eye(3)
+    spread = [np.broadcast_to(v**2, (SAMPLES, 3)) for v in (noise.white, noise.wander)]
+    size = np.linalg.norm(truth, axis=1)
+    samples = Samples("gyroscope", INTERVAL * np.arange(SAMPLES), truth, size, *spread, None, None, None)
+    return expected_rms_error(found, [Judged(samples, truth, J, SAMPLES)], noise, {})
+
+
+def test_what_is_less_known_widens_the_interval() -> None:
+    truth = truth_of(1.0)
+    noise = Noise(np.full(3, WHITE), np.full(3, 0.5 * WHITE), TAU, "static", 1e9)
+    known = interval(truth, noise, 0.0)
+    for less in (replace(noise, length=60.0), replace(noise, source="rests", length=0.0)):
+        low, high = interval(truth, less, 0.0)
+        assert low <= known[0] * 1.001
+        assert high > 1.05 * known[1]
+    few, many = interval(truth, noise, WHITE, freedom=3.0), interval(truth, noise, WHITE)
+    assert few[1] > 1.2 * many[1]
+
+
+def test_without_noise_or_uncertainty_nothing_is_expected() -> None:
+    assert interval(truth_of(1.0), Noise(np.zeros(3), np.zeros(3), TAU, "none"), 0.0) == (0.0, 0.0)
