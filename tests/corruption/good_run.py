@@ -1,0 +1,111 @@
+"""Count the good units that are refused or wrongly doubted: units of the blind study's families, as it draws them.
+
+    python tests/corruption/good_run.py --units 1000 --seed 5 --out good.jsonl [--cores 1]
+
+Each goes through the checks of its recordings, noise, fit, held-out error and diagnosis, as in a run. Where nothing
+is hidden, any verdict but ``nothing_missing`` is wrong; else only a doubt about reference or floor. A unit that is in
+the file is not run again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections import defaultdict
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from pipeline.diagnosis.diagnose import diagnose
+from pipeline.errors import PipelineError
+from pipeline.model.effects import leaving_out
+from pipeline.preprocessing.checks import check_recordings
+from pipeline.records import SENSORS
+from pipeline.signal.noise import estimate_noise
+from pipeline.study.bench import recordings_of
+from pipeline.study.cases import FAMILIES, Case, draw
+from pipeline.study.figures import wilson
+from pipeline.study.judge import calibrated, settings_of
+from pipeline.validation.heldout import validate
+
+DOUBTS = ("reference_in_doubt", "floor_in_doubt")
+
+
+def judged(family: str, number: int, seed: int) -> dict[str, Any]:
+    """Return what is said of one unit."""
+    case = draw(family, number, seed)
+    settings = settings_of(case.model, case.method)
+    line: dict[str, Any] = {"family": family, "number": number, "seed": seed, "refused": None, "verdicts": {}}
+    try:
+        recordings = check_recordings(recordings_of(case), settings)
+    except PipelineError as error:
+        return line | {"refused": error.message}
+    for sensor in SENSORS if case.kind == "null" else (case.sensor,):
+        line["verdicts"][sensor] = said(case, recordings, sensor, settings)
+    return line
+
+
+def said(case: Case, recordings: Any, sensor: str, settings: Any) -> dict[str, Any]:
+    """Return verdict and held-out error of a sensor."""
+    try:
+        noise = estimate_noise(sensor, recordings, settings["sensor"][sensor])
+        calibration = calibrated(recordings, sensor, settings)
+        held = validate(calibration, recordings, noise, settings)
+        with leaving_out(case.left_out):
+            found = diagnose(calibration, recordings, noise, settings)
+    except PipelineError as error:
+        return {"verdict": "refused", "message": error.message}
+    ratio = held["steps"][-1]["rms_error"] / held["noise_floor"]
+    return {"verdict": found["verdict"], "selected": found["selected"], "error_over_floor": ratio}
+
+
+def wrong(line: dict[str, Any]) -> str:
+    """Return what is wrong about a unit; empty where nothing is."""
+    if line["refused"]:
+        return "refused: " + line["refused"]
+    nothing_hidden = line["family"].startswith("null")
+    for sensor, one in line["verdicts"].items():
+        if one["verdict"] in ("refused", *DOUBTS) or (nothing_hidden and one["verdict"] != "nothing_missing"):
+            return f"{sensor}: {one}"
+    return ""
+
+
+def report(lines: list[dict[str, Any]]) -> str:
+    """Return the count by family, with Wilson intervals, and each wrong unit."""
+    by_family: dict[str, list[str]] = defaultdict(list)
+    for line in lines:
+        by_family[line["family"]].append(wrong(line))
+    by_family["all"] = [wrong(line) for line in lines]
+    out = [f"{'family':<24}{'units':>6}{'wrong':>7}  share, 95 % interval"]
+    for family, found in by_family.items():
+        count = sum(map(bool, found))
+        low, high = wilson(count, len(found))
+        out.append(f"{family:<24}{len(found):>6}{count:>7}  {count / len(found):.1%}, {low:.1%} to {high:.1%}")
+    out += [f"{x['family']} {x['number']} seed {x['seed']}: {wrong(x)}" for x in lines if wrong(x)]
+    return "\n".join(out) + "\n"
+
+
+def main() -> int:
+    """Run it; exit code 1 where over 1 % are wrong."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--units", type=int, default=1000)
+    parser.add_argument("--seed", type=int, default=5)
+    parser.add_argument("--cores", type=int, default=1)
+    parser.add_argument("--out", type=Path, required=True)
+    options = parser.parse_args()
+    lines = [json.loads(x) for x in options.out.read_text().splitlines()] if options.out.is_file() else []
+    done = {(x["family"], x["number"], x["seed"]) for x in lines}
+    wanted = [(FAMILIES[k % len(FAMILIES)], k // len(FAMILIES), options.seed) for k in range(options.units)]
+    wanted = [item for item in wanted if item not in done]
+    with ProcessPoolExecutor(options.cores) as pool, options.out.open("a", encoding="utf-8") as stream:
+        for line in pool.map(judged, *zip(*wanted, strict=True)) if wanted else ():
+            stream.write(json.dumps(line) + "\n")
+            stream.flush()
+            lines.append(line)
+    sys.stdout.write(report(lines))
+    return int(sum(bool(wrong(x)) for x in lines) > 0.01 * len(lines))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,45 @@
+"""Corrupted units end refused, doubtful, marked or right, never silently wrong."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from typing import TYPE_CHECKING
+
+import pytest
+from all_ways import single_ways
+from judged import RIGHT, SILENT
+from run import drawn, run
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+# Of the draw with seed 1: one chain of stages, a class each.
+TENTH = (
+    "u0001", "u0034", "u0035", "u0036", "u0037", "u0039", "u0045", "u0059", "u0061", "u0062", "u0086", "u0099", "u0106",
+    "u0108", "u0115", "u0123", "u0124",
+)  # fmt: skip
+
+
+def _options(**given: object) -> Namespace:
+    return Namespace(**{"units": 0, "seed": 1, "good": 0, "only": [], "kind": "", **given})
+
+
+@pytest.mark.workflow
+def test_a_tenth_of_the_ways_leaves_no_silent_error_and_good_units_right(tmp_path: Path) -> None:
+    copies = drawn(_options(units=len(single_ways()), only=TENTH)) + drawn(_options(good=2))
+    judgements = run(copies, tmp_path)
+    assert len({j.kind for j in judgements}) == len(TENTH) + 1
+    assert [j.line for j in judgements if j.outcome == SILENT] == []
+    assert {j.outcome for j in judgements if j.unit.startswith("good")} == {RIGHT}
+
+
+def test_there_are_at_least_150_ways() -> None:
+    names = {(way.kind, way.name) for way in single_ways()}
+    assert len(names) == len(single_ways()) >= 150
+
+
+@pytest.mark.corruption
+@pytest.mark.parametrize("seed", [1, 2])
+def test_170_ways_leave_no_silent_error(tmp_path: Path, seed: int) -> None:
+    judgements = run(drawn(_options(units=170, seed=seed, good=12)), tmp_path)
+    assert [j.line for j in judgements if j.outcome == SILENT] == []
