@@ -113,4 +113,4 @@ def _profile(calibration: Path, ingest: str | None) -> LogProfile:
         composed = composer.unit(str(document.get("unit")), [*layers, f"ingest={ingest}"])
     except Problem as error:
         raise ConfigurationError(str(error)) from None
-    return LogProfile(composed["ingest"], profile.axis_map)
+    return LogProfile(composed["ingest"], profile.axis_maps)

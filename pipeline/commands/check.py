@@ -20,6 +20,7 @@ from pipeline.formats.checks import checks_of
 from pipeline.formats.files import FILE, candidate_files
 from pipeline.formats.ingest_error import IngestError
 from pipeline.formats.read import read_table, to_recording
+from pipeline.preprocessing.checks import check_recordings
 from pipeline.signal.segments import cut
 from pipeline.survey.facts import as_text, facts
 from pipeline.survey.mcap_topics import topic_lines
@@ -31,6 +32,7 @@ from pipeline.survey.unit_evidence import UNKNOWN
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from pipeline.records import Recording
     from pipeline.survey.proposal import Proposal
     from pipeline.survey.shape import Shape
 
@@ -64,6 +66,15 @@ class Reading:
     sensor: dict[str, Any]
     said: str
     entry: dict[str, Any] = field(default_factory=lambda: {"role": "rests", "axis": None})
+    name: str = ""
+    bench: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What checks of a recording read of a unit's configuration."""
+        procedure = {"recordings": {self.name: self.entry}} | {k: v for k, v in self.bench.items() if k != "table"}
+        table = self.bench.get("table", {})
+        return {"procedure": procedure, "table": table, "sensor": self.sensor, "ingest": self.ingest}
 
 
 def main(argv: Sequence[str]) -> int:
@@ -159,9 +170,11 @@ def _of_campaign(directory: Path | None) -> list[Reading]:
             entry = config["procedure"]["recordings"][recording]
             said = f"unit {name} of campaign {campaign.name}, recording {recording}: "
             said += f"ingest={config['ingest']['name']}, sensor={config['sensor']['name']}"
+            tolerance = config["procedure"]["mounting_tolerance_deg"]
+            bench = {"table": config["table"], "mounting_tolerance_deg": tolerance}
+            found = [[(folder / f).resolve() for f in files] for files in candidates]
             readings += [
-                Reading([(folder / f).resolve() for f in files], config["ingest"], config["sensor"], said, entry)
-                for files in candidates
+                Reading(files, config["ingest"], config["sensor"], said, entry, recording, bench) for files in found
             ]
     return readings
 
@@ -191,17 +204,24 @@ def _tell(reading: Reading) -> PipelineError | None:
     try:
         table = read_table(reading.files, reading.ingest)
         checks = checks_of(reading.ingest)
-        recording = to_recording(reading.files[0].stem, reading.entry, table, reading.sensor, checks)
+        name = reading.name or reading.files[0].stem
+        recording = to_recording(name, reading.entry, table, reading.sensor, checks)
         parts = cut(recording, reading.entry.get("windows")) if recording.role == "session" else []
+        checked = check_recordings(parts or [recording], reading.settings)
+        parts, recording = (checked, recording) if parts else ([], checked[0])
     except PipelineError as error:
         topics = topic_lines(reading.files[0], fields=kind_of(error) == "missing_topic") if _is_mcap(reading) else []
         place = _place(error.file, reading.files)
         print(as_text([("REFUSED", f"{place}{error.message}"), ("code", kind_of(error)), *topics]) + "\n")
         return error
     topics = topic_lines(reading.files[0], fields=False) if _is_mcap(reading) else []
-    segments = [("segments" if i == 0 else "", f"{p.name}: {p.notes[-1].detail}") for i, p in enumerate(parts)]
+    segments = [("segments" if i == 0 else "", f"{p.name}: {_segment(p)}") for i, p in enumerate(parts)]
     print(as_text([*topics, *facts(recording, reading.sensor), *segments]) + "\n")
     return None
+
+
+def _segment(part: Recording) -> str:
+    return next(n.detail for n in part.notes if n.code == "N-SEGMENT")
 
 
 def _place(file: str | None, files: Sequence[Path]) -> str:

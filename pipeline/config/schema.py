@@ -14,6 +14,9 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Axis = Literal["x", "y", "z"]
 SignedAxis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
+AxisMap = Annotated[list[SignedAxis], Field(min_length=3, max_length=3)]
+Sense = Literal[1, -1]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class Section(BaseModel):
@@ -34,6 +37,7 @@ class DataSheet(Section):
     scale_factor: Positive
     cross_axis: Positive
     effects: dict[str, Positive]
+    axis_map: AxisMap | None = None
     repeatability_bias: NonNegative | None = None
     repeatability_scale_factor: NonNegative | None = None
 
@@ -42,7 +46,7 @@ class Sensor(Section):
     """A sensor model."""
 
     name: str
-    axis_map: Annotated[list[SignedAxis], Field(min_length=3, max_length=3)]
+    axis_map: AxisMap
     temperature_accuracy_degc: NonNegative | None = None
     accelerometer: DataSheet
     gyroscope: DataSheet
@@ -59,6 +63,8 @@ class Table(Section):
     angle_accuracy_deg: NonNegative
     rate_accuracy: NonNegative
     orthogonality_deg: NonNegative
+    sense: Sense = 1
+    zero_deg: Finite = 0.0
     wobble_deg: NonNegative | None = None
     levelling_deg: NonNegative | None = None
     gravity_accuracy_g: NonNegative | None = None
@@ -103,6 +109,9 @@ class RecordingFile(Section):
     role: Literal["accelerometer", "gyroscope", "rests", "validation", "static", "session"]
     axis: Axis | None
     optional: bool
+    up: SignedAxis | None = None
+    sense: Sense | None = None
+    zero_deg: Finite | None = None
     setup: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")] | None = None
     program: list[Rest | Turn | Repeated] | None = None
     windows: list[Window] | None = None
@@ -116,6 +125,7 @@ class Procedure(Section):
     folder: str
     recordings: dict[str, RecordingFile]
     holdout_every: Annotated[int, Field(ge=0)]
+    mounting_tolerance_deg: Positive = 5.0
 
 
 class Stages(Section):

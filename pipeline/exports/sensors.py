@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import yaml
 
+from pipeline.formats.axes import STRAIGHT, maps_of_log
 from pipeline.model.effects.base import Owner
 from pipeline.model.user_effects import owner_of
 from pipeline.records import SENSORS, SensorCalibration
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
 STANDARD_GRAVITY = 9.80665  # m/s^2
 OF_THE_BIAS = ("bias_temperature", "bias_temperature_quadratic")
 TEMPERATURES = (-40.0, 85.0)  # degC, the widest that parts of this kind are made for
-STRAIGHT = ["+x", "+y", "+z"]
 
 
 def calibrations(document: dict[str, Any]) -> dict[str, SensorCalibration]:
@@ -42,12 +42,15 @@ def bench_effects(calibration: SensorCalibration) -> list[str]:
 
 
 def axes_of_readings(document: dict[str, Any]) -> list[str]:
-    """Return a sentence on how the sensor's axes become the body's, where they differ."""
-    axis_map = (document.get("log") or {}).get("axis_map") or STRAIGHT
-    if list(axis_map) == STRAIGHT:
-        return []
-    pairs = ", ".join(f"{a} along body {b}" for a, b in zip("xyz", axis_map, strict=True))
-    return [f"Turn the readings to body axes first: the sensor's {pairs}."]
+    """Return a sentence a sensor on how its axes become the body's, where they differ; one where both are alike."""
+    maps = maps_of_log(document.get("log") or {})
+    whose = dict.fromkeys(maps.values(), "sensor") if len(set(maps.values())) == 1 else {m: s for s, m in maps.items()}
+    lines = []
+    for axis_map, sensor in whose.items():
+        if axis_map != STRAIGHT:
+            pairs = ", ".join(f"{a} along body {b}" for a, b in zip("xyz", axis_map, strict=True))
+            lines.append(f"Turn the readings to body axes first: the {sensor}'s {pairs}.")
+    return lines
 
 
 def forward(calibration: SensorCalibration) -> NDArray[np.float64]:

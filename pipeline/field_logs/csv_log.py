@@ -167,7 +167,7 @@ class _Log:
             columns = [self.columns[c] for c in SIGNALS[signal]]
             for k, column in enumerate(columns):
                 numbers[:, k] = _in_house_unit(column, numbers[:, k])
-            out[signal] = self.profile.to_body(numbers) if signal in SENSORS else numbers[:, 0]
+            out[signal] = self.profile.to_body(signal, numbers) if signal in SENSORS else numbers[:, 0]
         if self.settings.rate_hz is not None:
             out["time"] = np.arange(rows, rows + block.rows) / self.settings.rate_hz
         if "time" in out:

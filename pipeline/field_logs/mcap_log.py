@@ -143,7 +143,7 @@ class _Work:
             self.origin_ns = first if first > EPOCH_AFTER_S * NANOSECONDS else 0
         time_ns = batch.time_ns - self.origin_ns
         time = time_ns // 10**9 + (time_ns % 10**9) / NANOSECONDS
-        given = {s: self.profile.to_body(v) for s, v in batch.values.items()}
+        given = {s: self.profile.to_body(s, v) for s, v in batch.values.items()}
         warmth = batch.temperature
         if self.temperatures is not None:
             warmth = self.temperatures.at(rows, time, batch, self.origin_ns)

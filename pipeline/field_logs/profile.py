@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import ConfigurationError, InputError
-from pipeline.formats.axes import axis_matrix
+from pipeline.formats.axes import STRAIGHT, axis_matrix, maps_of_log
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 EPOCH_AFTER_S = 1e8  # 3 years: no sensor has been on for longer
-STRAIGHT = ("+x", "+y", "+z")
 
 
 def _canonical() -> dict[str, Any]:
@@ -34,12 +33,12 @@ class LogProfile:
     ----------
     ingest : mapping
         The ingest profile, with the sections ``csv`` and ``mcap``; the canonical one by default.
-    axis_map : sequence of str
-        Body axis that each reading axis points along.
+    axis_maps : mapping
+        Sensor to the body axis that each of its reading axes points along; straight where it is not named.
     """
 
     ingest: Mapping[str, Any] = field(default_factory=_canonical)
-    axis_map: Sequence[str] = STRAIGHT
+    axis_maps: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
     @classmethod
     def of_calibration(cls, document: Mapping[str, Any], file: str) -> LogProfile:
@@ -54,17 +53,20 @@ class LogProfile:
         if log is None:
             return cls()
         try:
-            axis_matrix(log["axis_map"])
-            found = cls({**log["ingest"]}, tuple(log["axis_map"]))
+            maps = maps_of_log({"axis_map": log["axis_map"]})
+            for axis_map in maps.values():
+                axis_matrix(axis_map)
+            found = cls({**log["ingest"]}, maps)
         except (KeyError, TypeError, ConfigurationError) as error:
             told = "log is not what a run writes; expected ingest, an object, and axis_map, for example [+x, +y, +z]"
             raise InputError(f"{told}; got {error}", file) from None
         return found
 
-    def to_body(self, readings: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return (n, 3) readings in the body's axes."""
-        if tuple(self.axis_map) == STRAIGHT:
+    def to_body(self, sensor: str, readings: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return (n, 3) readings of a sensor in the body's axes."""
+        axis_map = tuple(self.axis_maps.get(sensor, STRAIGHT))
+        if axis_map == STRAIGHT:
             return readings
-        matrix = axis_matrix(self.axis_map)
+        matrix = axis_matrix(axis_map)
         turned: NDArray[np.float64] = readings[:, np.argmax(np.abs(matrix), axis=1)] * matrix.sum(axis=1)
         return turned

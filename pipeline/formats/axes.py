@@ -7,12 +7,15 @@ where
 i   : reading axis x, y, z
 m_i : body axis that it points along
 s_i : ``+`` or ``-``
+
+Each sensor of a unit may have a map of its own: some chips have a left-handed accelerometer frame beside a right-handed
+gyroscope frame.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,8 +23,10 @@ from pipeline.errors import ConfigurationError
 from pipeline.formats.units import TRIADS
 from pipeline.records import AXES, Note
 
+STRAIGHT = ("+x", "+y", "+z")
+
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -48,16 +53,41 @@ def axis_matrix(axis_map: Sequence[str]) -> NDArray[np.float64]:
     return matrix
 
 
-def to_body_axes(table: ChannelTable, axis_map: Sequence[str]) -> ChannelTable:
+def axis_maps(sensor: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
+    """Return the axis map of each sensor: its own, else that of the unit, else straight.
+
+    Parameters
+    ----------
+    sensor : mapping
+        Section of the unit's configuration.
+    """
+    common = sensor.get("axis_map") or STRAIGHT
+    return {s: tuple((sensor.get(s) or {}).get("axis_map") or common) for s in TRIADS}
+
+
+def maps_of_log(log: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
+    """Return the axis maps in the section ``log`` of a calibration: one a sensor, in older files one for both."""
+    stated = log.get("axis_map") or STRAIGHT
+    return {s: tuple(stated[s] if isinstance(stated, dict) else stated) for s in TRIADS}
+
+
+def to_body_axes(table: ChannelTable, maps: Mapping[str, Sequence[str]]) -> ChannelTable:
     """Turn a table's readings into the body's axes, integers and all.
 
     A left-handed map is used as it stands, with a note: no rotation does that, only a sensor with such axes.
+
+    Parameters
+    ----------
+    table : ChannelTable
+    maps : mapping
+        Axis map of ``accelerometer`` and ``gyroscope``.
     """
-    matrix = axis_matrix(axis_map)
-    if np.array_equal(matrix, np.eye(3)):
+    values, encodings, notes = dict(table.values), dict(table.encodings), table.notes
+    matrices = {sensor: axis_matrix(maps[sensor]) for sensor in TRIADS}
+    if all(np.array_equal(m, np.eye(3)) for m in matrices.values()):
         return table
-    values, encodings = dict(table.values), dict(table.encodings)
-    for triad in TRIADS.values():
+    for sensor, triad in TRIADS.items():
+        matrix = matrices[sensor]
         for row, body in enumerate(triad):
             reading = triad[int(np.flatnonzero(matrix[row])[0])]
             sign = matrix[row].sum()
@@ -67,8 +97,8 @@ def to_body_axes(table: ChannelTable, axis_map: Sequence[str]) -> ChannelTable:
             if reading in table.encodings:
                 encoding = table.encodings[reading]
                 encodings[body] = replace(encoding, scale=sign * encoding.scale)
-    notes = table.notes
-    if np.linalg.det(matrix) < 0:
-        detail = f"sensor.axis_map [{', '.join(map(str, axis_map))}] is left-handed"
-        notes = (*notes, Note("N-LEFTHANDED", 1, 0, 0, detail))
+    left = [s for s, m in matrices.items() if np.linalg.det(m) < 0 and TRIADS[s][0] in table.values]
+    if left:
+        detail = ", ".join(f"[{', '.join(maps[s])}] of the {s}" for s in left)
+        notes = (*notes, Note("N-LEFTHANDED", len(left), 0, 0, f"left-handed axis map: {detail}"))
     return replace(table, values=values, encodings=encodings, notes=notes)

@@ -75,7 +75,7 @@ def read_gcsv(path: Path, checks: Checks) -> ChannelTable:
 
     description = describe(path)
     table = read_one(path, description.format, checks)
-    table = to_body_axes(table, description.orientation)
+    table = to_body_axes(table, dict.fromkeys(TRIADS, description.orientation))
     kept = {k: v for k, v in description.facts.items() if k in ("id", "note", "fwversion", "vendor", "orientation")}
     return replace(table, source={**table.source, "gcsv": kept})
 

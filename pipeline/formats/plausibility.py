@@ -1,10 +1,11 @@
 """What cannot be true of a recording: refused, because it would calibrate without complaint.
 
 Time that does not increase or keeps another rate than is known, specific force far from gravity, readings that the
-sensor cannot give, rates that do not fit the table or the way in which gravity turns, an axis that is not the one that
-the table turned about, an attitude that is no rotation. Each is nearly always a wrong unit or column.
+sensor cannot give, rates that do not fit the table or the way in which gravity turns, an attitude that is no rotation.
+Each is nearly always a wrong unit or column.
 
-What is merely marked (gaps, clipped and stuck readings) is found in ``pipeline.formats.marks``.
+What is merely marked (gaps, clipped and stuck readings) is found in ``pipeline.formats.marks``; whether the unit is
+mounted as stated, in ``pipeline.preprocessing.mounting``.
 """
 
 from __future__ import annotations
@@ -33,10 +34,6 @@ QUATERNION_TOLERANCE = 0.01
 RATE_TOLERANCE = 0.2
 ENOUGH = 200_000  # samples that a median is taken of
 TURNING_DPS = 5.0
-CHANGING = 0.1  # standard deviation over largest rate, from which a rate changes enough to be followed
-SLOWEST_DPS = 0.1  # standard deviation of a rate that can be followed
-LARGEST_BIAS_DPS = 20.0  # zero-rate output of consumer MEMS (MPU-6050 product specification)
-ALIKE, UNLIKE = 0.9, 0.5
 
 
 def examine(
@@ -191,51 +188,3 @@ def _check_turn_rate(table: ChannelTable) -> None:
                 fault="implausible_rate",
                 hint="correct the unit of gyro_x, gyro_y and gyro_z in ingest.csv.columns",
             )
-
-
-def check_axis(table: ChannelTable, axis: str | None) -> None:
-    """Refuse a turn about another axis than the procedure says, or the other way round.
-
-    What a body axis reads of the table's rate tells which one turned:
-
-        g_i = sum((w_i - mean w_i) (r - mean r)) / sum((r - mean r)^2)
-
-    The gain g is about 1 for the axis turned about and a few hundredths, the cross-axis sensitivity, for the others.
-    Means are taken off since a bias of some deg/s may exceed a slow table's rate; where the rate does not change, they
-    stay, and only a rate beyond any bias tells something.
-
-    Parameters
-    ----------
-    table : ChannelTable
-        In body axes.
-    axis : str or None
-        Body axis that the table turned about.
-    """
-    if axis is None or "table_rate" not in table.values or "gyro_x" not in table.values:
-        return
-    rate = table.values["table_rate"]
-    changing = float(np.std(rate)) > CHANGING * float(np.max(np.abs(rate)))
-    centre = np.mean if changing else np.zeros_like
-    rate = rate - centre(rate)
-    power = float(rate @ rate)
-    if power < len(rate) * (SLOWEST_DPS if changing else LARGEST_BIAS_DPS) ** 2:
-        return
-    gyro = {c[-1]: table.values[c] - centre(table.values[c]) for c in TRIADS["gyroscope"]}
-    gain = {a: float(w @ rate) / power for a, w in gyro.items()}
-    other = max(gain, key=lambda a: abs(gain[a]))
-    alike = gain[other] * np.sqrt(power / max(float(gyro[other] @ gyro[other]), 1e-30))
-    listed = ", ".join(f"{a} {g:+.3g}" for a, g in gain.items())
-    if abs(alike) < ALIKE:
-        return
-    if other == axis and gain[axis] < 0.0:
-        problem = f"the readings about {axis} have the sign opposite to the table's rate"
-    elif abs(gain[axis]) < UNLIKE * abs(gain[other]):
-        problem = f"the table is said to turn about {axis}, and {other} turns with it"
-    else:
-        return
-    raise IngestError(
-        f"{problem} (read of each deg/s of the table: {listed})",
-        table.path,
-        fault="wrong_axis",
-        hint="correct sensor.axis_map, the columns, or the recording's axis in the procedure",
-    )

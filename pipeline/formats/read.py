@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import MissingInputError
-from pipeline.formats.axes import to_body_axes
+from pipeline.formats.axes import STRAIGHT, axis_maps, to_body_axes
 from pipeline.formats.checks import checks_of
 from pipeline.formats.disturbances import leave_out_disturbances
 from pipeline.formats.files import candidate_files, recording_files
 from pipeline.formats.ingest_error import IngestError
-from pipeline.formats.plausibility import check_axis, examine
+from pipeline.formats.plausibility import examine
 from pipeline.formats.shaken_rests import leave_out_shaken_rests
 from pipeline.formats.table_log import unwrapped
 from pipeline.formats.units import ATTITUDE, TABLE_CHANNELS, TRIADS
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from pipeline.formats.checks import Checks
     from pipeline.formats.csv_settings import CsvFormat
 
-AXIS_MAP = ("+x", "+y", "+z")
 EPOCH_AFTER_NS = 100_000_000 * 1_000_000_000  # 3 years: no sensor has been on for longer
 
 
@@ -168,20 +167,20 @@ def to_recording(
         table = follow_program(table, entry["program"])
     table = unwrapped(table)
     flags, notes = examine(table, sensor, checks)
-    axis_map = tuple(sensor.get("axis_map") or AXIS_MAP)
+    maps = axis_maps(sensor)
     stated = table.source.get("gcsv", {}).get("orientation", "XYZ")
-    if stated != "XYZ" and axis_map != AXIS_MAP:
+    other = [m for m in maps.values() if m != STRAIGHT]
+    if stated != "XYZ" and other:
         raise IngestError(
-            f"the file states its orientation ({stated}) and sensor.axis_map is [{', '.join(axis_map)}]",
+            f"the file states its orientation ({stated}) and sensor.axis_map is [{', '.join(other[0])}]",
             table.path,
             fault="gcsv",
             hint="one of them has to go: write orientation,XYZ in the file, or set sensor.axis_map=[+x,+y,+z]",
         )
-    table = to_body_axes(table, axis_map)
+    table = to_body_axes(table, maps)
     if entry.get("axis") is None and ATTITUDE[0] in table.values and "table_rate" not in table.values:
         attitude = np.column_stack([table.values[c] for c in ATTITUDE])
         table.values["table_rate"] = rate_of_attitude((table.time_ns - table.time_ns[0]) / 1e9, attitude)
-    check_axis(table, entry.get("axis"))
     values = table.values
     notes = [*notes, *(_absent(sensor_name, table) for sensor_name in TRIADS if TRIADS[sensor_name][0] not in values)]
     recording = Recording(

@@ -126,7 +126,13 @@ def moves_of(force: NDArray[np.float64], rate: NDArray[np.float64], time_s: NDAr
 
 
 def misfit_deg(moves: Sequence[Move], scales: Sequence[float]) -> NDArray[np.float64]:
-    """Return the median angle that each scale leaves between the gravity it predicts and the one that was read.
+    """Return the median over moves of ``misfits_deg``: (len(scales),) array, deg."""
+    median: NDArray[np.float64] = np.median(misfits_deg(moves, scales), axis=0)
+    return median
+
+
+def misfits_deg(moves: Sequence[Move], scales: Sequence[float]) -> NDArray[np.float64]:
+    """Return the angle that each scale leaves between the gravity it predicts after a move and the one that was read.
 
     Parameters
     ----------
@@ -136,7 +142,7 @@ def misfit_deg(moves: Sequence[Move], scales: Sequence[float]) -> NDArray[np.flo
 
     Returns
     -------
-    (len(scales),) array, deg
+    (len(moves), len(scales)) array, deg
     """
     factors = np.radians(np.asarray(scales, float))[None, :, None]
     direction = np.repeat(np.stack([m.before for m in moves])[:, None, :], len(scales), axis=1)
@@ -149,9 +155,8 @@ def misfit_deg(moves: Sequence[Move], scales: Sequence[float]) -> NDArray[np.flo
             direction * np.cos(angle) + np.cross(axis, direction) * np.sin(angle) + axis * along * (1 - np.cos(angle))
         )
     after = np.stack([m.after for m in moves])[:, None, :]
-    left = np.degrees(np.arccos(np.clip(np.sum(direction * after, axis=2), -1.0, 1.0)))
-    median: NDArray[np.float64] = np.median(left, axis=0)
-    return median
+    left: NDArray[np.float64] = np.degrees(np.arccos(np.clip(np.sum(direction * after, axis=2), -1.0, 1.0)))
+    return left
 
 
 def declared_scale(table: ChannelTable) -> tuple[float, str] | None:

@@ -144,12 +144,14 @@ def _motion_of_turn(
     if vague is not None:
         log.followed_samples &= ~vague
     still = still_samples(time, rate)
-    return _turn(log, AXES.index(recording.axis), gravity_g, earth, still, temperature, offset)
+    axis = AXES.index(recording.axis)
+    return _turn(log, axis, level_at_zero(axis, recording.up), gravity_g, earth, still, temperature, offset)
 
 
 def _turn(  # noqa: PLR0917  (bound one by one for the motion at an offset)
     log: TurnLog,
     axis: int,
+    home: NDArray[np.float64],
     gravity_g: float,
     earth: NDArray[np.float64] | None,
     still: NDArray[np.bool_],
@@ -160,10 +162,10 @@ def _turn(  # noqa: PLR0917  (bound one by one for the motion at an offset)
     angle, rate, acceleration = log.angle, log.rate, log.acceleration
     if np.any(offset):
         angle, rate, acceleration = log.at(log.time + offset)
-    level = _level(axis, angle)
+    level = turn_about_axis(home, axis, -angle)
     if lag > 0.0:
         rate, acceleration = log.lagged(log.time + offset, lag)
-        past = [_level(axis, log.at(log.time + offset - lag * node)[0]) for node in NODES]
+        past = [turn_about_axis(home, axis, -log.at(log.time + offset - lag * node)[0]) for node in NODES]
         level = np.tensordot(WEIGHTS, np.array(past), 1)
     force = gravity_g * level[:, 2, :]
     omega, alpha = np.zeros_like(force), np.zeros_like(force)
@@ -182,16 +184,29 @@ def _turn(  # noqa: PLR0917  (bound one by one for the motion at an offset)
         rate=rate,
         axis=axis,
         still=still,
-        at_offset=partial(_turn, log, axis, gravity_g, earth, still, temperature),
-        at_lag=partial(_turn, log, axis, gravity_g, earth, still, temperature),
+        at_offset=partial(_turn, log, axis, home, gravity_g, earth, still, temperature),
+        at_lag=partial(_turn, log, axis, home, gravity_g, earth, still, temperature),
         level=level,
         followed=log.followed_samples,
     )
 
 
-def _level(axis: int, angle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the level axes in the body frame, as rows: (n, 3, 3) array."""
-    return turn_about_axis(LEVEL_AT_ZERO[axis], axis, -angle)
+def level_at_zero(axis: int, up: str = "") -> NDArray[np.float64]:
+    """Return the level axes in the body frame at table angle 0, as rows: (3, 3) array.
+
+    Parameters
+    ----------
+    axis : int
+        Of the turn.
+    up : str
+        Body axis, with its sign, that points up all the time, where the turn axis stands vertical; level x is then the
+        body axis after it in cyclic order.
+    """
+    if not up:
+        return np.asarray(LEVEL_AT_ZERO[axis])
+    upward = np.eye(3)[AXES.index(up[1])] * (1.0 if up[0] == "+" else -1.0)
+    level_x = np.eye(3)[(AXES.index(up[1]) + 1) % 3]
+    return np.array([level_x, np.cross(upward, level_x), upward])
 
 
 def _motion_of_attitude(

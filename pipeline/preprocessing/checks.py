@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from pipeline.preprocessing.mounting import check_mounting
+
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
@@ -15,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def check_recordings(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> list[Recording]:
-    """Return the recordings of a unit with notes on what was found.
+    """Return the recordings of a unit, their turns by the convention, with notes on what was found.
 
     Parameters
     ----------
@@ -29,5 +31,4 @@ def check_recordings(recordings: Sequence[Recording], settings: Mapping[str, Any
     InputError
         If the recordings contradict each other, or the table's log contradicts itself or gravity.
     """
-    del settings
-    return list(recordings)
+    return check_mounting(recordings, settings)

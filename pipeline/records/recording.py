@@ -97,6 +97,9 @@ class Recording:
         Columns that came as integers.
     setup : str
         Which of several tables, mountings or sessions it was made in; empty where there is one alone.
+    up : str
+        ``+x``, ``-z`` ..: the body axis that points up throughout a turn about a vertical axis; empty elsewhere, where
+        the table's angle says which one does.
     clock_shared : bool
         Whether the time between this recording and the unit's others is known (their times do not overlap).
     """
@@ -118,6 +121,7 @@ class Recording:
     encodings: dict[str, Encoding] = field(default_factory=dict)
     clock_shared: bool = True
     setup: str = ""
+    up: str = ""
 
     @cached_property
     def time(self) -> NDArray[np.float64]:

@@ -8,6 +8,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 from pipeline import __version__
+from pipeline.formats.axes import axis_maps
 from pipeline.formats.parquet import load_recordings
 from pipeline.records import SENSORS
 from pipeline.stages.batch import parse_job, read_json, run_batch, write_json
@@ -29,7 +30,7 @@ def main(argv: Sequence[str]) -> int:
         document = header(unit, part) | {
             "status": "ok",
             "error": None,
-            "log": {"ingest": part["ingest"], "axis_map": part["sensor"]["axis_map"]},
+            "log": {"ingest": part["ingest"], "axis_map": {s: list(m) for s, m in axis_maps(part["sensor"]).items()}},
             "inputs": inputs(job.inputs["ingest"] / f"{unit}.parquet"),
             "not_calibrated": reasons,
         }

@@ -21,7 +21,7 @@ from pipeline.field_logs.mcap_log import compensate_mcap
 from pipeline.field_logs.profile import LogProfile
 from pipeline.formats.ros2 import DEFINITIONS, IMU, TEMPERATURE
 from pipeline.model.compensation import load
-from pipeline.records import FittedEffect, SensorCalibration
+from pipeline.records import SENSORS, FittedEffect, SensorCalibration
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -304,7 +304,7 @@ def test_readings_mapped_from_json_give_imu_messages(calibration: Path, tmp_path
 
 def test_the_sensors_axes_are_turned_to_the_bodys(calibration: Path, tmp_path: Path) -> None:
     log, out = write_log(tmp_path / "log.mcap"), tmp_path / "out.mcap"
-    compensate_mcap(load(calibration), log, out, LogProfile({}, ("-y", "+x", "+z")))
+    compensate_mcap(load(calibration), log, out, LogProfile({}, dict.fromkeys(SENSORS, ("-y", "+x", "+z"))))
     force, rate = in_house_units(decoded(out, "/imu/data"))
     turned = np.stack([force[:, 1], -force[:, 0], force[:, 2]], axis=1)  # body x is the reading's y, body y is -x
     expected = load(calibration).apply(turned, rate, np.zeros(COUNT), smoothing=0.0).accelerometer

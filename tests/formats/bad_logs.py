@@ -156,6 +156,16 @@ def with_table_axis(order: tuple[int, int, int], sign: float = 1.0) -> bytes:
     return table(values, table_rate_dps=RATE)
 
 
+def with_angle(angle: np.ndarray, rate: np.ndarray, *, mirrored: str = "", upright: bool = False) -> bytes:
+    """Return the turn about x with a table log, an axis of the accelerometer mirrored, or about a vertical axis."""
+    values = VALUES.copy()
+    if mirrored:
+        values[:, 1 + "xyz".index(mirrored)] *= -1.0
+    if upright:
+        values[:, 1:4] = [1.0, 0.0, 0.0]
+    return table(values, table_angle_deg=angle, table_rate_dps=rate)
+
+
 def table_log(offset_s: float, drift: float) -> bytes:
     """Return the log of a table whose clock is ahead by an offset and gains."""
     own = np.arange(-200, SAMPLES + 200) * INTERVAL_S
@@ -388,9 +398,28 @@ def cases() -> dict[str, Case]:
         "38 dead": one(scaled(slice(6, 7), 0.0), fault="stuck", says="gyro_z is 0 deg/s in all 3000 rows"),
         "39": one(clipped(), notes=("N-CLIP",), flags={420: 2, 423: 2}),
         "40 axis": one(
-            with_table_axis((2, 0, 1)), fault="wrong_axis", says="said to turn about x, and y turns with it"
+            with_table_axis((2, 0, 1)), fault="wrong_axis", says="said to turn about x, and the gyroscope turns about y"
         ),
-        "40 sign": one(with_table_axis((0, 1, 2), -1.0), fault="wrong_axis", says="sign opposite to the table's rate"),
+        "40 sign": one(with_table_axis((0, 1, 2), -1.0), fault="wrong_sense", says="sign opposite to the table's rate"),
+        "40 sense": one(
+            with_angle(-TABLE_ANGLE, -RATE), fault="wrong_sense", says="counted left-handed about x; .*table.sense=-1"
+        ),
+        "45": one(
+            with_angle(TABLE_ANGLE + 180.0, RATE),
+            fault="wrong_face",
+            says=r"found is body -z up at a table angle of 0\.1 deg, .*set procedure\.recordings\.log\.up=-z",
+        ),
+        "46": one(with_angle(TABLE_ANGLE + 37.0, RATE), fault="wrong_zero", says=r"table\.zero_deg=37\.1"),
+        "47": one(
+            with_angle(TABLE_ANGLE, RATE, mirrored="y"),
+            fault="mirrored_axes",
+            says=r"gravity turns as in a turn about body -x, and the gyroscope reads a turn about \+x",
+        ),
+        "48": one(
+            with_angle(TABLE_ANGLE, RATE, upright=True),
+            fault="wrong_face",
+            says=r"the turn axis stands vertical, and stated is \+z up; .*procedure\.recordings\.log\.up=\+x",
+        ),
         "41": Case(
             {FILE: whole, "table.csv": table_log(5.25, 40e-6)},
             notes=("N-SYNC",),

@@ -1,4 +1,4 @@
-"""Each of the 44 bad inputs is refused with its facts, or repaired with a note; see docs/bad_inputs.md."""
+"""Each of the 48 bad inputs is refused with its facts, or repaired with a note; see docs/bad_inputs.md."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from pipeline.errors import ConfigurationError, InputError, MissingInputError
 from pipeline.formats.parquet import load_recordings, save_recordings
 from pipeline.formats.read import read_recordings
 from pipeline.formats.settings import check_ingest
+from pipeline.preprocessing.checks import check_recordings
 from pipeline.report.campaign_page import render
 from pipeline.stages.gather import same_files
 
@@ -28,7 +29,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "bad_inputs.md"
 @pytest.mark.parametrize("number", CASES)
 def test_the_page_tells_the_codes_of_each_bad_input(number: str) -> None:
     rows = dict(re.findall(r"^\| (\d+) (\|.*)$", PAGE.read_text(), re.MULTILINE))
-    assert len(rows) == 44
+    assert len(rows) == 48
     told = rows[number.split(maxsplit=1)[0].lstrip("0")]
     told += rows["10"] if "as 10" in told else ""
     case = CASES[number]
@@ -46,7 +47,8 @@ def write(folder: Path, case: Case, number: str) -> None:
 def read(folder: Path, case: Case) -> Recording:
     names = [Path(f).stem for f in case.files if f != "table.csv"] or ["log"]
     check_ingest(case.ingest())
-    return read_recordings(procedure(*names), case.ingest(), SENSOR, folder)[0]
+    settings = {"procedure": procedure(*names), "ingest": case.ingest(), "sensor": SENSOR}
+    return check_recordings(read_recordings(settings["procedure"], case.ingest(), SENSOR, folder), settings)[0]
 
 
 def fault_of(error: Exception) -> str:

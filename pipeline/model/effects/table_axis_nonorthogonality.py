@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
     from pipeline.records import Motion
 
+UPRIGHT = 0.5  # sine of the turn axis's elevation, which is 0 or 1: gravity turns with the angle, or not at all
 LEANS = (
     ("x", "y"),
     ("x", "z"),
@@ -59,6 +60,9 @@ class TableAxisNonorthogonality(Effect):
         if motion.axis is None or motion.angle is None or motion.rate is None:
             return out
         axis, f = motion.axis, motion.specific_force
+        assert motion.level is not None  # noqa: S101
+        upright = abs(motion.level[0, 2, axis]) > UPRIGHT
+        up = motion.level[0, 2] if upright else UP_AT_ZERO[axis]
         gravity = length(f)[:, None] if sensor == "accelerometer" else None
         for step in (1, 2):
             lean = np.zeros(3)
@@ -67,7 +71,7 @@ class TableAxisNonorthogonality(Effect):
                 out[:, :, 2 * axis + step - 1] = motion.rate[:, None] * (K @ lean)
                 continue
             across = skew(ABOUT[axis] @ lean)  # across @ u = theta x u
-            home = turn_about_axis(across @ UP_AT_ZERO[axis], axis, -motion.angle)
+            home = turn_about_axis(across @ up, axis, -motion.angle)
             out[:, :, 2 * axis + step - 1] = (f @ across.T - gravity * home) @ K.T
         return out
 

@@ -1,0 +1,169 @@
+"""The mounting of the unit in each turn: found, compared with what is stated, and brought into the convention.
+
+Another turn axis, upward face or sense than stated, and a zero that is off by more than
+``procedure.mounting_tolerance_deg``, are refused with the setting that describes them; what is stated is applied to the
+table's angle and rate, so that everything after ingest works with the convention (``pipeline.preprocessing.bench``).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.formats.axes import axis_maps, axis_matrix
+from pipeline.formats.ingest_error import IngestError
+from pipeline.preprocessing.bench import found_bench, signed_axis, stated_bench, usual_up
+from pipeline.preprocessing.departures import Tolerance, Turn, departure, words
+from pipeline.preprocessing.frames import as_map, check_moves, check_turns, nearest_permutation
+from pipeline.preprocessing.turn_fit import fit_turn
+from pipeline.records import Note
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.preprocessing.departures import Departure
+    from pipeline.records import Recording
+
+TOLERANCE_DEG = 5.0
+TIME_OFFSET_S = 0.04  # largest plausible one where the sensor's config states none: as in configs/sensor/*.yaml
+AGREES_G = 0.7  # of 1 g, within 45 deg of the axis
+
+
+def check_mounting(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> list[Recording]:
+    """Return the recordings with the table's angle and rate by the convention.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+        All of one unit, in body axes.
+    settings : mapping
+        Sections ``procedure``, ``table`` and ``sensor`` of the unit's configuration.
+
+    Raises
+    ------
+    IngestError
+        If a turn is mounted otherwise than stated, or accelerometer and gyroscope contradict each other.
+    """
+    procedure, table, sensor = (settings.get(key) or {} for key in ("procedure", "table", "sensor"))
+    turns = [_turn(r, procedure.get("recordings") or {}, table) for r in recordings]
+    known = [t for t in turns if t is not None]
+    maps = axis_maps(sensor)
+    accelerometer = _accelerometer_axes(known)
+    check_turns([(t.recording, t.fit) for t in known], accelerometer, maps)
+    for recording in recordings:
+        if recording.role == "rests":
+            check_moves(recording, maps)
+    tolerance = _tolerance(procedure, table, sensor)
+    departures = [d for t in known if (d := departure(t, tolerance)) is not None]
+    if departures:
+        raise _refusal(departures, known, accelerometer, maps)
+    return [r if t is None else _applied(t) for r, t in zip(recordings, turns, strict=True)]
+
+
+def _tolerance(procedure: Mapping[str, Any], table: Mapping[str, Any], sensor: Mapping[str, Any]) -> Tolerance:
+    limits = (sensor.get("accelerometer") or {}).get("effects") or {}
+    return Tolerance(
+        float(procedure.get("mounting_tolerance_deg") or TOLERANCE_DEG),
+        float(limits.get("time_offset") or TIME_OFFSET_S),
+        float(table.get("rate_accuracy") or 0.0) if table.get("motion") == "commanded" else 0.0,
+    )
+
+
+def _turn(recording: Recording, entries: Mapping[str, Any], table: Mapping[str, Any]) -> Turn | None:
+    if recording.axis is None or (recording.table_angle is None and recording.table_rate is None):
+        return None
+    stated = stated_bench(entries.get(recording.name) or {}, table, recording.axis)
+    fit = fit_turn(recording)
+    return Turn(recording, stated, fit, found_bench(fit, recording.axis), recording.name in entries)
+
+
+def _accelerometer_axes(turns: Sequence[Turn]) -> NDArray[np.float64] | None:
+    """Return the signed permutation that takes the stated faces to what the accelerometer reads, if one does."""
+    total, count = np.zeros((3, 3)), np.zeros(3)
+    seen = []
+    for turn in turns:
+        p, q, stated = turn.fit.cosine, turn.fit.sine, turn.stated
+        if p is None or q is None or stated.vertical or turn.fit.vertical is not None:
+            continue
+        up, a = signed_axis(usual_up(stated.axis)), signed_axis(f"+{stated.axis}")
+        across, at_zero = np.cross(up, a), np.radians(stated.offset)
+        c, s = np.cos(at_zero), np.sin(at_zero)
+        cosine, sine = c * p - stated.sense * s * q, s * p + stated.sense * c * q
+        total += np.outer(cosine, up) + np.outer(sine, across)
+        count += np.abs(up) + np.abs(across)
+        seen += [(cosine, up), (sine, across)]
+    found = nearest_permutation(total / count) if np.all(count) else None
+    if found is None or any(reading @ (found @ true) < AGREES_G for reading, true in seen):
+        return None
+    return found
+
+
+def _refusal(
+    departures: Sequence[Departure],
+    turns: Sequence[Turn],
+    accelerometer: NDArray[np.float64] | None,
+    maps: Mapping[str, Sequence[str]],
+) -> IngestError:
+    first = departures[0]
+    others = [d.turn.name for d in departures[1:]]
+    also = f"; likewise refused: {', '.join(others)}" if others else ""
+    return IngestError(
+        first.problem + also,
+        first.turn.recording.source.get("file"),
+        fault=first.fault,
+        hint=_hint(departures, turns, accelerometer, maps),
+    )
+
+
+def _hint(
+    departures: Sequence[Departure],
+    turns: Sequence[Turn],
+    accelerometer: NDArray[np.float64] | None,
+    maps: Mapping[str, Sequence[str]],
+) -> str:
+    found = [d.settings for d in departures]
+    alike = len(departures) == len(turns) and all(f == found[0] for f in found)
+    ways = []
+    if alike and found[0] and set(found[0]) <= {"sense", "zero_deg"}:
+        ways.append(", ".join(f"table.{k}={v}" for k, v in found[0].items()))
+    elif all(d.turn.configurable for d in departures) and any(found):
+        ways.append(
+            ", ".join(f"procedure.recordings.{d.turn.name}.{k}={v}" for d in departures for k, v in d.settings.items())
+        )
+    if accelerometer is not None and not np.array_equal(accelerometer, np.eye(3)):
+        mirrored = np.linalg.det(accelerometer) < 0.0
+        now = axis_matrix(maps["accelerometer"])
+        key = "sensor.accelerometer.axis_map" if mirrored else "sensor.axis_map"
+        ways.append(f"{key}={as_map(accelerometer.T @ now)}")
+    if not ways:
+        return "mount the unit as docs/mounting.md says, or correct the columns and sensor.axis_map"
+    return f"if the bench is so, set {', or '.join(ways)} (docs/mounting.md); else correct the columns or the mounting"
+
+
+def _applied(turn: Turn) -> Recording:
+    """Return the recording with angle and rate by the convention, and a note where that changes them."""
+    recording, bench = turn.recording, turn.stated
+    notes = list(recording.notes)
+    if turn.fit.unknown and recording.table_angle is not None and recording.accelerometer is not None:
+        detail = f"upward face, turn axis and zero are taken as stated: {turn.fit.unknown}"
+        notes.append(Note("N-MOUNTING", 1, 0, 0, detail))
+    if bench.conventional:
+        return replace(recording, notes=tuple(notes))
+    angle, rate = recording.table_angle, recording.table_rate
+    detail = f"as stated, {words(bench)}: the angle is taken {bench.sense:+d} times and {bench.offset:+g} deg"
+    if bench.vertical:
+        detail = f"as stated, body {bench.up} points up throughout; the angle is taken {bench.sense:+d} times"
+    notes.append(Note("N-MOUNTING", recording.samples, 0, 0, detail))
+    encodings = {k: e for k, e in recording.encodings.items() if k not in ("table_angle", "table_rate")}
+    return replace(
+        recording,
+        up=bench.up if bench.vertical else "",
+        table_angle=None if angle is None else bench.sense * angle + bench.offset,
+        table_rate=None if rate is None else bench.sense * rate,
+        encodings=encodings,
+        notes=tuple(notes),
+    )

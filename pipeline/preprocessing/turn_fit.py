@@ -1,0 +1,141 @@
+"""What one turn recording tells of its mounting, before any calibration.
+
+In a turn about a level axis the accelerometer reads
+
+    r(A) = c + p cos A + q sin A,    p = K u,   q = K (u x a),   c = b + K (component of gravity along a)
+
+where
+
+A : table angle, counted right-handed about body axis a
+u : body axis that points up at A = 0
+K : inverse of the calibration matrix, the unit matrix to a few percent; b: bias
+
+so ``q x p`` points along the turn axis, and p and q give the upward face and the zero. An angle that counts the other
+way turns the sign of q. The gyroscope's gain against the table's rate r in the same rows,
+
+    k = sum((w - mean w) (r - mean r)) / sum((r - mean r)^2)
+
+points along the turn axis as well. Means are taken off since a bias of some deg/s may exceed a slow table's rate; where
+the rate does not change, they stay, and only a rate beyond any bias tells something.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pipeline.records import Recording
+
+# Smallest eigenvalue of the mean of (1, cos A, sin A)^T (1, cos A, sin A), reached by an arc of 111 deg. Below, a
+# nonlinearity of 0.5 % (MPU-6050 product specification 3.4) would turn p by more than 3 deg.
+LEAST_COVERAGE = 0.01
+LARGEST_UNCERTAINTY = 0.02  # g, of p and q: 1 deg
+CHANGING = 0.1  # standard deviation over largest rate, from which a rate changes enough to be followed
+SLOWEST_DPS = 0.1  # standard deviation of a rate that can be followed
+LARGEST_BIAS_DPS = 20.0  # zero-rate output of consumer MEMS (MPU-6050 product specification)
+ALIKE = 0.9  # correlation of a gyroscope axis with the rate from which its gain is evidence
+
+
+@dataclass(frozen=True)
+class TurnFit:
+    """Evidence of one recording.
+
+    Attributes
+    ----------
+    constant, cosine, sine : (3,) array or None, g
+        c, p and q above; None where the angle does not cover enough.
+    gain : (3,) array or None
+        k above, deg/s per deg/s of the table's angle; None where the rate does not tell.
+    mean_rate : float, deg/s
+        Mean rate of the angle over the samples; with a time offset it is a part of the zero.
+    arc : float, deg
+        What the angle covers.
+    unknown : str
+        Why gravity tells nothing; empty where it does.
+    """
+
+    constant: NDArray[np.float64] | None
+    cosine: NDArray[np.float64] | None
+    sine: NDArray[np.float64] | None
+    gain: NDArray[np.float64] | None
+    mean_rate: float
+    arc: float
+    unknown: str = ""
+
+    @property
+    def turn_axis(self) -> NDArray[np.float64] | None:
+        """Unit vector about which the unit turns as the angle grows, by gravity: (3,) array, or None."""
+        if self.cosine is None or self.sine is None or self.vertical is not None:
+            return None
+        return _unit(np.cross(self.sine, self.cosine))
+
+    @property
+    def vertical(self) -> NDArray[np.float64] | None:
+        """Direction of gravity's reaction where the turn leaves it as it is (a vertical axis): (3,) array, or None."""
+        if self.constant is None or self.cosine is None or self.sine is None:
+            return None
+        turning = float(np.hypot(np.linalg.norm(self.cosine), np.linalg.norm(self.sine)))
+        staying = float(np.linalg.norm(self.constant))
+        return _unit(self.constant) if turning < 0.25 * staying else None
+
+
+def fit_turn(recording: Recording) -> TurnFit:
+    """Return what the rows of a turn recording tell of its mounting.
+
+    Parameters
+    ----------
+    recording : Recording
+        In body axes, with the table's angle, its rate, or both.
+    """
+    angle = recording.table_angle
+    rate = recording.table_rate
+    slope = None if angle is None or recording.samples < 2 else np.gradient(angle, recording.time)
+    gain = None
+    if rate is not None or slope is not None:
+        used = rate if rate is not None else slope
+        gain = _gain(recording, used)
+        if gain is not None and rate is not None and slope is not None and float(rate @ slope) < 0.0:
+            gain = -gain  # the rate counts against the angle: compared with gravity here, and refused as a reference
+    if angle is None or recording.accelerometer is None:
+        missing = "angle of the table" if angle is None else "accelerometer"
+        return TurnFit(None, None, None, gain, 0.0, 0.0, f"the log holds no {missing}")
+    keep = recording.sound
+    A, reading = np.radians(angle[keep]), recording.accelerometer[keep]
+    arc = float(np.ptp(angle)) if len(angle) else 0.0
+    mean_rate = 0.0 if slope is None else float(np.mean(slope))
+    design = np.column_stack([np.ones_like(A), np.cos(A), np.sin(A)])
+    normal = design.T @ design
+    if len(A) < 6 or np.linalg.eigvalsh(normal / len(A))[0] < LEAST_COVERAGE:
+        return TurnFit(None, None, None, gain, mean_rate, arc, f"the table angle covers {arc:.3g} deg only")
+    found = np.linalg.solve(normal, design.T @ reading)
+    left = reading - design @ found
+    scatter = float(np.sqrt(np.max(np.mean(left**2, axis=0)) * np.max(np.diag(np.linalg.inv(normal))[1:])))
+    if scatter > LARGEST_UNCERTAINTY:
+        return TurnFit(None, None, None, gain, mean_rate, arc, "the accelerometer does not follow the table angle")
+    return TurnFit(found[0], found[1], found[2], gain, mean_rate, arc)
+
+
+def _gain(recording: Recording, rate: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+    if recording.gyroscope is None or rate is None:
+        return None
+    keep = recording.sound
+    rate, gyro = rate[keep], recording.gyroscope[keep]
+    changing = float(np.std(rate)) > CHANGING * float(np.max(np.abs(rate), initial=0.0))
+    if changing:
+        rate, gyro = rate - np.mean(rate), gyro - np.mean(gyro, axis=0)
+    power = float(rate @ rate)
+    if power <= len(rate) * (SLOWEST_DPS if changing else LARGEST_BIAS_DPS) ** 2:
+        return None
+    gain = rate @ gyro / power
+    other = int(np.argmax(np.abs(gain)))
+    alike = abs(gain[other]) * np.sqrt(power / max(float(gyro[:, other] @ gyro[:, other]), 1e-30))
+    return np.asarray(gain) if alike >= ALIKE else None
+
+
+def _unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(vector / max(float(np.linalg.norm(vector)), 1e-30))

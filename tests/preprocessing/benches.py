@@ -1,0 +1,82 @@
+"""Turns of a unit on benches of any mounting, by rotation matrices and nothing of the package's own kinematics."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from pipeline.preprocessing.bench import signed_axis
+from pipeline.records import Recording
+
+INTERVAL_S = 0.12
+BIAS = {"accelerometer": np.array([0.03, -0.02, 0.05]), "gyroscope": np.array([1.2, -0.8, 0.5])}
+K = {
+    "accelerometer": np.array([[1.01, 0.004, -0.006], [0.002, 0.99, 0.005], [-0.003, 0.007, 1.02]]),
+    "gyroscope": np.array([[0.99, 0.006, -0.002], [-0.004, 1.015, 0.003], [0.005, -0.001, 1.004]]),
+}
+USUAL_UP = {"x": "+z", "y": "+z", "z": "+x"}
+# Rests at 24 angles for the accelerometer, turns both ways between rests for the gyroscope.
+STEPS = np.repeat(np.arange(0.0, 361.0, 15.0), 12)
+RATE = np.concatenate([np.zeros(40), *[np.append(np.full(50, r), np.zeros(20)) for r in (60.0, -60.0)]])
+
+
+@dataclass(frozen=True)
+class Setup:
+    """How a turn is mounted: what points up where the table shows ``zero``, and which way the angle counts.
+
+    Attributes
+    ----------
+    seat : (3,) array, deg
+        Rotation of the unit in its seat, body frame.
+    """
+
+    axis: str
+    up: str = ""
+    sense: int = 1
+    zero: float = 0.0
+    seat: Any = (0.0, 0.0, 0.0)
+
+    def recording(self, role: str, seed: int = 0, noise: float = 1.0) -> Recording:
+        """Return the turn as it is logged."""
+        turned = STEPS if role == "accelerometer" else np.cumsum(RATE) * INTERVAL_S
+        rate = np.zeros_like(STEPS) if role == "accelerometer" else RATE
+        axis, up = signed_axis(f"+{self.axis}"), signed_axis(self.up or USUAL_UP[self.axis])
+        seat = Rotation.from_rotvec(np.radians(self.seat)).inv()
+        # Seen from the body, up turns backwards about the axis while the body turns forwards.
+        force = seat.apply(Rotation.from_rotvec(-np.radians(turned)[:, None] * axis).apply(up))
+        omega = seat.apply(rate[:, None] * axis)
+        rng = np.random.default_rng([seed, *map(ord, role[0] + self.axis)])
+        sizes = {"accelerometer": 8e-4, "gyroscope": 0.01}
+        read = {
+            s: BIAS[s] + v @ K[s].T + noise * sizes[s] * rng.standard_normal(v.shape)
+            for s, v in (("accelerometer", force), ("gyroscope", omega))
+        }
+        return Recording(
+            f"{'accel' if role == 'accelerometer' else 'gyro'}_{self.axis}",
+            role,
+            self.axis,
+            (np.arange(len(turned)) * 120_000_000).astype(np.int64),
+            **read,
+            table_angle=self.sense * turned + self.zero,
+            table_rate=self.sense * rate,
+            source={"file": f"{'accel' if role == 'accelerometer' else 'gyro'}_{self.axis}.csv"},
+        )
+
+    def settings(self) -> dict[str, Any]:
+        """Return the entry of the recording in the procedure that states the mounting."""
+        return {"up": self.up or None, "sense": self.sense, "zero_deg": self.zero}
+
+
+def recordings_of(setups: dict[str, Setup], seed: int = 0, **both: Any) -> list[Recording]:
+    """Return turns for both sensors, each about every axis, mounted as ``setups`` say of the axis or as usual."""
+    roles = ("accelerometer", "gyroscope")
+    return [setups.get(a, Setup(a)).recording(role, seed, **both) for role in roles for a in "xyz"]
+
+
+def settings_of(recordings: list[Recording], setups: dict[str, Setup] | None = None, **table: Any) -> dict[str, Any]:
+    """Return a configuration that states the mounting of some axes."""
+    entries = {r.name: (setups or {}).get(r.axis or "", Setup(r.axis or "x")).settings() for r in recordings}
+    return {"procedure": {"recordings": entries if setups else {r.name: {} for r in recordings}}, "table": table}

@@ -1,0 +1,238 @@
+"""The mounting of each turn is found, refused where it is otherwise than stated, and applied where it is stated."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+import pytest
+from benches import BIAS, INTERVAL_S, Setup, recordings_of, settings_of
+from benches import K as TRUE_K
+from scipy.spatial.transform import Rotation
+
+from pipeline.estimation.accelerometer import reference_least_squares as accelerometer_fit
+from pipeline.estimation.gyroscope import reference_least_squares as gyroscope_fit
+from pipeline.formats.ingest_error import IngestError
+from pipeline.model.kinematics import reference_motion
+from pipeline.preprocessing.checks import check_recordings
+from pipeline.preprocessing.departures import words
+from pipeline.preprocessing.mounting import check_mounting
+from pipeline.records import Recording
+
+LEVEL = [
+    (a, s + u) for a in "xyz" for u in "xyz" for s in "+-" if u != a
+]  # 12 faces; with both senses, 24 orientations
+SHEET = {"noise_density": 4e-4, "bias_wander": 1e-4, "wander_time_s": 100.0}
+ZEROS = (0.0, 37.0, -151.0)
+FITS = {"accelerometer": accelerometer_fit, "gyroscope": gyroscope_fit}
+
+
+@pytest.mark.parametrize(("axis", "up"), LEVEL)
+def test_every_stated_orientation_sense_and_zero_gives_the_true_sensor(axis: str, up: str) -> None:
+    for sense, zero in product((1, -1), ZEROS):
+        setups = {axis: Setup(axis, up, sense, zero)}
+        recordings = recordings_of(setups)
+        checked = check_mounting(recordings, settings_of(recordings, setups))
+        for sensor, sigma in (("accelerometer", 8e-4), ("gyroscope", 0.01)):
+            own = [r for r in checked if r.role == sensor]
+            truth, reading = (np.concatenate(rows) for rows in zip(*[_pair(r, sensor) for r in own], strict=True))
+            design = np.column_stack([np.ones(len(truth)), truth])
+            found = np.linalg.lstsq(design, reading, rcond=None)[0]
+            error = found - np.vstack([BIAS[sensor], TRUE_K[sensor].T])
+            standard = sigma * np.sqrt(np.diag(np.linalg.inv(design.T @ design)))[:, None]
+            assert np.all(np.abs(error) < 5.0 * standard)
+
+
+def _pair(recording: Recording, sensor: str) -> tuple[np.ndarray, np.ndarray]:
+    motion = reference_motion(recording)
+    reading = recording.reading(sensor)
+    assert motion is not None
+    assert reading is not None
+    return (motion.specific_force if sensor == "accelerometer" else motion.angular_rate), reading
+
+
+def test_a_stated_bench_calibrates_within_the_expanded_uncertainty() -> None:
+    setups = {"x": Setup("x", "-y", -1, 37.0), "y": Setup("y", "+x", 1, -151.0), "z": Setup("z", "-y", -1, 12.5)}
+    sensors = {"accelerometer": SHEET, "gyroscope": SHEET | {"noise_density": 5e-3, "bias_wander": 3e-3}}
+    outside = 0
+    for seed in range(10):
+        recordings = recordings_of(setups, seed)
+        checked = check_mounting(recordings, settings_of(recordings, setups))
+        for sensor, fit in FITS.items():
+            table = {"gravity_g": 1.0, "latitude_deg": None, "azimuth_deg": None}
+            found = fit.fit(checked, None, {"table": table, "method": {"as_printed": False}, "sensor": sensors})
+            error = found.matrix - np.linalg.inv(TRUE_K[sensor])
+            expanded = np.array(found.to_json()["expanded_uncertainty"]["matrix"])
+            outside += int(np.sum(np.abs(error) > expanded))
+    assert outside <= 18  # of 180, each with probability 0.05: 18 or fewer with 0.998
+
+
+@pytest.mark.parametrize(("axis", "up"), LEVEL)
+def test_what_is_found_is_refused_with_the_setting_that_describes_it(axis: str, up: str) -> None:
+    for sense, zero in product((1, -1), (0.0, 37.0)):
+        setup = Setup(axis, up, sense, zero)
+        recordings = recordings_of({axis: setup})
+        if (sense, zero) == (1, 0.0) and up == {"x": "+z", "y": "+z", "z": "+x"}[axis]:
+            assert not [n for r in check_mounting(recordings, settings_of(recordings)) for n in r.notes]
+            continue
+        with pytest.raises(IngestError) as caught:
+            check_mounting(recordings, settings_of(recordings))
+        assert caught.value.file == f"accel_{axis}.csv"
+        assert f"likewise refused: gyro_{axis}" in caught.value.message
+        entries: dict[str, dict[str, Any]] = {r.name: {} for r in recordings}
+        for setting in caught.value.message.split("set ")[1].split(" (")[0].split(", "):
+            if setting.startswith("procedure."):
+                name, key, value = setting.removeprefix("procedure.recordings.").replace("=", ".", 1).split(".", 2)
+                entries[name][key] = value if key == "up" else float(value)
+        checked = check_mounting(recordings, {"procedure": {"recordings": entries}, "table": {}})
+        for before, after in zip(recordings_of({}), checked, strict=True):
+            motion, right = reference_motion(after), reference_motion(setup_free(before, setup, recordings))
+            assert motion is not None
+            assert right is not None
+            assert np.max(np.abs(motion.specific_force - right.specific_force)) < np.radians(1.2)
+
+
+def setup_free(recording: Recording, setup: Setup, logged: list[Recording]) -> Recording:
+    """Return the recording with the angle of the convention by the exact settings."""
+    if recording.axis != setup.axis:
+        return recording
+    own = next(r for r in logged if r.name == recording.name)
+    return check_mounting([own], {"procedure": {"recordings": {own.name: setup.settings()}}, "table": {}})[0]
+
+
+def test_the_table_states_sense_and_zero_for_all_recordings() -> None:
+    setups = {a: Setup(a, sense=-1, zero=20.0) for a in "xyz"}
+    recordings = recordings_of(setups)
+    with pytest.raises(IngestError, match=r"counted left-handed about x; .*table\.sense=-1|sense=-1"):
+        check_recordings(recordings, settings_of(recordings))
+    checked = check_recordings(recordings, settings_of(recordings, sense=-1, zero_deg=20.0))
+    assert {n.code for r in checked for n in r.notes} == {"N-MOUNTING"}
+    for usual, found in zip(recordings_of({}), checked, strict=True):
+        assert np.allclose(usual.table_angle, found.table_angle)
+        assert np.allclose(usual.table_rate, found.table_rate)
+
+
+def test_another_turn_axis_is_refused_by_gravity_and_by_the_gyroscope() -> None:
+    recordings = recordings_of({})
+    exchanged = [replace(r, axis={"x": "y", "y": "x"}.get(str(r.axis), r.axis)) for r in recordings]
+    with pytest.raises(
+        IngestError, match=r"said to turn about y, and gravity turns about x.*accel_x\.axis=x"
+    ) as caught:
+        check_mounting(exchanged, settings_of(exchanged))
+    assert caught.value.fault == "wrong_axis"
+    blind = [replace(r, accelerometer=None) for r in exchanged if r.role == "gyroscope"]
+    with pytest.raises(IngestError, match="said to turn about y, and the gyroscope turns about x"):
+        check_mounting(blind, settings_of(blind))
+
+
+def test_a_unit_turned_as_a_whole_is_refused_with_the_axis_map_that_is_right() -> None:
+    recordings = [_mapped(r, [[0, -1, 0], [1, 0, 0], [0, 0, 1]]) for r in recordings_of({})]
+    with pytest.raises(IngestError, match=r"or sensor\.axis_map=\[-y,\+x,\+z\]"):
+        check_mounting(recordings, settings_of(recordings))
+
+
+def _mapped(recording: Recording, accelerometer: Any, gyroscope: Any = None) -> Recording:
+    """Return a recording as a sensor reads it whose axes are turned or mirrored by a signed permutation."""
+    maps = np.array(accelerometer, float), np.array(accelerometer if gyroscope is None else gyroscope, float)
+    force, rate = recording.accelerometer, recording.gyroscope
+    assert force is not None
+    assert rate is not None
+    return replace(recording, accelerometer=force @ maps[0].T, gyroscope=rate @ maps[1].T)
+
+
+STRAIGHT, MIRROR_Z, REFLECTION = np.eye(3), np.diag([1.0, 1.0, -1.0]), -np.eye(3)
+
+
+@pytest.mark.parametrize(
+    ("accelerometer", "gyroscope", "says"),
+    [
+        (MIRROR_Z, STRAIGHT, r"the accelerometer is mirrored: set sensor\.accelerometer\.axis_map=\[\+x,\+y,-z\]"),
+        (STRAIGHT, MIRROR_Z, r"the gyroscope is mirrored: set sensor\.gyroscope\.axis_map=\[\+x,\+y,-z\]"),
+        (STRAIGHT, REFLECTION, r"the gyroscope is mirrored: set sensor\.gyroscope\.axis_map=\[-x,-y,-z\]"),
+        (MIRROR_Z, MIRROR_Z, r"both sensors are mirrored: set sensor\.axis_map=\[\+x,\+y,-z\]"),
+        (REFLECTION, REFLECTION, r"both sensors are mirrored: set sensor\.axis_map=\[-x,-y,-z\]"),
+        (STRAIGHT, np.diag([-1.0, -1.0, 1.0]), r"read in other axes: set sensor\.gyroscope\.axis_map=\[-x,-y,\+z\]"),
+        (REFLECTION, STRAIGHT, r"sensor\.accelerometer\.axis_map=\[-x,-y,-z\]"),
+    ],
+)
+def test_frames_that_contradict_each_other_are_refused_with_the_map_that_is_right(
+    accelerometer: np.ndarray, gyroscope: np.ndarray, says: str
+) -> None:
+    recordings = [_mapped(r, accelerometer, gyroscope) for r in recordings_of({})]
+    with pytest.raises(IngestError, match=says):
+        check_mounting(recordings, settings_of(recordings))
+
+
+def test_by_hand_gravity_and_the_gyroscope_belong_in_one_frame() -> None:
+    recording = _by_hand()
+    assert check_mounting([recording], {}) == [recording]
+    assert check_mounting([_mapped(recording, -np.eye(3), np.eye(3))], {})  # gravity's opposite turns alike
+    with pytest.raises(IngestError, match=r"gyroscope is mirrored: .*sensor\.gyroscope\.axis_map=\[\+x,\+y,-z\]"):
+        check_mounting([_mapped(recording, np.eye(3), MIRROR_Z)], {})
+    with pytest.raises(IngestError, match=r"contradict each other: in \d+ of 1\d moves"):
+        check_mounting([_mapped(recording, -np.eye(3))], {})
+
+
+def _by_hand() -> Recording:
+    """Return rests between moves of 75 deg about random axes."""
+    rng = np.random.default_rng(3)
+    axes = rng.standard_normal((12, 3))
+    rest, move = np.zeros((100, 3)), np.ones((50, 1))
+    turns = [75.0 * move * a / np.linalg.norm(a) for a in axes]
+    rate = np.concatenate([rest, *[part for turn in turns for part in (turn, rest)]])
+    attitude, force = Rotation.identity(), []
+    for w in rate:
+        attitude *= Rotation.from_rotvec(np.radians(w) * 0.02)
+        force.append(attitude.inv().apply([0.0, 0.0, 1.0]))
+    time = (np.arange(len(rate)) * 20_000_000).astype(np.int64)
+    noisy = np.array(force) + 1e-3 * rng.standard_normal(rate.shape)
+    return Recording("recording", "rests", None, time, noisy, rate + 0.05 * rng.standard_normal(rate.shape))
+
+
+def test_a_vertical_turn_axis_is_stated_or_refused() -> None:
+    upright = {a: Setup(a, f"{s}{a}") for a, s in zip("xyz", "+-+", strict=True)}
+    level = recordings_of({})[:3]
+    recordings = level + recordings_of(upright)[3:]
+    with pytest.raises(IngestError, match=r"gravity stays along body \+x .*gyro_x\.up=\+x, .*gyro_y\.up=-y"):
+        check_mounting(recordings, settings_of(recordings))
+    entries = {r.name: {"up": upright[str(r.axis)].up} if r.role == "gyroscope" else {} for r in recordings}
+    checked = check_mounting(recordings, {"procedure": {"recordings": entries}, "table": {}})
+    for recording in checked[3:]:
+        force, reading = _pair(recording, "accelerometer")
+        assert np.max(np.abs(reading - BIAS["accelerometer"] - force @ TRUE_K["accelerometer"].T)) < 5 * 8e-4
+    with pytest.raises(IngestError, match="about a vertical axis gravity does not turn"):
+        check_mounting(recordings_of(upright)[:1], {"procedure": {"recordings": {"accel_x": {"up": "+x"}}}})
+
+
+def test_what_a_short_arc_does_not_tell_is_said_and_not_guessed() -> None:
+    recording = Setup("x", "+z").recording("accelerometer")
+    assert recording.table_angle is not None
+    short = recording.select(recording.table_angle < 40.0)
+    note = check_mounting([short], settings_of([short]))[0].notes[0]
+    assert note.code == "N-MOUNTING"
+    assert "taken as stated: the table angle covers 30 deg only" in note.detail
+
+
+@pytest.mark.parametrize("rate_dps", [0.5, 1.0, 2.0, 5.0])
+def test_a_slow_turn_is_followed_although_the_bias_is_as_large_as_its_rate(rate_dps: float) -> None:
+    rests = np.zeros(25)  # 3 s
+    rate = np.concatenate([rests, np.full(round(360.0 / rate_dps / INTERVAL_S), rate_dps), rests])
+    bias = (-1.292, -1.973, -0.348)  # deg/s, MPU6050 (2) of Sudsanguan 2019, table 5.16
+    noise = 0.01 * np.random.default_rng(7).standard_normal((len(rate), 3))
+    reading = bias + np.outer(rate, TRUE_K["gyroscope"][:, 1]) + noise
+    time = (np.arange(len(rate)) * 120_000_000).astype(np.int64)
+    recording = Recording("gyro_y", "gyroscope", "y", time, gyroscope=reading, table_rate=rate)
+    assert check_mounting([recording], {})
+    if rate_dps > 1.0:
+        with pytest.raises(IngestError, match="said to turn about z, and the gyroscope turns about y"):
+            check_mounting([replace(recording, axis="z")], {})
+
+
+def test_a_bench_is_told_in_words() -> None:
+    from pipeline.preprocessing.bench import Bench  # noqa: PLC0415
+
+    assert words(Bench("x", "-y", -1, 37.04)) == (
+        "body -y up at a table angle of 37.0 deg, the angle counted left-handed about x"
+    )
