@@ -139,4 +139,4 @@ def test_a_missing_file_is_an_error_of_its_own(tmp_path: Path) -> None:
 
 def test_all_numbers_of_the_table_have_a_case() -> None:
     """Number 42 is a model's matter: without a temperature that varies its effects are not observable."""
-    assert {n[:2] for n in CASES} | {"42"} == {f"{i:02d}" for i in range(1, 45)}
+    assert {n[:2] for n in CASES} | {"42"} == {f"{i:02d}" for i in range(1, 49)}
