@@ -35,15 +35,20 @@ def read_summary(results: Path) -> list[dict[str, str]]:
 def findings_of(rows: Sequence[Mapping[str, Any]]) -> list[Finding]:
     """Return the verdicts in rows as of ``summary.csv``."""
     return [
-        Finding(row["unit"], sensor, row[f"{sensor}_verdict"], [n for n in row[f"{sensor}_selected"].split(";") if n])
+        Finding(
+            row["unit"],
+            sensor,
+            row[f"{sensor}_verdict"],
+            [n for n in (row[f"{sensor}_selected"] or "").split(";") if n],
+        )
         for row in rows
         for sensor in SENSORS
         if row.get(f"{sensor}_verdict")
     ]
 
 
-def verdict_lines(findings: Sequence[Finding]) -> list[str]:
-    """Return one line for each effect that is missing, then one for each other verdict but ``nothing_missing``."""
+def verdict_groups(findings: Sequence[Finding]) -> list[tuple[str, list[str]]]:
+    """Return units by the effect that they miss, then by each other verdict but ``nothing_missing``."""
     missing: dict[str, list[str]] = {}
     others: dict[str, list[str]] = {}
     for unit, sensor, verdict, selected in findings:
@@ -52,10 +57,17 @@ def verdict_lines(findings: Sequence[Finding]) -> list[str]:
                 missing.setdefault(f"{sensor}, {effect} missing", []).append(unit)
         elif verdict != "nothing_missing":
             others.setdefault(f"{sensor}, {verdict.replace('_', ' ')}", []).append(unit)
-    return [f"{what}: {_named(units)}" for group in (missing, others) for what, units in sorted(group.items())]
+    return [*sorted(missing.items()), *sorted(others.items())]
 
 
-def commands_of(part: Mapping[str, Any], sensor: str, unit: str, settings: Mapping[str, Any], results: str) -> JSON:
+def verdict_lines(findings: Sequence[Finding]) -> list[str]:
+    """Return ``verdict_groups`` as lines."""
+    return [f"{what}: {_named(units)}" for what, units in verdict_groups(findings)]
+
+
+def commands_of(
+    part: Mapping[str, Any], sensor: str, unit: str, settings: Mapping[str, Any], results: str = RESULTS
+) -> JSON:
     """Return the commands that add what a diagnosis selected: ``add`` for every run, ``once`` for one; else nothing.
 
     Parameters
@@ -77,8 +89,10 @@ def commands_of(part: Mapping[str, Any], sensor: str, unit: str, settings: Mappi
     }
 
 
-def next_commands(findings: Sequence[Finding], settings: Mapping[str, Any], results: str = RESULTS) -> list[str]:
-    """Return the commands to continue with, each behind what it does.
+def next_commands(
+    findings: Sequence[Finding], settings: Mapping[str, Any], results: str = RESULTS
+) -> list[tuple[str, str]]:
+    """Return the commands to continue with, each behind what it is for.
 
     Parameters
     ----------
@@ -95,11 +109,11 @@ def next_commands(findings: Sequence[Finding], settings: Mapping[str, Any], resu
     lines = []
     if len(missing) == 1:
         ((unit, effects),) = missing.items()
-        lines.append(f"to add what is missing: {add_command(settings, unit, effects, results)}")
+        lines.append(("to add what is missing", add_command(settings, unit, effects, results)))
     elif missing:
-        lines.append(f"to add to each what it misses: {add_missing_command(settings, results)}")
+        lines.append(("to add to each what it misses", add_missing_command(settings, results)))
     if any(f.verdict != "nothing_missing" for f in findings):
-        lines.append(f"for the evidence: {explain_command(settings, results)}")
+        lines.append(("for the evidence", explain_command(settings, results)))
     return lines
 
 
@@ -122,7 +136,8 @@ def outcome(results: Path, settings: Mapping[str, Any], *, of_this_run: bool) ->
     lines = [f"units calibrated: {calibrated}{failed}; look at {results}/index.html", *verdict_lines(findings)]
     if of_this_run:
         lines += _dropped(results, settings)
-    return "\n".join([*lines, *next_commands(findings, settings, str(results.parent))]) + "\n"
+    lines += [f"{what}: {command}" for what, command in next_commands(findings, settings, str(results.parent))]
+    return "\n".join(lines) + "\n"
 
 
 def _dropped(results: Path, settings: Mapping[str, Any]) -> list[str]:

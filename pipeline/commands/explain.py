@@ -134,7 +134,8 @@ def _summary(documents: Mapping[str, JSON], told: Told) -> list[str]:
     lines = [f"{len(findings)} sensors of {len(documents)} units: {counted}", *verdict_lines(findings)]
     if told.failures:
         lines.append(f"failed: {', '.join(told.failures)}")
-    return [*lines, *[line for line in next_commands(findings, told.settings, told.results) if " explain " not in line]]
+    continued = next_commands(findings, told.settings, told.results)[:-1]  # the last is this command
+    return [*lines, *[f"{what}: {command}" for what, command in continued]]
 
 
 def _failed(unit: str, failure: Mapping[str, Any]) -> str:

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup
 
+from pipeline.outcome import findings_of, next_commands, verdict_groups
 from pipeline.records import SENSORS
-from pipeline.report.fleet_figures import FAR, fleet_figures
+from pipeline.report.fleet_figures import FAR, fleet_figures, fleet_values
 from pipeline.report.numbers import number
 from pipeline.report.summary import COLUMNS
 from pipeline.report.templating import template
@@ -42,6 +43,8 @@ def render(
     *,
     twins: Sequence[Sequence[str]] = (),
     statistics: JSON | None = None,
+    history: JSON | None = None,
+    settings: JSON | None = None,
 ) -> str:
     """Return ``index.html``.
 
@@ -60,12 +63,17 @@ def render(
         Files of several units that are the same, byte for byte, under different names.
     statistics : dict, optional
         As of ``fleet_statistics.fleet_statistics``.
+    history : dict, optional
+        As of ``history_section.runs_data``.
+    settings : dict, optional
+        Of the run, for the commands to continue with.
 
     Returns
     -------
     str
     """
     shown = [_cells(row) for row in rows]
+    findings = findings_of(rows)
     by_unit = {row["unit"]: cells for row, cells in zip(rows, shown, strict=True)}
     text: str = template("campaign.html").render(
         campaign=campaign,
@@ -85,7 +93,12 @@ def render(
         statistics=statistics if statistics and len(rows) >= FEWEST_UNITS else None,
         far_shown=FAR_SHOWN,
         causes=_causes(failures),
+        found=verdict_groups(findings),
+        commands=next_commands(findings, settings or {"campaign": campaign}),
+        history=history,
+        history_data=_script_data({"units": history["units"]}) if history else None,
         names=_script_data([row["unit"] for row in rows]),
+        values=_script_data(fleet_values(rows)),
         first=FIRST,
         sections=comparisons,
         verdicts=VERDICTS,

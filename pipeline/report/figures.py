@@ -64,7 +64,9 @@ def measurement_and_model(sensor: str, residual: Residual, sigma: NDArray[np.flo
         f"{100 * outside:.1f} % of the residuals lie outside the band; white noise alone puts 4.6 % there.{source}"
     )
     ratio = max(r / s for r, s in zip(rms(residual.error), sigma, strict=True))
-    finding = f"{name}: the residual is {number(ratio)} × the noise" + ("" if ratio > NOISE else ", so nothing is left")
+    finding = f"{name}: reading minus model is {number(ratio)} × the noise" + (
+        "" if ratio > NOISE else ", so nothing is left"
+    )
     svg = chart(
         f"{sensor}-{name}",
         f"{sensor}: measurement and model. {finding}",

@@ -32,6 +32,17 @@ def fleet_figures(rows: list[JSON]) -> list[Figure]:
     return [f for sensor in UNITS if (f := _errors(sensor, rows))]
 
 
+def fleet_values(rows: list[JSON]) -> dict[str, dict[str, list[str]]]:
+    """Return what each dot of the charts stands for, by chart and colour, in the order of the units."""
+    return {
+        f"fleet-{sensor}": {
+            colour: ["" if (v := r.get(f"{sensor}_{column}")) is None else f"{v:.6g}" for r in rows]
+            for colour, column in (("c3", "error_before"), ("c4", "noise_floor"), ("after", "error_after"))
+        }
+        for sensor in UNITS
+    }
+
+
 def _errors(sensor: str, rows: list[JSON]) -> Figure | None:
     def column(name: str) -> np.ndarray[Any, np.dtype[np.float64]]:
         values = [r.get(f"{sensor}_{name}") for r in rows]

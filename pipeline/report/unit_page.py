@@ -14,6 +14,7 @@ from pipeline.json_text import json_text
 from pipeline.model.inversion import compensate, linear_truth, sensor_effects
 from pipeline.model.kinematics import reference_motion
 from pipeline.model.user_effects import effect_of
+from pipeline.outcome import commands_of
 from pipeline.records import SENSORS, SensorCalibration
 from pipeline.report import figures, tables
 from pipeline.report.attitude_figure import attitude_over_time
@@ -71,16 +72,15 @@ def render(
     """
     pointed = (validation or {}).get("attitude") or {}
     ok, rests = calibration.get("status") == "ok", rests_logged(recordings)
+    sensors = [
+        _sensor(sensor, calibration, validation, diagnosis, recordings, settings, words or {}) for sensor in SENSORS
+    ]
     page: str = template("unit.html").render(
         calibration=calibration,
         ok=ok,
         passed=verdict(calibration, validation),
         checks=checks(validation),
-        sensors=[
-            _sensor(sensor, calibration, validation, diagnosis, recordings, settings, words or {}) for sensor in SENSORS
-        ]
-        if ok
-        else [],
+        sensors=sorted(sensors, key=_order) if ok else [],
         attitude=pointed if pointed.get("curve") else None,
         attitude_figure=attitude_over_time(pointed),
         moves=turned if (turned := (validation or {}).get("gravity_direction") or {}).get("moves") else None,
@@ -144,7 +144,13 @@ def _sensor(  # noqa: PLR0917  (the inputs of the page, passed on)
         "left_by_method": _left_by_method(held_out, found),
         "verdict": VERDICTS.get(found.get("verdict", ""), "There is no diagnosis."),
         "words": words.get(sensor) or [],
+        "commands": commands_of(found, sensor, str(calibration.get("unit")), settings.get("run") or {}),
     }
+
+
+def _order(sensor: JSON) -> int:
+    """Return the place of a sensor: what is missing or in doubt before what is explained, and that before none."""
+    return 2 if sensor["part"] is None else int(sensor["diagnosis"].get("verdict") == "nothing_missing")
 
 
 def _left_by_method(held_out: JSON, found: JSON) -> bool:

@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.atomic import write_atomically
-from pipeline.history import record, unit_state
+from pipeline.history import of_units, record, unit_state
 from pipeline.report.campaign_page import render
 from pipeline.report.comparison_page import section
 from pipeline.report.comparison_units import unit_figures
 from pipeline.report.fleet_statistics import fleet_statistics, parameters
 from pipeline.report.fleet_table import write_parameters
+from pipeline.report.history_section import runs_data, times_of, with_history
 from pipeline.report.summary import summary_row, write_summary
 from pipeline.stages.batch import FAILED, parse_job, read_json, write_json
 
@@ -72,15 +73,33 @@ def main(argv: Sequence[str]) -> int:
     write_summary(job.output / "summary.csv", rows)
     write_json(job.output / "failures.json", failures)
     write_parameters(job.output / "parameters.parquet", rows, fitted)
-    record(job.output, states, job.run["run"])
+    entries = record(job.output, states, job.run["run"])
+    _publish_histories(job.output, entries)
     statistics = fleet_statistics(rows, fitted)
     write_json(job.output / "fleet.json", statistics)
     sections = [section(c, figures, f"comparison-{i}") for i, c in enumerate(job.run["compare"], 1)]
     page = render(
-        job.run["campaign"], rows, failures, sections, job.run["page"], twins=same_files(inputs), statistics=statistics
+        job.run["campaign"],
+        rows,
+        failures,
+        sections,
+        job.run["page"],
+        twins=same_files(inputs),
+        statistics=statistics,
+        history=runs_data(entries, job.run["run"]),
+        settings=job.run["run"],
     )
     write_atomically(job.output / "index.html", page)
     return 0
+
+
+def _publish_histories(results: Path, entries: Sequence[dict[str, Any]]) -> None:
+    """Put into the page of each unit that several runs have changed what they changed."""
+    times = times_of(entries)
+    for unit, history in of_units(entries).items():
+        page = results / "reports" / f"{unit}.html"
+        if len(history) > 1 and page.is_file():
+            write_atomically(page, with_history(page.read_text(encoding="utf-8"), history, times))
 
 
 def same_files(inputs: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[list[str]]:

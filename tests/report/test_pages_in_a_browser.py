@@ -11,6 +11,7 @@ import pytest
 from playwright.sync_api import Browser, Page, sync_playwright
 
 from pipeline.report import campaign_page, unit_page
+from pipeline.report.history_section import runs_data
 from pipeline.report.shapes import Line
 from pipeline.report.svg import Panel, chart
 from pipeline.report.templating import asset
@@ -39,7 +40,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> Path:
     unit = build_unit()
     words = {"accelerometer": ["Quadratic nonlinearity is missing."], "gyroscope": []}
     (folder / "unit.html").write_text(unit_page.render(*unit.arguments, words=words))
-    (folder / "campaign.html").write_text(campaign_page.render("factory", fleet(), failures()))
+    (folder / "campaign.html").write_text(campaign_page.render("factory", fleet(), failures(), history=runs()))
     (folder / "chart.html").write_text(one_chart())
     return folder
 
@@ -63,6 +64,22 @@ def fleet() -> list[dict[str, Any]]:
             }
         rows.append(row if row["status"] == "ok" else {k: v for k, v in row.items() if "_" not in k})
     return rows
+
+
+def runs() -> dict[str, Any]:
+    """Return three runs: the first, one that adds an effect to two units, and one that drops it from one of them."""
+
+    def state(effects: list[str], error: float) -> dict[str, Any]:
+        part = {"effects": effects, "error": error, "floor": 0.0008, "verdict": "nothing_missing", "selected": []}
+        return {"status": "ok", "overrides": {}, "accelerometer": None, "gyroscope": part}
+
+    changes = [
+        {"U0": state([], 0.1), "U9": state([], 0.2), "U1": state([], 0.3)},
+        {"U0": state(["g_sensitivity"], 0.001), "U9": state(["g_sensitivity"], 0.1)},
+        {"U9": state([], 0.2)},
+    ]
+    entries = [{"run": i, "time": "2026-02-03T04:05:06", "units": u, "gone": []} for i, u in enumerate(changes, 1)]
+    return runs_data(entries, {"campaign": "factory"}) or {}
 
 
 def failures() -> list[dict[str, Any]]:
@@ -191,6 +208,45 @@ def test_a_dot_of_the_fleet_is_named(browser: Browser, pages: Path) -> None:
     page.keyboard.press("ArrowRight")
     page.keyboard.press("ArrowRight")
     assert page.locator(".readout b").first.text_content() == fleet()[1]["unit"]
+    page.context.close()
+
+
+def test_a_dot_tells_the_value_of_the_unit_and_not_a_rounded_coordinate(browser: Browser, pages: Path) -> None:
+    page = opened(browser, pages / "campaign.html")
+    picture = page.locator("svg[data-names]").first
+    picture.focus()
+    box, told = picture.bounding_box() or {}, set()
+    for share in np.linspace(0.2, 0.9, 8):
+        page.mouse.move(box["x"] + box["width"] * share, box["y"] + box["height"] * 0.3)
+        unit, row = page.locator(".readout b, .readout span").all_text_contents()[:2]
+        known = next(r for r in fleet() if r["unit"] == unit)
+        values = [f"{known[f'accelerometer_{k}']:.6g}" for k in ("error_before", "error_after", "noise_floor")]
+        assert row.split()[-2] in values
+        told.add(row.split()[-2])
+    assert len(told) > 2
+    page.context.close()
+
+
+def test_any_two_runs_are_compared_with_the_largest_change_first(browser: Browser, pages: Path) -> None:
+    page = opened(browser, pages / "campaign.html")
+
+    def rows() -> list[list[str]]:
+        return [r.split("\t") for r in page.locator("#runs-table tbody").inner_text().splitlines()]
+
+    same = ["nothing missing", "nothing missing"]
+    assert rows() == [["U9", "gyroscope", "0.1", "0.2", "125", "250", *same, "− g sensitivity"]]
+    page.locator("#run-a").select_option("1")
+    page.locator("#run-b").select_option("2")
+    assert [(r[0], r[2], r[3], r[8]) for r in rows()] == [
+        ("U0", "0.1", "0.001", "+ g sensitivity"),
+        ("U9", "0.2", "0.1", "+ g sensitivity"),
+    ]
+    page.locator("#run-b").select_option("1")
+    assert page.locator("#runs-said").text_content() == "No unit differs between these runs."
+    told = page.locator("#runs .card").inner_text()
+    assert "U9: run 3 no longer has gyroscope.g_sensitivity, which run 2 had." in told
+    assert f"python -m pipeline add factory U9 gyroscope.g_sensitivity --results {pages.parent}" in told
+    assert left_alone(page, pages / "campaign.html")
     page.context.close()
 
 

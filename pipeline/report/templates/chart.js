@@ -9,8 +9,13 @@ const scaleOf = (element) => {
 };
 const place = (axis, value, range = axis.view) => axis.start + (value - range.low) / (range.high - range.low) * (axis.stop - axis.start);
 const valueAt = (axis, at, range = axis.view) => range.low + (at - axis.start) / (axis.stop - axis.start) * (range.high - range.low);
-const plain = (value) => value === 0 ? "0" : Math.abs(value) >= 1e-4 && Math.abs(value) < 1e6 ? String(+value.toPrecision(4)) : value.toExponential(2);
-const say = (axis, value) => plain(axis.kind === "log" ? 10 ** value : value).replace("-", "\u2212");
+const plain = (value, digits = 4) => value === 0 ? "0" : Math.abs(value) >= 1e-4 && Math.abs(value) < 1e6 ? String(+value.toPrecision(digits)) : value.toExponential(Math.min(digits - 1, 2));
+const say = (axis, value, digits) => plain(axis.kind === "log" ? 10 ** value : value, digits).replace("-", "\u2212");
+const told = (axis, value) => { // with the digits that a coordinate of a tenth of a pixel holds
+  const step = (axis.full.high - axis.full.low) / Math.abs(axis.stop - axis.start) / SUBDIVISION;
+  const share = axis.kind === "log" ? Math.LN10 * step : step / Math.abs(value);
+  return share >= 1 ? "0" : say(axis, value, Math.min(4, Math.max(1, Math.ceil(-Math.log10(share)))));
+};
 
 function ticksOf(axis, count) {
   const { low, high } = axis.view, out = [];
@@ -47,7 +52,7 @@ function pointsOf(path) { // [x, low, high] of each vertex in drawing units; of 
 }
 
 function prepare(svg) {
-  const figure = svg.closest("figure"), x = scaleOf(svg), names = window.chartNames?.[svg.dataset.names];
+  const figure = svg.closest("figure"), x = scaleOf(svg), names = window.chartNames?.[svg.dataset.names], values = window.chartValues?.[svg.getAttribute("aria-labelledby").split("-t ")[0]];
   const panels = [...svg.querySelectorAll(".panel")].map((group) => ({ group, y: scaleOf(group), layers: group.querySelector(".layers"), grid: group.querySelector(".grid"), ticks: group.querySelector(".ticks") }));
   const xTicks = svg.querySelector(":scope > .ticks"), xTop = +xTicks.firstElementChild?.getAttribute("y");
   const readout = document.createElement("div"), cursor = document.createElementNS(SVG, "path"), frame = document.createElementNS(SVG, "rect");
@@ -110,14 +115,14 @@ function prepare(svg) {
     if (!found.length) return hide();
     if (names) found = [found.reduce((a, b) => a[1].far <= b[1].far ? a : b)];
     const first = found[0][1].point ?? found[0][1].range, value = valueAt(x, first[0] / SUBDIVISION, x.full);
-    const read = (v) => say(panel.y, valueAt(panel.y, v / SUBDIVISION, panel.y.full));
+    const read = (v) => told(panel.y, valueAt(panel.y, v / SUBDIVISION, panel.y.full));
     const head = document.createElement("b");
-    head.textContent = names ? names[Math.round(value) - 1] : `${x.label}: ${say(x, value)}`;
+    head.textContent = names ? names[Math.round(value) - 1] : `${x.label}: ${told(x, value)}`;
     const rows = found.map(([colour, { point, range }]) => {
       const row = document.createElement("span"), dot = document.createElement("i");
       dot.className = colour;
       const name = figure.querySelector(`.legend .${colour}`)?.parentNode.textContent.trim() ?? "";
-      const numbers = point ? read(point[1]) + (range ? ` (${read(Math.max(range[1], range[2]))} to ${read(Math.min(range[1], range[2]))})` : "") : `${read(Math.max(range[1], range[2]))} to ${read(Math.min(range[1], range[2]))}`;
+      const numbers = values ? (values[colour] ?? values.after)[Math.round(value) - 1] : point ? read(point[1]) + (range ? ` (${read(Math.max(range[1], range[2]))} to ${read(Math.min(range[1], range[2]))})` : "") : `${read(Math.max(range[1], range[2]))} to ${read(Math.min(range[1], range[2]))}`;
       row.append(dot, `${name} ${numbers} ${panel.y.unit}`);
       return row;
     });
