@@ -28,7 +28,7 @@ blocks of samples, so that its size does not depend on the number of samples.
 A finite recording does not tell exactly how large the noise is. The levels of wander, drift and parameters are factors
 of their variances with distributions of their own, and the interval is that of the mixture over ``LEVELS``:
 
-    wander      exp(2 s z), z standard normal, s = sqrt(correlation time / length of the static rest)
+    wander      exp(2 s z), z standard normal, s = sqrt(correlation time / length of static rest and fit)
     drift       z^2: its size is hardly known at all
     parameters  nu / chi^2(nu), nu the degrees of freedom of the calibration
 
@@ -66,6 +66,7 @@ LEVELS = np.array(
 )  # probabilities at which a level is taken
 WEIGHTS = np.diff(np.concatenate([[0.0], 0.5 * (LEVELS[1:] + LEVELS[:-1]), [1.0]]))
 BLOCKS = 40  # of all held-out recordings; wander within a block counts as noise that forgets in its correlation time
+NARROWEST = 0.5  # s of a wander of minutes, which may be of another kind: of a random walk (study, null_random_walk)
 FEW = 300  # samples by which white noise counts as known where no static recording tells it: some rests of seconds
 KNOWN = 1e4  # degrees of freedom from which on a level is known
 
@@ -115,7 +116,11 @@ class Inputs:
 
 
 def expected_rms_error(
-    calibration: SensorCalibration, judged: Sequence[Judged], noise: Noise, settings: Mapping[str, Any]
+    calibration: SensorCalibration,
+    judged: Sequence[Judged],
+    noise: Noise,
+    settings: Mapping[str, Any],
+    fitted_s: float = 0.0,
 ) -> tuple[float, float]:
     """Return the interval of the rms error, g or deg/s.
 
@@ -127,6 +132,8 @@ def expected_rms_error(
     noise : Noise
     settings : mapping
         Sections ``table`` (``rate_accuracy``) and ``sensor`` (``bias_wander``, ``wander_time_s``, ``counts_per_unit``).
+    fitted_s : float, s
+        Length of the recordings of the fit.
     """
     sheet = (settings.get("sensor") or {}).get(calibration.sensor) or {}
     step = 1.0 / float(sheet["counts_per_unit"]) if sheet.get("counts_per_unit") else 0.0
@@ -140,8 +147,9 @@ def expected_rms_error(
     form = _form(calibration.matrix, judged, inputs)
     if form.cumulants(np.ones((4, 1)))[0, 0] <= 0.0:
         return 0.0, 0.0
+    watched = noise.length + (fitted_s if _residual_wander(calibration) is not None else 0.0)
     low, high = (
-        quantile(form, *_levels(calibration, noise, upper=upper), 1.0 - TAIL if upper else TAIL)
+        quantile(form, *_levels(calibration, noise, watched, upper=upper), 1.0 - TAIL if upper else TAIL)
         for upper in (False, True)
     )
     return float(np.sqrt(low)), float(np.sqrt(high))
@@ -151,15 +159,21 @@ def _drift(calibration: SensorCalibration, noise: Noise, sheet: Mapping[str, Any
     """Return the variance of a drift beside the wander, per axis.
 
     It is what the data sheet expects of slow wander beyond the wander that was seen, and what the residuals of the fit,
-    which last longer than a rest, show beyond both; of these at most ``INFLATED`` times as much as is expected, since a
+    which last longer than a rest, show beyond it; of these at most ``INFLATED`` times as much as is expected, since a
     residual may hold an effect that is missing.
     """
     time, size = float(sheet.get("wander_time_s") or DEFAULT_TIME_S), float(sheet.get("bias_wander") or 0.0)
     slow = noise.wander**2 * min(1.0, noise.correlation_time / time)
     expected = np.maximum(noise.wander**2, size**2)
+    found = _residual_wander(calibration)
+    fitted = noise.wander**2 if found is None else np.minimum(found**2, INFLATED**2 * expected)
+    return np.asarray(np.maximum(size**2 - slow, 0.0) + np.maximum(fitted - noise.wander**2, 0.0))
+
+
+def _residual_wander(calibration: SensorCalibration) -> Values | None:
+    """Return the wander that the residuals of the fit show, (3,), or None where its method does not tell it."""
     found = [s.details["bias_wander"] for s in calibration.stages if "bias_wander" in s.details]
-    fitted = np.minimum(np.square(found[-1]), INFLATED**2 * expected) if found else expected
-    return np.asarray(np.maximum(size**2 - slow, 0.0) + np.maximum(fitted - expected, 0.0))
+    return np.array(found[-1]) if found else None
 
 
 def _covariance(calibration: SensorCalibration, table: Mapping[str, Any]) -> Values:
@@ -242,7 +256,7 @@ def _weights(M: Values, judged: Judged, inputs: Inputs) -> Values:
     return np.asarray((1.0 - g) * u[:, :, None] * u[:, None, :] + g * np.eye(3))
 
 
-def _levels(calibration: SensorCalibration, noise: Noise, *, upper: bool) -> tuple[Values, Values]:
+def _levels(calibration: SensorCalibration, noise: Noise, watched: float, *, upper: bool) -> tuple[Values, Values]:
     """Return the levels that are mixed, (4, k), and their probabilities (k,).
 
     At the lower end drift and errors of parameters are left out, and wander is as little known as a data sheet tells
@@ -252,8 +266,10 @@ def _levels(calibration: SensorCalibration, noise: Noise, *, upper: bool) -> tup
 
     z = ndtri(LEVELS)
     width = SHEET_WIDTH
-    if upper and noise.length > 0.0:
-        width = float(np.clip(np.sqrt(noise.correlation_time / noise.length), SHARPEST_WIDTH, SHEET_WIDTH))
+    if upper and watched > 0.0:
+        minutes = min(1.0, noise.correlation_time / DEFAULT_TIME_S)
+        width = np.sqrt(max(noise.correlation_time / watched, NARROWEST**2 * minutes))
+        width = float(np.clip(width, SHARPEST_WIDTH, SHEET_WIDTH))
     told = noise.source != "data_sheet"
     wander = np.exp(2.0 * width * z)
     drift = 2.0 * gammaincinv(0.5, LEVELS) if upper else np.zeros(len(z))

@@ -87,7 +87,9 @@ def validate(
         part["noise_floor"], part["vector_noise_floor"] = noise_floors(calibration, samples)
         part["reference_rms"] = float(np.sqrt(np.nanmean(np.concatenate([s.magnitude for s in samples]) ** 2)))
         part["steps"], part["notes"] = ladder(calibration, samples, other)
-        part["expected_rms_error"], lack = _expected(calibration, samples, noise, settings, other)
+        part["expected_rms_error"], lack = _expected(
+            calibration, samples, noise, settings, other, fitted_s=_length(calibration.sensor, recordings)
+        )
         part["notes"] += lack
     part["limits"], part["pass"] = check_limits(
         calibration, part, (settings.get("limits") or {}).get(calibration.sensor)
@@ -127,6 +129,8 @@ def _expected(
     noise: Noise,
     settings: Mapping[str, Any],
     other: SensorCalibration | None,
+    *,
+    fitted_s: float,
 ) -> tuple[list[float] | None, list[str]]:
     """Return the interval of the last step's rms error (None where an effect is left out), and notes on it.
 
@@ -136,7 +140,7 @@ def _expected(
     known = [p for p in parts if p is not None]
     if len(known) < len(parts):
         return None, []
-    low, high = expected_rms_error(calibration, known, noise, settings)
+    low, high = expected_rms_error(calibration, known, noise, settings, fitted_s)
     if not any(s.earth_left_out for s in samples):
         return [low, high], []
     note = (
@@ -144,6 +148,12 @@ def _expected(
         f"error allows for its {EARTH_RATE_DPS:.2g} deg/s"
     )
     return [max(low - EARTH_RATE_DPS, 0.0), high + EARTH_RATE_DPS], [note]
+
+
+def _length(sensor: str, recordings: Sequence[Recording]) -> float:
+    """Return how long the recordings of a sensor's fit last, s."""
+    own = [r.time for r in recordings if r.role in {sensor, "rests"} and r.reading(sensor) is not None and r.samples]
+    return float(sum(time[-1] - time[0] for time in own))
 
 
 def noise_floors(calibration: SensorCalibration, samples: Sequence[Samples]) -> tuple[float, float | None]:
