@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.diagnosis.words import in_words
 from pipeline.errors import InputError, MissingInputError
 from pipeline.history import read_history
+from pipeline.model.plausible import sentences
 from pipeline.outcome import Finding, commands_of, next_commands, read_summary, verdict_lines
 from pipeline.records import SENSORS
 
@@ -53,7 +54,11 @@ def main(argv: Sequence[str]) -> int:
     arguments = parser.parse_args(argv)
     told = find(arguments.campaign, arguments.units, arguments.results)
     documents = {unit: _read(file) for unit, file in told.files.items()}
-    texts = [explain(unit, document, _validation(told.files[unit]), told) for unit, document in documents.items()]
+    texts = [
+        explain(unit, document, _beside(told.files[unit], "validations"), told)
+        + _implausible(_beside(told.files[unit], "calibrations"))
+        for unit, document in documents.items()
+    ]
     texts += [_failed(unit, failure) for unit, failure in told.failures.items()]
     if len(texts) > 1:
         texts.insert(0, "\n".join(_summary(documents, told)) + "\n")
@@ -167,9 +172,14 @@ def _held_out(part: JSON | None) -> list[str]:
     return [f"As calibrated in this run, held-out motion errs by {error:.3g} {unit} rms of the magnitude{ratio}."]
 
 
-def _validation(diagnosis: Path) -> JSON:
-    """Return ``validations/<unit>.json`` of the same results; nothing where there is none."""
-    file = diagnosis.parent.parent / "validations" / diagnosis.name
+def _implausible(calibration: JSON) -> str:
+    """Return what in a calibration is far beyond the data sheet."""
+    return "".join(f"  {line}\n" for sensor in SENSORS for line in sentences(sensor, calibration.get(sensor)))
+
+
+def _beside(diagnosis: Path, folder: str) -> JSON:
+    """Return the unit's file in another folder of the same results; nothing where there is none."""
+    file = diagnosis.parent.parent / folder / diagnosis.name
     try:
         found: JSON = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, json.JSONDecodeError):

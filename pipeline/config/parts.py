@@ -76,8 +76,8 @@ READS: dict[str, tuple[str, ...]] = {
     "calibration": (
         "sensor.name",
         "sensor.axis_map",
-        "sensor.accelerometer.axis_map",
-        "sensor.gyroscope.axis_map",
+        "sensor.accelerometer",
+        "sensor.gyroscope",
         "table.name",
         "procedure.name",
         "method",

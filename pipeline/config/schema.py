@@ -40,6 +40,7 @@ class DataSheet(Section):
     axis_map: AxisMap | None = None
     repeatability_bias: NonNegative | None = None
     repeatability_scale_factor: NonNegative | None = None
+    accept_implausible: bool = False
 
 
 class Sensor(Section):

@@ -19,8 +19,8 @@ from pipeline.exports.sensors import (
     OF_THE_BIAS,
     STANDARD_GRAVITY,
     TEMPERATURES,
-    axes_of_readings,
     axis_by_axis,
+    before_use,
     bias_polynomial,
     calibrations,
     comment,
@@ -56,7 +56,7 @@ def export(calibration: dict[str, Any], settings: dict[str, Any], validation: di
         "Axes x y z are those of the calibration: they must be the sensor's after its own orientation.",
         "ArduPilot takes a new gyroscope offset at each start unless INS_GYR_CAL is 0.",
         *(OF_THERMAL if thermal else []),
-        *axes_of_readings(calibration),
+        *before_use(calibration),
         *lost,
         *(f"With all of the calibration: {line}." for line in final_errors(validation)),
     ]

@@ -19,7 +19,7 @@ from pipeline.exports.sensors import (
     OF_THE_BIAS,
     STANDARD_GRAVITY,
     TEMPERATURES,
-    axes_of_readings,
+    before_use,
     bias_polynomial,
     calibrations,
     final_errors,
@@ -47,7 +47,7 @@ def export(calibration: dict[str, Any], settings: dict[str, Any], validation: di
     remarks = [
         f"Unit {calibration['unit']}: calibrated = MixingMatrix(T) raw + Bias(T), m/s^2 and rad/s, T in degC.",
         "Body frame x y z; Rt is the identity. At rest the upward axis reads + local gravity.",
-        *axes_of_readings(calibration),
+        *before_use(calibration),
         *(f"Left out: {line}." for line in missing(calibration)),
         *left_out(found, (*OF_THE_BIAS, SCALE)),
         *(f"To third order of the temperature, {s}: {SCALE}." for s, c in found.items() if SCALE in sensor_effects(c)),

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.exports.kalibr import noise, sampling_rate
-from pipeline.exports.sensors import STANDARD_GRAVITY, axes_of_readings, calibrations, final_errors, left_out, missing
+from pipeline.exports.sensors import STANDARD_GRAVITY, before_use, calibrations, final_errors, left_out, missing
 
 FILE_NAME = "basalt_imu.json"
 LOWER = ([0, 1, 2, 1, 2, 2], [0, 0, 0, 1, 1, 2])
@@ -32,7 +32,7 @@ def export(calibration: dict[str, Any], settings: dict[str, Any], validation: di
     remarks = [
         f"Unit {calibration['unit']}: a = (1 + S) raw - b, w = (1 + G) raw - b, m/s^2 and rad/s, in frame i;",
         "R_i_b takes body vectors (the table's axes) to frame i. At rest the upward axis reads +.",
-        *axes_of_readings(calibration),
+        *before_use(calibration),
         *left_out(found),
         *(f"The {line}." for line in final_errors(validation)),
     ]

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.exports.sensors import axes_of_readings, calibrations, comment, final_errors, forward, left_out
+from pipeline.exports.sensors import before_use, calibrations, comment, final_errors, forward, left_out
 
 FILE_NAME = "betaflight.txt"
 
@@ -28,7 +28,7 @@ def export(calibration: dict[str, Any], settings: dict[str, Any], validation: di
         f"Unit {calibration['unit']}: acc = raw - zero in whole counts, for a driver with {counts:g} counts per g.",
         "Axes x y z are those of the calibration: they must be the sensor's, before align_acc.",
         "The gyroscope is not in here: Betaflight takes its mean at start for its bias.",
-        *axes_of_readings(calibration),
+        *before_use(calibration),
         *left_out({"accelerometer": c}),
         f"The matrix of the accelerometer is left out: that leaves about {share:.2g} g at 1 g.",
         *(f"With all of the calibration: {line}." for line in final_errors(validation) if "accelerometer" in line),

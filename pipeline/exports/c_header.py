@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.exports import c_template as text
 from pipeline.exports.c_terms import fields_of, number, terms_of
-from pipeline.exports.sensors import axes_of_readings, bench_effects, calibrations, final_errors, missing
+from pipeline.exports.sensors import before_use, bench_effects, calibrations, final_errors, missing
 from pipeline.model.compensation import SMOOTHING_S
 from pipeline.model.compensation_stream import OF_THE_PAST, OF_THE_ROOM
 from pipeline.model.effects.base import REFERENCE_TEMPERATURE, Owner
@@ -120,7 +120,7 @@ def _remarks(
         f"Calibration of unit {document['unit']} (sensor {document['sensor']}).",
         "Units: g (9.80665 m/s^2), deg/s, degC, s. Frame: body, x y z. truth = matrix * (raw - bias - effects).",
         "At rest the upward axis reads + local gravity. Effects of mounting, table and timing are not in here.",
-        *axes_of_readings(document),
+        *before_use(document),
         "Use: imu_state state = {0}; then imu_update(&state, ...) for each sample of a sensor, in their order;",
         "or imu_compensate(...), which looks at one sample by itself.",
         "Define IMU_REAL as float before including this for single precision; the default is double.",

@@ -13,7 +13,7 @@ import numpy as np
 
 from pipeline.exports.sensors import (
     STANDARD_GRAVITY,
-    axes_of_readings,
+    before_use,
     calibrations,
     comment,
     final_errors,
@@ -35,7 +35,7 @@ def export(calibration: dict[str, Any], settings: dict[str, Any], validation: di
         "The bias of the accelerometer comes after the matrix.",
         "Body frame x y z, to which DLIO's extrinsics must refer; at rest the upward axis reads + local gravity.",
         *(f"Left out: {line}." for line in missing(calibration)),
-        *axes_of_readings(calibration),
+        *before_use(calibration),
         *left_out(found),
     ]
     intrinsics: dict[str, Any] = {}

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.exports.sensors import axes_of_readings, calibrations, comment, final_errors, left_out, missing
+from pipeline.exports.sensors import before_use, calibrations, comment, final_errors, left_out, missing
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -29,7 +29,7 @@ def export(calibration: dict[str, Any], settings: dict[str, Any], validation: di
     remarks = [
         f"Unit {calibration['unit']}: misalignment * ((uncalibrated - offset) .* sensitivity), g and deg/s.",
         "Body frame x y z; at rest the upward axis reads + local gravity. Include FusionMath.h before this.",
-        *axes_of_readings(calibration),
+        *before_use(calibration),
         *(f"Left out: {line}." for line in missing(calibration)),
         *left_out(found),
         *(f"The {line}." for line in final_errors(validation)),

@@ -11,7 +11,7 @@ from typing import Any
 
 from pipeline.exports.sensors import (
     STANDARD_GRAVITY,
-    axes_of_readings,
+    before_use,
     calibrations,
     comment,
     final_errors,
@@ -32,7 +32,7 @@ def export(calibration: dict[str, Any], settings: dict[str, Any], validation: di
         f"Unit {calibration['unit']}: a = SM raw - bias in m/s^2, SM row by row; the bias comes after the matrix.",
         "Body frame x y z; at rest the upward axis reads + local gravity.",
         "The gyroscope is not in this format: imu_calib takes its mean at start for its bias.",
-        *axes_of_readings(calibration),
+        *before_use(calibration),
         *left_out({"accelerometer": found}),
         *(f"The {line}." for line in final_errors(validation) if "accelerometer" in line),
     ]

@@ -14,7 +14,7 @@ import numpy as np
 
 from pipeline.exports.sensors import (
     STANDARD_GRAVITY,
-    axes_of_readings,
+    before_use,
     calibrations,
     final_errors,
     forward,
@@ -35,7 +35,7 @@ def export(calibration: dict[str, Any], settings: dict[str, Any], validation: di
     G = sensor_effects(gyroscope).get("g_sensitivity", np.zeros(9)).reshape(3, 3)
     notes = [
         f"Unit {calibration['unit']}: m/s^2 and rad/s, body frame x y z; at rest the upward axis reads +.",
-        *axes_of_readings(calibration),
+        *before_use(calibration),
         *left_out(found, ("g_sensitivity",)),
         *(f"The {line}." for line in final_errors(validation)),
     ]

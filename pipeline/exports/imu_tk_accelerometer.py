@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.exports.sensors import STANDARD_GRAVITY, axes_of_readings, calibrations, comment, final_errors, left_out
+from pipeline.exports.sensors import STANDARD_GRAVITY, before_use, calibrations, comment, final_errors, left_out
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -40,7 +40,7 @@ def triad(
         f"Unit {document['unit']}, {sensor}: T (misalignment), K (scale factors), B (bias); x = T K (raw - B).",
         f"raw and x in {'m/s^2' if sensor == 'accelerometer' else 'rad/s'}, body frame x y z; T is not triangular.",
         "At rest the upward axis of the accelerometer reads + local gravity.",
-        *axes_of_readings(document),
+        *before_use(document),
         *left_out({sensor: calibration}),
         *(f"The {line}." for line in final_errors(validation) if sensor in line),
     ]

@@ -16,7 +16,7 @@ import numpy as np
 
 from pipeline.exports.sensors import (
     STANDARD_GRAVITY,
-    axes_of_readings,
+    before_use,
     calibrations,
     final_errors,
     forward,
@@ -43,7 +43,7 @@ def export(calibration: dict[str, Any], settings: dict[str, Any], validation: di
     remarks = [
         f"Unit {calibration['unit']}. acc = inv(R_a) inv(K_a) (raw - b_a), raw in g, acc in m/s^2;",
         "gyr = inv(R_g) inv(K_g) (raw - K_ga acc - b_g) in deg/s. Body frame x y z; at rest the upward axis reads +.",
-        *axes_of_readings(calibration),
+        *before_use(calibration),
         *left_out(found, ("g_sensitivity",)),
         *(f"The {line}." for line in final_errors(validation)),
     ]

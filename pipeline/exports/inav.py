@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.exports.sensors import axes_of_readings, axis_by_axis, calibrations, comment, final_errors
+from pipeline.exports.sensors import axis_by_axis, before_use, calibrations, comment, final_errors
 
 FILE_NAME = "inav.txt"
 ONE = 4096
@@ -33,7 +33,7 @@ def export(calibration: dict[str, Any], settings: dict[str, Any], validation: di
         "Whole numbers: up to half a count and 1.2e-4 of the scale are lost.",
         "Axes x y z are those of the calibration: they must be the sensor's, before align_acc.",
         "The gyroscope is not in here: INAV takes its mean at start for its bias.",
-        *axes_of_readings(calibration),
+        *before_use(calibration),
         *lost,
         *(f"With all of the calibration: {line}." for line in final_errors(validation)),
     ]

@@ -19,7 +19,7 @@ import numpy as np
 
 from pipeline.exports.sensors import (
     STANDARD_GRAVITY,
-    axes_of_readings,
+    before_use,
     calibrations,
     comment,
     final_errors,
@@ -46,7 +46,7 @@ Set rostopic to your driver's; b is not read by Kalibr, subtract it yourself or 
 def export(calibration: dict[str, Any], settings: dict[str, Any], validation: dict[str, Any] | None) -> str:
     """Return the YAML text."""
     remarks = [f"Unit {calibration['unit']}.", *HEADER.splitlines()]
-    remarks += [*axes_of_readings(calibration), *missing(calibration)]
+    remarks += [*before_use(calibration), *missing(calibration)]
     remarks += [*left_out(calibrations(calibration), ("g_sensitivity",)), *final_errors(validation)]
     return comment(remarks) + yaml_text({"imu0": entry(calibration, settings)})
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.exports import kalibr
-from pipeline.exports.sensors import axes_of_readings, calibrations, comment, final_errors, left_out, missing, yaml_text
+from pipeline.exports.sensors import before_use, calibrations, comment, final_errors, left_out, missing, yaml_text
 
 FILE_NAME = "kalibr_imu_chain.yaml"
 HEADER = """\
@@ -42,6 +42,6 @@ def export(calibration: dict[str, Any], settings: dict[str, Any], validation: di
     parts = {"accelerometer": accelerometer, "gyroscope": gyroscope}
     biases = [f"b of the {sensor}: {part['b']}" for sensor, part in parts.items() if "b" in part]
     remarks = [f"Unit {calibration['unit']}.", *HEADER.splitlines(), *biases]
-    remarks += [*axes_of_readings(calibration), *missing(calibration)]
+    remarks += [*before_use(calibration), *missing(calibration)]
     remarks += [*left_out(found, ("g_sensitivity",)), *final_errors(validation)]
     return "%YAML:1.0\n" + comment(remarks) + yaml_text({"imu0": imu})

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.exports.sensors import STANDARD_GRAVITY, axes_of_readings, calibrations, diagonal, final_errors, left_out
+from pipeline.exports.sensors import STANDARD_GRAVITY, before_use, calibrations, diagonal, final_errors, left_out
 
 FILE_NAME = "paparazzi_imu.xml"
 NAMES = {
@@ -28,7 +28,7 @@ def export(calibration: dict[str, Any], settings: dict[str, Any], validation: di
     remarks = [
         f"Unit {calibration['unit']}: (raw - NEUTRAL) * SENS, raw in counts, axis by axis.",
         "Axes x y z are those of the calibration: they must be the sensor's, before BODY_TO_IMU.",
-        *axes_of_readings(calibration),
+        *before_use(calibration),
         *left_out(found),
     ]
     lines = []

@@ -18,8 +18,8 @@ from pipeline.exports.sensors import (
     OF_THE_BIAS,
     STANDARD_GRAVITY,
     TEMPERATURES,
-    axes_of_readings,
     axis_by_axis,
+    before_use,
     bias_polynomial,
     calibrations,
     comment,
@@ -56,7 +56,7 @@ def export(calibration: dict[str, Any], settings: dict[str, Any], validation: di
         "Set CAL_ACC0_ID and CAL_GYRO0_ID to your device's ids (PX4 ignores offsets of an id it does not know),",
         "and CAL_ACC0_PRIO and CAL_ACC0_ROT as they are in your vehicle.",
         *(OF_THERMAL if thermal else []),
-        *axes_of_readings(calibration),
+        *before_use(calibration),
         *lost,
         *(f"With all of the calibration: {line}." for line in final_errors(validation)),
     ]

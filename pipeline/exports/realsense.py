@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.exports.sensors import STANDARD_GRAVITY, axes_of_readings, calibrations, final_errors, left_out, missing
+from pipeline.exports.sensors import STANDARD_GRAVITY, before_use, calibrations, final_errors, left_out, missing
 
 if TYPE_CHECKING:
     from pipeline.records import SensorCalibration
@@ -30,7 +30,7 @@ def export(calibration: dict[str, Any], settings: dict[str, Any], validation: di
     remarks = [
         f"Unit {calibration['unit']}: calibrated = [x y z -1] (scale_and_alignment; bias), rows, m/s^2 and rad/s.",
         "Body frame x y z, to which the camera's extrinsics must refer; at rest the upward axis reads +.",
-        *axes_of_readings(calibration),
+        *before_use(calibration),
         *left_out(found),
         *(f"The {line}." for line in final_errors(validation)),
     ]

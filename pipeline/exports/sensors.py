@@ -9,6 +9,7 @@ import yaml
 
 from pipeline.formats.axes import STRAIGHT, maps_of_log
 from pipeline.model.effects.base import Owner
+from pipeline.model.plausible import sentences
 from pipeline.model.user_effects import owner_of
 from pipeline.records import SENSORS, SensorCalibration
 
@@ -51,6 +52,11 @@ def axes_of_readings(document: dict[str, Any]) -> list[str]:
             pairs = ", ".join(f"{a} along body {b}" for a, b in zip("xyz", axis_map, strict=True))
             lines.append(f"Turn the readings to body axes first: the {sensor}'s {pairs}.")
     return lines
+
+
+def before_use(document: dict[str, Any]) -> list[str]:
+    """Return what to know before using an export: the sensor's axes, and what is implausible in the calibration."""
+    return axes_of_readings(document) + [line for s in SENSORS for line in sentences(s, document.get(s))]
 
 
 def forward(calibration: SensorCalibration) -> NDArray[np.float64]:

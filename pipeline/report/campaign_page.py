@@ -80,6 +80,7 @@ def render(
         rows=shown,
         failures=failures,
         twins=twins,
+        implausible=_implausible(rows),
         ok=sum(row["status"] == "ok" for row in rows),
         passed=sum(row.get("pass") is True for row in rows),
         not_passed=sum(row.get("pass") is False for row in rows),
@@ -115,6 +116,12 @@ def _causes(failures: list[JSON]) -> list[tuple[str, list[str]]]:
         cause = f"{failure.get('code')} in stage {failure.get('stage') or 'unknown'}"
         causes.setdefault(cause, []).append(str(failure.get("unit")))
     return sorted(causes.items(), key=lambda c: -len(c[1]))
+
+
+def _implausible(rows: list[JSON]) -> list[tuple[str, str, str]]:
+    """Return unit, sensor and parameters of sensors with parameters far beyond the data sheet."""
+    found = ((r["unit"], s, str(r.get(f"{s}_implausible") or "")) for r in rows for s in SENSORS)
+    return [(unit, sensor, names.replace(";", ", ")) for unit, sensor, names in found if names]
 
 
 def _script_data(value: object) -> Markup:

@@ -26,7 +26,8 @@ SENSOR_COLUMNS = (
     "verdict",
     "selected",
 )
-COLUMNS = (*UNIT_COLUMNS, *(f"{s}_{c}" for s in SENSORS for c in SENSOR_COLUMNS), "pass")
+IMPLAUSIBLE = tuple(f"{s}_implausible" for s in SENSORS)
+COLUMNS = (*UNIT_COLUMNS, *(f"{s}_{c}" for s in SENSORS for c in SENSOR_COLUMNS), "pass", *IMPLAUSIBLE)
 SHEET_COLUMNS = ("table", "procedure", "ingest", "filter", "certificate", "overrides")  # of units.csv, said elsewhere
 
 
@@ -74,6 +75,8 @@ def summary_row(
             ";".join(selected) if selected else None,
         )
         row |= {f"{sensor}_{column}": value for column, value in zip(SENSOR_COLUMNS, values, strict=True)}
+        implausible = (calibration.get(sensor) or {}).get("implausible")
+        row[f"{sensor}_implausible"] = ";".join(e["parameter"] for e in implausible) if implausible else None
     for key, value in sheet_row.items():
         if key not in SHEET_COLUMNS and key not in UNIT_COLUMNS:
             row[f"sheet_{key}" if key in COLUMNS else key] = value

@@ -13,6 +13,7 @@ from pipeline.command_lines import run_command
 from pipeline.json_text import json_text
 from pipeline.model.inversion import compensate, linear_truth, sensor_effects
 from pipeline.model.kinematics import reference_motion
+from pipeline.model.plausible import sentences
 from pipeline.model.user_effects import effect_of
 from pipeline.outcome import commands_of
 from pipeline.records import SENSORS, SensorCalibration
@@ -141,6 +142,7 @@ def _sensor(  # noqa: PLR0917  (the inputs of the page, passed on)
         "ranking": tables.ranking_rows(found),
         "evidence_figures": [f for f in (ranking(sensor, found), added_variable(sensor, found)) if f]
         + unexplained(sensor, found),
+        "implausible": sentences(sensor, part),
         "left_by_method": _left_by_method(held_out, found),
         "verdict": VERDICTS.get(found.get("verdict", ""), "There is no diagnosis."),
         "words": words.get(sensor) or [],

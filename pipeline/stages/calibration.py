@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline import __version__
 from pipeline.formats.axes import axis_maps
 from pipeline.formats.parquet import load_recordings
+from pipeline.model.plausible import implausible
 from pipeline.records import SENSORS
 from pipeline.stages.batch import parse_job, read_json, run_batch, write_json
 
@@ -34,10 +35,17 @@ def main(argv: Sequence[str]) -> int:
             "inputs": inputs(job.inputs["ingest"] / f"{unit}.parquet"),
             "not_calibrated": reasons,
         }
-        document |= {s: None if s in reasons else f for s, f in fits.items()}
+        document |= {s: None if s in reasons else judged(s, f, part["sensor"][s]) for s, f in fits.items()}
         write_json(job.output / f"{unit}.json", document)
 
     return run_batch(job, work)
+
+
+def judged(sensor: str, fit: dict[str, Any], sheet: dict[str, Any]) -> dict[str, Any]:
+    """Return a sensor's fit with what in it is beyond the data sheet, and what of this the user accepts."""
+    found = implausible(sensor, fit, sheet)
+    accepted = sheet["accept_implausible"]
+    return fit | {"implausible": [] if accepted else found, "implausible_accepted": found if accepted else []}
 
 
 def header(unit: str, part: dict[str, Any]) -> dict[str, Any]:

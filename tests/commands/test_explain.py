@@ -46,6 +46,16 @@ def results(tmp_path: Path) -> Path:
     return tmp_path / "results"
 
 
+def test_a_parameter_beyond_the_data_sheet_is_told(results: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = results / "bench" / "calibrations"
+    folder.mkdir()
+    entry = {"parameter": "bias_x", "value": 90.0, "unit": "deg/s", "limit": 20.0, "ratio": 4.5, "likely_cause": "dust"}
+    (folder / "U1.json").write_text(json.dumps({"accelerometer": None, "gyroscope": {"implausible": [entry]}}))
+    main([str(results / "bench"), "U1"])
+    said = "bias_x is +90 deg/s, 4.5 times the data sheet's limit of 20 deg/s. Likely cause: dust."
+    assert said in capsys.readouterr().out
+
+
 def test_the_missing_effect_is_named_with_its_size_and_the_commands_that_add_it(
     results: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

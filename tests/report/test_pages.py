@@ -153,6 +153,21 @@ def test_the_campaign_page_names_failures_and_compares_units_of_one_serial(unit:
     assert not [link for link in Text(page).links if "//" in link]
 
 
+def test_parameters_beyond_the_data_sheet_are_shown_on_both_pages_and_in_the_summary(unit: Unit) -> None:
+    entry = {"parameter": "scale_factor_x", "value": -0.5, "unit": "1", "limit": 0.03, "ratio": 16.7}
+    entries = [{**entry, "likely_cause": "readings 0.5 times the truth"}]
+    calibration = unit.calibration | {"gyroscope": {**unit.calibration["gyroscope"], "implausible": entries}}
+    text = Text(render(calibration, unit.validation, unit.diagnosis, [], unit.settings)).text
+    assert "Implausible for this model of gyroscope: scale_factor_x; scale_factor_x is -0.5, 16.7 times" in text
+    assert "sensor.gyroscope.accept_implausible=true" in text
+    row = summary_row("U", calibration, unit.validation, unit.diagnosis, {})
+    assert (row["accelerometer_implausible"], row["gyroscope_implausible"]) == (None, "scale_factor_x")
+    page = Text(campaign_page.render("bench", [row], []))
+    assert "1 sensor beyond the data sheet" in page.text
+    assert "U , gyroscope: scale_factor_x" in page.text
+    assert "beyond the data sheet" not in Text(campaign_page.render("bench", rows(unit, 2), [])).text
+
+
 def test_a_row_of_a_large_campaign_is_small(unit: Unit) -> None:
     size = {n: len(campaign_page.render("bench", rows(unit, n), [])) for n in (100, 200)}
     assert (size[200] - size[100]) / 100 < 1500
