@@ -32,6 +32,7 @@ ACCURACIES = (
     "azimuth_accuracy_deg",
     "clock_accuracy_ppm",
 )
+BOTH = ("accelerometer", "gyroscope")
 NOISE = ("noise_density", "bias_wander", "wander_time_s")
 FIT = (
     "table.motion",
@@ -64,13 +65,11 @@ READS: dict[str, tuple[str, ...]] = {
         "table.angle_accuracy_deg",
         "table.orthogonality_deg",
         "sensor.axis_map",
-        "sensor.accelerometer.axis_map",
-        "sensor.gyroscope.axis_map",
-        "sensor.accelerometer.effects.time_offset",
-        "sensor.accelerometer.full_scale",
-        "sensor.gyroscope.full_scale",
+        *(f"sensor.{sensor}.{key}" for sensor in BOTH for key in ("axis_map", "full_scale", "effects")),
+        *(f"sensor.{sensor}.{key}" for sensor in BOTH for key in ("bias", "scale_factor", "cross_axis", *NOISE)),
+        "table.gravity_g",
     ),
-    "filter": ("filter", *(f"sensor.{sensor}.{key}" for sensor in ("accelerometer", "gyroscope") for key in NOISE)),
+    "filter": ("filter", *(f"sensor.{sensor}.{key}" for sensor in BOTH for key in NOISE)),
     "fit": FIT,
     "effects": (*FIT, "effects.{sensor}", "sensor.{sensor}.effects"),
     "calibration": (

@@ -1,0 +1,252 @@
+"""What the channels of a recording say of its rotation, in one form, so that they can be compared.
+
+A table's angle or attitude gives the mean rate over the interval between two samples, exactly. A logged rate and a
+gyroscope give the rate at the samples. The gyroscope is brought to the table's scale by
+
+    reading = b + K rate,    K = weighted median of (y - median y) / (r - median r),    b = median (y - K r)
+
+with weights ``|r - median r|``, cut off at their 99th percentile: some spikes in the table's rate do not move it.
+
+How far two of them may be apart without a contradiction follows from the configured limits of the effects that explain
+a difference: ``time_offset`` and ``low_pass_lag`` (s), ``table_rate_ripple``, ``table_encoder_error`` and
+``clock_rate`` (relative to a rate), ``table_encoder_error`` and ``table_backlash`` (deg), ``g_sensitivity``,
+``g_squared_sensitivity`` and the gyroscope's ``scale_factor`` and ``cross_axis``; and from three times the stated
+standard uncertainties of the table.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.formats.ingest_error import IngestError
+from pipeline.records import AXES, SENSORS
+from pipeline.records.attitude import conjugate_product, continuous
+from pipeline.records.median import median
+from pipeline.records.neighbours import noise_of_steps
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from pipeline.records import Recording
+
+    Array = NDArray[np.float64]
+
+GAP = 1.5  # median intervals, as pipeline.formats.marks
+EXPANDED = 3.0  # coverage of a stated standard uncertainty: 99.7 % of a normal distribution
+SAMPLED = 0.05  # relative: of an angle that is summed up from the rate in moves of some samples (1.6 % in 3 deg)
+LEAST_TURN_DEG = 60.0  # for gravity to tell an angle: biases of 0.1 g distort its phase by 6 deg
+LEAST_SWING_G = 0.5  # radius of gravity's circle, from which the axis is level
+FASTEST_DEG = 90.0  # in one interval, beyond which the phase may lose a turn
+LEAST_RATE_DPS = 1.0  # 90 % of the moving samples turn at least so fast where a rate tells the gyroscope's scale
+
+
+@dataclass(frozen=True)
+class Limits:
+    """How far channels may be apart where an effect of the catalogue explains it.
+
+    Attributes
+    ----------
+    late_s : float, s
+    clock : float, relative
+    rate : float, relative
+    rate_stated : float, relative
+        Three times the stated standard uncertainty of the table's rate.
+    angle_deg : float, deg
+    angle_stated_deg : float, deg
+    gain : float, relative
+        Of a gyroscope by its data sheet.
+    offset_dps : float, deg/s
+        What gravity adds to the gyroscope's reading.
+    """
+
+    late_s: float
+    clock: float
+    rate: float
+    rate_stated: float
+    angle_deg: float
+    angle_stated_deg: float
+    gain: float
+    offset_dps: float
+
+    @classmethod
+    def of(cls, settings: Mapping[str, Any]) -> Limits:
+        """Return the limits that a unit's configuration states; what it does not state is 0."""
+        sensor, table = settings.get("sensor") or {}, settings.get("table") or {}
+        effects = [(sensor.get(s) or {}).get("effects") or {} for s in SENSORS]
+        gyroscope = sensor.get("gyroscope") or {}
+
+        def most(name: str) -> float:
+            return max(float(e.get(name) or 0.0) for e in effects)
+
+        stated = EXPANDED * float(table.get("rate_accuracy") or 0.0)
+        angle = EXPANDED * float(table.get("angle_accuracy_deg") or 0.0)
+        encoder = most("table_encoder_error")
+        return cls(
+            late_s=most("time_offset") + most("low_pass_lag"),
+            clock=1e-6 * most("clock_rate"),
+            rate=max(SAMPLED, most("table_rate_ripple") + np.radians(encoder) + 1e-6 * most("clock_rate") + stated),
+            rate_stated=stated,
+            angle_deg=encoder + 2.0 * most("table_backlash") + angle,
+            angle_stated_deg=angle,
+            gain=float(gyroscope.get("scale_factor") or 0.0) + float(gyroscope.get("cross_axis") or 0.0),
+            offset_dps=most("g_sensitivity") + most("g_squared_sensitivity"),
+        )
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A rotation as one channel tells it.
+
+    Attributes
+    ----------
+    name : str
+        ``table_rate``, ``table_angle``, ``table_attitude`` or ``gyroscope``.
+    low, high : (m,) array, deg/s
+        The rate at the samples (m = n) or over the intervals between them (m = n - 1); infinite where it is not known.
+    turned : (n - 1,) array, deg
+        Angle turned in each interval; 0 where it is not known.
+    noise : float, deg/s
+    """
+
+    name: str
+    low: Array
+    high: Array
+    turned: Array
+    noise: float
+
+    @property
+    def of_intervals(self) -> bool:
+        """Whether it gives means over intervals."""
+        return len(self.low) == len(self.turned)
+
+
+def gaps(recording: Recording) -> NDArray[np.bool_]:
+    """Return which intervals are longer than 1.5 times the usual one: (n - 1,) array."""
+    return np.asarray(np.diff(recording.time_ns) > GAP * recording.interval * 1e9)
+
+
+def of_angle(recording: Recording, angle: Array) -> Channel:
+    """Return what a table's angle says."""
+    return _of_turned("table_angle", recording, np.diff(angle))
+
+
+def of_attitude(recording: Recording, attitude: Array) -> Channel:
+    """Return what a table's attitude says of the size of the rate."""
+    return _of_turned("table_attitude", recording, np.linalg.norm(spin(attitude), axis=1))
+
+
+def spin(attitude: Array) -> Array:
+    """Return the rotation vector, in the body, from each attitude to the next: (n - 1, 3) array, deg."""
+    q = continuous(attitude)
+    sine = conjugate_product(q[:-1], q[1:])
+    size = np.linalg.norm(sine, axis=1, keepdims=True)
+    angle = 2.0 * np.arcsin(np.minimum(size, 1.0))
+    vector: Array = np.degrees(np.where(size > 0, sine * angle / np.where(size > 0, size, 1.0), 0.0))
+    return vector
+
+
+def _of_turned(name: str, recording: Recording, turned: Array) -> Channel:
+    rate = turned / np.diff(recording.time)
+    lost = gaps(recording)
+    return Channel(name, np.where(lost, -np.inf, rate), np.where(lost, np.inf, rate), np.where(lost, 0.0, turned), 0.0)
+
+
+def of_rate(recording: Recording, name: str, rate: Array, known: NDArray[np.bool_] | None = None) -> Channel:
+    """Return what rates at the samples say; those that are not known allow anything."""
+    dt = np.diff(recording.time)
+    turned = np.where(gaps(recording), 0.0, 0.5 * (rate[1:] + rate[:-1]) * dt)
+    low = high = rate
+    if known is not None and not known.all():
+        low, high = np.where(known, rate, -np.inf), np.where(known, rate, np.inf)
+        turned = np.where(known[1:] & known[:-1], turned, 0.0)
+    noise = float(noise_of_steps(np.abs(np.diff(rate)))) if name == "gyroscope" and len(rate) > 1 else 0.0
+    return Channel(name, low, high, turned, noise)
+
+
+def gravity_turned(recording: Recording, axis: int) -> Array | None:
+    """Return the angle by which gravity turned about an axis in each interval, deg; None where it does not turn."""
+    if recording.accelerometer is None:
+        return None
+    across = recording.accelerometer[:, [(axis + 1) % 3, (axis + 2) % 3]]
+    low, high = np.percentile(across, [1.0, 99.0], axis=0)
+    centred = across - np.where(high - low > 3.0 * LEAST_SWING_G, (low + high) / 2.0, 0.0)
+    if float(median(np.hypot(*centred.T))) < LEAST_SWING_G:
+        return None
+    phase = np.degrees(np.unwrap(np.arctan2(centred[:, 1], centred[:, 0])))
+    turned = np.diff(phase)
+    if float(np.ptp(phase)) < LEAST_TURN_DEG or float(np.percentile(np.abs(turned), 99.0)) > FASTEST_DEG:
+        return None
+    turned[gaps(recording)] = 0.0
+    return np.asarray(turned)
+
+
+def of_gravity(recording: Recording, turned: Array, like: Channel) -> Channel:
+    """Return what gravity says, with the sign of another channel."""
+    sign = float(np.sign(np.sum(turned * like.turned))) or 1.0
+    noise = float(noise_of_steps(np.abs(np.diff(turned)))) / recording.interval
+    return replace(_of_turned("gravity", recording, sign * turned), noise=noise)
+
+
+def slope_of(y: Array, rate: Array) -> tuple[float, float] | None:
+    """Return gain and bias of a gyroscope's axis against a table's rate; None where the rate hardly changes."""
+    dr, dy = rate - median(rate), y - median(y)
+    size = np.abs(dr)
+    weight = np.minimum(size, np.partition(size, -max(len(size) // 100, 1))[-max(len(size) // 100, 1)])
+    if float(weight.max()) < LEAST_RATE_DPS:
+        return None
+    used = size > 0.1 * weight.max()
+    ratio, weight = dy[used] / dr[used], weight[used]
+    order = np.argsort(ratio)
+    total = np.cumsum(weight[order])
+    gain = float(ratio[order[np.searchsorted(total, 0.5 * total[-1])]])
+    if gain == 0.0:
+        return None
+    return gain, float(median(y - gain * rate))
+
+
+def rate_of_turn(recording: Recording) -> Array | None:
+    """Return the table's rate at the samples, by its rate, else by its angle: (n,) array, deg/s."""
+    if recording.table_rate is not None:
+        return recording.table_rate
+    if recording.table_angle is None:
+        return None
+    rate: Array = np.gradient(recording.table_angle, recording.time)
+    return rate
+
+
+def axis_index(recording: Recording) -> int:
+    """Return the index of the axis that a recording turns about."""
+    return AXES.index(str(recording.axis))
+
+
+def place(recording: Recording, first: int, last: int) -> str:
+    """Say where samples are: their numbers and times; rows of the file where none were left out."""
+    what = "row" if recording.samples == recording.source.get("rows") else "sample"
+    t = recording.time
+    if first == last:
+        return f"{what} {first + 1} ({t[first]:.9g} s)"
+    return f"{what}s {first + 1} to {last + 1} ({t[first]:.9g} to {t[last]:.9g} s)"
+
+
+def column(recording: Recording, channel: str, settings: Mapping[str, Any]) -> str:
+    """Return how the file names a channel."""
+    if not str(recording.source.get("file", "")).endswith(".csv"):
+        return channel
+    columns = ((settings.get("ingest") or {}).get("csv") or {}).get("columns") or {}
+    if channel in ("gyroscope", "table_attitude"):
+        first = "gyro_x" if channel == "gyroscope" else "table_qw"
+        last = "gyro_z" if channel == "gyroscope" else "table_qz"
+        return f"{column(recording, first, settings)} .. {column(recording, last, settings)}"
+    entry = columns.get(channel)
+    name = entry.get("column") if isinstance(entry, dict) else None
+    return str(name) if name is not None else channel
+
+
+def refusal(recording: Recording, fault: str, message: str, hint: str) -> IngestError:
+    """Return the error that names a recording's file."""
+    return IngestError(f"recording {recording.name}: {message}", recording.source.get("file"), fault=fault, hint=hint)

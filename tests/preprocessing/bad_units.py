@@ -1,0 +1,188 @@
+"""A sound unit and the ways in which its recordings contradict each other, as ``docs/bad_inputs.md`` numbers them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.simulation.campaign import simulate_unit
+from pipeline.simulation.description import UnitDescription, read_config
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from pipeline.records import Recording
+
+    Unit = list[Recording]
+    Change = Callable[[Unit], Unit]
+
+RADIAN = np.pi / 180.0
+SETTINGS: dict[str, Any] = {
+    "sensor": read_config("sensor", "mpu6050"),
+    "table": read_config("table", "acutronic"),
+    "ingest": read_config("ingest", "canonical_csv"),
+}
+
+
+@cache
+def sound(seed: int = 4, effects: str = "") -> tuple[Recording, ...]:
+    """Return the recordings of a simulated unit, as if they were read from CSV files."""
+    hidden = dict.fromkeys(effects.split())
+    unit = UnitDescription("U", course={"rates_dps": (30.0, 60.0), "both_directions": True}, effects=hidden)
+    recordings, _ = simulate_unit(unit, seed, 1)
+    return tuple(replace(r, source={"file": f"{r.name}.csv", "rows": r.samples}) for r in recordings)
+
+
+def at(names: str, change: Callable[[Recording], Recording]) -> Change:
+    """Return a change of some recordings; of all without names."""
+    chosen = names.split()
+    return lambda unit: [change(r) if not chosen or r.name in chosen else r for r in unit]
+
+
+def of(channel: str, change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Recording], Recording]:
+    """Return a change of one channel, where it is logged."""
+
+    def apply(recording: Recording) -> Recording:
+        values = getattr(recording, channel)
+        return recording if values is None else replace(recording, **{channel: change(values.copy())})
+
+    return apply
+
+
+def without(channel: str, change: Callable[[Recording], Recording]) -> Callable[[Recording], Recording]:
+    return lambda r: replace(change(r), **{channel: None})
+
+
+def both(*changes: Callable[[Recording], Recording]) -> Callable[[Recording], Recording]:
+    def apply(recording: Recording) -> Recording:
+        for change in changes:
+            recording = change(recording)
+        return recording
+
+    return apply
+
+
+def times(factor: float) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda v: v * factor
+
+
+def spike(size: float, rows: slice) -> Callable[[np.ndarray], np.ndarray]:
+    def apply(values: np.ndarray) -> np.ndarray:
+        values[rows] += size
+        return values
+
+    return apply
+
+
+def frozen(first: int, last: int) -> Callable[[np.ndarray], np.ndarray]:
+    def apply(values: np.ndarray) -> np.ndarray:
+        values[first:last] = values[first]
+        return values
+
+    return apply
+
+
+def late(rows: int) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda v: np.concatenate([np.repeat(v[:1], rows, axis=0), v[:-rows]])
+
+
+def clock(factor: int) -> Callable[[Recording], Recording]:
+    return lambda r: replace(r, time_ns=r.time_ns * factor)
+
+
+def quaternion(row: int) -> Callable[[np.ndarray], np.ndarray]:
+    def apply(q: np.ndarray) -> np.ndarray:
+        q[row] = [1.0, 0.0, 0.0, 0.0]
+        return q
+
+    return apply
+
+
+def table_of(seed: int) -> Change:
+    """Return the change that gives the held-out motion the table's log of another unit."""
+
+    def apply(unit: Unit) -> Unit:
+        other = {r.name: r for r in sound(seed)}["validation"]
+        mine = {"table_rate": other.table_rate, "table_attitude": other.table_attitude}
+        return at("validation", lambda r: replace(r, **mine))(unit)
+
+    return apply
+
+
+@dataclass
+class Case:
+    """A change, and the refusal or the note that has to come of it: its code, file and a part of its sentence."""
+
+    change: Change
+    fault: str = ""
+    says: str = ""
+    file: str = ""
+    note: str = ""
+
+
+def cases() -> dict[str, Case]:
+    """Return all cases, named by their number."""
+    rate, angle = "table_rate", "table_angle"
+    scale, wrong = "reference_scale", "reference_contradiction"
+    gyro_radians = of("gyroscope", times(RADIAN))
+    return {
+        "49 rate in rad/s": Case(
+            at("", of(rate, times(RADIAN))), scale, "table_rate_dps looks like rad/s declared as deg/s", "accel_x.csv"
+        ),
+        "49 rate in rpm": Case(at("", of(rate, times(1 / 6))), scale, "looks like rpm", "accel_x.csv"),
+        "49 rate twice": Case(at("gyro_y", of(rate, times(2.0))), scale, "is twice what it should be", "gyro_y.csv"),
+        "49 rate of the held-out motion": Case(
+            at("validation", of(rate, times(RADIAN))), scale, "looks like rad/s", "validation.csv"
+        ),
+        "49 rate alone, gravity tells": Case(
+            at("", without(angle, of(rate, times(RADIAN)))), scale, "by gravity", "accel_x.csv"
+        ),
+        "49 rate and gyroscope": Case(
+            at("", both(of(rate, times(RADIAN)), gyro_radians)),
+            scale,
+            r"table_rate_dps and gyro_x_dps .. gyro_z_dps look like rad/s",
+            "accel_x.csv",
+        ),
+        "49 angle": Case(at("", of(angle, times(RADIAN))), scale, "table_angle_deg looks like rad declared as deg"),
+        "49 angle alone": Case(at("", without(rate, of(angle, times(2.0)))), scale, "table_angle_deg is twice"),
+        "49 rate by 2 %": Case(at("", of(rate, times(1.02))), note="table_rate_dps is 1.02 times", file="gyro_x.csv"),
+        "50 ms": Case(at("", clock(1000)), "reference_time", "time_s looks like ms declared as s", "accel_x.csv"),
+        "50 us of an angle": Case(at("", without(rate, clock(10**6))), "reference_time", "looks like us"),
+        "50 ms of the rest": Case(
+            at("static", clock(1000)), "reference_time", "0.12 s in the unit's other", "static.csv"
+        ),
+        "51 spike": Case(
+            at("gyro_x", of(rate, spike(4000.0, slice(30, 31)))),
+            wrong,
+            r"table_rate_dps is 4000 deg/s in row 31 \(.* s\), while table_angle_deg and gyro_x_dps .. gyro_z_dps show",
+            "gyro_x.csv",
+        ),
+        "51 small spike": Case(
+            at("gyro_x", of(rate, spike(-30.0, slice(20, 22)))), wrong, "rows 21 to 22", "gyro_x.csv"
+        ),
+        "51 spike of the held-out rate": Case(
+            at("validation", without("table_attitude", of(rate, spike(100.0, slice(500, 501))))), wrong, "row 501"
+        ),
+        "51 spike of an angle": Case(at("accel_z", of(angle, spike(20.0, slice(9, 10)))), wrong, "rows 9 to 11"),
+        "51 jump of an angle": Case(at("accel_z", of(angle, spike(2.5, slice(405, None)))), note="table_angle_deg"),
+        "51 quaternion": Case(at("validation", of("table_attitude", quaternion(300))), wrong, "rows 300 to 302"),
+        "51 another unit's log": Case(table_of(5), wrong, "validation: table_", "validation.csv"),
+        "51 conjugate attitude": Case(
+            at("validation", of("table_attitude", lambda q: q * [1, -1, -1, -1])), wrong, "about other body axes"
+        ),
+        "51 frozen": Case(at("validation", of(rate, frozen(300, 700))), wrong, "is it frozen", "validation.csv"),
+        "51 nothing but zeros": Case(at("gyro_z", of(rate, times(0.0))), wrong, "table_rate_dps"),
+        "51 reversed": Case(at("accel_y", of(angle, lambda v: v[::-1])), wrong, "table_angle_deg"),
+        "51 sections lost": Case(
+            at("accel_y", of(angle, lambda v: np.append(np.delete(v, slice(300, 360)), np.repeat(v[-1], 60)))),
+            wrong,
+            "table_angle_deg",
+        ),
+        "52 rate late": Case(at("gyro_x", of(rate, late(1))), wrong, r"runs 0.12\d* s late against table_angle_deg"),
+        "52 one recording late": Case(
+            at("validation", both(of(rate, late(3)), of("table_attitude", late(3)))), wrong, "0.36 s apart"
+        ),
+    }

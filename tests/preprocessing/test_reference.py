@@ -1,0 +1,66 @@
+"""Recordings of a unit that contradict each other are refused with the cause, or marked; sound ones are left alone."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+from bad_units import SETTINGS, cases, sound
+
+from pipeline.formats.ingest_error import IngestError
+from pipeline.preprocessing.checks import check_recordings
+from pipeline.study.bench import recordings_of
+from pipeline.study.cases import FAMILIES, draw
+
+if TYPE_CHECKING:
+    from pipeline.records import Note, Recording
+
+CASES = cases()
+PAGE = Path(__file__).parents[2] / "docs" / "bad_inputs.md"
+
+
+def notes_of(before: list[Recording], after: list[Recording]) -> dict[str, tuple[Note, ...]]:
+    return {a.name: a.notes[len(b.notes) :] for b, a in zip(before, after, strict=True) if a.notes != b.notes}
+
+
+@pytest.mark.parametrize("number", [n for n, c in CASES.items() if c.fault])
+def test_a_contradiction_is_refused_by_its_code_with_file_rows_and_cause(number: str) -> None:
+    case = CASES[number]
+    with pytest.raises(IngestError) as caught:
+        check_recordings(case.change(list(sound())), SETTINGS)
+    assert caught.value.fault == case.fault, caught.value.message
+    assert re.search(case.says, caught.value.message), caught.value.message
+    assert caught.value.hint
+    if case.file:
+        assert caught.value.file == case.file
+
+
+@pytest.mark.parametrize("number", [n for n, c in CASES.items() if c.note])
+def test_what_an_effect_may_explain_is_noted(number: str) -> None:
+    case = CASES[number]
+    unit = case.change(list(sound()))
+    found = notes_of(unit, check_recordings(unit, SETTINGS))
+    assert found
+    if case.file:
+        assert case.file.removesuffix(".csv") in found
+    assert all(note.code in PAGE.read_text() and case.note in note.detail for notes in found.values() for note in notes)
+
+
+@pytest.mark.parametrize("number", CASES)
+def test_the_page_tells_the_codes_of_each_bad_unit(number: str) -> None:
+    rows = dict(re.findall(r"^\| (\d+) (\|.*)$", PAGE.read_text(), re.MULTILINE))
+    assert f"`{CASES[number].fault or 'N-REFERENCE'}`" in rows[number.split(maxsplit=1)[0]]
+
+
+@pytest.mark.parametrize("effects", ["", "gyroscope.time_offset gyroscope.low_pass_lag", "gyroscope.clock_rate"])
+def test_sound_units_are_left_alone_whatever_is_hidden_in_them(effects: str) -> None:
+    unit = list(sound(6, effects))
+    assert not notes_of(unit, check_recordings(unit, SETTINGS))
+
+
+def test_no_family_of_the_blind_study_is_refused_or_noted() -> None:
+    for family in FAMILIES:
+        unit = recordings_of(draw(family, 3, 20))
+        assert not notes_of(unit, check_recordings(unit, SETTINGS)), family
