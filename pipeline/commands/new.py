@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
+from pipeline.command_lines import run_command
 from pipeline.errors import ConfigurationError, InputError
 
 if TYPE_CHECKING:
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 GROUPS = ("sensor", "table", "procedure", "method", "filter", "ingest", "certificate")
-HEADER = "unit,serial,lot,date,sensor,procedure,overrides"
+HEADER = "unit,serial,lot,date,sensor,table,procedure,overrides"
 SETTINGS = """\
 # Hydra overrides for all units of this campaign; units.csv and the command line are stronger.
 overrides:
@@ -34,22 +35,28 @@ def main(argv: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(prog="python -m pipeline new", description=__doc__)
     parser.add_argument("directory", type=Path, metavar="DIR", help="the campaign's directory; made if need be")
     parser.add_argument("--sensor", default="generic", help="sensor model of the example row (default: generic)")
+    parser.add_argument("--table", help="table of the example row (default: that of the procedure)")
     parser.add_argument("--procedure", default="three_axis_turns", help="procedure (default: three_axis_turns)")
     parser.add_argument("--unit", default="U1", help="name of the example unit (default: U1)")
     arguments = parser.parse_args(argv)
     sheet = arguments.directory / "units.csv"
     if sheet.exists():
         raise InputError("exists; a campaign is not laid out over another one", str(sheet))
-    _option("sensor", arguments.sensor)
+    sensor = _option("sensor", arguments.sensor)
     procedure = _option("procedure", arguments.procedure)
+    table_name = arguments.table or procedure["table"]
+    table = _option("table", table_name)
     folder = arguments.directory / procedure["folder"].replace("{unit}", arguments.unit)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "README.md").write_text(_recordings(arguments.procedure, procedure), encoding="utf-8")
-    (arguments.directory / "campaign.yaml").write_text(SETTINGS + _options(), encoding="utf-8")
-    row = f"{arguments.unit},,,,{arguments.sensor},{arguments.procedure},"
+    (arguments.directory / "campaign.yaml").write_text(
+        SETTINGS + _ranges(arguments.sensor, sensor) + _options(), encoding="utf-8"
+    )
+    row = f"{arguments.unit},,,,{arguments.sensor},{table_name},{arguments.procedure},"
     sheet.write_text(f"{HEADER}\n{row}\n", encoding="utf-8")
     print(f"{sheet}: one row a unit; recordings go to {folder} (its README.md says which)")
-    print(f"then: snakemake --cores 2 --config campaign={arguments.directory}")
+    print(_accuracy(table_name, table))
+    print(f"then: {run_command({'campaign': str(arguments.directory)})}")
     return 0
 
 
@@ -60,6 +67,35 @@ def _option(group: str, name: str) -> dict[str, Any]:
         raise ConfigurationError(f"no {group} is called {name!r}; known: {options}")
     content: dict[str, Any] = yaml.safe_load(file.read_text(encoding="utf-8"))
     return content
+
+
+def _accuracy(name: str, table: dict[str, Any]) -> str:
+    """Return which accuracy the results take for granted, and how to state another."""
+    if table["motion"] == "none":
+        return f"table {name}: none; the unit is set down or held by hand"
+    others = ", ".join(sorted(f.stem for f in (CONFIGS / "table").glob("*.yaml") if f.stem != name))
+    angle, rate = f"{table['angle_accuracy_deg']:g} deg", f"{100 * table['rate_accuracy']:g} %"
+    return (
+        f"table {name}: its angles are taken as right within {angle}, its rates within {rate} (standard uncertainty); "
+        f"for another table, write {others} or a file of your own in configs/table/ into the column table"
+    )
+
+
+def _ranges(name: str, sensor: dict[str, Any]) -> str:
+    """Return how to set other ranges than those of the sensor's file, as comments."""
+    units = {"accelerometer": "g", "gyroscope": "deg/s"}
+    held = ", ".join(f"{s} +-{sensor[s]['full_scale']:g} {unit}" for s, unit in units.items())
+    lines = [
+        "",
+        f"# The sensor {name} is taken at the ranges {held}. For others, twice as large here:",
+        "# models:",
+    ]
+    lines.append(f"#   {name}:")
+    for part in units:
+        full_scale, counts = (float(sensor[part][key]) for key in ("full_scale", "counts_per_unit"))
+        lines.append(f"#     - sensor.{part}.full_scale={2 * full_scale:g}")
+        lines.append(f"#     - sensor.{part}.counts_per_unit={counts / 2:.10g}")
+    return "\n".join(lines) + "\n"
 
 
 def _recordings(name: str, procedure: dict[str, Any]) -> str:

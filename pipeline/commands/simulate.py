@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
+from pipeline.command_lines import run_command
 from pipeline.errors import ConfigurationError
 from pipeline.model.effect_files import read_effect_files
 from pipeline.model.effects import register
@@ -63,7 +64,7 @@ def main(argv: Sequence[str]) -> int:
     for own in read_effect_files(sorted((beside / "effects").glob("*.yaml"))).values():
         register(own)
     write_campaign(description, directory, (lambda _: None) if quiet else print, sheet_only=sheet_only)
-    print(f"then: snakemake --cores 2 --config campaign={directory}")
+    print(f"then: {run_command({'campaign': str(directory)})}")
     return 0
 
 
