@@ -108,7 +108,7 @@ def implausible(sensor: str, part: Mapping[str, Any], sheet: Mapping[str, Any]) 
 def _of_effects(
     sensor: str, part: Mapping[str, Any], limits: Mapping[str, float]
 ) -> Iterator[tuple[str, float, float, str, float]]:
-    """Yield name, value, expanded uncertainty, unit and limit of the parameters of effects that have a limit."""
+    """Yield name, value, expanded uncertainty, unit and limit of the effects' parameters with uncertainty and limit."""
     for entry in part["effects"]:
         try:
             effect = effect_of(FittedEffect(entry["name"], entry["parameters"], entry.get("definition")))
@@ -117,9 +117,9 @@ def _of_effects(
         for (symbol, p), limit in zip(
             entry["parameters"].items(), parameter_limits(effect, sensor, limits), strict=True
         ):
-            if np.isfinite(limit):
-                uncertainty = float(p.get("expanded_uncertainty") or 0.0)
-                yield f"{entry['name']}.{symbol}", float(p["value"]), uncertainty, p["unit"], float(limit)
+            uncertainty = p.get("expanded_uncertainty")  # the staged method states none for its by-products
+            if np.isfinite(limit) and uncertainty is not None:
+                yield f"{entry['name']}.{symbol}", float(p["value"]), float(uncertainty), p["unit"], float(limit)
 
 
 def _scale_cause(sensor: str, factors: np.ndarray) -> str:

@@ -89,6 +89,9 @@ def test_one_axis_a_bias_a_cross_axis_term_and_an_effect_are_named() -> None:
 
 def test_what_is_not_known_well_enough_is_not_marked() -> None:
     assert marked("mpu6050", "accelerometer", np.eye(3), 0.5, sigma=0.1) == []
+    fitted = FittedEffect("quadratic_nonlinearity", {f"K2_{a}": {"value": 0.5, "unit": "1/g"} for a in "xyz"})
+    part = SensorCalibration("accelerometer", effects=(fitted,)).to_json()
+    assert implausible("accelerometer", part, sheet("mpu6050", "accelerometer")) == []
 
 
 def test_the_user_can_accept_them() -> None:
