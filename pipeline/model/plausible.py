@@ -9,10 +9,10 @@ where
 
 A parameter p with the expanded uncertainty U and the data-sheet limit L is implausible where
 
-    |p| - U > max(4 L, F)
+    |p| - 2 U > max(4 L, F)
 
 A data sheet states L as a bound, or as one standard deviation. Four of these are exceeded by a good sensor's 12
-parameters in 12 * 6.3e-5 = 0.08 % of units. F is what a low-cost sensor is allowed (MPU-6000/6050 product specification
+parameters in 12 * 6.3e-5 = 0.08 % of units; 2 U are four standard uncertainties. F is what a low-cost sensor is allowed (MPU-6000/6050 product specification
 3.4, relative to its range): the sheet of a better one holds for its own mounting and its own bench, and the STIM300 of
 the founding thesis departs from its sheet by 17 L in bias and 10 L in scale factor.
 """
@@ -79,7 +79,7 @@ def implausible(sensor: str, part: Mapping[str, Any], sheet: Mapping[str, Any]) 
     entries: list[Entry] = []
 
     def judge(name: str, value: float, uncertainty: float, unit: str, limit: float, floor: float, cause: str) -> None:  # noqa: PLR0917  (a row of a table)
-        if abs(value) - uncertainty > max(MULTIPLE * limit, floor):
+        if abs(value) - 2.0 * uncertainty > max(MULTIPLE * limit, floor):
             entry = {"parameter": name, "value": value, "unit": unit, "limit": limit, "ratio": abs(value) / limit}
             entries.append({**entry, "likely_cause": cause})
 
@@ -117,7 +117,7 @@ def _of_effects(
         for (symbol, p), limit in zip(
             entry["parameters"].items(), parameter_limits(effect, sensor, limits), strict=True
         ):
-            uncertainty = p.get("expanded_uncertainty")  # the staged method states none for its by-products
+            uncertainty = p.get("expanded_uncertainty")
             if np.isfinite(limit) and uncertainty is not None:
                 yield f"{entry['name']}.{symbol}", float(p["value"]), float(uncertainty), p["unit"], float(limit)
 
