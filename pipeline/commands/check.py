@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.atomic import write_atomically
 from pipeline.config.campaign import load_campaign
-from pipeline.config.compose import Composer, Problem
+from pipeline.config.compose import CONFIGS, Composer, Problem
 from pipeline.errors import ConfigurationError, PipelineError
 from pipeline.formats.checks import checks_of
 from pipeline.formats.files import FILE, candidate_files
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
 DEFAULT_PROFILE = "canonical_csv"
 LOOKED_AT_BYTES = 1 << 25
+LOOKED_AT_FOLDERS = 4  # the log's, and a campaign's above raw/<unit>/
 ANOTHER_LAYOUT = ("missing_column", "no_header")
 EPILOG = """\
 A file of a campaign is read as the campaign's configuration says, any other with --ingest (canonical_csv) and, where
@@ -49,7 +50,7 @@ where you have to decide. It is never applied unasked: read it, save it, and nam
 examples:
   python -m pipeline check log.csv
   python -m pipeline check log.csv --save my_bench/configs/ingest/my_logger.yaml
-  python -m pipeline check log.csv --ingest my_bench/configs/ingest/my_logger.yaml
+  python -m pipeline check log.csv --ingest my_logger
   python -m pipeline check raw/*.mcap --sensor mpu6050
   snakemake --cores 2 --config campaign=my_bench overrides=ingest=my_logger
 
@@ -111,7 +112,7 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("files", type=Path, nargs="+", metavar="FILE", help=".csv or other text, .gcsv, .mcap")
-    parser.add_argument("--ingest", metavar="PROFILE", help="name in configs/ingest, or a file (YAML)")
+    parser.add_argument("--ingest", metavar="PROFILE", help="name in configs/ingest or of a saved profile, or its file")
     parser.add_argument("--sensor", metavar="NAME", help="name in configs/sensor, for full scale and counts")
     parser.add_argument("--save", type=Path, metavar="FILE", help="write the proposed profile there")
     return parser
@@ -133,7 +134,9 @@ def _readings(files: Sequence[Path], profile: str | None, sensor: str | None) ->
         elif found not in readings:
             readings.append(found)
     if others:
-        ingest, sheet = _composed(profile or DEFAULT_PROFILE, sensor, _campaign_of(others[0]))
+        campaign = _campaign_of(others[0])
+        chosen = _named(profile, others[0], campaign) if profile else DEFAULT_PROFILE
+        ingest, sheet = _composed(chosen, sensor, campaign)
         said = f"ingest={ingest['name']}" + (f", sensor={sensor}" if sensor else "")
         parts = [p["file"] for p in (ingest["csv"] or {}).get("parts") or []]
         readings += [Reading(group, ingest, sheet if sensor else {}, said) for group in _grouped(others, parts)]
@@ -177,6 +180,29 @@ def _of_campaign(directory: Path | None) -> list[Reading]:
                 Reading(files, config["ingest"], config["sensor"], said, entry, recording, bench) for files in found
             ]
     return readings
+
+
+def _named(profile: str, file: Path, campaign: Path | None) -> str:
+    """Return a profile as it is to be read: a name that is known, or the only saved file of that name.
+
+    A file is looked for in the working directory, in the folders about the log, and in ``configs/ingest`` of each of
+    these and of the campaigns below the working directory.
+
+    Raises
+    ------
+    ConfigurationError
+        If files of that name hold different profiles.
+    """
+    known = [root / "ingest" / f"{profile}.yaml" for root in (CONFIGS, *([campaign / "configs"] if campaign else []))]
+    if Path(profile).suffix in (".yaml", ".yml") or any(place.is_file() for place in known):
+        return profile
+    folders = [Path.cwd(), *list(file.resolve().parents)[:LOOKED_AT_FOLDERS]]
+    places = [place for folder in folders for place in (folder, folder / "configs" / "ingest")]
+    places += sorted(Path.cwd().glob("*/configs/ingest"))
+    found = {f.resolve(): f.read_bytes() for place in places if (f := place / f"{profile}.yaml").is_file()}
+    if len(set(found.values())) > 1:
+        raise ConfigurationError(f"--ingest {profile} is one of {', '.join(map(str, found))}; name its path")
+    return str(next(iter(found), profile))
 
 
 def _composed(profile: str, sensor: str | None, campaign: Path | None) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -276,6 +302,6 @@ def _tell_proposals(proposals: Sequence[Proposal], sensor: dict[str, Any], save:
 
 NEXT = """\
 If every line is right, save it (--save FILE) in configs/ingest/{name}.yaml of your campaign, and look once more with
-python -m pipeline check FILE --ingest .../{name}.yaml; a run uses it with the override ingest={name} or by the column
+python -m pipeline check FILE --ingest {name}; a run uses it with the override ingest={name} or by the column
 ingest of units.csv.
 """

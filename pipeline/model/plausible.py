@@ -12,9 +12,10 @@ A parameter p with the expanded uncertainty U and the data-sheet limit L is impl
     |p| - 2 U > max(4 L, F)
 
 A data sheet states L as a bound, or as one standard deviation. Four of these are exceeded by a good sensor's 12
-parameters in 12 * 6.3e-5 = 0.08 % of units; 2 U are four standard uncertainties. F is what a low-cost sensor is allowed (MPU-6000/6050 product specification
-3.4, relative to its range): the sheet of a better one holds for its own mounting and its own bench, and the STIM300 of
-the founding thesis departs from its sheet by 17 L in bias and 10 L in scale factor.
+parameters in 12 * 6.3e-5 = 0.08 % of units; 2 U are four standard uncertainties. F is what a low-cost sensor is allowed
+(MPU-6000/6050 product specification 3.4, relative to its range): the sheet of a better one holds for its own mounting
+and its own bench, and the STIM300 of the founding thesis departs from its sheet by 17 L in bias and 10 L in scale
+factor.
 """
 
 from __future__ import annotations

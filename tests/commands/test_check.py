@@ -142,9 +142,23 @@ def test_a_saved_proposal_is_used_when_it_is_named(
     Path("log.csv").write_text("t,ax,ay,az\n" + "".join(f"{0.01 * i:.2f},0,0,1\n" for i in range(100)))
     assert Checked(capsys, "log.csv", "--save", "mine.yaml").code == 2
     assert yaml.safe_load(Path("mine.yaml").read_text())["name"] == "mine"
-    checked = Checked(capsys, "log.csv", "--ingest", "mine.yaml")
-    assert checked.code == 0
-    assert "ingest=mine" in checked.out
+    bench = tmp_path / "bench" / "configs" / "ingest"
+    bench.mkdir(parents=True)
+    for named in ("mine.yaml", "mine"):
+        checked = Checked(capsys, "log.csv", "--ingest", named)
+        assert checked.code == 0
+        assert "ingest=mine" in checked.out
+    shutil.move("mine.yaml", bench / "mine.yaml")
+    shutil.copy("log.csv", "bench/log.csv")
+    for folder, file in ((tmp_path, "log.csv"), (tmp_path, "bench/log.csv"), (bench.parent, "../log.csv")):
+        monkeypatch.chdir(folder)
+        assert Checked(capsys, file, "--ingest", "mine").code == 0
+    monkeypatch.chdir(tmp_path)
+    assert main(["check", "log.csv", "--ingest", "yours"]) == 2
+    assert "no such ingest" in capsys.readouterr().err
+    Path("mine.yaml").write_text((bench / "mine.yaml").read_text() + "# another\n")
+    assert main(["check", "log.csv", "--ingest", "mine"]) == 2
+    assert "--ingest mine is one of" in capsys.readouterr().err
 
 
 def test_a_profile_with_something_left_to_fill_in_is_refused_by_name(
