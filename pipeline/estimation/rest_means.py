@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.signal.creep import creep_in
 from pipeline.signal.rests import find_rests, rests_from_table
 
 if TYPE_CHECKING:
@@ -20,6 +21,9 @@ if TYPE_CHECKING:
 
     from pipeline.records import Recording
     from pipeline.signal.rests import Rest
+
+
+BY_HAND = ("rests", "validation")
 
 
 @dataclass(frozen=True)
@@ -126,16 +130,27 @@ def describe_rests(pairs: Sequence[tuple[Recording, Rest]]) -> list[dict[str, An
             "recording": recording.name,
             "time_s": float(recording.time[rest.start]),
             "duration_s": float(recording.time[rest.stop - 1] - recording.time[rest.start]),
+            "creep_dps": _creep_rate(recording, rest),
             "reason": rest.reason,
         }
         for recording, rest in pairs
     ]
 
 
+def _creep_rate(recording: Recording, rest: Rest) -> float:
+    """Return the rate at which the unit tilts in a rest, deg/s; 0 where it does not stand out of the noise."""
+    if recording.accelerometer is None:
+        return 0.0
+    return float(np.linalg.norm(creep_in(recording, rest.start, rest.stop).rate))
+
+
 def rest_means(
     recording: Recording, rests: Sequence[Rest], sensor: str = "accelerometer"
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return the mean reading of each rest, without clipped, stuck or missing samples.
+
+    By hand a unit may creep: the mean over its directions is too short, and is made longer by that (see
+    ``pipeline.signal.creep``).
 
     Parameters
     ----------
@@ -163,6 +178,9 @@ def rest_means(
     means = np.full((len(rests), 3), np.nan)
     filled = counts > 0
     means[filled] = centre + sums[filled] / counts[filled, None]
+    if sensor == "accelerometer" and recording.role in BY_HAND and recording.table_angle is None:
+        creeps = [creep_in(recording, rest.start, rest.stop) for rest in rests]
+        means *= 1.0 + np.array([creep.shortening for creep in creeps])[:, None]
     return means, counts
 
 

@@ -6,7 +6,9 @@ It is pinned by the first of these that there is:
 
 1. ``static``: a long rest. Temperature and warm-up, which would pass for wander, are regressed out. The scatter within
    the rests of the other recordings joins in for the white noise, where it agrees.
-2. ``rests``: the rests of the other recordings, each with a mean of its own.
+2. ``rests``: the rests of the other recordings, each with a mean of its own. By hand a unit creeps, which moves gravity
+   from one axis to another and is no wander of a bias: there the accelerometer's wander is that of the component along
+   gravity, and its white noise the scatter about a parabola in time.
 3. ``residual``: short windows of turns, less a local polynomial: white noise alone. With P the projection that removes
    the polynomial and R the autocovariance of the filter, ``median(|P y|^2) = white^2 tr(P R) (1 - 2/(9 nu))^3``, where
    ``nu = tr(P R)^2 / tr(P R P R)`` (Satterthwaite 1946; the median, so that windows over a ramp do not count).
@@ -20,17 +22,16 @@ A recording held out for validation is not looked at.
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pipeline.errors import ConfigurationError, InputError
 from pipeline.records import Noise, Recording
-from pipeline.records.neighbours import noise_of_steps
 from pipeline.signal.allan import allan_deviation
-from pipeline.signal.filters import apply_filter
-from pipeline.signal.rests import find_rests, rests_from_table, runs
+from pipeline.signal.creep import along_gravity, creep_of
+from pipeline.signal.filter_noise import filter_autocovariance
+from pipeline.signal.rest_readings import rest_readings, stretches_of, usable
 from pipeline.signal.temperature import temperature_of
 from pipeline.signal.wander import RATIOS, Blocks, Likelihood, blocks_of, likelihood, variance_of_mean, with_scatter
 
@@ -43,16 +44,13 @@ if TYPE_CHECKING:
 
 __all__ = ["allan_deviation", "estimate_noise", "filter_autocovariance", "noise_of"]
 
-GAP = 1.5
 WANDER_TIME_S = 100.0  # where the data sheet gives none
 TIMES = np.exp2(np.arange(-6.0, 4.0))  # correlation times tried, in those of the data sheet
-IMPULSE_SAMPLES = 4096
 SHORTEST_BLOCK = 8
 FEWEST_SAMPLES = 60
 WINDOW, WINDOW_DEGREE, WINDOW_ARC_DEG = 16, 4, 60.0
 WARM_UP_S = (60.0, 180.0, 500.0)
 SMALLEST_WHITE = 1e-9  # keeps the weights of a noise-free recording finite
-EDGE_S, FEWEST_TO_SETTLE, SETTLED = 0.5, 6, 8.0
 SEEN, AGREES = 6.0, 4.0  # twice the gain in log-likelihood
 
 
@@ -72,18 +70,20 @@ def estimate_noise(sensor: str, recordings: list[Recording], data_sheet: dict[st
     ConfigurationError
         If neither the recordings nor the data sheet tell the noise.
     """
-    usable = [r for r in recordings if r.role != "validation" and r.reading(sensor) is not None and r.samples > 1]
-    static = [r for r in usable if r.role == "static"]
-    rests = [rest for r in usable if r.role != "static" for rest in _rests(r, sensor, everything=False)]
-    long_rests = [rest for r in static for rest in _rests(r, sensor, everything=True)]
+    known = [r for r in recordings if r.role != "validation" and r.reading(sensor) is not None and r.samples > 1]
+    static = [r for r in known if r.role == "static"]
+    rests = [rest for r in known if r.role != "static" for rest in rest_readings(r, sensor, everything=False)]
+    long_rests = [rest for r in static for rest in rest_readings(r, sensor, everything=True)]
     for source, found, more in (("static", long_rests, rests), ("rests", rests, [])):
         if sum(len(time) for time, _ in found) >= FEWEST_SAMPLES:
-            chosen = static if source == "static" else usable
+            if sensor == "accelerometer" and source == "rests" and _by_hand(known):
+                return _noise_along_gravity(found, known, data_sheet)
+            chosen = static if source == "static" else known
             noise = _noise_of_rests(found, more, chosen, data_sheet, source)
             length = sum(float(time[-1] - time[0]) for time, _ in found) if source == "static" else 0.0
             return replace(noise, length=length)
-    white = _white_of_turns(usable, sensor)
-    return _with_sheet_wander(white, data_sheet, "residual") if white is not None else _of_sheet(usable, data_sheet)
+    white = _white_of_turns(known, sensor)
+    return _with_sheet_wander(white, data_sheet, "residual") if white is not None else _of_sheet(known, data_sheet)
 
 
 def noise_of(sensor: str, recordings: Sequence[Recording], settings: Mapping[str, Any]) -> Noise | None:
@@ -105,84 +105,34 @@ def noise_of(sensor: str, recordings: Sequence[Recording], settings: Mapping[str
         return None
 
 
-def filter_autocovariance(recording: Recording) -> NDArray[np.float64]:
-    """Return the autocovariance of a recording's filter output for white noise of variance 1: (l,) array from lag 0."""
-    if recording.filter["name"] == "none" or recording.samples < 2:
-        return np.ones(1)
-    impulse = np.zeros((IMPULSE_SAMPLES, 3))
-    impulse[IMPULSE_SAMPLES // 2] = 1.0
-    time_ns = np.arange(IMPULSE_SAMPLES) * round(recording.interval * 1e9)
-    settings = {k: v for k, v in recording.filter.items() if k not in ("delay_s", "noise_gain")}
-    response = apply_filter(Recording("impulse", "static", None, time_ns, impulse), settings).accelerometer
-    assert response is not None  # noqa: S101
-    spectrum = np.fft.rfft(response[:, 0], 2 * IMPULSE_SAMPLES)
-    covariance: NDArray[np.float64] = np.fft.irfft(np.abs(spectrum) ** 2)[:IMPULSE_SAMPLES]
-    far = np.flatnonzero(np.abs(covariance) > 1e-9 * covariance[0])[-1]
-    return covariance[: far + 1]
+def _by_hand(recordings: list[Recording]) -> bool:
+    logged = any(r.table_angle is not None or r.table_rate is not None for r in recordings)
+    return any(r.role == "rests" for r in recordings) and not logged
 
 
-def _stretches(recording: Recording, mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Return the runs of a mask, cut at gaps in time."""
-    cuts = np.flatnonzero(np.diff(recording.time_ns) > GAP * recording.interval * 1e9) + 1
-    if len(cuts) == 0:
-        return runs(mask)
-    pieces: list[tuple[int, int]] = []
-    for start, stop in runs(mask):
-        edges = [start, *cuts[(cuts > start) & (cuts < stop)].tolist(), stop]
-        pieces += pairwise(edges)
-    return pieces
-
-
-def _usable(recording: Recording, values: NDArray[np.float64]) -> NDArray[np.bool_]:
-    return np.asarray(np.isfinite(values).all(axis=1) & recording.sound)
-
-
-def _rests(recording: Recording, sensor: str, *, everything: bool) -> list[Rest]:
-    """Return the times and readings of each rest of a recording."""
-    values = recording.reading(sensor)
-    assert values is not None  # noqa: S101
-    still = _usable(recording, values)
-    if not everything:
-        found = rests_from_table(recording)
-        if not found and recording.role == "rests":
-            found = find_rests(recording)
-        resting = np.zeros(recording.samples, bool)
-        memory = len(filter_autocovariance(recording)) - 1  # so long a filter's output holds what was before the rest
-        ahead = memory if recording.filter.get("zero_phase") else 0
-        for rest in found:
-            first = rest.start + memory * (rest.start > 0)
-            resting[first : rest.stop - ahead * (rest.stop < recording.samples)] = rest.accepted
-        still &= resting
-    if everything:  # a gap does not end a static rest: the likelihood knows the times
-        return [(recording.time[still], values[still])] if still.any() else []
-    settled = _settled(recording, values, _stretches(recording, still))
-    return [(recording.time[a:b], values[a:b]) for a, b in settled if b - a > 2]
-
-
-def _settled(
-    recording: Recording, values: NDArray[np.float64], stretches: list[tuple[int, int]]
-) -> list[tuple[int, int]]:
-    """Return rests without the samples at their edges that still move; the sensor's clock may be off the table's."""
-    ends = np.array(stretches, int).reshape(-1, 2)
-    lengths = ends[:, 1] - ends[:, 0]
-    edges = np.minimum(int(EDGE_S / recording.interval) + 1, lengths // 3)
-    for edge in np.unique(edges[lengths >= FEWEST_TO_SETTLE]).tolist():
-        alike = np.flatnonzero((edges == edge) & (lengths >= FEWEST_TO_SETTLE))
-        length = int(lengths[alike].min())
-        inside = values[ends[alike, :1] + np.arange(length)]
-        spread = noise_of_steps(np.abs(np.diff(inside, axis=1)), axis=1, keepdims=True)
-        for side in (1, -1):
-            ordered = inside if side == 1 else values[ends[alike, 1:] - 1 - np.arange(3 * edge)]
-            middle = np.median(ordered[:, edge : 3 * edge], axis=1, keepdims=True)
-            off = np.abs(ordered[:, :edge] - middle) > SETTLED * spread
-            moving = np.any(off & (spread > 0), axis=2)
-            cut = np.where(moving, np.arange(1, edge + 1), 0).max(axis=1)
-            ends[alike, 0 if side == 1 else 1] += side * cut
-    return [(a, b) for a, b in ends.tolist()]
+def _noise_along_gravity(rests: list[Rest], chosen: list[Recording], sheet: dict[str, Any]) -> Noise:
+    """Return the noise of an accelerometer that may creep: see the module, 2."""
+    found = [along_gravity(time, values) for time, values in rests]
+    along = [(time, values[:, None]) for (time, _), (values, _) in zip(rests, found, strict=True)]
+    noise = _noise_of_rests(along, [], chosen, sheet, "rests", creeping=[k for k, (_, c) in enumerate(found) if c])
+    covariance = filter_autocovariance(chosen[0])
+    creeps = [creep_of(time, values) for time, values in rests]
+    lost = [len(time) - creep.freedom for (time, _), creep in zip(rests, creeps, strict=True)]
+    counts = np.array([len(time) for time, _ in rests])
+    free = np.sum(counts * covariance[0] - np.array(lost) * counts * variance_of_mean(covariance, counts))
+    white = np.sqrt(np.sum([creep.squares for creep in creeps], axis=0) / float(free))
+    wander = np.full(3, float(noise.wander[0]))
+    return replace(noise, white=np.maximum(white, SMALLEST_WHITE), wander=wander)
 
 
 def _noise_of_rests(
-    rests: list[Rest], more: list[Rest], chosen: list[Recording], sheet: dict[str, Any], source: str
+    rests: list[Rest],
+    more: list[Rest],
+    chosen: list[Recording],
+    sheet: dict[str, Any],
+    source: str,
+    *,
+    creeping: Sequence[int] = (),
 ) -> Noise:
     covariance = filter_autocovariance(chosen[0])
     memory = int(np.searchsorted(-np.abs(covariance), -0.01 * covariance[0]))
@@ -191,18 +141,22 @@ def _noise_of_rests(
     if more and len(covariance) == 1:  # a filter still settles in a short rest after a move
         blocks = with_scatter(blocks, blocks_of(more, shortest))
     passed = (2.0 * covariance.sum() - covariance[0]) > 0.5  # at 0 Hz; a high-pass lets no wander through
-    if blocks.cut.sum() - len(np.unique(blocks.rest[blocks.cut])) < 3 or not passed:
+    told = blocks.cut & ~np.isin(blocks.rest, creeping)
+    if told.sum() - len(np.unique(blocks.rest[told])) < 3 or not passed:
         expected = np.sum(blocks.count * (covariance[0] - variance_of_mean(covariance, blocks.count)))
         return _with_sheet_wander(np.sqrt(blocks.scatter / max(float(expected), 1e-300)), sheet, source)
-    found = likelihood(blocks, _nuisance(blocks, chosen, source), covariance, TIMES * _wander_time(sheet))
+    found = likelihood(blocks, _nuisance(blocks, chosen, source, creeping), covariance, TIMES * _wander_time(sheet))
     return _best(found, sheet, source)
 
 
-def _nuisance(blocks: Blocks, chosen: list[Recording], source: str) -> NDArray[np.float64]:
-    """Return a constant for each rest and, in a static recording, temperature and warm-up."""
+def _nuisance(
+    blocks: Blocks, chosen: list[Recording], source: str, creeping: Sequence[int] = ()
+) -> NDArray[np.float64]:
+    """Return a constant for each rest, and a line where the unit creeps; for a static one temperature and warm-up."""
     rest, centre = blocks.rest[blocks.cut], (blocks.start + blocks.length / 2.0)[blocks.cut]
     columns = [(rest == r).astype(float) for r in np.unique(rest)]
     if source != "static":
+        columns += [(rest == r) * (centre - centre[rest == r].mean()) for r in np.intersect1d(rest, creeping)]
         return np.stack(columns, axis=1)
     columns += [np.exp(-(centre - centre.min()) / tau) for tau in WARM_UP_S if centre.min() < 4.0 * tau]
     for recording in chosen:
@@ -223,10 +177,11 @@ def _best(found: Likelihood, sheet: dict[str, Any], source: str) -> Noise:
         row = sheet_row
     if pooled[row] < SEEN:
         return _unseen(found, sheet_row, sheet, source)
+    columns = range(gain.shape[2])
     apart = gain[row].max(axis=0).sum() - pooled[row] > SEEN
-    axes = [slice(c, c + 1) for c in range(3)] if apart else [slice(0, 3)] * 3
+    axes = [slice(c, c + 1) for c in columns] if apart else [slice(None)] * len(columns)
     ratio = np.array([_peak(gain[row][:, axis].sum(axis=1)) for axis in axes])
-    white = np.array([np.interp(ratio[c], RATIOS, found.white[row, :, c]) for c in range(3)])
+    white = np.array([np.interp(ratio[c], RATIOS, found.white[row, :, c]) for c in columns])
     white = np.maximum(white, SMALLEST_WHITE)
     return Noise(white, white * ratio, float(TIMES[row] * _wander_time(sheet)), source)
 
@@ -246,7 +201,8 @@ def _unseen(found: Likelihood, row: int, sheet: dict[str, Any], source: str) -> 
     white = np.maximum(found.white[row, 0], SMALLEST_WHITE)
     noise = _with_sheet_wander(white, sheet, source)
     column = np.argmin(np.abs(RATIOS[:, None] - noise.wander / white), axis=0)
-    loss = 2.0 * np.sum(found.log_likelihood[row, 0] - found.log_likelihood[row, column, np.arange(3)])
+    each = np.arange(len(white))
+    loss = 2.0 * np.sum(found.log_likelihood[row, 0] - found.log_likelihood[row, column[each], each])
     return noise if loss < AGREES else Noise(white, np.zeros(3), noise.correlation_time, source)
 
 
@@ -268,7 +224,7 @@ def _white_of_turns(recordings: list[Recording], sensor: str) -> NDArray[np.floa
     for recording in recordings:
         values = recording.reading(sensor)
         assert values is not None  # noqa: S101
-        slow = _usable(recording, values)
+        slow = usable(recording, values)
         if recording.table_rate is not None:
             slow &= np.abs(recording.table_rate) * recording.interval * WINDOW < WINDOW_ARC_DEG
         covariance = np.zeros(WINDOW)
@@ -277,7 +233,7 @@ def _white_of_turns(recordings: list[Recording], sensor: str) -> NDArray[np.floa
         PR = P @ covariance[np.abs(np.subtract.outer(np.arange(WINDOW), np.arange(WINDOW)))]
         trace = float(np.trace(PR))
         nu = trace**2 / float(np.sum(PR * PR.T))
-        for start, stop in _stretches(recording, slow):
+        for start, stop in stretches_of(recording, slow):
             count = (stop - start) // WINDOW
             windows = values[start : start + count * WINDOW].reshape(count, WINDOW, 3)
             squares.append(np.sum(np.einsum("ij,njc->nic", P, windows) ** 2, axis=1) / trace)

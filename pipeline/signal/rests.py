@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.signal.creep import creep_in
 from pipeline.signal.quiet_rates import RATE_LIMIT_DPS, quiet_pieces
 
 if TYPE_CHECKING:
@@ -46,6 +47,9 @@ NEIGHBOURS = 5
 # Limits of a rest that is averaged. That of its rate, 0.7 deg/s off its neighbours, stands beside the data: a hand-held
 # rest of a consumer gyroscope differs by its g-sensitivity (0.1 deg/s/g) and tremor (0.3 deg/s over some seconds).
 TURN_LIMIT_DEG = 2.0
+# A steady tilt is modelled up to this rate (``pipeline.signal.creep``); units in real hands and on soft seats creep by
+# up to 0.3 deg/s.
+CREEP_LIMIT_DPS, STEADY_LIMIT_DEG = 0.5, 10.0
 SCATTER_LIMIT = 3.0
 SMALLEST_SCATTER_G2 = 3e-6  # 1 mg on each axis, so that a quiet sensor may settle by 0.1 deg
 SIGNIFICANT = 6.0  # standard deviations
@@ -239,7 +243,8 @@ def _plateau(counts: Sequence[int]) -> int:
 
 def _scatter(recording: Recording, rest: Rest, noise_variance: float) -> str:
     assert recording.accelerometer is not None  # noqa: S101
-    variance = float(np.var(recording.accelerometer[rest.start : rest.stop], axis=0).sum())
+    creep = creep_in(recording, rest.start, rest.stop)
+    variance = float(creep.squares.sum()) / max(creep.freedom, 1)
     ratio = np.sqrt(variance / max(noise_variance, SMALLEST_SCATTER_G2))
     if ratio <= SCATTER_LIMIT:
         return ""
@@ -247,9 +252,14 @@ def _scatter(recording: Recording, rest: Rest, noise_variance: float) -> str:
 
 
 def _turn(recording: Recording, rest: Rest) -> str:
-    """Compare the directions of the rest's four quarters."""
+    """Compare the directions of the rest's four quarters, where it creeps steadily less the straight line."""
     assert recording.accelerometer is not None  # noqa: S101
     force = recording.accelerometer[rest.start : rest.stop]
+    creep = creep_in(recording, rest.start, rest.stop)
+    rate, span = float(np.linalg.norm(creep.rate)), float(recording.time[rest.stop - 1] - recording.time[rest.start])
+    if 0.0 < rate <= CREEP_LIMIT_DPS and rate * span <= STEADY_LIMIT_DEG:
+        steady = np.cross(force.mean(axis=0), np.radians(creep.rate))  # du/dt = -omega x u
+        force = force - np.outer(recording.time[rest.start : rest.stop] - recording.time[rest.start], steady)
     quarter = len(force) // 4
     if quarter == 0:
         return ""

@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.estimation.rest_means import rest_means
+from pipeline.estimation.rest_means import rest_means, split_rests
 from pipeline.model.effects.base import truth
 from pipeline.model.effects.time_offset import shifted
 from pipeline.model.kinematics import earth_rate, reference_motion
+from pipeline.signal.creep import creep_in, vertical_creep
 from pipeline.signal.noise import filter_autocovariance
 from pipeline.signal.wander import variance_of_average, variance_of_mean
 
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from pipeline.signal.rests import Rest
 
 OTHER = {"accelerometer": "gyroscope", "gyroscope": "accelerometer"}
+RAW = 0.05  # by which scale and axes of sensors may differ before calibration: scale 3 %, cross-axis 2 % (data sheets)
 
 
 @dataclass(frozen=True)
@@ -146,6 +148,9 @@ def samples_of_rests(
 ) -> Samples | None:
     """Return the mean readings of rests, or None where there are none.
 
+    Of a gyroscope they are less the rate at which the unit creeps, as far as the accelerometer shows it; what it does
+    not show counts as noise of the rest (``pipeline.signal.creep``).
+
     Parameters
     ----------
     sensor : str
@@ -170,18 +175,35 @@ def samples_of_rests(
     gravity = float(table.get("gravity_g") or 1.0) if sensor == "accelerometer" else 0.0
     time = means(recording.time)
     assert time is not None  # noqa: S101
+    white = share[:, None] * noise.white**2
+    if sensor == "gyroscope" and recording.accelerometer is not None:
+        rate, unknown = _creep(recording, rests, other)
+        reading, white = reading - rate, white + unknown
     return Samples(
         sensor,
         time,
         reading,
         np.full(len(rests), gravity),
-        share[:, None] * noise.white**2,
+        white,
         averaged[:, None] * wander,
         None,
         other if len(other) else None,
         means(recording.temperature),
         resting=True,
     )
+
+
+def _creep(
+    recording: Recording, rests: Sequence[Rest], force: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the rate at which the unit creeps in each rest, deg/s, and the variance of what is not known of it."""
+    creeps = [creep_in(recording, rest.start, rest.stop) for rest in rests]
+    every = [creep_in(recording, rest.start, rest.stop) for rest in split_rests(recording, 0).used]
+    rate, error = np.array([c.rate for c in creeps]), np.array([c.uncertainty for c in creeps])
+    upward = (force / np.linalg.norm(force, axis=1, keepdims=True)) ** 2
+    seen = error**2 + RAW**2 * np.sum(rate**2, axis=1)
+    about = vertical_creep(np.array([c.rate for c in every]))
+    return rate, seen[:, None] * (1.0 - upward) + about**2 * upward
 
 
 def white_variance(recording: Recording, noise: Noise) -> NDArray[np.float64]:

@@ -17,6 +17,7 @@ import numpy as np
 from pipeline.errors import CannotCalibrateError
 from pipeline.estimation.rest_means import holdout_interval, rest_means, sound_samples, split_rests
 from pipeline.estimation.turns import stop_and_go, table_motion
+from pipeline.signal.creep import creep_in
 from pipeline.signal.rests import Rest, rests_from_table
 
 if TYPE_CHECKING:
@@ -151,10 +152,15 @@ def _rows(
         source, rests = own[0][0], [rest for _, rest in own]
         mean, count = rest_means(source, rests)
         keep, row = _samples(source, rests)
-        deviation = np.asarray(source.accelerometer)[keep] - mean[row]
         gain = float(source.filter.get("noise_gain", 1.0)) or 1.0
-        scatter += float(np.sum(deviation**2)) / (3.0 * gain**2)
-        spare += int(np.sum(np.maximum(count - 1, 0)))
+        if by_hand:  # where a unit may creep
+            creeps = [creep_in(source, rest.start, rest.stop) for rest in rests]
+            squares, free = sum(float(c.squares.sum()) for c in creeps), sum(c.freedom for c in creeps)
+        else:
+            squares = float(np.sum((np.asarray(source.accelerometer)[keep] - mean[row]) ** 2))
+            free = int(np.sum(np.maximum(count - 1, 0)))
+        scatter += squares / (3.0 * gain**2)
+        spare += free
         means.append(mean)
         counts.append(count)
         parts.append((source, keep))

@@ -1,12 +1,15 @@
 """The gyroscope by hand: at rest it feels nothing, and a move must turn gravity before into gravity after.
 
-    at rest:  r = (y - b - z) / s_e,     dr/db = -1/s_e,   dr/dp = -dz/dp / s_e
+    at rest:  r = (y - b - z - K w) / s_e,     dr/db = -1/s_e,   dr/dp = -dz/dp / s_e
     a move:   r = W E^T (u_after - A_0 u_before),   omega = M (y - b - z)
 
 where
 
     y, b, M : reading and bias, deg/s, and matrix
     z, p    : effects and their parameters, with the specific force of the accelerometer, at rest and as it is turned on
+    w       : rate at which a unit creeps in a rest, across gravity as the accelerometer shows it (K = M^-1). Of that
+              about gravity no more is known than that it is as large: it is an error of the rest, of variance
+              sum |w|^2 / (2 m)
     u       : direction of gravity by the calibrated accelerometer; A_0 as in ``pipeline.estimation.hand_held.moves``
     E       : two directions across u_after; W whitens what noise of the gyroscope, integrated, what it turned between
               its samples, and noise of the accelerometer leave there
@@ -35,6 +38,7 @@ from pipeline.estimation.hand_held.model import State, added, motion_of
 from pipeline.estimation.hand_held.moves import moves_of, tangents, to_the_end
 from pipeline.estimation.hand_held.rests import ROLE, rests_of
 from pipeline.model.rotation import skew
+from pipeline.signal.creep import vertical_creep
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -82,6 +86,7 @@ class HandHeldGyroscope:
         self.kinds = 1 if self.moves is None else 2
         self.directions = np.eye(12)[:, : 3 if self.moves is None else 12]
         self.rests_equations = 3 * len(self.rests.time)
+        self.vertical = vertical_creep(rests.creep)
         self.gravity = float(np.median(np.linalg.norm(force, axis=1)))
         if self.moves is not None:
             self.before, self.after = gravity.at_end[self.moves.before], gravity.at_start[self.moves.after]
@@ -123,7 +128,7 @@ class HandHeldGyroscope:
             length=stacked("length"),
             joined=np.ones_like(same) if self.rests.clock_shared else same,
             error=stacked("error"),
-            common=None if self.moves is None else _placed(pieces[1]["common"], sizes[0]),
+            common=_blocks([piece["common"] for piece in pieces], sizes),
         )
 
     def samples(self) -> float:
@@ -137,6 +142,7 @@ class HandHeldGyroscope:
         nothing = np.zeros_like(self.held_force)
         motion = motion_of(self.held.time, self.held_force, nothing, self.held.temperature, still=True)
         left = self.held.reading - state.bias - added(self.sensor, state.terms, motion, state.K)
+        left -= self.held.creep @ state.K.T
         return float(np.sqrt(np.mean(np.sum((left @ state.matrix.T) ** 2, axis=1))))
 
     def missed(self, state: State) -> tuple[Values, Values]:
@@ -161,7 +167,7 @@ class HandHeldGyroscope:
         rests, K = self.rests, state.K
         motion = motion_of(rests.time, self.force, np.zeros_like(self.force), rests.temperature, still=True)
         error = np.sqrt(rests.share[:, None]) * self.white
-        left = rests.reading - state.bias - added(self.sensor, state.terms, motion, K)
+        left = rests.reading - state.bias - added(self.sensor, state.terms, motion, K) - rests.creep @ K.T
         m = len(rests.time)
         base = np.zeros((m, 3, 12))
         base[:, :, :3] = np.eye(3)
@@ -183,7 +189,22 @@ class HandHeldGyroscope:
             "start": rests.start,
             "length": rests.length,
             "recording": rests.recording,
+            "common": self._of_creep(K, error),
         }
+
+    def _of_creep(self, K: Values, error: Values) -> Values | None:
+        """Return the covariance of the rests' equations by what is not known of their creep: (3 m, 3 m) array."""
+        across = self.rests.creep_error
+        if not across.any() and not self.vertical:
+            return None
+        u = self.force / np.linalg.norm(self.force, axis=1, keepdims=True)
+        upward = u[:, :, None] * u[:, None, :]
+        rate = across[:, None, None] ** 2 * (np.eye(3) - upward) + self.vertical**2 * upward
+        own = K @ rate @ K.T / error[:, :, None] / error[:, None, :]
+        m = len(own)
+        out = np.zeros((m, 3, m, 3))
+        out[np.arange(m), :, np.arange(m)] = own
+        return out.reshape(3 * m, 3 * m)
 
     def _of_moves(self, state: State, candidates: Sequence[Term]) -> dict[str, Any]:
         moves = self.moves
@@ -273,10 +294,15 @@ class HandHeldGyroscope:
         return motion_of(self.moves.time.ravel(), force.reshape(shape), rate.reshape(shape), warmth, still=False)
 
 
-def _placed(block: Values, first: int) -> Values:
-    """Return a block behind ``first`` rows and columns of zeros."""
-    out = np.zeros((first + len(block), first + len(block)))
-    out[first:, first:] = block
+def _blocks(blocks: Sequence[Values | None], sizes: Sequence[int]) -> Values | None:
+    """Return blocks along the diagonal, zeros where one is None; None where all are."""
+    if all(block is None for block in blocks):
+        return None
+    out, at = np.zeros((sum(sizes), sum(sizes))), 0
+    for block, size in zip(blocks, sizes, strict=True):
+        if block is not None:
+            out[at : at + size, at : at + size] = block
+        at += size
     return out
 
 

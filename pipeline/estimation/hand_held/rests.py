@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from pipeline.estimation.rest_means import holdout_interval, rest_means, sound_samples, split_rests
+from pipeline.signal.creep import creep_in
 from pipeline.signal.noise import filter_autocovariance
 from pipeline.signal.temperature import smooth_temperature
 from pipeline.signal.wander import variance_of_mean
@@ -51,6 +52,10 @@ class Rests:
     held_out : (m,) array of bool
     span : (m, 2) array of int
         Its first sample, and the one after its last.
+    creep : (m, 3) array, deg/s
+        Rate across gravity at which the unit tilts, by the readings of the accelerometer; 0 where it stands still.
+    creep_error : (m,) array, deg/s
+        Standard uncertainty of each of its two components.
     clock_shared : bool
         Whether the time between the recordings is known.
     """
@@ -66,6 +71,8 @@ class Rests:
     recording: NDArray[np.intp]
     held_out: NDArray[np.bool_]
     span: NDArray[np.intp]
+    creep: Values
+    creep_error: Values
     clock_shared: bool
 
     def select(self, index: NDArray[np.bool_]) -> Self:
@@ -156,6 +163,9 @@ def _of_recording(sensor: str, recording: Recording, rests: Sequence[Rest]) -> d
     assert reading is not None  # noqa: S101
     inside = [slice(a, b) for a, b in span]
     scatter = [np.sum((reading[s][good[s]] - mean) ** 2, axis=0) for s, mean in zip(inside, means, strict=True)]
+    creeps = [creep_in(recording, a, b) for a, b in span.tolist()] if recording.accelerometer is not None else []
+    if sensor == "accelerometer":  # less the tilt of a unit that creeps
+        scatter = [c.squares * max(n - 1, 1) / max(c.freedom, 1) for c, n in zip(creeps, counts, strict=True)]
     warmth = np.full(recording.samples, np.nan)
     if recording.temperature is not None:
         warmth = smooth_temperature(time, recording.temperature)
@@ -170,4 +180,6 @@ def _of_recording(sensor: str, recording: Recording, rests: Sequence[Rest]) -> d
         "time": np.array([time[s].mean() for s in inside]),
         "temperature": np.array([warmth[s].mean() for s in inside]),
         "span": span,
+        "creep": np.array([c.rate for c in creeps]) if creeps else np.zeros((len(span), 3)),
+        "creep_error": np.array([c.uncertainty for c in creeps]) if creeps else np.zeros(len(span)),
     }
