@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import csv
+import math
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pipeline.command_lines import RESULTS, add_command, add_missing_command, explain_command, once_command
-from pipeline.history import SENSORS, dropped, of_units, read_history
+from pipeline.history import SENSORS, difference, dropped, of_units, read_history
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -14,7 +15,8 @@ if TYPE_CHECKING:
 
 UNITS = {"accelerometer": "g", "gyroscope": "deg/s"}
 JSON = dict[str, Any]
-NAMED = 5  # units that a line names
+NAMED = 5  # units that a line names, and lines of one kind
+SAME = 0.02  # relative change of an error, below which it is not told
 
 
 class Finding(NamedTuple):
@@ -134,33 +136,52 @@ def outcome(results: Path, settings: Mapping[str, Any], *, of_this_run: bool) ->
     failed = f", failed: {len(rows) - calibrated}" if calibrated < len(rows) else ""
     findings = findings_of(rows)
     lines = [f"units calibrated: {calibrated}{failed}; look at {results}/index.html", *verdict_lines(findings)]
-    if of_this_run:
-        lines += _dropped(results, settings)
+    entries = read_history(results) if of_this_run else []
+    if entries:
+        lines += [*_changes(entries), *_dropped(entries, settings, str(results.parent))]
     lines += [f"{what}: {command}" for what, command in next_commands(findings, settings, str(results.parent))]
     return "\n".join(lines) + "\n"
 
 
-def _dropped(results: Path, settings: Mapping[str, Any]) -> list[str]:
-    """Return a line for each unit whose effects an earlier run had and this one has not."""
-    entries = read_history(results)
+def _changes(entries: Sequence[JSON]) -> list[str]:
+    """Return a line for each sensor whose effects or error the last run has changed, the largest change first."""
     states = of_units(entries)
-    by_unit: dict[str, list[tuple[str, str]]] = {}
-    for unit, sensor, effect, _ in dropped(entries):
-        by_unit.setdefault(unit, []).append((sensor, effect))
-    lines = []
-    for unit, effects in list(by_unit.items())[:NAMED]:
-        (run, before), (_, after) = states[unit][-2:]
-        sensor = effects[0][0]
-        errors = [state[sensor]["error"] for state in (before, after)]
-        rise = f"; its held-out error: {errors[0]:.3g} -> {errors[1]:.3g} {UNITS[sensor]}" if None not in errors else ""
-        names = [f"{s}.{e}" for s, e in effects]
-        again = add_command(settings, unit, names, str(results.parent))
-        lines.append(
-            f"{unit}: this run no longer has {', '.join(names)}, which run {run} had{rise}; "
-            f"to have it in every run: {again}"
-        )
-    more = len(by_unit) - NAMED
-    return [*lines, *([f"and {more} more units that no longer have an effect"] * (more > 0))]
+    found: list[tuple[float, str]] = []
+    for unit in entries[-1]["units"]:
+        if len(states[unit]) < 2 or not states[unit][-2][1]:
+            continue
+        before, after = (state for _, state in states[unit][-2:])
+        change = difference(before, after)
+        for sensor in SENSORS:
+            parts = [state.get(sensor) or {} for state in (before, after)]
+            errors = [float(part.get("error") or 0.0) for part in parts]
+            words = ", ".join(change.words(sensor)).replace("\N{MINUS SIGN}", "-").replace("\N{RIGHTWARDS ARROW}", "->")
+            if not all(errors):
+                continue
+            factor = abs(math.log(errors[1] / errors[0]))
+            if factor < SAME and not change.added[sensor] and not change.removed[sensor]:
+                continue
+            floor = parts[1].get("floor")
+            ratio = f", {errors[1] / floor:.3g} times the noise floor" if floor else ""
+            told = f"held-out error {errors[0]:.3g} -> {errors[1]:.3g} {UNITS[sensor]}{ratio}"
+            found.append((factor, f"{unit}, {sensor}: {words}; {told}"))
+    lines = [line for _, line in sorted(found, key=lambda f: -f[0])]
+    more = len(lines) - NAMED
+    return [*lines[:NAMED], *([f"and {more} more sensors that changed"] * (more > 0))]
+
+
+def _dropped(entries: Sequence[JSON], settings: Mapping[str, Any], results: str) -> list[str]:
+    """Return a line for each unit whose effects an earlier run had and this one has not."""
+    by_unit: dict[tuple[str, int], list[str]] = {}
+    for unit, sensor, effect, run in dropped(entries):
+        by_unit.setdefault((unit, run), []).append(f"{sensor}.{effect}")
+    lines = [
+        f"{unit}: this run no longer has {', '.join(effects)}, which run {run} had; "
+        f"to have it in every run: {add_command(settings, unit, effects, results)}"
+        for (unit, run), effects in by_unit.items()
+    ]
+    more = len(lines) - NAMED
+    return [*lines[:NAMED], *([f"and {more} more units that no longer have an effect"] * (more > 0))]
 
 
 def _named(units: Sequence[str]) -> str:

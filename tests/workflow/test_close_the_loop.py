@@ -129,6 +129,8 @@ def test_the_held_out_error_falls_to_its_floor_and_the_other_unit_stays(loop: Lo
     assert loop.other["added"] == loop.other["first"]
     assert len(loop.other["first"]) > 20
     assert "missing:" not in loop.said["added"]
+    told = f"{HIDDEN}, gyroscope: + g_sensitivity; held-out error {before:.3g} -> {after:.3g} deg/s, "
+    assert told + f"{after / floor_after:.3g} times the noise floor\n" in loop.said["added"]
 
 
 def test_the_history_draws_the_fall_with_what_was_added(loop: Loop) -> None:
@@ -147,6 +149,6 @@ def test_removing_undoes_it_and_says_what_the_run_no_longer_has(loop: Loop) -> N
     assert list((loop.directory / "my demo" / "devices").iterdir()) == []
     assert loop.errors["removed"] == loop.errors["first"]
     said = " ".join(loop.said["removed"].split())
-    assert f"{HIDDEN}: this run no longer has gyroscope.g_sensitivity, which run 2 had; its held-out error" in said
+    assert f"{HIDDEN}: this run no longer has gyroscope.g_sensitivity, which run 2 had; to have it" in said
     assert "The last run no longer has g sensitivity, which run 2 had." in loop.pages["removed"]
     assert [f.name for f in sorted((loop.results / "history").iterdir())] == ["0001.json", "0002.json", "0003.json"]
