@@ -279,3 +279,17 @@ def test_every_figure_of_the_page_says_its_finding(unit: Unit) -> None:
         title = re.search(r"<title[^>]*>(.+?)</title>", figure)
         assert title is not None
         assert finding.group(1) in title.group(1)
+
+
+@pytest.mark.parametrize(
+    ("factor", "cause"), [(1.0, "as the data sheet says"), (6.0, "vibration at rest"), (0.1, "a filter")]
+)
+def test_white_noise_far_from_the_data_sheet_gets_a_likely_cause(factor: float, cause: str) -> None:
+    white = factor * 1e-3 * np.sqrt(0.5 / 0.01)
+    reading = white * np.random.default_rng(1).standard_normal((2000, 3)) + [0.0, 0.0, 1.0]
+    rest = Recording("static", "static", None, 10_000_000 * np.arange(2000), accelerometer=reading)
+    noise = {"white": [white] * 3, "wander": [0.0] * 3, "correlation_time_s": 100.0, "source": "static"}
+    figure = allan("accelerometer", [rest], noise, {"noise_density": 1e-3}, None)
+    assert figure is not None
+    assert cause in figure.finding
+    assert ("filter" in figure.finding) == (factor < 1.0)
