@@ -38,6 +38,7 @@ FOREIGN = {
     b"SQLite format 3": "an SQLite database (a ROS 2 bag of the old kind): convert it to MCAP",
     b"#ROSBAG": "a ROS 1 bag: convert it to MCAP",
     b"\x89HDF": "an HDF5 or MATLAB file: export it as text",
+    b"MATLAB 7.3": "an HDF5 file (MATLAB 7.3): export it as text",
     b"MATLAB 5.0": "a MATLAB file: export it as text",
     b"PAR1": "a Parquet file: export it as text",
     b"\xff\xfe": UTF_16,

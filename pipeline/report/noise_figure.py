@@ -34,8 +34,8 @@ FEWEST, LONGEST = 60, 4096
 GAP, UNEVEN = 1.5, 0.5  # of the median interval: a gap, and a scatter that no average over equal times stands for
 PER_DECADE = 8
 SURE = 4.0  # averages of the longest time drawn; of fewer the deviation is a guess
-# Factor between both from which a cause is named: the MPU-6050's digital filters of 5 to 260 Hz change the white noise of
-# a sample by sqrt(52) = 7 at one sampling rate, a range by 2 to 8.
+# Factor between both from which a cause is named: the MPU-6050's digital filters of 5 to 260 Hz change the white noise
+# of a sample by sqrt(52) = 7 at one sampling rate, a range by 2 to 8.
 FAR = 5.0
 NEAR = 1.3  # factor between what was found and a data sheet that counts as the same
 

@@ -8,14 +8,14 @@ from pipeline.formats.csv_columns import BRACKETS, SPELLINGS, unit_in_brackets
 from pipeline.formats.units import CHANNELS, UNITS
 
 WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d")
-MERGED = re.compile(r"(a|acc|accel|f|g|gyr|gyro|w|omega|rot)([xyz])")
+MERGED = re.compile(r"(a|ac|acc|accl|accel|f|g|gy|gyr|gyro|w|omega|rot)([xyz])")
 SENSOR_WORDS = {
-    "accelerometer": {"a", "acc", "accel", "accelerometer", "acceleration", "f", "force"},
+    "accelerometer": {"a", "ac", "acc", "accl", "accel", "accelerometer", "acceleration", "f", "force"},
     "gyroscope": {"g", "gy", "gyr", "gyro", "gyroscope", "w", "omega", "rotation", "rot", "angular"},
 }
 NO_SENSOR = {"mag", "magnetometer", "magnetic", "gravity", "table", "encoder", "user", "variance", "covariance", "bias"}
 TIME_FIRST = {"t", "ts", "sec", "secs", "tow", "utc", "epoch", "elapsed", "date"}
-TIME_WORDS = {"time", "timestamp", "datetime", "millis", "micros", "seconds"}
+TIME_WORDS = {"time", "timestamp", "datetime", "millis", "micros", "seconds", "ticks", "zeit", "tiempo", "temps"}
 TABLE_WORDS = {"table", "turntable", "encoder", "enc"}
 OTHERS = {
     "temperature": {"temp", "temperature", "tmp"},
@@ -35,8 +35,8 @@ def words_of(name: str) -> list[str]:
     axis = bracket is not None and bracket.group(1).strip().lower() in ("0", "1", "2", "3", "x", "y", "z")
     text = name if axis or bracket is None else name[: bracket.start()]
     words = [w.lower() for w in WORD.findall(text)]
-    merged = MERGED.fullmatch(words[-1]) if words else None
-    return [*words[:-1], *merged.groups()] if merged else words
+    merged = [(w, MERGED.fullmatch(w)) for w in words]
+    return [part for w, found in merged for part in (found.groups() if found else (w,))]
 
 
 def axis_of(words: list[str]) -> str:
@@ -91,7 +91,8 @@ def stated_unit(name: str, channel: str) -> tuple[str | None, str]:
     ending = " ".join(words)
     for unit, spellings in UNIT_ENDINGS:
         for spelling in spellings:
-            if unit in UNITS[channel] and ending.endswith(f" {spelling}"):
+            alone = ending == spelling and spelling in TIME_WORDS
+            if unit in UNITS[channel] and (alone or ending.endswith(f" {spelling}")):
                 return unit, f"the name says {unit}"
     found = SPELLINGS.get(words[-1]) if len(words) > 1 else None
     return (found, f"the name says {found}") if found in UNITS[channel] else (None, "")

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from pipeline.survey.shape import Shape
 
 COUNTING = 0.98  # share of steps by exactly 1
+SCATTER = 0.2  # of intervals over their median: times of arrival, not of sampling
 TEMPERATURE_RANGE = (-60.0, 130.0)
 
 
@@ -30,6 +31,8 @@ class Columns:
     time : int or None
     counter : int or None
         A column that counts samples.
+    arrival : int or None
+        A time that scatters beside a counter without a gap, which then is the time.
     triads : dict of str to (int, int, int)
         Sensor to its x, y, z.
     others : dict of str to int
@@ -42,6 +45,7 @@ class Columns:
     shape: Shape
     time: int | None = None
     counter: int | None = None
+    arrival: int | None = None
     triads: dict[str, tuple[int, int, int]] = field(default_factory=dict)
     others: dict[str, int] = field(default_factory=dict)
     steady: bool = True
@@ -54,9 +58,11 @@ def find_columns(shape: Shape) -> Columns:
     words = {i: words_of(shape.names[i]) if shape.header else [] for i in shape.numbers}
     _find_time(found, words)
     for sensor in (*TRIADS, "?"):
-        triad = _triad({i: w for i, w in words.items() if sensor_of(w) == sensor})
+        named = {i: w for i, w in words.items() if sensor_of(w) == sensor}
+        triad = _triad(named)
         if triad is not None:
             found.triads[sensor] = triad
+            _tell_others(found, sensor, named)
     bare = found.triads.pop("?", None)
     if bare is not None and not found.triads:
         found.triads[_sensor_of_file(shape, bare)] = bare
@@ -80,7 +86,10 @@ def _find_time(found: Columns, words: dict[int, list[str]]) -> None:
     named = [i for i in numbers if is_time(words[i])]
     unnamed = [] if found.shape.header else [i for i in rising if i not in counters]
     candidates = [i for i in named if i in rising] or named or unnamed
-    if candidates:
+    gap_free = [i for i in counters if i not in candidates and bool(np.all(np.diff(numbers[i]) == 1.0))]
+    if candidates and gap_free and _scatters(numbers[candidates[0]]):
+        found.arrival, found.counter = candidates[0], gap_free[0]
+    elif candidates:
         found.time = candidates[0]
     elif counters:
         found.counter = counters[0]
@@ -92,6 +101,11 @@ def _find_time(found: Columns, words: dict[int, list[str]]) -> None:
             f"{found.shape.names[index]} does not increase at {back} rows: sessions one after the other (session: 1, "
             "2 .. reads one of them), or a counter that overflows"
         )
+
+
+def _scatters(time: NDArray[np.float64]) -> bool:
+    steps = np.diff(time)
+    return bool(np.std(steps) > SCATTER * abs(float(np.median(steps)))) and bool(time[-1] > time[0])
 
 
 def _counts(values: NDArray[np.float64]) -> bool:
@@ -113,6 +127,21 @@ def _triad(words: dict[int, list[str]]) -> tuple[int, int, int] | None:
             x, y, z = (axes[n] for n in names)
             return x, y, z
     return None
+
+
+def _tell_others(found: Columns, sensor: str, words: dict[int, list[str]]) -> None:
+    """Tell of further columns that may be the same sensor: another one of the board, or filtered readings."""
+    groups: dict[tuple[str, ...], dict[int, list[str]]] = {}
+    for index, w in words.items():
+        at = len(w) - 1 - w[::-1].index(axis_of(w))
+        groups.setdefault((*w[:at], *w[at + 1 :]), {})[index] = w
+    triads = [t for group in groups.values() if (t := _triad(group)) is not None]
+    if len(triads) > 1:
+        texts = [", ".join(found.shape.names[i] for i in t) for t in triads]
+        taken = ", ".join(found.shape.names[i] for i in found.triads[sensor])
+        others = "; ".join(text for text in texts if text != taken)
+        what = sensor if sensor != "?" else "sensor"
+        found.remarks.append(f"{len(triads)} triads may be the {what}: taken {taken}; the others are {others}; choose")
 
 
 def _sensor_of_file(shape: Shape, triad: tuple[int, int, int]) -> str:

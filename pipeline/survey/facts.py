@@ -11,7 +11,7 @@ from pipeline.formats.marks import CLIPPED, GAP, STUCK, UNIT_NAMES, equal_share
 from pipeline.formats.turn_evidence import misfit_deg, moves_of, rests_of
 from pipeline.records import AXES, SENSORS
 from pipeline.signal.rests import rests_from_table
-from pipeline.survey.unit_evidence import FEWEST_RESTS_FOR_A_SPHERE, sphere
+from pipeline.survey.unit_evidence import BURSTS, FEWEST_RESTS_FOR_A_SPHERE, sphere
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -72,8 +72,12 @@ def _time(recording: Recording) -> str:
     interval, time = recording.interval, recording.time_ns
     span = float(time[-1] - time[0]) / 1e9
     jitter = float(np.std(np.diff(time) / 1e9)) / interval
-    text = f"{recording.samples:,} rows over {_number(span)} s at {1 / interval:.6g} Hz (median interval "
-    text += f"{_number(interval * 1e3)} ms), from {_number(float(time[0]) / 1e9)} s"
+    mean = span / max(recording.samples - 1, 1)
+    rate, median = f"{1 / interval:.6g} Hz", f"{_number(interval * 1e3)} ms"
+    bursty = abs(mean / interval - 1.0) > BURSTS
+    rate = f"{1 / mean:.6g} Hz on average ({rate} by the median interval of " if bursty else f"{rate} (median interval "
+    rate += median
+    text = f"{recording.samples:,} rows over {_number(span)} s at {rate}), from {_number(float(time[0]) / 1e9)} s"
     gaps = 0 if recording.flags is None else int(np.count_nonzero(recording.flags & GAP))
     if gaps:
         return f"{text}; {gaps} gap{'s'[: gaps > 1]} (see the notes)"

@@ -15,7 +15,7 @@ import numpy as np
 
 from pipeline.formats.turn_evidence import moves_of
 from pipeline.formats.units import COUNTS, GYROSCOPE, TRIADS
-from pipeline.survey.column_names import stated_unit
+from pipeline.survey.column_names import stated_unit, words_of
 from pipeline.survey.columns import Columns, find_columns
 from pipeline.survey.unit_evidence import ASSUMED_HZ, UNKNOWN, Guess, force_unit, rate_unit, time_unit
 
@@ -176,9 +176,14 @@ def _time(parts: list[Columns], proposal: Proposal) -> NDArray[np.float64] | Non
     """Propose where the time comes from, and return it in s; None where it is not known."""
     first = parts[0].shape
     count = len(next(iter(first.numbers.values())))
+    if parts[0].arrival is not None:
+        return _counted(parts[0], proposal)
     if parts[0].time is not None:
         values, name = first.numbers[parts[0].time], first.names[parts[0].time]
         guess = time_unit(values, *stated_unit(name, "time"))
+        if "ticks" in words_of(name):
+            text = f"{name}: counts_per_unit is the number of ticks a second"
+            guess = Guess({"unit": COUNTS, "counts_per_unit": UNKNOWN}, text)
         proposal.csv["rate_hz"] = None
         proposal.evidence.pop("rate_hz", None)
         proposal.evidence["time"] = guess.evidence
@@ -197,6 +202,22 @@ def _time(parts: list[Columns], proposal: Proposal) -> NDArray[np.float64] | Non
     proposal.csv["rate_hz"] = UNKNOWN
     proposal.evidence["rate_hz"] = "there is no time column: the sampling rate in Hz"
     return None
+
+
+def _counted(columns: Columns, proposal: Proposal) -> NDArray[np.float64] | None:
+    """Propose a counter without a gap as time, at the mean rate of the times of arrival beside it."""
+    shape = columns.shape
+    assert columns.counter is not None  # noqa: S101
+    assert columns.arrival is not None  # noqa: S101
+    arrival, count, name = shape.numbers[columns.arrival], shape.numbers[columns.counter], shape.names[columns.arrival]
+    second = time_unit(arrival, *stated_unit(name, "time")).second_s
+    rate = None if second is None else float(f"{(count[-1] - count[0]) / ((arrival[-1] - arrival[0]) * second):.6g}")
+    key = shape.key(columns.counter)
+    proposal.csv["rate_hz"] = None
+    proposal.columns[0]["time"] = {"column": key, "unit": COUNTS, "counts_per_unit": UNKNOWN if rate is None else rate}
+    said = "the sampling rate in Hz" if rate is None else f"{rate:g} Hz on average by {name}"
+    proposal.evidence["time"] = f"{key} counts samples without a gap, and the intervals of {name} scatter; {said}"
+    return None if rate is None else (count - count[0]) / rate
 
 
 def _moves(

@@ -33,6 +33,7 @@ SCALES = np.geomspace(1.0, 1000.0, 481)
 ASSUMED_HZ = 100.0  # where the time is not known
 CONVINCING_DEG = 12.0
 TOO_FAST_FOR_RADIANS = 40.0
+BURSTS = 0.1  # mean over median interval, from which both are told
 RATES_HZ = (5.0, 20_000.0)
 SINCE_1970_S = (1e9, 4e9)  # 2001 to 2096
 FEWEST_RESTS_FOR_A_SPHERE = 9
@@ -70,15 +71,23 @@ def time_unit(values: NDArray[np.float64], stated: str | None, why: str) -> Gues
     steps = np.diff(values)
     step = float(np.median(steps[steps > 0])) if np.any(steps > 0) else 0.0
     seconds = {unit: length / 1e9 for unit, (length, _) in UNITS["time"].items() if unit != COUNTS}
+    mean = float(np.mean(steps)) if len(steps) and np.all(steps >= 0) else step
+
+    def on_average(second: float) -> str:
+        if not step or abs(mean / step - 1.0) < BURSTS:
+            return ""
+        return f" by the median interval and {1 / (mean * second):.4g} Hz on average: rows in bursts, or gaps"
+
     if stated is not None:
-        rate = f", {1 / (step * seconds[stated]):.4g} Hz" if step else ""
+        rate = f", {1 / (step * seconds[stated]):.4g} Hz{on_average(seconds[stated])}" if step else ""
         return Guess({"unit": stated}, why + rate, seconds[stated])
     suits = [u for u, s in seconds.items() if step and RATES_HZ[0] <= 1 / (step * s) <= RATES_HZ[1]]
     since = [u for u in suits if SINCE_1970_S[0] < float(values[0]) * seconds[u] < SINCE_1970_S[1]]
     for unit in since or suits:
         others = [f", or {u} at {1 / (step * seconds[u]):.4g} Hz" for u in suits if u != unit and not since]
         what = "since 1970, in " if since else ""
-        evidence = f"{what}steps of {step:.6g}, so {unit} at {1 / (step * seconds[unit]):.4g} Hz{''.join(others)}"
+        rate = f"{1 / (step * seconds[unit]):.4g} Hz{on_average(seconds[unit])}"
+        evidence = f"{what}steps of {step:.6g}, so {unit} at {rate}{''.join(others)}"
         return Guess({"unit": unit}, evidence, seconds[unit])
     return Guess({"unit": UNKNOWN}, f"steps of {step:g} suit no unit of time: s, ms, us or ns?")
 

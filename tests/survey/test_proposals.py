@@ -15,6 +15,7 @@ from pipeline.formats.checks import Checks
 from pipeline.formats.csv_read import read_csv
 from pipeline.formats.csv_settings import csv_formats
 from pipeline.formats.ingest_error import IngestError
+from pipeline.formats.text_file import load_text
 from pipeline.survey.profile_text import as_yaml
 from pipeline.survey.proposal import Proposal, propose
 from pipeline.survey.shape import find_shape
@@ -128,3 +129,52 @@ def test_a_counter_of_samples_is_no_time_until_its_rate_is_stated() -> None:
     (proposal,) = propose([find_shape(text.encode(), "log.csv")])
     entry: dict[str, Any] = yaml.safe_load(as_yaml(proposal, "mine"))["csv"]["columns"]["time"]
     assert entry == {"column": "n", "unit": "counts", "counts_per_unit": "???"}
+
+
+@pytest.mark.parametrize(
+    ("header", "expected"),
+    [
+        ("millis,AcX,AcY,AcZ,GyX,GyY,GyZ", ("millis", "ms", "AcX", "GyZ")),
+        ("Zeit [s],ax_raw,ay_raw,az_raw,gx_raw,gy_raw,gz_raw", ("Zeit [s]", "s", "ax_raw", "gz_raw")),
+        ("time_ticks,accX,accY,accZ,gyroX,gyroY,gyroZ", ("time_ticks", "counts", "accX", "gyroZ")),
+    ],
+)
+def test_common_names_are_known(header: str, expected: tuple[str, ...]) -> None:
+    step = {"ms": 10.0, "s": 0.01}.get(expected[1], 160.0)
+    text = header + "\n" + "".join(f"{step * i:g},0.01,0.02,0.99,{0.1 * (i % 3)},0.1,0.2\n" for i in range(200))
+    columns = propose([find_shape(text.encode(), "log.csv")])[0].columns[0]
+    found = [columns[c]["column"] for c in ("time", "accel_x", "gyro_z")]
+    assert [found[0], columns["time"]["unit"], *found[1:]] == list(expected)
+    assert (columns["time"].get("counts_per_unit") == "???") == (expected[1] == "counts")
+
+
+def test_a_counter_without_a_gap_goes_before_times_of_arrival_that_scatter() -> None:
+    """Rows of 99 Hz that arrive in bursts of ten, 2 ms apart."""
+    n = np.arange(500)
+    arrival = 10.0 * (n // 10) / 99.0 + 0.002 * (n % 10)
+    head, rows = "seq,t_s,ax,ay,az\n", zip(n, arrival, strict=True)
+    counted = head + "".join(f"{i},{t:.6f},0,0,1.0\n" for i, t in rows)
+    (proposal,) = propose([find_shape(counted.encode(), "log.csv")])
+    entry = proposal.columns[0]["time"]
+    assert (entry["column"], entry["unit"]) == ("seq", "counts")
+    assert entry["counts_per_unit"] == pytest.approx(99.0, rel=0.02)
+    gap = head + "".join(f"{i + (i > 250)},{t:.6f},0,0,1.0\n" for i, t in zip(n, arrival, strict=True))
+    (proposal,) = propose([find_shape(gap.encode(), "log.csv")])
+    assert proposal.columns[0]["time"]["column"] == "t_s"
+    assert "500 Hz by the median interval and 100.5 Hz on average" in proposal.evidence["time"]
+
+
+def test_several_triads_of_one_sensor_are_told() -> None:
+    head = "t,acc_x,acc_y,acc_z,acc_lp_x,acc_lp_y,acc_lp_z\n"
+    text = head + "".join(f"{0.01 * i:.2f},0,0,1.0,0.1,0,1.0\n" for i in range(100))
+    (proposal,) = propose([find_shape(text.encode(), "log.csv")])
+    assert proposal.columns[0]["accel_x"]["column"] == "acc_x"
+    told = "2 triads may be the accelerometer: taken acc_x, acc_y, acc_z; the others are acc_lp_x, acc_lp_y, acc_lp_z"
+    assert any(told in remark for remark in proposal.remarks)
+
+
+def test_a_matlab_file_of_hdf5_is_named(tmp_path: Path) -> None:
+    file = tmp_path / "log.csv"
+    file.write_bytes(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(512, b"\0") + b"\x89HDF\r\n\x1a\n")
+    with pytest.raises(IngestError, match=r"an HDF5 file \(MATLAB 7.3\): export it as text"):
+        load_text(file)
