@@ -1,8 +1,8 @@
 """Checks that need all recordings of a unit: their mounting, their reference, and whether they share samples.
 
-Checks of a single file are in ``pipeline.formats``. The order is: units (rad/s for deg/s), mounting (which direction
-was up, which way the table turned), then the reference (do angle, rate, attitude, gravity and the sensor agree), then
-shared samples.
+Checks of a single file are in ``pipeline.formats``. The order is: the reference of the turns (do angle, rate,
+gyroscope, gravity and time agree in size), mounting (which direction was up, which way the table turned), then the
+reference of held-out motion, then shared samples.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from pipeline.preprocessing.mounting import check_mounting
-from pipeline.preprocessing.reference import check_reference, check_units
+from pipeline.preprocessing.reference import check_motion, check_turns
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -33,5 +33,5 @@ def check_recordings(recordings: Sequence[Recording], settings: Mapping[str, Any
     InputError
         If the recordings contradict each other, or the table's log contradicts itself or gravity.
     """
-    check_units(recordings, settings)
-    return check_reference(check_mounting(recordings, settings), settings)
+    turns, delays = check_turns(recordings, settings)
+    return check_motion(check_mounting(turns, settings), delays, settings)

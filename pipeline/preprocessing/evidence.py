@@ -28,7 +28,7 @@ from pipeline.records.median import median
 from pipeline.records.neighbours import noise_of_steps
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 
 GAP = 1.5  # median intervals, as pipeline.formats.marks
 EXPANDED = 3.0  # coverage of a stated standard uncertainty: 99.7 % of a normal distribution
+OPPOSITE = 0.8  # correlation, from which two channels differ in sign alone
+SIGN_BLOCK = 8  # intervals, over which short moves show their angle in both
 SAMPLED = 0.05  # relative: of an angle that is summed up from the rate in moves of some samples (1.6 % in 3 deg)
 LEAST_TURN_DEG = 60.0  # for gravity to tell an angle: biases of 0.1 g distort its phase by 6 deg
 LEAST_SWING_G = 0.5  # radius of gravity's circle, from which the axis is level
@@ -168,6 +170,21 @@ def of_rate(recording: Recording, name: str, rate: Array, known: NDArray[np.bool
     return Channel(name, low, high, turned, noise)
 
 
+def alike(channel: Channel, other: Channel) -> Channel:
+    """Return a channel with the sign of another, where they are the same but for it: an angle counted left-handed."""
+    if not _alike(channel.turned, other.turned) < -OPPOSITE:
+        return channel
+    return replace(channel, low=-channel.high, high=-channel.low, turned=-channel.turned)
+
+
+def _alike(one: Array, two: Array) -> float:
+    """Return the correlation of two angles turned, by blocks; 0 where one does not turn."""
+    starts = np.arange(0, len(one), SIGN_BLOCK)
+    a, b = np.add.reduceat(one, starts), np.add.reduceat(two, starts)
+    size = float(np.linalg.norm(a) * np.linalg.norm(b))
+    return float(a @ b) / size if size > 0.0 else 0.0
+
+
 def gravity_turned(recording: Recording, axis: int) -> Array | None:
     """Return the angle by which gravity turned about an axis in each interval, deg; None where it does not turn."""
     if recording.accelerometer is None:
@@ -185,9 +202,11 @@ def gravity_turned(recording: Recording, axis: int) -> Array | None:
     return np.asarray(turned)
 
 
-def of_gravity(recording: Recording, turned: Array, like: Channel) -> Channel:
-    """Return what gravity says, with the sign of another channel."""
-    sign = float(np.sign(np.sum(turned * like.turned))) or 1.0
+def of_gravity(recording: Recording, turned: Array, channels: Sequence[Channel]) -> Channel:
+    """Return what gravity says, with the sign of the gyroscope, or of that channel that it is most like."""
+    found = [(_alike(turned, c.turned), c.name == "gyroscope") for c in channels]
+    sure = [f for f in found if f[1] and abs(f[0]) > OPPOSITE] or found
+    sign = -1.0 if max(sure, key=lambda f: abs(f[0]))[0] < 0.0 else 1.0
     noise = float(noise_of_steps(np.abs(np.diff(turned)))) / recording.interval
     return replace(_of_turned("gravity", recording, sign * turned), noise=noise)
 

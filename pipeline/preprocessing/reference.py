@@ -15,6 +15,7 @@ import numpy as np
 
 from pipeline.preprocessing.evidence import (
     Limits,
+    alike,
     axis_index,
     column,
     gravity_turned,
@@ -52,11 +53,16 @@ if TYPE_CHECKING:
 
 FEWEST = 32  # samples, two short stretches
 MANY = 20  # samples, more than a spike or a jump concerns
+HALF = 0.5  # of the usual gain, which the axis turned about shows at least
 SAME = 0.1  # relative: gains of two turns that are of one gyroscope
 
 
-def check_units(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> None:
-    """Refuse turns whose columns are of wrong units; before the mounting, which the units would hide.
+def check_turns(
+    recordings: Sequence[Recording], settings: Mapping[str, Any]
+) -> tuple[list[Recording], dict[str, float]]:
+    """Return the recordings with notes on the reference of their turns, and how late the sensor is in each, s.
+
+    Signs and directions do not count: this goes before the mounting, which wrong units would hide.
 
     Parameters
     ----------
@@ -68,12 +74,17 @@ def check_units(recordings: Sequence[Recording], settings: Mapping[str, Any]) ->
     Raises
     ------
     IngestError
-        If table angle, rate, gyroscope, gravity and time disagree in scale.
+        If channels of a turn contradict each other beyond what an effect of the catalogue explains.
     """
     limits = Limits.of(settings)
-    for recording in _turns(recordings):
+    turns = _turns(recordings)
+    for recording in turns:
         check_scale_of_turn(recording, limits, settings)
     check_intervals([r for r in recordings if r.samples >= FEWEST], settings)
+    gyroscope = Gyroscope(turns)
+    found = {r.name: _check_turn(r, gyroscope, limits, settings) for r in turns}
+    delays = {name: f.delay for name, f in found.items() if f.delay is not None}
+    return [replace(r, notes=(*r.notes, *found[r.name].notes)) if r.name in found else r for r in recordings], delays
 
 
 def _turns(recordings: Sequence[Recording]) -> list[Recording]:
@@ -81,31 +92,33 @@ def _turns(recordings: Sequence[Recording]) -> list[Recording]:
     return [r for r in logged if r.axis is not None and rate_of_turn(r) is not None]
 
 
-def check_reference(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> list[Recording]:
-    """Return the recordings, with the note ``N-REFERENCE`` where their reference is in doubt.
+def check_motion(
+    recordings: Sequence[Recording], delays: Mapping[str, float], settings: Mapping[str, Any]
+) -> list[Recording]:
+    """Return the recordings with notes on the reference of held-out motion.
 
     Parameters
     ----------
     recordings : sequence of Recording
-        All of a unit.
+        All of a unit, their turns as they are mounted.
+    delays : mapping of str to float, s
+        Of the turns.
     settings : mapping
         Sections ``sensor``, ``table`` and ``ingest``.
 
     Raises
     ------
     IngestError
-        If channels contradict each other beyond what an effect of the catalogue explains.
+        If its channels contradict each other, or a recording is late otherwise than all others.
     """
     limits = Limits.of(settings)
-    logged = [r for r in recordings if r.samples >= FEWEST and r.role != "static"]
-    turns = _turns(recordings)
-    gyroscope = Gyroscope(turns)
-    found = [(r, _check_turn(r, gyroscope, limits, settings)) for r in turns]
-    moved = [r for r in logged if r.axis is None and not (r.table_rate is None and r.table_attitude is None)]
-    found += [(r, _check_motion(r, gyroscope, limits, settings)) for r in moved]
-    check_delays([(r, f.delay) for r, f in found if f.delay is not None], limits)
-    notes = {r.name: f.notes for r, f in found}
-    return [replace(r, notes=(*r.notes, *notes.get(r.name, ()))) for r in recordings]
+    gyroscope = Gyroscope(_turns(recordings))
+    moved = [r for r in recordings if r.samples >= FEWEST and r.role != "static" and r.axis is None]
+    moved = [r for r in moved if not (r.table_rate is None and r.table_attitude is None)]
+    found = {r.name: _check_motion(r, gyroscope, limits, settings) for r in moved}
+    late = {**delays, **{name: f.delay for name, f in found.items() if f.delay is not None}}
+    check_delays([(r, late[r.name]) for r in recordings if r.name in late], limits)
+    return [replace(r, notes=(*r.notes, *found[r.name].notes)) if r.name in found else r for r in recordings]
 
 
 @dataclass(frozen=True)
@@ -130,11 +143,11 @@ class Gyroscope:
             if len(known) == 3:
                 gain, bias = np.array(known).T
                 found[axis].append((float(np.percentile(np.abs(rate), 90.0)), gain, bias))
-        gains = [gain[a] for a, turned in found.items() for _, gain, _ in turned]
+        gains = [abs(gain[a]) for a, turned in found.items() for _, gain, _ in turned]
         self.usual = float(median(np.array(gains))) if len(gains) > 2 else 1.0
         self.matrix = self.usual * np.eye(3)
         for axis, turned in found.items():
-            fitting = [f for f in turned if abs(f[1][axis] / self.usual - 1.0) <= SAME]
+            fitting = [f for f in turned if abs(abs(f[1][axis]) / self.usual - 1.0) <= SAME]
             if fitting:
                 self.matrix[:, axis] = max(fitting, key=lambda f: f[0])[1]
         biases = [bias for turned in found.values() for _, _, bias in turned]
@@ -145,12 +158,16 @@ class Gyroscope:
         rate = rate_of_turn(recording)
         if recording.gyroscope is None or rate is None:
             return None
-        reading, gain = recording.gyroscope[:, axis], self.matrix[axis, axis]
-        fit = slope_of(reading, rate)
-        if fit is not None and abs(fit[0] / gain - 1.0) <= SAME:
-            return np.asarray((reading - fit[1]) / fit[0])
-        bias = float(median(reading - gain * rate)) if self.bias is None else float(self.bias[axis])
-        return np.asarray((reading - bias) / gain)
+        fits = [slope_of(recording.gyroscope[:, i], rate) for i in range(3)]
+        gains = [0.0 if f is None else abs(f[0]) / self.usual for f in fits]
+        fit = fits[axis]
+        if fit is not None and abs(gains[axis] - 1.0) <= SAME:
+            return np.asarray((recording.gyroscope[:, axis] - fit[1]) / fit[0])
+        if max(gains) > HALF > gains[axis]:
+            return None  # another axis turns: a matter of the mounting
+        gain = self.matrix[axis, axis]
+        bias = median(recording.gyroscope[:, axis] - gain * rate) if self.bias is None else self.bias[axis]
+        return np.asarray((recording.gyroscope[:, axis] - float(bias)) / gain)
 
     def vector(self, recording: Recording) -> Array | None:
         """Return the angular rate: (n, 3) array, deg/s; None where no turn tells the bias."""
@@ -164,13 +181,14 @@ def _check_turn(recording: Recording, gyroscope: Gyroscope, limits: Limits, sett
     if recording.table_rate is not None:
         channels.append(of_rate(recording, "table_rate", recording.table_rate))
     if recording.table_angle is not None:
-        channels.append(of_angle(recording, recording.table_angle))
+        angle = of_angle(recording, recording.table_angle)
+        channels.append(alike(angle, channels[0]) if channels else angle)
     seen = gyroscope.along(recording, axis_index(recording))
     if seen is not None:
         channels.append(of_rate(recording, "gyroscope", seen, recording.sound))
     phase = gravity_turned(recording, axis_index(recording))
     if phase is not None and recording.table_angle is not None:
-        channels.append(of_gravity(recording, phase, channels[-1]))
+        channels.append(of_gravity(recording, phase, channels))
     found = _compare(recording, channels, limits, settings)
     doubt = doubt_of_scale(recording, limits, settings)
     if doubt is None:

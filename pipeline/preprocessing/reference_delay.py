@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 FURTHEST, FURTHEST_S = 25, 10.0  # samples of delay that are tried at least, and s at most
 FINEST_S = 0.05  # step in which delays are tried; a parabola finds what lies between
 FEWEST_DELAYS = 4  # recordings, of which one alone may be late
+HALF = 0.5  # of an interval, between a rate at its end and the mean over it
 QUARTER = 0.25  # of an interval, within which a delay between samples is known
 BETTER = 0.5  # share of its power that a signal has to keep where it is no other's
 NEARLY = 0.1  # share of the power by which one delay has to be better than a smaller one
@@ -54,7 +55,7 @@ def delay_of(
         if float(squares.min()) >= BETTER * power:
             continue  # nothing moves, or they are not alike at any delay
         delay = (_nearest_minimum(squares, NEARLY * power) - furthest) * step
-        if abs(delay) > allowed + QUARTER * step:
+        if abs(delay) > max(allowed, HALF * step) + QUARTER * step:
             raise refusal(
                 recording,
                 "reference_contradiction",

@@ -146,6 +146,7 @@ class Comparison:
         if other.name == "gravity":  # a move between two samples of the angle may be shared by two of the sensor
             low, high, bend = np.minimum(2.0 * low, 0.0), np.maximum(2.0 * high, 0.0), np.zeros_like(bend)
         size = np.maximum(np.abs(low), np.abs(high))
+        size[np.isinf(size)] = np.nan
         noise = BY_NOISE * (claim.noise + other.noise) + RESOLVED_DEG / self.interval
         gross, stated = limits.rate * size, limits.rate_stated * size
         if claim.of_intervals:

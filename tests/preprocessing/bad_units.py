@@ -175,7 +175,7 @@ def cases() -> dict[str, Case]:
         ),
         "51 frozen": Case(at("validation", of(rate, frozen(300, 700))), wrong, "is it frozen", "validation.csv"),
         "51 nothing but zeros": Case(at("gyro_z", of(rate, times(0.0))), wrong, "table_rate_dps"),
-        "51 reversed": Case(at("accel_y", of(angle, lambda v: v[::-1])), wrong, "table_angle_deg"),
+        "51 reversed": Case(at("gyro_y", of(angle, lambda v: v[::-1])), wrong, "table_angle_deg"),
         "51 sections lost": Case(
             at("accel_y", of(angle, lambda v: np.append(np.delete(v, slice(300, 360)), np.repeat(v[-1], 60)))),
             wrong,
