@@ -14,10 +14,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.formats.turn_evidence import moves_of
-from pipeline.formats.units import COUNTS, GYROSCOPE, TRIADS
+from pipeline.formats.units import COUNTS, GYROSCOPE, TRIADS, UNITS
 from pipeline.survey.column_names import stated_unit, words_of
 from pipeline.survey.columns import Columns, find_columns
-from pipeline.survey.unit_evidence import ASSUMED_HZ, UNKNOWN, Guess, force_unit, rate_unit, time_unit
+from pipeline.survey.unit_evidence import (
+    ASSUMED_HZ,
+    UNKNOWN,
+    Guess,
+    force_unit,
+    rate_unit,
+    rate_unit_by_table,
+    time_unit,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -152,7 +160,8 @@ def _proposal(parts: list[Columns]) -> Proposal:
     rate = _readings("gyroscope", parts)
     if rate is not None:
         moves, why_none = _moves(force, rate, time_s, steady=parts[0].steady)
-        _add("gyroscope", parts, proposal, rate_unit(rate, moves, why_none, timed=time_s is not None))
+        by_table = _by_table(parts, rate)
+        _add("gyroscope", parts, proposal, by_table or rate_unit(rate, moves, why_none, timed=time_s is not None))
     if force is None and rate is None:
         proposal.remarks.append("no three columns look like an accelerometer or a gyroscope: name them in columns")
     for columns, entries in zip(parts, proposal.columns, strict=True):
@@ -230,6 +239,17 @@ def _moves(
         return [], "the rows are not one series in time, so the turns of gravity cannot tell the unit"
     moves = moves_of(force, rate, time_s if time_s is not None else np.arange(len(rate)) / ASSUMED_HZ)
     return moves, "" if moves else "no move between rests turns gravity and tells the unit"
+
+
+def _by_table(parts: list[Columns], rate: NDArray[np.float64]) -> Guess | None:
+    """Return what the table's rate in the same rows says of the gyroscope's unit."""
+    for columns in parts:
+        if "gyroscope" in columns.triads and "table_rate" in columns.others:
+            index = columns.others["table_rate"]
+            stated, _ = stated_unit(columns.shape.names[index], "table_rate")
+            multiplier, divisor = UNITS["table_rate"][stated or "deg/s"]
+            return rate_unit_by_table(rate, columns.shape.numbers[index] * multiplier / divisor)
+    return None
 
 
 def _readings(sensor: str, parts: list[Columns]) -> NDArray[np.float64] | None:

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 UNKNOWN = "???"
 FORCE_UNITS = {"g": 1.0, "m/s^2": STANDARD_GRAVITY, "mg": 1000.0}
 CLOSE = 0.12  # bias and scale factor of a low-cost sensor in one position
+CLOSE_BY_TABLE = 0.05  # scale factor of a low-cost sensor (MPU-6050: 3 %), and a unit that leans on the table
+FOLLOWED = 0.3  # share of the rates' rms that the table's rate leaves at most: axes lean, and rates are noisy
 CLOSE_BY_TURNS = 0.2  # those of both sensors, in few moves
 USUAL_COUNTS_PER_G = (16384.0, 8192.0, 4096.0, 2048.0, 1024.0, 256.0)
 USUAL_COUNTS_PER_DPS = (131.0, 65.5, 32.8, 16.4, 8.2)
@@ -167,6 +169,36 @@ def rate_unit(rate: NDArray[np.float64], moves: Sequence[Move], why_none: str, *
     if largest > TOO_FAST_FOR_RADIANS:
         return Guess({"unit": "deg/s"}, f"up to {largest:.4g}, too fast for rad/s, so deg/s")
     return Guess({"unit": UNKNOWN}, f"up to {largest:.4g}; {why_none or 'the time is not known'}: deg/s or rad/s?")
+
+
+def rate_unit_by_table(rate: NDArray[np.float64], table_rate: NDArray[np.float64]) -> Guess | None:
+    """Return the unit of angular rates by the table's rate in the same rows; None where they do not follow it.
+
+    Parameters
+    ----------
+    rate : (n, 3) array
+    table_rate : (n,) array, deg/s
+    """
+    table = table_rate - table_rate.mean()
+    power = float(table @ table)
+    if power < len(table):  # 1 deg/s rms: below, noise and bias wander tell more than the table
+        return None
+    centred = rate - rate.mean(axis=0)
+    slopes = table @ centred / power
+    left = centred - np.outer(table, slopes)
+    if np.sum(left**2) > FOLLOWED**2 * np.sum(centred**2):
+        return None
+    size = float(np.linalg.norm(slopes))
+    seen = f"{size:.4g} a deg/s of the table's rate in the same rows"
+    if whole(rate):
+        usual = min(USUAL_COUNTS_PER_DPS, key=lambda c: abs(np.log(size / c)))
+        near = abs(size / usual - 1) < CLOSE_BY_TABLE
+        taken = f"; {usual:g} is the usual number near it" if near else ""
+        entry = {"unit": COUNTS, "counts_per_unit": usual if near else float(f"{size:.3g}")}
+        return Guess(entry, f"counts, {seen}{taken}")
+    units = {"deg/s": 1.0, "rad/s": 1.0 / DEGREES}
+    unit = next((u for u, one in units.items() if abs(size / one - 1) < CLOSE_BY_TABLE), UNKNOWN)
+    return Guess({"unit": unit}, f"{seen}, " + ("neither deg/s nor rad/s" if unit == UNKNOWN else f"so {unit}"))
 
 
 def _degrees_or_radians(moves: Sequence[Move]) -> Guess:

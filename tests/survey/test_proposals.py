@@ -178,3 +178,27 @@ def test_a_matlab_file_of_hdf5_is_named(tmp_path: Path) -> None:
     file.write_bytes(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(512, b"\0") + b"\x89HDF\r\n\x1a\n")
     with pytest.raises(IngestError, match=r"an HDF5 file \(MATLAB 7.3\): export it as text"):
         load_text(file)
+
+
+@pytest.mark.parametrize(
+    ("scale", "entry"),
+    [
+        (16.4, {"unit": "counts", "counts_per_unit": 16.4}),
+        (70.0, {"unit": "counts", "counts_per_unit": 69.8}),
+        (1.0, {"unit": "deg/s"}),
+        (np.pi / 180.0, {"unit": "rad/s"}),
+    ],
+)
+def test_the_rate_of_the_table_in_the_same_rows_tells_the_unit_of_the_gyroscope(
+    scale: float, entry: dict[str, Any]
+) -> None:
+    rng = np.random.default_rng(2)
+    rate = np.repeat([0.0, 50.0, 0.0, -100.0, 0.0], 100)
+    readings = 0.997 * scale * np.outer(rate, [0.02, 0.999, -0.03]) + scale * rng.normal(0.5, 0.1, (500, 3))
+    shown = np.round(readings) if entry["unit"] == "counts" else readings
+    rows = "".join(f"{0.01 * i:.2f},{r:g},{x:.6g},{y:.6g},{z:.6g}\n" for i, (r, (x, y, z)) in enumerate(
+        zip(rate, shown, strict=True)
+    ))  # fmt: skip
+    (proposal,) = propose([find_shape(f"t,table_rate_dps,gx,gy,gz\n{rows}".encode(), "log.csv")])
+    assert {k: proposal.columns[0]["gyro_y"].get(k) for k in entry} == entry, proposal.evidence
+    assert "a deg/s of the table's rate in the same rows" in proposal.evidence["gyroscope"]
