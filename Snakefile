@@ -4,17 +4,20 @@
 #   snakemake --cores 2 --config campaign=NAME_OR_DIR            runs another campaign
 #   ... --config campaign=C 'overrides=[filter=rc_low_pass]'     Hydra overrides for every unit of the run
 #
-# ingest -> filter -> fit/{sensor}/{stage} ... -> validate, diagnose, calibration -> export, report -> gather -> verdict
+# ingest -> filter -> fit/{sensor}/{stage} ... -> validate, diagnose, calibration -> export -> report -> gather -> verdict
 #
 # One job handles a batch of units; each writes one file per unit below results/<campaign>/batches/<batch>/<stage>/.
 
 
 include: "workflow/rules/common.smk"
+include: "workflow/rules/gather.smk"
 
 
 rule all:
+    default_target: True
     input:
         f"{RESULTS}/complete.json",
+        pages,
 
 
 include: "workflow/rules/simulate.smk"
@@ -26,7 +29,6 @@ include: "workflow/rules/diagnose.smk"
 include: "workflow/rules/calibration.smk"
 include: "workflow/rules/export.smk"
 include: "workflow/rules/report.smk"
-include: "workflow/rules/gather.smk"
 include: "workflow/rules/thesis.smk"
 include: "workflow/rules/verdict.smk"
 

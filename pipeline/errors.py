@@ -43,6 +43,12 @@ class MissingInputError(InputError):
     code = "missing_file"
 
 
+class DamagedFileError(InputError):
+    """A file that an earlier stage of a run wrote is damaged or missing: the same command makes it again."""
+
+    code = "damaged_file"
+
+
 class ConfigurationError(PipelineError):
     """A setting is unknown, of the wrong type or out of its range."""
 

@@ -21,11 +21,12 @@ from pipeline.locks import jobs_at_work, take_run
 from pipeline.progress import AT_UNIT, Progress
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
 EVERY = {True: 1.0, False: 30.0}  # s between lines, by whether it is a terminal
 BLOCKS = ("JOB_INFO", "JOB_STARTED", "JOB_FINISHED", "PROGRESS", "SHELLCMD", "RUN_INFO", "RESOURCES_INFO", "GROUP_INFO")
 REFUSALS = ("LockException", "ProtectedOutputException")  # of Snakemake, before any job
+INTERRUPTED = ("Terminating processes on user request", "Shutting down, this might take")  # Ctrl-C; SIGTERM
 CHATTER = ("Select jobs to execute", "Execute ")
 CLEAR = "\r\x1b[K"
 
@@ -47,6 +48,7 @@ class Watch(logging.Handler):
         self.progress = Progress(batches)
         self.broken: list[tuple[str, Path]] = []
         self.refused = ""
+        self.interrupted = False
         self.ended = threading.Event()
         self.idle: Callable[[], None] = lambda: None  # called where there is nothing to be done
         self.stream: TextIO = sys.stderr
@@ -69,6 +71,8 @@ class Watch(logging.Handler):
                 self.broken.append((str(told.get("rule_name")), Path((told.get("log") or [os.devnull])[0])))
         elif str(record.msg).startswith("Nothing to be done"):
             self.idle()
+        elif str(record.msg).startswith(INTERRUPTED):
+            self.interrupted = True
         elif record.levelno >= logging.ERROR:
             self.refused = next((name for name in REFUSALS if name in str(record.msg)), self.refused)
 
@@ -90,6 +94,13 @@ class Watch(logging.Handler):
         if not quiet:
             threading.Thread(target=self._tell, kwargs={"terminal": terminal}, daemon=True).start()
 
+    def tell_changed(self, changed: Sequence[str]) -> None:
+        """Say which files were changed or deleted since they were made, and are made again."""
+        if changed:
+            more = [f"  and {len(changed) - 10} more"] * (len(changed) > 10)
+            lines = ["Changed or deleted since the last run, made again:", *(f"  {c}" for c in changed[:10]), *more]
+            print("\n".join(lines), file=self.stream, flush=True)
+
     def last_words(self) -> None:
         """Say what broke and which command recovers, after everything that Snakemake says."""
         self.ended.set()
@@ -103,7 +114,12 @@ class Watch(logging.Handler):
                 f"  {command}\nIf none is at work:\n  {unlock} && {command}",
                 file=self.stream,
             )
-        if self.broken:
+        if self.interrupted or getattr(sys, "last_type", None) is KeyboardInterrupt:
+            print(
+                f"\nThe run was interrupted. Finished jobs are kept, others begin anew. To continue:\n  {command}",
+                file=self.stream,
+            )
+        elif self.broken:
             lines = [f"\n{len(self.broken)} jobs broke; what they had begun is removed, all others are done:"]
             lines += [f"  {rule}: {_cause(log)} (all of it: {log})" for rule, log in self.broken[:10]]
             lines += [f"  and {len(self.broken) - 10} more"] * (len(self.broken) > 10)

@@ -145,13 +145,13 @@ class PartFile:
     content: bytes
 
     def write(self) -> str:
-        """Write the file, unless it is there; return its path."""
-        if not self.path.is_file():
+        """Write the file, unless it is there unchanged; return its path."""
+        if not self.path.is_file() or self.path.read_bytes() != self.content:
             write_atomically(self.path, self.content)
         return str(self.path)
 
 
-def part_file(campaign: Campaign, stage: str, units: Sequence[str], sensor: str = "") -> PartFile:
+def part_file(campaign: Campaign, stage: str, units: Sequence[str], sensor: str = "", again: int = 0) -> PartFile:
     """Return a stage's part of the configuration of some units.
 
     Parameters
@@ -162,6 +162,8 @@ def part_file(campaign: Campaign, stage: str, units: Sequence[str], sensor: str 
     units : sequence of str
     sensor : str
         The sensor of a stage of a fit.
+    again : int
+        How often the job is repeated because what it wrote has been changed (``pipeline.written``).
     """
     if stage == "gather":
         content = _of_gather(campaign)
@@ -180,6 +182,8 @@ def part_file(campaign: Campaign, stage: str, units: Sequence[str], sensor: str 
         content["campaign"] = campaign.name
     if stage == "ingest":
         content["directory"] = str(campaign.recorded)
+    if again:
+        content["again"] = again
     text = _canonical(content)
     name = f"{stage}-{sensor}" if sensor else stage
     path = campaign.results / "configs" / f"{name}-{hashlib.sha256(text).hexdigest()[:16]}.json"
@@ -212,6 +216,7 @@ def _of_gather(campaign: Campaign) -> dict[str, Any]:
     compared = {u for c in campaign.compare for g in c["groups"] for u in g["units"]}
     return {
         "campaign": campaign.name,
+        "batches": campaign.batches,
         "rows": [unit.row for unit in campaign.units.values()],
         "overrides": {name: unit.overrides for name, unit in campaign.units.items() if unit.overrides},
         "run": campaign.run_settings(),

@@ -24,7 +24,7 @@ import numpy as np
 import pyarrow as pa
 from pyarrow import parquet
 
-from pipeline.errors import InputError
+from pipeline.errors import DamagedFileError, InputError
 from pipeline.formats.units import ACCELEROMETER, ATTITUDE, CHANNELS, GYROSCOPE, decode, encode
 from pipeline.records import Encoding, Note, Recording
 
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 SCHEMA_VERSION = 1
+AGAIN = "the same command once more makes it again"
 ROW_GROUP = 1_000_000  # samples
 KEY, KEY_CRC = b"recordings", b"recordings_crc32"
 BLOCKS = {"accelerometer": ACCELEROMETER, "gyroscope": GYROSCOPE, "table_attitude": ATTITUDE}
@@ -105,9 +106,7 @@ def load_recordings(path: Path, *, times_alone: bool = False) -> list[Recording]
         raise
     except Exception as error:  # damaged lengths and names surface as errors of many kinds
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(
-            f"cannot be read, it is missing or damaged ({reason}); delete it and run again", str(path)
-        ) from error
+        raise DamagedFileError(f"cannot be read, it is missing or damaged ({reason}); {AGAIN}", str(path)) from error
     recordings, start = [], 0
     for entry in data["recordings"]:
         if times_alone:
@@ -205,7 +204,7 @@ def _checked_metadata(metadata: dict[bytes, bytes], path: str) -> dict[str, Any]
     if data["schema_version"] != SCHEMA_VERSION:
         raise InputError(
             f"schema_version {data['schema_version']} is not known to this version ({SCHEMA_VERSION}); "
-            "delete the file and run again",
+            "delete the results and run again",
             path,
         )
     return data
@@ -242,5 +241,5 @@ def _recording(entry: dict[str, Any], table: Any, path: str) -> Recording:  # no
     )
 
 
-def _damaged(reason: str, path: str) -> InputError:
-    return InputError(f"the file is damaged: {reason}; delete it and run again", path)
+def _damaged(reason: str, path: str) -> DamagedFileError:
+    return DamagedFileError(f"the file is damaged: {reason}; {AGAIN}", path)

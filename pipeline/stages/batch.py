@@ -8,17 +8,20 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import shutil
 import sys
 import traceback
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.atomic import flushed_together, write_atomically
-from pipeline.errors import PipelineError
+from pipeline.errors import DamagedFileError, PipelineError
 from pipeline.json_text import json_text
 from pipeline.locks import hold_as_job
+from pipeline.written import keep_record
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -40,6 +43,8 @@ class Job:
     inputs : dict of str to Path
         Folders of the stages before.
     output : Path
+    results : Path
+        Of the campaign.
     """
 
     stage: str
@@ -47,6 +52,7 @@ class Job:
     run: dict[str, Any]
     inputs: dict[str, Path]
     output: Path
+    results: Path
 
 
 def parse_job(stage: str, argv: Sequence[str], inputs: Sequence[str], options: Sequence[str] = ()) -> Job:
@@ -68,7 +74,7 @@ def parse_job(stage: str, argv: Sequence[str], inputs: Sequence[str], options: S
         register_user_effects(content["user_effects"])
     run = {k: v for k, v in content.items() if k != "units"} | {name: arguments[name] for name in options}
     folders = {name: arguments[name] for name in inputs}
-    return Job(stage, content["units"], run, folders, arguments["output"])
+    return Job(stage, content["units"], run, folders, arguments["output"], config.parent.parent)
 
 
 def together(content: dict[str, Any]) -> dict[str, Any]:
@@ -83,8 +89,19 @@ def _merged(common: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
     return {**common, **own, **below}
 
 
-def run_batch(job: Job, work: Callable[[str, dict[str, Any]], None]) -> int:
+def run_batch(
+    job: Job,
+    work: Callable[[str, dict[str, Any]], None],
+    of_failed: Callable[[str, dict[str, Any], dict[str, Any]], None] | None = None,
+) -> int:
     """Call ``work(unit, part)`` for each unit; a failure is recorded and the others go on.
+
+    Parameters
+    ----------
+    job : Job
+    work : callable
+    of_failed : callable, optional
+        Called with unit, part and failure for each unit that has failed, here or in a stage before.
 
     Returns
     -------
@@ -100,12 +117,27 @@ def run_batch(job: Job, work: Callable[[str, dict[str, Any]], None]) -> int:
                 shutil.copyfile(earlier[0], job.output / f"{unit}{FAILED}")
             else:
                 _run_unit(job, unit, part, work)
+            failed = job.output / f"{unit}{FAILED}"
+            if of_failed and failed.is_file():
+                of_failed(unit, part, read_json(failed))
+    note_written(job, job.output)
     return 0
+
+
+def note_written(job: Job, output: Path, names: Sequence[str] = ("",)) -> None:
+    """Keep a record of what a job wrote, so that the next run sees what was changed since."""
+    if output.is_relative_to(job.results):
+        below = output.relative_to(job.results).as_posix()
+        keep_record(job.results, below.removeprefix("."), job.run.get("again", 0), names)
 
 
 def _run_unit(job: Job, unit: str, part: dict[str, Any], work: Callable[[str, dict[str, Any]], None]) -> None:
     try:
         work(unit, part)
+    except DamagedFileError as error:
+        with suppress(OSError):
+            os.utime(str(error.file))  # the next run sees that the file is not as it was written
+        _record_failure(job, unit, error.code, error.message, error.file)
     except PipelineError as error:
         _record_failure(job, unit, error.code, error.message, error.file)
     except OSError as error:
@@ -128,8 +160,18 @@ def _record_failure(job: Job, unit: str, code: str, message: str, file: str | No
 
 
 def read_json(path: Path) -> Any:  # noqa: ANN401  (any JSON value)
-    """Read a JSON file of a run."""
-    return json.loads(path.read_text(encoding="utf-8"))
+    """Read a JSON file of a run.
+
+    Raises
+    ------
+    DamagedFileError
+        If it does not exist or is no JSON.
+    """
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        reason = f"cannot be read, it is missing or damaged ({error}); the same command once more makes it again"
+        raise DamagedFileError(reason, str(path)) from None
 
 
 def write_json(path: Path, value: Any) -> None:  # noqa: ANN401

@@ -1,83 +1,89 @@
-"""Stage gather: publish every unit's files under their stable paths, and write the summary and the campaign page."""
+"""Stage gather: publish every unit's files under their stable paths, and write the summary and the campaign page.
+
+The whole set is made beside the published one, and takes its place when it is complete: whatever stops the stage, the
+published files are those of one run.
+"""
 
 from __future__ import annotations
 
 import os
 import shutil
+import traceback
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.atomic import write_atomically
+from pipeline.atomic import flushed_together, write_atomically
+from pipeline.errors import PipelineError
 from pipeline.history import of_units, record, unit_state
+from pipeline.publish import PUBLISHED, finish_publishing, publish_all
 from pipeline.report.campaign_page import render
 from pipeline.report.comparison_page import section
 from pipeline.report.comparison_units import unit_figures
+from pipeline.report.failure_page import failure_page
 from pipeline.report.fleet_statistics import fleet_statistics, parameters
 from pipeline.report.fleet_table import write_parameters
 from pipeline.report.history_section import runs_data, times_of, with_history
 from pipeline.report.summary import summary_row, write_summary
-from pipeline.stages.batch import FAILED, parse_job, read_json, write_json
+from pipeline.stages.batch import FAILED, note_written, parse_job, read_json, write_json
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-PUBLISHED = {"validate": "validations", "diagnose": "diagnoses"}
+    from pipeline.stages.batch import Job
+
+NEW = ".new"  # the set in the making, below the results
+FOLDERS = {"validate": "validations", "diagnose": "diagnoses"}
+
+
+@dataclass
+class Gathered:
+    """What one unit adds to the campaign: its documents, and each file to publish with its stable path."""
+
+    calibration: dict[str, Any]
+    failure: dict[str, Any] | None = None
+    documents: dict[str, Any] = field(default_factory=lambda: dict.fromkeys(FOLDERS))
+    files: list[tuple[Path, str]] = field(default_factory=list)
+    figures: Any = None
+    row: dict[str, Any] = field(default_factory=dict)
+    state: dict[str, Any] = field(default_factory=dict)
+    fitted: dict[str, tuple[float, float | None, str]] = field(default_factory=dict)
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run the stage; ``--output`` is the campaign's results, ``--batches`` the folder of the batches concerned."""
-    job = parse_job("gather", argv, [], ["batches"])
-    of_unit = {unit: Path(folder) for folder in job.run["batches"].split(",") for unit in _units(Path(folder))}
-    for name in ("calibrations", "validations", "diagnoses", "reports", "certificates", "exports"):
-        shutil.rmtree(job.output / name, ignore_errors=True)
-        (job.output / name).mkdir(parents=True)
-    compared = {u for c in job.run["compare"] for g in c["groups"] for u in g["units"]}
-    rows, failures, figures = [], [], {}
-    inputs: dict[str, list[dict[str, Any]]] = {}
-    fitted: dict[str, dict[str, tuple[float, float | None, str]]] = {}
-    states: dict[str, dict[str, Any]] = {}
-    for sheet_row in job.run["rows"]:
-        unit = sheet_row["unit"]
-        batch = of_unit[unit]
-        failure = _failure(batch, unit)
-        publish(batch / "report" / f"{unit}.html", job.output / "reports" / f"{unit}.html")
-        documents: dict[str, Any] = {"validate": None, "diagnose": None}
-        if failure:
-            failures.append(failure)
-            document = batch / "report" / f"{unit}.calibration.json"
-            calibration = read_json(document)
-            publish(document, job.output / "calibrations" / f"{unit}.json")
-        else:
-            calibration = read_json(batch / "calibration" / f"{unit}.json")
-            publish(batch / "calibration" / f"{unit}.json", job.output / "calibrations" / f"{unit}.json")
-            for stage, folder in PUBLISHED.items():
-                documents[stage] = read_json(batch / stage / f"{unit}.json")
-                publish(batch / stage / f"{unit}.json", job.output / folder / f"{unit}.json")
-            for part in documents["diagnose"].values():
-                if isinstance(part, dict) and part.get("suggested_file"):
-                    name = part["suggested_file"]
-                    publish(batch / "diagnose" / name, job.output / "diagnoses" / name)
-            for kind in ("json", "html"):
-                name = f"{unit}.{kind}"
-                publish(batch / "report" / "certificates" / name, job.output / "certificates" / name)
-            for file in sorted((batch / "export" / unit).iterdir()):
-                publish(file, job.output / "exports" / unit / file.name)
-        if unit in compared:
-            truth = _truth(Path(job.run["truths"][unit]))
-            figures[unit] = unit_figures(calibration, documents["validate"], documents["diagnose"], truth)
-        overrides = job.run["overrides"].get(unit, {})
-        states[unit] = unit_state(calibration, documents["validate"], documents["diagnose"], overrides)
-        inputs[unit] = calibration.get("inputs") or []
-        fitted[unit] = parameters(calibration)
-        rows.append(summary_row(unit, calibration, documents["validate"], documents["diagnose"], sheet_row))
-    write_summary(job.output / "summary.csv", rows)
-    write_json(job.output / "failures.json", failures)
-    write_parameters(job.output / "parameters.parquet", rows, fitted)
-    entries = record(job.output, states, job.run["run"])
-    _publish_histories(job.output, entries)
+    """Run the stage; ``--output`` is the mark that all is published: the list of failures."""
+    job = parse_job("gather", argv, [])
+    finish_publishing(job.results)
+    new = job.results / NEW
+    shutil.rmtree(new, ignore_errors=True)
+    for name in PUBLISHED:
+        if "." not in name:
+            (new / name).mkdir(parents=True)
+    with flushed_together(job.results):
+        batch_of = {unit: batch for batch, units in job.run["batches"].items() for unit in units}
+        rows = {row["unit"]: row for row in job.run["rows"]}
+        units = {u: _gather_unit(job, job.results / "batches" / batch_of[u], row, new) for u, row in rows.items()}
+        _write_campaign(job, units, new)
+    publish_all(new, job.results)
+    note_written(job, job.results, PUBLISHED)
+    write_json(job.output, [u.failure for u in units.values() if u.failure])
+    return 0
+
+
+def _write_campaign(job: Job, units: Mapping[str, Gathered], new: Path) -> None:
+    """Write what speaks of all units."""
+    rows, fitted = [u.row for u in units.values()], {name: u.fitted for name, u in units.items()}
+    failures = [u.failure for u in units.values() if u.failure]
+    write_summary(new / "summary.csv", rows)
+    write_json(new / "failures.json", failures)
+    write_parameters(new / "parameters.parquet", rows, fitted)
     statistics = fleet_statistics(rows, fitted)
-    write_json(job.output / "fleet.json", statistics)
+    write_json(new / "fleet.json", statistics)
+    figures = {name: u.figures for name, u in units.items() if u.figures is not None}
     sections = [section(c, figures, f"comparison-{i}") for i, c in enumerate(job.run["compare"], 1)]
+    inputs = {name: u.calibration.get("inputs") or [] for name, u in units.items()}
+    entries = record(job.results, {name: u.state for name, u in units.items()}, job.run["run"])
+    _publish_histories(new, entries)
     page = render(
         job.run["campaign"],
         rows,
@@ -89,17 +95,85 @@ def main(argv: Sequence[str]) -> int:
         history=runs_data(entries, job.run["run"]),
         settings=job.run["run"],
     )
-    write_atomically(job.output / "index.html", page)
-    return 0
+    write_atomically(new / "index.html", page)
 
 
-def _publish_histories(results: Path, entries: Sequence[dict[str, Any]]) -> None:
+def _publish_histories(new: Path, entries: Sequence[dict[str, Any]]) -> None:
     """Put into the page of each unit that several runs have changed what they changed."""
     times = times_of(entries)
     for unit, history in of_units(entries).items():
-        page = results / "reports" / f"{unit}.html"
+        page = new / "reports" / f"{unit}.html"
         if len(history) > 1 and page.is_file():
             write_atomically(page, with_history(page.read_text(encoding="utf-8"), history, times))
+
+
+def _gather_unit(job: Job, batch: Path, sheet_row: dict[str, str], new: Path) -> Gathered:
+    """Publish the files of one unit; one whose files cannot be gathered has failed."""
+    try:
+        found = _read_unit(job, batch, sheet_row)
+    except Exception as error:  # noqa: BLE001  (one unit never stops the campaign; the traceback is in the log)
+        traceback.print_exc()
+        found = _failed_unit(batch, sheet_row, error, new)
+    overrides = job.run["overrides"].get(sheet_row["unit"], {})
+    found.state = unit_state(found.calibration, found.documents["validate"], found.documents["diagnose"], overrides)
+    for source, target in found.files:
+        publish(source, new / target)
+    return found
+
+
+def _read_unit(job: Job, batch: Path, sheet_row: dict[str, str]) -> Gathered:
+    """Return what a unit adds to the campaign; nothing is written."""
+    unit = sheet_row["unit"]
+    failure = _failure(batch, unit)
+    page = batch / "report" / f"{unit}.html"
+    document = batch / "report" / f"{unit}.calibration.json" if failure else batch / "calibration" / f"{unit}.json"
+    found = Gathered(read_json(document), failure)
+    found.files = [(page, f"reports/{unit}.html"), (document, f"calibrations/{unit}.json")]
+    if not failure:
+        for stage, folder in FOLDERS.items():
+            found.documents[stage] = read_json(batch / stage / f"{unit}.json")
+            found.files.append((batch / stage / f"{unit}.json", f"{folder}/{unit}.json"))
+        for part in found.documents["diagnose"].values():
+            if isinstance(part, dict) and part.get("suggested_file"):
+                name = part["suggested_file"]
+                found.files.append((batch / "diagnose" / name, f"diagnoses/{name}"))
+        for kind in ("json", "html"):
+            name = f"{unit}.{kind}"
+            found.files.append((batch / "report" / "certificates" / name, f"certificates/{name}"))
+        exported = sorted((batch / "export" / unit).iterdir())
+        found.files += [(file, f"exports/{unit}/{file.name}") for file in exported]
+    validation, diagnosis = (found.documents[stage] for stage in FOLDERS)
+    missing = [str(source) for source, _ in found.files if not source.is_file()]
+    if missing:
+        raise FileNotFoundError(
+            f"{missing[0]} does not exist; delete the folder above it and run the same command again"
+        )
+    if any(unit in g["units"] for c in job.run["compare"] for g in c["groups"]):
+        truth = _truth(Path(job.run["truths"][unit]))
+        found.figures = unit_figures(found.calibration, validation, diagnosis, truth)
+    found.fitted = parameters(found.calibration)
+    found.row = summary_row(unit, found.calibration, validation, diagnosis, sheet_row)
+    return found
+
+
+def _failed_unit(batch: Path, sheet_row: dict[str, str], error: Exception, new: Path) -> Gathered:
+    """Return a unit that fails here, its page and its document written."""
+    unit = sheet_row["unit"]
+    code, message = "internal_error", f"{type(error).__name__}: {error} (a bug; see the log)"
+    file = None
+    if isinstance(error, PipelineError):
+        code, message, file = error.code, error.message, error.file
+    failure = {"unit": unit, "stage": "gather", "code": code, "message": message, "file": file}
+    keys = ("schema_version", "sensor", "table", "procedure", "method", "config_sha256", "software")
+    try:
+        known = read_json(batch / "calibration" / f"{unit}.json")
+    except PipelineError:
+        known = {}
+    calibration = {key: known.get(key) for key in keys} | {"unit": unit, "status": "failed", "error": failure}
+    calibration |= {"inputs": known.get("inputs") or [], "accelerometer": None, "gyroscope": None}
+    write_json(new / "calibrations" / f"{unit}.json", calibration)
+    write_atomically(new / "reports" / f"{unit}.html", failure_page(unit, failure))
+    return Gathered(calibration, failure, row=summary_row(unit, calibration, None, None, sheet_row))
 
 
 def same_files(inputs: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[list[str]]:
@@ -131,10 +205,6 @@ def _truth(path: Path) -> dict[str, Any] | None:
     """Return the truth behind a unit's recordings, where they were simulated."""
     document: dict[str, Any] | None = read_json(path) if path.is_file() else None
     return document
-
-
-def _units(batch: Path) -> list[str]:
-    return [f.stem for f in (batch / "report").glob("*.html")]
 
 
 def _failure(batch: Path, unit: str) -> dict[str, Any] | None:

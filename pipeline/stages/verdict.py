@@ -16,12 +16,13 @@ if TYPE_CHECKING:
 def main(argv: Sequence[str]) -> int:
     """Return 1 and name every failed unit, or write the mark of a complete campaign."""
     parser = argparse.ArgumentParser(prog="python -m pipeline verdict", description=__doc__)
-    parser.add_argument("--failures", type=Path, required=True, help="failures.json of the campaign")
+    parser.add_argument("--failures", type=Path, required=True, help="the failures that gather found")
+    parser.add_argument("--results", type=Path, required=True, help="of the campaign, as a person calls them")
     parser.add_argument("--output", type=Path, help="mark that is written where no unit has failed")
     arguments = parser.parse_args(argv)
     failures = read_json(arguments.failures)
     if failures:
-        page = arguments.failures.with_name("index.html")
+        page = arguments.results / "index.html"
         print(
             f"{len(failures)} unit{'s' * (len(failures) > 1)} failed (all others are done; see {page}):",
             file=sys.stderr,

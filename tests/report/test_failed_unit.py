@@ -14,7 +14,7 @@ def test_a_unit_that_fails_in_the_fit_shows_its_files_and_rests(tmp_path: Path) 
     recordings = [r for r in hand_held("mpu6050", 3).recordings if r.role == "rests"]
     part = Composer(tmp_path).unit("U1", ["procedure=multi_position", "sensor=mpu6050"]) | {"config_sha256": "0"}
     (tmp_path / "part.json").write_text(json.dumps({"units": {"U1": part}}))
-    folders = {name: tmp_path / name for name in ("filter", "calibration", "validate", "diagnose")}
+    folders = {name: tmp_path / name for name in ("filter", "calibration", "validate", "diagnose", "export")}
     for folder in folders.values():
         folder.mkdir()
     save_recordings(folders["filter"] / "U1.parquet", recordings)

@@ -9,6 +9,7 @@ import hashlib
 import os
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -77,7 +78,7 @@ class Disk:
         environment = os.environ | {"PYTHONPATH": str(self.directory / "own"), "PYTHONWARNINGS": ""}
         environment |= {"FAULT": fault} if fault else {}
         (self.directory / cwd).mkdir(exist_ok=True)
-        pipe = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+        pipe = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "start_new_session": True}
         return subprocess.Popen(command, cwd=self.directory / cwd, env=environment, text=True, **pipe)  # type: ignore[call-overload,no-any-return]
 
     def run(self, place: str, *config: str, fault: str = "", cwd: str = ".") -> tuple[int, str]:
@@ -145,6 +146,65 @@ def test_snakemake_that_is_killed_leaves_a_lock_and_jobs_that_end_by_themselves(
     assert code != 0
     assert "or one was killed here" in said
     assert "snakemake --unlock" in said
+    disk.recover(said)
+    assert disk.tree() == disk.trees[disk.place]
+
+
+def test_files_that_were_changed_or_deleted_are_made_again(disk: Disk) -> None:
+    results = disk.directory / "results" / "pair"
+    (fit,) = results.glob("batches/*-0002/fit/gyroscope/*/U2.json")
+    with (results / "calibrations" / "U1.json").open("a") as stream:  # a hard link: the file of the batch changes too
+        stream.write(" ")
+    (results / "reports" / "U1.html").unlink()
+    (results / "summary.csv").write_text("by hand")
+    shutil.rmtree(results / "exports" / "U2")
+    fit.write_text(fit.read_text().replace("1", "2"))
+    said, code = disk.run(disk.place)
+    assert code == 0, said
+    told = said[said.index("Changed or deleted since the last run") :].splitlines()[1:8]
+    for path in ("calibrations", "reports", "summary.csv", "exports"):
+        assert f"  results/pair/{path}" in told
+    assert disk.tree() == disk.trees[disk.place]
+    again, code = disk.run(disk.place)
+    assert "Nothing to be done" in again
+    assert code == 0
+
+
+def test_the_same_command_makes_a_damaged_file_again_whose_size_and_time_are_as_they_were(disk: Disk) -> None:
+    (file,) = (disk.directory / "results" / "pair").glob("batches/*-0001/ingest/U1.parquet")
+    was, content = file.stat(), bytearray(file.read_bytes())
+    for byte in range(1000, 1100):
+        content[byte] ^= 255
+    file.write_bytes(content)
+    os.utime(file, ns=(was.st_atime_ns, was.st_mtime_ns))
+    said, code = disk.run(disk.turn())
+    assert code != 0
+    assert "U1.parquet: the file is damaged: " in said or "missing or damaged (" in said
+    assert "the same command once more makes it again [damaged_file in report]" in said
+    said, code = disk.run(disk.place)
+    assert code == 0, said
+    now, wanted = disk.tree(), disk.trees[disk.place]
+    told = {"index.html", "reports/U1.html"}  # they tell of the run that failed
+    assert {name for name in now if now[name] != wanted.get(name)} <= told
+    assert now.keys() == wanted.keys()
+    shutil.rmtree(disk.directory / "results" / "pair" / "history")
+    shutil.rmtree(disk.directory / "results" / "pair" / "reports")
+    said, code = disk.run(disk.place)
+    assert code == 0, said
+
+
+def test_a_run_that_is_interrupted_says_so_and_goes_on_with_the_same_command(disk: Disk) -> None:
+    run = disk.start(disk.turn(), fault="hold")
+    for _ in range(600):
+        if (disk.directory / "held").exists():
+            break
+        time.sleep(0.1)
+    os.killpg(run.pid, signal.SIGINT)  # as Ctrl-C does
+    said = run.communicate(timeout=300)[0]
+    (disk.directory / "held").unlink()
+    assert run.returncode != 0
+    assert "The run was interrupted. Finished jobs are kept, others begin anew. To continue:" in said
+    assert "jobs broke" not in said
     disk.recover(said)
     assert disk.tree() == disk.trees[disk.place]
 

@@ -2,10 +2,12 @@
 import atexit
 import gc
 import hashlib
+import json
 import os
+import shlex
 import sys
 import time
-from glob import glob
+from pathlib import Path
 
 from snakemake.exceptions import WorkflowError
 from snakemake.settings.types import Quietness
@@ -20,7 +22,9 @@ from pipeline.config import code_digest, load_campaign, part_file
 from pipeline.errors import PipelineError
 from pipeline.formats.files import recording_files
 from pipeline.outcome import outcome
+from pipeline.publish import finish_publishing
 from pipeline.run_watch import Watch
+from pipeline.written import times_again
 
 try:
     CAMPAIGN = load_campaign(config)
@@ -28,17 +32,41 @@ except PipelineError as error:
     raise WorkflowError(str(error)) from None
 gc.freeze()  # the campaign stays: looking for garbage in thousands of configurations takes seconds
 
-RUN = f"{sys.executable} -m pipeline"
-RESULTS = str(CAMPAIGN.results)
+
+def without_braces(path):
+    """Return a path for Snakemake, which takes {name} for a wildcard: in place of one with braces, a link to it."""
+    if "{" not in str(path):
+        return str(path)
+    link = Path(
+        ".snakemake", "paths", hashlib.sha256(os.fsencode(path)).hexdigest()[:16]
+    )
+    link.parent.mkdir(parents=True, exist_ok=True)
+    if not link.is_symlink():
+        link.symlink_to(os.path.abspath(path))
+    return str(link)
+
+
+if "{" in str(CAMPAIGN.results):
+    CAMPAIGN.results.mkdir(parents=True, exist_ok=True)
+RUN = f"{shlex.quote(sys.executable)} -m pipeline"
+RESULTS = without_braces(CAMPAIGN.results)
 BATCH = f"{RESULTS}/batches/{{batch}}"
 LOG = f"{RESULTS}/logs/{{batch}}"
 SENSORS = ["accelerometer", "gyroscope"]
 STARTED = time.time()
 WAITING = {}  # parts of the configuration: written where jobs are run, not in a dry run
+AGAIN = (
+    {}
+)  # output to how often it has been made again, because files of it were changed or deleted
+CHANGED = []  # those files and folders
 RUNNING = not workflow.is_main_process
-if not RUNNING:
+if RUNNING:
+    # A job group on another machine: the main process has looked at the files before any job.
+    AGAIN = json.loads(Path(RESULTS, "configs", "again.json").read_text())
+else:
     WATCH = Watch(
-        RESULTS, {batch: len(units) for batch, units in CAMPAIGN.batches.items()}
+        str(CAMPAIGN.results),
+        {batch: len(units) for batch, units in CAMPAIGN.batches.items()},
     )
 
 
@@ -50,16 +78,25 @@ wildcard_constraints:
 
 def part(stage):
     """Return the function of a rule's params that names the stage's part of the configuration."""
-    return lambda wildcards: name_part(stage, CAMPAIGN.batches[wildcards.batch])
+    return lambda wildcards: name_part(
+        stage,
+        CAMPAIGN.batches[wildcards.batch],
+        f"batches/{wildcards.batch}/{stage}",
+    )
 
 
-def name_part(stage, units, sensor=""):
+def name_part(stage, units, output, sensor=""):
     """Return the path of a stage's part of the configuration, which is there once jobs are run."""
-    file = part_file(CAMPAIGN, stage, units, sensor)
+    if output not in AGAIN and not RUNNING:
+        AGAIN[output], changed = times_again(Path(RESULTS), output)
+        CHANGED.extend(changed)
+    file = part_file(CAMPAIGN, stage, units, sensor, AGAIN.get(output, 0))
+    path = f"{RESULTS}/configs/{file.path.name}"
     if RUNNING:
-        return file.write()
-    WAITING[file.path] = file
-    return str(file.path)
+        file.write()
+    else:
+        WAITING[path] = file
+    return path
 
 
 def begin_run():
@@ -75,12 +112,15 @@ def begin_run():
             plain=told.verbose or told.printshellcmds,
         )
         RUNNING = True
+        finish_publishing(CAMPAIGN.results)
         for file in WAITING.values():
             file.write()
+        WATCH.tell_changed(CHANGED)
+        Path(RESULTS, "configs", "again.json").write_text(json.dumps(AGAIN))
     except PipelineError as error:
         raise WorkflowError(str(error)) from None
     except OSError as error:
-        raise WorkflowError(f"{RESULTS} cannot be written: {error}") from None
+        raise WorkflowError(f"{CAMPAIGN.results} cannot be written: {error}") from None
     WAITING.clear()
 
 
@@ -112,7 +152,7 @@ def say_outcome(failures=""):
     if not os.path.exists(f"{RESULTS}/summary.csv"):
         return
     try:
-        recorded = max(glob(f"{RESULTS}/history/*.json"), default="")
+        recorded = max(Path(RESULTS, "history").glob("*.json"), default="")
         told = outcome(
             CAMPAIGN.results,
             CAMPAIGN.run_settings(),
@@ -132,4 +172,6 @@ def say_verdict():
 
 
 if not RUNNING:
-    WATCH.idle = say_outcome  # where there is nothing to be done, Snakemake calls no handler
+    WATCH.idle = (
+        say_outcome  # where there is nothing to be done, Snakemake calls no handler
+    )

@@ -7,7 +7,8 @@ def stage_before(wildcards):
 
 def part_of_fit(wildcards):
     stage = "effects" if wildcards.stage == "effects" else f"fit-{wildcards.stage}"
-    return name_part(stage, CAMPAIGN.batches[wildcards.batch], wildcards.sensor)
+    output = "batches/{batch}/fit/{sensor}/{stage}".format(**wildcards)
+    return name_part(stage, CAMPAIGN.batches[wildcards.batch], output, wildcards.sensor)
 
 
 def code_of_fit(wildcards):

@@ -1,43 +1,30 @@
 # Every unit's files under their stable paths, the summary and the campaign page; `snakemake --report` shows the pages.
+#
+# The published files are no output of the rule: Snakemake would delete them before the job, and when it fails. The stage
+# replaces them by a complete new set; what is changed or deleted by hand is found by `pipeline.written`.
 rule gather:
     input:
         of_batches("report"),
         of_batches("export"),
     output:
-        report(
-            f"{RESULTS}/index.html",
-            category="Campaign",
-            labels={"page": "the campaign"},
-        ),
-        report(
-            f"{RESULTS}/summary.csv",
-            category="Campaign",
-            labels={"page": "one row a unit"},
-        ),
-        f"{RESULTS}/failures.json",
-        f"{RESULTS}/parameters.parquet",
-        f"{RESULTS}/fleet.json",
-        [
-            directory(f"{RESULTS}/{name}")
-            for name in (
-                "calibrations",
-                "validations",
-                "diagnoses",
-                "certificates",
-                "exports",
-            )
-        ],
-        report(
-            directory(f"{RESULTS}/reports"),
-            patterns=["{unit}.html"],
-            category="Units",
-            labels={"unit": "{unit}"},
-        ),
+        f"{RESULTS}/batches/gathered.json",
     log:
         f"{RESULTS}/logs/gather.log",
     params:
-        config=lambda wildcards: name_part("gather", list(CAMPAIGN.units)),
+        config=lambda wildcards: name_part("gather", list(CAMPAIGN.units), ""),
         code=code_digest("pipeline.stages.gather"),
-        batches=",".join(f"{RESULTS}/batches/{batch}" for batch in CAMPAIGN.batches),
     shell:
-        "{RUN} gather --config {params.config:q} --batches {params.batches:q} --output {RESULTS:q} > {log:q} 2>&1"
+        "{RUN} gather --config {params.config:q} --output {output:q} > {log:q} 2>&1"
+
+
+def pages(wildcards):
+    """Return the published pages that exist, for `snakemake --report`."""
+    shown = {
+        "index.html": dict(category="Campaign", labels={"page": "the campaign"}),
+        "summary.csv": dict(category="Campaign", labels={"page": "one row a unit"}),
+        "reports": dict(
+            patterns=["{unit}.html"], category="Units", labels={"unit": "{unit}"}
+        ),
+    }
+    paths = {f"{RESULTS}/{name}": options for name, options in shown.items()}
+    return [report(p, **o) for p, o in paths.items() if os.path.exists(p)]

@@ -5,6 +5,7 @@ rule report:
         calibration=f"{BATCH}/calibration",
         validate=f"{BATCH}/validate",
         diagnose=f"{BATCH}/diagnose",
+        export=f"{BATCH}/export",
     output:
         directory(f"{BATCH}/report"),
     log:
@@ -14,4 +15,5 @@ rule report:
         code=code_digest("pipeline.stages.report"),
     shell:
         "{RUN} report --config {params.config:q} --filter {input.filter:q} --calibration {input.calibration:q}"
-        " --validate {input.validate:q} --diagnose {input.diagnose:q} --output {output:q} > {log:q} 2>&1"
+        " --validate {input.validate:q} --diagnose {input.diagnose:q}"
+        " --export {input.export:q} --output {output:q} > {log:q} 2>&1"

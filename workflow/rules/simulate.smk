@@ -5,7 +5,7 @@ if CAMPAIGN.simulation:
 
     rule simulate:
         input:
-            CAMPAIGN.simulation,
+            without_braces(CAMPAIGN.simulation),
         output:
             directory(SIMULATED),
         log:

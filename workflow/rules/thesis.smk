@@ -5,7 +5,7 @@ if CAMPAIGN.page == "thesis":
         input:
             rules.gather.output,
             collect(
-                f"{CAMPAIGN.directory}/{{file}}",
+                f"{without_braces(CAMPAIGN.directory)}/{{file}}",
                 file=[
                     "seeds.csv",
                     "printed/accel_parameters.csv",

@@ -1,11 +1,13 @@
 # The exit code of the run: fails, and names every failed unit with its cause, unless all units are calibrated.
 rule verdict:
     input:
-        failures=f"{RESULTS}/failures.json",
+        failures=f"{RESULTS}/batches/gathered.json",
         page=f"{RESULTS}/{CAMPAIGN.page}.html" if CAMPAIGN.page else [],
     output:
         f"{RESULTS}/complete.json",
     log:
         f"{RESULTS}/logs/verdict.log",
+    params:
+        results=str(CAMPAIGN.results),
     shell:
-        "{RUN} verdict --failures {input.failures:q} --output {output:q} 2> {log:q}"
+        "{RUN} verdict --failures {input.failures:q} --results {params.results:q} --output {output:q} 2> {log:q}"

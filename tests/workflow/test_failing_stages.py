@@ -1,0 +1,178 @@
+"""A fault in any stage fails one unit: its page names the cause, all others and the campaign's page are complete."""
+
+import csv
+import json
+import shutil
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline import publish
+from pipeline.config import load_campaign, part_file
+from pipeline.config.campaign import Campaign
+from pipeline.stages import batch, gather
+from pipeline.stages import report as report_stage
+
+STAGES = ("ingest", "filter", "fit", "calibration", "validate", "diagnose", "export", "report", "gather")
+FOLDERS = ("calibrations", "validations", "diagnoses", "reports", "certificates", "exports")
+
+
+def run_stages(campaign: Campaign) -> None:
+    """Run each stage in this process, as the rules do."""
+    (name,) = campaign.batches
+    folder = campaign.results / "batches" / name
+    units = campaign.batches[name]
+    fits = {sensor: f"fit/{sensor}/{stages[-1]}" for sensor, stages in campaign.chains[name].items()}
+
+    def stage(module: str, output: str, inputs: dict[str, str], *more: str, sensor: str = "") -> None:
+        part = part_file(campaign, module if module != "fit" else "fit-x", units, sensor).write()
+        given = [word for i, of in inputs.items() for word in (f"--{i}", str(folder / of))]
+        arguments = ["--config", part, *given, *more, "--output", str(folder / output)]
+        assert import_module(f"pipeline.stages.{module}").main(arguments) == 0
+
+    stage("ingest", "ingest", {})
+    stage("filter", "filter", {"ingest": "ingest"})
+    for sensor, output in fits.items():
+        more = ("--sensor", sensor, "--stage", output.rpartition("/")[2], "--previous=")
+        stage("fit", output, {"filter": "filter"}, *more, sensor=sensor)
+    stage("validate", "validate", {"filter": "filter", **fits})
+    stage("diagnose", "diagnose", {"filter": "filter", **fits})
+    stage("calibration", "calibration", {"ingest": "ingest", **fits})
+    stage("export", "export", {"calibration": "calibration", "validate": "validate"})
+    done = ("calibration", "validate", "diagnose", "export")
+    stage("report", "report", {"filter": "filter", **{s: s for s in done}})
+    stage("gather", "../gathered.json", {})
+
+
+@pytest.fixture(scope="module")
+def published(tmp_path_factory: pytest.TempPathFactory, simulated: Path) -> tuple[Campaign, Path]:
+    """A campaign of a good unit and, for each stage, one at which this stage fails after it has written its files."""
+    directory = tmp_path_factory.mktemp("faults") / "bench"
+    names = ["good", *(f"at_{stage}" for stage in STAGES)]
+    for name in names:
+        shutil.copytree(simulated, directory / "raw" / name)
+    (directory / "units.csv").write_text("unit\n" + "\n".join(names) + "\n")
+    campaign = load_campaign({"campaign": str(directory), "results": str(directory.parent / "results")})
+    run_unit, read_unit, render = batch._run_unit, gather._read_unit, report_stage.render
+
+    def faulty(job: batch.Job, unit: str, part: dict[str, Any], work: Callable[[str, dict[str, Any]], None]) -> None:
+        def fails(unit: str, part: dict[str, Any]) -> None:
+            work(unit, part)
+            raise MemoryError(f"no room for {unit}") if job.stage == "export" else RuntimeError(f"fault at {unit}")
+
+        run_unit(job, unit, part, fails if unit == f"at_{job.stage}" else work)
+
+    def faulty_gather(job: batch.Job, folder: Path, row: dict[str, str]) -> gather.Gathered:
+        if row["unit"] == "at_gather":
+            raise RuntimeError("fault at at_gather")
+        return read_unit(job, folder, row)
+
+    def faulty_render(document: dict[str, Any], *rest: Any, **more: Any) -> str:
+        if document["unit"] == "at_report" and document["status"] == "failed":
+            raise ValueError("the template fails too")
+        return render(document, *rest, **more)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(batch, "_run_unit", faulty)
+        patch.setattr(gather, "_read_unit", faulty_gather)
+        patch.setattr(report_stage, "render", faulty_render)
+        run_stages(campaign)
+    return campaign, campaign.results
+
+
+def test_a_fault_in_any_stage_fails_its_unit_alone(published: tuple[Campaign, Path]) -> None:
+    _, results = published
+    rows = {r["unit"]: r for r in csv.DictReader((results / "summary.csv").read_text().splitlines())}
+    assert list(rows) == ["good", *(f"at_{stage}" for stage in STAGES)]
+    assert rows["good"]["status"] == "ok"
+    assert (results / "validations" / "good.json").is_file()
+    assert len(list((results / "exports" / "good").iterdir())) > 10
+    index = (results / "index.html").read_text()
+    failures = {f["unit"]: f for f in json.loads((results / "failures.json").read_text())}
+    assert failures == {f["unit"]: f for f in json.loads((results / "batches" / "gathered.json").read_text())}
+    for stage in STAGES:
+        unit = f"at_{stage}"
+        cause = "no room for" if stage == "export" else "fault at"
+        assert failures[unit]["stage"].startswith(stage), failures[unit]
+        assert f"{cause} {unit}" in failures[unit]["message"]
+        assert rows[unit]["status"] == "failed"
+        assert json.loads((results / "calibrations" / f"{unit}.json").read_text())["status"] == "failed"
+        assert f"{cause} {unit}" in (results / "reports" / f"{unit}.html").read_text()
+        assert unit in index
+        assert not any((results / f / f"{unit}.json").exists() for f in ("validations", "diagnoses", "certificates"))
+        assert not (results / "exports" / unit).exists()
+
+
+def contents(results: Path) -> dict[str, bytes]:
+    """Return every published file."""
+    files = [results / name for name in publish.PUBLISHED if "." in name]
+    files += [f for folder in FOLDERS for f in (results / folder).rglob("*") if f.is_file()]
+    return {str(f.relative_to(results)): f.read_bytes() for f in files}
+
+
+def test_the_published_files_are_those_of_one_run_wherever_it_is_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def make(name: str, folder: Path) -> None:
+        for published in publish.PUBLISHED:
+            path = folder / published / "U1.json" if "." not in published else folder / published
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(f"{name} {published}")
+
+    class StoppedError(Exception):
+        pass
+
+    for stop in range(40):
+        results = tmp_path / str(stop)
+        make("old", results)
+        make("new", results / ".new")
+        old, new = contents(results), contents(results / ".new")
+        calls = iter(range(stop))
+
+        def stopping(do: Callable[..., Any], calls: Any = calls) -> Callable[..., Any]:
+            def step(*arguments: Any) -> Any:
+                if next(calls, None) is None:
+                    raise StoppedError
+                return do(*arguments)
+
+            return step
+
+        with monkeypatch.context() as patch:
+            patch.setattr(publish, "exchange", stopping(publish.exchange))
+            patch.setattr(Path, "rename", stopping(Path.rename))
+            patch.setattr(Path, "unlink", stopping(Path.unlink))
+            try:
+                publish.publish_all(results / ".new", results)
+                break
+            except StoppedError:
+                pass
+        now = contents(results)
+        assert now.keys() == old.keys()
+        assert all(now[k] in (old[k], new[k]) for k in now)
+        begun = (results / publish.COMPLETE).exists()
+        publish.finish_publishing(results)
+        assert contents(results) == (new if begun else old)
+        assert not (results / publish.COMPLETE).exists()
+    assert contents(results) == new
+    assert stop > len(publish.PUBLISHED)
+
+
+def test_what_a_killed_gather_leaves_is_the_old_set(published: tuple[Campaign, Path]) -> None:
+    campaign, results = published
+    before = contents(results)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gather, "render", lambda *_, **__: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            run_gather(campaign)
+    assert contents(results) == before
+    run_gather(campaign)
+    assert (results / "reports" / "at_export.html").is_file()
+    assert not (results / ".new").exists()
+
+
+def run_gather(campaign: Campaign) -> None:
+    part = part_file(campaign, "gather", list(campaign.units)).write()
+    gather.main(["--config", part, "--output", str(campaign.results / "batches" / "gathered.json")])
