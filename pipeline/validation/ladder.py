@@ -9,7 +9,7 @@ before anything (``raw``), after each stage of the fit, with matrix and bias, an
 where the effects are those of the reference motion, if the attitude is known. Then effects of timing move the reference
 to what the sensor felt, and the vector error is ``sqrt(mean |corrected - truth|^2)``; it contains a misalignment
 between unit and table, unless the fit was against the same table. Without a known attitude, effects are
-those of the log's own calibrated signals, by fixed point.
+those of the log's own calibrated signals, by fixed point, and effects of timing move the logged rate.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from pipeline.model.effects.base import truth
 from pipeline.model.inversion import Part, inverse_of, linear_truth, solve
 from pipeline.model.log_motion import LogEnd, fields_used, log_motion
 from pipeline.model.user_effects import effect_of
+from pipeline.records import Motion
 from pipeline.validation.samples import OTHER
 
 if TYPE_CHECKING:
@@ -33,11 +34,13 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.records import FittedEffect, Motion, SensorCalibration
+    from pipeline.records import FittedEffect, SensorCalibration
     from pipeline.validation.samples import Samples
 
     Corrected = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64] | None]
     Step = Callable[[Samples], Corrected]
+
+DEGREE = 3  # of the spline through a rate: 40 deg/s that change in 5 s are followed to 1e-4 deg/s at 0.12 s
 
 
 def ladder(
@@ -122,7 +125,8 @@ def _lack(calibration: SensorCalibration, fitted: FittedEffect, samples: Samples
         missing = [need for need in found.needs if getattr(samples.motion, need) is None]
         return f"the held-out recording holds no {' and no '.join(missing)}" if missing else None
     if found.moves:
-        return "the held-out recording logs no attitude, and without it the reference cannot be moved in time"
+        few = not samples.resting and len(samples.time) <= DEGREE
+        return f"the held-out recording has {len(samples.time)} samples, too few to follow its rate" if few else None
     try:
         used = fields_used(calibration.sensor, [fitted])
     except ConfigurationError as error:
@@ -139,7 +143,9 @@ def _with_effects(
     calibration: SensorCalibration, effects: Sequence[FittedEffect], other: SensorCalibration | None, samples: Samples
 ) -> Corrected:
     if samples.motion is None:
-        return _from_own_signals(calibration, effects, samples, other), samples.magnitude, None
+        own = [fitted for fitted in effects if not effect_of(fitted).moves]
+        moves = [fitted for fitted in effects if effect_of(fitted).moves]
+        return _from_own_signals(calibration, own, samples, other), _moved_magnitude(samples, moves), None
     sensor, motion, K = calibration.sensor, samples.motion, inverse_of(calibration)
     for fitted in effects:
         motion = effect_of(fitted).moved(motion, fitted.values)
@@ -150,6 +156,32 @@ def _with_effects(
     felt, stamped = truth(sensor, motion), truth(sensor, samples.motion)
     change = np.linalg.norm(felt, axis=1) - np.linalg.norm(stamped, axis=1)
     return linear_truth(calibration, rest), samples.magnitude + change, felt
+
+
+def _moved_magnitude(samples: Samples, effects: Sequence[FittedEffect]) -> NDArray[np.float64]:
+    """Return the reference's magnitude as the sensor felt it, by effects that move the motion in time.
+
+    That of a specific force is gravity at any time, that of a rest is 0. That of a rate is moved by a cubic spline
+    through the log; beyond its ends by more than an interval the log's end holds.
+    """
+    if not effects or samples.sensor == "accelerometer" or samples.resting:
+        return samples.magnitude
+    from scipy.interpolate import make_interp_spline  # noqa: PLC0415  (0.3 s, needed without an attitude log alone)
+
+    time, spline = samples.time, make_interp_spline(samples.time, samples.magnitude, k=DEGREE)
+    interval = float(np.median(np.diff(time)))
+
+    def motion(offset: float | NDArray[np.float64] = 0.0) -> Motion:
+        at = np.clip(time + offset, time[0] - interval, time[-1] + interval)
+        rate, nothing = np.zeros((2, len(time), 3))
+        rate[:, 0] = spline(at)
+        still = np.zeros(len(time), bool)
+        return Motion(time, nothing, rate, nothing, nothing, None, None, None, None, still, at_offset=motion)
+
+    moved = motion()
+    for fitted in effects:
+        moved = effect_of(fitted).moved(moved, fitted.values)
+    return np.abs(moved.angular_rate[:, 0])
 
 
 def _from_own_signals(

@@ -218,12 +218,14 @@ def test_an_effect_that_the_held_out_log_cannot_show_is_left_out_and_said() -> N
     assert part["steps"][2]["rms_error"] == part["steps"][1]["rms_error"]
 
 
-def test_timing_is_left_out_without_an_attitude_and_said() -> None:
-    c = calibration("gyroscope", fitted("time_offset", "gyroscope", 0.02))
-    recording = replace(read(held_out(300), gyroscope=c), table_attitude=None)
+@pytest.mark.parametrize(("name", "size"), [("time_offset", 0.03), ("low_pass_lag", 0.03), ("clock_rate", 300.0)])
+def test_timing_moves_the_rate_where_no_attitude_is_logged(name: str, size: float) -> None:
+    c = calibration("gyroscope", fitted(name, "gyroscope", size))
+    recording = replace(read(held_out(1500), 1.0, gyroscope=c), table_attitude=None)
     part = validate(c, [recording], noise_of("gyroscope"), SETTINGS)
-    assert "time_offset is left out" in part["notes"][0]
-    assert "no attitude" in part["notes"][0]
+    assert part["notes"] == []
+    assert part["steps"][-2]["rms_error"] > 4.0 * part["noise_floor"]
+    assert part["steps"][-1]["rms_error"] == pytest.approx(part["noise_floor"], rel=0.06)  # 3 / sqrt(2 n)
 
 
 def test_stages_of_a_staged_fit_are_steps() -> None:
