@@ -1,14 +1,14 @@
 """What speaks against compensating a log with a calibration: said beside the result, which is written all the same.
 
     rest  : a window of 100 samples whose scatter is at most twice that of the quietest tenth of the windows, and
-            twice that which successive differences have: nothing moves slowly either
+            twice that which successive differences have: nothing moves slowly either; gravity stands out of it
     error : ||a| - 1 g| or |w| of a rest's mean reading, before and after compensation
 
 A calibration that fits brings rests nearer to 1 g and to zero rate. Where it takes them away from there, the log was
 compensated already, is of another unit or sensor, or is read with other axes or units; or the sensor has changed.
 
-Between two rests gravity turns in the body by at most the integral of the rate's size. A gyroscope that integrates to
-less than half of that is not read in deg/s.
+Between two rests gravity turns in the body by at most the integral of the rate's size, from that at rest. A gyroscope
+that integrates to less than half of the turn is not read in deg/s.
 
 ``apply`` writes numbers rounded to 12 decimals, without zeros at their ends: 9 of 10 cells have 12 decimals. Fewer
 digits come from sensors, more from programs that write doubles.
@@ -35,6 +35,7 @@ WINDOW = 100
 MOST_WINDOWS = 20_000  # 2 million samples, 6 MB: the memory stays bounded
 QUIET, QUIETEST = 2.0, 0.1
 FEWEST_RESTS = 3
+DIRECTED = 0.1  # scatter over mean of a rest's specific force: its direction is known to 0.1 / sqrt(100) rad = 0.6 deg
 # Error after over error before. Where errors of both kinds are alike, by chance: a drift as large as the bias, three
 # components each, P(F(3, 3) < 1/9) = 4 %. An accelerometer is judged in three directions or more, and where the
 # correction is at least half of the error after it.
@@ -111,8 +112,9 @@ class Doubts:
             part[sensor] = cut.mean(axis=1)
             part[f"{sensor} scatter"] = np.sqrt(np.sum(cut.var(axis=1), axis=1))
             part[f"{sensor} noise"] = np.sqrt(np.sum(np.diff(cut, axis=1) ** 2, axis=2).mean(axis=1) / 2.0)
-            part[f"{sensor} size"] = np.sqrt(np.sum(cut**2, axis=2)).mean(axis=1)
-            part[f"{sensor} after"] = calibrated[sensor][: count * WINDOW].reshape(count, WINDOW, 3).mean(axis=1)
+            done = calibrated[sensor][: count * WINDOW].reshape(count, WINDOW, 3)
+            part[f"{sensor} size"] = np.linalg.norm(done, axis=2).mean(axis=1)  # a matrix may hold the factor
+            part[f"{sensor} after"] = done.mean(axis=1)
         if time is not None:
             part["time"] = time[: count * WINDOW].reshape(count, WINDOW).mean(axis=1)
         self.windows.append(part)
@@ -167,6 +169,9 @@ class Doubts:
         for sensor in present:
             scatter = table[f"{sensor} scatter"]
             still &= scatter <= QUIET * np.minimum(np.quantile(scatter, QUIETEST), table[f"{sensor} noise"])
+        if "accelerometer" in table:
+            size = np.linalg.norm(table["accelerometer"], axis=1)
+            still &= table["accelerometer scatter"] < DIRECTED * size
         if np.count_nonzero(still) < FEWEST_RESTS:
             return []
         found, worse = [], []
@@ -196,7 +201,8 @@ class Doubts:
         up = table["accelerometer"][at] / np.linalg.norm(table["accelerometer"][at], axis=1)[:, None]
         angle = np.degrees(np.arccos(np.clip(np.sum(up[1:] * up[:-1], axis=1), -1.0, 1.0)))
         step = np.diff(table["time"], prepend=table["time"][0])
-        path = np.cumsum(table["gyroscope size"] * np.clip(step, 0.0, None))[at]
+        rate = table["gyroscope after"] - table["gyroscope after"][at].mean(axis=0)  # whatever is taken off as bias
+        path = np.cumsum(np.linalg.norm(rate, axis=1) * np.clip(step, 0.0, None))[at]
         moved = angle > APART_DEG
         turned, integral = float(angle[moved].sum()), float(np.diff(path)[moved].sum())
         if turned == 0.0 or integral > turned / 2.0:

@@ -98,6 +98,20 @@ def test_readings_in_another_unit_are_named(
     assert any(message in line for line in warnings(calibration, table, capsys))
 
 
+def test_a_calibration_that_holds_the_factor_of_another_range_is_not_doubted(
+    calibration: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    document = json.loads(calibration.read_text())
+    for sensor in ("accelerometer", "gyroscope"):
+        part = document[sensor]
+        part["matrix"] = (np.array(part["matrix"]) / 4.0).tolist()
+        part["bias"] = (np.array(part["bias"]) * 4.0).tolist()
+    calibration.write_text(json.dumps(document))
+    table = readings()
+    table[:, 1:] *= 4.0
+    assert warnings(calibration, table, capsys) == []
+
+
 def test_raw_counts_are_named(calibration: Path, capsys: pytest.CaptureFixture[str]) -> None:
     table = readings()
     table[:, 1:] = np.round(table[:, 1:] * np.repeat([16384.0, 131.0], 3))
