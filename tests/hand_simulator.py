@@ -46,7 +46,8 @@ class Hand:
     white : dict of str to float
         Standard deviation of a sample, g and deg/s.
     effects : dict
-        ``quadratic`` ((3,), 1/g) and ``drift`` ((3,), g/s) of the accelerometer, ``g_sensitivity`` ((3, 3), deg/s/g).
+        ``quadratic`` ((3,), 1/g) and ``drift`` ((3,), g/s) of the accelerometer; ``g_sensitivity`` ((3, 3),
+        deg/s/g) and ``gyro_drift`` ((3,), deg/s/s) of the gyroscope.
     """
 
     rests: int = 40
@@ -210,6 +211,7 @@ def _effects(sensor: str, hand: Hand, felt: Array, time: Array) -> Array:
         total = total + (time - time.mean())[:, None] * np.asarray(hand.effects.get("drift", np.zeros(3)))
     else:
         total = total + felt @ np.asarray(hand.effects.get("g_sensitivity", np.zeros((3, 3)))).T
+        total = total + (time - time.mean())[:, None] * np.asarray(hand.effects.get("gyro_drift", np.zeros(3)))
     return total
 
 

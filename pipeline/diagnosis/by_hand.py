@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.diagnosis.by_hand_folds import held_out_errors, nested, with_all_rests
 from pipeline.diagnosis.by_hand_hidden import hidden_effects, next_experiment, nothing_to_see
 from pipeline.diagnosis.by_hand_left import dependences
 from pipeline.diagnosis.by_hand_picture import added_variable
@@ -50,7 +51,7 @@ def diagnose_by_hand(
     ----------
     calibration : SensorCalibration
     recordings : sequence of Recording
-        All of the unit; rests that are held out judge, and take no part in the selection.
+        All of the unit. All rests take part in the selection; ``pipeline.diagnosis.by_hand_folds`` judges it.
     noise : Noise or None
     settings : mapping
         Sections ``sensor``, ``table``, ``procedure`` and ``effects``.
@@ -60,20 +61,27 @@ def diagnose_by_hand(
     Returns
     -------
     dict
-        As of ``pipeline.diagnosis.diagnose.diagnose``.
+        As of ``pipeline.diagnosis.diagnose.diagnose``, and ``cross_validation`` (``by_hand_folds.nested``).
     """
     sensor = calibration.sensor
     wanted = settings["effects"][sensor]
     configured = [] if wanted == AUTO else list(wanted)
     try:
-        model = model_of(recordings, calibration, noise, settings, accelerometer)
+        every = {**settings, "procedure": {**settings["procedure"], "holdout_every": 0}}
+        if sensor == "accelerometer":
+            known = with_all_rests(calibration, recordings, noise, every)
+            model = model_of(recordings, known, noise, every)
+        else:
+            felt = accelerometer and with_all_rests(accelerometer, recordings, None, every)
+            model = model_of(recordings, calibration, noise, every, felt)
     except CannotCalibrateError as lack:
         return nothing_to_see(sensor, configured, lack.message)
     if model is None:
         return nothing_to_see(sensor, configured, f"no recording holds a rest with readings of the {sensor}")
     sheet = settings["sensor"][sensor]
     selection = select(model, calibration, configured, noise, sheet)
-    return _document(selection, configured, _without_creep(noise, sheet))
+    judged = nested(selection, calibration, configured, noise, sheet)
+    return _document(selection, configured, _without_creep(noise, sheet)) | {"cross_validation": judged}
 
 
 def _without_creep(noise: Noise | None, sheet: Mapping[str, Any]) -> Noise | None:
@@ -91,7 +99,7 @@ def _document(selection: HandSelection, configured: list[str], noise: Noise | No
     sensor, selected = selection.model.sensor, selection.names
     hidden = hidden_effects(selection, configured)
     unknown = dependences(selection)
-    held = [selection.model.held_out_error(fit.state) if selected else None for fit in selection.fits]
+    held = held_out_errors(selection) if selected else [None]
     seen = [s for s in selection.first.scores.values() if s.name not in selected and s.name not in hidden]
     order = [*selected, *(s.name for s in sorted(seen, key=lambda s: -s.delta_bic))]
     chi = [_chi(selection, fit, noise) for fit in selection.fits]

@@ -23,6 +23,8 @@ from pipeline.signal.filter_noise import filter_autocovariance
 from pipeline.signal.wander import variance_of_mean
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from pipeline.records import Recording
@@ -42,10 +44,12 @@ class Creep:
     ----------
     rate : (3,) array, deg/s
         omega across gravity, in the axes of the readings; zero where it does not stand out of the noise.
+    measured : (3,) array, deg/s
+        The same, also where it may be noise.
     uncertainty : float, deg/s
-        Standard uncertainty of each of its two components; 0 where the rate is zero.
+        Standard uncertainty of each of its two components.
     shortening : float
-        By which share the mean of the readings is too short; 0 likewise.
+        By which share the mean of the readings is too short; 0 where the rate is zero.
     squares : (3,) array
         Sum of squares of the readings about their parabola.
     freedom : int
@@ -55,6 +59,7 @@ class Creep:
     """
 
     rate: Values
+    measured: Values
     uncertainty: float
     shortening: float
     squares: Values
@@ -62,17 +67,32 @@ class Creep:
     bend: float
 
 
-def vertical_creep(rates: Values) -> float:
-    """Return the standard deviation of the rate about gravity, which the accelerometer does not show, deg/s.
+def believed_rates(creeps: Sequence[Creep]) -> tuple[Values, Values, float]:
+    """Return what to believe of the rates across gravity in the rests of one recording.
 
-    Nothing tells the three axes apart: it is that of the other two.
+    With the variance c^2 of a component between the rests, as the measured rates w of standard uncertainty e show it,
 
-    Parameters
-    ----------
-    rates : (m, 3) array, deg/s
-        Across gravity, of the rests of a recording.
+        rate = w c^2 / (c^2 + e^2),   error^2 = c^2 e^2 / (c^2 + e^2),   c^2 = mean(|w|^2 / 2 - e^2)
+
+    and c = 0 where noise alone explains the rates: ``|w|^2 / (2 e^2)`` has mean and variance 1 then. Nothing tells the
+    three axes apart: c is the standard deviation of the rate about gravity, too, which the accelerometer does not show.
+
+    Returns
+    -------
+    rate : (m, 3) array, deg/s
+    error : (m,) array, deg/s
+        Standard uncertainty of each of its two components.
+    about : float, deg/s
+        c.
     """
-    return float(np.sqrt(np.sum(rates**2) / (2.0 * max(len(rates), 1))))
+    w, e = np.array([creep.measured for creep in creeps]).reshape(-1, 3), np.array([c.uncertainty for c in creeps])
+    known = e > 0.0
+    half = 0.5 * np.sum(w**2, axis=1)
+    if not known.any() or np.mean(half[known] / e[known] ** 2) <= 1.0 + SIGNIFICANT / np.sqrt(known.sum()):
+        return np.zeros_like(w), np.zeros(len(w)), 0.0
+    variance = max(float(np.mean(half[known] - e[known] ** 2)), 0.0)
+    share = np.where(known, variance / (variance + e**2), 0.0)
+    return w * share[:, None], np.where(known, e * np.sqrt(share), np.sqrt(variance)), float(np.sqrt(variance))
 
 
 def along_gravity(time: Values, force: Values) -> tuple[Values, bool]:
@@ -120,7 +140,7 @@ def creep_of(time: Values, force: Values, share: float = 0.0) -> Creep:
     mean = force.mean(axis=0) if n else np.zeros(3)
     length = float(np.linalg.norm(mean))
     if n < FEWEST or length == 0.0 or time[-1] <= time[0]:
-        return Creep(np.zeros(3), 0.0, 0.0, np.sum((force - mean) ** 2, axis=0), max(n - 1, 0), 0.0)
+        return Creep(np.zeros(3), np.zeros(3), 0.0, 0.0, np.sum((force - mean) ** 2, axis=0), max(n - 1, 0), 0.0)
     u, span = mean / length, float(time[-1] - time[0])
     x = 2.0 * (time - time[0]) / span - 1.0
     basis, _ = np.linalg.qr(np.polynomial.legendre.legvander(x, DEGREE))
@@ -134,9 +154,9 @@ def creep_of(time: Values, force: Values, share: float = 0.0) -> Creep:
     white = float(np.sqrt(squares.sum() / (3 * freedom)))
     error = white * np.sqrt(12.0 * max(share, 1.0 / n)) / span
     slope = (line[-1] - line[0]) / span
+    measured, uncertainty = np.degrees(np.cross(slope, u) / length), float(np.degrees(error / length))
     if np.linalg.norm(slope) <= SIGNIFICANT * error:
-        return Creep(np.zeros(3), 0.0, 0.0, squares, freedom, 0.0)
+        return Creep(np.zeros(3), measured, uncertainty, 0.0, squares, freedom, 0.0)
     bend = float(np.linalg.norm(path - line, axis=1).max()) / length
     variance = float(np.mean(np.sum(path**2, axis=1))) / length**2
-    rate = np.degrees(np.cross(slope, u) / length)
-    return Creep(rate, float(np.degrees(error / length)), 0.5 * variance, squares, freedom, bend)
+    return Creep(measured, measured, uncertainty, 0.5 * variance, squares, freedom, bend)

@@ -19,7 +19,7 @@ from pipeline.estimation.rest_means import rest_means, split_rests
 from pipeline.model.effects.base import truth
 from pipeline.model.effects.time_offset import shifted
 from pipeline.model.kinematics import earth_rate, reference_motion
-from pipeline.signal.creep import creep_in, vertical_creep
+from pipeline.signal.creep import believed_rates, creep_in
 from pipeline.signal.noise import filter_autocovariance
 from pipeline.signal.wander import variance_of_average, variance_of_mean
 
@@ -197,12 +197,12 @@ def _creep(
     recording: Recording, rests: Sequence[Rest], force: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the rate at which the unit creeps in each rest, deg/s, and the variance of what is not known of it."""
-    creeps = [creep_in(recording, rest.start, rest.stop) for rest in rests]
-    every = [creep_in(recording, rest.start, rest.stop) for rest in split_rests(recording, 0).used]
-    rate, error = np.array([c.rate for c in creeps]), np.array([c.uncertainty for c in creeps])
+    every = {(r.start, r.stop): creep_in(recording, r.start, r.stop) for r in (*split_rests(recording, 0).used, *rests)}
+    rates, errors, about = believed_rates(list(every.values()))
+    chosen = [list(every).index((rest.start, rest.stop)) for rest in rests]
+    rate, error = rates[chosen], errors[chosen]
     upward = (force / np.linalg.norm(force, axis=1, keepdims=True)) ** 2
     seen = error**2 + RAW**2 * np.sum(rate**2, axis=1)
-    about = vertical_creep(np.array([c.rate for c in every]))
     return rate, seen[:, None] * (1.0 - upward) + about**2 * upward
 
 

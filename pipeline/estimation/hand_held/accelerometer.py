@@ -65,6 +65,7 @@ class RestingAccelerometer:
         held: Rests | None = None,
     ) -> None:
         self.rests, self.gravity, self.held = rests, gravity_g, held
+        self.calibration, self.noise = calibration, noise
         self.white = np.maximum(white_of(rests, noise), SMALLEST_NOISE)
         self.directions = _directions(calibration)
         self.rests_equations = len(rests.time)
@@ -123,6 +124,11 @@ class RestingAccelerometer:
             return None
         force, _ = self.felt(state, self.held)
         return float(np.sqrt(np.mean((np.linalg.norm(force, axis=1) - self.gravity) ** 2)))
+
+    def without(self, held: NDArray[np.bool_]) -> RestingAccelerometer:
+        """Return the model with some of its rests held out."""
+        kept, judged = self.rests.select(~held), self.rests.select(held)
+        return RestingAccelerometer(kept, self.calibration, self.gravity, self.noise, judged)
 
     def _motion(self, force: Values, rests: Rests) -> Motion:
         return motion_of(rests.time, force, np.zeros_like(force), rests.temperature, still=True)

@@ -8,8 +8,7 @@ where
     y, b, M : reading and bias, deg/s, and matrix
     z, p    : effects and their parameters, with the specific force of the accelerometer, at rest and as it is turned on
     w       : rate at which a unit creeps in a rest, across gravity as the accelerometer shows it (K = M^-1). Of that
-              about gravity no more is known than that it is as large: it is an error of the rest, of variance
-              sum |w|^2 / (2 m)
+              about gravity no more is known than that it is as large; see ``pipeline.signal.creep.believed_rates``
     u       : direction of gravity by the calibrated accelerometer; A_0 as in ``pipeline.estimation.hand_held.moves``
     E       : two directions across u_after; W whitens what noise of the gyroscope, integrated, what it turned between
               its samples, and noise of the accelerometer leave there
@@ -25,6 +24,7 @@ but in another move it does, as the vertical is elsewhere in the body. The frame
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -38,7 +38,6 @@ from pipeline.estimation.hand_held.model import State, added, motion_of
 from pipeline.estimation.hand_held.moves import moves_of, tangents, to_the_end
 from pipeline.estimation.hand_held.rests import ROLE, rests_of
 from pipeline.model.rotation import skew
-from pipeline.signal.creep import vertical_creep
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -86,7 +85,6 @@ class HandHeldGyroscope:
         self.kinds = 1 if self.moves is None else 2
         self.directions = np.eye(12)[:, : 3 if self.moves is None else 12]
         self.rests_equations = 3 * len(self.rests.time)
-        self.vertical = vertical_creep(rests.creep)
         self.gravity = float(np.median(np.linalg.norm(force, axis=1)))
         if self.moves is not None:
             self.before, self.after = gravity.at_end[self.moves.before], gravity.at_start[self.moves.after]
@@ -94,7 +92,7 @@ class HandHeldGyroscope:
             across = np.eye(3) - u[:, :, None] * u[:, None, :]
             self.spread = np.degrees(gravity.spread / self.gravity)[:, None, None] * across
             self.shared = np.degrees(across @ gravity.shared / self.gravity)
-            self.every = rests
+        self.every, self.known = rests, (gravity, noise, fewest)
 
     def equations(self, state: State, candidates: Sequence[Term] = ()) -> Equations:
         """Return the linear form at some parameters."""
@@ -145,6 +143,20 @@ class HandHeldGyroscope:
         left -= self.held.creep @ state.K.T
         return float(np.sqrt(np.mean(np.sum((left @ state.matrix.T) ** 2, axis=1))))
 
+    def without(self, held: NDArray[np.bool_]) -> HandHeldGyroscope:
+        """Return the model with some of its rests, and the moves that end at them, held out.
+
+        Parameters
+        ----------
+        held : (m,) array of bool
+            Of the rests that are not held out already.
+        """
+        out = self.every.held_out.copy()
+        out[~self.every.held_out] = held
+        moves = None if self.moves is None else self.moves.select(~out[self.moves.after])
+        gravity, noise, fewest = self.known
+        return HandHeldGyroscope(replace(self.every, held_out=out), moves, gravity, noise, fewest)
+
     def missed(self, state: State) -> tuple[Values, Values]:
         """Return by how much each move misses the direction of gravity after it, and what noise alone gives, deg.
 
@@ -194,12 +206,12 @@ class HandHeldGyroscope:
 
     def _of_creep(self, K: Values, error: Values) -> Values | None:
         """Return the covariance of the rests' equations by what is not known of their creep: (3 m, 3 m) array."""
-        across = self.rests.creep_error
-        if not across.any() and not self.vertical:
+        across, about = self.rests.creep_error, self.rests.creep_about
+        if not about.any():
             return None
         u = self.force / np.linalg.norm(self.force, axis=1, keepdims=True)
         upward = u[:, :, None] * u[:, None, :]
-        rate = across[:, None, None] ** 2 * (np.eye(3) - upward) + self.vertical**2 * upward
+        rate = across[:, None, None] ** 2 * (np.eye(3) - upward) + about[:, None, None] ** 2 * upward
         own = K @ rate @ K.T / error[:, :, None] / error[:, None, :]
         m = len(own)
         out = np.zeros((m, 3, m, 3))

@@ -80,6 +80,10 @@ class Model(Protocol):
         """Return the rms error at rests that no fit sees, g or deg/s; None where there are none."""
         ...
 
+    def without(self, held: NDArray[np.bool_]) -> Model:
+        """Return the model with some of its rests, and the moves before them, held out."""
+        ...
+
 
 def stepped(model: Model, state: State, step: Values) -> tuple[State, Values]:
     """Return the parameters after a step, and what of it was taken: effects may refuse a part of it."""

@@ -23,7 +23,7 @@ places anywhere) with d that is left over. More than four in a row are a rate th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -79,6 +79,10 @@ class Moves:
     temperature: Values
     weight: Values
     doubt: Values
+
+    def select(self, index: NDArray[np.bool_]) -> Moves:
+        """Return some of the moves."""
+        return Moves(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
     @property
     def count(self) -> int:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from pipeline.estimation.rest_means import holdout_interval, rest_means, sound_samples, split_rests
-from pipeline.signal.creep import creep_in
+from pipeline.signal.creep import believed_rates, creep_in
 from pipeline.signal.noise import filter_autocovariance
 from pipeline.signal.temperature import smooth_temperature
 from pipeline.signal.wander import variance_of_mean
@@ -56,6 +56,8 @@ class Rests:
         Rate across gravity at which the unit tilts, by the readings of the accelerometer; 0 where it stands still.
     creep_error : (m,) array, deg/s
         Standard uncertainty of each of its two components.
+    creep_about : (m,) array, deg/s
+        Standard deviation of the rate about gravity.
     clock_shared : bool
         Whether the time between the recordings is known.
     """
@@ -73,6 +75,7 @@ class Rests:
     span: NDArray[np.intp]
     creep: Values
     creep_error: Values
+    creep_about: Values
     clock_shared: bool
 
     def select(self, index: NDArray[np.bool_]) -> Self:
@@ -164,6 +167,7 @@ def _of_recording(sensor: str, recording: Recording, rests: Sequence[Rest]) -> d
     inside = [slice(a, b) for a, b in span]
     scatter = [np.sum((reading[s][good[s]] - mean) ** 2, axis=0) for s, mean in zip(inside, means, strict=True)]
     creeps = [creep_in(recording, a, b) for a, b in span.tolist()] if recording.accelerometer is not None else []
+    rate, error, about = believed_rates(creeps) if creeps else (np.zeros((len(span), 3)), np.zeros(len(span)), 0.0)
     if sensor == "accelerometer":  # less the tilt of a unit that creeps
         scatter = [c.squares * max(n - 1, 1) / max(c.freedom, 1) for c, n in zip(creeps, counts, strict=True)]
     warmth = np.full(recording.samples, np.nan)
@@ -180,6 +184,7 @@ def _of_recording(sensor: str, recording: Recording, rests: Sequence[Rest]) -> d
         "time": np.array([time[s].mean() for s in inside]),
         "temperature": np.array([warmth[s].mean() for s in inside]),
         "span": span,
-        "creep": np.array([c.rate for c in creeps]) if creeps else np.zeros((len(span), 3)),
-        "creep_error": np.array([c.uncertainty for c in creeps]) if creeps else np.zeros(len(span)),
+        "creep": rate,
+        "creep_error": error,
+        "creep_about": np.full(len(span), about),
     }
