@@ -20,6 +20,7 @@ import numpy as np
 
 from pipeline.model.kinematics import UP_AT_ZERO
 from pipeline.records import AXES
+from pipeline.signal.rests import still_samples
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -27,8 +28,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.preprocessing.turn_fit import TurnFit
+    from pipeline.records import Recording
 
-SIGNED_AXES = tuple(f"{sign}{axis}" for axis in AXES for sign in "+-")
+FEWEST_AT_REST = 10
+ACROSS = np.cross(UP_AT_ZERO, np.eye(3))  # u x a: what points up at 90 deg
 
 
 @dataclass(frozen=True)
@@ -94,20 +97,57 @@ def found_bench(fit: TurnFit, axis: str) -> Bench | None:
         return None
     a = AXES.index(axis)
     sense = 1 if fit.turn_axis[a] > 0.0 else -1
-    up, across = UP_AT_ZERO[a], np.cross(UP_AT_ZERO[a], np.eye(3)[a])
+    up, across = UP_AT_ZERO[a], ACROSS[a]
     along = fit.cosine @ up + sense * (fit.sine @ across)
     beside = fit.cosine @ across - sense * (fit.sine @ up)
-    at_zero = float(np.degrees(np.arctan2(beside, along)))  # A' where the table logs 0
-    face = 90.0 * round(at_zero / 90.0)
-    faces = {round(np.degrees(angle_of(signed_axis(u), axis))) % 360: u for u in SIGNED_AXES if u[1] != axis}
-    return Bench(axis, faces[round(face) % 360], sense, sense * (face - at_zero))
+    return bench_of(axis, sense, float(np.degrees(np.arctan2(beside, along))))
+
+
+def bench_of(axis: str, sense: int, at_zero: float) -> Bench:
+    """Return the bench with the nearest face and the smallest zero.
+
+    Parameters
+    ----------
+    axis : str
+    sense : int
+    at_zero : float, deg
+        The convention's angle where the table logs 0.
+    """
+    a, face = AXES.index(axis), 90.0 * round(at_zero / 90.0)
+    up = nearest_axis(np.cos(np.radians(face)) * UP_AT_ZERO[a] + np.sin(np.radians(face)) * ACROSS[a])
+    return Bench(axis, up, sense, sense * (face - at_zero))
+
+
+def off_at_rest(recording: Recording, bench: Bench) -> float | None:
+    """Return by how much gravity is ahead of the stated bench while the table rests, deg; None where it never does.
+
+    A bias of 0.1 g makes it 6 deg where all rests are at one angle.
+    """
+    angle, force = recording.table_angle, recording.accelerometer
+    if angle is None or force is None:
+        return None
+    still = still_samples(recording.time, np.gradient(angle, recording.time)) & recording.sound
+    if np.sum(still) < FEWEST_AT_REST:
+        return None
+    up, across = UP_AT_ZERO[AXES.index(bench.axis)], ACROSS[AXES.index(bench.axis)]
+    A = np.radians(bench.sense * angle[still] + bench.offset)
+    c, s, along, beside = np.cos(A), np.sin(A), force[still] @ up, force[still] @ across
+    return float(np.degrees(np.arctan2(c @ beside - s @ along, c @ along + s @ beside)))
+
+
+def by_convention(fit: TurnFit, bench: Bench) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Return p and q of a turn against the convention's angle: two (3,) arrays, or None where gravity does not tell."""
+    if fit.cosine is None or fit.sine is None or bench.vertical or fit.vertical is not None:
+        return None
+    at_zero = np.radians(bench.offset)
+    c, s = np.cos(at_zero), np.sin(at_zero)
+    return c * fit.cosine - bench.sense * s * fit.sine, s * fit.cosine + bench.sense * c * fit.sine
 
 
 def angle_of(direction: NDArray[np.float64], axis: str) -> float:
     """Return the convention's angle at which a body direction points up, rad."""
     a = AXES.index(axis)
-    up = UP_AT_ZERO[a]
-    return float(np.arctan2(direction @ np.cross(up, np.eye(3)[a]), direction @ up))
+    return float(np.arctan2(direction @ ACROSS[a], direction @ UP_AT_ZERO[a]))
 
 
 def usual_up(axis: str) -> str:

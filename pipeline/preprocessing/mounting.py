@@ -14,11 +14,13 @@ import numpy as np
 
 from pipeline.formats.axes import axis_maps, axis_matrix
 from pipeline.formats.ingest_error import IngestError
-from pipeline.preprocessing.bench import found_bench, signed_axis, stated_bench, usual_up
+from pipeline.model.kinematics import UP_AT_ZERO
+from pipeline.preprocessing.bench import ACROSS, by_convention, found_bench, stated_bench
 from pipeline.preprocessing.departures import Tolerance, Turn, departure, words
 from pipeline.preprocessing.frames import as_map, check_moves, check_turns, nearest_permutation
+from pipeline.preprocessing.seat_notes import seat_notes
 from pipeline.preprocessing.turn_fit import fit_turn
-from pipeline.records import Note
+from pipeline.records import AXES, Note
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -61,7 +63,8 @@ def check_mounting(recordings: Sequence[Recording], settings: Mapping[str, Any])
     departures = [d for t in known if (d := departure(t, tolerance)) is not None]
     if departures:
         raise _refusal(departures, known, accelerometer, maps)
-    return [r if t is None else _applied(t) for r, t in zip(recordings, turns, strict=True)]
+    doubts = seat_notes(known, table, sensor)
+    return [r if t is None else _applied(t, doubts.get(r.name, [])) for r, t in zip(recordings, turns, strict=True)]
 
 
 def _tolerance(procedure: Mapping[str, Any], table: Mapping[str, Any], sensor: Mapping[str, Any]) -> Tolerance:
@@ -86,13 +89,12 @@ def _accelerometer_axes(turns: Sequence[Turn]) -> NDArray[np.float64] | None:
     total, count = np.zeros((3, 3)), np.zeros(3)
     seen = []
     for turn in turns:
-        p, q, stated = turn.fit.cosine, turn.fit.sine, turn.stated
-        if p is None or q is None or stated.vertical or turn.fit.vertical is not None:
+        both = by_convention(turn.fit, turn.stated)
+        if both is None:
             continue
-        up, a = signed_axis(usual_up(stated.axis)), signed_axis(f"+{stated.axis}")
-        across, at_zero = np.cross(up, a), np.radians(stated.offset)
-        c, s = np.cos(at_zero), np.sin(at_zero)
-        cosine, sine = c * p - stated.sense * s * q, s * p + stated.sense * c * q
+        cosine, sine = both
+        a = AXES.index(turn.stated.axis)
+        up, across = UP_AT_ZERO[a], ACROSS[a]
         total += np.outer(cosine, up) + np.outer(sine, across)
         count += np.abs(up) + np.abs(across)
         seen += [(cosine, up), (sine, across)]
@@ -144,11 +146,12 @@ def _hint(
     return f"if the bench is so, set {', or '.join(ways)} (docs/mounting.md); else correct the columns or the mounting"
 
 
-def _applied(turn: Turn) -> Recording:
-    """Return the recording with angle and rate by the convention, and a note where that changes them."""
+def _applied(turn: Turn, doubts: Sequence[Note]) -> Recording:
+    """Return the recording with angle and rate by the convention, a note where that changes them, and its doubts."""
     recording, bench = turn.recording, turn.stated
-    notes = list(recording.notes)
-    if turn.fit.unknown and recording.table_angle is not None and recording.accelerometer is not None:
+    notes = [*recording.notes, *doubts]
+    logged = recording.table_angle is not None and recording.accelerometer is not None
+    if turn.fit.unknown and logged and recording.role != "gyroscope":  # that needs neither face nor zero
         detail = f"upward face, turn axis and zero are taken as stated: {turn.fit.unknown}"
         notes.append(Note("N-MOUNTING", 1, 0, 0, detail))
     if bench.conventional:

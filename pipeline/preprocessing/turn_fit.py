@@ -2,10 +2,12 @@
 
 In a turn about a level axis the accelerometer reads
 
-    r(A) = c + p cos A + q sin A,    p = K u,   q = K (u x a),   c = b + K (component of gravity along a)
+    f(A) = c + p cos A + q sin A,    p = K u,   q = K (u x a),   c = b + K (component of gravity along a) + d(r)
 
 where
 
+d : what goes with the rate r: lever arms (r^2), vibration (|r|), dependence on the rate (r), in a turn between rests;
+    taken off by least squares with 1, r, |r| and r^2
 A : table angle, counted right-handed about body axis a
 u : body axis that points up at A = 0
 K : inverse of the calibration matrix, the unit matrix to a few percent; b: bias
@@ -22,6 +24,7 @@ the rate does not change, they stay, and only a rate beyond any bias tells somet
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,9 +34,10 @@ if TYPE_CHECKING:
 
     from pipeline.records import Recording
 
-# Smallest eigenvalue of the mean of (1, cos A, sin A)^T (1, cos A, sin A), reached by an arc of 111 deg. Below, a
+# Smallest eigenvalue of the mean square of (cos A, sin A) beside a constant: reached by an arc of 110 deg. Below, a
 # nonlinearity of 0.5 % (MPU-6050 product specification 3.4) would turn p by more than 3 deg.
-LEAST_COVERAGE = 0.01
+LEAST_COVERAGE = 0.017
+SMALLEST_SHARE = 1e-6  # of the largest eigenvalue, below which a function of the rate is one of the others
 LARGEST_UNCERTAINTY = 0.02  # g, of p and q: 1 deg
 CHANGING = 0.1  # standard deviation over largest rate, from which a rate changes enough to be followed
 SLOWEST_DPS = 0.1  # standard deviation of a rate that can be followed
@@ -67,14 +71,14 @@ class TurnFit:
     arc: float
     unknown: str = ""
 
-    @property
+    @cached_property
     def turn_axis(self) -> NDArray[np.float64] | None:
         """Unit vector about which the unit turns as the angle grows, by gravity: (3,) array, or None."""
         if self.cosine is None or self.sine is None or self.vertical is not None:
             return None
         return _unit(np.cross(self.sine, self.cosine))
 
-    @property
+    @cached_property
     def vertical(self) -> NDArray[np.float64] | None:
         """Direction of gravity's reaction where the turn leaves it as it is (a vertical axis): (3,) array, or None."""
         if self.constant is None or self.cosine is None or self.sine is None:
@@ -108,16 +112,32 @@ def fit_turn(recording: Recording) -> TurnFit:
     A, reading = np.radians(angle[keep]), recording.accelerometer[keep]
     arc = float(np.ptp(angle)) if len(angle) else 0.0
     mean_rate = 0.0 if slope is None else float(np.mean(slope))
-    design = np.column_stack([np.ones_like(A), np.cos(A), np.sin(A)])
-    normal = design.T @ design
-    if len(A) < 6 or np.linalg.eigvalsh(normal / len(A))[0] < LEAST_COVERAGE:
+    other = _of_rate(rate if rate is not None else slope, keep)
+    # Normal equations of both, those of the rate eliminated.
+    columns = np.column_stack([other, np.cos(A), np.sin(A), reading])
+    products, m = columns.T @ columns, other.shape[1]
+    inverse = np.linalg.pinv(products[:m, :m], rcond=SMALLEST_SHARE, hermitian=True)
+    left = products[m:, m:] - products[m:, :m] @ inverse @ products[:m, m:]
+    normal = left[:2, :2]
+    if len(A) < 10 or np.linalg.eigvalsh(normal / len(A))[0] < LEAST_COVERAGE:
         return TurnFit(None, None, None, gain, mean_rate, arc, f"the table angle covers {arc:.3g} deg only")
-    found = np.linalg.solve(normal, design.T @ reading)
-    left = reading - design @ found
-    scatter = float(np.sqrt(np.max(np.mean(left**2, axis=0)) * np.max(np.diag(np.linalg.inv(normal))[1:])))
+    found = np.linalg.solve(normal, left[:2, 2:])
+    residual = np.diag(left[2:, 2:] - left[2:, :2] @ found) / len(A)
+    scatter = float(np.sqrt(np.max(residual.clip(0.0)) * np.max(np.diag(np.linalg.inv(normal)))))
     if scatter > LARGEST_UNCERTAINTY:
         return TurnFit(None, None, None, gain, mean_rate, arc, "the accelerometer does not follow the table angle")
-    return TurnFit(found[0], found[1], found[2], gain, mean_rate, arc)
+    constant = np.mean(reading, axis=0) - np.mean(columns[:, m : m + 2], axis=0) @ found
+    return TurnFit(constant, found[0], found[1], gain, mean_rate, arc)
+
+
+def _of_rate(rate: NDArray[np.float64] | None, keep: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return 1, r, |r| and r^2, with the largest |r| as unit: (n, at most 4) array."""
+    ones = np.ones(int(keep.sum()))
+    largest = 0.0 if rate is None else float(np.max(np.abs(rate), initial=0.0))
+    if rate is None or largest == 0.0:
+        return ones[:, None]
+    r = rate[keep] / largest
+    return np.column_stack([ones, r, np.abs(r), r * r])
 
 
 def _gain(recording: Recording, rate: NDArray[np.float64] | None) -> NDArray[np.float64] | None:

@@ -1,0 +1,97 @@
+"""Doubts about the seats of a unit, in words: the note ``N-REFERENCE`` on the turns that do not fit together."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.preprocessing.bench import by_convention
+from pipeline.preprocessing.seats import (
+    SMALLEST_DEG,
+    TIMES_STATED,
+    Conventional,
+    axis_off_deg,
+    find_seats,
+    letters,
+    table_explains,
+)
+from pipeline.records import AXES, Note
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.preprocessing.departures import Turn
+    from pipeline.preprocessing.seats import Seats
+
+# Largest plausible tilt (deg), lean (deg) and time offset (s) where the sensor's config states none.
+LIMITS = {"table_tilt": 1.0, "table_axis_nonorthogonality": 1.0, "time_offset": 0.04}
+
+
+def seat_notes(turns: Sequence[Turn], table: Mapping[str, Any], sensor: Mapping[str, Any]) -> dict[str, list[Note]]:
+    """Return the doubts about each recording, by name.
+
+    Parameters
+    ----------
+    turns : sequence of Turn
+        Of one unit; those of one setup are compared.
+    table, sensor : mapping
+        Sections of the unit's configuration.
+    """
+    orthogonality, angle = (float(table.get(k) or 0.0) for k in ("orthogonality_deg", "angle_accuracy_deg"))
+    allowed = max(SMALLEST_DEG, TIMES_STATED * float(np.hypot(orthogonality, angle)))
+    effects = (sensor.get("accelerometer") or {}).get("effects") or {}
+    limits = [float(effects.get(name) or limit) for name, limit in LIMITS.items()]
+    notes: dict[str, list[Note]] = {}
+    for setup in dict.fromkeys(t.recording.setup for t in turns):
+        own = {t.name: (t, c) for t in turns if t.recording.setup == setup and (c := _conventional(t)) is not None}
+        slow = [pair for pair in own.values() if pair[0].recording.role == "accelerometer"]
+        if {c.axis for _, c in slow} != set(range(3)):
+            continue
+        convention = [c for _, c in slow]
+        found = find_seats(convention)
+        doubt = found.largest > allowed and not table_explains(convention, found.K, limits)
+        if doubt:
+            notes |= {t.name: [_note(t, _seats_in_words(slow, found, allowed))] for t, _ in slow}
+        for turn, fast in own.values():
+            off = axis_off_deg(fast, found.K, [] if doubt else convention)
+            if turn.recording.role == "gyroscope" and np.max(np.abs(off)) > allowed:
+                notes[turn.name] = [_note(turn, _axis_in_words(turn, off, allowed))]
+    return notes
+
+
+def _conventional(turn: Turn) -> Conventional | None:
+    both = by_convention(turn.fit, turn.stated)
+    if both is None or turn.fit.constant is None:
+        return None
+    axis = AXES.index(turn.stated.axis)
+    return Conventional(turn.name, axis, turn.fit.constant, *both, turn.stated.sense * turn.fit.mean_rate)
+
+
+def _note(turn: Turn, detail: str) -> Note:
+    return Note("N-REFERENCE", turn.recording.samples, 0, 0, detail)
+
+
+def _seats_in_words(slow: Sequence[tuple[Turn, Conventional]], found: Seats, allowed: float) -> str:
+    if found.zeros is None:
+        seats = "; ".join(f"{t.name} {letters(s)}" for (t, _), s in zip(slow, found.seats, strict=True))
+        return (
+            f"the unit does not sit alike in the turns, by more than {allowed:.2g} deg; its rotation against the mean "
+            f"of the turns: {seats}; seat it alike (docs/mounting.md)"
+        )
+    settings = ", ".join(
+        f"procedure.recordings.{t.name}.zero_deg={t.stated.zero_deg + t.stated.sense * z:.2f}"
+        for (t, _), z in zip(slow, found.zeros, strict=True)
+        if abs(z) > SMALLEST_DEG / 3.0
+    )
+    return (
+        f"the zeros of the turns do not fit together, by more than {allowed:.2g} deg; gravity fits with {settings} "
+        "(docs/mounting.md)"
+    )
+
+
+def _axis_in_words(turn: Turn, off: Any, allowed: float) -> str:  # noqa: ANN401  ((3,) array)
+    return (
+        f"the unit does not sit in {turn.name} as in the turns for the accelerometer, by more than {allowed:.2g} deg: "
+        f"by gravity it is rotated by {letters(off)}, and the gyroscope's matrix is off by as much (docs/mounting.md)"
+    )
