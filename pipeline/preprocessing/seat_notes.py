@@ -46,7 +46,7 @@ def seat_notes(turns: Sequence[Turn], table: Mapping[str, Any], sensor: Mapping[
     for setup in dict.fromkeys(t.recording.setup for t in turns):
         own = {t.name: (t, c) for t in turns if t.recording.setup == setup and (c := _conventional(t)) is not None}
         slow = [pair for pair in own.values() if pair[0].recording.role == "accelerometer"]
-        if {c.axis for _, c in slow} != set(range(3)):
+        if {c.axis for _, c in slow} != set(range(3)) or any(_in_doubt(t) for t, _ in slow):
             continue
         convention = [c for _, c in slow]
         found = find_seats(convention)
@@ -66,6 +66,11 @@ def _conventional(turn: Turn) -> Conventional | None:
         return None
     axis = AXES.index(turn.stated.axis)
     return Conventional(turn.name, axis, turn.fit.constant, *both, turn.stated.sense * turn.fit.mean_rate)
+
+
+def _in_doubt(turn: Turn) -> bool:
+    """Return whether the angle of a turn is in doubt already, so that it tells nothing of seats."""
+    return any(note.code == "N-REFERENCE" for note in turn.recording.notes)
 
 
 def _note(turn: Turn, detail: str) -> Note:
