@@ -61,7 +61,7 @@ def _expanded(kind: str, entry: dict[str, Any]) -> list[Way]:
     return [Way(kind, function, dict(zip(parameters, one, strict=True)), bases) for one in itertools.product(*lists)]
 
 
-def corrupted(number: int, seed: int, ways: list[Way], pairs: float = 0.15) -> Copy:
+def corrupted(number: int, seed: int, ways: list[Way], pairs: float = 0.5) -> Copy:
     """Return unit ``number``: way by way, then at random, some with a second way on top.
 
     Parameters
@@ -75,14 +75,14 @@ def corrupted(number: int, seed: int, ways: list[Way], pairs: float = 0.15) -> C
     rng = np.random.default_rng([seed, number])
     first = ways[_in_turn(ways, seed)[number]] if number < len(ways) else ways[int(rng.integers(len(ways)))]
     chosen = [first]
-    if number >= len(ways) and rng.random() < pairs * 3:
+    if number >= len(ways) and rng.random() < pairs:
         chosen.append(ways[int(rng.integers(len(ways)))])
     for _ in range(20):
         common = [b for b in BASES if all(b in way.bases for way in chosen)]
         if common:
             base = str(rng.choice(common))
             try:
-                return _applied(chosen, base, number, seed, rng)
+                return _applied(chosen, base, number, seed, rng, varied=number >= len(ways))
             except NotApplicableError:
                 pass
         elif len(chosen) > 1:
@@ -98,9 +98,9 @@ def _in_turn(ways: list[Way], seed: int) -> list[int]:
     return [i for group in itertools.zip_longest(*kinds.values()) for i in group if i is not None]
 
 
-def _applied(chosen: list[Way], base: str, number: int, seed: int, rng: np.random.Generator) -> Copy:
-    copy = good_unit(base, 1000 * seed + number, f"u{number:04d}")
-    copy.other = good_unit(base, 500_000 + 1000 * seed + number)
+def _applied(chosen: list[Way], base: str, number: int, seed: int, rng: np.random.Generator, *, varied: bool) -> Copy:
+    copy = good_unit(base, 1000 * seed + number, f"u{number:04d}", varied=varied)
+    copy.other = good_unit(base, 500_000 + 1000 * seed + number, varied=varied)
     copy.rng = rng
     said = []
     unseen = []

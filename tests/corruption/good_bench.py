@@ -39,9 +39,11 @@ BASES: dict[str, dict[str, Any]] = {
 TABLE = [name for name in BASES if name != "by_hand"]
 
 
-def good_unit(base: str, seed: int, name: str = "unit") -> Copy:
-    """Return a good unit of a kind; its random numbers follow from the seed."""
+def good_unit(base: str, seed: int, name: str = "unit", *, varied: bool = False) -> Copy:
+    """Return a good unit of a kind; its random numbers follow from the seed, its course too where it is varied."""
     described = dict(BASES[base])
+    if varied and base != "by_hand":
+        described["course"] = described["course"] | _course(described["course"], np.random.default_rng(seed))
     wanted = described.pop("format", "csv")
     no_attitude, overrides = described.pop("no_attitude", False), described.pop("overrides", [])
     method = described.pop("method", "")
@@ -60,3 +62,18 @@ def good_unit(base: str, seed: int, name: str = "unit") -> Copy:
         name, base, unit.sensor, wanted, unit.interval_s, tables, truth,
         row=row, overrides=list(overrides),
     )  # fmt: skip
+
+
+def _course(usual: dict[str, Any], rng: np.random.Generator) -> dict[str, Any]:
+    """Return another course of the same kind."""
+    rate = float(rng.choice([20.0, 45.0, 60.0, 100.0]))
+    found: dict[str, Any] = {
+        "rates_dps": (rate,) if rng.random() < 0.4 else (rate, 1.5 * rate),
+        "validation_rate_dps": float(rng.uniform(20.0, 60.0)),
+        "validation_s": float(rng.uniform(60.0, 180.0)),
+    }
+    if "step_deg" in usual:
+        found |= {"step_deg": float(rng.choice([5.0, 10.0, 15.0])), "dwell_s": float(rng.uniform(1.0, 2.5))}
+    if usual["static_s"]:
+        found["static_s"] = float(rng.uniform(60.0, 180.0))
+    return found

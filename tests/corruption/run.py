@@ -49,6 +49,12 @@ def parsed() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
     add("--units", type=int, default=170, help="corrupted units; the first go through all ways, class by class")
+    add(
+        "--start",
+        type=int,
+        default=0,
+        help="number of the first; beyond the ways, units are random, some changed twice",
+    )
     add("--seed", type=int, default=1)
     add("--good", type=int, default=0, help="units that are not corrupted, beside them")
     add("--only", nargs="+", default=[], metavar="UNIT", help="only these units of the draw")
@@ -62,7 +68,7 @@ def drawn(options: argparse.Namespace) -> list[Copy]:
     """Return the units of a draw."""
     ways = single_ways()
     copies = []
-    for number in range(options.units):
+    for number in range(options.start, options.start + options.units):
         name = f"u{number:04d}"
         if options.only and name not in options.only:
             continue
@@ -75,7 +81,12 @@ def drawn(options: argparse.Namespace) -> list[Copy]:
             copies.append(copy)
     bases = list(BASES)
     for number in range(options.good):
-        copy = good_unit(bases[number % len(bases)], 900_000 + 1000 * options.seed + number, f"good{number:03d}")
+        copy = good_unit(
+            bases[number % len(bases)],
+            900_000 + 1000 * options.seed + number,
+            f"good{number:03d}",
+            varied=number >= len(bases),
+        )
         copy.kind, copy.way, copy.harmless = "(not corrupted)", "good", True
         copies.append(copy)
     return copies
