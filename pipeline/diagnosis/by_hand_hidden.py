@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 ONLY_MOVING = {*MOVING, "hysteresis"}
 FEWEST = 3  # equations beyond bias and matrix, from which on an effect of one coefficient can be judged
+WORTH = 0.25  # share of the residual's mean square, of what could be its cause
+MOST_NAMED = 3
 FIRM = 2.0  # times the noise, above which the scatter of the rests is worth a word
 ENOUGH = 40  # rests that leave room for what the catalogue holds
 EXPERIMENTS = {  # where that of the effect asks for a table
@@ -123,13 +125,44 @@ def next_experiment(
     if verdict == "not_enough_data":
         return MORE
     if over_noise > FIRM or verdict == "unexplained":
-        return (
-            f"set the unit down firmly for each rest: the rests scatter {over_noise:.2g} times the noise and follow "
-            "nothing that is recorded"
-        )
+        return _of_scatter(suspects(selection, hidden), over_noise)
     if "bias_temperature" in hidden:
         return f"to see bias temperature: record {catalogue()['bias_temperature'].excitation}"
     return "none is needed: nothing that these recordings can show is missing"
+
+
+def suspects(selection: HandSelection, hidden: Mapping[str, str]) -> list[str]:
+    """Return the effects that these recordings cannot tell, and that could be what the residual holds.
+
+    Such an effect shows in the equations, and at its limits it brings at least the share ``WORTH`` of the mean square
+    that is left; or it goes with the temperature, which was not recorded or did not change enough.
+    """
+    first, n = selection.first, len(selection.fits[0].residual)
+
+    def could(name: str) -> bool:
+        if "temperature" in catalogue()[name].needs:
+            return bool(np.isnan(selection.model.rests.temperature).any()) or name in first.scores
+        return name in first.scores and first.visible[name] >= first.spare[name] * n * float(np.log1p(WORTH))
+
+    def brings(name: str) -> float:
+        return -first.scores[name].delta_bic if name in first.scores else float("inf")
+
+    return sorted((name for name in hidden if could(name)), key=brings)
+
+
+def _of_scatter(names: Sequence[str], over_noise: float) -> str:
+    """Return what to record where the rests scatter more than the noise, and nothing that can be seen explains it."""
+    many = f"the rests scatter {over_noise:.2g} times the noise"
+    if not names:
+        return f"set the unit down firmly for each rest: {many} and follow nothing that is recorded"
+    listed = [_plain(name) for name in names[:MOST_NAMED]]
+    alike = " or ".join([", ".join(listed[:-1]), listed[-1]] if len(listed) > 1 else listed)
+    warm = any("temperature" in catalogue()[name].needs for name in names)
+    beside = ", with the temperature of the sensor beside them" if warm else ""
+    return (
+        f"{MORE}{beside}: {many}, and an unsteady hand explains that no better than {alike}, which "
+        "these rests do not tell"
+    )
 
 
 def _of_selected(entries: Mapping[str, Mapping[str, Any]], selected: Sequence[str]) -> str:

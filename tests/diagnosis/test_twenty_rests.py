@@ -42,3 +42,16 @@ def test_twenty_rests_name_what_is_hidden_and_nothing_else(sensor: str, name: st
     elif not name:
         assert judged is None
         assert part["residual_over_noise"] < 1.5
+
+
+def test_advice_names_what_too_few_rests_cannot_tell_where_they_scatter() -> None:
+    drawn = draw(Hand(effects={"quadratic": [0.003, -0.004, 0.003]}, **REAL), 11)
+    recordings = [drawn.recording]
+    found = nonlinear_least_squares.fit(recordings, None, drawn.settings)
+    noise = estimate_noise("accelerometer", recordings, drawn.settings["sensor"]["accelerometer"])
+    part = diagnose(found, recordings, noise, drawn.settings)
+    assert part["selected"] == []
+    assert part["residual_over_noise"] > 2.0
+    assert "quadratic_nonlinearity" in [entry["effect"] for entry in part["not_observable"]]
+    assert "no better than quadratic nonlinearity" in part["next_experiment"]
+    assert "firmly" not in part["next_experiment"]
