@@ -9,8 +9,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from pipeline.preprocessing.at_rest import check_static
+from pipeline.preprocessing.dead_axes import check_axes
 from pipeline.preprocessing.mounting import check_mounting
 from pipeline.preprocessing.reference import check_motion, check_turns
+from pipeline.preprocessing.shared_rows import check_shared_rows
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -33,5 +36,7 @@ def check_recordings(recordings: Sequence[Recording], settings: Mapping[str, Any
     InputError
         If the recordings contradict each other, or the table's log contradicts itself or gravity.
     """
-    turns, delays = check_turns(recordings, settings)
+    check_shared_rows(recordings)
+    check_axes(recordings)
+    turns, delays = check_turns(check_static(recordings, settings), settings)
     return check_motion(check_mounting(turns, settings), delays, settings)

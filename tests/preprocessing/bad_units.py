@@ -112,15 +112,58 @@ def table_of(seed: int) -> Change:
     return apply
 
 
+def knocked(first: int, last: int) -> Callable[[Recording], Recording]:
+    """Return a change that shakes the unit and leaves it tilted by 5 deg."""
+    shaking = np.random.default_rng(1).standard_normal((last - first, 3))
+
+    def apply(recording: Recording) -> Recording:
+        assert recording.accelerometer is not None
+        assert recording.gyroscope is not None
+        force, rate = recording.accelerometer.copy(), recording.gyroscope.copy()
+        force[first:last] += 0.2 * shaking
+        rate[first:last] += 20.0 * shaking
+        force[last:] += [0.09, 0.0, 0.0]
+        return replace(recording, accelerometer=force, gyroscope=rate)
+
+    return apply
+
+
+def copied(name: str, rows: slice | np.ndarray, start_s: int = 0) -> Change:
+    """Return the change that makes the held-out motion of samples of another recording, at other times."""
+
+    def apply(unit: Unit) -> Unit:
+        copy = next(r for r in unit if r.name == name).select(rows)
+        copy = replace(copy, name="validation", role="validation", axis=None, time_ns=copy.time_ns + start_s * 10**9)
+        return [copy if r.name == "validation" else r for r in unit]
+
+    return apply
+
+
+def stays(axis: int, every: int = 10**9) -> Callable[[np.ndarray], np.ndarray]:
+    """Return a change by which an axis stays at one value, but for glitches."""
+
+    def apply(values: np.ndarray) -> np.ndarray:
+        values[np.arange(len(values)) % every != every - 1, axis] = 0.25
+        return values
+
+    return apply
+
+
+def same_axes(values: np.ndarray) -> np.ndarray:
+    values[:, 1] = values[:, 0]
+    return values
+
+
 @dataclass
 class Case:
-    """A change, and the refusal or the note that has to come of it: its code, file and a part of its sentence."""
+    """A change, and the refusal (fault) or note (code) that has to come of it, its file and a part of its sentence."""
 
     change: Change
     fault: str = ""
     says: str = ""
     file: str = ""
     note: str = ""
+    code: str = "N-REFERENCE"
 
 
 def cases() -> dict[str, Case]:
@@ -184,5 +227,32 @@ def cases() -> dict[str, Case]:
         "52 rate late": Case(at("gyro_x", of(rate, late(1))), wrong, r"runs 0.12\d* s late against table_angle_deg"),
         "52 one recording late": Case(
             at("validation", both(of(rate, late(3)), of("table_attitude", late(3)))), wrong, "0.36 s apart"
+        ),
+        "53 moved at the end": Case(
+            at("static", knocked(850, 900)), note="only rows 1 to", file="static.csv", code="N-MOVED"
+        ),
+        "53 shaken all along": Case(
+            at("static", knocked(0, 1001)), "not_at_rest", "is for the noise at rest", "static.csv"
+        ),
+        "53 a turn": Case(
+            lambda unit: [replace(unit[0].select(slice(0, 400)), name="static", role="static", axis=None), *unit[1:-1]],
+            "not_at_rest",
+            "the table turns at up to 20 deg/s",
+        ),
+        "54 less one row": Case(
+            copied("gyro_y", np.delete(np.arange(421), 100)),
+            "shared_rows",
+            r"are those of recording gyro_y, rows 1 to 421 .*; held-out motion would not be held out",
+        ),
+        "54 at other times": Case(copied("accel_x", slice(50, 500), 4000), "shared_rows", "of recording accel_x"),
+        "54 every second row": Case(copied("accel_x", slice(None, None, 2)), "shared_rows", "of recording accel_x"),
+        "55 accelerometer": Case(
+            at("accel_y", of("accelerometer", stays(0))), "stuck", "accel_x stays within 0 g", "accel_y.csv"
+        ),
+        "55 gyroscope, with glitches": Case(
+            at("gyro_z", of("gyroscope", stays(2, 50))), "stuck", "gyro_z stays within", "gyro_z.csv"
+        ),
+        "55 two axes alike": Case(
+            at("", of("gyroscope", same_axes)), "copied_axis", "gyro_y is a copy of gyro_x in 100%", "accel_x.csv"
         ),
     }

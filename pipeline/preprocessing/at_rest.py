@@ -1,0 +1,160 @@
+"""Whether a static recording is at rest, for it pins the noise of every figure.
+
+It is cut into blocks of a second, of 16 samples at least. A block moves where
+
+    a sensor scatters in it by more than 4 times the usual scatter, and than exp(5 s) times its median, where s is the
+        standard deviation of the logarithm of the scatters by their quartiles: noise with a memory,
+    its mean is farther from the recording's median than the slow changes of a bias can be at rest, or
+    the table's log turns by 0.02 deg/s or more
+
+The usual scatter is the first quartile of the blocks', and no more than twice that of the table's rests in the unit's
+other recordings, or four times the data sheet's white noise where there are none. Slow changes by the data sheet's
+limits: six standard deviations of ``bias_wander``, ``bias_drift`` over the recording, ``bias_temperature`` times the
+range of the temperature, ``warm_up``; and 6 times the usual scatter, as if all noise of a block had a memory.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.preprocessing.evidence import place, refusal
+from pipeline.records import SENSORS, Note
+from pipeline.signal.rests import RATE_AT_REST_DPS, rests_from_table, runs
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.records import Recording
+
+    Array = NDArray[np.float64]
+
+BLOCK_S, FEWEST_OF_BLOCK = 1.0, 16
+FEWEST_OF_REST, RESTS = 8, 3  # samples of a rest, and rests of a recording, by which the usual scatter is told
+LOUDER = 4.0  # the scatter of 16 samples of white noise is so large in fewer than 1 of 10^9 blocks
+QUARTER_SIZE, UNUSUAL, WIDEST = 0.6745, 5.0, 0.4  # quartile of a normal distribution; its standard deviations
+OF_RESTS, OF_SHEET = 2.0, 4.0  # a bench that runs is louder than a unit on a desk; data sheets state typical noise
+SIGNIFICANT = 6.0  # standard deviations, as in pipeline.signal.rests
+FEWEST_SAMPLES = 60  # as of pipeline.signal.noise, which tells no noise by fewer
+SHORTEST_S = 10.0  # in which a wander of 100 s changes by a third of its size
+UNKNOWN_DEGC = 5.0  # change of temperature in some minutes of a room, where none is logged
+
+
+def check_static(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> list[Recording]:
+    """Return the recordings, of a static one only the part that rests, with the note ``N-MOVED``.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+        All of a unit.
+    settings : mapping
+        Section ``sensor``.
+
+    Raises
+    ------
+    IngestError
+        If too little of it rests.
+    """
+    return [_resting(r, recordings, settings) if r.role == "static" else r for r in recordings]
+
+
+def _resting(recording: Recording, recordings: Sequence[Recording], settings: Mapping[str, Any]) -> Recording:
+    size = max(FEWEST_OF_BLOCK, round(BLOCK_S / recording.interval)) if recording.samples > 1 else FEWEST_OF_BLOCK
+    count = recording.samples // size
+    if count < 2:
+        return recording
+    moving, why = np.zeros(count, bool), ""
+    if recording.table_rate is not None:
+        rate = np.abs(recording.table_rate[: count * size]).reshape(count, size).max(axis=1)
+        found = rate >= RATE_AT_REST_DPS
+        why = f"the table turns at up to {rate.max():.3g} deg/s" if found.any() else ""
+        moving |= found
+    for sensor in SENSORS:
+        reading = recording.reading(sensor)
+        if reading is None:
+            continue
+        sheet = (settings.get("sensor") or {}).get(sensor) or {}
+        found, what = _moving(recording, sensor, reading[: count * size].reshape(count, size, 3), sheet, recordings)
+        why = why or (what if found.any() else "")
+        moving |= found
+    if not moving.any():
+        return recording
+    parts = [(a * size, b * size if b < count else recording.samples) for a, b in runs(~moving)]
+    start, stop = max(parts, key=lambda part: part[1] - part[0], default=(0, 0))
+    start, stop = start + (size if start else 0), stop - (size if stop < recording.samples else 0)
+    length = (stop - start) * recording.interval
+    if stop - start < FEWEST_SAMPLES or length < SHORTEST_S:
+        raise refusal(
+            recording,
+            "not_at_rest",
+            f"it is for the noise at rest, and no {SHORTEST_S:g} s of it rest: {why} "
+            f"({int(moving.sum())} of {count} stretches of {size * recording.interval:.3g} s move)",
+            "remove it, the noise is then taken from the rests of the other recordings, or record it again",
+        )
+    t = recording.time
+    kept = replace(recording.select(slice(start, stop)), name=recording.name)
+    detail = (
+        f"only {place(recording, start, stop - 1)} are used of {t[0]:.6g} to {t[-1]:.6g} s: the rest of it moves; {why}"
+    )
+    left_out = recording.samples - (stop - start)
+    note = Note("N-MOVED", left_out, 0, 0, detail, float(t[0]), float(t[-1]))
+    return replace(kept, notes=(*recording.notes, note))
+
+
+def _moving(
+    recording: Recording, sensor: str, blocks: Array, sheet: Mapping[str, Any], recordings: Sequence[Recording]
+) -> tuple[NDArray[np.bool_], str]:
+    """Return which blocks a sensor moves in, and the largest sign of it in words."""
+    unit = "g" if sensor == "accelerometer" else "deg/s"
+    means, scatter = blocks.mean(axis=1), blocks.std(axis=1, ddof=1)
+    usual, middle = np.percentile(scatter, [25.0, 50.0], axis=0)
+    spread = np.minimum(np.log(middle / np.maximum(usual, np.finfo(float).tiny)) / QUARTER_SIZE, WIDEST)
+    louder = np.maximum(LOUDER, np.exp((QUARTER_SIZE + UNUSUAL) * spread))
+    known = _of_rests(recordings, sensor)
+    white = float(sheet.get("noise_density") or 0.0) * np.sqrt(0.5 / recording.interval)
+    if known is not None:
+        usual = np.minimum(usual, OF_RESTS * np.maximum(known, white))
+    elif white:
+        usual = np.minimum(usual, OF_SHEET * white)
+    step = np.abs(np.diff(blocks.reshape(-1, 3), axis=0))
+    usual = np.maximum(usual, 0.5 * np.where(step > 0.0, step, np.inf).min(axis=0, initial=np.inf))
+    loud = scatter / usual
+    away = np.abs(means - np.median(means, axis=0))
+    allowed = _slow(recording, sheet) + SIGNIFICANT * usual
+    moving = np.any(loud > louder, axis=1) | np.any(away > allowed, axis=1)
+    if np.any(loud > louder):
+        return moving, f"the {sensor} scatters {loud.max():.3g} times as usual"
+    return (
+        moving,
+        f"the {sensor} changes by {away.max():.3g} {unit}, a resting one by {allowed.max():.3g} {unit} at most",
+    )
+
+
+def _slow(recording: Recording, sheet: Mapping[str, Any]) -> float:
+    """Return by how much a bias can change at rest."""
+    effects = sheet.get("effects") or {}
+    warmth = recording.temperature
+    change = UNKNOWN_DEGC if warmth is None else float(np.ptp(warmth))
+    duration = float(recording.time[-1] - recording.time[0])
+    return (
+        SIGNIFICANT * float(sheet.get("bias_wander") or 0.0)
+        + float(effects.get("bias_drift") or 0.0) * duration
+        + float(effects.get("bias_temperature") or 0.0) * change
+        + float(effects.get("warm_up") or 0.0)
+    )
+
+
+def _of_rests(recordings: Sequence[Recording], sensor: str) -> Array | None:
+    """Return the scatter in the table's rests of the other recordings: (3,) array; None where there are none."""
+    found = []
+    for recording in recordings:
+        reading = recording.reading(sensor)
+        if reading is None or recording.role == "static" or recording.axis is None:
+            continue
+        rests = [r for r in rests_from_table(recording) if r.stop - r.start >= FEWEST_OF_REST]
+        found += [reading[r.start : r.stop].std(axis=0, ddof=1) for r in rests[:: len(rests) // RESTS + 1]]
+    return np.median(found, axis=0) if found else None
