@@ -52,7 +52,7 @@ examples:
   python -m pipeline check log.csv --save my_bench/configs/ingest/my_logger.yaml
   python -m pipeline check log.csv --ingest my_logger
   python -m pipeline check raw/*.mcap --sensor mpu6050
-  snakemake --cores 2 --config campaign=my_bench overrides=ingest=my_logger
+  snakemake --cores 2 --config campaign=my_bench 'overrides=[ingest=my_logger]'
 
 exit code: 0 if ingest reads every file, 2 if it refuses one or does not know its layout.
 """

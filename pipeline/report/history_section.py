@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 MARK, LINK_MARK = "<!-- history -->", "<!-- history link -->"  # in templates/unit.html
 SHOWN = 12  # runs that a chart shows: the first, and the last ones
 LABEL = 50  # letters of a bar's text before the ratio; a bar is 66 letters long
+STATES = 10_000  # of units in runs after the first that a campaign's page holds, 0.2 kB each
 SAME = 0.02  # relative change of an error, below which it stays
 
 
@@ -71,12 +72,14 @@ def runs_data(entries: Sequence[JSON], settings: JSON) -> JSON | None:
     """
     if len(entries) < 2:
         return None
+    kept = _kept(entries)
+    numbers = [e["run"] for e in kept]
     units = [
-        [unit, [[run, _short(state)] for run, state in states]]
+        [unit, [[run, _short(state)] for run, state in shown]]
         for unit, states in of_units(entries).items()
-        if len(states) > 1
+        if len(shown := _at(states, numbers)) > 1
     ]
-    runs = [[e["run"], f"run {e['run']}, {_time(e)}: {_count(e)}"] for e in entries]
+    runs = [[e["run"], f"run {e['run']}, {_time(e)}: {_count(e)}"] for e in kept]
     lost: dict[tuple[str, int], list[str]] = {}
     for unit, sensor, effect, run in dropped(entries):
         lost.setdefault((unit, run), []).append(f"{sensor}.{effect}")
@@ -85,6 +88,23 @@ def runs_data(entries: Sequence[JSON], settings: JSON) -> JSON | None:
         for (unit, run), effects in lost.items()
     ]
     return {"runs": runs, "units": units, "dropped": told, "number": entries[-1]["run"]}
+
+
+def _kept(entries: Sequence[JSON]) -> list[JSON]:
+    """Return the runs that can be compared: the first, and the last ones, as many as ``STATES`` allows."""
+    kept, count = [entries[-1]], len(entries[-1]["units"])
+    for entry in reversed(entries[1:-1]):
+        count += len(entry["units"])
+        if count > STATES:
+            break
+        kept.append(entry)
+    return [entries[0], *reversed(kept)]
+
+
+def _at(states: Sequence[tuple[int, JSON]], runs: Sequence[int]) -> list[tuple[int, JSON]]:
+    """Return the states that hold after some runs, each once."""
+    found = [next((s for s in reversed(states) if s[0] <= run), None) for run in runs]
+    return list({s[0]: s for s in found if s}.values())
 
 
 def _time(entry: JSON) -> str:

@@ -4,7 +4,7 @@ import re
 from html import unescape
 from typing import Any
 
-from pipeline.report.history_section import LINK_MARK, MARK, with_history
+from pipeline.report.history_section import LINK_MARK, MARK, runs_data, with_history
 
 TIMES = {1: "2026-02-03 04:05", 2: "2026-02-04 04:05", 5: "2026-02-07 04:05"}
 
@@ -48,3 +48,18 @@ def test_a_long_history_shows_the_first_run_and_the_last_ones() -> None:
     drawn = texts(with_history(MARK, states, dict.fromkeys(range(1, 41), "2026")))
     shown = [int(found[1]) for t in drawn if (found := re.match(r"run (\d+)", t))]
     assert shown == [1, *range(30, 41)]
+
+
+def test_the_data_of_a_comparison_stay_bounded_and_hold_the_first_run_and_the_last_ones() -> None:
+    units = [f"U{i}" for i in range(4000)]
+    entries = [
+        {"run": run, "time": "2026-02-03T04:05:06", "units": {u: state([], 0.01 * run) for u in units}, "gone": []}
+        for run in range(1, 7)
+    ]
+    data = runs_data(entries, {"campaign": "c"}) or {}
+    assert [number for number, _ in data["runs"]] == [1, 5, 6]  # two of 4,000 states fit
+    assert [[run, s["gyroscope"][0]] for run, s in data["units"][0][1]] == [[1, 0.01], [5, 0.05], [6, 0.06]]
+    entries[4]["units"] = {}
+    data = runs_data(entries, {"campaign": "c"}) or {}
+    assert [number for number, _ in data["runs"]] == [1, 4, 5, 6]
+    assert [run for run, _ in data["units"][0][1]] == [1, 4, 6]
