@@ -12,7 +12,7 @@ where
     r_b, r_k : standard deviations from one switching-on to the next (``sensor.<sensor>.repeatability_bias``,
                ``repeatability_scale_factor``)
 
-Both are added after a fit, as they depend on no method. What is not stated is named.
+Both are added after the last stage of a fit, as they depend on no method. What is not stated is named.
 """
 
 from __future__ import annotations

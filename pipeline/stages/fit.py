@@ -21,9 +21,12 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 
+NOT_LAST = "no"
+
+
 def main(argv: Sequence[str]) -> int:
     """Run the stage."""
-    job = parse_job("fit", argv, ["filter"], ["sensor", "stage", "previous"])
+    job = parse_job("fit", argv, ["filter"], ["sensor", "stage", "previous", "last"])
     sensor, stage = job.run["sensor"], job.run["stage"]
     module = import_module(f"pipeline.estimation.{sensor}.{stage}")
     if job.run["previous"]:
@@ -40,7 +43,9 @@ def main(argv: Sequence[str]) -> int:
         noises = load_noises(job.inputs["filter"], unit)
         try:
             found = module.fit(recordings, previous, part | {"noise": noises})
-            write_json(target, with_stated(found, recordings, part).to_json())
+            if job.run["last"] != NOT_LAST:  # else the next stage would take it over, and it would count twice
+                found = with_stated(found, recordings, part)
+            write_json(target, found.to_json())
         except CannotCalibrateError as reason:
             write_json(target, {"not_calibrated": reason.message})
 

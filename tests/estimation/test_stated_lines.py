@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -11,9 +12,14 @@ from table_turns import Bench, settings
 
 from pipeline.estimation.gyroscope import reference_least_squares
 from pipeline.estimation.stated import with_stated
+from pipeline.formats.parquet import save_recordings
 from pipeline.records import FittedEffect
+from pipeline.stages import fit as fit_stage
+from pipeline.stages.noises import save_noises
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from pipeline.records import Recording, SensorCalibration
 
 K = np.diag([1.02, 0.99, 1.01])
@@ -92,3 +98,23 @@ def test_without_a_thermometer_in_the_recordings_that_is_said(fitted: Any) -> No
     found = with_stated(fitted[0], cold, sheet(accuracy=0.5))
     left = {entry["source"]: entry["reason"] for entry in (found.budget or {})["not_included"]}
     assert left["temperature"] == "the recordings hold no temperature"
+
+
+def test_a_chain_of_stages_counts_what_is_stated_once(tmp_path: Path) -> None:
+    bench = Bench("gyroscope", [0.3, -0.2, 0.5], K, white=0.01)
+    turns = [r.select(np.abs(r.table_rate) > 1.0) for r in bench.turns_at([60.0, -60.0])]  # without a rest in them
+    still = replace(bench.turns_at([0.0])[0], name="static", role="static")
+    part = settings() | {"sensor": sheet(repeatability_bias=0.02)["sensor"] | {"accelerometer": {}}, "effects": {}}
+    (tmp_path / "part.json").write_text(json.dumps({"units": {"U": part}}))
+    filtered, stages = tmp_path / "filter", [tmp_path / "bias", tmp_path / "cholesky_lu"]
+    filtered.mkdir()
+    save_recordings(filtered / "U.parquet", [*turns, still])
+    save_noises(filtered, "U", [*turns, still], settings())
+    for stage, previous, last in zip(stages, ["", str(stages[0])], ["no", "yes"], strict=True):
+        chosen = ["--sensor", "gyroscope", "--stage", stage.name, "--previous", previous, "--last", last]
+        folders = ["--config", str(tmp_path / "part.json"), "--filter", str(filtered), "--output", str(stage)]
+        fit_stage.main([*folders, *chosen])
+    first, last_one = (json.loads((stage / "U.json").read_text()) for stage in stages)
+    u = [np.sqrt(np.diag(np.array(found["covariance"]["values"])))[:3] for found in (first, last_one)]
+    assert u[0].max() < 0.005  # the bias of the rest, without what is stated
+    assert u[1] == pytest.approx(np.full(3, 0.02), rel=0.05)

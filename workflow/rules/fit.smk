@@ -19,6 +19,11 @@ def code_of_fit(wildcards):
     return "".join(code_digest(module) for module in modules)
 
 
+def is_last_stage(wildcards):
+    chain = CAMPAIGN.chains[wildcards.batch][wildcards.sensor]
+    return "yes" if wildcards.stage == chain[-1] else "no"
+
+
 rule fit:
     input:
         filter=f"{BATCH}/filter",
@@ -30,6 +35,8 @@ rule fit:
     params:
         config=part_of_fit,
         code=code_of_fit,
+        last=is_last_stage,
     shell:
         "{RUN} fit --config {params.config:q} --sensor {wildcards.sensor} --stage {wildcards.stage}"
-        " --filter {input.filter:q} --previous={input.previous:q} --output {output:q} > {log:q} 2>&1"
+        " --last {params.last} --filter {input.filter:q} --previous={input.previous:q} --output {output:q}"
+        " > {log:q} 2>&1"
