@@ -92,7 +92,7 @@ def edit_effects(
         If the unit or an effect is unknown, a stronger layer sets the effects, or the file cannot be edited.
     """
     file = _file(directory, unit, layers)
-    text = file.read_text(encoding="utf-8") if file.is_file() else ""
+    text = file.read_bytes().decode() if file.is_file() else ""  # line ends as they are
     of_unit = layers.of(unit)
     said: list[str] = []
     for sensor in dict.fromkeys(sensor for sensor, _ in effects):

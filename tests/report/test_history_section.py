@@ -4,7 +4,10 @@ import re
 from html import unescape
 from typing import Any
 
+from pipeline.report import unit_page
 from pipeline.report.history_section import LINK_MARK, MARK, runs_data, with_history
+
+from .conftest import Unit
 
 TIMES = {1: "2026-02-03 04:05", 2: "2026-02-04 04:05", 5: "2026-02-07 04:05"}
 
@@ -63,3 +66,12 @@ def test_the_data_of_a_comparison_stay_bounded_and_hold_the_first_run_and_the_la
     data = runs_data(entries, {"campaign": "c"}) or {}
     assert [number for number, _ in data["runs"]] == [1, 4, 5, 6]
     assert [run for run, _ in data["units"][0][1]] == [1, 4, 6]
+
+
+def test_the_page_of_a_unit_that_failed_tells_its_runs_too(unit: Unit) -> None:
+    failed = {"unit": "U1", "status": "failed", "error": {"code": "bad_input", "message": "no number"}, "inputs": []}
+    page = unit_page.render(failed, None, None, [], unit.settings)
+    states = [(1, state([], 0.126)), (2, {"status": "failed", "error": "bad_input", "overrides": {}})]
+    told = with_history(page, states, TIMES)
+    assert "Run 2, 2026-02-04 04:05 UTC: not calibrated: bad_input" in told
+    assert unit_page.render(*unit.arguments).count(MARK) == 1

@@ -79,7 +79,7 @@ function prepare(svg) {
       }
       const sy = (y.full.high - y.full.low) / (y.view.high - y.view.low), ty = y.start - sy * place(y, y.view.low, y.full);
       layers.setAttribute("transform", `translate(${tx} ${ty}) scale(${sx / SUBDIVISION} ${sy / SUBDIVISION})`);
-      const up = ticksOf(y, Math.max(2, (y.start - y.stop) / 28));
+      const few = ticksOf(y, Math.max(2, (y.start - y.stop) / 28)), up = few.length > 1 ? few : ticksOf(y, 4);
       ticks.replaceChildren(...up.map(([v, text]) => label(x.start - 4, place(y, v) + 3.5, text, "e")));
       grid.setAttribute("d", up.map(([v]) => `M${x.start} ${place(y, v)}H${x.stop}`).join("") + across.map(([v]) => `M${place(x, v)} ${y.stop}V${y.start}`).join(""));
     }
