@@ -25,7 +25,7 @@ if CAMPAIGN.page == "thesis":
         log:
             f"{RESULTS}/logs/thesis.log",
         params:
-            campaign=str(CAMPAIGN.directory),
+            campaign=lambda wildcards: str(CAMPAIGN.directory),
             code=code_digest("pipeline.thesis.page"),
         shell:
             "{RUN} thesis page --campaign {params.campaign:q} --results {RESULTS:q} --output {output:q} > {log:q} 2>&1"

@@ -8,6 +8,6 @@ rule verdict:
     log:
         f"{RESULTS}/logs/verdict.log",
     params:
-        results=str(CAMPAIGN.results),
+        results=lambda wildcards: str(CAMPAIGN.results),
     shell:
         "{RUN} verdict --failures {input.failures:q} --results {params.results:q} --output {output:q} 2> {log:q}"
