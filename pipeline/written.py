@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 from pipeline.atomic import write_atomically
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
     from pathlib import Path
 
 NOT_OURS = ".snakemake_timestamp"  # Snakemake writes it into every output folder
@@ -67,24 +67,23 @@ def _record(results: Path, output: str) -> Path:
 
 def _digest(path: Path) -> str:
     """Return a digest of the names, sizes and times of a file, or of all files below a folder."""
-    digest = hashlib.sha256()
-    for line in sorted(_lines(str(path), "")):
-        digest.update(line.encode(errors="surrogateescape"))
-    return digest.hexdigest()[:32]
-
-
-def _lines(path: str, name: str) -> Iterator[str]:
-    try:
-        with os.scandir(path) as entries:
-            for entry in entries:
-                below = f"{name}/{entry.name}"
-                if entry.is_dir(follow_symlinks=False):
-                    yield from _lines(entry.path, below)
-                elif entry.name != NOT_OURS:
-                    found = entry.stat(follow_symlinks=False)
-                    yield f"{below}\0{found.st_size}\0{found.st_mtime_ns}\n"
-    except NotADirectoryError:
-        found = os.lstat(path)
-        yield f"{name}\0{found.st_size}\0{found.st_mtime_ns}\n"
-    except FileNotFoundError:
-        yield f"{name}\0absent\n"
+    lines: list[str] = []
+    folders = [str(path)]
+    while folders:
+        folder = folders.pop()
+        try:
+            with os.scandir(folder) as entries:
+                for entry in entries:
+                    if entry.is_dir(follow_symlinks=False):
+                        folders.append(entry.path)
+                    elif entry.name != NOT_OURS:
+                        found = entry.stat(follow_symlinks=False)
+                        lines.append(f"{entry.path}\0{found.st_size}\0{found.st_mtime_ns}")
+        except NotADirectoryError:
+            found = os.lstat(folder)
+            lines.append(f"{folder}\0{found.st_size}\0{found.st_mtime_ns}")
+        except FileNotFoundError:
+            lines.append(f"{folder}\0absent")
+    lines.sort()
+    text = "\n".join(lines).replace(str(path), "")  # results may be moved
+    return hashlib.sha256(text.encode(errors="surrogateescape")).hexdigest()[:32]
