@@ -36,7 +36,7 @@ GROUPS = ("sensor", "table", "procedure", "method", "filter", "ingest", "certifi
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 RUN_SETTINGS = ("batch_size",)
 NOT_WANTED = "not_wanted"  # stage of a sensor whose method is null
-LARGEST_CONFIG = 10_000  # values of a group's option; the largest that ships has 160, and Hydra takes 0.1 ms for each
+LARGEST_CONFIG = 10_000  # values of a group's option; the largest that ships has 160
 OF_A_SETUP = ("mounting", "bias")  # effects that exist as one setup's own alone (pipeline.model.setups)
 NUMBER = re.compile(r"([a-z_][a-z_0-9]*(?:\.[A-Za-z_][A-Za-z_0-9]*)*)=(-?(?:0|[1-9][0-9]*)(\.[0-9]+)?)")
 

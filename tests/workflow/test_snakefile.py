@@ -2,15 +2,18 @@
 
 import csv
 import json
+import os
 import re
 import shutil
+import subprocess
+import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from .conftest import Bench
+from .conftest import ROOT, Bench
 
 pytestmark = pytest.mark.workflow
 
@@ -224,3 +227,27 @@ def test_jobs_find_what_the_users_own_python_path_holds(
     bench.snakemake("--until", "ingest")
     (log,) = bench.results.glob("logs/*/ingest.log")
     assert "own path" in log.read_text()
+
+
+def test_campaign_results_and_environment_may_lie_anywhere(tmp_path: Path, simulated: Path) -> None:
+    name = "it's {mine}, all"
+    bench = lay_out(tmp_path / "a b,{c}", "unit,procedure\nA1,own\n", simulated, ["A1"])
+    campaign = bench.campaign.rename(bench.directory / name)
+    own = campaign / "configs" / "procedure" / "own.yaml"
+    own.parent.mkdir(parents=True)
+    own.write_bytes((ROOT / "configs" / "procedure" / "three_axis_turns.yaml").read_bytes())
+    python = tmp_path / "the environment's" / "python"
+    python.parent.mkdir()
+    python.write_text(f'#!/bin/sh\nexec {sys.executable} "$@"\n')
+    python.chmod(0o755)
+    (bench.directory / "sitecustomize.py").write_text(f"import sys\nsys.executable = {str(python)!r}\n")
+    command = [sys.executable, "-m", "snakemake", "--cores", "2", "-s", str(ROOT / "Snakefile"), "--config"]
+    command += [f"campaign={name}/", "results=r {batch}, 's"]
+    environment = os.environ | {"PYTHONPATH": str(bench.directory), "PYTHONWARNINGS": ""}
+    done = subprocess.run(
+        command, cwd=bench.directory, env=environment, capture_output=True, text=True, check=False, timeout=600
+    )
+    assert done.returncode == 0, done.stderr
+    results = bench.directory / "r {batch}, 's" / name
+    assert json.loads((results / "calibrations" / "A1.json").read_text())["status"] == "ok"
+    assert f"r {{batch}}, 's/{name}/index.html" in done.stderr
