@@ -1,13 +1,16 @@
 """The direction of gravity before and after every move, by the calibrated accelerometer.
 
-    u = f / |f|,   f of the rest's mean, or of its half second next to the move where |u_near - u_mean| > 4 s
+    u = u_mean -+ (w x u_mean) T / 2,   or that of the half second next to the move where it is off by more than 4 s
 
 where
 
-    s : standard deviation that white noise gives the mean of the half second, across u
+    u_mean : direction of the rest's mean, T its length
+    w      : rate at which the unit creeps, as far as the rests show one (``pipeline.signal.creep.believed_rates``);
+             what is not known of it is an error of each end
+    s      : standard deviation that white noise gives the mean of the half second, across u
 
-A unit in a hand, or on a soft support, creeps after it was set down. The mean of its rest then is not where the move
-ended; half a second of the accelerometer is, but is noisier than the mean, so that it is taken only where it differs.
+A unit in a hand, or on a soft support, creeps after it was set down, and not always steadily. Then half a second of the
+accelerometer is where the move ended, but is noisier than the mean, so that it is taken only where it differs.
 """
 
 from __future__ import annotations
@@ -52,15 +55,19 @@ class Gravity:
         Unit vectors along it where the move before ends and where the next one begins.
     spread : (m,) array, g
         Standard deviation by the scatter of the accelerometer's rests.
+    ends : (m,) array, g
+        Standard deviation of each end beyond that, by what is not known of the creep.
     shared : (m, 3, 12) array, g
         What the errors of the accelerometer's calibration, each of its standard uncertainty, do to the force.
     creeping : (m,) array of bool
+        Whether the half second next to a move is off the mean by more than 4 s.
     """
 
     force: Values
     at_start: Values
     at_end: Values
     spread: Values
+    ends: Values
     shared: Values
     creeping: NDArray[np.bool_]
 
@@ -81,13 +88,16 @@ def gravity_of(recordings: Sequence[Recording], felt: Rests, accelerometer: Sens
     for at_start in (True, False):
         reading, share = _near(recordings, felt, at_start=at_start)
         near = _unit(_force(reading, felt, accelerometer))
-        creeps = np.linalg.norm(near - u, axis=1) > SIGNIFICANT * np.sqrt(share * white)
-        ends.append(np.where(creeps[:, None], near, u))
+        half = (0.5 if at_start else -0.5) * felt.length[:, None]
+        steady = _unit(u + half * np.cross(np.radians(felt.creep), u))  # du/dt = -w x u
+        creeps = np.linalg.norm(near - steady, axis=1) > SIGNIFICANT * np.sqrt(share * white)
+        ends.append(np.where(creeps[:, None], near, steady))
         noise = np.where(creeps, np.maximum(noise, share), noise)
-        moved |= creeps
+        moved |= np.linalg.norm(near - u, axis=1) > SIGNIFICANT * np.sqrt(share * white)
     between = [float(stage.details.get("scatter_between_rests") or 0.0) for stage in accelerometer.stages]
     spread = np.sqrt(noise * white + max(between, default=0.0) ** 2)
-    return Gravity(force, ends[0], ends[1], spread, _of_calibration(accelerometer, felt.reading), moved)
+    unsure = np.linalg.norm(force, axis=1) * np.radians(felt.creep_error) * 0.5 * felt.length
+    return Gravity(force, ends[0], ends[1], spread, unsure, _of_calibration(accelerometer, felt.reading), moved)
 
 
 def _force(reading: Values, felt: Rests, accelerometer: SensorCalibration) -> Values:

@@ -91,6 +91,7 @@ class HandHeldGyroscope:
             u = force / np.linalg.norm(force, axis=1, keepdims=True)
             across = np.eye(3) - u[:, :, None] * u[:, None, :]
             self.spread = np.degrees(gravity.spread / self.gravity)[:, None, None] * across
+            self.ends = np.degrees(gravity.ends / self.gravity)[:, None, None] * across
             self.shared = np.degrees(across @ gravity.shared / self.gravity)
         self.every, self.known = rests, (gravity, noise, fewest)
 
@@ -231,7 +232,8 @@ class HandHeldGyroscope:
         untold = np.einsum("ksij,ksj->ksi", G @ state.matrix, moves.doubt)
         own = np.einsum("ksij,j,kslj->kil", PM, self.white**2, PM) + np.einsum("ksi,ksj->kij", untold, untold)
         means = np.einsum("kimc,mcd->kimd", directions, self.spread)
-        variance = own + np.einsum("kimd,klmd->kil", means, means)
+        ends = np.einsum("kimc,mcd->kimd", directions, self.ends)
+        variance = own + np.einsum("kimd,klmd->kil", means, means) + np.einsum("kimd,klmd->kil", ends, ends)
         W = np.asarray(np.linalg.solve(np.linalg.cholesky(variance), np.eye(2)), np.float64)
         base = np.concatenate([-PM.sum(axis=1), np.einsum("ksei,ksj->keij", P, v).reshape(moves.count, 2, 9)], axis=2)
         n = 2 * moves.count
