@@ -125,6 +125,11 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
     if unknown:
         raise ConfigurationError(f"--config {unknown[0]}: unknown setting{nearest(unknown[0], valid)}")
     directory = find_campaign(str(settings.get("campaign", "demo")))
+    for name in (str(directory), str(settings.get("results", ""))):
+        if not name.isprintable():
+            raise ConfigurationError(
+                f"{name!r}: characters that can be printed are expected, in UTF-8; rename the folder"
+            )
     composer = Composer(directory, as_list(settings.get(PYTHON, []), PYTHON, "paths of Python files"))
     layers, of_run = load_layers(directory, settings, composer)
     own_file = layers.campaign

@@ -163,3 +163,12 @@ def test_a_campaign_with_configs_of_its_own_may_lie_anywhere(tmp_path: Path, nam
     (tmp_path / name).mkdir()
     own = campaign(tmp_path / name, "unit,table\nU1,mine\n", **{"configs/table/mine.yaml": TABLE})
     assert load_campaign({"campaign": str(own)}).units["U1"].config["table"]["name"] == "mine"
+
+
+@pytest.mark.parametrize("name", [b"a\xffb", b"a\nb"], ids=["not UTF-8", "line end"])
+def test_a_path_that_no_page_can_name_is_refused(tmp_path: Path, name: bytes) -> None:
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/" + name))
+    folder.mkdir()
+    assert "in UTF-8, is expected; rename it" in refused(campaign(folder))
+    (tmp_path / "good").mkdir()
+    assert "in UTF-8, is expected; rename it" in refused(campaign(tmp_path / "good"), results=str(folder))

@@ -62,7 +62,8 @@ CHANGED = []  # those files and folders
 RUNNING = not workflow.is_main_process
 if RUNNING:
     # A job group on another machine: the main process has looked at the files before any job.
-    AGAIN = json.loads(Path(RESULTS, "configs", "again.json").read_text())
+    seen = Path(RESULTS, "configs", "again.json")
+    AGAIN = json.loads(seen.read_text()) if seen.is_file() else {}
 else:
     WATCH = Watch(
         str(CAMPAIGN.results),
