@@ -49,7 +49,7 @@ def next_experiment(
         What the recordings did.
     """
     if verdict == "unexplained":
-        return _of_unknown(unknown)
+        return of_unknown(unknown)
     if selected:
         return _of_selected({entry["effect"]: entry for entry in ranking}, selected)
     if facts.one_way:
@@ -60,7 +60,14 @@ def next_experiment(
     return "none is needed: nothing that these recordings can show is missing"
 
 
-def _of_unknown(unknown: Sequence[Mapping[str, Any]]) -> str:
+def of_unknown(unknown: Sequence[Mapping[str, Any]]) -> str:
+    """Return what would tell on what the residual depends.
+
+    Parameters
+    ----------
+    unknown : sequence of mapping
+        Entries of ``unexplained``.
+    """
     if not unknown:
         return FAR_OFF
     covariate = str(unknown[0]["covariate"])

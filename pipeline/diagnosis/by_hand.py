@@ -17,10 +17,11 @@ from pipeline.diagnosis.by_hand_folds import held_out_errors, nested, with_all_r
 from pipeline.diagnosis.by_hand_hidden import hidden_effects, next_experiment, nothing_to_see
 from pipeline.diagnosis.by_hand_left import dependences
 from pipeline.diagnosis.by_hand_picture import added_variable
+from pipeline.diagnosis.verdict import evidence_of, judged
 from pipeline.errors import CannotCalibrateError
 from pipeline.estimation.hand_held.equations import HandNoise
 from pipeline.estimation.hand_held.likelihood import beside
-from pipeline.estimation.hand_held.result import AUTO, model_of
+from pipeline.estimation.hand_held.result import AUTO, calibration_of, model_of
 from pipeline.estimation.hand_held.selection import select
 from pipeline.estimation.selection import GATE_BIC, INFLATED
 from pipeline.model.effects import effect
@@ -44,6 +45,8 @@ def diagnose_by_hand(
     noise: Noise | None,
     settings: Mapping[str, Any],
     accelerometer: SensorCalibration | None = None,
+    *,
+    validation: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Return a sensor's part of ``diagnoses/<unit>.json``.
 
@@ -57,6 +60,8 @@ def diagnose_by_hand(
         Sections ``sensor``, ``table``, ``procedure`` and ``effects``.
     accelerometer : SensorCalibration, optional
         For the gyroscope, which needs the direction of gravity; without it, it is calibrated again.
+    validation : mapping, optional
+        The sensor's part of ``validations/<unit>.json``; without it, the held-out error is worked out here.
 
     Returns
     -------
@@ -74,14 +79,30 @@ def diagnose_by_hand(
         else:
             felt = accelerometer and with_all_rests(accelerometer, recordings, None, every)
             model = model_of(recordings, calibration, noise, every, felt)
+        why = "" if model else f"no recording holds a rest with readings of the {sensor}"
     except CannotCalibrateError as lack:
-        return nothing_to_see(sensor, configured, lack.message)
+        model, why = None, lack.message
     if model is None:
-        return nothing_to_see(sensor, configured, f"no recording holds a rest with readings of the {sensor}")
+        nothing = nothing_to_see(sensor, configured, why)
+        return judged(nothing, evidence_of(nothing, calibration, recordings, noise, settings, validation))
     sheet = settings["sensor"][sensor]
     selection = select(model, calibration, configured, noise, sheet)
-    judged = nested(selection, calibration, configured, noise, sheet)
-    return _document(selection, configured, _without_creep(noise, sheet)) | {"cross_validation": judged}
+    expected = _without_creep(noise, sheet)
+    document = _document(selection, configured, expected)
+    document["cross_validation"] = nested(selection, calibration, configured, noise, sheet)
+    names = selection.names
+    found = evidence_of(
+        document,
+        calibration,
+        recordings,
+        noise,
+        settings,
+        validation,
+        other=accelerometer if sensor == "gyroscope" else None,
+        full=(lambda: calibration_of(model, selection.fits[-1], calibration, settings)) if names else None,
+    )
+    left = _over_noise(selection, selection.fits[-1], expected)
+    return judged(document, replace(found, left_over_noise=left))
 
 
 def _without_creep(noise: Noise | None, sheet: Mapping[str, Any]) -> Noise | None:

@@ -6,6 +6,7 @@ with what else would look alike, what cannot be seen in these recordings, what r
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,12 +17,13 @@ from pipeline.diagnosis.held_out import held_out_error, held_out_floor
 from pipeline.diagnosis.method_errors import method_errors
 from pipeline.diagnosis.observability import facts_of, not_observable
 from pipeline.diagnosis.pictures import pictures
+from pipeline.diagnosis.verdict import evidence_of, judged
 from pipeline.diagnosis.wander import fitted_wander
 from pipeline.errors import NotObservableError
 from pipeline.estimation.design import Start, Term
 from pipeline.estimation.effects_stage import AUTO
 from pipeline.estimation.hand_held.rests import by_hand
-from pipeline.estimation.joint import fit_terms
+from pipeline.estimation.joint import calibration_of, fit_terms
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import FAR_ABOVE, GATE_BIC, select
 from pipeline.model.effects import catalogue, effect
@@ -50,6 +52,8 @@ def diagnose(
     noise: Noise | None,
     settings: Mapping[str, Any],
     accelerometer: SensorCalibration | None = None,
+    *,
+    validation: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Return a sensor's part of ``diagnoses/<unit>.json``.
 
@@ -64,36 +68,55 @@ def diagnose(
         Sections ``sensor``, ``table`` and ``effects``; ``procedure`` for recordings by hand.
     accelerometer : SensorCalibration, optional
         For the gyroscope by hand, which needs the direction of gravity; without it, it is calibrated again.
+    validation : mapping, optional
+        The sensor's part of ``validations/<unit>.json``; without it, the held-out error is worked out here.
 
     Returns
     -------
     dict
-        ``verdict, residual_over_noise, selected, ranking, not_observable, unexplained, next_experiment, override``;
-        beside these ``configured, suggested_effect`` (``pipeline.diagnosis.first_guess``), ``wander``
-        (``...wander``), ``held_out`` (``error_before, error_after, floor``), ``pictures`` (``...pictures``) and
-        ``method_errors`` (``...method_errors``).
+        ``verdict, reason`` (``pipeline.diagnosis.verdict``), ``residual_over_noise, selected, ranking, not_observable,
+        unexplained, next_experiment, override``; beside these ``configured, suggested_effect``
+        (``pipeline.diagnosis.first_guess``), ``wander`` (``...wander``), ``held_out`` (``error_before, error_after,
+        floor``), ``pictures`` (``...pictures``) and ``method_errors`` (``...method_errors``).
     """
     sensor = calibration.sensor
     if by_hand(sensor, recordings):
         from pipeline.diagnosis.by_hand import diagnose_by_hand  # noqa: PLC0415  (recordings by hand alone)
 
-        return diagnose_by_hand(calibration, recordings, noise, settings, accelerometer)
+        return diagnose_by_hand(calibration, recordings, noise, settings, accelerometer, validation=validation)
     wanted = settings["effects"][sensor]
     configured = [] if wanted == AUTO else list(wanted)
     observations = observe(sensor, recordings, settings["table"])
     try:
         selection = select(observations, configured, noise, settings["sensor"][sensor], calibration)
     except NotObservableError as reason:
-        return _nothing(sensor, configured, reason.message)
+        nothing = _nothing(sensor, configured, reason.message)
+        return judged(nothing, evidence_of(nothing, calibration, recordings, noise, settings, validation))
     unknown = unexplained(selection)
     beside = select_beside(selection, unknown, configured, noise, settings["sensor"][sensor])
     document = _document(beside, unknown, configured, recordings, noise, table=settings["table"])
-    return document | {
+    document |= {
         "suggested_effect": None if beside is selection else suggested_effect(unknown, sensor, catalogue()),
-        "residual_over_noise": _over_noise(selection, recordings, noise),
+        "residual_over_noise": _over_noise(selection.base, recordings, noise),
         "pictures": pictures(selection, unknown, noise, beside),
         "method_errors": method_errors(calibration, beside, recordings, settings),
     }
+
+    def fitted(fit: Fit) -> SensorCalibration:
+        return calibration_of(sensor, fit, selection.observations, None, settings)
+
+    found = evidence_of(
+        document,
+        calibration,
+        recordings,
+        noise,
+        settings,
+        validation,
+        free=lambda: fitted(selection.base),
+        full=(lambda: fitted(selection.fit)) if selection.names else None,
+    )
+    left = _over_noise(selection.fit, recordings, noise)
+    return judged(document, replace(found, left_over_noise=left))
 
 
 def _nothing(sensor: str, configured: list[str], reason: str) -> dict[str, Any]:
@@ -316,10 +339,10 @@ def _look_alikes(selection: Selection, score: Score) -> list[dict[str, Any]]:
     return [{"effect": name, "share": share} for share, name in alike]
 
 
-def _over_noise(selection: Selection, recordings: Sequence[Recording], noise: Noise | None) -> float | None:
-    """Return the rms residual of base and configured effects over that of noise alone."""
+def _over_noise(fit: Fit, recordings: Sequence[Recording], noise: Noise | None) -> float | None:
+    """Return the rms residual of a fit over that of noise alone."""
     if noise is None:
         return None
     gain = max(float(r.filter.get("noise_gain", 1.0)) for r in recordings)
     floor = float(np.sqrt(np.mean((gain * noise.white) ** 2 + noise.wander**2)))
-    return float(selection.base.residual_rms / floor) if floor > 0 else None
+    return float(fit.residual_rms / floor) if floor > 0 else None

@@ -29,7 +29,7 @@ def in_words(part: Mapping[str, Any] | None, sensor: str) -> list[str]:
     """
     if part is None:
         return [f"The {sensor} was not calibrated, so there is nothing to diagnose."]
-    lines = [_verdict(part, sensor)]
+    lines = [_verdict(part, sensor), *([part["reason"]] if part.get("reason") else [])]
     entries = {entry["effect"]: entry for entry in part["ranking"]}
     for name in part["selected"]:
         lines += _selected(entries[name], sensor, with_shape=bool(part.get("suggested_effect")))
@@ -97,6 +97,9 @@ def _verdict(part: Mapping[str, Any], sensor: str) -> str:
         "missing_effect": f"The model of the {sensor} misses {_names(part['selected'])}.",
         "unexplained": f"The {sensor} does something that no effect of the catalogue explains.",
         "not_enough_data": f"The recordings cannot tell whether an effect of the {sensor} is missing.",
+        "reference_in_doubt": f"The reference of the {sensor} is in doubt: recordings contradict each other.",
+        "floor_in_doubt": f"The noise of the {sensor} is in doubt: it may be taken for too large and hide an effect.",
+        "left_by_method": f"The {sensor} is explained; approximations of its method or filter leave more than noise.",
     }[part["verdict"]]
     ratio = part["residual_over_noise"]
     if ratio is None:

@@ -31,6 +31,9 @@ VERDICTS = {
     "missing_effect": ("missing effect", "warn"),
     "unexplained": ("unexplained", "warn"),
     "not_enough_data": ("not enough data", ""),
+    "left_by_method": ("left by method", "warn"),
+    "reference_in_doubt": ("reference in doubt", "warn"),
+    "floor_in_doubt": ("floor in doubt", "warn"),
 }
 
 

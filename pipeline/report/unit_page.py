@@ -36,12 +36,14 @@ if TYPE_CHECKING:
     from pipeline.records import Recording
 
 JSON = dict[str, Any]
-FAR = 1.5  # of the noise floor: an error beyond it is not noise
 VERDICTS = {
     "nothing_missing": "Nothing significant is missing from the model.",
     "missing_effect": "A physical effect is missing from the model.",
     "unexplained": "Something is missing that no known effect explains.",
     "not_enough_data": "The recording is too short to say what is missing.",
+    "left_by_method": "The sensor is explained; approximations of its method or filter leave more than noise.",
+    "reference_in_doubt": "The reference is in doubt: recordings contradict each other.",
+    "floor_in_doubt": "The noise is in doubt: it may be taken for too large and hide an effect.",
 }
 
 
@@ -143,7 +145,6 @@ def _sensor(  # noqa: PLR0917  (the inputs of the page, passed on)
         "evidence_figures": [f for f in (ranking(sensor, found), added_variable(sensor, found)) if f]
         + unexplained(sensor, found),
         "implausible": sentences(sensor, part),
-        "left_by_method": _left_by_method(held_out, found),
         "verdict": VERDICTS.get(found.get("verdict", ""), "There is no diagnosis."),
         "words": words.get(sensor) or [],
         "commands": commands_of(found, sensor, str(calibration.get("unit")), settings.get("run") or {}),
@@ -153,14 +154,6 @@ def _sensor(  # noqa: PLR0917  (the inputs of the page, passed on)
 def _order(sensor: JSON) -> int:
     """Return the place of a sensor: what is missing or in doubt before what is explained, and that before none."""
     return 2 if sensor["part"] is None else int(sensor["diagnosis"].get("verdict") == "nothing_missing")
-
-
-def _left_by_method(held_out: JSON, found: JSON) -> bool:
-    """Return whether held-out errors stand above the noise although a free matrix and bias would leave noise alone."""
-    after, floor = final_step(held_out).get("rms_error"), held_out.get("noise_floor")
-    if found.get("verdict") != "nothing_missing" or not after or not floor or not held_out.get("held_out", True):
-        return False
-    return bool(after > FAR * floor and (found.get("residual_over_noise") or FAR) < FAR)
 
 
 def _sigma(noise: JSON | None, traces: list[Residual]) -> NDArray[np.float64] | None:

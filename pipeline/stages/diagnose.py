@@ -8,7 +8,7 @@ from pipeline.atomic import write_atomically
 from pipeline.diagnosis.diagnose import diagnose
 from pipeline.diagnosis.guess_words import effect_file
 from pipeline.formats.parquet import load_recordings
-from pipeline.stages.batch import parse_job, run_batch, write_json
+from pipeline.stages.batch import parse_job, read_json, run_batch, write_json
 from pipeline.stages.fits import load_fits
 from pipeline.stages.noises import require_noises
 
@@ -18,16 +18,17 @@ if TYPE_CHECKING:
 
 def main(argv: Sequence[str]) -> int:
     """Run the stage."""
-    job = parse_job("diagnose", argv, ["filter", "accelerometer", "gyroscope"])
+    job = parse_job("diagnose", argv, ["filter", "accelerometer", "gyroscope", "validate"])
 
     def work(unit: str, part: dict[str, Any]) -> None:
         recordings = load_recordings(job.inputs["filter"] / f"{unit}.parquet")
         document: dict[str, Any] = {"schema_version": 1, "unit": unit}
         fits = load_fits(job.inputs, unit)
         noises = require_noises(job.inputs["filter"], unit, recordings, part["sensor"], fits)
+        validation = read_json(job.inputs["validate"] / f"{unit}.json")
         for sensor, calibration in fits.items():
             document[sensor] = found = calibration and diagnose(
-                calibration, recordings, noises[sensor], part, fits["accelerometer"]
+                calibration, recordings, noises[sensor], part, fits["accelerometer"], validation=validation[sensor]
             )
             if found and found.get("suggested_effect"):
                 found["suggested_file"] = suggested_file(unit, sensor)

@@ -18,7 +18,7 @@ from pipeline.model.inversion import linear_truth
 from pipeline.model.kinematics import EARTH_RATE_DPS
 from pipeline.validation.expected import expected_rms_error
 from pipeline.validation.floor import squared_norm_errors, squared_vector_errors
-from pipeline.validation.ladder import ladder
+from pipeline.validation.ladder import ladder, last_step
 from pipeline.validation.limits import check_limits
 from pipeline.validation.samples import samples_of_motion, samples_of_rests
 from pipeline.validation.sensitivity import judged
@@ -156,6 +156,36 @@ def _length(sensor: str, recordings: Sequence[Recording]) -> float:
     return float(sum(time[-1] - time[0] for time in own))
 
 
+def last_error(
+    calibration: SensorCalibration,
+    recordings: Sequence[Recording],
+    noise: Noise,
+    settings: Mapping[str, Any],
+    *,
+    other: SensorCalibration | None = None,
+    smoothed: bool = False,
+) -> tuple[float, list[float]] | None:
+    """Return the rms error after the last step and its interval; None where nothing is held out or no interval is told.
+
+    Parameters
+    ----------
+    calibration, recordings, noise, settings, other
+        As of ``validate``.
+    smoothed : bool
+        Whether the reference of a filtered recording goes through its filter, too: then the filter leaves no error.
+    """
+    samples, reason = _choose(calibration.sensor, recordings, noise, settings, smoothed=smoothed)
+    if reason is not None:
+        return None
+    fitted_s = _length(calibration.sensor, recordings)
+    expected, _ = _expected(calibration, samples, noise, settings, other, fitted_s=fitted_s)
+    found = [step for s in samples if (step := last_step(calibration, s, other)) is not None]
+    if expected is None or not found:
+        return None
+    error = np.concatenate([np.linalg.norm(vector, axis=1) - magnitude for vector, magnitude, _ in found])
+    return float(np.sqrt(np.nanmean(error**2))), expected
+
+
 def noise_floors(calibration: SensorCalibration, samples: Sequence[Samples]) -> tuple[float, float | None]:
     """Return the rms error, and where an attitude is known the vector rms error, that noise alone would give.
 
@@ -188,7 +218,7 @@ def _truth(calibration: SensorCalibration, samples: Samples) -> NDArray[np.float
 
 
 def _choose(
-    sensor: str, recordings: Sequence[Recording], noise: Noise, settings: Mapping[str, Any]
+    sensor: str, recordings: Sequence[Recording], noise: Noise, settings: Mapping[str, Any], *, smoothed: bool = False
 ) -> tuple[list[Samples], str | None]:
     """Return the samples to judge on, and why they are not held out where they are not."""
     table = settings["table"]
@@ -198,7 +228,7 @@ def _choose(
         chosen = [r for r in recordings if r.role == role]
         if by_rests:  # hand-held: between its rests nobody knows the specific force
             chosen = [r for r in chosen if _logs_table(r)]
-        found = [samples_of_motion(sensor, r, noise, table) for r in chosen]
+        found = [samples_of_motion(sensor, r, noise, table, smoothed=smoothed) for r in chosen]
         return [s for s in found if s is not None and np.isfinite(s.reading).all(axis=1).any()]
 
     def resting(rests: Mapping[str, Sequence[Rest]]) -> list[Samples]:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.estimation.observations import through_filter
 from pipeline.estimation.rest_means import rest_means, split_rests
 from pipeline.model.effects.base import truth
 from pipeline.model.effects.time_offset import shifted
@@ -99,7 +100,9 @@ class Samples:
         )
 
 
-def samples_of_motion(sensor: str, recording: Recording, noise: Noise, table: Mapping[str, Any]) -> Samples | None:
+def samples_of_motion(
+    sensor: str, recording: Recording, noise: Noise, table: Mapping[str, Any], *, smoothed: bool = False
+) -> Samples | None:
     """Return a recording's samples, or None where it holds no readings of the sensor or no reference for them.
 
     Parameters
@@ -109,6 +112,8 @@ def samples_of_motion(sensor: str, recording: Recording, noise: Noise, table: Ma
     noise : Noise
     table : mapping
         ``gravity_g``, ``latitude_deg``, ``azimuth_deg``.
+    smoothed : bool
+        Whether the reference goes through the recording's filter, where its attitude is known.
     """
     reading = recording.reading(sensor)
     if reading is None or recording.samples == 0:
@@ -118,14 +123,17 @@ def samples_of_motion(sensor: str, recording: Recording, noise: Noise, table: Ma
     earth = None if latitude is None or azimuth is None else earth_rate(latitude, azimuth)
     delay = float(recording.filter.get("delay_s", 0.0))
     motion = reference_motion(recording, gravity, earth)
+    smoothed = smoothed and motion is not None and recording.filter["name"] != "none"
     if motion is not None:
-        motion = shifted(motion, -delay)
+        motion = through_filter(motion, recording) if smoothed else shifted(motion, -delay)
     magnitude = np.full(recording.samples, gravity)
     if sensor == "gyroscope":
         known = _rate(recording, motion, earth, delay)
         if known is None:
             return None
         magnitude = known
+    if smoothed and motion is not None:
+        magnitude = np.linalg.norm(truth(sensor, motion), axis=1)
     temperature = recording.temperature if motion is None else motion.temperature
     n = recording.samples
     return Samples(

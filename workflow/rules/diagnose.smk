@@ -4,6 +4,7 @@ rule diagnose:
         filter=f"{BATCH}/filter",
         accelerometer=last_fit("accelerometer"),
         gyroscope=last_fit("gyroscope"),
+        validate=f"{BATCH}/validate",
     output:
         directory(f"{BATCH}/diagnose"),
     log:
@@ -13,4 +14,4 @@ rule diagnose:
         code=code_digest("pipeline.stages.diagnose"),
     shell:
         "{RUN} diagnose --config {params.config:q} --filter {input.filter:q} --accelerometer {input.accelerometer:q}"
-        " --gyroscope {input.gyroscope:q} --output {output:q} > {log:q} 2>&1"
+        " --gyroscope {input.gyroscope:q} --validate {input.validate:q} --output {output:q} > {log:q} 2>&1"

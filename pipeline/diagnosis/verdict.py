@@ -1,0 +1,272 @@
+"""The verdict on one sensor: what its selection found, against the error on held-out motion.
+
+The held-out error of a calibration that lacks nothing lies in the interval of ``pipeline.validation.expected``. What
+says otherwise decides, the first that applies:
+
+    reference_in_doubt  a check of the recordings says so (note ``N-REFERENCE``), or the fit is explained to its noise
+                        and the held-out motion is not: the recordings contradict each other
+    missing_effect      effects were selected, and with them the held-out error lies in its interval
+    unexplained         the residual of the fit, or the held-out error, is above what noise leaves, for no known reason
+    floor_in_doubt      the held-out error is below its interval, or the residual far below the noise
+    left_by_method      the error is above, but that of a free fit of the same recordings is not
+    not_enough_data, nothing_missing
+
+"Above" and "below" compare with the 99 % interval. A held-out error whose interval is not known decides nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from pipeline.diagnosis.advice import of_unknown
+from pipeline.model.effects.base import unit_of
+from pipeline.validation.heldout import last_error
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from pipeline.records import Noise, Recording, SensorCalibration
+
+IN_DOUBT = "N-REFERENCE"
+EXPLAINED = 1.5  # times the noise: a residual of a fit up to it is noise; 0.92 to 1.14 in 140 sensors of null families
+QUIET = 0.6  # times the noise: a residual below it contradicts the noise of the rests
+FREE = ("reference_least_squares", "nonlinear_least_squares")  # methods that leave bias and matrix free
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """A held-out rms error and the interval in which it is expected, g or deg/s."""
+
+    error: float
+    low: float
+    high: float
+
+    @property
+    def above(self) -> bool:
+        """Whether more is left than noise and stated uncertainties explain."""
+        return self.error > self.high
+
+    @property
+    def below(self) -> bool:
+        """Whether less is left than the noise would leave."""
+        return self.error < self.low
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What decides.
+
+    Attributes
+    ----------
+    sensor : str
+    found : str
+        Verdict of the selection alone.
+    selected : sequence of str
+        Effects.
+    over_noise, left_over_noise : float or None
+        Residual of the fit over the noise, without and with what was selected.
+    published : HeldOut or None
+        Of the unit's calibration.
+    free, full : HeldOut or None
+        Of a free fit of the same recordings, and with the selected effects; of filtered recordings against the
+        filtered reference.
+    doubts : sequence of str
+        What the recordings' checks say of the reference.
+    method : str
+    as_printed : bool
+        Whether the method takes the equations of the founding document as printed.
+    filtered : bool
+    """
+
+    sensor: str
+    found: str
+    selected: Sequence[str] = ()
+    over_noise: float | None = None
+    left_over_noise: float | None = None
+    published: HeldOut | None = None
+    free: HeldOut | None = None
+    full: HeldOut | None = None
+    doubts: Sequence[str] = field(default_factory=tuple)
+    method: str = ""
+    as_printed: bool = False
+    filtered: bool = False
+
+
+def held_out_of(part: Mapping[str, Any] | None) -> HeldOut | None:
+    """Return the last error of a sensor's validation; None where nothing is held out or no interval is known.
+
+    Parameters
+    ----------
+    part : mapping or None
+        The sensor's part of ``validations/<unit>.json``.
+    """
+    if not part or not part.get("held_out") or not part.get("expected_rms_error"):
+        return None
+    return HeldOut(float(part["steps"][-1]["rms_error"]), *map(float, part["expected_rms_error"]))
+
+
+def doubts_of(sensor: str, recordings: Sequence[Recording]) -> list[str]:
+    """Return what the notes on the recordings say of the reference of a sensor.
+
+    A note on turns of the other sensor concerns that one alone.
+    """
+    own = [r for r in recordings if r.role not in {"accelerometer", "gyroscope"} or r.role == sensor]
+    return [f"{r.name}: {note.detail}" for r in own for note in r.notes if note.code == IN_DOUBT]
+
+
+def evidence_of(  # noqa: PLR0917  (what a diagnosis is made of)
+    document: Mapping[str, Any],
+    calibration: SensorCalibration,
+    recordings: Sequence[Recording],
+    noise: Noise | None,
+    settings: Mapping[str, Any],
+    validation: Mapping[str, Any] | None,
+    *,
+    other: SensorCalibration | None = None,
+    free: Callable[[], SensorCalibration] | None = None,
+    full: Callable[[], SensorCalibration] | None = None,
+) -> Evidence:
+    """Return what decides; the held-out error of further fits only where that of the calibration is above its interval.
+
+    Parameters
+    ----------
+    document : mapping
+        The diagnosis of the selection alone.
+    calibration : SensorCalibration
+    recordings : sequence of Recording
+    noise : Noise or None
+    settings : mapping
+        Sections ``table``, ``sensor``, ``procedure`` and ``method``.
+    validation : mapping or None
+        The sensor's part of ``validations/<unit>.json``.
+    other : SensorCalibration, optional
+        Of the other sensor.
+    free, full : callable, optional
+        Return the calibrations of a free fit, without and with what was selected.
+    """
+    sensor = calibration.sensor
+    method = settings.get("method") or {}
+    filtered = any(r.filter["name"] != "none" for r in recordings if r.role == "validation")
+
+    def error_of(fit: Callable[[], SensorCalibration] | None, *, smoothed: bool) -> HeldOut | None:
+        if fit is None or noise is None:
+            return None
+        found = last_error(fit(), recordings, noise, settings, other=other, smoothed=smoothed)
+        return None if found is None else HeldOut(found[0], *found[1])
+
+    published = held_out_of(validation) if validation else error_of(lambda: calibration, smoothed=False)
+    contradicted = published is not None and published.above
+    return Evidence(
+        sensor,
+        str(document["verdict"]),
+        tuple(document["selected"]),
+        document["residual_over_noise"],
+        published=published,
+        free=error_of(free, smoothed=True) if contradicted else None,
+        full=error_of(full, smoothed=True) if contradicted else None,
+        doubts=doubts_of(sensor, recordings),
+        method=str(method.get(sensor) or ""),
+        as_printed=bool(method.get("as_printed")),
+        filtered=filtered,
+    )
+
+
+def decide(e: Evidence) -> tuple[str, str]:
+    """Return the verdict, and why as one or two sentences; empty where the selection says it.
+
+    Parameters
+    ----------
+    e : Evidence
+    """
+    if e.doubts:
+        return "reference_in_doubt", f"A check of the recordings contradicts the reference: {'; '.join(e.doubts)}."
+    if e.published and e.published.above:
+        return _above(e, e.published)
+    if e.found in {"missing_effect", "unexplained"}:
+        return e.found, ""
+    if e.published and e.published.below:
+        return "floor_in_doubt", _too_low(e, e.published)
+    if e.over_noise is not None and e.over_noise < QUIET:
+        return "floor_in_doubt", (
+            f"The residual of the fit is {e.over_noise:.2g} times the noise that was found. Noise cannot be larger at "
+            "rest than in turns: check that the unit did not move in the static recording, and record it again."
+        )
+    return e.found, ""
+
+
+def _above(e: Evidence, published: HeldOut) -> tuple[str, str]:
+    unit = unit_of(e.sensor)
+    told = (
+        f"On held-out motion the error is {published.error:.3g} {unit}; noise and stated uncertainties leave at most "
+        f"{published.high:.3g} {unit}"
+    )
+    if e.found == "missing_effect" and not (e.full and e.full.above):
+        return "missing_effect", ""
+    if e.found == "unexplained":
+        return "unexplained", f"{told}."
+    free = e.free or published
+    if not free.above or e.as_printed:
+        return "left_by_method", f"{told}. {_of_method(e)}"
+    left = e.left_over_noise if e.selected else e.over_noise
+    if e.full and e.selected:
+        told += f", and with what was selected {e.full.error:.3g} {unit} stay, against at most {e.full.high:.3g}"
+    if left is not None and left > EXPLAINED:
+        return "unexplained", f"{told}. The residual of the fit is {left:.3g} times the noise, too."
+    return "reference_in_doubt", (
+        f"{told}. Yet the recordings of the fit are explained to their noise, so that fit and held-out recording "
+        "contradict each other: check that the held-out recording is of this unit in the same mounting, and the rate, "
+        "attitude and clock that the table logged in it."
+    )
+
+
+def _of_method(e: Evidence) -> str:
+    if e.as_printed:
+        return f"The method {e.method} takes equations as they are printed, with their errata (as_printed)."
+    if e.free is None:
+        return f"The method {e.method} leaves it."
+    found = f"A free fit of the same recordings leaves {e.free.error:.3g} {unit_of(e.sensor)}"
+    if e.filtered and e.method in FREE:
+        return f"{found} against the filtered reference: the filter, which delays and smooths, leaves the rest."
+    culprit = f"the method {e.method} and the filter leave" if e.filtered else f"the method {e.method} leaves"
+    against = " against the filtered reference" if e.filtered else ""
+    return f"{found}{against}: {culprit} the rest."
+
+
+def _too_low(e: Evidence, published: HeldOut) -> str:
+    unit = unit_of(e.sensor)
+    return (
+        f"On held-out motion the error is {published.error:.3g} {unit}, less than the noise that was found would leave "
+        f"({published.low:.3g} to {published.high:.3g} {unit}): the noise is taken for too large, and may hide an "
+        "effect. Check that the unit did not move in the recording that the noise is taken from."
+    )
+
+
+def judged(document: dict[str, Any], e: Evidence) -> dict[str, Any]:
+    """Return a diagnosis with the verdict that the evidence leads to, the reason, and what to do next.
+
+    Parameters
+    ----------
+    document : dict
+        Of the selection alone.
+    e : Evidence
+    """
+    verdict, reason = decide(e)
+    step = _next_step(verdict, e)
+    if verdict == "unexplained" != e.found:
+        step = of_unknown(document["unexplained"])
+    return document | {"verdict": verdict, "reason": reason} | ({"next_experiment": step} if step else {})
+
+
+def _next_step(verdict: str, e: Evidence) -> str:
+    """Return what to do next where the verdict is about the recordings or the method; empty otherwise."""
+    if verdict == "reference_in_doubt":
+        return "check the table's log and the mounting as said above, and record the recordings concerned again"
+    if verdict == "floor_in_doubt":
+        return "record static again: ten minutes or more at rest, on a base that does not shake"
+    if verdict != "left_by_method":
+        return ""
+    changes = ["the equations as corrected (method.as_printed=false)"] if e.as_printed else []
+    changes += [] if e.method in FREE else ["a method that fits the full matrix (reference_least_squares)"]
+    changes += ["no filter (filter=none)"] if e.filtered else []
+    return f"calibrate the same recordings with {' and '.join(changes)}" if changes else ""

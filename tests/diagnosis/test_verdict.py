@@ -1,0 +1,73 @@
+"""The order of the verdicts: what the selection found, against held-out errors and what the recordings' checks say."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from bench_session import Session, record
+
+from pipeline.diagnosis.verdict import Evidence, HeldOut, decide, doubts_of, held_out_of, judged
+from pipeline.records import Note, Recording
+
+INSIDE, ABOVE, BELOW = HeldOut(1.0, 0.9, 1.2), HeldOut(9.0, 0.9, 1.2), HeldOut(0.5, 0.9, 1.2)
+NOTHING = Evidence("gyroscope", "nothing_missing", over_noise=1.0, published=INSIDE, method="reference_least_squares")
+MISSING = replace(NOTHING, found="missing_effect", selected=("g_sensitivity",), over_noise=9.0, left_over_noise=1.0)
+STAGED = replace(NOTHING, published=ABOVE, free=INSIDE, method="staged")
+
+
+@pytest.mark.parametrize(
+    ("evidence", "verdict", "words"),
+    [
+        (NOTHING, "nothing_missing", ""),
+        (replace(NOTHING, published=None), "nothing_missing", ""),
+        (replace(NOTHING, published=ABOVE), "reference_in_doubt", "contradict each other"),
+        (replace(NOTHING, published=ABOVE, over_noise=4.0), "unexplained", "4 times the noise"),
+        (replace(NOTHING, published=BELOW), "floor_in_doubt", "taken for too large"),
+        (replace(NOTHING, over_noise=0.1), "floor_in_doubt", "0.1 times the noise"),
+        (replace(MISSING, published=ABOVE, free=ABOVE, full=INSIDE), "missing_effect", ""),
+        (replace(MISSING, published=ABOVE, free=ABOVE, full=ABOVE), "reference_in_doubt", "9 deg/s stay"),
+        (replace(MISSING, published=ABOVE, full=ABOVE, left_over_noise=3.0), "unexplained", "3 times the noise"),
+        (replace(MISSING, published=BELOW), "missing_effect", ""),
+        (replace(MISSING, doubts=("validation: off",)), "reference_in_doubt", "validation: off"),
+        (replace(NOTHING, found="unexplained", published=ABOVE), "unexplained", "at most 1.2 deg/s"),
+        (STAGED, "left_by_method", "the method staged leaves the rest"),
+        (replace(STAGED, filtered=True), "left_by_method", "the method staged and the filter leave the rest"),
+        (replace(STAGED, filtered=True, method="reference_least_squares"), "left_by_method", "the filter, which"),
+        (replace(STAGED, free=ABOVE, as_printed=True), "left_by_method", "as_printed"),
+        (replace(STAGED, free=ABOVE), "reference_in_doubt", "contradict each other"),
+        (replace(NOTHING, found="not_enough_data", published=BELOW), "floor_in_doubt", "too large"),
+    ],
+)
+def test_the_first_that_applies_is_said_with_its_numbers(evidence: Evidence, verdict: str, words: str) -> None:
+    found, reason = decide(evidence)
+    assert found == verdict
+    assert words in reason
+    assert bool(words) == bool(reason)
+    document: dict[str, Any] = {"verdict": evidence.found, "next_experiment": "none is needed", "unexplained": []}
+    step = judged(document, evidence)["next_experiment"]
+    assert (step == "none is needed") == (verdict in {"nothing_missing", "missing_effect"} or verdict == evidence.found)
+    if evidence.method == "reference_least_squares":
+        assert "reference_least_squares" not in step + reason
+
+
+def test_only_held_out_errors_with_an_interval_decide() -> None:
+    part = {"held_out": True, "steps": [{"rms_error": 2.0}], "expected_rms_error": [0.5, 1.5]}
+    found = held_out_of(part)
+    assert found is not None
+    assert found.above
+    assert held_out_of(None) is held_out_of(part | {"held_out": False}) is None
+    assert held_out_of(part | {"expected_rms_error": None}) is None
+
+
+def test_a_note_on_the_turns_of_one_sensor_does_not_concern_the_other() -> None:
+    def noted(recording: Recording) -> Recording:
+        return replace(recording, notes=(Note("N-REFERENCE", 1, 0, 0, "angle and rate differ"),))
+
+    turn, held_out = (
+        next(noted(r) for r in record(Session(1)) if r.role == role) for role in ("gyroscope", "validation")
+    )
+    assert doubts_of("gyroscope", [turn]) == [f"{turn.name}: angle and rate differ"]
+    assert doubts_of("accelerometer", [turn]) == []
+    assert len(doubts_of("accelerometer", [held_out])) == 1
