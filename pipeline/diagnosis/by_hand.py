@@ -61,7 +61,8 @@ def diagnose_by_hand(
     accelerometer : SensorCalibration, optional
         For the gyroscope, which needs the direction of gravity; without it, it is calibrated again.
     validation : mapping, optional
-        The sensor's part of ``validations/<unit>.json``; without it, the held-out error is worked out here.
+        The sensor's part of ``validations/<unit>.json``; without it, a free fit stands for the
+        calibration.
 
     Returns
     -------
@@ -84,7 +85,7 @@ def diagnose_by_hand(
         model, why = None, lack.message
     if model is None:
         nothing = nothing_to_see(sensor, configured, why)
-        return judged(nothing, evidence_of(nothing, calibration, recordings, noise, settings, validation))
+        return judged(nothing, evidence_of(nothing, sensor, recordings, noise, settings, validation))
     sheet = settings["sensor"][sensor]
     selection = select(model, calibration, configured, noise, sheet)
     expected = _without_creep(noise, sheet)
@@ -93,7 +94,7 @@ def diagnose_by_hand(
     names = selection.names
     found = evidence_of(
         document,
-        calibration,
+        sensor,
         recordings,
         noise,
         settings,
@@ -102,7 +103,7 @@ def diagnose_by_hand(
         full=(lambda: calibration_of(model, selection.fits[-1], calibration, settings)) if names else None,
     )
     left = _over_noise(selection, selection.fits[-1], expected)
-    return judged(document, replace(found, left_over_noise=left))
+    return judged(document, replace(found, left_over_noise=left, on_table=False))
 
 
 def _without_creep(noise: Noise | None, sheet: Mapping[str, Any]) -> Noise | None:

@@ -69,7 +69,8 @@ def diagnose(
     accelerometer : SensorCalibration, optional
         For the gyroscope by hand, which needs the direction of gravity; without it, it is calibrated again.
     validation : mapping, optional
-        The sensor's part of ``validations/<unit>.json``; without it, the held-out error is worked out here.
+        The sensor's part of ``validations/<unit>.json``; without it, a free fit stands for the
+        calibration.
 
     Returns
     -------
@@ -91,7 +92,7 @@ def diagnose(
         selection = select(observations, configured, noise, settings["sensor"][sensor], calibration)
     except NotObservableError as reason:
         nothing = _nothing(sensor, configured, reason.message)
-        return judged(nothing, evidence_of(nothing, calibration, recordings, noise, settings, validation))
+        return judged(nothing, evidence_of(nothing, sensor, recordings, noise, settings, validation))
     unknown = unexplained(selection)
     beside = select_beside(selection, unknown, configured, noise, settings["sensor"][sensor])
     document = _document(beside, unknown, configured, recordings, noise, table=settings["table"])
@@ -107,7 +108,7 @@ def diagnose(
 
     found = evidence_of(
         document,
-        calibration,
+        sensor,
         recordings,
         noise,
         settings,

@@ -77,6 +77,8 @@ class Evidence:
     as_printed : bool
         Whether the method takes the equations of the founding document as printed.
     filtered : bool
+    on_table : bool
+        Whether the fit is to a table's motion; a few rests by hand may leave a small residual by chance.
     """
 
     sensor: str
@@ -91,6 +93,7 @@ class Evidence:
     method: str = ""
     as_printed: bool = False
     filtered: bool = False
+    on_table: bool = True
 
 
 def held_out_of(part: Mapping[str, Any] | None) -> HeldOut | None:
@@ -117,7 +120,7 @@ def doubts_of(sensor: str, recordings: Sequence[Recording]) -> list[str]:
 
 def evidence_of(  # noqa: PLR0917  (what a diagnosis is made of)
     document: Mapping[str, Any],
-    calibration: SensorCalibration,
+    sensor: str,
     recordings: Sequence[Recording],
     noise: Noise | None,
     settings: Mapping[str, Any],
@@ -133,19 +136,18 @@ def evidence_of(  # noqa: PLR0917  (what a diagnosis is made of)
     ----------
     document : mapping
         The diagnosis of the selection alone.
-    calibration : SensorCalibration
+    sensor : str
     recordings : sequence of Recording
     noise : Noise or None
     settings : mapping
         Sections ``table``, ``sensor``, ``procedure`` and ``method``.
     validation : mapping or None
-        The sensor's part of ``validations/<unit>.json``.
+        The sensor's part of ``validations/<unit>.json``; without it, the free fit stands for the calibration.
     other : SensorCalibration, optional
         Of the other sensor.
     free, full : callable, optional
         Return the calibrations of a free fit, without and with what was selected.
     """
-    sensor = calibration.sensor
     method = settings.get("method") or {}
     filtered = any(r.filter["name"] != "none" for r in recordings if r.role == "validation")
 
@@ -155,7 +157,7 @@ def evidence_of(  # noqa: PLR0917  (what a diagnosis is made of)
         found = last_error(fit(), recordings, noise, settings, other=other, smoothed=smoothed)
         return None if found is None else HeldOut(found[0], *found[1])
 
-    published = held_out_of(validation) if validation else error_of(lambda: calibration, smoothed=False)
+    published = held_out_of(validation) if validation else error_of(free, smoothed=False)
     contradicted = published is not None and published.above
     return Evidence(
         sensor,
@@ -187,7 +189,7 @@ def decide(e: Evidence) -> tuple[str, str]:
         return e.found, ""
     if e.published and e.published.below:
         return "floor_in_doubt", _too_low(e, e.published)
-    if e.over_noise is not None and e.over_noise < QUIET:
+    if e.on_table and e.found == "nothing_missing" and e.over_noise is not None and e.over_noise < QUIET:
         return "floor_in_doubt", (
             f"The residual of the fit is {e.over_noise:.2g} times the noise that was found. Noise cannot be larger at "
             "rest than in turns: check that the unit did not move in the static recording, and record it again."

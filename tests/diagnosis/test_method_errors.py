@@ -16,6 +16,7 @@ from pipeline.diagnosis.diagnose import diagnose
 from pipeline.diagnosis.words import in_words
 from pipeline.signal.filters import apply_filter
 from pipeline.signal.noise import estimate_noise
+from pipeline.validation.heldout import validate
 
 if TYPE_CHECKING:
     from pipeline.records import Recording, SensorCalibration
@@ -44,7 +45,9 @@ def diagnosed(
     for stage in config["stages"][sensor]:
         calibration = import_module(f"pipeline.estimation.{sensor}.{stage}").fit(recordings, calibration, settings)
     assert calibration is not None
-    return calibration, diagnose(calibration, recordings, estimate_noise(sensor, recordings, SHEET[sensor]), settings)
+    noise = estimate_noise(sensor, recordings, SHEET[sensor])
+    validation = validate(calibration, recordings, noise, settings)
+    return calibration, diagnose(calibration, recordings, noise, settings, validation=validation)
 
 
 def by_name(part: dict[str, Any]) -> dict[str, dict[str, Any]]:
