@@ -256,7 +256,7 @@ def test_words_say_verdict_size_and_what_to_do() -> None:
     assert "misses quadratic nonlinearity" in text
     assert "K2_x = " in text
     assert "held-out" in text
-    assert "effects.accelerometer=[quadratic_nonlinearity]" in text
+    assert part["override"] == "effects.accelerometer=[quadratic_nonlinearity]"
     assert in_words(None, "gyroscope") == ["The gyroscope was not calibrated, so there is nothing to diagnose."]
 
 

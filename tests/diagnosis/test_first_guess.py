@@ -163,7 +163,7 @@ def test_a_known_effect_is_named_beside_unknown_physics_that_would_hide_or_disto
     assert part["selected"] == [name]
     assert part["unexplained"][0]["shape"].startswith("5 cycles")
     text = "\n".join(in_words(part, sensor))
-    assert f"overrides='effects.{sensor}=[{name},unknown_angle]'" in text
+    assert f"add {sensor}.unknown_angle." in text
 
 
 def test_a_shape_gains_what_a_joint_fit_with_it_gains() -> None:
