@@ -138,7 +138,7 @@ def mark_stuck(table: ChannelTable, sensor: str, flags: NDArray[np.uint16]) -> l
     Raises
     ------
     IngestError
-        If an axis never changes while the others of its sensor do.
+        If an axis never changes, or stays for half of the rows, while the others of its sensor do.
     """
     neighbours = {c: v[1:] == v[:-1] for c in TRIADS[sensor] if (v := table.values.get(c)) is not None}
     notes = []
@@ -157,6 +157,14 @@ def mark_stuck(table: ChannelTable, sensor: str, flags: NDArray[np.uint16]) -> l
             )
         rows = stuck_rows(same, share)
         rows = rows[(flags[rows] & CLIPPED) == 0]
+        if rows.size >= len(same) / 2 and others and all(others):
+            raise IngestError(
+                f"{channel} stays at one value for longer than its noise allows in {rows.size} of "
+                f"{len(same) + 1} rows, while the other axes change",
+                table.place(int(rows[0])),
+                fault="stuck",
+                hint="is the sensor's axis alive?",
+            )
         if 0 < rows.size < len(same) / 2:
             flags[rows] |= STUCK
             detail = (

@@ -2,11 +2,11 @@
 
 One value c of a channel (at a sample, or over an interval) is contradicted by another channel w where
 
-    c > w_max + 3 b + d   or   c < w_min - 3 b - d
+    c > w_max + m b + d   or   c < w_min - m b - d
 
-where w_min and w_max are both the mean of the two nearest values of another channel of the table, or of a sensor the
-extremes within the largest plausible delay, and b is the largest second difference of w there: a short move may reach
-its rate between the samples that w shows. Stretches, of 16 samples and of a twelfth of the
+where w_min and w_max are both the mean of the two nearest values of another channel of the table (m = 3), or of a
+sensor the extremes within the largest plausible delay (m = 1), and b is the largest second difference of w there: a
+short move may reach its rate between the samples that w shows. Stretches, of 16 samples and of a twelfth of the
 recording, are contradicted where
 
     |sum (c - w) dt| > d_s + T range(w) + 3 sqrt(sum (dc dt / 2)^2 + sum (dw dt / 2)^2)
@@ -152,12 +152,13 @@ class Comparison:
         if claim.of_intervals:
             gross = gross + limits.angle_deg / self.interval
             stated = stated + limits.angle_stated_deg / self.interval
+        bend = bend if of_sensor else BENDS * bend
         if of_sensor:
             share = limits.rate + limits.gain
             sure = share if alone else CURVED
             gross, stated = gross + share * size + limits.offset_dps, stated + sure * size + limits.offset_dps
         with np.errstate(invalid="ignore"):
-            off = np.maximum(claim.low - high, low - claim.high) - BENDS * bend - noise
+            off = np.maximum(claim.low - high, low - claim.high) - bend - noise
             gross, stated = off - gross, off - stated
         return np.where(np.isfinite(gross), gross, -np.inf), np.where(np.isfinite(stated), stated, -np.inf)
 

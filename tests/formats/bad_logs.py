@@ -126,9 +126,9 @@ def indexed() -> dict[str, Any]:
     return {n: {"column": i, "unit": u} for i, (n, u) in enumerate(zip(names, units, strict=True))}
 
 
-def stuck() -> bytes:
+def stuck(last: int = 1100) -> bytes:
     values = VALUES.copy()
-    values[1000:1100, 5] = values[1000, 5]
+    values[1000:last, 5] = values[1000, 5]
     return text(rows_of(values))
 
 
@@ -395,6 +395,7 @@ def cases() -> dict[str, Case]:
             kept=ALL,
         ),
         "38": one(stuck(), notes=("N-STUCK",), flags={1000: 4, 1099: 4}),
+        "38 half": one(stuck(2900), fault="stuck", says="gyro_y stays at one value .* in 1900 of 3000 rows"),
         "38 dead": one(scaled(slice(6, 7), 0.0), fault="stuck", says="gyro_z is 0 deg/s in all 3000 rows"),
         "39": one(clipped(), notes=("N-CLIP",), flags={420: 2, 423: 2}),
         "40 axis": one(
