@@ -18,7 +18,7 @@ from pipeline.model.kinematics import UP_AT_ZERO
 from pipeline.preprocessing.bench import ACROSS, by_convention, found_bench, stated_bench
 from pipeline.preprocessing.departures import Tolerance, Turn, departure, words
 from pipeline.preprocessing.frames import as_map, check_moves, check_turns, nearest_permutation
-from pipeline.preprocessing.seat_notes import seat_notes
+from pipeline.preprocessing.seat_notes import refined_zeros, seat_notes
 from pipeline.preprocessing.turn_fit import fit_turn
 from pipeline.records import AXES, Note
 
@@ -127,14 +127,22 @@ def _hint(
     accelerometer: NDArray[np.float64] | None,
     maps: Mapping[str, Sequence[str]],
 ) -> str:
-    found = [d.settings for d in departures]
+    zeros = refined_zeros(turns)
+    found = [
+        d.settings | {k: f"{zeros[d.turn.name]:.2f}" for k in d.settings if k == "zero_deg" and d.turn.name in zeros}
+        for d in departures
+    ]
     alike = len(departures) == len(turns) and all(f == found[0] for f in found)
     ways = []
     if alike and found[0] and set(found[0]) <= {"sense", "zero_deg"}:
         ways.append(", ".join(f"table.{k}={v}" for k, v in found[0].items()))
     elif all(d.turn.configurable for d in departures) and any(found):
         ways.append(
-            ", ".join(f"procedure.recordings.{d.turn.name}.{k}={v}" for d in departures for k, v in d.settings.items())
+            ", ".join(
+                f"procedure.recordings.{d.turn.name}.{k}={v}"
+                for d, settings in zip(departures, found, strict=True)
+                for k, v in settings.items()
+            )
         )
     if accelerometer is not None and not np.array_equal(accelerometer, np.eye(3)):
         mirrored = np.linalg.det(accelerometer) < 0.0

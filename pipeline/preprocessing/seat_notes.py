@@ -15,12 +15,14 @@ from pipeline.preprocessing.seats import (
     find_seats,
     letters,
     table_explains,
+    zero_of,
 )
 from pipeline.records import AXES, Note
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from pipeline.preprocessing.bench import Bench
     from pipeline.preprocessing.departures import Turn
     from pipeline.preprocessing.seats import Seats
 
@@ -60,12 +62,28 @@ def seat_notes(turns: Sequence[Turn], table: Mapping[str, Any], sensor: Mapping[
     return notes
 
 
-def _conventional(turn: Turn) -> Conventional | None:
-    both = by_convention(turn.fit, turn.stated)
+def refined_zeros(turns: Sequence[Turn]) -> dict[str, float]:
+    """Return the zero of each turn, deg, by all turns at once; nothing where one seat does not explain them.
+
+    The zero of one turn by itself is uncertain by the misalignment of the axes.
+    """
+    own = {t.name: (t, t.found, c) for t in turns if t.found and (c := _conventional(t, t.found)) is not None}
+    slow = [c for t, _, c in own.values() if t.recording.role == "accelerometer"]
+    if {c.axis for c in slow} != set(range(3)):
+        return {}
+    found = find_seats(slow)
+    if found.zeros is None:
+        return {}
+    return {name: bench.zero_deg + bench.sense * zero_of(c, found.K) for name, (_, bench, c) in own.items()}
+
+
+def _conventional(turn: Turn, bench: Bench | None = None) -> Conventional | None:
+    bench = bench or turn.stated
+    both = by_convention(turn.fit, bench)
     if both is None or turn.fit.constant is None:
         return None
-    axis = AXES.index(turn.stated.axis)
-    return Conventional(turn.name, axis, turn.fit.constant, *both, turn.stated.sense * turn.fit.mean_rate)
+    axis = AXES.index(bench.axis)
+    return Conventional(turn.name, axis, turn.fit.constant, *both, bench.sense * turn.fit.mean_rate)
 
 
 def _in_doubt(turn: Turn) -> bool:

@@ -136,6 +136,13 @@ def _zeros(turns: Sequence[Conventional], seats: Vector) -> tuple[Vector, Vector
     return np.asarray(seats.mean(axis=0), np.float64), None
 
 
+def zero_of(turn: Conventional, K: Vector) -> float:
+    """Return the zero of a turn with K known, deg: the rotation of ``K^-1 (p, q)`` onto the face, turned back."""
+    p, q = np.linalg.solve(K, np.column_stack([turn.cosine, turn.sine])).T
+    up, across = _ideal(turn.axis)
+    return -float(np.degrees(np.arctan2(p @ across - q @ up, p @ up + q @ across)))
+
+
 def table_explains(turns: Sequence[Conventional], K: Vector, limits: Sequence[float]) -> bool:
     """Return whether tilt, leaning axes and a time offset explain the turns, and level seats do not better.
 

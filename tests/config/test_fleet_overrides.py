@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from pipeline.__main__ import main
 from pipeline.config import Campaign, load_campaign
 from pipeline.config.compose import _parse_with_hydra, parse
-from pipeline.config.parts import in_common
+from pipeline.config.parts import in_common, part
 from pipeline.errors import ConfigurationError
 from pipeline.stages.batch import together
 
@@ -50,6 +50,16 @@ def fleet(tmp_path: Path) -> Path:
 
 def load(directory: Path, **settings: object) -> Campaign:
     return load_campaign({"campaign": str(directory), **settings})
+
+
+def test_sheet_and_device_state_the_mounting(fleet: Path) -> None:
+    (fleet / "devices" / "U1.yaml").write_text(
+        "overrides:\n- table.sense=-1\n- procedure.recordings.gyro_z.up=-z\n- sensor.gyroscope.axis_map=[+x,-y,-z]\n"
+    )
+    found = part(load(fleet).units["U1"].config, "ingest")
+    assert found["table"]["sense"] == -1
+    assert found["procedure"]["recordings"]["gyro_z"]["up"] == "-z"
+    assert found["sensor"]["gyroscope"]["axis_map"] == ["+x", "-y", "-z"]
 
 
 def test_a_device_is_stronger_than_its_lot_and_a_lot_than_its_model(fleet: Path) -> None:

@@ -237,6 +237,17 @@ def test_axes_of_the_sensor_that_are_not_the_bodys_are_stated_in_each_format(tmp
             assert "x along body -y, y along body +x" in " ".join(path.read_text().split()), path.name
 
 
+def test_axes_of_one_sensor_that_are_not_the_bodys_are_stated_with_its_name(tmp_path: Path) -> None:
+    unit = Unit(tmp_path / "plain")
+    maps = {"accelerometer": ["+x", "+y", "-z"], "gyroscope": ["+x", "+y", "+z"]}
+    unit.document["log"] = {"ingest": {}, "axis_map": maps}
+    for path in export_all(unit.document, SETTINGS, tmp_path / "turned"):
+        if path.name != "kalibr_imu.yaml":  # noise alone
+            text = " ".join(path.read_text().split())
+            assert "the accelerometer's x along body +x, y along body +y, z along body -z" in text, path.name
+            assert "gyroscope's x along" not in text, path.name
+
+
 def test_every_format_says_what_it_leaves_out(tmp_path: Path) -> None:
     quadratic = effect("quadratic_nonlinearity", K2_x=1e-3, K2_y=1e-3, K2_z=1e-3)
     Unit(tmp_path, accelerometer=(quadratic,))

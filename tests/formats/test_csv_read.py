@@ -182,6 +182,16 @@ def test_axis_map_turns_readings_and_their_counts_into_body_axes(tmp_path: Path)
     assert read.encodings["accel_x"].scale == 1 / 16384
 
 
+def test_a_sensor_may_have_an_axis_map_of_its_own(tmp_path: Path, canonical: dict[str, Any]) -> None:
+    made = make_recording()
+    write_canonical_csv(tmp_path / "accel_x.csv", made)
+    sensor = {**SENSOR, "accelerometer": {**SENSOR["accelerometer"], "axis_map": ["+x", "+y", "-z"]}}
+    read = read_recordings(procedure("accel_x"), canonical, sensor, tmp_path)[0]
+    np.testing.assert_allclose(read.accelerometer, made.accelerometer * [1.0, 1.0, -1.0], atol=1e-6)
+    np.testing.assert_allclose(read.gyroscope, made.gyroscope, atol=1e-6)
+    assert [n.detail for n in read.notes] == ["left-handed axis map: [+x, +y, -z] of the accelerometer"]
+
+
 def test_left_handed_axis_map_is_noted(tmp_path: Path, canonical: dict[str, Any]) -> None:
     write_canonical_csv(tmp_path / "accel_x.csv", make_recording())
     sensor = {**SENSOR, "axis_map": ["+y", "+x", "+z"]}

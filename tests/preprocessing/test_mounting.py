@@ -91,7 +91,7 @@ def test_what_is_found_is_refused_with_the_setting_that_describes_it(axis: str, 
             motion, right = reference_motion(after), reference_motion(setup_free(before, setup, recordings))
             assert motion is not None
             assert right is not None
-            assert np.max(np.abs(motion.specific_force - right.specific_force)) < np.radians(1.2)
+            assert np.max(np.abs(motion.specific_force - right.specific_force)) < np.radians(0.1)
 
 
 def setup_free(recording: Recording, setup: Setup, logged: list[Recording]) -> Recording:
