@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import unicodedata
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import count
@@ -126,10 +127,8 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
         raise ConfigurationError(f"--config {unknown[0]}: unknown setting{nearest(unknown[0], valid)}")
     directory = find_campaign(str(settings.get("campaign", "demo")))
     for name in (str(directory), str(settings.get("results", ""))):
-        if not name.isprintable():
-            raise ConfigurationError(
-                f"{name!r}: characters that can be printed are expected, in UTF-8; rename the folder"
-            )
+        if any(unicodedata.category(character) in ("Cc", "Cs") for character in name):
+            raise ConfigurationError(f"{name!r}: a path without control characters, in UTF-8, is expected; rename it")
     composer = Composer(directory, as_list(settings.get(PYTHON, []), PYTHON, "paths of Python files"))
     layers, of_run = load_layers(directory, settings, composer)
     own_file = layers.campaign
