@@ -132,7 +132,7 @@ def _hint(
         d.settings | {k: f"{zeros[d.turn.name]:.2f}" for k in d.settings if k == "zero_deg" and d.turn.name in zeros}
         for d in departures
     ]
-    alike = len(departures) == len(turns) and all(f == found[0] for f in found)
+    alike = len(departures) == len(turns) > 1 and all(f == found[0] for f in found)
     ways = []
     if alike and found[0] and set(found[0]) <= {"sense", "zero_deg"}:
         ways.append(", ".join(f"table.{k}={v}" for k, v in found[0].items()))

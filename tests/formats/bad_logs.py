@@ -403,14 +403,14 @@ def cases() -> dict[str, Case]:
         ),
         "40 sign": one(with_table_axis((0, 1, 2), -1.0), fault="wrong_sense", says="sign opposite to the table's rate"),
         "40 sense": one(
-            with_angle(-TABLE_ANGLE, -RATE), fault="wrong_sense", says="counted left-handed about x; .*table.sense=-1"
+            with_angle(-TABLE_ANGLE, -RATE), fault="wrong_sense", says="counted left-handed about x; .*log.sense=-1"
         ),
         "45": one(
             with_angle(TABLE_ANGLE + 180.0, RATE),
             fault="wrong_face",
             says=r"found is body -z up at a table angle of 0\.1 deg, .*set procedure\.recordings\.log\.up=-z",
         ),
-        "46": one(with_angle(TABLE_ANGLE + 37.0, RATE), fault="wrong_zero", says=r"table\.zero_deg=37\.1"),
+        "46": one(with_angle(TABLE_ANGLE + 37.0, RATE), fault="wrong_zero", says=r"log\.zero_deg=37\.1"),
         "47": one(
             with_angle(TABLE_ANGLE, RATE, mirrored="y"),
             fault="mirrored_axes",
