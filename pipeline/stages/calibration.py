@@ -1,4 +1,8 @@
-"""Stage calibration: both sensors' fits, the inputs and the software in one document."""
+"""Stage calibration: both sensors' fits, the inputs and the software in one document.
+
+A calibration that makes held-out motion significantly worse than the raw readings is null, with the reason; a unit
+without any calibrated sensor has failed.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +12,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 from pipeline import __version__
+from pipeline.errors import CannotCalibrateError
 from pipeline.formats.axes import axis_maps
 from pipeline.formats.parquet import load_recordings
 from pipeline.model.plausible import implausible
@@ -23,11 +28,18 @@ LIBRARIES = ("numpy", "scipy", "pyarrow", "mcap")
 
 def main(argv: Sequence[str]) -> int:
     """Run the stage."""
-    job = parse_job("calibration", argv, ["ingest", "accelerometer", "gyroscope"])
+    job = parse_job("calibration", argv, ["ingest", "accelerometer", "gyroscope", "validate"])
 
     def work(unit: str, part: dict[str, Any]) -> None:
         fits = {sensor: read_json(job.inputs[sensor] / f"{unit}.json") for sensor in SENSORS}
+        validation = read_json(job.inputs["validate"] / f"{unit}.json")
         reasons = {s: f["not_calibrated"] for s, f in fits.items() if "not_calibrated" in f}
+        if not part["method"]["as_printed"]:  # printed errata are shown as they are; the verdict is left_by_method
+            parts = {s: validation[s] for s in SENSORS if s not in reasons}
+            reasons |= {s: p["worse_than_raw"] for s, p in parts.items() if p and p["worse_than_raw"]}
+        if len(reasons) == len(SENSORS):
+            told = "; ".join(f"{sensor}: {reason}" for sensor, reason in reasons.items())
+            raise CannotCalibrateError(f"no sensor could be calibrated. {told}")
         document = header(unit, part) | {
             "status": "ok",
             "error": None,

@@ -22,6 +22,7 @@ from pipeline.validation.ladder import ladder, last_step
 from pipeline.validation.limits import check_limits
 from pipeline.validation.samples import samples_of_motion, samples_of_rests
 from pipeline.validation.sensitivity import judged
+from pipeline.validation.worse import worse_than_raw
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -62,7 +63,8 @@ def validate(
     dict
         ``unit, samples, expected_rms_error`` (None where an effect is left out), ``noise_floor, vector_noise_floor,
         steps`` of the published file, and ``held_out`` (false: judged on the samples of the fit), ``reason`` (why),
-        ``reference_rms`` (of the reference's magnitude), ``noise``, ``notes``, ``limits`` and ``pass``.
+        ``reference_rms`` (of the reference's magnitude), ``noise``, ``notes``, ``worse_than_raw`` (why the
+        calibration does harm, or None; ``pipeline.validation.worse``), ``limits`` and ``pass``.
         ``vector_rms_error`` is the root of the mean squared length of the difference to the reference.
     """
     samples, reason = _choose(calibration.sensor, recordings, noise, settings)
@@ -81,7 +83,7 @@ def validate(
     if part["samples"] == 0:
         nothing: dict[str, Any] = dict.fromkeys((*FIGURES, "vector_rms_error"))
         part |= {"expected_rms_error": None, "noise_floor": None, "vector_noise_floor": None}
-        part |= {"reference_rms": None, "notes": []}
+        part |= {"reference_rms": None, "notes": [], "worse_than_raw": None}
         part["steps"] = [{"name": name, **nothing} for name in ("raw", "calibrated")]
     else:
         part["noise_floor"], part["vector_noise_floor"] = noise_floors(calibration, samples)
@@ -91,6 +93,9 @@ def validate(
             calibration, samples, noise, settings, other, fitted_s=_length(calibration.sensor, recordings)
         )
         part["notes"] += lack
+        part["worse_than_raw"] = (
+            worse_than_raw(calibration, samples, part["expected_rms_error"], other) if part["held_out"] else None
+        )
     part["limits"], part["pass"] = check_limits(
         calibration, part, (settings.get("limits") or {}).get(calibration.sensor)
     )

@@ -392,3 +392,17 @@ def test_earths_rotation_without_attitude_is_told_and_allowed_for() -> None:
     assert plain["notes"] == []
     assert "Earth's rotation is left out" in part["notes"][0]
     assert part["expected_rms_error"][1] == pytest.approx(plain["expected_rms_error"][1] + 15.041 / 3600.0, rel=1e-4)
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_a_calibration_that_does_harm_is_told_from_one_that_does_not(sensor: str) -> None:
+    c = calibration(sensor)
+    recording = read(held_out(1500), 1.0, **{sensor: c})
+    assert validate(c, [recording], noise_of(sensor), SETTINGS)["worse_than_raw"] is None
+    foreign = replace(c, bias=-c.bias)
+    told = validate(foreign, [recording], noise_of(sensor), SETTINGS)["worse_than_raw"]
+    assert "makes held-out motion worse" in told
+    ideal = SensorCalibration(sensor)
+    quiet = read(held_out(1500), 1.0, **{sensor: ideal})
+    nearly = replace(ideal, matrix=ideal.matrix * (1.0 + 1e-6))
+    assert validate(nearly, [quiet], noise_of(sensor), SETTINGS)["worse_than_raw"] is None

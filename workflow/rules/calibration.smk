@@ -4,6 +4,7 @@ rule calibration:
         ingest=f"{BATCH}/ingest",
         accelerometer=last_fit("accelerometer"),
         gyroscope=last_fit("gyroscope"),
+        validate=f"{BATCH}/validate",
     output:
         directory(f"{BATCH}/calibration"),
     log:
@@ -13,4 +14,4 @@ rule calibration:
         code=code_digest("pipeline.stages.calibration"),
     shell:
         "{RUN} calibration --config {params.config:q} --ingest {input.ingest:q} --accelerometer {input.accelerometer:q}"
-        " --gyroscope {input.gyroscope:q} --output {output:q} > {log:q} 2>&1"
+        " --gyroscope {input.gyroscope:q} --validate {input.validate:q} --output {output:q} > {log:q} 2>&1"
