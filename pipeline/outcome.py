@@ -15,6 +15,10 @@ if TYPE_CHECKING:
 
 UNITS = {"accelerometer": "g", "gyroscope": "deg/s"}
 JSON = dict[str, Any]
+ORDER = (
+    "missing_effect", "reference_in_doubt", "unexplained", "floor_in_doubt", "left_by_method", "not_enough_data",
+    "nothing_missing",
+)  # fmt: skip
 NAMED = 5  # units that a line names, and lines of one kind
 SAME = 0.02  # relative change of an error, below which it is not told
 
@@ -50,16 +54,20 @@ def findings_of(rows: Sequence[Mapping[str, Any]]) -> list[Finding]:
 
 
 def verdict_groups(findings: Sequence[Finding]) -> list[tuple[str, list[str]]]:
-    """Return units by the effect that they miss, then by each other verdict but ``nothing_missing``."""
-    missing: dict[str, list[str]] = {}
-    others: dict[str, list[str]] = {}
+    """Return units by the effect that they miss, and by each other verdict but ``nothing_missing``."""
+    groups: dict[tuple[int, str], list[str]] = {}
     for unit, sensor, verdict, selected in findings:
-        if verdict == "missing_effect":
-            for effect in selected:
-                missing.setdefault(f"{sensor}, {effect} missing", []).append(unit)
-        elif verdict != "nothing_missing":
-            others.setdefault(f"{sensor}, {verdict.replace('_', ' ')}", []).append(unit)
-    return [*sorted(missing.items()), *sorted(others.items())]
+        told = (
+            [f"{effect} missing" for effect in selected] if verdict == "missing_effect" else [verdict.replace("_", " ")]
+        )
+        for what in told if verdict != "nothing_missing" else []:
+            groups.setdefault((place(verdict), f"{sensor}, {what}"), []).append(unit)
+    return [(what, units) for (_, what), units in sorted(groups.items())]
+
+
+def place(verdict: str | None) -> int:
+    """Return the place of a verdict: what can be added, then what is in doubt, in the order in which verdicts apply."""
+    return ORDER.index(verdict) if verdict in ORDER else len(ORDER)
 
 
 def verdict_lines(findings: Sequence[Finding]) -> list[str]:

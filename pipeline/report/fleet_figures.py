@@ -59,7 +59,7 @@ def _errors(sensor: str, rows: list[JSON]) -> Figure | None:
     series = [("c3", "before"), ("c4", "noise floor")]
     for chosen, colour, name in (
         (complete, 2, "after, nothing missing"),
-        (known & ~complete, 0, "after, something missing or unexplained"),
+        (known & ~complete, 0, "after, any other verdict"),
     ):
         if chosen.any():
             layers.append(Dots(order[chosen], np.log10(after[chosen]), colour))

@@ -15,7 +15,7 @@ from pipeline.model.inversion import compensate, linear_truth, sensor_effects
 from pipeline.model.kinematics import reference_motion
 from pipeline.model.plausible import sentences
 from pipeline.model.user_effects import effect_of
-from pipeline.outcome import commands_of
+from pipeline.outcome import commands_of, place
 from pipeline.records import SENSORS, SensorCalibration
 from pipeline.report import figures, tables
 from pipeline.report.attitude_figure import attitude_over_time
@@ -152,8 +152,8 @@ def _sensor(  # noqa: PLR0917  (the inputs of the page, passed on)
 
 
 def _order(sensor: JSON) -> int:
-    """Return the place of a sensor: what is missing or in doubt before what is explained, and that before none."""
-    return 2 if sensor["part"] is None else int(sensor["diagnosis"].get("verdict") == "nothing_missing")
+    """Return the place of a sensor: what is missing or in doubt before what is explained, one without a fit last."""
+    return 99 if sensor["part"] is None else place(sensor["diagnosis"].get("verdict"))
 
 
 def _sigma(noise: JSON | None, traces: list[Residual]) -> NDArray[np.float64] | None:
