@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.preprocessing.evidence import LEAST_RATE_DPS, axis_index, rate_of_turn, refusal
+from pipeline.preprocessing.evidence import LEAST_RATE_DPS, axis_index, quantiles, rate_of_turn, refusal
 from pipeline.records import AXES, SENSORS
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 HALF_TURN_DEG = 180.0
 SPANNED = 0.2  # of what the motion requires
-INNER = (5.0, 95.0)  # percentiles
+INNER = (0.05, 0.95)  # shares of the samples
 COPIED = 0.5  # share of the changes of an axis that are another's to the last digit
 LEVEL_G = 0.5  # of the axes across a turn together, from which gravity turns in the body
 FEWEST = 32
@@ -107,7 +107,7 @@ def _turned(recording: Recording, rate: Array) -> float:
 
 
 def _span(values: Array) -> float:
-    low, high = np.percentile(values, INNER)
+    low, high = quantiles(values, *INNER)
     return float(high - low)
 
 

@@ -24,6 +24,7 @@ from pipeline.preprocessing.evidence import (
     of_gravity,
     of_rate,
     place,
+    quantiles,
     rate_of_turn,
     refusal,
     slope_of,
@@ -84,7 +85,7 @@ def check_turns(
     gyroscope = Gyroscope(turns)
     found = {r.name: _check_turn(r, gyroscope, limits, settings) for r in turns}
     delays = {name: f.delay for name, f in found.items() if f.delay is not None}
-    return [replace(r, notes=(*r.notes, *found[r.name].notes)) if r.name in found else r for r in recordings], delays
+    return _with_notes(recordings, found), delays
 
 
 def _turns(recordings: Sequence[Recording]) -> list[Recording]:
@@ -118,7 +119,7 @@ def check_motion(
     found = {r.name: _check_motion(r, gyroscope, limits, settings) for r in moved}
     late = {**delays, **{name: f.delay for name, f in found.items() if f.delay is not None}}
     check_delays([(r, late[r.name]) for r in recordings if r.name in late], limits)
-    return [replace(r, notes=(*r.notes, *found[r.name].notes)) if r.name in found else r for r in recordings]
+    return _with_notes(recordings, found)
 
 
 @dataclass(frozen=True)
@@ -138,11 +139,11 @@ class Gyroscope:
             rate, axis = rate_of_turn(recording), axis_index(recording)
             if rate is None or recording.gyroscope is None:
                 continue
-            fits = [slope_of(recording.gyroscope[:, i], rate) for i in range(3)]
+            fits = _slopes(recording, rate)
             known = [f for f in fits if f is not None]
             if len(known) == 3:
                 gain, bias = np.array(known).T
-                found[axis].append((float(np.percentile(np.abs(rate), 90.0)), gain, bias))
+                found[axis].append((float(quantiles(np.abs(rate), 0.9)[0]), gain, bias))
         gains = [abs(gain[a]) for a, turned in found.items() for _, gain, _ in turned]
         self.usual = float(median(np.array(gains))) if len(gains) > 2 else 1.0
         self.matrix = self.usual * np.eye(3)
@@ -158,7 +159,7 @@ class Gyroscope:
         rate = rate_of_turn(recording)
         if recording.gyroscope is None or rate is None:
             return None
-        fits = [slope_of(recording.gyroscope[:, i], rate) for i in range(3)]
+        fits = _slopes(recording, rate)
         gains = [0.0 if f is None else abs(f[0]) / self.usual for f in fits]
         fit = fits[axis]
         if fit is not None and abs(gains[axis] - 1.0) <= SAME:
@@ -174,6 +175,20 @@ class Gyroscope:
         if recording.gyroscope is None or self.bias is None:
             return None
         return np.asarray(np.linalg.solve(self.matrix, (recording.gyroscope - self.bias).T).T)
+
+
+def _slopes(recording: Recording, rate: Array) -> list[tuple[float, float] | None]:
+    """Return gain and bias of each axis of a turn's gyroscope against the table's rate; kept with the recording."""
+    assert recording.gyroscope is not None  # noqa: S101
+    if "slopes" not in recording.kept:
+        recording.kept["slopes"] = [slope_of(recording.gyroscope[:, i], rate) for i in range(3)]
+    found: list[tuple[float, float] | None] = recording.kept["slopes"]
+    return found
+
+
+def _with_notes(recordings: Sequence[Recording], found: Mapping[str, Found]) -> list[Recording]:
+    notes = {name: f.notes for name, f in found.items() if f.notes}
+    return [replace(r, notes=(*r.notes, *notes[r.name])) if r.name in notes else r for r in recordings]
 
 
 def _check_turn(recording: Recording, gyroscope: Gyroscope, limits: Limits, settings: Mapping[str, Any]) -> Found:
