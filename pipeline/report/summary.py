@@ -25,6 +25,7 @@ SENSOR_COLUMNS = (
     "noise_floor",
     "verdict",
     "selected",
+    "reason",
 )
 IMPLAUSIBLE = tuple(f"{s}_implausible" for s in SENSORS)
 COLUMNS = (*UNIT_COLUMNS, *(f"{s}_{c}" for s in SENSORS for c in SENSOR_COLUMNS), "pass", *IMPLAUSIBLE)
@@ -73,6 +74,7 @@ def summary_row(
             held_out.get("noise_floor"),
             found.get("verdict"),
             ";".join(selected) if selected else None,
+            found.get("reason") or None,
         )
         row |= {f"{sensor}_{column}": value for column, value in zip(SENSOR_COLUMNS, values, strict=True)}
         implausible = (calibration.get(sensor) or {}).get("implausible")
