@@ -2,7 +2,8 @@
 
 At rest the reading is the bias; in a move, the integrated reading must turn the direction of gravity before it into
 that after it. The accelerometer is calibrated on the way, and gives the frame. The equations are those of
-``pipeline.estimation.hand_held.gyroscope``; both kinds are weighted by their own scatter.
+``pipeline.estimation.hand_held.gyroscope``; both kinds are weighted by their own scatter, and moves that contradict
+the others have less weight (``pipeline.estimation.hand_held.outlying``).
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from pipeline.estimation.hand_held.fit import fit as fit_by_hand
 from pipeline.estimation.hand_held.gyroscope import FEWEST_MOVES, model_of
 from pipeline.estimation.hand_held.likelihood import NEW
 from pipeline.estimation.hand_held.model import State
+from pipeline.estimation.hand_held.outlying import described, fit_robustly
 from pipeline.estimation.hand_held.rests import ROLE, by_hand
 from pipeline.estimation.least_squares import certified
 from pipeline.estimation.serial_noise import prior_of
@@ -78,7 +80,9 @@ def fit(
     start = State(np.average(model.rests.reading, axis=0, weights=model.rests.count), np.eye(3))
     _require_determined(model.equations(start).base)
     prior = prior_of("gyroscope", recordings, settings)
-    found = fit_by_hand(model, start, noises_about(prior, float(np.mean(model.white)), model.kinds), {})
+    noises = noises_about(prior, float(np.mean(model.white)), model.kinds)
+    model, found, outlying = fit_robustly(model, lambda weighted: fit_by_hand(weighted, start, noises, {}))
+    assert model.moves is not None  # noqa: S101
     names = [f"bias_{a}" for a in AXES] + [f"matrix_{a}{b}" for a in AXES for b in AXES]
     _require_known(names, np.sqrt(np.diag(found.covariance)), model.moves.count)
     values = np.concatenate([found.state.bias, found.state.matrix.ravel()])
@@ -95,6 +99,9 @@ def fit(
         "direction_error_rms_deg": float(np.sqrt(np.mean(apart**2))),
         "scatter_of_rests": found.noise.scatter[0],
         "scatter_of_moves": found.noise.scatter[1],
+        "scatter_of_directions": found.noise.direction,
+        "moves_weighted_down": len(outlying.index),
+        "moves_outlying": described(outlying, model, recordings),
         "condition": found.condition,
         "degrees_of_freedom": float(found.degrees_of_freedom.min()),
     }

@@ -1,6 +1,6 @@
 """The linear form to which rests and moves are brought, and the noise that is in it.
 
-    r = X d + e,    cov e = k C,    C = I + S + sum_j a_j^2 diag(g_j) + q^2 H R H^T
+    r = X d + e,    cov e = k C,    C = I + S + sum_j a_j^2 diag(g_j) + c^2 D + q^2 H R H^T
 
 where
 
@@ -9,17 +9,20 @@ X   : (n, p) derivatives of the model with respect to its parameters, d the step
 S   : (n, n) what the reference, the accelerometer, has in common for several equations of the gyroscope
 g_j : (n,) scatter of the rests, or of the moves, beyond white noise (tremor, creep), in units of a typical white error;
       a_j is its size
+D   : (n, n) what an error of the direction of gravity at each rest does to the two moves that meet there, for errors as
+      large as a typical white error of a move; c is their size (a seat that gives way, a hand that leans)
 H   : (n, 3 t) what a bias of each axis in each of t stretches of time does to the equations, over its white noise
 R   : (t, t) correlation of a bias wander between the stretches, averaged over each, the same for the axes
 q   : wander over white noise
 k   : at least 1, what is left of the scatter when the noise is chosen from a grid
 
-By hand nobody knows beforehand how firmly a unit rests, so that ``a``, ``q`` and ``k`` are free in every comparison.
+By hand nobody knows beforehand how firmly a unit rests, so that ``a``, ``c``, ``q`` and ``k`` are free in all
+comparisons.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import TYPE_CHECKING
 
@@ -42,18 +45,20 @@ if TYPE_CHECKING:
 UNLIKELY = -4.0
 FACTORS = 3.0 ** np.arange(-2.0, 3.0)  # of the wander that is believed
 RATIOS = (0.1, 0.3, 1.0)  # of wander to white noise, where nothing is believed of it
+BESIDE = (0.0, 3.0)  # scatter of moves with which one of directions is compared
 FINE = (0.0, 1.0, 3.0, 9.0, 27.0)  # of rests, and of moves, where noises are not compared for many models
 LEVELS = ((0.0, 2.0, 6.0, 20.0), (0.0, 4.0, 16.0))  # of rests, and of moves
 
 
 @dataclass(frozen=True)
 class HandNoise:
-    """One noise: wander over white noise, its correlation time in s, scatter of each kind, a prior log weight."""
+    """One noise: wander over white noise, its correlation time in s, scatter of each kind, prior log weight, and c."""
 
     ratio: float
     time: float
     scatter: tuple[float, ...]
     prior: float
+    direction: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -79,8 +84,8 @@ class Equations:
         Whether the time between them is known.
     error : (n,) array, g, deg/s or deg
         By how much white noise scatters each equation.
-    common : (n, n) array or None
-        S.
+    common, direction : (n, n) array or None
+        S and D.
     """
 
     residual: Values
@@ -94,6 +99,7 @@ class Equations:
     joined: NDArray[np.bool_]
     error: Values
     common: Values | None = None
+    direction: Values | None = None
     _kernels: dict[float, Values] = field(default_factory=dict, compare=False, repr=False)
 
     @property
@@ -115,6 +121,7 @@ class Equations:
             self.joined,
             self.error[:count],
             None if self.common is None else self.common[:count, :count],
+            None if self.direction is None else self.direction[:count, :count],
         )
 
     def kernel(self, time: float) -> Values:
@@ -129,6 +136,8 @@ class Equations:
         C = np.diag(1.0 + np.square(noise.scatter) @ self.scatter)
         if self.common is not None:
             C += self.common
+        if self.direction is not None and noise.direction:
+            C += noise.direction**2 * self.direction
         return C + noise.ratio**2 * self.kernel(noise.time) if noise.ratio else C
 
     def whitened(self, noise: HandNoise, values: Values) -> tuple[Values, float]:
@@ -156,7 +165,10 @@ def noises_for(noise: Noise | None, kinds: int) -> list[HandNoise]:
     if kinds > 1:  # beside two kinds of scatter, a wander far from that of a static rest tells nothing more
         wanders = [s for s in wanders if s.prior > UNLIKELY]
     levels: Sequence[tuple[float, ...]] = list(product(*LEVELS[:kinds]))
-    return [HandNoise(s.ratio, s.time, level, s.prior) for s in wanders for level in levels]
+    noises = [HandNoise(s.ratio, s.time, level, s.prior) for s in wanders for level in levels]
+    return noises + [
+        replace(n, direction=c) for n in noises if kinds > 1 and n.scatter[1] == 0.0 for c in LEVELS[1][1:]
+    ]
 
 
 def noises_about(prior: Prior, white: float, kinds: int) -> list[HandNoise]:
@@ -176,4 +188,6 @@ def noises_about(prior: Prior, white: float, kinds: int) -> list[HandNoise]:
     believed = [(ratio, belief) for ratio, belief in pairs if np.isfinite(belief)]
     none = float(np.log(SURE * (len(FINE) - 1)))  # as nobody states a scatter, none at all is believed before any
     levels = [(level, none * level.count(0.0)) for level in product(FINE, repeat=kinds)]
-    return [HandNoise(ratio, prior.time, level, belief + b) for ratio, belief in believed for level, b in levels]
+    noises = [HandNoise(ratio, prior.time, level, belief + b) for ratio, belief in believed for level, b in levels]
+    beside = [n for n in noises if kinds > 1 and n.scatter[1] in BESIDE]
+    return noises + [replace(n, direction=c) for n in beside for c in FINE[2:]]

@@ -91,8 +91,10 @@ class HandHeldGyroscope:
             u = force / np.linalg.norm(force, axis=1, keepdims=True)
             across = np.eye(3) - u[:, :, None] * u[:, None, :]
             self.spread = np.degrees(gravity.spread / self.gravity)[:, None, None] * across
+            self.across = across
             self.ends = np.degrees(gravity.ends / self.gravity)[:, None, None] * across
             self.shared = np.degrees(across @ gravity.shared / self.gravity)
+            self.excess = np.zeros(self.moves.count)
         self.every, self.known = rests, (gravity, noise, fewest)
 
     def equations(self, state: State, candidates: Sequence[Term] = ()) -> Equations:
@@ -128,6 +130,7 @@ class HandHeldGyroscope:
             joined=np.ones_like(same) if self.rests.clock_shared else same,
             error=stacked("error"),
             common=_blocks([piece["common"] for piece in pieces], sizes),
+            direction=_blocks([piece.get("direction") for piece in pieces], sizes),
         )
 
     def samples(self) -> float:
@@ -143,6 +146,13 @@ class HandHeldGyroscope:
         left = self.held.reading - state.bias - added(self.sensor, state.terms, motion, state.K)
         left -= self.held.creep @ state.K.T
         return float(np.sqrt(np.mean(np.sum((left @ state.matrix.T) ** 2, axis=1))))
+
+    def with_excess(self, variance: Values) -> HandHeldGyroscope:
+        """Return the model with an error of its own for each move, of a variance in deg^2: (k,) array."""
+        gravity, noise, fewest = self.known
+        out = HandHeldGyroscope(self.every, self.moves, gravity, noise, fewest)
+        out.excess = variance
+        return out
 
     def without(self, held: NDArray[np.bool_]) -> HandHeldGyroscope:
         """Return the model with some of its rests, and the moves that end at them, held out.
@@ -234,6 +244,7 @@ class HandHeldGyroscope:
         means = np.einsum("kimc,mcd->kimd", directions, self.spread)
         ends = np.einsum("kimc,mcd->kimd", directions, self.ends)
         variance = own + np.einsum("kimd,klmd->kil", means, means) + np.einsum("kimd,klmd->kil", ends, ends)
+        variance += self.excess[:, None, None] * np.eye(2)
         W = np.asarray(np.linalg.solve(np.linalg.cholesky(variance), np.eye(2)), np.float64)
         base = np.concatenate([-PM.sum(axis=1), np.einsum("ksei,ksj->keij", P, v).reshape(moves.count, 2, 9)], axis=2)
         n = 2 * moves.count
@@ -255,6 +266,7 @@ class HandHeldGyroscope:
             "wander": wander.reshape(3, n, moves.count),
             "error": np.sqrt(np.einsum("kii->ki", variance)).ravel(),
             "common": self._common(W, directions),
+            "direction": self._of_directions(W, directions, np.sqrt(np.einsum("kii->ki", variance))),
             "start": moves.time[:, 0],
             "length": moves.time[:, -1] - moves.time[:, 0],
             "recording": self.every.recording[moves.after],
@@ -278,6 +290,12 @@ class HandHeldGyroscope:
         apart = np.kron(np.eye(len(W)), np.ones((2, 2))) == 0.0
         common: Values = np.where(apart, means @ means.T, 0.0) + calibration @ calibration.T
         return common
+
+    def _of_directions(self, W: Values, directions: Values, error: Values) -> Values:
+        """Return what errors of the rests' directions, as large as a typical white error, share: (2 k, 2 k) array."""
+        each = np.einsum("kij,kjmc,mcd->kimd", W, directions, self.across).reshape(2 * len(W), -1)
+        shared: Values = float(np.median(error)) ** 2 * each @ each.T
+        return shared
 
     def _turned(self, state: State) -> tuple[Motion, Values, Values]:
         """Return the motion of all samples of the moves, ``v = y - b - z`` and A."""
@@ -333,7 +351,7 @@ def model_of(
     ----------
     recordings : sequence of Recording
     calibration : SensorCalibration or None
-        Of the gyroscope; not looked at.
+        Of the gyroscope: moves that its method found far off the others are left out.
     noise : Noise or None
     settings : mapping
         Sections ``table`` and ``procedure``.
@@ -345,7 +363,6 @@ def model_of(
     CannotCalibrateError
         If the accelerometer cannot be calibrated.
     """
-    del calibration
     if accelerometer is None:
         try:
             accelerometer = nonlinear_least_squares.fit(recordings, None, settings)
@@ -357,7 +374,14 @@ def model_of(
     if observed is None:
         return None
     rests, gravity = observed
-    return HandHeldGyroscope(rests, moves_of(recordings, rests), gravity, noise)
+    moves = moves_of(recordings, rests)
+    if moves is not None and calibration is not None:
+        told = [move for stage in calibration.stages for move in stage.details.get("moves_outlying", ())]
+        off = {(move["recording"], float(move["time_s"])) for move in told}
+        names = [recordings[int(i)].name for i in rests.recording[moves.after]]
+        keys = zip(names, moves.time[:, 0].tolist(), strict=True)
+        moves = moves.select(np.array([key not in off for key in keys]))
+    return HandHeldGyroscope(rests, moves, gravity, noise)
 
 
 def observed_rests(
