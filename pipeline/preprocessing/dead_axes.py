@@ -92,8 +92,8 @@ def _check_spans(recording: Recording) -> None:
         return
     across = [(axis + 1) % 3, (axis + 2) % 3]
     spans = [_span(recording.accelerometer[:, i]) for i in across]
-    if max(spans) < LEVEL_G:
-        return
+    if max(spans) < LEVEL_G or _span(recording.accelerometer[:, axis]) > LEVEL_G:
+        return  # a turn about the vertical, or about another axis: the mounting's matter
     for i, spanned in zip(across, spans, strict=True):
         if spanned < SPANNED:
             _refuse(recording, f"accel_{AXES[i]}", spanned, 1.0, "g")
