@@ -13,10 +13,10 @@ from run import drawn, run
 if TYPE_CHECKING:
     from pathlib import Path
 
-# Of the draw with seed 1: one chain of stages, a class each.
+# Of the draw with seed 1, a class each, calibrated by one chain of stages; most of them were silent errors once.
 TENTH = (
-    "u0001", "u0034", "u0035", "u0036", "u0037", "u0039", "u0045", "u0059", "u0061", "u0062", "u0086", "u0099", "u0106",
-    "u0108", "u0115", "u0123", "u0124",
+    "u0001", "u0013", "u0036", "u0037", "u0046", "u0045", "u0062", "u0076", "u0086", "u0100", "u0124", "u0145", "u0148",
+    "u0177", "u0187", "u0123", "u0276",
 )  # fmt: skip
 
 
@@ -27,7 +27,7 @@ def _options(**given: object) -> Namespace:
 @pytest.mark.workflow
 def test_a_tenth_of_the_ways_leaves_no_silent_error_and_good_units_right(tmp_path: Path) -> None:
     copies = drawn(_options(units=len(single_ways()), only=TENTH)) + drawn(_options(good=2))
-    judgements = run(copies, tmp_path)
+    judgements = run(copies, tmp_path, cores=2)
     assert len({j.kind for j in judgements}) == len(TENTH) + 1
     assert [j.line for j in judgements if j.outcome == SILENT] == []
     assert {j.outcome for j in judgements if j.unit.startswith("good")} == {RIGHT}
