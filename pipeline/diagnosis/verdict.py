@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 IN_DOUBT = "N-REFERENCE"
 EXPLAINED = 1.5  # times the noise: a residual of a fit up to it is noise; 0.92 to 1.14 in 140 sensors of null families
 QUIET = 0.6  # times the noise: a residual below it contradicts the noise of the rests
-FREE = ("reference_least_squares", "nonlinear_least_squares")  # methods that leave bias and matrix free
+FREE = ("reference_least_squares", "nonlinear_least_squares", "cholesky_lu")  # methods that leave bias and matrix free
 
 
 @dataclass(frozen=True)

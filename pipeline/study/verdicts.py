@@ -12,6 +12,7 @@ JSON = dict[str, Any]
 ALIKE = 0.95
 EXCESS = 0.05
 STANDS_OUT = 100.0
+DOUBTFUL = ("reference_in_doubt", "unexplained", "floor_in_doubt")
 
 
 def named(hidden: str, said: JSON, name: str) -> bool:
@@ -51,8 +52,8 @@ def not_seen(truth: JSON, said: JSON) -> bool:
 
 
 def warned(said: JSON) -> bool:
-    """Return whether a warning is said: unexplained, beyond the data sheet, or more wander than the sensor has."""
-    return bool(said["verdict"] == "unexplained" or not said["plausible"] or said["inflated"])
+    """Return whether a warning is said: a doubtful verdict, beyond the data sheet, or more wander than expected."""
+    return bool(said["verdict"] in DOUBTFUL or not said["plausible"] or said["inflated"])
 
 
 def not_silent(truth: JSON, said: JSON) -> bool:

@@ -93,9 +93,9 @@ def after(stage: str, batch: str) -> set[str]:
 @pytest.mark.parametrize(
     ("config", "expected"),
     [
-        ("overrides=limits.gyroscope.bias=20", after("validate calibration export report", REFERENCE)
-            | after("validate calibration export report", STAGED)),
-        ("unit_overrides={A1: [limits.gyroscope.bias=20]}", after("validate calibration export report", REFERENCE)),
+        ("overrides=limits.gyroscope.bias=20", after("all", REFERENCE)
+            | after("all", STAGED)),
+        ("unit_overrides={A1: [limits.gyroscope.bias=20]}", after("all", REFERENCE)),
         ("unit_overrides={B1: [filter.zero_phase=true]}", {f"filter/{STAGED}"}
             | {f"fit/{STAGED}/accelerometer/{s}" for s in ("orthogonality", "misalignment", "bias", "scale_factor")}
             | {f"fit/{STAGED}/gyroscope/{s}" for s in ("bias", "orthogonality_and_misalignment", "scale_factor")}
