@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.diagnosis.diagnose import diagnose
-from pipeline.errors import PipelineError
+from pipeline.errors import CannotCalibrateError, PipelineError
 from pipeline.estimation.stated import with_stated
 from pipeline.model.effects import leaving_out
 from pipeline.preprocessing.checks import check_recordings
@@ -51,17 +51,22 @@ def judged(family: str, number: int, seed: int) -> dict[str, Any]:
 
 
 def fitted(recordings: Any, sensor: str, settings: Any) -> Any:
-    """Return the calibration after all stages of the method."""
+    """Return the calibration after all stages of the method; None where the recordings do not suffice."""
     found = None
-    for stage in settings["method"]["stages"][sensor]:
-        found = import_module(f"pipeline.estimation.{sensor}.{stage}").fit(recordings, found, settings)
-        found = with_stated(found, recordings, settings)
+    try:
+        for stage in settings["method"]["stages"][sensor]:
+            found = import_module(f"pipeline.estimation.{sensor}.{stage}").fit(recordings, found, settings)
+            found = with_stated(found, recordings, settings)
+    except CannotCalibrateError:
+        return None
     return found
 
 
 def said(case: Case, recordings: Any, fits: Any, noises: Any, sensor: str) -> dict[str, Any]:
     """Return verdict and held-out error of a sensor."""
     settings, noise = settings_of(case.model, case.method), noises[sensor]
+    if fits[sensor] is None:
+        return {"verdict": "refused", "message": "not calibrated"}
     other = next(fit for s, fit in fits.items() if s != sensor)
     try:
         held = validate(fits[sensor], recordings, noise, settings, other=other)
