@@ -165,6 +165,8 @@ def doubt_of_scale(recording: Recording, limits: Limits, settings: Mapping[str, 
     dt = np.diff(recording.time)
     even = np.abs(np.diff(rate)) <= EVEN * np.abs(rate[1:])
     even &= (np.abs(rate[1:]) > LEAST_TOTAL_DEG) & ~gaps(recording)
+    even[1:-1] &= even[2:] & even[:-2]  # two samples on either side of a short move's peak are alike by chance
+    even[[0, -1]] = False
     if even.sum() < FEWEST:
         return None
     name, time = (column(recording, c, settings) for c in ("table_rate", "time"))
