@@ -13,7 +13,7 @@ where
           stretch is mostly a turn, and that median stands for it
     s_c : white noise of a sample, by the differences of successive samples: median |y[i+1] - y[i]| / (0.6745 sqrt 2)
     d_c : 1.4826 times the median of |m_c - r_c| in the stretch, which is the standard deviation of m where the unit
-          rests for more than half of it, with the tremor of a hand in it; no more than the limit of a rest's rate
+          rests for more than half of it, with the tremor of a hand in it; q d_c is no more than what a hand trembles
     V   : median of sum_c v_c in the stretch: noise and tremor
     q   : 6: of 10^5 windows of three axes, noise alone takes 6e-4 for a turn
 
@@ -41,6 +41,9 @@ WINDOW_S, FEWEST = 0.2, 3
 SIGNIFICANT = 6.0
 NEIGHBOURS = 5
 RATE_LIMIT_DPS = 0.7  # of a stretch against those around it: hand-held rests differ by g-sensitivity and creep
+# Of a window's mean, however much the stretch trembles. The rests of a published MPU-6050 recording in a hand reach 1.7
+# but for the ends of moves; its moves reach 60 (see tests/signal/test_rests.py).
+TREMOR_LIMIT_DPS = 2.5
 SAME_DEG = 2.0
 NORMAL = 1.4826  # standard deviation over median absolute deviation of a normal distribution
 
@@ -75,8 +78,8 @@ def quiet_pieces(rate: Values, stretches: Sequence[tuple[int, int]], interval: f
     white = NORMAL * np.median(differences, axis=0) / np.sqrt(2.0 * size)
     spread = NORMAL * np.array([np.median(own, axis=0) for own in off])
     noise = np.array([np.median(variance) for _, variance in windows])
-    spread = np.minimum(np.where(resting[:, None], spread, np.median(spread, axis=0)), RATE_LIMIT_DPS)
-    limit = SIGNIFICANT * np.maximum(white, spread)
+    spread = np.where(resting[:, None], spread, np.median(spread, axis=0))
+    limit = np.minimum(SIGNIFICANT * np.maximum(white, spread), np.maximum(SIGNIFICANT * white, TREMOR_LIMIT_DPS))
     loud = SIGNIFICANT**2 * np.where(resting, noise, np.median(noise))
     pieces: Spans = []
     for i, (start, stop) in enumerate(stretches):

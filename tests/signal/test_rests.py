@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -193,7 +194,7 @@ def test_the_ten_rests_of_a_published_mpu6050_recording_are_found() -> None:
 def test_the_published_intervals_that_reach_into_a_move_are_refused(number: int, mean_rate_x: float) -> None:
     recording = _mpu6050()
     assert recording.gyroscope is not None
-    rests = find_rests(recording)
+    rests = find_rests(replace(recording, gyroscope=None))  # their intervals begin where the accelerometer is quiet
     intervals = [(rest.start, rest.stop) for rest in rests]
     start, stop = intervals[number - 1]
     # Their limits are not published, their mean rate is: go on into the next move until it is that.
