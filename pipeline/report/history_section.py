@@ -148,7 +148,7 @@ def _chart(sensor: str, entries: Sequence[JSON]) -> Figure | None:
     levels = {"noise floor": last["floor"]} if last["floor"] else {}
     svg = bars(f"history-{sensor}", finding, description, rows, f"rms error, {unit} (logarithmic)", levels=levels)
     return Figure(
-        svg, "Error on held-out motion after each run that changed it; what the run added or removed.", (), finding
+        svg, "Error on held-out motion after each run that changed the unit, and what it added or removed.", (), finding
     )
 
 
