@@ -80,6 +80,8 @@ def commands_of(
 ) -> JSON:
     """Return the commands that add what a diagnosis selected: ``add`` for every run, ``once`` for one; else nothing.
 
+    ``verb`` is what they are for: to add what is missing, or to try what does not explain all.
+
     Parameters
     ----------
     part : mapping
@@ -93,7 +95,9 @@ def commands_of(
     if not part.get("override"):
         return {}
     effects = [f"{sensor}.{name}" for name in part["selected"]]
+    verb = "add" if part["verdict"] == "missing_effect" else "try"
     return {
+        "verb": f"{verb} {'it' if len(effects) == 1 else 'them'}",
         "add": add_command(settings, unit, effects, results),
         "once": once_command(settings, unit, part["override"], results),
     }

@@ -114,9 +114,8 @@ def explain(unit: str, document: JSON, validation: JSON, told: Told) -> str:
         lines += [f"    {sentence}" for sentence in [verdict, *_held_out(validation.get(sensor)), *rest]]
         commands = commands_of(part or {}, sensor, unit, told.settings, told.results)
         if commands:
-            what = "it" if part and len(part["selected"]) == 1 else "them"
-            lines += [f"    To add {what}:", f"      {commands['add']}"]
-            lines += [f"    To add {what} for one run only:", f"      {commands['once']}"]
+            lines += [f"    To {commands['verb']}:", f"      {commands['add']}"]
+            lines += [f"    To {commands['verb']} for one run only:", f"      {commands['once']}"]
     return "\n".join(lines) + "\n"
 
 
