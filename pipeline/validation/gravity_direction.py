@@ -19,9 +19,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.estimation.design import Term
-from pipeline.estimation.hand_held.gyroscope import HandHeldGyroscope, observed_rests
+from pipeline.estimation.hand_held.gyroscope import HandHeldGyroscope
 from pipeline.estimation.hand_held.model import State
 from pipeline.estimation.hand_held.moves import moves_of
+from pipeline.estimation.hand_held.observed import observed_rests
 from pipeline.estimation.hand_held.rests import HELD_OUT, ROLE, by_hand
 from pipeline.model.effects import effect
 

@@ -16,9 +16,10 @@ from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.hand_held.budget import budgeted_by_hand
 from pipeline.estimation.hand_held.equations import noises_about
 from pipeline.estimation.hand_held.fit import fit as fit_by_hand
-from pipeline.estimation.hand_held.gyroscope import FEWEST_MOVES, model_of
+from pipeline.estimation.hand_held.gyroscope import FEWEST_MOVES
 from pipeline.estimation.hand_held.likelihood import NEW
 from pipeline.estimation.hand_held.model import State
+from pipeline.estimation.hand_held.observed import model_of
 from pipeline.estimation.hand_held.outlying import described, fit_robustly
 from pipeline.estimation.hand_held.rests import ROLE, by_hand
 from pipeline.estimation.least_squares import certified

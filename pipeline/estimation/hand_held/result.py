@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.hand_held import accelerometer, gyroscope
+from pipeline.estimation.hand_held import accelerometer, observed
 from pipeline.estimation.hand_held.budget import budgeted_by_hand
 from pipeline.estimation.hand_held.equations import noises_for
 from pipeline.estimation.hand_held.fit import plausible, require_observable
@@ -50,7 +50,7 @@ def model_of(
     """
     if calibration.sensor == "accelerometer":
         return accelerometer.model_of(recordings, calibration, noise, settings)
-    return gyroscope.model_of(recordings, calibration, noise, settings, other)
+    return observed.model_of(recordings, calibration, noise, settings, other)
 
 
 def fit_effects_by_hand(
