@@ -211,7 +211,8 @@ def _creep(
     rate, error = rates[chosen], errors[chosen]
     upward = (force / np.linalg.norm(force, axis=1, keepdims=True)) ** 2
     seen = error**2 + RAW**2 * np.sum(rate**2, axis=1)
-    return rate, seen[:, None] * (1.0 - upward) + about**2 * upward
+    nearest = np.eye(3)[np.argmax(upward, axis=1)]  # one error: shared out to three axes it would count as several
+    return rate, seen[:, None] * (1.0 - upward) + about**2 * nearest
 
 
 def white_variance(recording: Recording, noise: Noise) -> NDArray[np.float64]:
