@@ -8,7 +8,9 @@ says otherwise decides, the first that applies:
     missing_effect      effects were selected, and with them the held-out error lies in its interval
     unexplained         the residual of the fit, or the held-out error, is above what noise leaves, for no known reason
     floor_in_doubt      the held-out error is below its interval, or the residual far below the noise
-    left_by_method      the error is above, but that of a free fit of the same recordings is not
+    left_by_method      the error is above, but that of a free fit of the same recordings is not; or the method's matrix
+                        or bias differs from that of a free fit by more than both fits' noise, which the error of the
+                        magnitude need not show (a rotation)
     not_enough_data, nothing_missing
 
 "Above" and "below" compare with the 99 % interval. A held-out error whose interval is not known decides nothing.
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
 IN_DOUBT = "N-REFERENCE"
 EXPLAINED = 1.5  # times the noise: a residual of a fit up to it is noise; 0.92 to 1.14 in 140 sensors of null families
 QUIET = 0.6  # times the noise: a residual below it contradicts the noise of the rests
+COMPARED = ("bias", "scale_factor", "non_orthogonality", "rotation")  # parts compared with the uncertainty of both fits
 FREE = ("reference_least_squares", "nonlinear_least_squares", "cholesky_lu")  # methods that leave bias and matrix free
 
 
@@ -73,6 +76,8 @@ class Evidence:
         filtered reference.
     doubts : sequence of str
         What the recordings' checks say of the reference.
+    approximations : sequence of str
+        In what the method's matrix and bias differ from those of a free fit (``pipeline.diagnosis.method_errors``).
     method : str
     as_printed : bool
         Whether the method takes the equations of the founding document as printed.
@@ -90,6 +95,7 @@ class Evidence:
     free: HeldOut | None = None
     full: HeldOut | None = None
     doubts: Sequence[str] = field(default_factory=tuple)
+    approximations: Sequence[str] = field(default_factory=tuple)
     method: str = ""
     as_printed: bool = False
     filtered: bool = False
@@ -168,6 +174,7 @@ def evidence_of(  # noqa: PLR0917  (what a diagnosis is made of)
         free=error_of(free, smoothed=True) if contradicted else None,
         full=error_of(full, smoothed=True) if contradicted else None,
         doubts=doubts_of(sensor, recordings),
+        approximations=[error["name"] for error in document.get("method_errors") or () if error["name"] in COMPARED],
         method=str(method.get(sensor) or ""),
         as_printed=bool(method.get("as_printed")),
         filtered=filtered,
@@ -193,6 +200,11 @@ def decide(e: Evidence) -> tuple[str, str]:
         return "floor_in_doubt", (
             f"The residual of the fit is {e.over_noise:.2g} times the noise that was found. Noise cannot be larger at "
             "rest than in turns: check that the unit did not move in the static recording, and record it again."
+        )
+    if e.found == "nothing_missing" and e.approximations:
+        return "left_by_method", (
+            f"The method {e.method} leaves errors that a free fit of the same recordings does not: "
+            f"{', '.join(name.replace('_', ' ') for name in e.approximations)}."
         )
     return e.found, ""
 

@@ -35,6 +35,8 @@ STAGED = replace(NOTHING, published=ABOVE, free=INSIDE, method="staged")
         (STAGED, "left_by_method", "the method staged leaves the rest"),
         (replace(STAGED, filtered=True), "left_by_method", "the method staged and the filter leave the rest"),
         (replace(STAGED, filtered=True, method="reference_least_squares"), "left_by_method", "the filter, which"),
+        (replace(NOTHING, method="staged", approximations=("rotation", "bias")), "left_by_method", "rotation, bias"),
+        (replace(MISSING, method="staged", approximations=("rotation",)), "missing_effect", ""),
         (replace(STAGED, free=ABOVE, as_printed=True), "left_by_method", "as_printed"),
         (replace(STAGED, free=ABOVE), "reference_in_doubt", "contradict each other"),
         (replace(NOTHING, found="not_enough_data", published=BELOW), "floor_in_doubt", "too large"),
