@@ -194,6 +194,11 @@ def decide(e: Evidence) -> tuple[str, str]:
         return _above(e, e.published)
     if e.found in {"missing_effect", "unexplained"}:
         return e.found, ""
+    return _within(e)
+
+
+def _within(e: Evidence) -> tuple[str, str]:
+    """Return the verdict where no effect was found and the held-out error is not above its interval."""
     if e.published and e.published.below:
         return "floor_in_doubt", _too_low(e, e.published)
     if e.on_table and e.found == "nothing_missing" and e.over_noise is not None and e.over_noise < QUIET:
