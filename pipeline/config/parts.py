@@ -52,6 +52,22 @@ FIT = (
     "uncertainty.monte_carlo",
 )
 SENSORS_AND_TABLE = ("sensor", "table", "procedure.holdout_every")
+# Effects that explain a departure of table, clock or gyroscope, whose limits the checks of the recordings read.
+LIMITS_OF_CHECKS = (
+    "time_offset",
+    "low_pass_lag",
+    "clock_rate",
+    "table_encoder_error",
+    "table_rate_ripple",
+    "table_backlash",
+    "table_tilt",
+    "table_axis_nonorthogonality",
+    "g_sensitivity",
+    "g_squared_sensitivity",
+    "bias_drift",
+    "bias_temperature",
+    "warm_up",
+)
 READS: dict[str, tuple[str, ...]] = {
     "ingest": (
         "ingest",
@@ -65,7 +81,8 @@ READS: dict[str, tuple[str, ...]] = {
         "table.angle_accuracy_deg",
         "table.orthogonality_deg",
         "sensor.axis_map",
-        *(f"sensor.{sensor}.{key}" for sensor in BOTH for key in ("axis_map", "full_scale", "effects")),
+        *(f"sensor.{sensor}.{key}" for sensor in BOTH for key in ("axis_map", "full_scale")),
+        *(f"sensor.{sensor}.effects.{name}" for sensor in BOTH for name in LIMITS_OF_CHECKS),
         *(f"sensor.{sensor}.{key}" for sensor in BOTH for key in ("bias", "scale_factor", "cross_axis", *NOISE)),
         "table.gravity_g",
     ),

@@ -102,7 +102,7 @@ def after(stage: str, batch: str) -> set[str]:
             | after("all", STAGED)),
         ('unit_overrides={A2: ["effects.gyroscope=[bias_temperature]"]}',
             {f"fit/{REFERENCE}/gyroscope/effects"} | after("all", REFERENCE)),
-        ("unit_overrides={A1: [sensor.gyroscope.effects.g_sensitivity=0.3]}",
+        ("unit_overrides={A1: [sensor.gyroscope.effects.quadratic_nonlinearity=2e-4]}",
             {f"fit/{REFERENCE}/gyroscope/effects"} | after("all", REFERENCE)),
     ],
 )  # fmt: skip
