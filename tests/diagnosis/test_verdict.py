@@ -23,6 +23,7 @@ STAGED = replace(NOTHING, published=ABOVE, free=INSIDE, method="staged")
         (NOTHING, "nothing_missing", ""),
         (replace(NOTHING, published=None), "nothing_missing", ""),
         (replace(NOTHING, published=ABOVE), "reference_in_doubt", "contradict each other"),
+        (replace(NOTHING, published=ABOVE, free=INSIDE), "reference_in_doubt", "contradict each other"),
         (replace(NOTHING, published=ABOVE, over_noise=4.0), "unexplained", "4 times the noise"),
         (replace(NOTHING, published=BELOW), "floor_in_doubt", "taken for too large"),
         (replace(NOTHING, over_noise=0.1), "floor_in_doubt", "0.1 times the noise"),
