@@ -11,6 +11,10 @@ The usual scatter is the first quartile of the blocks', and no more than twice t
 other recordings, or four times the data sheet's white noise where there are none. Slow changes by the data sheet's
 limits: six standard deviations of ``bias_wander``, ``bias_drift`` over the recording, ``bias_temperature`` times the
 range of the temperature, ``warm_up``; and 6 times the usual scatter, as if all noise of a block had a memory.
+
+A static recording whose scatter is more than twice that of the rests of the other recordings gets the note
+``N-REFERENCE``: its noise is not that of the others. Rests are those of the table's log, or the quietest tenth of a
+recording by hand. White noise grows with the square root of the sampling rate, which is allowed for.
 """
 
 from __future__ import annotations
@@ -59,7 +63,41 @@ def check_static(recordings: Sequence[Recording], settings: Mapping[str, Any]) -
     IngestError
         If too little of it rests.
     """
-    return [_resting(r, recordings, settings) if r.role == "static" else r for r in recordings]
+    return [_doubted(_resting(r, recordings, settings), recordings) if r.role == "static" else r for r in recordings]
+
+
+def _doubted(recording: Recording, recordings: Sequence[Recording]) -> Recording:
+    """Return a static recording, with the note ``N-REFERENCE`` where it is louder than the rests of the others."""
+    others = [r for r in recordings if r.role != "static" and r.samples > 1]
+    if recording.samples < FEWEST_SAMPLES or not others:
+        return recording
+    faster = np.sqrt(max(1.0, max(r.interval for r in others) / recording.interval))
+    notes = []
+    for sensor in SENSORS:
+        reading, known = recording.reading(sensor), _of_rests(recordings, sensor)
+        known = _of_quiet_blocks(recordings, sensor) if known is None else known
+        if reading is None or known is None:
+            continue
+        blocks = _blocks(recording, reading)
+        if not len(blocks):
+            continue
+        step = np.abs(np.diff(reading, axis=0))
+        known = np.maximum(known, np.where(step > 0.0, step, np.inf).min(axis=0, initial=np.inf))
+        ratio = float(np.max(np.median(blocks.std(axis=1, ddof=1), axis=0) / known))
+        if ratio > OF_RESTS * faster:
+            detail = (
+                f"the {sensor} scatters {ratio:.3g} times as much as in the rests of the other recordings; "
+                "its noise would be taken for that of all"
+            )
+            notes.append(Note("N-REFERENCE", recording.samples, 0, 0, detail))
+    return replace(recording, notes=(*recording.notes, *notes)) if notes else recording
+
+
+def _blocks(recording: Recording, reading: Array) -> Array:
+    """Return the readings in blocks of a second: (k, n, 3) array."""
+    size = max(FEWEST_OF_BLOCK, round(BLOCK_S / recording.interval))
+    count = len(reading) // size
+    return reading[: count * size].reshape(count, size, 3)
 
 
 def _resting(recording: Recording, recordings: Sequence[Recording], settings: Mapping[str, Any]) -> Recording:
@@ -157,4 +195,14 @@ def _of_rests(recordings: Sequence[Recording], sensor: str) -> Array | None:
             continue
         rests = [r for r in rests_from_table(recording) if r.stop - r.start >= FEWEST_OF_REST]
         found += [reading[r.start : r.stop].std(axis=0, ddof=1) for r in rests[:: len(rests) // RESTS + 1]]
+    return np.median(found, axis=0) if found else None
+
+
+def _of_quiet_blocks(recordings: Sequence[Recording], sensor: str) -> Array | None:
+    """Return the scatter of the quietest tenth of the recordings by hand: (3,) array; None where there are none."""
+    found = [
+        np.percentile(_blocks(r, reading).std(axis=1, ddof=1), 10.0, axis=0)
+        for r in recordings
+        if r.role == "rests" and (reading := r.reading(sensor)) is not None and len(_blocks(r, reading)) >= 10
+    ]
     return np.median(found, axis=0) if found else None

@@ -1,9 +1,10 @@
 """Samples that two recordings of a unit share: held-out data that is not held out.
 
 The rows of all recordings are compared as the numbers of their sensor channels, rounded to ten digits so that another
-unit of the file does not hide them. A row counts where it occurs once in its own recording: rests of a coarse sensor
-repeat rows. Two recordings share samples where at least 20 such rows follow each other in both, each within 8 rows of
-the one before; by chance that is as improbable as
+unit of the file does not hide them. Where recordings hold different numbers of decimals, they are compared again at the
+coarser ones, so that a rounded copy is found. A row counts where it occurs once in its own recording: rests of a
+coarse sensor repeat rows. Two recordings share samples where at least 20 such rows follow each other in both, each
+within 8 rows of the one before; by chance that is as improbable as
 
     (8 c / n)^19,   c : rows that occur in both,   n : rows of the longer recording
 
@@ -13,6 +14,7 @@ rows or time, cut, or with rows left out.
 
 from __future__ import annotations
 
+import itertools
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
 
 FEWEST, APART = 20, 8
 DIGITS = 10  # of 16 bits of counts in any unit, 5 are significant; twice that
+OF_DECIMALS = 200  # samples by which the decimals are told: a finer reading ends in a zero in a tenth of them
 MIX = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio (Knuth, TAOCP 3, 6.4): spreads sums of bit patterns
 
 
@@ -46,7 +49,27 @@ def check_shared_rows(recordings: Sequence[Recording]) -> None:
     IngestError
         Naming both, and the rows.
     """
-    keys = [_keys(r) for r in recordings]
+    decimals = [_decimals(r) for r in recordings]
+    pairs = {tuple(min(a, b) for a, b in zip(x, y, strict=True)) for x, y in itertools.combinations(decimals, 2)}
+    for coarse in sorted(pairs, reverse=True):
+        _check_at(recordings, coarse)
+
+
+def _decimals(recording: Recording) -> tuple[int, ...]:
+    """Return the decimals of each sensor's readings, by its first samples; ``DIGITS`` for an absent sensor."""
+    out = []
+    for sensor in SENSORS:
+        reading = recording.reading(sensor)
+        part = np.zeros((0, 3)) if reading is None else reading[:OF_DECIMALS]
+        part = part[np.isfinite(part).all(axis=1)]
+        exact = (d for d in range(1, DIGITS) if len(part) and np.all(np.abs(part - np.round(part, d)) < 10.0**-DIGITS))
+        out.append(next(exact, DIGITS))
+    return tuple(out)
+
+
+def _check_at(recordings: Sequence[Recording], decimals: Sequence[int]) -> None:
+    """Refuse two recordings that hold the same samples, rounded to the decimals of each sensor."""
+    keys = [_keys(r, decimals) for r in recordings]
     if not any(len(k) for k in keys):
         return
     value = np.concatenate(keys)
@@ -70,13 +93,13 @@ def check_shared_rows(recordings: Sequence[Recording]) -> None:
             _check_pair(recordings[one], recordings[two], row[chosen], row[chosen + step])
 
 
-def _keys(recording: Recording) -> NDArray[np.uint64]:
+def _keys(recording: Recording, decimals: Sequence[int]) -> NDArray[np.uint64]:
     """Return a number for each row's readings; rows with equal readings have equal numbers."""
-    found = [r for s in SENSORS if (r := recording.reading(s)) is not None]
+    pairs = zip(SENSORS, decimals, strict=True)
+    found = [np.round(r, d) for s, d in pairs if (r := recording.reading(s)) is not None]
     if not found:
         return np.zeros(0, np.uint64)
-    values = np.concatenate(found, axis=1)
-    values = np.ascontiguousarray(np.round(values, DIGITS) + 0.0)  # no negative zero
+    values = np.ascontiguousarray(np.concatenate(found, axis=1) + 0.0)  # no negative zero
     bits = values.view(np.uint64)
     key = np.zeros(len(bits), np.uint64)
     for column in range(bits.shape[1]):

@@ -149,6 +149,10 @@ def stays(axis: int, every: int = 10**9) -> Callable[[np.ndarray], np.ndarray]:
     return apply
 
 
+def thousandths(values: np.ndarray) -> np.ndarray:
+    return np.round(values, 3)
+
+
 def same_axes(values: np.ndarray) -> np.ndarray:
     values[:, 1] = values[:, 0]
     return values
@@ -238,6 +242,13 @@ def cases() -> dict[str, Case]:
             lambda unit: [replace(unit[0].select(slice(0, 400)), name="static", role="static", axis=None), *unit[1:-1]],
             "not_at_rest",
             "the table turns at up to 20 deg/s",
+        ),
+        "54 rounded": Case(
+            lambda unit: at("validation", both(of("accelerometer", thousandths), of("gyroscope", thousandths)))(
+                copied("gyro_y", slice(None))(unit)
+            ),
+            "shared_rows",
+            "of recording gyro_y",
         ),
         "54 less one row": Case(
             copied("gyro_y", np.delete(np.arange(421), 100)),

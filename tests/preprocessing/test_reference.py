@@ -6,16 +6,19 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
 from bad_units import SETTINGS, cases, sound
 
 from pipeline.formats.ingest_error import IngestError
+from pipeline.preprocessing.at_rest import check_static
 from pipeline.preprocessing.checks import check_recordings
+from pipeline.records import Recording
 from pipeline.study.bench import recordings_of
 from pipeline.study.cases import FAMILIES, draw
 
 if TYPE_CHECKING:
-    from pipeline.records import Note, Recording
+    from pipeline.records import Note
 
 CASES = cases()
 PAGE = Path(__file__).parents[2] / "docs" / "bad_inputs.md"
@@ -64,3 +67,15 @@ def test_no_family_of_the_blind_study_is_refused_or_noted() -> None:
     for family in FAMILIES:
         unit = recordings_of(draw(family, 3, 20))
         assert not notes_of(unit, check_recordings(unit, SETTINGS)), family
+
+
+@pytest.mark.parametrize(("times", "codes"), [(1.0, []), (1.5, []), (3.0, ["N-REFERENCE"])])
+def test_a_static_recording_louder_than_the_rests_by_hand_is_in_doubt(times: float, codes: list[str]) -> None:
+    rng = np.random.default_rng(8)
+    turning = np.repeat(np.arange(40) % 2, 100)[:, None] * [30.0, 0.0, 0.0]
+    noise = 0.05 * rng.standard_normal((4000, 3))
+    by_hand = Recording("recording", "rests", None, np.arange(4000) * 10**7, gyroscope=turning + noise)
+    own = times * 0.05 * rng.standard_normal((3000, 3))
+    static = Recording("static", "static", None, (5000 + np.arange(3000)) * 10**7, gyroscope=own)
+    found = check_static([by_hand, static], {"sensor": {"gyroscope": {"bias_wander": 0.01}}})[1]
+    assert [n.code for n in found.notes] == codes
