@@ -73,7 +73,7 @@ def drawn(options: argparse.Namespace) -> list[Copy]:
         if options.only and name not in options.only:
             continue
         try:
-            copy = corrupted(number, options.seed, ways)
+            copy = _writable(corrupted(number, options.seed, ways))
         except NotApplicableError as reason:
             sys.stderr.write(f"{name}: {reason}\n")
             continue
@@ -90,6 +90,13 @@ def drawn(options: argparse.Namespace) -> list[Copy]:
         copy.kind, copy.way, copy.harmless = "(not corrupted)", "good", True
         copies.append(copy)
     return copies
+
+
+def _writable(copy: Copy) -> Copy:
+    """Return a unit whose columns have the same length in each recording."""
+    if any(len({len(v) for v in table.values()}) > 1 for table in copy.tables.values()):
+        raise NotApplicableError(f"{copy.way} leaves columns of unequal length")
+    return copy
 
 
 def run(copies: list[Copy], out: Path, cores: int = 1) -> list[Judgement]:
