@@ -21,12 +21,13 @@ sys.path.insert(0, str(Path(__file__).parent))
 from all_ways import corrupted, single_ways
 from good_bench import BASES, good_unit
 from judged import OUTCOMES, SILENT, Judgement, judge, refused
-from unit_copy import Copy, NotApplicableError, write
+from unit_copy import TIME, Copy, NotApplicableError, write
 
 from pipeline.config import load_campaign
 from pipeline.errors import PipelineError
 
 ROOT = Path(__file__).parents[2]
+LATEST_S = 2.0**63 / 1e9
 COLUMNS = ("unit", "sensor", "table", "procedure", "method", "filter", "overrides")
 CONFIGURED = ("settings", "axis map", "gravity stated", "two at once", "by hand")
 
@@ -96,6 +97,8 @@ def _writable(copy: Copy) -> Copy:
     """Return a unit whose columns have the same length in each recording."""
     if any(len({len(v) for v in table.values()}) > 1 for table in copy.tables.values()):
         raise NotApplicableError(f"{copy.way} leaves columns of unequal length")
+    if any(np.max(np.abs(table[TIME])) > LATEST_S for table in copy.tables.values()):
+        raise NotApplicableError(f"{copy.way} leaves times that no 64-bit stamp in ns holds")
     return copy
 
 

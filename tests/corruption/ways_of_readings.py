@@ -21,6 +21,8 @@ WHITE = {
 def scaled(copy: Copy, scope: str, sensor: str, factor: float) -> None:
     """Multiply all axes of a sensor: a wrong unit or range."""
     copy.map_readings(scope, sensor, factor * np.eye(3))
+    if factor < 0.0 and sensor == "accelerometer" and "recording" in copy.tables:
+        copy.unseen = "by hand neither the magnitude of gravity nor the way in which it turns shows its sign"
 
 
 def scaled_axis(copy: Copy, scope: str, sensor: str, factor: float) -> None:
