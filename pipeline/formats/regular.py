@@ -1,10 +1,12 @@
-"""Which paths are regular files: to open a FIFO waits for ever, a device may never end. Standard library only."""
+"""Which paths are regular files: to open a FIFO waits for ever, a device may never end."""
 
 from __future__ import annotations
 
 import os
 import stat
 from typing import TYPE_CHECKING
+
+from pipeline.errors import ConfigurationError
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -35,3 +37,33 @@ def not_regular(path: Path) -> str:
     if kind == stat.S_IFREG:
         return ""
     return f"is {KINDS.get(kind, 'no regular file')}; a regular file, or a symbolic link to one, is expected"
+
+
+def read_text(path: Path, largest: int, what: str) -> str:
+    """Return the text of a UTF-8 file, of which at most ``largest`` bytes are read.
+
+    Parameters
+    ----------
+    path : Path
+    largest : int
+        Bytes.
+    what : str
+        What the file holds, for the message: ``settings``.
+
+    Raises
+    ------
+    ConfigurationError
+        If it is no regular file, cannot be read, is not UTF-8, or is larger.
+    """
+    try:
+        other = not_regular(path)
+        if other:
+            raise ConfigurationError(other, str(path))
+        with path.open("rb") as stream:
+            content = stream.read(largest + 1)
+        text = content.decode("utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigurationError(f"cannot be read: {error}", str(path)) from None
+    if len(content) > largest:
+        raise ConfigurationError(f"has more than {largest} bytes, the limit for {what}", str(path))
+    return text

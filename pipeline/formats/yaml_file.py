@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from pipeline.errors import ConfigurationError
-from pipeline.formats.regular import not_regular
+from pipeline.formats.regular import read_text
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -75,18 +75,7 @@ def read_yaml(path: Path, largest: int = LARGEST_SIZE) -> Any:  # noqa: ANN401  
     ConfigurationError
         If it is no regular file, cannot be read, is no YAML, or is beyond the limits.
     """
-    try:
-        other = not_regular(path)
-        if other:
-            raise ConfigurationError(other, str(path))
-        with path.open("rb") as stream:
-            content = stream.read(LARGEST_BYTES + 1)
-        text = content.decode("utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigurationError(f"cannot be read: {error}", str(path)) from None
-    if len(content) > LARGEST_BYTES:
-        raise ConfigurationError(f"is larger than {LARGEST_BYTES} bytes, the limit for settings", str(path))
-    return load_yaml(text, str(path), largest)
+    return load_yaml(read_text(path, LARGEST_BYTES, "settings"), str(path), largest)
 
 
 def load_yaml(text: str, where: str, largest: int = LARGEST_SIZE) -> Any:  # noqa: ANN401

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from pipeline.errors import ConfigurationError, MissingInputError, PipelineError
-from pipeline.formats.regular import not_regular
+from pipeline.formats.regular import read_text
 from pipeline.model.effects import built_in, register
 from pipeline.model.effects.base import Effect
 from pipeline.model.user_effects import FormulaEffect, effect_from
@@ -56,7 +56,7 @@ def read_effect_file(file: Path) -> FormulaEffect:
     ConfigurationError
         If it is not as it should be, with its line.
     """
-    return _effect_of_text(_text_of(file), file)
+    return _effect_of_text(read_text(file, LARGEST_BYTES, "an effect"), file)
 
 
 def load_python_effect(path: str | Path, sha256: str | None = None) -> Effect:
@@ -143,21 +143,6 @@ def _checked(found: Any, file: Path, digest: str) -> Effect:  # noqa: ANN401  (w
         raise ConfigurationError(f"a built-in effect is called {found.name}; give yours another name", str(file))
     found.definition = {"python": file.name, "sha256": digest, "owner": str(found.owner)}
     return found
-
-
-def _text_of(file: Path) -> str:
-    try:
-        other = not_regular(file)
-        if other:
-            raise ConfigurationError(other, str(file))
-        with file.open("rb") as stream:
-            content = stream.read(LARGEST_BYTES + 1)
-        text = content.decode("utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigurationError(f"cannot be read: {error}", str(file)) from None
-    if len(content) > LARGEST_BYTES:
-        raise ConfigurationError(f"has more than {LARGEST_BYTES} bytes, the limit for an effect", str(file))
-    return text
 
 
 def _effect_of_text(text: str, file: Path) -> FormulaEffect:
