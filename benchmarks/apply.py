@@ -79,8 +79,8 @@ def write_mcap(path: Path, samples: int) -> None:
     """Write what a recorder writes: quantised readings in zstd chunks, and a temperature ten times a second."""
     from mcap.writer import Writer  # noqa: PLC0415
 
-    from pipeline.formats.mcap_write import _Template, imu_table  # noqa: PLC0415
-    from pipeline.formats.ros2 import DEFINITIONS, IMU, TEMPERATURE  # noqa: PLC0415
+    from pipeline.io.mcap_write import _Template, imu_table  # noqa: PLC0415
+    from pipeline.io.ros2 import DEFINITIONS, IMU, TEMPERATURE  # noqa: PLC0415
 
     generator = np.random.default_rng(1)
     warm = _Template("imu")
@@ -127,7 +127,7 @@ def csv_applied(log: Path, out: Path, calibration: Path) -> int:
 def mcap_unchanged(log: Path, out: Path, _calibration: Path) -> int:
     import zstandard  # noqa: PLC0415
 
-    from pipeline.formats.mcap_copy import CopyingWalk, McapCopy  # noqa: PLC0415
+    from pipeline.io.mcap_copy import CopyingWalk, McapCopy  # noqa: PLC0415
 
     class Again(McapCopy):
         """Packs every chunk again."""

@@ -52,16 +52,16 @@ def write_log(path: Path, rows: int) -> None:
 
 
 def read_ours(path: Path) -> tuple[int, list[float]]:
-    from pipeline.formats.csv_read import read_csv  # noqa: PLC0415  (a process loads its own reader only)
-    from pipeline.formats.csv_settings import csv_formats  # noqa: PLC0415
+    from pipeline.io.csv_read import read_csv  # noqa: PLC0415  (a process loads its own reader only)
+    from pipeline.io.csv_settings import csv_formats  # noqa: PLC0415
 
     table = read_csv([path], csv_formats(yaml.safe_load(PROFILE.read_text())))
     return len(table.time_ns), [float(table.time_ns[-1]) / 1e9, *(float(v[-1]) for v in table.values.values())]
 
 
 def read_marked(path: Path) -> tuple[int, list[float]]:
-    from pipeline.formats.checks import Checks  # noqa: PLC0415
-    from pipeline.formats.read import read_table, to_recording  # noqa: PLC0415
+    from pipeline.io.checks import Checks  # noqa: PLC0415
+    from pipeline.io.read import read_table, to_recording  # noqa: PLC0415
 
     ingest = yaml.safe_load(PROFILE.read_text())
     sensor = {"accelerometer": {"full_scale": 16.0}, "gyroscope": {"full_scale": 2000.0}}
@@ -98,8 +98,8 @@ def measure(reader: str, path: Path) -> dict[str, float]:
 
 def read_once(reader: str, path: Path) -> None:
     if reader != "bare":
-        importlib.import_module("pipeline.formats.read")
-        importlib.import_module("pipeline.formats.csv_read")
+        importlib.import_module("pipeline.io.read")
+        importlib.import_module("pipeline.io.csv_read")
     start = time.process_time()
     count, last = READERS[reader](path)
     cpu = time.process_time() - start

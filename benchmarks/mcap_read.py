@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
-from pipeline.formats.ros2 import DEFINITIONS, IMU
+from pipeline.io.ros2 import DEFINITIONS, IMU
 
 CHUNK = 1 << 20  # bytes
 LSB = 1 / 16384
@@ -51,8 +51,8 @@ def write_log(path: Path, messages: int, compression: CompressionType) -> None:
 
 
 def read_ours(path: Path, _messages: int) -> tuple[int, list[float]]:
-    from pipeline.formats.mcap import read_mcap  # noqa: PLC0415  (a process loads its own reader only)
-    from pipeline.formats.mcap_settings import McapFormat  # noqa: PLC0415
+    from pipeline.io.mcap import read_mcap  # noqa: PLC0415  (a process loads its own reader only)
+    from pipeline.io.mcap_settings import McapFormat  # noqa: PLC0415
 
     table = read_mcap(path, McapFormat())
     return len(table.time_ns), [float(v[:1000].sum()) for v in table.values.values()]
@@ -85,7 +85,7 @@ def measure(reader: str, path: Path, messages: int) -> dict[str, float]:
 
 def read_once(reader: str, path: Path, messages: int) -> None:
     read = {"ours": read_ours, "official": read_official}[reader]
-    importlib.import_module({"ours": "pipeline.formats.mcap", "official": "mcap_ros2.reader"}[reader])
+    importlib.import_module({"ours": "pipeline.io.mcap", "official": "mcap_ros2.reader"}[reader])
     start = time.process_time()
     count, sums = read(path, messages)
     cpu = time.process_time() - start

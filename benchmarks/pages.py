@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.diagnosis.words import in_words
-from pipeline.formats.parquet import load_recordings
+from pipeline.io.parquet import load_recordings
 from pipeline.records import SENSORS
 from pipeline.report import campaign_page, certificate_page
 from pipeline.report.certificate import certificate

@@ -16,10 +16,10 @@ from pipeline.atomic import write_atomically
 from pipeline.config.campaign import load_campaign
 from pipeline.config.compose import CONFIGS, Composer, Problem
 from pipeline.errors import ConfigurationError, PipelineError
-from pipeline.formats.checks import checks_of
-from pipeline.formats.files import FILE, candidate_files
-from pipeline.formats.ingest_error import IngestError
-from pipeline.formats.read import read_table, to_recording
+from pipeline.io.checks import checks_of
+from pipeline.io.files import FILE, candidate_files
+from pipeline.io.ingest_error import IngestError
+from pipeline.io.read import read_table, to_recording
 from pipeline.preprocessing.checks import check_recordings
 from pipeline.signal.segments import cut
 from pipeline.survey.facts import as_text, facts

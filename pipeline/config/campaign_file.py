@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Any
 from pipeline.config.compose import RUN_SETTINGS, nearest
 from pipeline.config.user_effects import ONLY_FROM_THE_COMMAND_LINE, PYTHON
 from pipeline.errors import ConfigurationError
-from pipeline.formats.regular import not_regular
-from pipeline.formats.yaml_file import read_yaml
+from pipeline.io.regular import not_regular
+from pipeline.io.yaml_file import read_yaml
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

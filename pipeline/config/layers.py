@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from pipeline.config.campaign_file import as_list, split_run_settings, unknown_key
 from pipeline.config.compose import GROUPS, Problem, default_option, nearest, parse
 from pipeline.errors import ConfigurationError
-from pipeline.formats.yaml_file import read_yaml
+from pipeline.io.yaml_file import read_yaml
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping

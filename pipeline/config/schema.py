@@ -189,7 +189,7 @@ class Limits(Section):
 
 
 class Ingest(Section):
-    """How files become recordings; ``pipeline.formats`` documents the keys of ``csv``, ``mcap`` and ``checks``."""
+    """How files become recordings; ``pipeline.io`` documents the keys of ``csv``, ``mcap`` and ``checks``."""
 
     name: str
     csv: dict[str, Any]

@@ -1,6 +1,6 @@
 """Which physical effect is missing, where no table says what the body did: from hand-held rests and moves.
 
-The selection is ``pipeline.estimation.hand_held.selection``; here it becomes the same document that
+The selection is ``pipeline.estimation.multi_position.selection``; here it becomes the same document that
 ``pipeline.diagnosis.diagnose`` makes of a table's recordings. The residual of the rests is compared with what white
 noise and the expected bias wander leave; how firmly a unit rests by hand nobody knows, so that a scatter of the rests
 beyond that is told, but is by itself no sign of a missing effect.
@@ -19,18 +19,18 @@ from pipeline.diagnosis.by_hand_left import dependences
 from pipeline.diagnosis.by_hand_picture import added_variable
 from pipeline.diagnosis.verdict import evidence_of, judged
 from pipeline.errors import CannotCalibrateError
-from pipeline.estimation.hand_held.equations import HandNoise
-from pipeline.estimation.hand_held.likelihood import beside
-from pipeline.estimation.hand_held.result import AUTO, calibration_of, model_of
-from pipeline.estimation.hand_held.selection import select
+from pipeline.estimation.multi_position.equations import HandNoise
+from pipeline.estimation.multi_position.likelihood import beside
+from pipeline.estimation.multi_position.result import AUTO, calibration_of, model_of
+from pipeline.estimation.multi_position.selection import select
 from pipeline.estimation.selection import GATE_BIC, INFLATED
 from pipeline.model.effects import effect
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.estimation.hand_held.fit import HandFit
-    from pipeline.estimation.hand_held.selection import HandSelection, Scored
+    from pipeline.estimation.multi_position.fit import HandFit
+    from pipeline.estimation.multi_position.selection import HandSelection, Scored
     from pipeline.estimation.ranking import Score
     from pipeline.records import Noise, Recording, SensorCalibration
 

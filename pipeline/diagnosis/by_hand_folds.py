@@ -17,8 +17,8 @@ import numpy as np
 
 from pipeline.errors import PipelineError
 from pipeline.estimation.accelerometer import nonlinear_least_squares
-from pipeline.estimation.hand_held.fit import fit
-from pipeline.estimation.hand_held.selection import FAR, select
+from pipeline.estimation.multi_position.fit import fit
+from pipeline.estimation.multi_position.selection import FAR, select
 from pipeline.model.effects import effect
 
 if TYPE_CHECKING:
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.estimation.hand_held.model import Model, State
-    from pipeline.estimation.hand_held.selection import HandSelection
+    from pipeline.estimation.multi_position.model import Model, State
+    from pipeline.estimation.multi_position.selection import HandSelection
     from pipeline.records import Noise, Recording, SensorCalibration
 
 FOLDS = 3

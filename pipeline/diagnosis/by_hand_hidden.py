@@ -6,7 +6,7 @@ or where even at the sensor's limits the gain that it reaches on average,
 
     factor n log(1 + lambda / n),   lambda = sum_j limit_j^2 |column_j|^2,
 
-stays below the gate ``v log n + 10`` (see ``pipeline.estimation.hand_held.likelihood``).
+stays below the gate ``v log n + 10`` (see ``pipeline.estimation.multi_position.likelihood``).
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ import numpy as np
 
 from pipeline.diagnosis.advice import UNKNOWN
 from pipeline.diagnosis.observability import LEAST_SPAN_DEGC, MOVING
-from pipeline.estimation.hand_held.model import refusal
+from pipeline.estimation.multi_position.model import refusal
 from pipeline.estimation.selection import GATE_BIC
 from pipeline.model.effects import catalogue
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.estimation.hand_held.selection import HandSelection
+    from pipeline.estimation.multi_position.selection import HandSelection
     from pipeline.estimation.ranking import Score
     from pipeline.model.effects.base import Effect
 

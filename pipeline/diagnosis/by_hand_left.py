@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.estimation.design import Term
-from pipeline.estimation.hand_held.likelihood import beside
+from pipeline.estimation.multi_position.likelihood import beside
 from pipeline.estimation.selection import GATE_BIC
 from pipeline.model.effects.base import Effect, Layout, Owner, Parameter
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.estimation.hand_held.selection import HandSelection
+    from pipeline.estimation.multi_position.selection import HandSelection
     from pipeline.records import Motion
 
     Values = NDArray[np.float64]

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.estimation.hand_held.fit import Limits, solve
+from pipeline.estimation.multi_position.fit import Limits, solve
 from pipeline.model.effects.base import Layout, unit_of
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.estimation.hand_held.selection import HandSelection
+    from pipeline.estimation.multi_position.selection import HandSelection
     from pipeline.model.effects.base import Effect
 
     Values = NDArray[np.float64]

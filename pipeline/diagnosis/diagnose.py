@@ -22,8 +22,8 @@ from pipeline.diagnosis.wander import fitted_wander
 from pipeline.errors import NotObservableError
 from pipeline.estimation.design import Start, Term
 from pipeline.estimation.effects_stage import AUTO
-from pipeline.estimation.hand_held.rests import by_hand
 from pipeline.estimation.joint import calibration_of, fit_terms
+from pipeline.estimation.multi_position.rests import by_hand
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import FAR_ABOVE, GATE_BIC, select
 from pipeline.model.effects import catalogue, effect

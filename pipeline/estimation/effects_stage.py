@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from pipeline.estimation.hand_held.rests import by_hand
 from pipeline.estimation.joint import fit_joint
+from pipeline.estimation.multi_position.rests import by_hand
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import select
 from pipeline.records import SensorCalibration
@@ -44,7 +44,7 @@ def fit_effects(
         return before
     noise = noise_of(sensor, recordings, settings)
     if by_hand(sensor, recordings):
-        from pipeline.estimation.hand_held.result import fit_effects_by_hand  # noqa: PLC0415  (recordings by hand alone)
+        from pipeline.estimation.multi_position.result import fit_effects_by_hand  # noqa: PLC0415  (recordings by hand alone)
 
         return fit_effects_by_hand(before, recordings, noise, settings)
     names = list(wanted)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import yaml
 
-from pipeline.formats.axes import STRAIGHT, maps_of_log
+from pipeline.io.axes import STRAIGHT, maps_of_log
 from pipeline.model.effects.base import Owner
 from pipeline.model.plausible import sentences
 from pipeline.model.user_effects import owner_of

@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.formats.ingest_error import IngestError
-from pipeline.formats.mcap_container import Container
-from pipeline.formats.mcap_decode import ChannelDecoder
-from pipeline.formats.mcap_kinds import ABSENT, SHORT, VECTORS, topic_of, wanted_by_map, wanted_of
-from pipeline.formats.mcap_settings import TIME
-from pipeline.formats.mcap_walk import Walk
-from pipeline.formats.message_definition import short_name
-from pipeline.formats.ros2 import IMU, TEMPERATURE
-from pipeline.formats.units import COUNTS, TRIADS, decode, to_house_unit
+from pipeline.io.ingest_error import IngestError
+from pipeline.io.mcap_container import Container
+from pipeline.io.mcap_decode import ChannelDecoder
+from pipeline.io.mcap_kinds import ABSENT, SHORT, VECTORS, topic_of, wanted_by_map, wanted_of
+from pipeline.io.mcap_settings import TIME
+from pipeline.io.mcap_walk import Walk
+from pipeline.io.message_definition import short_name
+from pipeline.io.ros2 import IMU, TEMPERATURE
+from pipeline.io.units import COUNTS, TRIADS, decode, to_house_unit
 from pipeline.model.fading_line import FadingLine
 from pipeline.records import Encoding
 
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.formats.mcap_chunk import Rows
-    from pipeline.formats.mcap_settings import MappedField, McapFormat
+    from pipeline.io.mcap_chunk import Rows
+    from pipeline.io.mcap_settings import MappedField, McapFormat
 
 
 @dataclass(frozen=True)

@@ -19,10 +19,10 @@ from pipeline.field_logs.mcap_input import Readings, Temperatures
 from pipeline.field_logs.mcap_output import new_imu, replaced
 from pipeline.field_logs.output import replacing, require_apart
 from pipeline.field_logs.profile import EPOCH_AFTER_S, LogProfile
-from pipeline.formats.mcap_copy import CopyingWalk, McapCopy
-from pipeline.formats.mcap_settings import mcap_format
-from pipeline.formats.record_stream import check_magic
-from pipeline.formats.ros2 import DEFINITIONS, IMU
+from pipeline.io.mcap_copy import CopyingWalk, McapCopy
+from pipeline.io.mcap_settings import mcap_format
+from pipeline.io.record_stream import check_magic
+from pipeline.io.ros2 import DEFINITIONS, IMU
 from pipeline.model.compensation import SMOOTHING_S
 from pipeline.records import SENSORS
 
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from mcap.records import McapRecord
 
     from pipeline.field_logs.mcap_input import Batch
-    from pipeline.formats.mcap_chunk import Rows
-    from pipeline.formats.mcap_container import Container
+    from pipeline.io.mcap_chunk import Rows
+    from pipeline.io.mcap_container import Container
     from pipeline.model.compensation import Compensation
 
 LAST_ID = 0xFFFF  # ids of added definitions count down from here, those of recorders up from 0

@@ -7,18 +7,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.formats.mcap_chunk import HEAD
-from pipeline.formats.mcap_kinds import VECTORS
-from pipeline.formats.mcap_records import MESSAGE, MESSAGE_HEAD, RECORD_HEAD
-from pipeline.formats.mcap_write import imu_table
-from pipeline.formats.units import STANDARD_GRAVITY, TRIADS
+from pipeline.io.mcap_chunk import HEAD
+from pipeline.io.mcap_kinds import VECTORS
+from pipeline.io.mcap_records import MESSAGE, MESSAGE_HEAD, RECORD_HEAD
+from pipeline.io.mcap_write import imu_table
+from pipeline.io.units import STANDARD_GRAVITY, TRIADS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from pipeline.formats.mcap_chunk import Rows
-    from pipeline.formats.mcap_decode import ChannelDecoder
-    from pipeline.formats.message_template import Template
+    from pipeline.io.mcap_chunk import Rows
+    from pipeline.io.mcap_decode import ChannelDecoder
+    from pipeline.io.message_template import Template
 
     Truths = dict[str, NDArray[np.float64]]
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import ConfigurationError, InputError
-from pipeline.formats.axes import STRAIGHT, axis_matrix, maps_of_log
+from pipeline.io.axes import STRAIGHT, axis_matrix, maps_of_log
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

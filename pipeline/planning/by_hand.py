@@ -2,7 +2,7 @@
 
     r = a Z d + C^1/2 w,    w standard normal, C the covariance by the data sheet, and a unit that rests firmly
 
-Each draw of w goes with signs d of its own through the likelihoods of ``pipeline.estimation.hand_held``, at any size a
+Each draw of w goes with signs d of its own through the likelihoods of ``estimation.multi_position``, at any size a
 without a new simulation, as all sums of squares are polynomials in a. Equations are few by hand, and their noise is not
 known beforehand, so that the large-sample formulas of ``pipeline.planning.expectation`` do not hold here.
 """
@@ -17,10 +17,10 @@ import numpy as np
 from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.design import Term
-from pipeline.estimation.hand_held.equations import HandNoise
-from pipeline.estimation.hand_held.likelihood import beside
-from pipeline.estimation.hand_held.result import model_of
-from pipeline.estimation.hand_held.selection import select
+from pipeline.estimation.multi_position.equations import HandNoise
+from pipeline.estimation.multi_position.likelihood import beside
+from pipeline.estimation.multi_position.result import model_of
+from pipeline.estimation.multi_position.selection import select
 from pipeline.estimation.selection import GATE_BIC, GATE_P
 from pipeline.planning.detection import ALIKE, ALMOST_SURE, PARTLY, Detection, limits_or_none, smallest
 from pipeline.records import SensorCalibration
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.estimation.hand_held.likelihood import Beside
-    from pipeline.estimation.hand_held.selection import HandSelection
+    from pipeline.estimation.multi_position.likelihood import Beside
+    from pipeline.estimation.multi_position.selection import HandSelection
     from pipeline.planning.rehearsal import Rehearsal
     from pipeline.records import Noise
 

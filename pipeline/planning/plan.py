@@ -20,7 +20,7 @@ import numpy as np
 from pipeline.diagnosis.by_hand_hidden import hidden_effects
 from pipeline.diagnosis.observability import not_observable
 from pipeline.errors import NotObservableError
-from pipeline.estimation.hand_held.rests import by_hand
+from pipeline.estimation.multi_position.rests import by_hand
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import unselected
 from pipeline.model.effects import effect

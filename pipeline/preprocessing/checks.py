@@ -1,6 +1,6 @@
 """Checks that need all recordings of a unit: their mounting, their reference, and whether they share samples.
 
-Checks of a single file are in ``pipeline.formats``. The order is: the reference of the turns (do angle, rate,
+Checks of a single file are in ``pipeline.io``. The order is: the reference of the turns (do angle, rate,
 gyroscope, gravity and time agree in size), mounting (which direction was up, which way the table turned), then the
 reference of held-out motion, then shared samples.
 """

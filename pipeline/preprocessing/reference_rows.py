@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-BY_NOISE = 10.0  # standard deviations, as of disturbances (pipeline.formats.disturbances)
+BY_NOISE = 10.0  # standard deviations, as of disturbances (pipeline.io.disturbances)
 BENDS = 3.0  # of a move as long as one interval, whose second difference shows a quarter of its rate
 SHORT, LONG = 16, 12  # samples of a short stretch; long ones in a recording
 RESOLVED_DEG = 1e-3  # of a logged angle: the tenth of a common encoder's 0.01 deg

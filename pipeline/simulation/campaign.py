@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import ConfigurationError
-from pipeline.formats.csv_write import write_canonical_csv
+from pipeline.io.csv_write import write_canonical_csv
 from pipeline.records import AXES, SENSORS
 from pipeline.simulation.description import read_config
 from pipeline.simulation.draw import drawn_effects, drawn_sensors
@@ -172,7 +172,7 @@ def _wanted(unit: UnitDescription, planned: list[Planned]) -> list[Planned]:
 def write_recording(folder: Path, recording: Recording, kind: str, sheets: dict[str, Any]) -> None:
     """Write one recording as ``<name>.csv`` or ``<name>.mcap``, in the axes of the unit's body."""
     if kind == "mcap":
-        from pipeline.formats.mcap_write import write_mcap  # noqa: PLC0415  (needs the mcap library)
+        from pipeline.io.mcap_write import write_mcap  # noqa: PLC0415  (needs the mcap library)
 
         write_mcap(folder / f"{recording.name}.mcap", recording)
         return

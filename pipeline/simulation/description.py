@@ -25,8 +25,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import ConfigurationError, MissingInputError
-from pipeline.formats.unit_name import wrong_name
-from pipeline.formats.yaml_file import read_yaml
+from pipeline.io.unit_name import wrong_name
+from pipeline.io.yaml_file import read_yaml
 from pipeline.simulation.procedures import ONE_RECORDING, TABLE_PROCEDURES, Course
 from pipeline.simulation.table_logs import table_log_of
 

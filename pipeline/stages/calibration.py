@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline import __version__
 from pipeline.errors import CannotCalibrateError
-from pipeline.formats.axes import axis_maps
-from pipeline.formats.parquet import load_recordings
+from pipeline.io.axes import axis_maps
+from pipeline.io.parquet import load_recordings
 from pipeline.model.plausible import implausible
 from pipeline.records import SENSORS
 from pipeline.stages.batch import parse_job, read_json, run_batch, write_json

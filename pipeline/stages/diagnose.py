@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.atomic import write_atomically
 from pipeline.diagnosis.diagnose import diagnose
 from pipeline.diagnosis.guess_words import effect_file
-from pipeline.formats.parquet import load_recordings
+from pipeline.io.parquet import load_recordings
 from pipeline.stages.batch import parse_job, read_json, run_batch, write_json
 from pipeline.stages.fits import load_fits
 from pipeline.stages.noises import require_noises

@@ -9,7 +9,7 @@ import os
 import shutil
 from typing import TYPE_CHECKING, Any
 
-from pipeline.formats.parquet import load_recordings, save_recordings
+from pipeline.io.parquet import load_recordings, save_recordings
 from pipeline.signal.filters import apply_filter
 from pipeline.stages.batch import parse_job, run_batch
 from pipeline.stages.noises import save_noises

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import CannotCalibrateError
 from pipeline.estimation.stated import with_stated
-from pipeline.formats.parquet import load_recordings
+from pipeline.io.parquet import load_recordings
 from pipeline.records import SensorCalibration
 from pipeline.stages.batch import parse_job, read_json, run_batch, write_json
 from pipeline.stages.noises import load_noises

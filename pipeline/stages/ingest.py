@@ -6,8 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.formats.parquet import save_recordings
-from pipeline.formats.read import read_recordings
+from pipeline.io.parquet import save_recordings
+from pipeline.io.read import read_recordings
 from pipeline.preprocessing.checks import check_recordings
 from pipeline.signal.segments import cut
 from pipeline.stages.batch import parse_job, run_batch

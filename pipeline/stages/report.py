@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.atomic import write_atomically
 from pipeline.diagnosis.words import in_words
 from pipeline.estimation.rest_means import rests_by_use
-from pipeline.formats.parquet import load_recordings
+from pipeline.io.parquet import load_recordings
 from pipeline.records import SENSORS
 from pipeline.report import certificate_page
 from pipeline.report.certificate import certificate

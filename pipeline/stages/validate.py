@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from pipeline.formats.parquet import load_recordings
+from pipeline.io.parquet import load_recordings
 from pipeline.stages.batch import parse_job, run_batch, write_json
 from pipeline.stages.fits import load_fits
 from pipeline.stages.noises import require_noises

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 
-from pipeline.formats.csv_columns import BRACKETS, SPELLINGS, unit_in_brackets
-from pipeline.formats.units import CHANNELS, UNITS
+from pipeline.io.csv_columns import BRACKETS, SPELLINGS, unit_in_brackets
+from pipeline.io.units import CHANNELS, UNITS
 
 WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d")
 MERGED = re.compile(r"(a|ac|acc|accl|accel|f|g|gy|gyr|gyro|w|omega|rot)([xyz])")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.formats.units import TRIADS
+from pipeline.io.units import TRIADS
 from pipeline.survey.column_names import axis_of, is_time, other_channel, sensor_of, words_of
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.formats.marks import CLIPPED, GAP, STUCK, UNIT_NAMES, equal_share
-from pipeline.formats.turn_evidence import misfit_deg, moves_of, rests_of
+from pipeline.io.marks import CLIPPED, GAP, STUCK, UNIT_NAMES, equal_share
+from pipeline.io.turn_evidence import misfit_deg, moves_of, rests_of
 from pipeline.records import AXES, SENSORS
 from pipeline.signal.rests import rests_from_table
 from pipeline.survey.unit_evidence import BURSTS, FEWEST_RESTS_FOR_A_SPHERE, sphere

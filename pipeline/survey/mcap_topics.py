@@ -5,11 +5,11 @@ from __future__ import annotations
 from itertools import islice
 from typing import TYPE_CHECKING, Any
 
-from pipeline.formats.ingest_error import IngestError
-from pipeline.formats.mcap_kinds import SHORT
-from pipeline.formats.mcap_walk import Walk
-from pipeline.formats.message_definition import short_name
-from pipeline.formats.official_decoders import object_decoder, ros2_decoder
+from pipeline.io.ingest_error import IngestError
+from pipeline.io.mcap_kinds import SHORT
+from pipeline.io.mcap_walk import Walk
+from pipeline.io.message_definition import short_name
+from pipeline.io.official_decoders import object_decoder, ros2_decoder
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -8,7 +8,7 @@ import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.formats.units import TRIADS
+from pipeline.io.units import TRIADS
 
 if TYPE_CHECKING:
     from pipeline.survey.proposal import Entries, Proposal

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.formats.turn_evidence import moves_of
-from pipeline.formats.units import COUNTS, GYROSCOPE, TRIADS, UNITS
+from pipeline.io.turn_evidence import moves_of
+from pipeline.io.units import COUNTS, GYROSCOPE, TRIADS, UNITS
 from pipeline.survey.column_names import stated_unit, words_of
 from pipeline.survey.columns import Columns, find_columns
 from pipeline.survey.unit_evidence import (
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.formats.turn_evidence import Move
+    from pipeline.io.turn_evidence import Move
     from pipeline.survey.shape import Shape
 
 UNITS_OF = {"accelerometer": ("g", "mg", "m/s^2"), "gyroscope": ("deg/s", "rad/s")}

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.formats.parquet import load_recordings
+from pipeline.io.parquet import load_recordings
 from pipeline.records import Noise
 from pipeline.validation.samples import samples_of_motion
 

@@ -5,7 +5,7 @@
 where
 
     u : direction of gravity by the calibrated accelerometer
-    A : what the gyroscope says that the move turned (``pipeline.estimation.hand_held.moves``)
+    A : what the gyroscope says that the move turned (``pipeline.estimation.multi_position.moves``)
 
 The integral starts anew at each rest. Held out are the moves that end at a held-out rest, or those of a recording for
 validation.
@@ -19,11 +19,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.estimation.design import Term
-from pipeline.estimation.hand_held.gyroscope import HandHeldGyroscope
-from pipeline.estimation.hand_held.model import State
-from pipeline.estimation.hand_held.moves import moves_of
-from pipeline.estimation.hand_held.observed import observed_rests
-from pipeline.estimation.hand_held.rests import HELD_OUT, ROLE, by_hand
+from pipeline.estimation.multi_position.gyroscope import HandHeldGyroscope
+from pipeline.estimation.multi_position.model import State
+from pipeline.estimation.multi_position.moves import moves_of
+from pipeline.estimation.multi_position.observed import observed_rests
+from pipeline.estimation.multi_position.rests import HELD_OUT, ROLE, by_hand
 from pipeline.model.effects import effect
 
 if TYPE_CHECKING:

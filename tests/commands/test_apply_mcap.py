@@ -19,7 +19,7 @@ from pipeline.commands.apply import main
 from pipeline.errors import InputError
 from pipeline.field_logs.mcap_log import compensate_mcap
 from pipeline.field_logs.profile import LogProfile
-from pipeline.formats.ros2 import DEFINITIONS, IMU, TEMPERATURE
+from pipeline.io.ros2 import DEFINITIONS, IMU, TEMPERATURE
 from pipeline.model.compensation import load
 from pipeline.records import SENSORS, FittedEffect, SensorCalibration
 

@@ -11,8 +11,8 @@ import pytest
 import yaml
 
 from pipeline.__main__ import main
-from pipeline.formats.csv_write import write_canonical_csv
-from pipeline.formats.mcap_write import write_mcap
+from pipeline.io.csv_write import write_canonical_csv
+from pipeline.io.mcap_write import write_mcap
 from pipeline.records import Recording
 from pipeline.simulation.campaign import write_campaign
 from pipeline.simulation.description import description_from

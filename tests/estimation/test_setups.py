@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.joint import fit_joint
-from pipeline.formats.parquet import load_recordings, save_recordings
+from pipeline.io.parquet import load_recordings, save_recordings
 from pipeline.model.effects import effect
 from pipeline.model.effects.base import truth
 from pipeline.model.kinematics import reference_motion

@@ -12,7 +12,7 @@ from table_turns import Bench, settings
 
 from pipeline.estimation.gyroscope import reference_least_squares
 from pipeline.estimation.stated import with_stated
-from pipeline.formats.parquet import save_recordings
+from pipeline.io.parquet import save_recordings
 from pipeline.records import FittedEffect
 from pipeline.stages import fit as fit_stage
 from pipeline.stages.noises import save_noises

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.estimation.accelerometer import reference_least_squares as accelerometer_fit
 from pipeline.estimation.gyroscope import reference_least_squares as gyroscope_fit
-from pipeline.formats.ingest_error import IngestError
+from pipeline.io.ingest_error import IngestError
 from pipeline.model.kinematics import reference_motion
 from pipeline.preprocessing.checks import check_recordings
 from pipeline.preprocessing.departures import words

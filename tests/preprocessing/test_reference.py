@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from bad_units import SETTINGS, cases, sound
 
-from pipeline.formats.ingest_error import IngestError
+from pipeline.io.ingest_error import IngestError
 from pipeline.preprocessing.at_rest import check_static
 from pipeline.preprocessing.checks import check_recordings
 from pipeline.records import Recording

@@ -6,7 +6,7 @@ from pathlib import Path
 from hand_session import hand_held
 
 from pipeline.config.compose import Composer
-from pipeline.formats.parquet import save_recordings
+from pipeline.io.parquet import save_recordings
 from pipeline.stages import report
 
 

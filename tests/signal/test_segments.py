@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from pipeline.errors import InputError
-from pipeline.formats.channel_table import ChannelTable
-from pipeline.formats.checks import Checks
-from pipeline.formats.read import to_recording
-from pipeline.formats.table_log import unwrapped
+from pipeline.io.channel_table import ChannelTable
+from pipeline.io.checks import Checks
+from pipeline.io.read import to_recording
+from pipeline.io.table_log import unwrapped
 from pipeline.records.attitude import rate_of_attitude
 from pipeline.signal.segments import cut
 from pipeline.simulation.campaign import course_of, simulate_unit

@@ -12,7 +12,7 @@ import pytest
 from pipeline.commands.simulate import main
 from pipeline.config import load_campaign
 from pipeline.errors import ConfigurationError, MissingInputError
-from pipeline.formats.read import read_recordings
+from pipeline.io.read import read_recordings
 from pipeline.model.kinematics import reference_motion
 from pipeline.records import SENSORS, Recording
 from pipeline.simulation.campaign import simulate_unit, write_campaign

@@ -11,11 +11,11 @@ import yaml
 from loggers import GRAVITY, LOGGERS, Logger, motion
 
 from pipeline.config.compose import Composer
-from pipeline.formats.checks import Checks
-from pipeline.formats.csv_read import read_csv
-from pipeline.formats.csv_settings import csv_formats
-from pipeline.formats.ingest_error import IngestError
-from pipeline.formats.text_file import load_text
+from pipeline.io.checks import Checks
+from pipeline.io.csv_read import read_csv
+from pipeline.io.csv_settings import csv_formats
+from pipeline.io.ingest_error import IngestError
+from pipeline.io.text_file import load_text
 from pipeline.survey.profile_text import as_yaml
 from pipeline.survey.proposal import Proposal, propose
 from pipeline.survey.shape import find_shape

@@ -8,7 +8,7 @@ import pytest
 from bench_session import Session, record
 
 from pipeline.config.compose import Composer
-from pipeline.formats.parquet import save_recordings
+from pipeline.io.parquet import save_recordings
 from pipeline.records import SENSORS, SensorCalibration
 from pipeline.stages import calibration
 

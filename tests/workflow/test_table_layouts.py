@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.formats.parquet import load_recordings
+from pipeline.io.parquet import load_recordings
 
 from .conftest import ROOT, Bench
 

@@ -20,7 +20,7 @@ os.environ["PYTHONPATH"] = os.pathsep.join(
 
 from pipeline.config import code_digest, load_campaign, part_file
 from pipeline.errors import PipelineError
-from pipeline.formats.files import recording_files
+from pipeline.io.files import recording_files
 from pipeline.outcome import outcome
 from pipeline.publish import finish_publishing
 from pipeline.run_watch import Watch

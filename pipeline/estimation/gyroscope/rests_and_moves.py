@@ -2,8 +2,8 @@
 
 At rest the reading is the bias; in a move, the integrated reading must turn the direction of gravity before it into
 that after it. The accelerometer is calibrated on the way, and gives the frame. The equations are those of
-``pipeline.estimation.hand_held.gyroscope``; both kinds are weighted by their own scatter, and moves that contradict
-the others have less weight (``pipeline.estimation.hand_held.outlying``).
+``estimation.multi_position.gyroscope``; both kinds are weighted by their own scatter, and moves that contradict
+the others have less weight (``pipeline.estimation.multi_position.outlying``).
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import CannotCalibrateError, NotObservableError
-from pipeline.estimation.hand_held.budget import budgeted_by_hand
-from pipeline.estimation.hand_held.equations import noises_about
-from pipeline.estimation.hand_held.fit import fit as fit_by_hand
-from pipeline.estimation.hand_held.gyroscope import FEWEST_MOVES
-from pipeline.estimation.hand_held.likelihood import NEW
-from pipeline.estimation.hand_held.model import State
-from pipeline.estimation.hand_held.observed import model_of
-from pipeline.estimation.hand_held.outlying import described, fit_robustly
-from pipeline.estimation.hand_held.rests import ROLE, by_hand
 from pipeline.estimation.least_squares import certified
+from pipeline.estimation.multi_position.budget import budgeted_by_hand
+from pipeline.estimation.multi_position.equations import noises_about
+from pipeline.estimation.multi_position.fit import fit as fit_by_hand
+from pipeline.estimation.multi_position.gyroscope import FEWEST_MOVES
+from pipeline.estimation.multi_position.likelihood import NEW
+from pipeline.estimation.multi_position.model import State
+from pipeline.estimation.multi_position.observed import model_of
+from pipeline.estimation.multi_position.outlying import described, fit_robustly
+from pipeline.estimation.multi_position.rests import ROLE, by_hand
 from pipeline.estimation.serial_noise import prior_of
 from pipeline.records import AXES, SensorCalibration, StageResult
 from pipeline.signal.noise import noise_of

@@ -1,0 +1,183 @@
+"""The accelerometer at rest: the length of what it feels is that of gravity.
+
+    r = (G' - |f|) / s_e,   f = M v,   v = y - b - z(f),   G'^2 = G^2 + 2 s^2 w
+    d|f|/db = -n^T M,   d|f|/dM_ij = n_i v_j,   d|f|/dp = -n^T M dz/dp,   n = f / |f|
+
+where
+
+    y   : (3,) mean reading of a rest, g; w its share of a sample's variance s^2
+    b, M: bias, g, and matrix, here ``M = Q L`` with the rotation Q left as it is and L lower triangular: the length of
+          gravity says nothing of how the sensor is mounted
+    z   : effects, at the force that has the length of gravity; p their parameters
+    s_e : by how much white noise scatters |f|: ``s_e^2 = w sum_c (M^T n)_c^2 s_c^2``
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.estimation.multi_position.equations import Equations
+from pipeline.estimation.multi_position.model import State, added, motion_of
+from pipeline.estimation.multi_position.rests import HELD_OUT, rests_of
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.estimation.design import Term
+    from pipeline.estimation.multi_position.rests import Rests
+    from pipeline.records import Motion, Noise, Recording, SensorCalibration
+
+    Values = NDArray[np.float64]
+
+ROUNDS = 12
+SETTLED = 1e-12  # g
+SMALLEST_NOISE = 1e-9  # g
+
+
+class RestingAccelerometer:
+    """Equations of the accelerometer's rests.
+
+    Parameters
+    ----------
+    rests : Rests
+        Those of the fit.
+    calibration : SensorCalibration
+        Of the method before: its matrix gives the rotation, and a part of L that it could not determine stays.
+    gravity_g : float, g
+    noise : Noise or None
+    held : Rests, optional
+        Those that no fit sees.
+    """
+
+    sensor = "accelerometer"
+    kinds = 1
+
+    def __init__(
+        self,
+        rests: Rests,
+        calibration: SensorCalibration,
+        gravity_g: float,
+        noise: Noise | None,
+        held: Rests | None = None,
+    ) -> None:
+        self.rests, self.gravity, self.held = rests, gravity_g, held
+        self.calibration, self.noise = calibration, noise
+        self.white = np.maximum(white_of(rests, noise), SMALLEST_NOISE)
+        self.directions = _directions(calibration)
+        self.rests_equations = len(rests.time)
+
+    def equations(self, state: State, candidates: Sequence[Term] = ()) -> Equations:
+        """Return the linear form at some parameters."""
+        rests, K = self.rests, state.K
+        force, v = self.felt(state, rests)
+        length = np.linalg.norm(force, axis=1)
+        n = force / length[:, None]
+        along = n @ state.matrix
+        error = np.sqrt(rests.share * (along**2 @ self.white**2))
+        target = np.sqrt(self.gravity**2 + 2.0 * rests.share * np.mean(self.white**2))
+        motion = self._motion(self.gravity * n, rests)
+        full = np.concatenate([-along, (n[:, :, None] * v[:, None, :]).reshape(-1, 9)], axis=1)
+
+        def columns(term: Term) -> Values:
+            Z = term.effect.columns(self.sensor, motion, K, term.values)
+            return np.asarray(np.einsum("nc,ncp->np", -along, Z) / error[:, None])
+
+        hold = np.zeros((3, len(error), len(error)))
+        hold[:, np.arange(len(error)), np.arange(len(error))] = (along * self.white / error[:, None]).T
+        return Equations(
+            residual=(target - length) / error,
+            base=full @ self.directions / error[:, None],
+            effects=[columns(term) for term in state.terms],
+            candidates=[columns(term) for term in candidates],
+            scatter=np.square(np.median(error) / error)[None],
+            wander=hold,
+            start=rests.start,
+            length=rests.length,
+            joined=rests.joined,
+            error=error,
+        )
+
+    def felt(self, state: State, rests: Rests) -> tuple[Values, Values]:
+        """Return the specific force of each rest, g, and v: (m, 3) arrays."""
+        v, K = rests.reading - state.bias, state.K
+        force = v @ state.matrix.T
+        for _ in range(ROUNDS if state.terms else 0):
+            size = np.linalg.norm(force, axis=1, keepdims=True)
+            motion = self._motion(self.gravity * force / size, rests)
+            v = rests.reading - state.bias - added(self.sensor, state.terms, motion, K)
+            before, force = force, v @ state.matrix.T
+            if np.abs(force - before).max() < SETTLED:
+                break
+        return force, v
+
+    def samples(self) -> float:
+        """Return how many samples are behind the equations."""
+        return float(self.rests.count.sum())
+
+    def held_out_error(self, state: State) -> float | None:
+        """Return the rms error of |f| at rests that no fit sees, g; None where there are none."""
+        if self.held is None or len(self.held.time) == 0:
+            return None
+        force, _ = self.felt(state, self.held)
+        return float(np.sqrt(np.mean((np.linalg.norm(force, axis=1) - self.gravity) ** 2)))
+
+    def without(self, held: NDArray[np.bool_]) -> RestingAccelerometer:
+        """Return the model with some of its rests held out."""
+        kept, judged = self.rests.select(~held), self.rests.select(held)
+        return RestingAccelerometer(kept, self.calibration, self.gravity, self.noise, judged)
+
+    def _motion(self, force: Values, rests: Rests) -> Motion:
+        return motion_of(rests.time, force, np.zeros_like(force), rests.temperature, still=True)
+
+
+def white_of(rests: Rests, noise: Noise | None) -> Values:
+    """Return the white noise of a raw sample: (3,) array."""
+    if noise is not None and np.all(np.isfinite(noise.white)) and np.all(noise.white > 0):
+        return noise.white
+    return rests.white
+
+
+def _directions(calibration: SensorCalibration) -> Values:
+    """Return what b and the lower triangle of L do to bias and matrix: (12, 9) array, fewer where some stay fixed."""
+    flipped, _ = np.linalg.qr(calibration.matrix[:, ::-1])
+    Q = flipped[:, ::-1]
+    Q = Q * np.sign(np.diag(Q.T @ calibration.matrix))
+    directions = [np.eye(12)[i] for i in range(3)]
+    known = calibration.covariance
+    plain = bool(np.allclose(Q, np.eye(3), atol=1e-9))
+    Q = np.eye(3) if plain else Q
+    for i, j in zip(*np.tril_indices(3), strict=True):
+        at = 3 + 3 * i + j
+        if i != j and plain and known is not None and known[at, at] == 0.0:
+            continue
+        directions.append(np.concatenate([np.zeros(3), np.outer(Q[:, i], np.eye(3)[j]).ravel()]))
+    return np.array(directions).T
+
+
+def model_of(
+    recordings: Sequence[Recording],
+    calibration: SensorCalibration,
+    noise: Noise | None,
+    settings: Mapping[str, Any],
+) -> RestingAccelerometer | None:
+    """Return the model of the recordings' rests, or None where they hold none.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+    calibration : SensorCalibration
+        Of the accelerometer's method.
+    noise : Noise or None
+    settings : mapping
+        Sections ``table`` and ``procedure``.
+    """
+    rests = rests_of("accelerometer", recordings, settings, calibration)
+    if rests is None:
+        return None
+    gravity = float(settings["table"].get("gravity_g") or 1.0)
+    held = rests_of("accelerometer", recordings, settings, role=HELD_OUT) or rests.select(rests.held_out)
+    return RestingAccelerometer(rests.select(~rests.held_out), calibration, gravity, noise, held)

@@ -1,0 +1,334 @@
+"""The gyroscope by hand: at rest it feels nothing, and a move must turn gravity before into gravity after.
+
+    at rest:  r = (y - b - z - K w) / s_e,     dr/db = -1/s_e,   dr/dp = -dz/dp / s_e
+    a move:   r = W E^T (u_after - A_0 u_before),   omega = M (y - b - z)
+
+where
+
+    y, b, M : reading and bias, deg/s, and matrix
+    z, p    : effects and their parameters, with the specific force of the accelerometer, at rest and as it is turned on
+    w       : rate at which a unit creeps in a rest, across gravity as the accelerometer shows it (K = M^-1). Of that
+              about gravity no more is known than that it is as large; see ``pipeline.signal.creep.believed_rates``
+    u       : direction of gravity by the calibrated accelerometer; A_0 as in ``estimation.multi_position.moves``
+    E       : two directions across u_after; W whitens what noise of the gyroscope, integrated, what it turned between
+              its samples, and noise of the accelerometer leave there
+
+The errors of u are those of the rests' means, which two moves share, and those of the accelerometer's calibration,
+which all share: ``du = (1 - u u^T) (M_a dy - M_a db_a + dM_a v_a) / G``. A unit that still settles or is let go turns
+by some tenths of a degree within a rest: then u is not of the rest's mean but of its half second next to the move
+(``pipeline.estimation.multi_position.gravity``).
+
+Source of the moves: Tedaldi, Pretto & Menegatti, ICRA 2014, eq. 12. A turn about the vertical says nothing in one move,
+but in another move it does, as the vertical is elsewhere in the body. The frame is that of the accelerometer's matrix.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.estimation.multi_position.accelerometer import SMALLEST_NOISE, white_of
+from pipeline.estimation.multi_position.equations import Equations
+from pipeline.estimation.multi_position.model import State, added, motion_of
+from pipeline.estimation.multi_position.moves import tangents, to_the_end
+from pipeline.model.rotation import skew
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.estimation.design import Term
+    from pipeline.estimation.multi_position.gravity import Gravity
+    from pipeline.estimation.multi_position.moves import Moves
+    from pipeline.estimation.multi_position.rests import Rests
+    from pipeline.records import Motion, Noise
+
+    Values = NDArray[np.float64]
+
+FEWEST_MOVES = 6  # two equations each, for the nine of the matrix
+ROUNDS = 6
+SETTLED_DPS = 1e-7
+
+
+class HandHeldGyroscope:
+    """Equations of the gyroscope's rests and moves.
+
+    Parameters
+    ----------
+    rests : Rests
+        All, also those held out: a move may begin at one.
+    moves : Moves or None
+    gravity : Gravity
+        At each rest, by the accelerometer.
+    noise : Noise or None
+    fewest : int
+        Moves, below which none is looked at.
+    """
+
+    sensor = "gyroscope"
+
+    def __init__(
+        self, rests: Rests, moves: Moves | None, gravity: Gravity, noise: Noise | None, fewest: int = FEWEST_MOVES
+    ) -> None:
+        force = gravity.force
+        self.white = np.maximum(white_of(rests, noise), SMALLEST_NOISE)
+        self.rests, self.force = rests.select(~rests.held_out), force[~rests.held_out]
+        self.held, self.held_force = rests.select(rests.held_out), force[rests.held_out]
+        self.moves = moves if moves is not None and moves.count >= fewest else None
+        self.kinds = 1 if self.moves is None else 2
+        self.directions = np.eye(12)[:, : 3 if self.moves is None else 12]
+        self.rests_equations = 3 * len(self.rests.time)
+        self.gravity = float(np.median(np.linalg.norm(force, axis=1)))
+        if self.moves is not None:
+            self.before, self.after = gravity.at_end[self.moves.before], gravity.at_start[self.moves.after]
+            u = force / np.linalg.norm(force, axis=1, keepdims=True)
+            across = np.eye(3) - u[:, :, None] * u[:, None, :]
+            self.spread = np.degrees(gravity.spread / self.gravity)[:, None, None] * across
+            self.across = across
+            self.ends = np.degrees(gravity.ends / self.gravity)[:, None, None] * across
+            self.shared = np.degrees(across @ gravity.shared / self.gravity)
+            self.excess = np.zeros(self.moves.count)
+        self.every, self.known = rests, (gravity, noise, fewest)
+
+    def equations(self, state: State, candidates: Sequence[Term] = ()) -> Equations:
+        """Return the linear form at some parameters."""
+        pieces = [self._at_rest(state, candidates)]
+        if self.moves is not None:
+            pieces.append(self._of_moves(state, candidates))
+        sizes = [len(piece["residual"]) for piece in pieces]
+        stretches = [piece["wander"].shape[2] for piece in pieces]
+        wander = np.zeros((3, sum(sizes), sum(stretches)))
+        scatter = np.zeros((len(pieces), sum(sizes)))
+        row = column = 0
+        for kind, piece in enumerate(pieces):
+            own = slice(row, row + sizes[kind])
+            wander[:, own, column : column + stretches[kind]] = piece["wander"]
+            scatter[kind, own] = np.square(np.median(piece["error"]) / piece["error"])
+            row, column = own.stop, column + stretches[kind]
+        recording = np.concatenate([piece["recording"] for piece in pieces])
+        same = recording[:, None] == recording
+
+        def stacked(name: str) -> Any:  # noqa: ANN401
+            return np.concatenate([piece[name] for piece in pieces])
+
+        return Equations(
+            residual=stacked("residual"),
+            base=stacked("base") @ self.directions,
+            effects=[np.concatenate(z) for z in zip(*(piece["effects"] for piece in pieces), strict=True)],
+            candidates=[np.concatenate(z) for z in zip(*(piece["candidates"] for piece in pieces), strict=True)],
+            scatter=scatter,
+            wander=wander,
+            start=stacked("start"),
+            length=stacked("length"),
+            joined=np.ones_like(same) if self.rests.clock_shared else same,
+            error=stacked("error"),
+            common=_blocks([piece["common"] for piece in pieces], sizes),
+            direction=_blocks([piece.get("direction") for piece in pieces], sizes),
+        )
+
+    def samples(self) -> float:
+        """Return how many samples are behind the equations."""
+        return float(self.rests.count.sum()) + (0.0 if self.moves is None else float(np.sum(self.moves.weight > 0)))
+
+    def held_out_error(self, state: State) -> float | None:
+        """Return the rms of the rate at rests that no fit sees, deg/s; None where there are none."""
+        if len(self.held.time) == 0:
+            return None
+        nothing = np.zeros_like(self.held_force)
+        motion = motion_of(self.held.time, self.held_force, nothing, self.held.temperature, still=True)
+        left = self.held.reading - state.bias - added(self.sensor, state.terms, motion, state.K)
+        left -= self.held.creep @ state.K.T
+        return float(np.sqrt(np.mean(np.sum((left @ state.matrix.T) ** 2, axis=1))))
+
+    def with_excess(self, variance: Values) -> HandHeldGyroscope:
+        """Return the model with an error of its own for each move, of a variance in deg^2: (k,) array."""
+        gravity, noise, fewest = self.known
+        out = HandHeldGyroscope(self.every, self.moves, gravity, noise, fewest)
+        out.excess = variance
+        return out
+
+    def without(self, held: NDArray[np.bool_]) -> HandHeldGyroscope:
+        """Return the model with some of its rests, and the moves that end at them, held out.
+
+        Parameters
+        ----------
+        held : (m,) array of bool
+            Of the rests that are not held out already.
+        """
+        out = self.every.held_out.copy()
+        out[~self.every.held_out] = held
+        moves = None if self.moves is None else self.moves.select(~out[self.moves.after])
+        gravity, noise, fewest = self.known
+        return HandHeldGyroscope(replace(self.every, held_out=out), moves, gravity, noise, fewest)
+
+    def missed(self, state: State) -> tuple[Values, Values]:
+        """Return by how much each move misses the direction of gravity after it, and what noise alone gives, deg.
+
+        Returns
+        -------
+        error : (k,) array
+            Angle between the integrated and the felt direction.
+        noise : (k,) array
+            Mean of that angle under white noise of both sensors, and the scatter of the accelerometer's rests.
+        """
+        assert self.moves is not None  # noqa: S101
+        A = self._turned(state)[2]
+        predicted = np.einsum("kij,kj->ki", A[:, 0], self.before)
+        across = np.linalg.norm(np.cross(predicted, self.after), axis=1)
+        error = np.degrees(np.arctan2(across, np.einsum("ki,ki->k", predicted, self.after)))
+        own = self._of_moves(state, ())["error"].reshape(-1, 2)
+        return error, np.sqrt(0.25 * np.pi * np.sum(own**2, axis=1))
+
+    def _at_rest(self, state: State, candidates: Sequence[Term]) -> dict[str, Any]:
+        rests, K = self.rests, state.K
+        motion = motion_of(rests.time, self.force, np.zeros_like(self.force), rests.temperature, still=True)
+        error = np.sqrt(rests.share[:, None]) * self.white
+        left = rests.reading - state.bias - added(self.sensor, state.terms, motion, K) - rests.creep @ K.T
+        m = len(rests.time)
+        base = np.zeros((m, 3, 12))
+        base[:, :, :3] = np.eye(3)
+        wander = np.zeros((3, m, 3, m))
+        for c in range(3):
+            wander[c, np.arange(m), c, np.arange(m)] = self.white[c] / error[:, c]
+
+        def columns(term: Term) -> Values:
+            Z = term.effect.columns(self.sensor, motion, K, term.values) / error[:, :, None]
+            return np.asarray(Z.reshape(3 * m, -1))
+
+        return {
+            "residual": (left / error).ravel(),
+            "base": (base / error[:, :, None]).reshape(3 * m, 12),
+            "effects": [columns(term) for term in state.terms],
+            "candidates": [columns(term) for term in candidates],
+            "wander": wander.reshape(3, 3 * m, m),
+            "error": error.ravel(),
+            "start": rests.start,
+            "length": rests.length,
+            "recording": rests.recording,
+            "common": self._of_creep(K, error),
+        }
+
+    def _of_creep(self, K: Values, error: Values) -> Values | None:
+        """Return the covariance of the rests' equations by what is not known of their creep: (3 m, 3 m) array."""
+        across, about = self.rests.creep_error, self.rests.creep_about
+        if not about.any():
+            return None
+        u = self.force / np.linalg.norm(self.force, axis=1, keepdims=True)
+        upward = u[:, :, None] * u[:, None, :]
+        rate = across[:, None, None] ** 2 * (np.eye(3) - upward) + about[:, None, None] ** 2 * upward
+        own = K @ rate @ K.T / error[:, :, None] / error[:, None, :]
+        m = len(own)
+        out = np.zeros((m, 3, m, 3))
+        out[np.arange(m), :, np.arange(m)] = own
+        return out.reshape(3 * m, 3 * m)
+
+    def _of_moves(self, state: State, candidates: Sequence[Term]) -> dict[str, Any]:
+        moves = self.moves
+        assert moves is not None  # noqa: S101
+        motion, v, A = self._turned(state)
+        predicted = np.einsum("kij,kj->ki", A[:, 0], self.before)
+        E = tangents(self.after)
+        G = (E @ skew(predicted))[:, None] @ A
+        P = moves.weight[:, :, None, None] * G  # of a rate at a sample, deg per deg/s
+        PM = P @ state.matrix
+        directions = self._directions(E, A[:, 0])
+        untold = np.einsum("ksij,ksj->ksi", G @ state.matrix, moves.doubt)
+        own = np.einsum("ksij,j,kslj->kil", PM, self.white**2, PM) + np.einsum("ksi,ksj->kij", untold, untold)
+        means = np.einsum("kimc,mcd->kimd", directions, self.spread)
+        ends = np.einsum("kimc,mcd->kimd", directions, self.ends)
+        variance = own + np.einsum("kimd,klmd->kil", means, means) + np.einsum("kimd,klmd->kil", ends, ends)
+        variance += self.excess[:, None, None] * np.eye(2)
+        W = np.asarray(np.linalg.solve(np.linalg.cholesky(variance), np.eye(2)), np.float64)
+        base = np.concatenate([-PM.sum(axis=1), np.einsum("ksei,ksj->keij", P, v).reshape(moves.count, 2, 9)], axis=2)
+        n = 2 * moves.count
+        wander = np.zeros((3, moves.count, 2, moves.count))
+        held = -W @ PM.sum(axis=1) * self.white
+        wander[:, np.arange(moves.count), :, np.arange(moves.count)] = held.transpose(0, 2, 1)
+
+        def columns(term: Term) -> Values:
+            K = state.K
+            Z = term.effect.columns(self.sensor, motion, K, term.values).reshape(*moves.weight.shape, 3, -1)
+            return np.asarray((W @ -np.einsum("ksej,ksjp->kep", PM, Z)).reshape(n, -1))
+
+        apart = np.degrees(np.einsum("kej,kj->ke", E, self.after - predicted))
+        return {
+            "residual": np.einsum("kij,kj->ki", W, apart).ravel(),
+            "base": (W @ base).reshape(n, 12),
+            "effects": [columns(term) for term in state.terms],
+            "candidates": [columns(term) for term in candidates],
+            "wander": wander.reshape(3, n, moves.count),
+            "error": np.sqrt(np.einsum("kii->ki", variance)).ravel(),
+            "common": self._common(W, directions),
+            "direction": self._of_directions(W, directions, np.sqrt(np.einsum("kii->ki", variance))),
+            "start": moves.time[:, 0],
+            "length": moves.time[:, -1] - moves.time[:, 0],
+            "recording": self.every.recording[moves.after],
+        }
+
+    def _directions(self, E: Values, A: Values) -> Values:
+        """Return what an error of each rest's direction does to each move: (k, 2, m, 3) array."""
+        assert self.moves is not None  # noqa: S101
+        out = np.zeros((self.moves.count, 2, len(self.every.time), 3))
+        rows = np.arange(self.moves.count)
+        out[rows, :, self.moves.after] = E
+        out[rows, :, self.moves.before] = -E @ A
+        return out
+
+    def _common(self, W: Values, directions: Values) -> Values:
+        """Return what the accelerometer's errors have in common for different moves: (2 k, 2 k) array."""
+        n = 2 * len(W)
+        directions = np.einsum("kij,kjmc->kimc", W, directions)
+        means = np.einsum("kimc,mcd->kimd", directions, self.spread).reshape(n, -1)
+        calibration = np.einsum("kimc,mcp->kip", directions, self.shared).reshape(n, -1)
+        apart = np.kron(np.eye(len(W)), np.ones((2, 2))) == 0.0
+        common: Values = np.where(apart, means @ means.T, 0.0) + calibration @ calibration.T
+        return common
+
+    def _of_directions(self, W: Values, directions: Values, error: Values) -> Values:
+        """Return what errors of the rests' directions, as large as a typical white error, share: (2 k, 2 k) array."""
+        each = np.einsum("kij,kjmc,mcd->kimd", W, directions, self.across).reshape(2 * len(W), -1)
+        shared: Values = float(np.median(error)) ** 2 * each @ each.T
+        return shared
+
+    def _turned(self, state: State) -> tuple[Motion, Values, Values]:
+        """Return the motion of all samples of the moves, ``v = y - b - z`` and A."""
+        moves, K = self.moves, state.K
+        assert moves is not None  # noqa: S101
+        plain = moves.reading - state.bias
+        rate, A = self._integrated(plain, state)
+        v = plain
+        for _ in range(ROUNDS if state.terms else 0):
+            v = plain - added(self.sensor, state.terms, self._motion(rate, A), K).reshape(plain.shape)
+            before = rate
+            rate, A = self._integrated(v, state)
+            if np.abs(rate - before).max() < SETTLED_DPS:
+                break
+        return self._motion(rate, A), v, A
+
+    def _integrated(self, v: Values, state: State) -> tuple[Values, Values]:
+        assert self.moves is not None  # noqa: S101
+        rate = v @ state.matrix.T
+        return rate, to_the_end(rate, self.moves.time)
+
+    def _motion(self, rate: Values, A: Values) -> Motion:
+        assert self.moves is not None  # noqa: S101
+        end = np.einsum("kij,kj->ki", A[:, 0], self.before)
+        force = self.gravity * np.einsum("ksij,ki->ksj", A, end)
+        shape = (-1, 3)
+        warmth = self.moves.temperature.ravel()
+        return motion_of(self.moves.time.ravel(), force.reshape(shape), rate.reshape(shape), warmth, still=False)
+
+
+def _blocks(blocks: Sequence[Values | None], sizes: Sequence[int]) -> Values | None:
+    """Return blocks along the diagonal, zeros where one is None; None where all are."""
+    if all(block is None for block in blocks):
+        return None
+    out, at = np.zeros((sum(sizes), sum(sizes))), 0
+    for block, size in zip(blocks, sizes, strict=True):
+        if block is not None:
+            out[at : at + size, at : at + size] = block
+        at += size
+    return out

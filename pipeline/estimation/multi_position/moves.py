@@ -1,0 +1,218 @@
+"""Moves between rests: how the gyroscope's readings turn the direction of gravity.
+
+    dR/dt = R [omega]x,   R[k+1] = R[k] exp [phi_k]x,   phi_k = (omega_k + omega_k+1) dt/2 + omega_k x omega_k+1 dt^2/12
+    u_end = A_0 u_start,   A_k = R_end^T R_k,   du_end = u_end x sum_k A_k domega_k w_k
+
+where
+
+    omega : angular rate in the body frame, rad/s; between two samples a straight line (Savage 1998, coning term)
+    u     : unit vector along the specific force, in the body frame
+    A_k   : takes vectors from the body at sample k to the body at the end of the move
+    w_k   : weight of sample k in an integral by the trapezoidal rule, s
+
+Sampled slowly, a hand's accelerations begin and end between two samples. Where the rate bends there by s (deg/s^2), a
+share p of an interval behind the sample before, the second differences at both are ``d = (1 - p) s dt`` and
+``d' = p s dt``, and the rule is off by
+
+    s dt^2 p (1 - p) / 2 = dt d d' / (d + d') / 2
+
+which is taken off the readings where both stand out of the noise. Two bends the same way make four such differences in
+a row; or three, where they share a sample and cannot be told apart: then the rule is off by 0.12 d dt more (rms, both
+places anywhere) with d that is left over. More than four in a row are a rate that bends smoothly, and nothing is done.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.estimation.rest_means import sound_samples
+from pipeline.model.rotation import turn_by_vector
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.estimation.multi_position.rests import Rests
+    from pipeline.records import Recording
+
+    Values = NDArray[np.float64]
+
+LONGEST_S = 60.0
+GAP = 3.5  # intervals without a sample, over which a rate is not interpolated
+LEAST_TURN_DEG = 5.0
+FEWEST_STEPS = 100
+EQUAL_S = 2e-9
+MOSTLY = 0.9  # share of equal steps
+ROUNDED = 0.1  # of a step
+SMOOTH = 4
+UNTOLD = 0.12
+BENT = 8.0  # second difference over white noise, 2.4 of which is the noise's own
+
+
+@dataclass(frozen=True)
+class Moves:
+    """The samples of all moves, padded to the longest.
+
+    Attributes
+    ----------
+    before, after : (k,) array of int
+        Rests between which each move lies.
+    reading : (k, s, 3) array, deg/s
+        Less what the trapezoidal rule is off by bends between samples; the last sample is repeated.
+    time : (k, s) array, s
+    temperature : (k, s) array, degC
+        As of the rests before and after, in between by straight line; NaN where none was recorded.
+    weight : (k, s) array, s
+        0 beyond a move's end.
+    doubt : (k, s, 3) array, deg
+        Standard uncertainty, along one direction each, of the angle in the readings' axes: bends that share a sample.
+    """
+
+    before: NDArray[np.intp]
+    after: NDArray[np.intp]
+    reading: Values
+    time: Values
+    temperature: Values
+    weight: Values
+    doubt: Values
+
+    def select(self, index: NDArray[np.bool_]) -> Moves:
+        """Return some of the moves."""
+        return Moves(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
+
+    @property
+    def count(self) -> int:
+        """Number of moves."""
+        return len(self.before)
+
+
+def moves_of(recordings: Sequence[Recording], rests: Rests) -> Moves | None:
+    """Return the moves of which the rest at the end is for the fit, or None where there is none.
+
+    Left out are those with clipped, stuck or missing readings, with a gap, or longer than a minute.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+    rests : Rests
+        All of the gyroscope, also those held out.
+    """
+    found = []
+    for i, j in zip(range(len(rests.time) - 1), range(1, len(rests.time)), strict=True):
+        recording = recordings[rests.recording[j]]
+        span = slice(int(rests.span[i, 1]) - 1, int(rests.span[j, 0]) + 1)
+        if rests.held_out[j] or rests.recording[i] != rests.recording[j] or not _sound(recording, span):
+            continue
+        found.append((i, j, span))
+    if not found:
+        return None
+    clocks = {int(i): regular_time(recordings[i].time) for i in np.unique(rests.recording)}
+    longest = max(span.stop - span.start for _, _, span in found)
+    shape = (len(found), longest)
+    reading, time, weight = np.zeros((*shape, 3)), np.zeros(shape), np.zeros(shape)
+    for row, (_, j, span) in enumerate(found):
+        recording = recordings[rests.recording[j]]
+        n = span.stop - span.start
+        values = recording.gyroscope
+        assert values is not None  # noqa: S101
+        reading[row, :n], reading[row, n:] = values[span], values[span.stop - 1]
+        clock = clocks[int(rests.recording[j])]
+        time[row, :n], time[row, n:] = clock[span], clock[span.stop - 1]
+        step = np.diff(clock[span])
+        weight[row, : n - 1] += step / 2.0
+        weight[row, 1:n] += step / 2.0
+    taken, doubt = _bends(reading, weight, BENT * float(np.linalg.norm(rests.white)))
+    before, after = np.array([[i, j] for i, j, _ in found]).T
+    share = (time - rests.time[before][:, None]) / (rests.time[after] - rests.time[before])[:, None]
+    warm = rests.temperature[before][:, None]
+    temperature = warm + share * (rests.temperature[after][:, None] - warm)
+    return Moves(before, after, reading - taken, time, temperature, weight, doubt)
+
+
+def _bends(reading: Values, weight: Values, least: float) -> tuple[Values, Values]:
+    """Return what bends between samples make the trapezoidal rule take too much, and what stays in doubt.
+
+    Parameters
+    ----------
+    reading : (k, s, 3) array, deg/s
+    weight : (k, s) array, s
+    least : float, deg/s
+        Smaller second differences are none.
+
+    Returns
+    -------
+    taken : (k, s, 3) array, deg/s
+        As rates.
+    doubt : (k, s, 3) array, deg
+    """
+    second = np.diff(np.pad(reading, ((0, 0), (1, 1), (0, 0)), mode="edge"), n=2, axis=1)
+    second[np.linalg.norm(second, axis=2) < least] = 0.0
+    both = second[:, :-1] + second[:, 1:]
+    product = np.sum(second[:, :-1] * second[:, 1:], axis=2)
+    same = product > 0.0
+    place = np.zeros(weight.shape, np.intp)  # of each second difference among those the same way in a row
+    for j in range(1, weight.shape[1]):
+        place[:, j] = np.where(same[:, j - 1], place[:, j - 1] + 1, 0)
+    last = place.copy()
+    for j in range(weight.shape[1] - 2, -1, -1):
+        last[:, j] = np.where(same[:, j], last[:, j + 1], place[:, j])
+    bend = same & (place[:, :-1] % 2 == 0) & (last[:, :-1] < SMOOTH)
+    left = (place == 2) & (last == 2)  # the third of three
+    interval = np.max(weight, axis=1)[:, None]
+    shared = np.maximum(weight[:, :-1] + weight[:, 1:], 0.5 * interval)  # by the two samples that it is taken off
+    share = np.where(bend, 0.5 * interval * product / shared, 0.0) / np.maximum(np.sum(both**2, axis=2), 1e-300)
+    rate = share[:, :, None] * both
+    taken = np.zeros_like(reading)
+    taken[:, :-1] += rate
+    taken[:, 1:] += rate
+    return taken, UNTOLD * interval[:, :, None] * np.where(left[:, :, None], second, 0.0)
+
+
+def regular_time(time: Values) -> Values:
+    """Return stamps without the rounding of a regular clock: (n,) array, s; other stamps as they are.
+
+    A file that keeps six digits of a clock that ticks every 9.999 ms holds steps of 10 ms and now and then one of 9 ms,
+    over which 200 deg/s would be integrated wrongly by 0.2 deg. Nearly all steps are equal then, and all stamps lie
+    on a straight line to within a small part of a step; stamps of an irregular clock, or with a gap, do not.
+    """
+    steps = np.diff(time)
+    if len(steps) < FEWEST_STEPS or np.mean(np.abs(steps - np.median(steps)) < EQUAL_S) < MOSTLY:
+        return time
+    n = np.arange(len(time)) - 0.5 * (len(time) - 1)
+    line = time.mean() + n * float(n @ time) / float(n @ n)
+    return line if np.abs(time - line).max() <= ROUNDED * np.median(steps) else time
+
+
+def _sound(recording: Recording, span: slice) -> bool:
+    time = recording.time[span]
+    whole = bool(np.all(sound_samples(recording, "gyroscope")[span]))
+    return whole and len(time) > 2 and time[-1] - time[0] < LONGEST_S and np.diff(time).max() < GAP * recording.interval
+
+
+def to_the_end(rate: Values, time: Values) -> Values:
+    """Return A_k for every sample of every move: (k, s, 3, 3) array.
+
+    Parameters
+    ----------
+    rate : (k, s, 3) array, deg/s
+    time : (k, s) array, s
+    """
+    omega, dt = np.radians(rate), np.diff(time, axis=1)[:, :, None]
+    phi = 0.5 * (omega[:, 1:] + omega[:, :-1]) * dt + np.cross(omega[:, :-1], omega[:, 1:]) * dt**2 / 12.0
+    back = turn_by_vector(-phi)
+    A = np.empty((*rate.shape[:2], 3, 3))
+    A[:, -1] = np.eye(3)
+    for k in range(rate.shape[1] - 2, -1, -1):
+        np.matmul(A[:, k + 1], back[:, k], out=A[:, k])
+    return A
+
+
+def tangents(u: Values) -> Values:
+    """Return two unit vectors across each of (k, 3) unit vectors: (k, 2, 3) array."""
+    first = np.cross(u, np.eye(3)[np.argmin(np.abs(u), axis=1)])
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([first, np.cross(u, first)], axis=1)

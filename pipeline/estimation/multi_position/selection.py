@@ -1,0 +1,352 @@
+"""Which effects rests and moves ask for: forward selection with backward drop, as ``pipeline.estimation.selection``.
+
+    delta BIC > 10   and   m p < 0.01
+
+with the gain, delta BIC and p of ``estimation.multi_position.likelihood`` and m the number of candidates. After
+each acceptance all is fitted anew and every column is rebuilt there. An effect that would need ten times what the data
+sheet allows is no explanation of a few rests. Selected effects whose own delta BIC has become negative are dropped, and
+one that a rival replaces with delta BIC > 10 is exchanged.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.estimation.design import Term
+from pipeline.estimation.joint import starts_of
+from pipeline.estimation.multi_position.equations import noises_for
+from pipeline.estimation.multi_position.fit import HandFit, fit
+from pipeline.estimation.multi_position.likelihood import NEW, beside
+from pipeline.estimation.multi_position.model import State, candidates_for
+from pipeline.estimation.ranking import Score
+from pipeline.estimation.selection import GATE_BIC, GATE_P, MOST
+from pipeline.model.effect_limits import parameter_limits
+from pipeline.model.effects import catalogue, effect
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from typing import Any
+
+    from numpy.typing import NDArray
+
+    from pipeline.estimation.multi_position.equations import Equations, HandNoise
+    from pipeline.estimation.multi_position.likelihood import Beside
+    from pipeline.estimation.multi_position.model import Model
+    from pipeline.model.effects.base import Effect
+    from pipeline.records import Noise, SensorCalibration
+
+    Values = NDArray[np.float64]
+
+ROUNDS = 3 * MOST
+POSSIBLE = 10.0  # times its limits, beyond which an effect is no explanation
+FAR = 5.0  # times its limits, which keep an amplitude that goes with a time constant from running away
+COMPETES = 0.6  # share of the best delta BIC above which an effect is fitted to its optimum
+
+
+@dataclass(frozen=True)
+class Scored:
+    """Every candidate beside a model.
+
+    Attributes
+    ----------
+    scores : dict of str to Score
+        Of those in which the equations show anything.
+    visible : dict of str to float
+        Gain that each could reach on average with its parameters at their limits; infinite without limits.
+    shown : dict of str to array
+        Orthonormal directions of each at the model's best noise.
+    spare : dict of str to float
+        The factor on its gain; 0 where too few equations are left to judge it.
+    signal : dict of str to array
+        Its fitted, whitened signal there.
+    """
+
+    scores: dict[str, Score]
+    visible: dict[str, float]
+    shown: dict[str, Values]
+    spare: dict[str, float]
+    signal: dict[str, Values]
+
+
+@dataclass
+class HandSelection:
+    """What was selected, and how every candidate did.
+
+    Attributes
+    ----------
+    names : list of str
+    steps : dict of str to Score
+        Of each selected effect when it was accepted.
+    fits : list of HandFit
+        Base and configured effects, then with each further selected one; the last is the whole model.
+    first, last : Scored
+        Beside base and configured effects, and beside all that was selected.
+    own : dict of str to Scored
+        Every candidate beside all selected effects but one.
+    model : Model
+    noises : list of HandNoise
+    candidates : list of Effect
+    limits : dict of str to array
+    """
+
+    names: list[str]
+    steps: dict[str, Score]
+    fits: list[HandFit]
+    first: Scored
+    last: Scored
+    own: dict[str, Scored]
+    model: Model
+    noises: list[HandNoise]
+    candidates: list[Effect]
+    limits: dict[str, Values]
+
+
+def select(
+    model: Model,
+    start: SensorCalibration,
+    configured: Sequence[str],
+    noise: Noise | None,
+    sheet: Mapping[str, Any],
+) -> HandSelection:
+    """Select effects.
+
+    Parameters
+    ----------
+    model : Model
+    start : SensorCalibration
+        Where the fit of the base starts; its effects are starts of the configured ones.
+    configured : sequence of str
+    noise : Noise or None
+    sheet : mapping
+        The sensor's section of the configuration.
+    """
+    return _Search(model, start, configured, noise, sheet).run()
+
+
+def fit_configured(
+    model: Model,
+    start: SensorCalibration,
+    configured: Sequence[str],
+    noises: Sequence[HandNoise],
+    limits: Mapping[str, Values] | None = None,
+) -> HandFit:
+    """Fit base and configured effects, from the best of their starts."""
+    fits = []
+    for terms in starts_of(configured, model.sensor, start):
+        state = State(start.bias, start.matrix, tuple(Term(t.effect, np.array(t.values, float)) for t in terms))
+        fits.append(fit(model, state, noises, limits or {}))
+    return max(fits, key=lambda found: found.log_likelihood)
+
+
+def limits_of(sensor: str, sheet: Mapping[str, Any]) -> dict[str, Values]:
+    """Return the limits of every effect's parameters, infinite where the data sheet has none."""
+    given = sheet.get("effects") or {}
+    return {name: parameter_limits(e, sensor, given) for name, e in catalogue().items() if sensor in e.sensors}
+
+
+class _Search:
+    """The state of a selection."""
+
+    def __init__(
+        self,
+        model: Model,
+        start: SensorCalibration,
+        configured: Sequence[str],
+        noise: Noise | None,
+        sheet: Mapping[str, Any],
+    ) -> None:
+        self.model = model
+        self.noises = noises_for(noise, model.kinds)
+        self.limits = limits_of(model.sensor, sheet)
+        self.effects = candidates_for(model.sensor, model.rests, configured)
+        self.kept_near = {n: FAR * limit for n, limit in self.limits.items() if effect(n).nonlinear}
+        self.base = fit_configured(model, start, configured, self.noises, self.kept_near)
+        self.held = len(self.base.state.terms)
+        self.names: list[str] = []
+        self.steps: dict[str, Score] = {}
+        self.fit = self.base
+        self.known: dict[tuple[tuple[str, ...], tuple[str, ...]], Scored] = {}
+
+    def run(self) -> HandSelection:
+        first = scored = self._scored([])
+        for _ in range(ROUNDS):
+            best = self._best(scored) if len(self.names) < MOST else None
+            if best is not None:
+                self._add(best)
+                self._drop()
+            elif not self._exchange():
+                break
+            scored = self._scored(self.names)
+        return HandSelection(
+            self.names,
+            self.steps,
+            self._ladder(),
+            first,
+            scored,
+            {name: self._own(name) for name in self.names},
+            self.model,
+            self.noises,
+            self.effects,
+            self.limits,
+        )
+
+    def _scored(self, names: Sequence[str]) -> Scored:
+        """Score every effect beside base, configured and some of the selected effects."""
+        key = tuple(self.names), tuple(names)
+        if key not in self.known:
+            self.known[key] = self._score_all(names)
+        return self.known[key]
+
+    def _score_all(self, names: Sequence[str]) -> Scored:
+        terms, found, equations = self._beside(names)
+        before, at = found.of_model()
+        out = Scored({}, {}, {}, {}, {})
+        for j, term in enumerate(terms):
+            name, count = term.effect.name, found.count(j, at)
+            if count == 0:
+                continue
+            added = count + len(term.effect.nonlinear)
+            factor = found.correction(j, at, added, equations.scatter)
+            after, own = found.of_candidate(j)
+            gain = factor * max(2.0 * (after - before), 0.0)
+            score = self._score(term, added, gain, found.raw[j][own], found.residual[own])
+            score = replace(score, log_likelihood=after, setting=own, admissible=factor > 0.0)
+            if name in out.scores and out.scores[name].delta_bic >= score.delta_bic:
+                continue
+            shown = found.shown(j, at)
+            out.scores[name], out.spare[name], out.shown[name] = score, factor, shown
+            out.signal[name] = shown @ (shown.T @ found.residual[at])
+            out.visible[name] = self._reach(term, found.raw[j][at], factor)
+        self._refine(out, names, before)
+        return out
+
+    def _beside(self, names: Sequence[str]) -> tuple[list[Term], Beside, Equations]:
+        """Return the candidates beside some of the selected effects, and their columns."""
+        kept = [t for i, t in enumerate(self.fit.state.terms) if i < self.held or t.effect.name in names]
+        fitted = {term.effect.name: term.values for term in self.fit.state.terms}
+        terms = []
+        for this in self.effects:
+            if this.name in fitted and this.name not in names:
+                terms.append(Term(this, _silent(this, self.model.sensor, fitted[this.name])))
+            elif this.name not in names:
+                terms += [Term(this, values) for values in this.starts(self.model.sensor)]
+        equations = self.model.equations(replace(self.fit.state, terms=tuple(kept)), terms)
+        return terms, beside(equations, self.noises), equations
+
+    def _score(self, term: Term, added: int, gain: float, raw: Values, residual: Values) -> Score:
+        """Return the score of a candidate after one linear step."""
+        from scipy.special import chdtrc  # noqa: PLC0415  (0.1 s that only rankings pay)
+
+        inverse = np.linalg.pinv(raw, rcond=NEW)
+        n, step = len(residual), inverse @ residual
+        left = residual - raw @ step
+        values = term.values + step
+        uncertainty = np.sqrt(max(1.0, float(left @ left) / n) * np.sum(inverse**2, axis=1))
+        return Score(
+            term.effect.name,
+            gain - added * float(np.log(n)),
+            float(chdtrc(added, gain)),
+            added,
+            values,
+            uncertainty,
+            0.0,
+            0,
+            plausible=bool(np.all(np.abs(values) - 2.0 * uncertainty <= self.limits[term.effect.name])),
+        )
+
+    def _reach(self, term: Term, raw: Values, factor: float) -> float:
+        """Return the gain that an effect at its limits reaches on average."""
+        limit = self.limits[term.effect.name]
+        seen = np.linalg.norm(raw, axis=0) > 0.0
+        power = float(np.sum((limit[seen] * np.linalg.norm(raw[:, seen], axis=0)) ** 2))
+        return factor * len(raw) * float(np.log1p(power / len(raw)))
+
+    def _refine(self, scored: Scored, names: Sequence[str], before: float) -> None:
+        """Take those that compete to their optimum, where one linear step may not lead there."""
+        from scipy.special import chdtrc  # noqa: PLC0415  (as above)
+
+        top = max((s.delta_bic for s in scored.scores.values()), default=0.0)
+        for score in list(scored.scores.values()):
+            curved = bool(effect(score.name).nonlinear) or (self.model.kinds > 1 and top > GATE_BIC)
+            if not curved or score.delta_bic < max(COMPETES * top, 0.0):
+                continue
+            terms = [t for i, t in enumerate(self.fit.state.terms) if i < self.held or t.effect.name in names]
+            start = replace(self.fit.state, terms=(*terms, Term(effect(score.name), score.values)))
+            found = fit(self.model, start, self.noises, self.kept_near)
+            gain = max(2.0 * (found.log_likelihood - before), 0.0) * scored.spare[score.name]
+            scored.scores[score.name] = replace(
+                score,
+                delta_bic=gain - score.parameters * float(np.log(len(found.residual))),
+                p_value=float(chdtrc(score.parameters, gain)),
+                values=found.state.terms[-1].values,
+                log_likelihood=found.log_likelihood,
+            )
+
+    def _best(self, scored: Scored) -> Score | None:
+        """Return the candidate to accept; of two within the gate of each other a plausible one goes first."""
+        passing = [s for s in scored.scores.values() if s.name not in self.names and self._passes(s)]
+        worth = {s.name: s.delta_bic - (0.0 if s.plausible else GATE_BIC) for s in passing}
+        return max(passing, key=lambda s: worth[s.name], default=None)
+
+    def _passes(self, score: Score) -> bool:
+        held = [term.effect.name for term in self.fit.state.terms]
+        if any(score.name in effect(name).contains or name in effect(score.name).contains for name in held):
+            return False
+        significant = score.delta_bic > GATE_BIC and score.p_value * len(self.effects) < GATE_P
+        return score.admissible and significant and self._possible(score)
+
+    def _possible(self, score: Score) -> bool:
+        """Return whether an effect needs no more than ten times its limits: beyond, it is no explanation."""
+        least = np.abs(score.values) - 2.0 * score.uncertainty
+        return bool(np.all(least <= POSSIBLE * self.limits[score.name]))
+
+    def _add(self, score: Score) -> None:
+        self.names.append(score.name)
+        self.steps[score.name] = score
+        terms = (*self.fit.state.terms, Term(effect(score.name), score.values))
+        self.fit = fit(self.model, replace(self.fit.state, terms=terms), self.noises, self.kept_near)
+
+    def _remove(self, name: str) -> None:
+        self.names.remove(name)
+        del self.steps[name]
+        terms = tuple(t for t in self.fit.state.terms if t.effect.name != name)
+        self.fit = fit(self.model, replace(self.base.state, terms=terms), self.noises, self.kept_near)
+
+    def _own(self, name: str) -> Scored:
+        return self._scored([n for n in self.names if n != name])
+
+    def _drop(self) -> None:
+        for name in self.names[:-1]:
+            own = self._own(name).scores.get(name)
+            if own is None or own.delta_bic < 0.0:
+                self._remove(name)
+
+    def _exchange(self) -> bool:
+        """Replace a selected effect by one that explains clearly more in its place."""
+        for name in self.names:
+            scores = self._own(name).scores
+            own = scores[name].delta_bic if name in scores else float("-inf")
+            rivals = [s for s in scores.values() if s.name not in self.names and s.admissible and self._possible(s)]
+            rival = max(rivals, key=lambda s: s.delta_bic, default=None)
+            if rival is not None and rival.delta_bic > own + GATE_BIC:
+                self._remove(name)
+                self._add(rival)
+                return True
+        return False
+
+    def _ladder(self) -> list[HandFit]:
+        """Return the fits of the base and with each further selected effect."""
+        fits = [self.base]
+        for count in range(1, len(self.names)):
+            terms = self.fit.state.terms[: self.held + count]
+            fits.append(fit(self.model, replace(self.fit.state, terms=terms), self.noises, self.kept_near))
+        return [*fits, self.fit] if self.names else fits
+
+
+def _silent(this: Effect, sensor: str, values: Values) -> Values:
+    """Return parameters at which an effect adds nothing, its nonlinear ones as they are."""
+    nonlinear = [p.name in this.nonlinear for p in this.parameters(sensor)]
+    return np.where(nonlinear, values, 0.0)

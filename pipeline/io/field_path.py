@@ -1,0 +1,161 @@
+"""Paths to numbers within messages: ``linear_acceleration.x``, ``acc[0]``, ``samples[2].value``, ``position[table]``.
+
+``[2]`` counts from 0. ``[table]`` is the element whose name, in the list ``name`` beside it, is ``table``
+(sensor_msgs/JointState); ``[*]`` is the only element. A path to a moment ends at a message with seconds and
+nanoseconds.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from decimal import Decimal
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pipeline.io.message_template import Place, Template
+
+ONLY = "*"
+NAMES = "name"
+STAMPS = (("sec", "nanosec"), ("secs", "nsecs"), ("seconds", "nanos"), ("sec", "nsec"))
+_STEP = re.compile(r"([^.\[\]]+)((?:\[\d+\])*)")
+_LAST = re.compile(r"(.*?)(?:\[([^\[\]]+)\])?")
+
+
+@dataclass(frozen=True)
+class FieldPath:
+    """A path, cut into its steps.
+
+    Attributes
+    ----------
+    text : str
+        As written.
+    base : str
+        Without the last index.
+    index : int, str or None
+        The last index: a number, a name, ``*``, or none.
+    """
+
+    text: str
+    base: str
+    index: int | str | None
+
+    @classmethod
+    def parse(cls, text: str) -> FieldPath:
+        """Cut a path; ``ValueError`` if it is none."""
+        match = _LAST.fullmatch(text)
+        base, last = match.groups() if match else ("", None)
+        if not all(_STEP.fullmatch(part) for part in base.split(".")):
+            raise ValueError(f"{text!r} is no path to a field, such as linear_acceleration.x or position[table]")
+        return cls(text, base, int(last) if last is not None and last.isdigit() else last)
+
+    @property
+    def steps(self) -> list[str | int]:
+        """Names and indices of the base, in order."""
+        found: list[str | int] = []
+        for part in self.base.split("."):
+            name, _, rest = part.partition("[")
+            found.append(name)
+            found += [int(i) for i in re.findall(r"\d+", rest)]
+        return found
+
+    @property
+    def names(self) -> FieldPath:
+        """Path to the list of names beside the numbers."""
+        parent = self.base.rpartition(".")[0]
+        base = f"{parent}.{NAMES}" if parent else NAMES
+        return FieldPath(base, base, None)
+
+
+def place_of(path: FieldPath, template: Template) -> tuple[int, str] | None:
+    """Return the byte and the type of a number in a template; None if it stands in an empty list.
+
+    Raises
+    ------
+    ValueError
+        If the message has no such number.
+    """
+    place: Place | None = template.places.get(path.base)
+    if place is None:
+        raise ValueError(f"it has no number {path.base}; it has {', '.join(template.places)}")
+    if place.count is None or path.index is None:
+        if place.count is not None or path.index is not None:
+            raise ValueError(f"{path.text} is {'one number' if place.count is None else 'a list, and needs an index'}")
+        return place.offset, place.code
+    index = path.index
+    if isinstance(index, str):
+        found = _named(path, place.count, template.texts.get(path.names.base))
+        if found is None:
+            return None
+        index = found
+    if index >= place.count:
+        raise ValueError(f"{path.base} has {place.count} elements, too few for {path.text}")
+    return place.offset + index * int(place.code[2:]), place.code
+
+
+def _named(path: FieldPath, count: int, names: object) -> int | None:
+    """Return which element bears a name; None for an empty list."""
+    if not isinstance(names, list):
+        raise ValueError(f"{path.names.base} is no list of names, which {path.text} needs")  # noqa: TRY004
+    if path.index == ONLY and len(names) != 1:
+        raise ValueError(f"it has the joints {', '.join(names)}; set ingest.mcap.joint")
+    if path.index not in (ONLY, *names):
+        raise ValueError(f"{path.index} is not among its names, which are {', '.join(names) or 'none'}")
+    if count == 0:
+        return None
+    if count != len(names):
+        raise ValueError(f"it has {count} numbers of {path.base} for {len(names)} joints")
+    return 0 if path.index == ONLY else names.index(str(path.index))
+
+
+def look_up(path: FieldPath, message: object) -> Any:  # noqa: ANN401  (a number, or a message)
+    """Return what a path leads to in a decoded message; None if it is an element of an empty list."""
+    value: Any = message
+    for step in path.steps:
+        value = _step(value, step, path)
+    if path.index is None:
+        return value
+    if isinstance(path.index, int):
+        return _step(value, path.index, path)
+    index = _named(path, len(value), list(look_up(path.names, message)))
+    return None if index is None else value[index]
+
+
+def _step(value: Any, step: str | int, path: FieldPath) -> Any:  # noqa: ANN401
+    descriptor = getattr(value, "DESCRIPTOR", None)
+    if descriptor is not None and isinstance(step, str):
+        known = descriptor.fields_by_name.get(step)
+        if known is None:
+            raise ValueError(f"it has no field {path.text}; there are {', '.join(descriptor.fields_by_name)}")
+        if known.has_presence and not value.HasField(step):
+            raise ValueError(f"it does not say {step} of {path.text}")
+        return getattr(value, step)
+    try:
+        return getattr(value, step) if isinstance(step, str) and not isinstance(value, dict) else value[step]
+    except (AttributeError, KeyError, IndexError, TypeError) as error:
+        known_names = list(value) if isinstance(value, dict) else getattr(value, "__slots__", [])
+        raise ValueError(f"it has no field {path.text}; there are {', '.join(map(str, known_names))}") from error
+
+
+def number_at(path: FieldPath, message: object) -> float | None:
+    """Return a number of a decoded message; None if it is an element of an empty list."""
+    value = look_up(path, message)
+    if value is None and path.index is not None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | float | Decimal):
+        raise ValueError(f"{path.text} is {value!r}; a number is expected")  # noqa: TRY004
+    return float(value)
+
+
+def stamp_at(path: FieldPath, message: object) -> tuple[int, int] | int | Decimal:
+    """Return the moment at a path of a decoded message: (seconds, nanoseconds), or one number."""
+    value = look_up(path, message)
+    if isinstance(value, int | float | Decimal) and not isinstance(value, bool):
+        return value if isinstance(value, int) else Decimal(value)
+    if isinstance(value, str) and value.isdigit():
+        return int(value)
+    for names in STAMPS:
+        pair = [value.get(n) if isinstance(value, dict) else getattr(value, n, None) for n in names]
+        if isinstance(pair[0], int) and isinstance(pair[1], int):
+            return pair[0], pair[1]
+    raise ValueError(f"{path.text} is {value!r}; a number, or seconds and nanoseconds, are expected")

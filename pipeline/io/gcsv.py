@@ -1,0 +1,145 @@
+"""Gyroflow's self-describing log, ``.gcsv``: scales, orientation and column names stand in the file itself.
+
+    GYROFLOW IMU LOG            (or CAMERA IMU LOG)
+    version,1.3
+    orientation,YxZ
+    tscale,0.001                time [s]                  = tscale * t
+    gscale,0.00122173047        angular rate [rad/s]      = gscale * count
+    ascale,0.00048828125        specific force [g]        = ascale * count
+    t,gx,gy,gz,ax,ay,az
+    0,39,86,183,-1137,-15689,-2986
+
+Source: docs.gyroflow.xyz/app/technical-details/gcsv-format (versions 1.0 to 1.3). The orientation names, for the
+body's x, y and z, the reading that points along it, in capitals, or against it, in small letters. A magnetometer
+(``mx`` ..) is not used. Columns with canonical names (``temperature_degc``, ``table_angle_deg`` ...) may follow, in the
+unit that the name says. A recording without an accelerometer holds ``t,gx,gy,gz``.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from typing import TYPE_CHECKING
+
+from pipeline.io.csv_settings import Column, CsvFormat
+from pipeline.io.ingest_error import IngestError
+from pipeline.io.text_file import refuse_foreign, unchanged
+from pipeline.io.units import ATTITUDE, COUNTS, DEGREES, TRIADS
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from pipeline.io.channel_table import ChannelTable
+    from pipeline.io.checks import Checks
+
+FIRST_LINES = (b"GYROFLOW IMU LOG", b"CAMERA IMU LOG")
+LONGEST_HEADER = 1 << 16
+LAST_VERSION = "1.3"
+EXTRA = {
+    "temperature_degc": ("temperature", "degC"),
+    "table_angle_deg": ("table_angle", "deg"),
+    "table_rate_dps": ("table_rate", "deg/s"),
+    **{name: (name, "1") for name in ATTITUDE},
+}
+
+
+@dataclass(frozen=True)
+class Description:
+    """What the head of a ``.gcsv`` file says.
+
+    Attributes
+    ----------
+    format : CsvFormat
+    orientation : tuple of str
+        Body axis that each reading axis x, y, z points along, as ``sensor.axis_map``.
+    facts : dict of str to str
+        All lines of the head.
+    """
+
+    format: CsvFormat
+    orientation: tuple[str, str, str]
+    facts: dict[str, str]
+
+
+def read_gcsv(path: Path, checks: Checks) -> ChannelTable:
+    """Read a ``.gcsv`` file, in the axes that its orientation says; raw counts stay integers.
+
+    Raises
+    ------
+    IngestError
+        If the head is not that of such a file, or as for any text log.
+    """
+    from pipeline.io.axes import to_body_axes  # noqa: PLC0415
+    from pipeline.io.csv_read import read_one  # noqa: PLC0415
+
+    description = describe(path)
+    table = read_one(path, description.format, checks)
+    table = to_body_axes(table, dict.fromkeys(TRIADS, description.orientation))
+    kept = {k: v for k, v in description.facts.items() if k in ("id", "note", "fwversion", "vendor", "orientation")}
+    return replace(table, source={**table.source, "gcsv": kept})
+
+
+def describe(path: Path) -> Description:
+    """Read the head of a ``.gcsv`` file."""
+    with unchanged(path), path.open("rb") as stream:
+        start = stream.read(LONGEST_HEADER)
+    refuse_foreign(start[:16], str(path))
+    lines = start.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n").split(b"\n")
+    if not any(lines[0].startswith(first) for first in FIRST_LINES):
+        raise IngestError(
+            f"not a .gcsv file: it starts with {lines[0][:40]!r}, GYROFLOW IMU LOG is expected",
+            f"{path}:1",
+            fault="gcsv",
+        )
+    facts: dict[str, str] = {}
+    for number, line in enumerate(lines[1:], 1):
+        cells = [c.strip() for c in line.decode("utf-8", "replace").split(",")]
+        if cells[0] in ("t", "time"):
+            return Description(_format(cells, facts, number, path), _orientation(facts, path), facts)
+        if len(cells) > 1:
+            facts[cells[0]] = ",".join(cells[1:])
+    raise IngestError("the head of the file has no line of column names (t,gx,gy,gz,...)", str(path), fault="gcsv")
+
+
+def _format(names: list[str], facts: dict[str, str], skip: int, path: Path) -> CsvFormat:
+    version = facts.get("version", "1")
+    if version.split(".")[0] != "1":
+        raise IngestError(
+            f"version {version} of .gcsv is not known; known are 1 to {LAST_VERSION}", str(path), fault="gcsv"
+        )
+    tick = Fraction(_number(facts, "tscale", path)) * 1_000_000_000
+    columns = [Column("time", names[0], "s")]
+    for sensor, letter, scale, factor in (("gyroscope", "g", "gscale", DEGREES), ("accelerometer", "a", "ascale", 1.0)):
+        present = [f"{letter}{axis}" for axis in "xyz" if f"{letter}{axis}" in names]
+        if present:
+            per_unit = 1.0 / (float(Fraction(_number(facts, scale, path))) * factor)
+            columns += [
+                Column(channel, f"{letter}{channel[-1]}", COUNTS, counts_per_unit=per_unit)
+                for channel in TRIADS[sensor]
+            ]
+    columns += [Column(channel, name, unit, optional=True) for name, (channel, unit) in EXTRA.items()]
+    return CsvFormat(",", header=True, skip_lines=skip, rate_hz=None, columns=tuple(columns), tick_ns=tick)
+
+
+def _number(facts: dict[str, str], key: str, path: Path) -> str:
+    text = facts.get(key, "")
+    if not re.fullmatch(r"\+?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", text) or float(text) == 0:
+        what = f"is {text!r}" if text else "is missing"
+        raise IngestError(
+            f"{key} {what}; a positive number is expected in the head of the file", str(path), fault="gcsv"
+        )
+    return text
+
+
+def _orientation(facts: dict[str, str], path: Path) -> tuple[str, str, str]:
+    """Return the axis map of an orientation: body axis j is the reading named by letter j."""
+    text = facts.get("orientation", "XYZ")
+    if sorted(text.lower()) != ["x", "y", "z"]:
+        raise IngestError(
+            f"orientation is {text!r}; it names X, Y and Z once each, small where turned round", str(path), fault="gcsv"
+        )
+    found = {
+        letter.lower(): ("+" if letter.isupper() else "-") + body for letter, body in zip(text, "xyz", strict=True)
+    }
+    return found["x"], found["y"], found["z"]

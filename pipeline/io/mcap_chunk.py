@@ -1,0 +1,244 @@
+"""Where the messages lie in a run of records (a chunk, or what stands between chunks), proven for every byte.
+
+A run is cut by following the lengths from record to record:
+
+    start_0 = 0,   start_{i+1} = start_i + 9 + length_i,   and the last record ends where the run ends
+
+Three ways find the same cuts. If all records look alike the starts are an arithmetic series; if the file has an index
+the starts are its offsets; else the lengths are followed one by one. The first two are guesses that numpy compares with
+the rule above for all records at once, so that neither a series nor an index is believed.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from pipeline.io.mcap_records import MESSAGE, MESSAGE_HEAD, RECORD_HEAD, Cursor
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+LARGEST_CHUNK = 1 << 30  # bytes; recorders write about 1 MiB
+LARGEST_EXPANSION = 1000
+ALWAYS_ALLOWED = 1 << 24  # bytes; a small chunk of equal bytes packs better than any log
+HEAD = np.dtype(
+    {
+        "names": ["opcode", "length", "channel", "sequence", "log_time", "publish_time"],
+        "formats": ["u1", "<u8", "<u2", "<u4", "<u8", "<u8"],
+        "offsets": [0, 1, 9, 11, 15, 23],
+        "itemsize": RECORD_HEAD + MESSAGE_HEAD,
+    }
+)
+_RECORD = struct.Struct("<BQ")
+
+
+@dataclass
+class Run:
+    """Records that lie one after the other.
+
+    Attributes
+    ----------
+    data : bytes
+    offset : int
+        Byte of the file at which they, or their chunk, begin.
+    name : str
+        For messages, ``chunk 3`` for example.
+    index : dict of int to (n,) array of int64
+        Channel to the offsets that the file's index gives; may be wrong.
+    """
+
+    data: bytes | memoryview
+    offset: int
+    name: str
+    index: dict[int, NDArray[np.int64]] = field(default_factory=dict)
+
+
+@dataclass
+class Rows:
+    """The messages of one channel in one run.
+
+    Attributes
+    ----------
+    channel : int
+    data : (m,) array of uint8
+        The run.
+    heads : (n,) structured array
+        Opcode, length, channel, sequence and times of each message.
+    starts : (n,) array of int64
+        Where the payload of each message begins in ``data``.
+    sizes : (n,) array of int64
+        Bytes of each payload.
+    stride : int
+        Distance of the starts where it is the same for all, else 0.
+    run : Run
+    """
+
+    channel: int
+    data: NDArray[np.uint8]
+    heads: NDArray[np.void]
+    starts: NDArray[np.int64]
+    sizes: NDArray[np.int64]
+    stride: int
+    run: Run
+
+    def payload(self, row: int) -> bytes:
+        """Return the data of one message."""
+        start = int(self.starts[row])
+        return self.data[start : start + int(self.sizes[row])].tobytes()
+
+    def payloads(self) -> Iterator[bytes]:
+        """Return the data of each message."""
+        return map(self.payload, range(len(self.starts)))
+
+    def table(self, layout: np.dtype[np.void]) -> NDArray[np.void]:
+        """Return all messages, each as one item of a layout of their common size."""
+        if self.stride:
+            return np.ndarray(len(self.starts), layout, self.data.data, int(self.starts[0]), (self.stride,))
+        windows = sliding_window_view(self.data, layout.itemsize)[self.starts]
+        return np.asarray(windows.view(layout)[:, 0])
+
+
+def unpack(content: bytes, expected: int, compression: str) -> bytes | memoryview:
+    """Return a chunk's records.
+
+    Parameters
+    ----------
+    content : bytes
+        As they lie in the file.
+    expected : int
+        How many bytes the chunk claims to hold.
+    compression : str
+        Empty, ``zstd`` or ``lz4``.
+
+    Raises
+    ------
+    ValueError
+        If the claim is too large for any log, before memory is taken, or not what the chunk holds.
+    """
+    if expected > min(LARGEST_CHUNK, max(ALWAYS_ALLOWED, LARGEST_EXPANSION * len(content))):
+        raise ValueError(f"a chunk claims to hold {expected} bytes, packed into {len(content)}: damaged, or no log")
+    data: bytes | memoryview
+    if compression == "zstd":
+        import zstandard  # noqa: PLC0415
+
+        promised = zstandard.get_frame_parameters(content).content_size
+        if promised not in (expected, zstandard.CONTENTSIZE_UNKNOWN):
+            raise ValueError(f"a chunk claims to hold {expected} bytes, and its zstd frame says {promised}")
+        data = zstandard.ZstdDecompressor().decompress(content, max_output_size=max(1, expected)) if expected else b""
+    elif compression == "lz4":
+        import lz4.frame  # noqa: PLC0415
+
+        unpacker = lz4.frame.LZ4FrameDecompressor()
+        data = unpacker.decompress(content, max_length=expected + 1) if expected else b""
+    elif compression == "":
+        data = content
+    else:
+        raise ValueError(f"a chunk is packed with {compression!r}; zstd, lz4 and none are supported")
+    if len(data) != expected:
+        raise ValueError(f"a chunk claims to hold {expected} bytes and holds {len(data)}")
+    return data
+
+
+def split(run: Run) -> tuple[list[tuple[int, memoryview]], list[Rows]]:
+    """Cut a run into its messages and its other records.
+
+    Returns
+    -------
+    others : list of (opcode, content)
+    rows : list of Rows
+        One for each channel.
+
+    Raises
+    ------
+    ValueError
+        If the records do not fill the run.
+    """
+    data = np.frombuffer(run.data, np.uint8)
+    first, others = _leading(run.data)
+    if first == len(data):
+        return others, []
+    whole = _alike(run, data, first)
+    if whole is not None:
+        return others, [whole]
+    starts = _indexed(run, data, first)
+    if starts is None:
+        starts, more = _followed(run.data, first)
+        others += more
+    return others, _by_channel(run, data, starts)
+
+
+def _leading(data: bytes | memoryview) -> tuple[int, list[tuple[int, memoryview]]]:
+    """Return where the first message begins, and the records before it."""
+    starts, others = _followed(data, 0, stop_at_message=True)
+    return (int(starts[0]) if starts.size else len(data)), others
+
+
+def _followed(
+    data: bytes | memoryview, start: int, *, stop_at_message: bool = False
+) -> tuple[NDArray[np.int64], list[tuple[int, memoryview]]]:
+    """Follow the lengths from record to record: the starts of the messages, and the other records."""
+    view, end, starts, others = memoryview(data), len(data), [], []
+    while start < end:
+        if start + RECORD_HEAD > end:
+            raise ValueError(f"{end - start} bytes are left after the last record of a chunk")
+        opcode, length = _RECORD.unpack_from(view, start)
+        after = start + RECORD_HEAD + length
+        if after > end or opcode == 0 or (opcode == MESSAGE and length < MESSAGE_HEAD):
+            raise ValueError(f"a record of kind {opcode} with {length} bytes does not fit at byte {start} of a chunk")
+        if opcode == MESSAGE:
+            starts.append(start)
+            if stop_at_message:
+                break
+        else:
+            others.append((opcode, view[start + RECORD_HEAD : after]))
+        start = after
+    return np.array(starts, np.int64), others
+
+
+def _alike(run: Run, data: NDArray[np.uint8], first: int) -> Rows | None:
+    """Return the messages if from the first one on all are of one channel and one length."""
+    cursor = Cursor(memoryview(run.data)[first + 1 :])
+    length, channel = cursor.number(8), cursor.number(2)
+    stride = RECORD_HEAD + length
+    count, rest = divmod(len(data) - first, stride)
+    if rest:
+        return None
+    heads = np.ndarray(count, HEAD, data.data, first, (stride,))
+    if not ((heads["opcode"] == MESSAGE) & (heads["length"] == length) & (heads["channel"] == channel)).all():
+        return None
+    starts = first + HEAD.itemsize + stride * np.arange(count, dtype=np.int64)
+    return Rows(channel, data, heads, starts, np.full(count, length - MESSAGE_HEAD), stride, run)
+
+
+def _indexed(run: Run, data: NDArray[np.uint8], first: int) -> NDArray[np.int64] | None:
+    """Return the starts that the index gives if following the lengths gives the same."""
+    if not run.index:
+        return None
+    starts = np.sort(np.concatenate(list(run.index.values())))
+    if not (len(starts) and starts[0] == first and starts[-1] + HEAD.itemsize <= len(data)):
+        return None
+    heads = _heads(data, starts)
+    fitting = (heads["opcode"] == MESSAGE) & (heads["length"] >= MESSAGE_HEAD) & (heads["length"] <= len(data))
+    ends = starts + RECORD_HEAD + heads["length"].astype(np.int64)
+    return starts if fitting.all() and np.array_equal(ends, np.append(starts[1:], len(data))) else None
+
+
+def _heads(data: NDArray[np.uint8], starts: NDArray[np.int64]) -> NDArray[np.void]:
+    return np.asarray(sliding_window_view(data, HEAD.itemsize)[starts].view(HEAD)[:, 0])
+
+
+def _by_channel(run: Run, data: NDArray[np.uint8], starts: NDArray[np.int64]) -> list[Rows]:
+    heads = _heads(data, starts)
+    rows = []
+    for channel in np.unique(heads["channel"]).tolist():
+        own = heads["channel"] == channel
+        sizes = heads["length"][own].astype(np.int64) - MESSAGE_HEAD
+        rows.append(Rows(channel, data, heads[own], starts[own] + HEAD.itemsize, sizes, 0, run))
+    return rows

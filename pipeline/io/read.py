@@ -1,0 +1,240 @@
+"""All recordings of one unit: files found, read, checked, turned into body axes, their clocks compared.
+
+Times of a unit count from power-on. Where the times of two files overlap they cannot be one clock (each file starts at
+0), and the time between the recordings is unknown. Times since 1970 are counted from the unit's first sample instead: a
+double holds 1.7*10^9 s to 2*10^-7 s only, too coarse to differentiate.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.errors import MissingInputError
+from pipeline.io.axes import STRAIGHT, axis_maps, to_body_axes
+from pipeline.io.checks import checks_of
+from pipeline.io.disturbances import leave_out_disturbances
+from pipeline.io.files import candidate_files, recording_files
+from pipeline.io.ingest_error import IngestError
+from pipeline.io.plausibility import examine
+from pipeline.io.shaken_rests import leave_out_shaken_rests
+from pipeline.io.table_log import unwrapped
+from pipeline.io.units import ATTITUDE, TABLE_CHANNELS, TRIADS
+from pipeline.records import Note, Recording
+from pipeline.records.attitude import rate_of_attitude
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from pipeline.io.channel_table import ChannelTable
+    from pipeline.io.checks import Checks
+    from pipeline.io.csv_settings import CsvFormat
+
+EPOCH_AFTER_NS = 100_000_000 * 1_000_000_000  # 3 years: no sensor has been on for longer
+
+
+def read_recordings(
+    procedure: Mapping[str, Any], ingest: Mapping[str, Any], sensor: Mapping[str, Any], folder: Path
+) -> list[Recording]:
+    """Read all recordings of a unit.
+
+    Parameters
+    ----------
+    procedure, ingest, sensor : mapping
+        Sections of the unit's configuration.
+    folder : Path
+        Where the unit's recordings lie.
+
+    Returns
+    -------
+    list of Recording
+        In the order of the procedure; optional ones that do not exist are left out.
+
+    Raises
+    ------
+    MissingInputError
+        If files that are not optional do not exist; one error names all.
+    InputError
+        If a file cannot be used; ``file`` holds its path, and line where there is one.
+    ConfigurationError
+        If the ingest profile or the axis map is no such thing.
+    """
+    files = recording_files(procedure, ingest, folder)
+    wanted = candidate_files(procedure, ingest)
+    _check_complete(procedure, files, wanted, folder)
+    checks, read = checks_of(ingest), table_reader(ingest)
+    recordings = []
+    for name, paths in files.items():
+        table = read(paths)
+        other = [f for c in wanted[name] for f in c if folder / f not in paths and (folder / f).exists()]
+        recording = to_recording(name, procedure["recordings"][name], table, sensor, checks)
+        if other:
+            detail = f"{', '.join(other)} exists too and was not read"
+            recording = replace(recording, notes=(*recording.notes, Note("N-NOTREAD", len(other), 0, 0, detail)))
+        recordings.append(recording)
+    _check_different(recordings)
+    return _compare_clocks(recordings)
+
+
+def read_table(paths: Sequence[Path], ingest: Mapping[str, Any]) -> ChannelTable:
+    """Read the file or files of one recording, by their suffix."""
+    return table_reader(ingest)(paths)
+
+
+def table_reader(ingest: Mapping[str, Any]) -> Callable[[Sequence[Path]], ChannelTable]:
+    """Return ``read_table`` for files of one profile, which is checked once, when the first of its kind is read."""
+
+    @cache
+    def csv_layouts() -> list[CsvFormat]:
+        from pipeline.io.csv_settings import csv_formats  # noqa: PLC0415
+
+        return csv_formats(ingest)
+
+    def read(paths: Sequence[Path]) -> ChannelTable:
+        if paths[0].suffix == ".mcap":
+            from pipeline.io.mcap import read_mcap  # noqa: PLC0415  (the decoder costs what a text log need not pay)
+            from pipeline.io.mcap_settings import mcap_format  # noqa: PLC0415
+
+            return read_mcap(paths[0], mcap_format(ingest))
+        if paths[0].suffix == ".gcsv":
+            from pipeline.io.gcsv import read_gcsv  # noqa: PLC0415
+
+            return read_gcsv(paths[0], checks_of(ingest))
+        from pipeline.io.csv_read import read_csv  # noqa: PLC0415
+
+        return read_csv(paths, csv_layouts(), checks_of(ingest))
+
+    return read
+
+
+def _check_complete(
+    procedure: Mapping[str, Any],
+    files: Mapping[str, list[Path]],
+    wanted: Mapping[str, list[list[str]]],
+    folder: Path,
+) -> None:
+    """Raise one error that names all missing files."""
+    missing = []
+    for name, candidates in wanted.items():
+        if name not in files:
+            if not procedure["recordings"][name].get("optional", False):
+                missing.append(f"{name} (tried {', or '.join(' with '.join(c) for c in candidates)})")
+            continue
+        taken = next(c for c in candidates if any(folder / f in files[name] for f in c))
+        missing += [f"{name} ({f})" for f in taken if folder / f not in files[name]]
+    if missing:
+        reason = "" if folder.is_dir() else "; the folder does not exist"
+        raise MissingInputError(
+            f"missing recordings: {'; '.join(missing)}{reason}{_of_one_sensor(procedure, files)}", str(folder)
+        )
+
+
+def _of_one_sensor(procedure: Mapping[str, Any], files: Mapping[str, list[Path]]) -> str:
+    """Return how a unit with one sensor is described, where all recordings of one sensor are missing."""
+    entries = procedure["recordings"].items()
+    there = {sensor: [n in files for n, e in entries if e["role"] == sensor] for sensor in TRIADS}
+    lacking = [sensor for sensor, found in there.items() if found and not any(found)]
+    others = any(any(found) for found in there.values())
+    return f"; of a unit without {lacking[0]}, set method.{lacking[0]}=null" if len(lacking) == 1 and others else ""
+
+
+def to_recording(
+    name: str, entry: Mapping[str, Any], table: ChannelTable, sensor: Mapping[str, Any], checks: Checks
+) -> Recording:
+    """Return a table's samples as a recording in body axes, examined and marked.
+
+    Parameters
+    ----------
+    name : str
+    entry : mapping
+        What the procedure says of the recording: ``role``, ``axis``, and its ``program`` where the table logs nothing.
+    table : ChannelTable
+        Its channels are taken out of it.
+    sensor : mapping
+        Section of the unit's configuration.
+    checks : Checks
+    """
+    if entry.get("program") and not set(TABLE_CHANNELS) & table.values.keys():
+        from pipeline.io.table_program import follow_program  # noqa: PLC0415  (few tables need it)
+
+        table = follow_program(table, entry["program"])
+    table = unwrapped(table)
+    flags, notes = examine(table, sensor, checks)
+    maps = axis_maps(sensor)
+    stated = table.source.get("gcsv", {}).get("orientation", "XYZ")
+    other = [m for m in maps.values() if m != STRAIGHT]
+    if stated != "XYZ" and other:
+        raise IngestError(
+            f"the file states its orientation ({stated}) and sensor.axis_map is [{', '.join(other[0])}]",
+            table.path,
+            fault="gcsv",
+            hint="one of them has to go: write orientation,XYZ in the file, or set sensor.axis_map=[+x,+y,+z]",
+        )
+    table = to_body_axes(table, maps)
+    if entry.get("axis") is None and ATTITUDE[0] in table.values and "table_rate" not in table.values:
+        attitude = np.column_stack([table.values[c] for c in ATTITUDE])
+        table.values["table_rate"] = rate_of_attitude((table.time_ns - table.time_ns[0]) / 1e9, attitude)
+    values = table.values
+    notes = [*notes, *(_absent(sensor_name, table) for sensor_name in TRIADS if TRIADS[sensor_name][0] not in values)]
+    recording = Recording(
+        name=name,
+        role=entry["role"],
+        axis=entry.get("axis"),
+        setup=entry.get("setup") or "",
+        time_ns=table.time_ns,
+        accelerometer=_stack(values, TRIADS["accelerometer"]),
+        gyroscope=_stack(values, TRIADS["gyroscope"]),
+        temperature=values.get("temperature"),
+        table_angle=values.get("table_angle"),
+        table_rate=values.get("table_rate"),
+        table_attitude=_stack(values, ATTITUDE),
+        flags=flags,
+        source=table.source,
+        notes=(*table.notes, *notes),
+        encodings=table.encodings,
+    )
+    if checks.disturbed_rows:
+        recording = leave_out_shaken_rests(recording, table.note)
+    return leave_out_disturbances(recording, table.note, checks.disturbed_rows)
+
+
+def _absent(sensor: str, table: ChannelTable) -> Note:
+    rows = len(table.time_ns)
+    return Note("N-ABSENT", rows, 0, 0, f"the file holds no readings of the {sensor}: it cannot calibrate this sensor")
+
+
+def _stack(values: dict[str, NDArray[np.float64]], channels: Sequence[str]) -> NDArray[np.float64] | None:
+    return np.column_stack([values.pop(c) for c in channels]) if channels[0] in values else None
+
+
+def _check_different(recordings: Sequence[Recording]) -> None:
+    """Refuse one file under two names: held-out data would not be held out, or one axis would stand for another."""
+    seen: dict[str, Recording] = {}
+    for recording in recordings:
+        twin = seen.setdefault(recording.source["sha256"], recording)
+        if twin is not recording:
+            raise IngestError(
+                f"recordings {twin.name} and {recording.name} are the same file, byte for byte "
+                f"({twin.source['file']}); each needs its own",
+                recording.source["file"],
+                fault="same_file",
+            )
+
+
+def _compare_clocks(recordings: list[Recording]) -> list[Recording]:
+    """Count times from power-on where they count from 1970, and say whether the recordings share a clock."""
+    if recordings and all(r.time_ns[0] > EPOCH_AFTER_NS for r in recordings):
+        origin = min(int(r.time_ns[0]) for r in recordings)
+        detail = f"times count from the unit's first sample, {origin} ns in the clock of the files"
+        note = Note("N-EPOCH", len(recordings), 0, 0, detail)
+        recordings = [replace(r, time_ns=r.time_ns - origin, notes=(*r.notes, note)) for r in recordings]
+    spans = sorted((int(r.time_ns[0]), int(r.time_ns[-1])) for r in recordings)
+    overlap = any(start <= end for (_, end), (start, _) in itertools.pairwise(spans))
+    return [replace(r, clock_shared=False) for r in recordings] if overlap else recordings

@@ -1,0 +1,205 @@
+"""Moments to integer nanoseconds, and what cannot be true of them.
+
+    t [ns] = seconds * 10^9 + nanoseconds,   0 <= nanoseconds < 10^9
+
+A double holds a time since 1970 to 238 ns only, so that no moment passes through one, unless the log itself sends it as
+one; then its whole seconds and its fraction are converted apart, which loses nothing more.
+"""
+
+from __future__ import annotations
+
+from decimal import Decimal
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.io.ingest_error import IngestError
+from pipeline.io.units import UNITS
+from pipeline.records import Note
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+SECOND = 1_000_000_000
+LARGEST = np.iinfo(np.int64).max
+SINCE_1970 = 100_000_000 * SECOND  # later than 3 years: no clock that counts from power-on
+YEAR_2000, YEAR_2100 = 946_684_800 * SECOND, 4_102_444_800 * SECOND
+COARSEST = 0.01  # of the median interval, the resolution of a moment that is sent as a floating-point number
+
+
+def nanoseconds(moment: tuple[int, int] | float | Decimal, unit: str) -> int:
+    """Return one moment in ns: (seconds, nanoseconds), or a number in a unit."""
+    if isinstance(moment, tuple):
+        if not 0 <= moment[1] < SECOND:
+            raise ValueError(f"its stamp has {moment[1]} nanoseconds; 0 to 999999999 are possible")
+        found = moment[0] * SECOND + moment[1]
+    else:
+        found = int((Decimal(moment) * int(UNITS["time"][unit][0])).to_integral_value())
+    if abs(found) > LARGEST:
+        raise ValueError(f"its stamp of {found} ns is none")
+    return found
+
+
+def of_pair(seconds: NDArray[Any], nanos: NDArray[Any]) -> NDArray[np.int64]:
+    """Return moments in ns of seconds and nanoseconds."""
+    parts = nanos.astype(np.int64)
+    wrong = np.flatnonzero((parts < 0) | (parts >= SECOND))
+    if wrong.size:
+        row = int(wrong[0])
+        raise ValueError(f"the stamp {row + 1} messages on has {parts[row]} nanoseconds; 0 to 999999999 are possible")
+    whole: NDArray[np.int64] = seconds.astype(np.int64) * SECOND + parts
+    return whole
+
+
+def of_number(values: NDArray[Any], unit: str) -> NDArray[np.int64]:
+    """Return moments in ns of numbers in a unit."""
+    scale = int(UNITS["time"][unit][0])
+    if values.dtype.kind in "iu":
+        if values.size and int(max(values.max(), -int(values.min()))) > LARGEST // scale:
+            raise ValueError(f"a stamp of {values.max()} {unit} is none")
+        counted: NDArray[np.int64] = values.astype(np.int64) * scale
+        return counted
+    numbers = values.astype(np.float64)
+    if not (np.abs(numbers) < LARGEST / scale).all():
+        raise ValueError("a stamp is no finite number, or beyond all times")
+    whole = np.floor(numbers)
+    parts: NDArray[np.int64] = whole.astype(np.int64) * scale + np.rint((numbers - whole) * scale).astype(np.int64)
+    return parts
+
+
+def check_plausible(
+    topic: str, time: NDArray[np.int64], log_time: NDArray[np.int64], difference_s: float | None, path: str
+) -> None:
+    """Refuse stamps that no clock gave.
+
+    Parameters
+    ----------
+    topic : str
+    time, log_time : (n,) array of int64, ns
+        Of the headers, and of the recorder.
+    difference_s : float or None
+        How far both may be apart, beyond a constant where the stamps do not count from 1970; None: any.
+
+    Raises
+    ------
+    IngestError
+    """
+    absolute = bool((np.abs(time) > SINCE_1970).any())
+    strange = np.flatnonzero((time < YEAR_2000) | (time > YEAR_2100)) if absolute else np.flatnonzero(time < 0)
+    if strange.size:
+        row = int(strange[0])
+        raise IngestError(
+            f"message {row + 1} on {topic}: header stamp {time[row] / 1e9:.9g} s is no time since power-on and lies "
+            f"outside the years 2000 to 2100 ({strange.size} such messages)",
+            path,
+            fault="bad_time",
+            hint="correct the logger's clock, or set ingest.mcap.time_source=log_time",
+        )
+    if difference_s is None:
+        return
+    apart = time - log_time
+    if not (absolute and (log_time > YEAR_2000).all()):
+        apart = apart - np.int64(np.median(apart[:: max(1, len(apart) // 1001)]))
+    far = np.flatnonzero(np.abs(apart) > difference_s * SECOND)
+    if far.size:
+        row = int(far[0])
+        raise IngestError(
+            f"message {row + 1} on {topic}: header stamp and the recorder's time are {apart[row] / 1e9:.9g} s apart "
+            f"({far.size} such messages); {difference_s:g} s are allowed",
+            path,
+            fault="bad_time",
+            hint="one of the clocks is wrong; if the log was replayed, set ingest.mcap.clock_difference_s=null",
+        )
+
+
+def in_order(
+    topic: str, time: NDArray[np.int64], columns: Sequence[NDArray[Any]], reorder_s: float, path: str
+) -> tuple[NDArray[np.intp] | None, list[Note]]:
+    """Return the order in which times increase, without messages that stand there twice; None where all is in order.
+
+    Parameters
+    ----------
+    topic : str
+    time : (n,) array of int64, ns
+    columns : sequence of (n,) array
+        All that is read of the messages, for comparison.
+    reorder_s : float
+        How late a message may stand in the file, after later ones.
+
+    Raises
+    ------
+    IngestError
+        If messages stand later than that, or two with one stamp differ.
+    """
+    steps = np.diff(time)
+    if (steps > 0).all():
+        return None, []
+    notes = []
+    late = np.maximum.accumulate(time) - time
+    if late.max() > reorder_s * SECOND:
+        row = int(np.argmax(late > reorder_s * SECOND))
+        raise IngestError(
+            f"message {row + 1} on {topic}: header stamp {time[row] / 1e9:.9g} s after "
+            f"{(time[row] + late[row]) / 1e9:.9g} s ({int((steps < 0).sum())} such messages); stamps have to increase",
+            path,
+            fault="bad_time",
+            hint=f"a log that was restarted belongs in two files (up to {reorder_s:g} s are put in order: "
+            "ingest.mcap.reorder_s)",
+        )
+    order = np.argsort(time, kind="stable")
+    inversions = int((steps < 0).sum())
+    if inversions:
+        detail = f"times on {topic} go back {inversions} times, by up to {late.max() / 1e9:.9g} s; sorted by time"
+        notes.append(Note("N-SORT", inversions, 0, 0, detail))
+    again = np.flatnonzero(np.diff(time[order]) == 0) + 1
+    if again.size:
+        one, other = order[again - 1], order[again]
+        same = np.ones(len(again), np.bool_)
+        for column in columns:
+            equal_nan = column.dtype.kind == "f"
+            same &= (column[one] == column[other]) | (equal_nan and np.isnan(column[one]) & np.isnan(column[other]))
+        if not same.all():
+            row = int(np.argmin(same))
+            raise IngestError(
+                f"message {int(other[row]) + 1} on {topic}: header stamp {time[other[row]] / 1e9:.9g} s as message "
+                f"{int(one[row]) + 1}, with other numbers ({int((~same).sum())} such messages)",
+                path,
+                fault="bad_time",
+                hint="two sensors may send on one topic",
+            )
+        notes.append(Note("N-DUP", int(again.size), 0, 0, f"messages on {topic} that stand there twice were dropped"))
+        order = np.delete(order, again)
+    return order, notes
+
+
+def check_fine(topic: str, time: NDArray[np.int64], path: str) -> None:
+    """Refuse times in floating-point numbers that are too coarse to differentiate."""
+    if len(time) < 2:
+        return
+    resolution = float(np.spacing(np.abs(time).max() / 1e9)) * 1e9
+    interval = float(np.median(np.diff(time)))
+    if resolution > COARSEST * interval:
+        raise IngestError(
+            f"times on {topic} are floating-point numbers that hold {resolution:.3g} ns, more than {COARSEST:.0%} of "
+            f"the interval of {interval:.3g} ns",
+            path,
+            fault="bad_time",
+            hint="log integer times",
+        )
+
+
+def time_error(time_ns: NDArray[np.int64], place: str, row: int) -> IngestError:
+    """Return the refusal of a time that does not increase."""
+    steps = np.diff(time_ns)
+    repeats = steps[row - 1] == 0
+    what, fault = ("repeats", "duplicate_time") if repeats else ("goes back to", "time_back")
+    count = int(np.count_nonzero(steps <= 0))
+    return IngestError(
+        f"time {what} {time_ns[row] / 1e9:.9g} s after {time_ns[row - 1] / 1e9:.9g} s ({count} such samples); time has "
+        "to increase: a log that was restarted belongs in two files",
+        place,
+        fault=fault,
+        hint="" if repeats else "or set ingest.csv.session=1, 2 .. to read one part of it",
+    )

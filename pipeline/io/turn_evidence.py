@@ -1,0 +1,180 @@
+"""How gravity turns between rests tells the unit of the angular rates.
+
+A vector at rest in the room turns in the sensor's axes against the sensor's own rate:
+
+    du/dt = -(s w) x u
+
+where
+
+    u : direction of the specific force at rest, before and after a move
+    w : reading of the gyroscope, minus its mean in the rests on both sides
+    s : deg/s in one of its units, which is looked for
+
+The unit whose s carries u over the moves, from rest to rest, with the smallest angle left is the right one; the next
+possible unit (57.3 times, or another range of the sensor) misses by tens of degrees.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.io.units import DEGREES, TRIADS
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.io.channel_table import ChannelTable
+
+BLOCK_S = 0.25
+SHORTEST_BLOCK = 5
+STILL = 9.0  # times the 10th percentile of the variance
+SMALLEST_VARIANCE = 1e-7  # relative to the square of the specific force
+LARGEST_DRIFT_DEG = 2.0
+BINS = 64
+LONGEST_MOVE_S = 30.0
+SMALLEST_TURN_DEG = 20.0
+FEWEST_MOVES = 3
+MOST_MOVES = 40
+MOST_SAMPLES = 200_000
+FITS_DEG, FAILS_DEG = 15.0, 30.0
+
+
+@dataclass(frozen=True)
+class Move:
+    """What happened between two rests.
+
+    Attributes
+    ----------
+    turns : (64, 3) array
+        Integral of the angular rate over parts of the move, unit of the gyroscope times s.
+    before, after : (3,) array
+        Direction of the specific force at rest.
+    """
+
+    turns: NDArray[np.float64]
+    before: NDArray[np.float64]
+    after: NDArray[np.float64]
+
+    @property
+    def angle_deg(self) -> float:
+        """Angle by which gravity turned in the sensor's axes, deg."""
+        return float(np.degrees(np.arccos(np.clip(self.before @ self.after, -1.0, 1.0))))
+
+
+def rests_of(force: NDArray[np.float64], interval_s: float) -> list[tuple[int, int]]:
+    """Return the samples, start and stop, of stretches of at least half a second in which the sensor rests.
+
+    Parameters
+    ----------
+    force : (n, 3) array
+        Specific force in any unit.
+    interval_s : float, s
+    """
+    width = max(SHORTEST_BLOCK, round(BLOCK_S / interval_s))
+    count = len(force) // width
+    if count < 4:
+        return []
+    blocks = force[: count * width].reshape(count, width, 3)
+    means = blocks.mean(axis=1)
+    scatter = blocks.var(axis=1).sum(axis=1)
+    size = float(np.median(np.linalg.norm(means, axis=1)))
+    still = scatter < max(STILL * float(np.quantile(scatter, 0.1)), SMALLEST_VARIANCE * size**2)
+    edges = np.flatnonzero(np.diff(still.astype(np.int8), prepend=0, append=0))
+    found = [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= 2]
+    return [(a * width, b * width) for a, b in found if _keeps_its_direction(means[a:b])]
+
+
+def _keeps_its_direction(means: NDArray[np.float64]) -> bool:
+    """Return whether the ends of a stretch point the same way; slow motion all along is no rest."""
+    first, last = means[0], means[-1]
+    size = float(np.linalg.norm(first))
+    return bool(np.linalg.norm(last - first) <= np.radians(LARGEST_DRIFT_DEG) * max(size, 1e-30))
+
+
+def moves_of(force: NDArray[np.float64], rate: NDArray[np.float64], time_s: NDArray[np.float64]) -> list[Move]:
+    """Return the moves between rests in which gravity turned by more than 20 degrees.
+
+    Parameters
+    ----------
+    force, rate : (n, 3) array
+        In any unit.
+    time_s : (n,) array, s
+    """
+    steps = np.diff(time_s, append=2 * time_s[-1] - time_s[-2])
+    rests = rests_of(force, float(np.median(steps)))
+    found: list[Move] = []
+    for (a, b), (c, d) in itertools.pairwise(rests):
+        if len(found) == MOST_MOVES or time_s[c] - time_s[b - 1] > LONGEST_MOVE_S:
+            continue
+        ends = [force[a:b].mean(axis=0), force[c:d].mean(axis=0)]
+        before, after = (e / np.linalg.norm(e) for e in ends)
+        start = max(a, b - 1)
+        bias = (rate[a:b].mean(axis=0) + rate[c:d].mean(axis=0)) / 2
+        turned = (rate[start : c + 1] - bias) * steps[start : c + 1, None]
+        edges = np.linspace(0, len(turned), BINS + 1).astype(int)
+        sums = np.concatenate([np.zeros((1, 3)), np.cumsum(turned, axis=0)])
+        move = Move(np.diff(sums[edges], axis=0), before, after)
+        if move.angle_deg > SMALLEST_TURN_DEG:
+            found.append(move)
+    return found
+
+
+def misfit_deg(moves: Sequence[Move], scales: Sequence[float]) -> NDArray[np.float64]:
+    """Return the median over moves of ``misfits_deg``: (len(scales),) array, deg."""
+    median: NDArray[np.float64] = np.median(misfits_deg(moves, scales), axis=0)
+    return median
+
+
+def misfits_deg(moves: Sequence[Move], scales: Sequence[float]) -> NDArray[np.float64]:
+    """Return the angle that each scale leaves between the gravity it predicts after a move and the one that was read.
+
+    Parameters
+    ----------
+    moves : sequence of Move
+    scales : sequence of float
+        Candidates of ``s``, deg/s in one unit of the gyroscope.
+
+    Returns
+    -------
+    (len(moves), len(scales)) array, deg
+    """
+    factors = np.radians(np.asarray(scales, float))[None, :, None]
+    direction = np.repeat(np.stack([m.before for m in moves])[:, None, :], len(scales), axis=1)
+    for part in np.stack([m.turns for m in moves], axis=1):
+        vector = -part[:, None, :] * factors
+        angle = np.linalg.norm(vector, axis=2, keepdims=True)
+        axis = vector / np.maximum(angle, 1e-12)
+        along = np.sum(axis * direction, axis=2, keepdims=True)
+        direction = (
+            direction * np.cos(angle) + np.cross(axis, direction) * np.sin(angle) + axis * along * (1 - np.cos(angle))
+        )
+    after = np.stack([m.after for m in moves])[:, None, :]
+    left: NDArray[np.float64] = np.degrees(np.arccos(np.clip(np.sum(direction * after, axis=2), -1.0, 1.0)))
+    return left
+
+
+def declared_scale(table: ChannelTable) -> tuple[float, str] | None:
+    """Return by what factor the angular rates are off, and what shows it; None where they fit or nothing shows it."""
+    if not {"accel_x", "gyro_x"} <= table.values.keys():
+        return None
+    part = slice(0, MOST_SAMPLES)
+    force, rate = (np.column_stack([table.values[c][part] for c in TRIADS[s]]) for s in ("accelerometer", "gyroscope"))
+    time_s = (table.time_ns[part] - table.time_ns[0]) / 1e9
+    moves = moves_of(force, rate, time_s)
+    if len(moves) < FEWEST_MOVES:
+        return None
+    scales = (1.0, DEGREES, 1 / DEGREES)
+    left = misfit_deg(moves, scales)
+    best = int(np.argmin(left))
+    if left[0] < FAILS_DEG or left[best] > FITS_DEG:
+        return None
+    return 1 / scales[best], (
+        f"in {len(moves)} moves between rests gravity turns as the rates do if they are multiplied by "
+        f"{scales[best]:.4g} ({left[best]:.1f} deg are left, {left[0]:.0f} deg as declared)"
+    )

@@ -1,0 +1,137 @@
+"""YAML files of users, read within limits: no file of a stranger costs more time or memory than its size explains.
+
+An alias (``*name``) stands for everything that its anchor holds. A few lines of aliases of aliases can so stand for
+10^9 values. Before anything is built, the events of the parser are counted, an alias with all that it stands for:
+
+    size = number of scalars, lists and mappings, each alias counted with the size of its anchor
+
+Numbers, dates and repeated keys are read as Hydra reads them: ``1e-3`` is a number, a date stays a text, a key that
+stands twice is refused.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Any
+
+import yaml
+
+from pipeline.errors import ConfigurationError
+from pipeline.io.regular import read_text
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from pathlib import Path
+
+# A simulation.yaml with 10,000 units of 30 values each, which the largest fleet needs, stays below.
+LARGEST_BYTES, LARGEST_SIZE, DEEPEST = 10_000_000, 400_000, 50
+FLOAT = re.compile(  # that of OmegaConf, which reads 1e3 as a number where YAML 1.1 has a text
+    r"""^(?:
+     [-+]?[0-9]+(?:_[0-9]+)*\.[0-9_]*(?:[eE][-+]?[0-9]+)?
+    |[-+]?[0-9]+(?:_[0-9]+)*(?:[eE][-+]?[0-9]+)
+    |\.[0-9]+(?:_[0-9]+)*(?:[eE][-+][0-9]+)?
+    |[-+]?[0-9]+(?:_[0-9]+)*(?::[0-5]?[0-9])+\.[0-9_]*
+    |[-+]?\.(?:inf|Inf|INF)
+    |\.(?:nan|NaN|NAN))$""",
+    re.VERBOSE,
+)
+NOT_AS_YAML = ("tag:yaml.org,2002:float", "tag:yaml.org,2002:timestamp")
+
+_Base: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+class _Loader(_Base):  # type: ignore[misc]
+    """A safe loader that reads scalars as Hydra does, and refuses keys that stand twice."""
+
+    yaml_implicit_resolvers = {  # noqa: RUF012  (PyYAML's own attribute)
+        first: [(tag, how) for tag, how in resolvers if tag not in NOT_AS_YAML]
+        for first, resolvers in _Base.yaml_implicit_resolvers.items()
+    }
+
+    def construct_mapping(self, node: yaml.Node, deep: bool = False) -> Any:  # noqa: ANN401, FBT001, FBT002
+        """Build a mapping."""
+        seen = set()
+        for key, _ in node.value if isinstance(node, yaml.MappingNode) else ():
+            if key.tag != "tag:yaml.org,2002:merge" and key.value in seen:
+                raise yaml.constructor.ConstructorError(None, None, f"{key.value!r} stands twice", key.start_mark)
+            seen.add(key.value if isinstance(key.value, str) else id(key))
+        return super().construct_mapping(node, deep)
+
+
+_Loader.add_implicit_resolver("tag:yaml.org,2002:float", FLOAT, list("-+0123456789."))
+
+
+def read_yaml(path: Path, largest: int = LARGEST_SIZE) -> Any:  # noqa: ANN401  (whatever the file holds)
+    """Read a YAML file of plain values.
+
+    Parameters
+    ----------
+    path : Path
+    largest : int
+        The largest size, as above.
+
+    Raises
+    ------
+    ConfigurationError
+        If it is no regular file, cannot be read, is no YAML, or is beyond the limits.
+    """
+    return load_yaml(read_text(path, LARGEST_BYTES, "settings"), str(path), largest)
+
+
+def load_yaml(text: str, where: str, largest: int = LARGEST_SIZE) -> Any:  # noqa: ANN401
+    """Return what a YAML text holds.
+
+    Raises
+    ------
+    ConfigurationError
+        As ``read_yaml``.
+    """
+    try:
+        _check_size(yaml.parse(text, Loader=_Loader), where, largest)
+        return yaml.load(text, _Loader)  # noqa: S506  (a safe loader)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        place = f"{where}:{mark.line + 1}" if mark else where
+        reason = getattr(error, "problem", None) or " ".join(str(error).split())
+        raise ConfigurationError(f"is not YAML: {reason}", place) from None
+    except (ValueError, TypeError, RecursionError) as error:
+        raise ConfigurationError(f"holds a value that cannot be read: {error}", where) from None
+
+
+def _check_size(events: Iterable[yaml.Event], where: str, largest: int) -> None:
+    """Refuse a text whose aliases stand for too much, stand within themselves, or that is nested too deeply."""
+    known: dict[str, tuple[int, int]] = {}  # size and depth of each anchor that is complete
+    above: list[tuple[str | None, int, int]] = []  # anchor, size before it, and depth of what stands beside it
+    size = deepest = 0
+    for event in events:
+        line = event.start_mark.line + 1 if event.start_mark else 1
+        added, depth = 0, 0
+        if isinstance(event, yaml.AliasEvent):
+            if event.anchor not in known:
+                raise ConfigurationError(f"the alias *{event.anchor} has no anchor before it", f"{where}:{line}")
+            added, depth = known[event.anchor]
+        elif isinstance(event, yaml.ScalarEvent):
+            added = 1
+            if event.anchor:
+                known[event.anchor] = (1, 0)
+        elif isinstance(event, yaml.CollectionStartEvent):
+            above.append((event.anchor, size, deepest))
+            known.pop(event.anchor or "", None)
+            added, deepest = 1, 0
+        elif isinstance(event, yaml.CollectionEndEvent):
+            anchor, before, beside = above.pop()
+            if anchor:
+                known[anchor] = (size - before, deepest + 1)
+            depth, deepest = deepest + 1, beside
+        size, deepest = size + added, max(deepest, depth)
+        _check_limits(size, largest, len(above) + deepest, f"{where}:{line}")
+
+
+def _check_limits(size: int, largest: int, depth: int, place: str) -> None:
+    if size > largest:
+        raise ConfigurationError(
+            f"holds more than {largest} values, each alias (*) counted with all that it stands for; use fewer aliases",
+            place,
+        )
+    if depth > DEEPEST:
+        raise ConfigurationError(f"is nested more than {DEEPEST} deep", place)

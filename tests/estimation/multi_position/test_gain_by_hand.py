@@ -1,0 +1,54 @@
+"""The gain of an effect beside a scatter that nobody knows: as an F-test judges it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.special import chdtrc, fdtrc
+
+from pipeline.estimation.multi_position.equations import Equations, HandNoise
+from pipeline.estimation.multi_position.likelihood import beside
+
+WHITE = [HandNoise(0.0, 1.0, (0.0,), 0.0)]
+
+
+def equations_of(residual: np.ndarray, base: np.ndarray, candidate: np.ndarray) -> Equations:
+    n = len(residual)
+    start = np.arange(n, dtype=float)
+    return Equations(
+        residual, base, [], [candidate], np.ones((1, n)), np.zeros((3, n, n)), start, np.ones(n), np.eye(n) > 0, start
+    )
+
+
+@pytest.mark.parametrize(("rests", "added"), [(27, 3), (27, 9), (40, 3), (16, 3)])
+def test_p_is_that_of_the_f_test_where_only_the_rests_tell_their_scatter(rests: int, added: int) -> None:
+    rng = np.random.default_rng(rests + added)
+    for size in (0.0, 8.0, 16.0):
+        base, candidate = rng.standard_normal((rests, 9)), rng.standard_normal((rests, added))
+        r = 30.0 * rng.standard_normal(rests) + size * candidate.sum(axis=1)
+        found = beside(equations_of(r, base, candidate), WHITE)
+        gain = (
+            2.0 * (found.of_candidate(0)[0] - found.of_model()[0]) * found.correction(0, 0, added, np.ones((1, rests)))
+        )
+        before = r - base @ np.linalg.lstsq(base, r)[0]
+        both = np.column_stack([base, candidate])
+        after = r - both @ np.linalg.lstsq(both, r)[0]
+        spare = rests - 9 - added
+        F = (before @ before - after @ after) / added / (after @ after / spare)
+        exact = fdtrc(added, spare, F)
+        assert np.log(chdtrc(added, gain)) == pytest.approx(np.log(exact), rel=0.15, abs=0.15)
+
+
+def test_a_candidate_that_leaves_no_equation_to_judge_it_by_counts_nothing() -> None:
+    rng = np.random.default_rng(3)
+    found = beside(
+        equations_of(rng.standard_normal(12), rng.standard_normal((12, 9)), rng.standard_normal((12, 2))), WHITE
+    )
+    assert found.correction(0, 0, 2, np.ones((1, 12))) == 0.0
+
+
+def test_a_candidate_that_the_base_holds_shows_nothing() -> None:
+    rng = np.random.default_rng(4)
+    base = rng.standard_normal((30, 9))
+    found = beside(equations_of(rng.standard_normal(30), base, base[:, :2] @ rng.standard_normal((2, 3))), WHITE)
+    assert found.count(0, 0) == 0

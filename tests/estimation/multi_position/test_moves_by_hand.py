@@ -1,0 +1,108 @@
+"""The gyroscope by hand: moves turn gravity as they should, and tell its matrix."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from hand_session import hand_held
+from scipy.special import stdtrit
+
+from pipeline.errors import CannotCalibrateError, NotObservableError
+from pipeline.estimation.design import Term
+from pipeline.estimation.effects_stage import fit_effects
+from pipeline.estimation.gyroscope import rests_and_moves
+from pipeline.estimation.multi_position.model import State
+from pipeline.estimation.multi_position.moves import to_the_end
+from pipeline.estimation.multi_position.observed import model_of
+from pipeline.model.effects import effect
+from pipeline.simulation.trajectory import rotation_about
+
+if TYPE_CHECKING:
+    from pipeline.records import Recording
+
+
+def test_a_steady_turn_is_integrated_exactly() -> None:
+    axis = np.array([2.0, -1.0, 2.0]) / 3.0
+    time = np.linspace(0.0, 2.0, 21)[None]
+    A = to_the_end(np.broadcast_to(40.0 * axis, (1, 21, 3)), time)
+    assert A[0, 0] == pytest.approx(rotation_about(axis, np.array([-80.0]))[0], abs=1e-12)
+    assert A[0, 10] == pytest.approx(rotation_about(axis, np.array([-40.0]))[0], abs=1e-12)
+
+
+def test_coning_motion_is_integrated_to_third_order() -> None:
+    def end(samples: int) -> np.ndarray:
+        t = np.linspace(0.0, 1.0, samples)
+        rate = 90.0 * np.stack([np.cos(6.0 * t), np.sin(6.0 * t), 0.3 * t], axis=1)
+        return to_the_end(rate[None], t[None])[0, 0]
+
+    exact = end(3201)
+    coarse, fine = (np.abs(end(n) - exact).max() for n in (26, 51))
+    assert fine < 1e-3
+    assert coarse / fine > 3.5
+
+
+def test_bias_and_matrix_are_found_within_their_uncertainty() -> None:
+    for model, seed in (("mpu6050", 1), ("stim300", 2)):
+        unit = hand_held(model, seed, interval_s=0.02)
+        found = unit.calibrated("gyroscope")
+        true = np.concatenate([unit.truth["gyroscope"]["bias"], unit.true_matrix("gyroscope").ravel()])
+        value = np.concatenate([found.bias, found.matrix.ravel()])
+        assert found.covariance is not None
+        off = np.abs(value - true) / np.sqrt(np.diag(found.covariance))
+        assert found.converged
+        assert off.max() < max(4.0, stdtrit(found.degrees_of_freedom, 1 - 0.5e-3 / 12)), off
+        assert np.abs(value - true)[3:].max() < 1e-3
+
+
+def test_derivatives_of_the_moves_are_those_of_their_residuals() -> None:
+    unit = hand_held("mpu6050", 4)
+    model = model_of(unit.recordings, None, None, unit.settings)
+    assert model is not None
+    terms = (
+        Term(effect("scale_factor_asymmetry"), np.array([2e-4, -1e-4, 1e-4])),
+        Term(effect("g_sensitivity"), np.full(9, 0.002)),
+    )
+    near = unit.calibrated("gyroscope")
+    state = State(near.bias, near.matrix, terms)
+    columns, step = model.equations(state).columns, 1e-5
+    scale = np.linalg.norm(columns, axis=0)
+    for j in (0, 4, 11, 12, 15, 20):
+        moved = []
+        for sign in (1.0, -1.0):
+            base, values = np.zeros(12), np.concatenate([t.values for t in terms])
+            base[j if j < 12 else 0] = sign * step if j < 12 else 0.0
+            values[max(j - 12, 0)] += sign * step if j >= 12 else 0.0
+            there = State(
+                state.bias + base[:3],
+                state.matrix + base[3:].reshape(3, 3),
+                tuple(replace(t, values=v) for t, v in zip(terms, np.split(values, [3]), strict=True)),
+            )
+            moved.append(-model.equations(there).residual)
+        slope = (moved[0] - moved[1]) / (2.0 * step)
+        assert np.linalg.norm(slope - columns[:, j]) < 0.03 * scale[j], j
+
+
+def test_an_effect_of_moves_is_fitted_with_the_matrix() -> None:
+    unit = hand_held("mpu6050", 5, {"gyroscope.scale_factor_asymmetry": None}, interval_s=0.02)
+    settings = {**unit.settings, "effects": {"gyroscope": ["scale_factor_asymmetry"]}}
+    found = fit_effects("gyroscope", unit.recordings, unit.calibrated("gyroscope"), settings)
+    truth = np.array(list(unit.truth["gyroscope"]["effects"]["scale_factor_asymmetry"].values()))
+    assert found.covariance is not None
+    assert np.all(np.abs(found.effects[0].values - truth) < 4.0 * np.sqrt(np.diag(found.covariance))[12:])
+    assert np.sqrt(np.diag(found.covariance))[12:].max() < 5e-4
+
+
+def test_without_rests_by_hand_the_gyroscope_is_left_null_with_the_reason() -> None:
+    unit = hand_held("mpu6050", 6)
+    turns: list[Recording] = [replace(r, role="gyroscope", axis="x") for r in unit.recordings]
+    with pytest.raises(CannotCalibrateError, match="24 rests"):
+        rests_and_moves.fit(turns, None, unit.settings)
+
+
+def test_too_few_moves_are_refused() -> None:
+    unit = hand_held("mpu6050", 6, procedure="six_positions", holdout_every=0)
+    with pytest.raises(NotObservableError, match="at least 6 moves"):
+        rests_and_moves.fit(unit.recordings, None, unit.settings)

@@ -1,0 +1,62 @@
+"""Damaged and cut logs: refused, or read to the same last bit; never anything else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import pytest
+from damaged_logs import RECORDERS, Tally, cuts, flips, log_of, messages_of, same_bits, table_of
+
+from pipeline.io.ingest_error import IngestError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+FEW = pytest.param(60, 20, id="few")
+MANY = pytest.param(2000, 200, id="many", marks=pytest.mark.fuzz)
+
+
+@pytest.mark.parametrize(("flipped", "cut"), [FEW, MANY])
+@pytest.mark.parametrize("recorder", RECORDERS)
+def test_damage_never_changes_a_value_in_silence(tmp_path: Path, recorder: str, flipped: int, cut: int) -> None:
+    whole = log_of(recorder, tmp_path)
+    truth, messages = table_of(whole), messages_of(whole)
+    bits, ends = Tally(), Tally()
+    for damaged in flips(whole, flipped, seed=11):
+        bits.take(damaged, truth, messages)
+    for damaged in cuts(whole, cut):
+        ends.take(damaged, truth, messages)
+    print(recorder, len(whole), "bytes; flips:", dict(bits.beside), "cuts:", dict(ends.beside))  # noqa: T201
+    assert bits.strange + ends.strange == []
+    assert bits.ours["wrong"] == ends.ours["wrong"] == 0
+    assert bits.ours["refused"] > flipped / 2
+    assert ends.ours["refused"] == ends.ours.total() > cut / 2
+
+
+@pytest.mark.parametrize("recorder", ["zstd, data checksum", "lz4", "uncompressed"])
+def test_cut_log_gives_its_complete_chunks_on_request(tmp_path: Path, recorder: str) -> None:
+    whole = log_of(recorder, tmp_path, samples=20)
+    truth = table_of(whole)
+    kept = set()
+    for damaged in cuts(whole, 40):
+        try:
+            table = table_of(damaged, allow_truncated=True)
+        except IngestError as error:
+            assert error.fault in {"truncated", "not_mcap"}  # noqa: PT017
+            continue
+        rows = len(table.time_ns)
+        kept.add(rows)
+        assert table.notes[0].code == "N-TRUNCATED"
+        assert "messages in" in table.notes[0].detail
+        beginning = {n: truth.values[n][:rows] for n in table.values}  # the first chunk lacks some topics
+        assert same_bits(table, replace(truth, time_ns=truth.time_ns[:rows], values=beginning))
+    assert len(kept) > 5
+    assert max(kept) == len(truth.time_ns)  # of a file that has lost nothing but its end
+
+
+def test_cut_log_without_chunks_is_refused_even_on_request(tmp_path: Path) -> None:
+    whole = log_of("unchunked, data checksum", tmp_path)
+    with pytest.raises(IngestError, match="not every message lies in a chunk with a checksum") as caught:
+        table_of(whole[: len(whole) // 2], allow_truncated=True)
+    assert caught.value.fault == "truncated"

@@ -1,0 +1,217 @@
+"""Recordings between the stages: every bit comes back, or the file is refused."""
+
+from __future__ import annotations
+
+import json
+import zlib
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from pyarrow import parquet
+from sample_logs import SENSOR, assert_same_bits, make_recording, procedure, profile
+
+from pipeline.errors import InputError
+from pipeline.io.parquet import load_recordings, save_recordings
+from pipeline.io.read import read_recordings
+from pipeline.records import Encoding, Note, Recording
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+FLIPS = 250
+
+
+def unit() -> list[Recording]:
+    """Return three recordings that hold different channels."""
+    full = make_recording(120)
+    noted = replace(
+        full,
+        flags=np.arange(120, dtype=np.uint16) % 3,
+        notes=(Note("N-GAP", 1, 2, 3, "a gap – noted"),),
+        source={"file": "raw/U1/accel_x.csv", "sha256": "ab" * 32, "rows": 120},
+        filter={"name": "rc_low_pass", "delay_s": 0.1, "noise_gain": np.float64(0.3)},
+        clock_shared=False,
+    )
+    bare = replace(
+        make_recording(7, seed=2, name="static"), role="static", axis=None, table_angle=None, temperature=None
+    )
+    force_only = replace(make_recording(33, seed=3, name="b"), gyroscope=None, table_attitude=None, table_rate=None)
+    return [noted, bare, force_only]
+
+
+def test_every_recording_comes_back_whole(tmp_path: Path) -> None:
+    save_recordings(tmp_path / "U1.parquet", unit())
+    loaded = load_recordings(tmp_path / "U1.parquet")
+    assert len(loaded) == 3
+    for one, other in zip(unit(), loaded, strict=True):
+        assert_same_bits(one, other)
+        for name in ("name", "role", "axis", "source", "notes", "filter", "encodings", "clock_shared"):
+            assert getattr(one, name) == getattr(other, name), name
+
+
+@settings(
+    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+)
+@given(
+    values=hnp.arrays(np.float64, (4, 3), elements=st.floats(allow_nan=True, allow_infinity=True)),
+    times=hnp.arrays(np.int64, 4),
+)
+def test_any_bits_come_back(tmp_path: Path, values: np.ndarray, times: np.ndarray) -> None:
+    saved = Recording("a", "rests", None, times, accelerometer=values)
+    save_recordings(tmp_path / "a.parquet", [saved])
+    (loaded,) = load_recordings(tmp_path / "a.parquet")
+    assert loaded.accelerometer is not None
+    assert loaded.accelerometer.tobytes() == values.tobytes()
+    assert loaded.time_ns.tobytes() == times.tobytes()
+
+
+def test_recording_without_samples_comes_back(tmp_path: Path) -> None:
+    saved = [make_recording(5), make_recording(5).select(slice(0, 0)), make_recording(6)]
+    save_recordings(tmp_path / "a.parquet", saved)
+    assert [r.samples for r in load_recordings(tmp_path / "a.parquet")] == [5, 0, 6]
+
+
+def counts(folder: Path) -> list[Recording]:
+    ingest = profile("mpu6050_multi_position")
+    ingest["csv"]["skip_lines"] = 0
+    generator = np.random.default_rng(5)
+    rows = generator.integers(-32768, 32767, (300, 6))
+    rows[:, 2] = 16384
+    text = "ax,ay,az,gx,gy,gz\n" + "".join(",".join(map(str, r)) + "\n" for r in rows.tolist())
+    (folder / "accel_x.csv").write_text(text)
+    return read_recordings(procedure("accel_x"), ingest, {**SENSOR, "axis_map": ["+x", "-z", "+y"]}, folder)
+
+
+def test_counts_stay_integers_on_disk(tmp_path: Path) -> None:
+    recordings = counts(tmp_path)
+    save_recordings(tmp_path / "a.parquet", recordings)
+    schema = parquet.read_schema(tmp_path / "a.parquet")
+    readings = [n for n in schema.names if n.startswith(("accel", "gyro"))]
+    assert len(readings) == 6
+    assert all(pa.types.is_integer(schema.field(n).type) for n in readings)
+    stored = parquet.read_table(tmp_path / "a.parquet").column("gyro_z").to_pylist()
+    text = [line.split(",")[4] for line in (tmp_path / "accel_x.csv").read_text().splitlines()[1:]]
+    assert stored == [int(c) for c in text]  # y of the sensor lies along -z of the body; the sign is in the scale
+    (loaded,) = load_recordings(tmp_path / "a.parquet")
+    assert_same_bits(loaded, recordings[0])
+    assert loaded.encodings == recordings[0].encodings
+    assert loaded.encodings["gyro_z"] == Encoding(scale=-1 / 131.0)
+
+
+def test_xsens_counts_stay_integers_on_disk(reference: Path, tmp_path: Path) -> None:
+    sensor = {"axis_map": SENSOR["axis_map"], "accelerometer": {}, "gyroscope": {}}
+    folder = reference / "xsens_mti_multi_position"
+    recordings = read_recordings(procedure("recording"), profile("xsens_mti_multi_position"), sensor, folder)
+    save_recordings(tmp_path / "a.parquet", recordings)
+    assert parquet.read_table(tmp_path / "a.parquet").column("accel_x")[:3].to_pylist() == [33108, 33096, 33104]
+    assert_same_bits(load_recordings(tmp_path / "a.parquet")[0], recordings[0])
+
+
+def test_filtered_counts_are_stored_as_doubles(tmp_path: Path) -> None:
+    (recording,) = counts(tmp_path)
+    assert recording.accelerometer is not None
+    smoothed = replace(recording, accelerometer=recording.accelerometer * 0.3)  # encodings forgotten
+    save_recordings(tmp_path / "a.parquet", [smoothed])
+    (loaded,) = load_recordings(tmp_path / "a.parquet")
+    assert_same_bits(loaded, smoothed)
+    assert set(loaded.encodings) == {"gyro_x", "gyro_y", "gyro_z"}
+
+
+def test_counts_beside_numbers_are_stored_as_doubles(tmp_path: Path) -> None:
+    recordings = [*counts(tmp_path), make_recording()]
+    save_recordings(tmp_path / "a.parquet", recordings)
+    for one, other in zip(recordings, load_recordings(tmp_path / "a.parquet"), strict=True):
+        assert_same_bits(one, other)
+
+
+def test_writing_again_gives_the_same_bytes(tmp_path: Path) -> None:
+    save_recordings(tmp_path / "a.parquet", unit())
+    save_recordings(tmp_path / "b.parquet", load_recordings(tmp_path / "a.parquet"))
+    assert (tmp_path / "a.parquet").read_bytes() == (tmp_path / "b.parquet").read_bytes()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.parquet", "b.parquet"]
+
+
+def test_the_recordings_of_a_unit_are_one_row_group(tmp_path: Path) -> None:
+    save_recordings(tmp_path / "a.parquet", unit())
+    metadata = parquet.read_metadata(tmp_path / "a.parquet")
+    assert [metadata.row_group(i).num_rows for i in range(metadata.num_row_groups)] == [120 + 7 + 33]
+
+
+def test_flipped_bit_never_changes_a_value_in_silence(tmp_path: Path) -> None:
+    file = tmp_path / "a.parquet"
+    truth = [*unit(), *counts(tmp_path)]
+    save_recordings(file, truth)
+    whole = file.read_bytes()
+    generator = np.random.default_rng(11)
+    footer = len(whole) - 8 - int.from_bytes(whole[-8:-4], "little")
+    places = np.concatenate([generator.integers(0, len(whole), FLIPS), generator.integers(footer, len(whole), FLIPS)])
+    refused = 0
+    for position, bit in zip(places, generator.integers(0, 8, len(places)), strict=True):
+        damaged = bytearray(whole)
+        damaged[position] ^= 1 << int(bit)
+        file.write_bytes(damaged)
+        try:
+            loaded = load_recordings(file)
+        except InputError:
+            refused += 1
+            continue
+        for one, other in zip(truth, loaded, strict=True):
+            assert_same_bits(one, other)
+            assert [one.name, one.notes, one.source, one.encodings == other.encodings or not other.encodings] == [
+                other.name,
+                other.notes,
+                other.source,
+                True,
+            ]
+    assert refused > FLIPS
+
+
+def test_file_that_ends_early_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "a.parquet"
+    save_recordings(file, unit())
+    whole = file.read_bytes()
+    for length in range(0, len(whole), 97):
+        file.write_bytes(whole[:length])
+        with pytest.raises(InputError, match="missing or damaged"):
+            load_recordings(file)
+
+
+def test_missing_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="missing or damaged") as caught:
+        load_recordings(tmp_path / "a.parquet")
+    assert caught.value.file == str(tmp_path / "a.parquet")
+
+
+def rewrite(path: Path, change: dict[str, Any]) -> None:
+    """Change the description in a file and its checksum, as another version of the writer might."""
+    table = parquet.read_table(path)
+    text = json.dumps({**json.loads(table.schema.metadata[b"recordings"]), **change}).encode()
+    metadata = {b"recordings": text, b"recordings_crc32": str(zlib.crc32(text)).encode()}
+    parquet.write_table(table.replace_schema_metadata(metadata), path)
+
+
+def test_unknown_schema_version_is_refused(tmp_path: Path) -> None:
+    save_recordings(tmp_path / "a.parquet", unit())
+    rewrite(tmp_path / "a.parquet", {})
+    assert len(load_recordings(tmp_path / "a.parquet")) == 3
+    rewrite(tmp_path / "a.parquet", {"schema_version": 99})
+    with pytest.raises(InputError, match="schema_version 99 is not known to this version"):
+        load_recordings(tmp_path / "a.parquet")
+
+
+def test_parquet_of_another_program_is_refused(tmp_path: Path) -> None:
+    parquet.write_table(pa.table({"x": [1, 2]}), tmp_path / "a.parquet")
+    with pytest.raises(InputError, match="holds no recordings"):
+        load_recordings(tmp_path / "a.parquet")
+
+
+def test_metadata_that_is_no_data_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match="object cannot be stored"):
+        save_recordings(tmp_path / "a.parquet", [replace(make_recording(3), source={"file": object()})])
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,109 @@
+"""The profiles that ship, as Hydra composes them, and the files that they ask for."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from sample_logs import procedure, profile
+
+from pipeline.config.compose import Composer
+from pipeline.errors import ConfigurationError
+from pipeline.io.files import candidate_files
+from pipeline.io.mcap_settings import mcap_format
+from pipeline.io.settings import check_ingest, csv_formats
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+PROFILES = (
+    "canonical_csv",
+    "mcap",
+    "mcap_fields",
+    "arduino_counts",
+    "xsens_mti_multi_position",
+    "mpu6050_multi_position",
+)
+
+
+@pytest.mark.parametrize("name", PROFILES)
+def test_composed_profile_is_sound(tmp_path: Path, name: str) -> None:
+    config = Composer(tmp_path).unit("U1", ["procedure=multi_position", "sensor=mpu6050", f"ingest={name}"])
+    check_ingest(config["ingest"], config["procedure"])
+    assert config["ingest"]["name"] == name
+    assert mcap_format(config["ingest"]).imu_topic is None
+
+
+def test_counts_of_the_arduino_profile_follow_the_sensor(tmp_path: Path) -> None:
+    layers = ["sensor=mpu6050", "ingest=arduino_counts", "sensor.gyroscope.counts_per_unit=65.5"]
+    config = Composer(tmp_path).unit("U1", layers)
+    (layout,) = csv_formats(config["ingest"])
+    scales = {c.channel: c.counts_per_unit for c in layout.columns}
+    assert scales["accel_x"] == config["sensor"]["accelerometer"]["counts_per_unit"] == 16384.0
+    assert scales["gyro_z"] == 65.5
+    assert scales["temperature"] == 340.0
+
+
+def test_file_names_need_only_the_standard_library() -> None:
+    code = (
+        "import sys, pipeline.io.files as f; from pathlib import Path;"
+        "f.recording_files({'recordings': {'a': {'file': 'a'}}}, {}, Path('.'));"
+        "print([m for m in ('numpy', 'pyarrow', 'mcap', 'yaml', 'omegaconf') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_a_log_of_messages_is_read_without_the_library_for_text() -> None:
+    code = (
+        "import sys, pipeline.io.read, pipeline.io.mcap;"
+        "print([m for m in ('pyarrow', 'scipy', 'yaml', 'omegaconf') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def parts(*files: str) -> dict[str, Any]:
+    ingest = profile("xsens_mti_multi_position")
+    ingest["csv"]["parts"] = [{**p, "file": f} for p, f in zip(ingest["csv"]["parts"], files, strict=True)]
+    return ingest
+
+
+def test_parts_with_fixed_names_belong_to_the_required_recording() -> None:
+    wanted = candidate_files(procedure("recording", optional=("static",)), parts("a.txt", "b.txt"))
+    assert wanted == {"recording": [["a.txt", "b.txt"], ["recording.mcap"]], "static": [["static.mcap"]]}
+
+
+def test_parts_named_after_the_recording_belong_to_each() -> None:
+    wanted = candidate_files(procedure("r", optional=("s",)), parts("{file}_acc.txt", "{file}_gyr.txt"))
+    assert wanted == {
+        "r": [["r_acc.txt", "r_gyr.txt"], ["r.mcap"]],
+        "s": [["s_acc.txt", "s_gyr.txt"], ["s.mcap"]],
+    }
+
+
+def test_parts_that_do_not_suit_the_procedure_are_refused() -> None:
+    with pytest.raises(ConfigurationError, match="this one requires a, b"):
+        check_ingest(parts("a.txt", "b.txt"), procedure("a", "b"))
+
+
+@pytest.mark.parametrize(
+    ("index", "change", "message"),
+    [
+        (0, {"file": ""}, r"parts\[0\].file is ''"),
+        (1, {"fil": "x"}, r"parts\[1\].fil is unknown; did you mean file"),
+        (1, {"columns": {"accel_x": {"column": 1, "unit": "g"}}}, "needs either a time column"),
+        (
+            1,
+            {"columns": {c: {"column": 0, "unit": u} for c, u in (("time", "s"), ("accel_x", "g"))}},
+            "accel_x stands in two parts",
+        ),
+    ],
+)
+def test_faulty_part_is_refused(index: int, change: dict[str, Any], message: str) -> None:
+    ingest = profile("xsens_mti_multi_position")
+    ingest["csv"]["parts"][index].update(change)
+    with pytest.raises(ConfigurationError, match=message):
+        check_ingest(ingest)

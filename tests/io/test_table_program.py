@@ -1,0 +1,83 @@
+"""A table without encoders, followed from its program: angles and rates against those of the simulation."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from simulated_logs import as_table
+
+from pipeline.io.ingest_error import IngestError
+from pipeline.io.table_program import follow_program
+from pipeline.records import Recording
+from pipeline.simulation.procedures import Course, plan
+from pipeline.simulation.session import Streams
+from pipeline.simulation.table_logs import as_program
+from pipeline.simulation.trajectory import Turn
+
+if TYPE_CHECKING:
+    from pipeline.simulation.program import Program
+
+BIAS, SCALE = np.array([1.3, -0.4, 0.2]), 1.01
+COURSE = Course(step_deg=30.0, rates_dps=(30.0, 60.0), both_directions=True, validation_s=0.0, static_s=0.0)
+
+
+def program_of(name: str) -> Program:
+    trajectory = next(p.trajectory for p in plan("three_axis_turns", COURSE, Streams(1, 0)["motion"]) if p.name == name)
+    assert isinstance(trajectory, Turn)
+    return trajectory.program
+
+
+def felt(name: str, begun: float, drift: float, pauses: Any, interval: float = 0.02) -> tuple[Recording, Any]:
+    """A recording of a table that began late, by a clock that drifts, and paused before some moves; its angle."""
+    program = program_of(name)
+    moves = np.append(program.knots[np.flatnonzero((program.rate == 0) & (program.acceleration != 0))], np.inf)
+    time = np.arange(0.0, begun + program.duration + float(np.sum(pauses)) + 3.0, interval)
+    own = (time - begun) * (1.0 + drift)
+    late = np.zeros_like(own)
+    for move, pause in zip(moves, pauses, strict=False):  # the table's own time stands still while it pauses
+        late = np.where(own - late > move, np.minimum(late + pause, np.maximum(own - move, late)), late)
+    angle, rate = program.at(own - late)[:2]
+    rng = np.random.default_rng(5)
+    axis = "xyz".index(name[-1])
+    gyro = BIAS + 0.03 * rng.standard_normal((len(time), 3))
+    gyro[:, axis] += SCALE * rate
+    up = np.zeros((len(time), 3))
+    a, b = (axis + 1) % 3, (axis + 2) % 3
+    up[:, a], up[:, b] = np.sin(np.radians(angle)), np.cos(np.radians(angle))
+    up += 1e-3 * rng.standard_normal(up.shape)
+    ns = np.rint(time * 1e9).astype(np.int64)
+    return Recording(name, "gyroscope", name[-1], ns, accelerometer=up, gyroscope=gyro), (angle, rate)
+
+
+@pytest.mark.parametrize("name", ["accel_x", "gyro_y"])
+@pytest.mark.parametrize(("begun", "drift"), [(0.0, 0.0), (17.3, 2e-4)])
+def test_a_program_is_placed_where_it_was_run(name: str, begun: float, drift: float) -> None:
+    recording, (angle, rate) = felt(name, begun, drift, [])
+    found = follow_program(as_table(recording), as_program(program_of(name)))
+    assert float(np.abs(found.values["table_angle"] - angle).max()) < 0.05
+    assert float(np.sqrt(np.mean((found.values["table_rate"] - rate) ** 2))) < 0.05
+    assert [n.code for n in found.notes] == ["N-PROGRAM"]
+
+
+def test_a_table_that_pauses_between_moves_is_followed_from_rest_to_rest() -> None:
+    pauses = np.tile([0.0, 0.15, 0.05, -0.0], 6)
+    recording, (angle, _) = felt("accel_x", 4.0, 1e-5, pauses)
+    found = follow_program(as_table(recording), as_program(program_of("accel_x")))
+    off = np.abs(found.values["table_angle"] - angle)
+    assert float(off.max()) < 0.1
+    assert float(np.median(off)) < 1e-6  # at rest the commanded angle itself
+
+
+def test_a_program_that_was_not_run_is_refused() -> None:
+    recording, _ = felt("accel_x", 0.0, 0.0, [])
+    with pytest.raises(IngestError, match=r"does not show the motion|fits at"):
+        follow_program(as_table(recording), as_program(program_of("gyro_x")))
+
+
+def test_a_program_needs_a_gyroscope() -> None:
+    recording, _ = felt("accel_x", 0.0, 0.0, [])
+    with pytest.raises(IngestError, match="gyroscope"):
+        follow_program(as_table(replace(recording, gyroscope=None)), as_program(program_of("accel_x")))
