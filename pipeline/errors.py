@@ -6,8 +6,6 @@ command line, and a failure record of one unit in a batch; all else that is rais
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 
 class PipelineError(Exception):
     """A user error.
@@ -20,7 +18,7 @@ class PipelineError(Exception):
         The file concerned, with its line as ``path:line`` where there is one.
     """
 
-    code: ClassVar[str] = "error"
+    code: str = "error"
 
     def __init__(self, message: str, file: str | None = None) -> None:
         super().__init__(message)
@@ -35,6 +33,46 @@ class InputError(PipelineError):
     """A recording or another input file cannot be used as it is."""
 
     code = "bad_input"
+
+
+class IngestError(InputError):
+    """A recording cannot be used as it is; ``code`` is that of ``docs/bad_inputs.md``.
+
+    Parameters
+    ----------
+    message : str
+        What is wrong and where, with the facts.
+    file : str, optional
+    fault : str
+        The code: ``not_a_number``, ``wrong_sense``, ``checksum`` ...
+    offset : int, optional
+        Byte of the file at which the fault was found.
+    hint : str
+        What to do about it.
+
+    Attributes
+    ----------
+    message : str
+        Fact, byte and hint in one line.
+    fact : str
+        What is wrong, without byte and hint.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        file: str | None = None,
+        *,
+        fault: str = "damaged",
+        offset: int | None = None,
+        hint: str = "",
+    ) -> None:
+        place = "" if offset is None else f" (byte {offset})"
+        super().__init__(f"{message}{place}" + (f"; {hint}" if hint else ""), file)
+        self.code = fault
+        self.fact = message
+        self.offset = offset
+        self.hint = hint
 
 
 class MissingInputError(InputError):

@@ -15,26 +15,25 @@ from typing import TYPE_CHECKING, Any
 from pipeline.atomic import write_atomically
 from pipeline.config.campaign import load_campaign
 from pipeline.config.compose import CONFIGS, Composer, Problem
-from pipeline.errors import ConfigurationError, PipelineError
+from pipeline.errors import ConfigurationError, IngestError, PipelineError
 from pipeline.io.checks import checks_of
 from pipeline.io.files import FILE, candidate_files
-from pipeline.io.ingest_error import IngestError
 from pipeline.io.read import read_table, to_recording
 from pipeline.preprocessing.checks import check_recordings
+from pipeline.profile_detection.mcap_topics import topic_lines
+from pipeline.profile_detection.profile_text import as_yaml
+from pipeline.profile_detection.proposal import propose
+from pipeline.profile_detection.recording_facts import as_text, facts
+from pipeline.profile_detection.text_layout import find_shape
+from pipeline.profile_detection.unit_guesses import UNKNOWN
 from pipeline.signal.segments import cut
-from pipeline.survey.facts import as_text, facts
-from pipeline.survey.mcap_topics import topic_lines
-from pipeline.survey.profile_text import as_yaml
-from pipeline.survey.proposal import propose
-from pipeline.survey.shape import find_shape
-from pipeline.survey.unit_evidence import UNKNOWN
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from pipeline.profile_detection.proposal import Proposal
+    from pipeline.profile_detection.text_layout import Shape
     from pipeline.records import Recording
-    from pipeline.survey.proposal import Proposal
-    from pipeline.survey.shape import Shape
 
 DEFAULT_PROFILE = "canonical_csv"
 LOOKED_AT_BYTES = 1 << 25
@@ -93,15 +92,8 @@ def main(argv: Sequence[str]) -> int:
         print(f"{arguments.save} was not written: there is nothing to propose")
     sys.stdout.flush()
     for reading, error in refused:
-        print(
-            f"python -m pipeline check: {error.file or reading.files[0]}: refused ({kind_of(error)})", file=sys.stderr
-        )
+        print(f"python -m pipeline check: {error.file or reading.files[0]}: refused ({error.code})", file=sys.stderr)
     return 2 if refused else 0
-
-
-def kind_of(error: PipelineError) -> str:
-    """Return the machine-readable kind of a refusal."""
-    return str(getattr(error, "fault", error.code))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -236,9 +228,9 @@ def _tell(reading: Reading) -> PipelineError | None:
         checked = check_recordings(parts or [recording], reading.settings)
         parts, recording = (checked, recording) if parts else ([], checked[0])
     except PipelineError as error:
-        topics = topic_lines(reading.files[0], fields=kind_of(error) == "missing_topic") if _is_mcap(reading) else []
+        topics = topic_lines(reading.files[0], fields=error.code == "missing_topic") if _is_mcap(reading) else []
         place = _place(error.file, reading.files)
-        print(as_text([("REFUSED", f"{place}{error.message}"), ("code", kind_of(error)), *topics]) + "\n")
+        print(as_text([("REFUSED", f"{place}{error.message}"), ("code", error.code), *topics]) + "\n")
         return error
     topics = topic_lines(reading.files[0], fields=False) if _is_mcap(reading) else []
     segments = [("segments" if i == 0 else "", f"{p.name}: {_segment(p)}") for i, p in enumerate(parts)]
@@ -264,7 +256,7 @@ def _is_mcap(reading: Reading) -> bool:
 
 def _shapes(reading: Reading, error: PipelineError) -> list[Shape]:
     """Return the shape of each text log that the profile does not describe."""
-    if not isinstance(error, IngestError) or error.fault not in ANOTHER_LAYOUT:
+    if not isinstance(error, IngestError) or error.code not in ANOTHER_LAYOUT:
         return []
     found = []
     for file in reading.files:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import ConfigurationError, PipelineError
-from pipeline.io.regular import not_regular
+from pipeline.io.file_access import not_regular
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.io.text_log import DECIMALS
+from pipeline.io.csv_cells import DECIMALS
 from pipeline.records import SENSORS
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.io.ingest_error import IngestError
+from pipeline.errors import IngestError
 from pipeline.io.mcap_container import Container
 from pipeline.io.mcap_decode import ChannelDecoder
 from pipeline.io.mcap_kinds import ABSENT, SHORT, VECTORS, topic_of, wanted_by_map, wanted_of

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pyarrow as pa
 
+from pipeline.errors import IngestError
 from pipeline.io.csv_fault import KIND_OF_SETTING, find_faults, quoted_numbers, refusal, with_parted_rows
 from pipeline.io.csv_layout import find_layout
 from pipeline.io.csv_parse import all_finite, parse
 from pipeline.io.csv_rows import Rows
 from pipeline.io.csv_settings import DROP, GAP
 from pipeline.io.csv_time import EXACT_BELOW_S, LONGEST_S, exact_times, seconds_per_unit
-from pipeline.io.ingest_error import IngestError
 from pipeline.io.text_file import load_text
 from pipeline.records import Note
 
@@ -109,7 +109,7 @@ def over_budget(error: IngestError, touched: int, rows: int, checks: Checks) -> 
         f"{touched} of {rows} rows would have to be repaired, more than the share of {checks.repaired_rows:g} that "
         "ingest.checks.repaired_rows allows"
     )
-    return IngestError(error.fact, error.file, fault=error.fault, hint=hint)
+    return IngestError(error.fact, error.file, fault=error.code, hint=hint)
 
 
 def _without_lines(layout: Layout, faults: list[Fault], rows: int) -> Layout:

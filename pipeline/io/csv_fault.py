@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 
 import pyarrow as pa
 
+from pipeline.errors import IngestError
 from pipeline.io.csv_parse import all_finite, parse
-from pipeline.io.ingest_error import IngestError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.errors import IngestError
 from pipeline.io.csv_columns import find_columns, refuse_twice
 from pipeline.io.csv_settings import AUTO, COMMENTED, WHITESPACE
-from pipeline.io.ingest_error import IngestError
 from pipeline.io.units import TRIADS
 from pipeline.records import Note
 

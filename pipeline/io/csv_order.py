@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.errors import IngestError
 from pipeline.io.csv_careful import over_budget
 from pipeline.io.csv_time import LARGEST_DISPLACEMENT, order_of, unwrap, wrap_note
-from pipeline.io.ingest_error import IngestError
-from pipeline.io.stamps import time_error
+from pipeline.io.timestamps import time_error
 from pipeline.records import Note
 
 if TYPE_CHECKING:
@@ -109,7 +109,7 @@ def _doubled(rows: Rows, time_ns: NDArray[np.int64], index: NDArray[np.intp], er
     here, before = index[twice], index[twice - 1]
     for values in rows.numbers.values():
         if not np.array_equal(values[here], values[before]):
-            if isinstance(error, IngestError) and error.fault != "duplicate_time":
+            if isinstance(error, IngestError) and error.code != "duplicate_time":
                 raise error
             place = int(twice[np.flatnonzero(values[here] != values[before])[0]])
             row = int(max(index[place], index[place - 1]))

@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pyarrow as pa
 
+from pipeline.errors import IngestError
 from pipeline.io.csv_columns import find_columns, refuse_twice
 from pipeline.io.csv_layout import LineNumbers, column_notes, fields
 from pipeline.io.csv_parse import all_finite, parse
 from pipeline.io.csv_rows import Rows
 from pipeline.io.csv_settings import AUTO, COMMENTED, WHITESPACE
 from pipeline.io.csv_time import EXACT_BELOW_S, exact_times, seconds_per_unit
-from pipeline.io.ingest_error import IngestError
 from pipeline.io.text_file import unchanged
 
 if TYPE_CHECKING:

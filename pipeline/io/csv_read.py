@@ -3,7 +3,7 @@
     value = (count - offset) / counts_per_unit
 
 Files of one recording that were logged at the same times are joined row by row; a table's log with a clock of its own
-is brought to the sensor's (``pipeline.io.table_clock``).
+is brought to the sensor's (``pipeline.io.clock_alignment``).
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.errors import IngestError
 from pipeline.io.channel_table import ChannelTable
 from pipeline.io.checks import Checks
 from pipeline.io.csv_careful import read_carefully
 from pipeline.io.csv_order import in_order
 from pipeline.io.csv_quick import read_quickly
 from pipeline.io.csv_time import LONGEST_S, refuse_coarse, seconds_per_unit, whole_times
-from pipeline.io.ingest_error import IngestError
 from pipeline.io.units import COUNTS, UNITS, decode, to_house_unit
 from pipeline.records import Encoding, Note
 
@@ -58,7 +58,7 @@ def read_csv(paths: Sequence[Path], formats: Sequence[CsvFormat], checks: Checks
     others = [t for t, layout in zip(tables, formats, strict=True) if layout.own_clock]
     joined = _joined(same)
     if others or TABLE_TIME in joined.values:
-        from pipeline.io.table_align import align, own_rows  # noqa: PLC0415  (few logs need it)
+        from pipeline.io.encoder_log import align, own_rows  # noqa: PLC0415  (few logs need it)
 
         for log in others or [own_rows(joined)]:
             joined = align(joined, log)

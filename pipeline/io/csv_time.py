@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pyarrow as pa
 
+from pipeline.errors import IngestError
 from pipeline.io.csv_parse import parse
-from pipeline.io.ingest_error import IngestError
 from pipeline.io.units import UNITS
 from pipeline.records import Note
 

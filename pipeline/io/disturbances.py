@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.io.marks import GAP, UNIT_NAMES
+from pipeline.io.quality_flags import GAP, UNIT_NAMES
 from pipeline.records.attitude import conjugate_product, continuous, level_in_body
 from pipeline.records.median import median
 from pipeline.records.neighbours import noise_of_steps

@@ -22,8 +22,8 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
+from pipeline.errors import IngestError
 from pipeline.io.csv_settings import Column, CsvFormat
-from pipeline.io.ingest_error import IngestError
 from pipeline.io.text_file import refuse_foreign, unchanged
 from pipeline.io.units import ATTITUDE, COUNTS, DEGREES, TRIADS
 

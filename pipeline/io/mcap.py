@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.errors import IngestError
 from pipeline.io.channel_table import ChannelTable
-from pipeline.io.ingest_error import IngestError
 from pipeline.io.mcap_kinds import ABSENT, SHORT, TABLE_UNITS, VECTORS, topic_of, wanted_by_map, wanted_of
 from pipeline.io.mcap_series import Gatherer, Series, check_finite
 from pipeline.io.mcap_settings import OWN, TIME
@@ -91,7 +91,7 @@ class _Reader:
         source = {"file": self.path, "sha256": self.walk.found.sha256, "rows": len(time)}
         table = ChannelTable(self.path, time, values, source, lambda _row: 0, self.encodings, notes=tuple(self.notes))
         if self.logs:
-            from pipeline.io.table_align import align  # noqa: PLC0415  (few logs need it)
+            from pipeline.io.encoder_log import align  # noqa: PLC0415  (few logs need it)
 
             for log in self.logs:
                 table = align(table, log)

@@ -19,12 +19,12 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
+from pipeline.errors import IngestError
 from pipeline.io.field_path import STAMPS, FieldPath, number_at, place_of, stamp_at
-from pipeline.io.ingest_error import IngestError
 from pipeline.io.message_definition import ROS1_TIME, ROS2_TIME, parse_definition, short_name
 from pipeline.io.message_template import Template, find_template
 from pipeline.io.official_decoders import object_decoder, ros2_decoder
-from pipeline.io.stamps import nanoseconds, of_number, of_pair
+from pipeline.io.timestamps import nanoseconds, of_number, of_pair
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

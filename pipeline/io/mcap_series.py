@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.io.ingest_error import IngestError
+from pipeline.errors import IngestError
 from pipeline.io.mcap_decode import ChannelDecoder, Wanted
 from pipeline.io.mcap_kinds import ABSENT
-from pipeline.io.stamps import check_fine, check_plausible, in_order
+from pipeline.io.timestamps import check_fine, check_plausible, in_order
 from pipeline.records import Note
 
 if TYPE_CHECKING:

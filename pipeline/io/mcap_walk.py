@@ -13,8 +13,8 @@ from __future__ import annotations
 import zlib
 from typing import TYPE_CHECKING, BinaryIO
 
+from pipeline.errors import IngestError
 from pipeline.io import mcap_records as records
-from pipeline.io.ingest_error import IngestError
 from pipeline.io.mcap_chunk import Run, split, unpack
 from pipeline.io.mcap_container import Container
 from pipeline.io.record_stream import RecordStream, Truncated

@@ -4,7 +4,7 @@ Time that does not increase or keeps another rate than is known, specific force 
 sensor cannot give, rates that do not fit the table or the way in which gravity turns, an attitude that is no rotation.
 Each is nearly always a wrong unit or column.
 
-What is merely marked (gaps, clipped and stuck readings) is found in ``pipeline.io.marks``; whether the unit is
+What is merely marked (gaps, clipped and stuck readings) is found in ``pipeline.io.quality_flags``; whether the unit is
 mounted as stated, in ``pipeline.preprocessing.mounting``.
 """
 
@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.errors import IngestError
 from pipeline.io.checks import Checks
-from pipeline.io.ingest_error import IngestError
-from pipeline.io.marks import mark_clipped, mark_gaps, mark_stuck
-from pipeline.io.stamps import time_error
+from pipeline.io.quality_flags import mark_clipped, mark_gaps, mark_stuck
+from pipeline.io.timestamps import time_error
 from pipeline.io.units import ATTITUDE, DEGREES, TRIADS
 from pipeline.records.median import median
 
@@ -174,7 +174,7 @@ def _check_turn_rate(table: ChannelTable) -> None:
         ratio = float(median(size / rate[turning]))
         seen = f"while the table turns the angular rate is {ratio:.3g} times the table's"
     else:
-        from pipeline.io.turn_evidence import declared_scale  # noqa: PLC0415  (imported where there is no table)
+        from pipeline.io.gravity_rotation import declared_scale  # noqa: PLC0415  (imported where there is no table)
 
         found = declared_scale(table)
         if found is None:

@@ -14,12 +14,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.errors import MissingInputError
+from pipeline.errors import IngestError, MissingInputError
 from pipeline.io.axes import STRAIGHT, axis_maps, to_body_axes
 from pipeline.io.checks import checks_of
 from pipeline.io.disturbances import leave_out_disturbances
 from pipeline.io.files import candidate_files, recording_files
-from pipeline.io.ingest_error import IngestError
 from pipeline.io.plausibility import examine
 from pipeline.io.shaken_rests import leave_out_shaken_rests
 from pipeline.io.table_log import unwrapped
@@ -162,7 +161,7 @@ def to_recording(
     checks : Checks
     """
     if entry.get("program") and not set(TABLE_CHANNELS) & table.values.keys():
-        from pipeline.io.table_program import follow_program  # noqa: PLC0415  (few tables need it)
+        from pipeline.io.commanded_motion import follow_program  # noqa: PLC0415  (few tables need it)
 
         table = follow_program(table, entry["program"])
     table = unwrapped(table)

@@ -8,8 +8,8 @@ import struct
 import zlib
 from typing import BinaryIO
 
+from pipeline.errors import IngestError
 from pipeline.io import mcap_records as records
-from pipeline.io.ingest_error import IngestError
 from pipeline.io.text_file import FOREIGN
 
 _RECORD = struct.Struct("<BQ")

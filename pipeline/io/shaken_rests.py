@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.io.disturbances import without_rows
-from pipeline.io.marks import UNIT_NAMES
+from pipeline.io.quality_flags import UNIT_NAMES
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.io.ingest_error import IngestError
+from pipeline.errors import IngestError
 from pipeline.io.units import ATTITUDE
 from pipeline.records.attitude import conjugate_product, continuous, level_in_body
 

@@ -13,8 +13,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from pipeline.io.ingest_error import IngestError
-from pipeline.io.regular import not_regular
+from pipeline.errors import IngestError
+from pipeline.io.file_access import not_regular
 from pipeline.records import Note
 
 if TYPE_CHECKING:

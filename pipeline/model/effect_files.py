@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from pipeline.errors import ConfigurationError, MissingInputError, PipelineError
-from pipeline.io.regular import read_text
+from pipeline.io.file_access import read_text
 from pipeline.model.effects import built_in, register
 from pipeline.model.effects.base import Effect
 from pipeline.model.user_effects import FormulaEffect, effect_from

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.io.ingest_error import IngestError
+from pipeline.errors import IngestError
 from pipeline.records import AXES, SENSORS
 from pipeline.records.attitude import conjugate_product, continuous
 from pipeline.records.median import median
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-GAP = 1.5  # median intervals, as pipeline.io.marks
+GAP = 1.5  # median intervals, as pipeline.io.quality_flags
 EXPANDED = 3.0  # coverage of a stated standard uncertainty: 99.7 % of a normal distribution
 OPPOSITE = 0.8  # correlation, from which two channels differ in sign alone
 SIGN_BLOCK = 8  # intervals, over which short moves show their angle in both

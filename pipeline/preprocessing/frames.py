@@ -21,9 +21,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.errors import IngestError
 from pipeline.io.axes import axis_matrix
-from pipeline.io.ingest_error import IngestError
-from pipeline.io.turn_evidence import FAILS_DEG, FEWEST_MOVES, MOST_SAMPLES, misfits_deg, moves_of
+from pipeline.io.gravity_rotation import FAILS_DEG, FEWEST_MOVES, MOST_SAMPLES, misfits_deg, moves_of
 from pipeline.preprocessing.bench import nearest_axis, off_axis_deg, signed_axis
 from pipeline.records import AXES
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.io.turn_evidence import Move
+    from pipeline.io.gravity_rotation import Move
     from pipeline.preprocessing.turn_fit import TurnFit
     from pipeline.records import Recording
 

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.errors import IngestError
 from pipeline.io.axes import axis_maps, axis_matrix
-from pipeline.io.ingest_error import IngestError
 from pipeline.model.kinematics import UP_AT_ZERO
 from pipeline.preprocessing.bench import ACROSS, by_convention, found_bench, stated_bench
 from pipeline.preprocessing.departures import Tolerance, Turn, departure, words

@@ -8,8 +8,8 @@ within 8 rows of the one before; by chance that is as improbable as
 
     (8 c / n)^19,   c : rows that occur in both,   n : rows of the longer recording
 
-for which 10^-6 is the limit, as for stuck readings (``pipeline.io.marks``). So whole copies are found, shifted in
-rows or time, cut, or with rows left out.
+for which 10^-6 is the limit, as for stuck readings (``pipeline.io.quality_flags``). So whole copies are found, shifted
+in rows or time, cut, or with rows left out.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.io.marks import BY_CHANCE
+from pipeline.io.quality_flags import BY_CHANCE
 from pipeline.preprocessing.evidence import place, refusal
 from pipeline.records import SENSORS
 

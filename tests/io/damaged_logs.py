@@ -12,7 +12,7 @@ from mcap.reader import NonSeekingReader
 from mcap.writer import CompressionType, Writer
 from sample_logs import make_recording
 
-from pipeline.io.ingest_error import IngestError
+from pipeline.errors import IngestError
 from pipeline.io.mcap import _Reader
 from pipeline.io.mcap_messages import read_container
 from pipeline.io.mcap_settings import McapFormat

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from sample_logs import SENSOR, procedure
 
-from pipeline.io.ingest_error import IngestError
+from pipeline.errors import IngestError
 from pipeline.io.read import read_recordings
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ def test_a_gyroscope_alone_is_read(tmp_path: Path) -> None:
 def test_a_head_that_says_too_little_is_refused(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(IngestError, match=message) as caught:
         read(tmp_path, text)
-    assert caught.value.fault == "gcsv"
+    assert caught.value.code == "gcsv"
 
 
 def test_two_maps_of_the_axes_are_one_too_many(tmp_path: Path) -> None:

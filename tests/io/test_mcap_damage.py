@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 from damaged_logs import RECORDERS, Tally, cuts, flips, log_of, messages_of, same_bits, table_of
 
-from pipeline.io.ingest_error import IngestError
+from pipeline.errors import IngestError
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -43,7 +43,7 @@ def test_cut_log_gives_its_complete_chunks_on_request(tmp_path: Path, recorder: 
         try:
             table = table_of(damaged, allow_truncated=True)
         except IngestError as error:
-            assert error.fault in {"truncated", "not_mcap"}  # noqa: PT017
+            assert error.code in {"truncated", "not_mcap"}  # noqa: PT017
             continue
         rows = len(table.time_ns)
         kept.add(rows)
@@ -59,4 +59,4 @@ def test_cut_log_without_chunks_is_refused_even_on_request(tmp_path: Path) -> No
     whole = log_of("unchunked, data checksum", tmp_path)
     with pytest.raises(IngestError, match="not every message lies in a chunk with a checksum") as caught:
         table_of(whole[: len(whole) // 2], allow_truncated=True)
-    assert caught.value.fault == "truncated"
+    assert caught.value.code == "truncated"

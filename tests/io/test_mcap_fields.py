@@ -13,8 +13,7 @@ from mcap.writer import Writer
 from rosbags.typesys import Stores, get_typestore
 from sample_logs import SENSOR, procedure, profile
 
-from pipeline.errors import ConfigurationError
-from pipeline.io.ingest_error import IngestError
+from pipeline.errors import ConfigurationError, IngestError
 from pipeline.io.mcap import read_mcap
 from pipeline.io.mcap_settings import mcap_format
 from pipeline.io.read import read_recordings
@@ -108,7 +107,7 @@ def test_other_encapsulations_are_refused(tmp_path: Path, kind: int) -> None:
     write(tmp_path / "a.mcap", ("/imu", "cdr", ROS2_IMU, messages))
     with pytest.raises(IngestError, match=f"message 2 on /imu .* its encapsulation is 00 {kind:02x} 00 00") as caught:
         read(tmp_path / "a.mcap")
-    assert caught.value.fault == "bad_message"
+    assert caught.value.code == "bad_message"
 
 
 def ros1_topic(topic: str, name: str, make: Callable[[int], dict[str, Any]]) -> tuple[str, str, Any, list[bytes]]:
@@ -154,7 +153,7 @@ def test_one_of_several_imus_is_chosen_by_topic(tmp_path: Path) -> None:
     write(tmp_path / "a.mcap", *topics)
     with pytest.raises(IngestError, match=r"2 topics are of type sensor_msgs/msg/Imu: /a, /b; choose one") as caught:
         read(tmp_path / "a.mcap")
-    assert caught.value.fault == "ambiguous"
+    assert caught.value.code == "ambiguous"
     table = read(tmp_path / "a.mcap", imu_topic="/a")
     assert_is_the_imu(table, 3)
     assert [n.detail for n in table.notes] == ["topics not used: /b (sensor_msgs/msg/Imu)"]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from mcap.writer import Writer
 
-from pipeline.io.ingest_error import IngestError
+from pipeline.errors import IngestError
 from pipeline.io.mcap import read_mcap
 from pipeline.io.mcap_settings import mcap_format
 
@@ -72,7 +72,7 @@ def test_message_later_than_the_limit_is_refused(tmp_path: Path) -> None:
     stamps = [EPOCH, EPOCH + 3000 * MS, EPOCH + 1000 * MS]
     with pytest.raises(IngestError, match=r"message 3 on /imu: header stamp .* \(1 such messages\)") as caught:
         read(tmp_path, stamps)
-    assert caught.value.fault == "bad_time"
+    assert caught.value.code == "bad_time"
     assert read(tmp_path, stamps, reorder_s=2.0).time_ns.tolist() == sorted(stamps)
 
 

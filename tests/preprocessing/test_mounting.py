@@ -12,9 +12,9 @@ from benches import BIAS, INTERVAL_S, Setup, recordings_of, settings_of
 from benches import K as TRUE_K
 from scipy.spatial.transform import Rotation
 
+from pipeline.errors import IngestError
 from pipeline.estimation.accelerometer import reference_least_squares as accelerometer_fit
 from pipeline.estimation.gyroscope import reference_least_squares as gyroscope_fit
-from pipeline.io.ingest_error import IngestError
 from pipeline.model.kinematics import reference_motion
 from pipeline.preprocessing.checks import check_recordings
 from pipeline.preprocessing.departures import words
@@ -121,7 +121,7 @@ def test_another_turn_axis_is_refused_by_gravity_and_by_the_gyroscope() -> None:
         IngestError, match=r"said to turn about y, and gravity turns about x.*accel_x\.axis=x"
     ) as caught:
         check_mounting(exchanged, settings_of(exchanged))
-    assert caught.value.fault == "wrong_axis"
+    assert caught.value.code == "wrong_axis"
     blind = [replace(r, accelerometer=None) for r in exchanged if r.role == "gyroscope"]
     with pytest.raises(IngestError, match="said to turn about y, and the gyroscope turns about x"):
         check_mounting(blind, settings_of(blind))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from bad_units import SETTINGS, cases, sound
 
-from pipeline.io.ingest_error import IngestError
+from pipeline.errors import IngestError
 from pipeline.preprocessing.at_rest import check_static
 from pipeline.preprocessing.checks import check_recordings
 from pipeline.records import Recording
@@ -33,7 +33,7 @@ def test_a_contradiction_is_refused_by_its_code_with_file_rows_and_cause(number:
     case = CASES[number]
     with pytest.raises(IngestError) as caught:
         check_recordings(case.change(list(sound())), SETTINGS)
-    assert caught.value.fault == case.fault, caught.value.message
+    assert caught.value.code == case.fault, caught.value.message
     assert re.search(case.says, caught.value.message), caught.value.message
     assert caught.value.hint
     if case.file:

@@ -10,11 +10,10 @@ import pytest
 from simulated_logs import as_table, beside_a_table, clock_errors
 from test_mcap_logs import header, imu, write_ros2
 
-from pipeline.errors import InputError
-from pipeline.io.ingest_error import IngestError
+from pipeline.errors import IngestError, InputError
+from pipeline.io.encoder_log import align
 from pipeline.io.read import read_recordings
 from pipeline.io.ros2 import IMU, JOINT_STATE
-from pipeline.io.table_align import align
 from pipeline.model.kinematics import reference_motion
 
 if TYPE_CHECKING:

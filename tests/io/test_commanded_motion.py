@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from simulated_logs import as_table
 
-from pipeline.io.ingest_error import IngestError
-from pipeline.io.table_program import follow_program
+from pipeline.errors import IngestError
+from pipeline.io.commanded_motion import follow_program
 from pipeline.records import Recording
 from pipeline.simulation.procedures import Course, plan
 from pipeline.simulation.session import Streams

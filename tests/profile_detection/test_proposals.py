@@ -11,14 +11,14 @@ import yaml
 from loggers import GRAVITY, LOGGERS, Logger, motion
 
 from pipeline.config.compose import Composer
+from pipeline.errors import IngestError
 from pipeline.io.checks import Checks
 from pipeline.io.csv_read import read_csv
 from pipeline.io.csv_settings import csv_formats
-from pipeline.io.ingest_error import IngestError
 from pipeline.io.text_file import load_text
-from pipeline.survey.profile_text import as_yaml
-from pipeline.survey.proposal import Proposal, propose
-from pipeline.survey.shape import find_shape
+from pipeline.profile_detection.profile_text import as_yaml
+from pipeline.profile_detection.proposal import Proposal, propose
+from pipeline.profile_detection.text_layout import find_shape
 
 REFERENCE = Path(__file__).parents[3] / "shared" / "data"
 

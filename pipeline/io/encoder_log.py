@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.errors import IngestError
 from pipeline.io.channel_table import ChannelTable
-from pipeline.io.ingest_error import IngestError
-from pipeline.io.table_clock import fit_clocks
+from pipeline.io.clock_alignment import fit_clocks
 from pipeline.io.table_log import interpolators, seconds_of, signals_of, unwrapped
 from pipeline.io.units import TABLE_CHANNELS
 from pipeline.records import Note
@@ -16,7 +16,7 @@ from pipeline.records import Note
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from pipeline.io.table_clock import ClockFit
+    from pipeline.io.clock_alignment import ClockFit
 
 TABLE_TIME = "table_time"
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.io.ingest_error import IngestError
+from pipeline.errors import IngestError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

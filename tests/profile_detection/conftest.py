@@ -1,4 +1,4 @@
-"""Fixtures of the survey of unknown files."""
+"""Fixtures of profile detection."""
 
 from __future__ import annotations
 

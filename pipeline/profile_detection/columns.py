@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.io.units import TRIADS
-from pipeline.survey.column_names import axis_of, is_time, other_channel, sensor_of, words_of
+from pipeline.profile_detection.column_names import axis_of, is_time, other_channel, sensor_of, words_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from pipeline.survey.shape import Shape
+    from pipeline.profile_detection.text_layout import Shape
 
 COUNTING = 0.98  # share of steps by exactly 1
 SCATTER = 0.2  # of intervals over their median: times of arrival, not of sampling

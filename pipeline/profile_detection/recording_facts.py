@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.io.marks import CLIPPED, GAP, STUCK, UNIT_NAMES, equal_share
-from pipeline.io.turn_evidence import misfit_deg, moves_of, rests_of
+from pipeline.io.gravity_rotation import misfit_deg, moves_of, rests_of
+from pipeline.io.quality_flags import CLIPPED, GAP, STUCK, UNIT_NAMES, equal_share
+from pipeline.profile_detection.unit_guesses import BURSTS, FEWEST_RESTS_FOR_A_SPHERE, sphere
 from pipeline.records import AXES, SENSORS
 from pipeline.signal.rests import rests_from_table
-from pipeline.survey.unit_evidence import BURSTS, FEWEST_RESTS_FOR_A_SPHERE, sphere
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

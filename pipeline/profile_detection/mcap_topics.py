@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import islice
 from typing import TYPE_CHECKING, Any
 
-from pipeline.io.ingest_error import IngestError
+from pipeline.errors import IngestError
 from pipeline.io.mcap_kinds import SHORT
 from pipeline.io.mcap_walk import Walk
 from pipeline.io.message_definition import short_name

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.io.ingest_error import IngestError
+from pipeline.errors import IngestError
 from pipeline.io.units import UNITS
 from pipeline.records import Note
 

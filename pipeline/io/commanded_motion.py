@@ -6,7 +6,7 @@ where
 
     P   : commanded angle by the program's own time, deg: rests, and turns with trapezoidal rate
     m_j : middle of move j by the program, s
-    t_j : the sensor's time there by offset and drift of the whole program (``pipeline.io.table_clock``), s
+    t_j : the sensor's time there by offset and drift of the whole program (``pipeline.io.clock_alignment``), s
     d_j : how far the move is off that, s
     k   : drift of the program's clock, 1: that of the moves, for pauses between them look like one
 
@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.io.channel_table import ChannelTable
-from pipeline.io.table_clock import fit_clocks
+from pipeline.io.clock_alignment import fit_clocks
 from pipeline.io.table_log import seconds_of
 from pipeline.io.units import TRIADS
 from pipeline.records import Note

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.io.units import TRIADS
 
 if TYPE_CHECKING:
-    from pipeline.survey.proposal import Entries, Proposal
+    from pipeline.profile_detection.proposal import Entries, Proposal
 
 WIDTH = 116
 

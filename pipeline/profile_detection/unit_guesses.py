@@ -1,7 +1,7 @@
 """Units that numbers seem to have, each with the evidence in words.
 
 specific force : |f| at rest is 1 in g, 9.8 in m/s^2, 1000 in mg; of counts, it is the number of counts a g
-angular rate   : the unit in which the rates turn gravity from rest to rest (``pipeline.io.turn_evidence``)
+angular rate   : the unit in which the rates turn gravity from rest to rest (``pipeline.io.gravity_rotation``)
 time           : intervals of sensors are 0.05 to 200 ms long
 """
 
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.io.turn_evidence import misfit_deg, rests_of
+from pipeline.io.gravity_rotation import misfit_deg, rests_of
 from pipeline.io.units import COUNTS, DEGREES, STANDARD_GRAVITY, UNITS
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.io.turn_evidence import Move
+    from pipeline.io.gravity_rotation import Move
 
 UNKNOWN = "???"
 FORCE_UNITS = {"g": 1.0, "m/s^2": STANDARD_GRAVITY, "mg": 1000.0}

@@ -33,7 +33,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.io.ingest_error import IngestError
+from pipeline.errors import IngestError
 from pipeline.io.table_log import Signals, seconds_of, signals_of
 from pipeline.io.units import TRIADS
 

@@ -1,8 +1,8 @@
 """A profile proposed for unknown text logs, each guess with what speaks for it; to be confirmed, never applied unasked.
 
 Names tell which column may hold which channel. Units follow from what a name states, else from physics
-(``pipeline.survey.unit_evidence``). Two files with the same times, one with the accelerometer and one with the
-gyroscope, are parts of one recording; what cannot be told of one file is taken from another of the same shape.
+(``unit_guesses``). Two files with the same times, one with the accelerometer and one with the gyroscope, are parts of
+one recording; what cannot be told of one file is taken from another of the same shape.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.io.turn_evidence import moves_of
+from pipeline.io.gravity_rotation import moves_of
 from pipeline.io.units import COUNTS, GYROSCOPE, TRIADS, UNITS
-from pipeline.survey.column_names import stated_unit, words_of
-from pipeline.survey.columns import Columns, find_columns
-from pipeline.survey.unit_evidence import (
+from pipeline.profile_detection.column_names import stated_unit, words_of
+from pipeline.profile_detection.columns import Columns, find_columns
+from pipeline.profile_detection.unit_guesses import (
     ASSUMED_HZ,
     UNKNOWN,
     Guess,
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.io.turn_evidence import Move
-    from pipeline.survey.shape import Shape
+    from pipeline.io.gravity_rotation import Move
+    from pipeline.profile_detection.text_layout import Shape
 
 UNITS_OF = {"accelerometer": ("g", "mg", "m/s^2"), "gyroscope": ("deg/s", "rad/s")}
 Entries = dict[str, dict[str, Any]]
