@@ -36,10 +36,11 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
+    from pipeline.campaign_results import CampaignResults
     from pipeline.model.compensation import Compensation
 
 __version__ = "0.1.0"
-__all__ = ["__version__", "load_calibration"]
+__all__ = ["__version__", "load_calibration", "load_campaign"]
 
 
 def load_calibration(path: str | Path, python_effects: Sequence[str | Path] = ()) -> Compensation:
@@ -66,3 +67,26 @@ def load_calibration(path: str | Path, python_effects: Sequence[str | Path] = ()
     from pipeline.model.compensation import load  # noqa: PLC0415  (numpy is imported only where it is needed)
 
     return load(path, python_effects)
+
+
+def load_campaign(folder: str | Path) -> CampaignResults:
+    """Load the published results of a campaign as pandas DataFrames.
+
+    Parameters
+    ----------
+    folder : str or Path
+        ``results/<campaign>``.
+
+    Returns
+    -------
+    CampaignResults
+        ``.summary``, ``.parameters``, ``.errors``, ``.diagnosis``, ``.effects`` and ``.unit(name)``.
+
+    Raises
+    ------
+    InputError
+        If the folder holds no results of a campaign.
+    """
+    from pipeline.campaign_results import open_campaign  # noqa: PLC0415  (pandas is imported only where it is needed)
+
+    return open_campaign(folder)

@@ -28,9 +28,10 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.records import AXES, SENSORS
+from pipeline.records import SENSORS
 from pipeline.report.comparison_statistics import Quantity
 from pipeline.report.limits import final_step
+from pipeline.report.parameters import fitted_parameters
 
 JSON = dict[str, Any]
 
@@ -84,7 +85,7 @@ def unit_figures(
                 noise_floor=held_out.get("noise_floor"),
                 table_time=table_time(sensor, calibration),
                 verdict=((diagnosis or {}).get(sensor) or {}).get("verdict") or "",
-                parameters=_parameters(part),
+                parameters={p.words: Quantity(p.value, p.standard_uncertainty) for p in fitted_parameters(part)},
             )
     return out
 
@@ -114,32 +115,3 @@ def _against_truth(part: JSON, held_out: JSON, truth: JSON | None) -> Quantity |
     left = matrix @ np.linalg.solve(np.array(truth["matrix"], float), np.eye(3)) - np.eye(3)
     bias = matrix @ (np.array(truth["bias"], float) - np.array(part["bias"], float))
     return Quantity(float(np.sqrt(size**2 * np.sum(left**2) / 3.0 + np.sum(bias**2))))
-
-
-def _parameters(part: JSON) -> dict[str, Quantity]:
-    """Return bias, matrix and effects with their standard uncertainties."""
-    out = {}
-    expanded, factor = part.get("expanded_uncertainty") or {}, part.get("coverage_factor") or {}
-    for i, a in enumerate(AXES):
-        out[f"bias {a}"] = _quantity(part["bias"][i], _at(expanded, "bias", i), _at(factor, "bias", i))
-    for i, a in enumerate(AXES):
-        for j, b in enumerate(AXES):
-            uncertainty, coverage = _at(expanded, "matrix", i, j), _at(factor, "matrix", i, j)
-            out[f"matrix {a}{b}"] = _quantity(part["matrix"][i][j], uncertainty, coverage)
-    for effect in part.get("effects") or []:
-        for name, p in effect["parameters"].items():
-            coverage = _at(factor, "bias", 0)
-            label = f"{effect['name'].replace('_', ' ')}: {name}"
-            out[label] = _quantity(p["value"], p.get("expanded_uncertainty"), coverage)
-    return out
-
-
-def _at(values: JSON, key: str, *index: int) -> float | None:
-    found: Any = values.get(key)
-    for i in index:
-        found = None if found is None else found[i]
-    return None if found is None else float(found)
-
-
-def _quantity(value: float, expanded: float | None, factor: float | None) -> Quantity:
-    return Quantity(value, expanded / factor if expanded is not None and factor else None)

@@ -1,0 +1,214 @@
+"""The results of a campaign as pandas DataFrames, for notebooks and scripts.
+
+    results = pipeline.load_campaign("results/demo")
+    results.errors.query("step == 'calibrated'").pivot(index="unit", columns="sensor", values="rms_error")
+
+Tables are read from the published files when they are first asked for. Accelerometer figures are in g (9.80665 m/s^2),
+gyroscope figures in deg/s; parameters have a column with their unit.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from difflib import get_close_matches
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pandas as pd
+
+from pipeline.errors import InputError, MissingInputError
+from pipeline.records import SENSORS
+from pipeline.report.parameters import fitted_parameters, reading_errors
+from pipeline.report.summary import COLUMNS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+JSON = dict[str, Any]
+PARAMETERS = ("unit", "sensor", "parameter", "value", "value_unit", "expanded_uncertainty", "coverage_factor")
+STEP = (
+    "step", "rms_error", "mean_abs_error", "max_error", "min_error", "sum_abs_error", "change_percent",
+    "vector_rms_error",
+)  # fmt: skip
+ERRORS = ("unit", "sensor", *STEP, "noise_floor", "vector_noise_floor")
+DIAGNOSIS = ("verdict", "residual_over_noise", "selected", "reason", "next_experiment", "override")
+RANKING = (
+    "effect", "delta_bic", "p_value", "explained_share", "held_out_error_before", "held_out_error_after", "plausible",
+)  # fmt: skip
+FIGURES = ("_before", "_after", "_floor")  # endings of the columns of summary.csv that hold numbers
+EFFECTS = ("unit", "sensor", *RANKING, "selected", "look_alikes")
+
+
+@dataclass(frozen=True)
+class UnitResults:
+    """What was published of one unit.
+
+    Attributes
+    ----------
+    name : str
+    calibration : dict
+        ``calibrations/<unit>.json``; of a failed unit with ``status`` "failed" and ``error``.
+    validation, diagnosis : dict or None
+        ``validations/<unit>.json``, ``diagnoses/<unit>.json``; None where the unit failed.
+    """
+
+    name: str
+    calibration: JSON
+    validation: JSON | None
+    diagnosis: JSON | None
+
+    def __repr__(self) -> str:
+        if self.calibration["status"] != "ok":
+            error = self.calibration.get("error") or {}
+            return f"<unit {self.name}: failed, {error.get('code')}: {error.get('message')}>"
+        told = [f"{s} {((self.diagnosis or {}).get(s) or {}).get('verdict')}" for s in SENSORS if self.calibration[s]]
+        return f"<unit {self.name}: {', '.join(told)}>"
+
+
+class CampaignResults:
+    """The published results of one campaign; see ``load_campaign``."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._documents: dict[str, UnitResults] = {}
+
+    def __repr__(self) -> str:
+        failed = int((self.summary["status"] != "ok").sum())
+        return f"<campaign {self.folder.name}: {len(self.units)} units, {failed} failed>"
+
+    @property
+    def units(self) -> list[str]:
+        """Names of the units, in the order of ``units.csv``."""
+        names: list[str] = self.summary["unit"].tolist()
+        return names
+
+    @cached_property
+    def summary(self) -> pd.DataFrame:
+        """``summary.csv``, one row a unit.
+
+        Columns: ``unit, serial, lot, date, status`` ("ok", "failed"), ``error, sensor, method``; for each sensor
+        ``<sensor>_error_before``, ``_error_after`` (rms), ``_mean_abs_before``, ``_mean_abs_after``, ``_noise_floor``
+        (g or deg/s), ``_verdict``, ``_selected`` (effects, joined by ";"), ``_reason``, ``_implausible``; ``pass``;
+        and the user's own columns of ``units.csv``.
+        """
+        file = self.folder / "summary.csv"
+        kinds = {name: "float" if name.endswith(FIGURES) else "str" for name in COLUMNS} | {"pass": "boolean"}
+        return pd.read_csv(file, dtype=kinds, keep_default_na=False, na_values=[""])
+
+    @cached_property
+    def parameters(self) -> pd.DataFrame:
+        """One row for each unit, sensor and parameter.
+
+        Columns: ``unit, sensor, parameter, value, value_unit, expanded_uncertainty`` (95 %, in the unit of the value)
+        and ``coverage_factor`` (k; the standard uncertainty is expanded_uncertainty / k).
+
+        Parameters of ``truth = matrix (reading - bias - effects)``: ``bias_x``, ``matrix_xy``, ``<effect>.<symbol>``.
+        Elements of ``K = matrix^-1``, which a data sheet states: ``scale_factor_error_x`` (``K_xx - 1``) and
+        ``cross_axis_xy`` (what axis x reads of a truth along y).
+        """
+        rows = [
+            (unit.name, sensor, *parameter)
+            for unit, sensor, part in self._parts("calibration")
+            for parameter in fitted_parameters(part) + reading_errors(part)
+        ]
+        return pd.DataFrame(rows, columns=list(PARAMETERS))
+
+    @cached_property
+    def errors(self) -> pd.DataFrame:
+        """Errors on held-out motion, one row for each unit, sensor and step, in the order in which steps are added.
+
+        Columns: ``unit, sensor, step`` ("raw", "stage:<name>", "calibrated", "+ <effect>"), ``rms_error,
+        mean_abs_error, max_error, min_error, sum_abs_error`` (g or deg/s, of the magnitude minus its reference),
+        ``change_percent`` (of mean_abs_error, against raw), ``vector_rms_error`` (empty without an attitude reference),
+        ``noise_floor`` and ``vector_noise_floor`` (rms that noise alone gives).
+        """
+        rows = [
+            {**part, **step, "unit": unit.name, "sensor": sensor, "step": step["name"]}
+            for unit, sensor, part in self._parts("validation")
+            for step in part.get("steps") or []
+        ]
+        return pd.DataFrame(rows, columns=list(ERRORS))
+
+    @cached_property
+    def diagnosis(self) -> pd.DataFrame:
+        """One row for each unit and sensor.
+
+        Columns: ``unit, sensor, verdict, residual_over_noise`` (rms residual of the diagnosis's own fit over the
+        noise), ``selected`` (missing effects, joined by ";"), ``reason, next_experiment, override`` (text).
+        """
+        rows = [
+            {"unit": unit.name, "sensor": sensor, **part, "selected": ";".join(part.get("selected") or [])}
+            for unit, sensor, part in self._parts("diagnosis")
+        ]
+        return pd.DataFrame(rows, columns=["unit", "sensor", *DIAGNOSIS])
+
+    @cached_property
+    def effects(self) -> pd.DataFrame:
+        """Every candidate effect that was ranked: one row for each unit, sensor and effect, best evidence first.
+
+        Columns: ``unit, sensor, effect, delta_bic`` (above 10: strong evidence), ``p_value, explained_share`` (of the
+        residual above the noise), ``held_out_error_before, held_out_error_after`` (rms of the vector, g or deg/s),
+        ``plausible`` (within the data sheet), ``selected`` (bool), ``look_alikes`` (effects with much the same signal,
+        joined by ";").
+        """
+        rows = [
+            {
+                "unit": unit.name,
+                "sensor": sensor,
+                **entry,
+                "selected": entry["effect"] in (part.get("selected") or []),
+                "look_alikes": ";".join(a["effect"] for a in entry.get("look_alikes") or []),
+            }
+            for unit, sensor, part in self._parts("diagnosis")
+            for entry in part.get("ranking") or []
+        ]
+        return pd.DataFrame(rows, columns=list(EFFECTS))
+
+    def unit(self, name: str) -> UnitResults:
+        """Return calibration, validation and diagnosis of one unit.
+
+        Raises
+        ------
+        InputError
+            If the campaign has no such unit.
+        """
+        if name not in self._documents:
+            if name not in self.units:
+                near = get_close_matches(name, self.units, n=5) or self.units[:5]
+                raise InputError(f"has no unit {name!r}; there are {', '.join(near)}", str(self.folder))
+            calibration = self._read("calibrations", name)
+            ok = calibration["status"] == "ok"
+            others = [self._read(folder, name) if ok else None for folder in ("validations", "diagnoses")]
+            self._documents[name] = UnitResults(name, calibration, *others)
+        return self._documents[name]
+
+    def _parts(self, document: str) -> Iterator[tuple[UnitResults, str, JSON]]:
+        """Yield unit, sensor and the sensor's part of a document, where there is one."""
+        for unit in map(self.unit, self.units):
+            for sensor in SENSORS:
+                part = (getattr(unit, document) or {}).get(sensor)
+                if part:
+                    yield unit, sensor, part
+
+    def _read(self, folder: str, unit: str) -> JSON:
+        file = self.folder / folder / f"{unit}.json"
+        try:
+            document: JSON = json.loads(file.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            raise MissingInputError("does not exist; run the campaign again", str(file)) from None
+        except ValueError as error:
+            raise InputError(f"is not JSON: {error}; run the campaign again", str(file)) from None
+        return document
+
+
+def open_campaign(folder: str | Path) -> CampaignResults:
+    """Return the results in a folder; see ``pipeline.load_campaign``."""
+    folder = Path(folder)
+    if (folder / "summary.csv").is_file():
+        return CampaignResults(folder)
+    parent = folder if folder.is_dir() else folder.parent
+    known = sorted(str(file.parent) for file in parent.glob("*/summary.csv"))
+    there = f"there are {', '.join(known)}" if known else f"{parent} holds no results of a campaign"
+    raise MissingInputError(f"holds no summary.csv of a campaign; {there}", str(folder))

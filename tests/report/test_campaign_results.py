@@ -1,0 +1,103 @@
+"""``pipeline.load_campaign``: the tables hold what the files hold, and the notebook of the docs runs."""
+
+from __future__ import annotations
+
+import ast
+import json
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+
+import pipeline
+from pipeline.errors import InputError, MissingInputError
+from pipeline.report.summary import summary_row, write_summary
+
+from .conftest import Unit, build_unit
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def unit() -> Unit:
+    return build_unit()
+
+
+@pytest.fixture(scope="module")
+def results(unit: Unit, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Publish a campaign of one calibrated and one failed unit."""
+    folder = tmp_path_factory.mktemp("bench") / "results" / "demo"
+    error = {"code": "bad_input", "message": "'x' is no number", "file": "a.csv:3"}
+    failed = {"unit": "007", "status": "failed", "error": error, "accelerometer": None, "gyroscope": None}
+    for name, document in (
+        ("calibrations/U1", unit.calibration), ("validations/U1", unit.validation), ("diagnoses/U1", unit.diagnosis),
+        ("calibrations/007", failed),
+    ):  # fmt: skip
+        (folder / f"{name}.json").parent.mkdir(parents=True, exist_ok=True)
+        (folder / f"{name}.json").write_text(json.dumps(document))
+    rows = [summary_row("U1", *unit.arguments[:3], {"date": "2026-01-01", "colour": "red"})]
+    write_summary(folder / "summary.csv", [*rows, summary_row("007", failed, None, None, {})])
+    return folder
+
+
+def test_each_table_holds_the_values_of_the_files(unit: Unit, results: Path) -> None:
+    campaign = pipeline.load_campaign(results)
+    assert repr(campaign) == "<campaign demo: 2 units, 1 failed>"
+    assert campaign.units == ["U1", "007"]  # a name of digits stays text
+    assert campaign.summary["pass"].tolist() == [False, False]
+    parameters = campaign.parameters.set_index(["unit", "sensor", "parameter"])
+    bias = parameters.loc["U1", "gyroscope", "bias_x"]
+    part = unit.calibration["gyroscope"]
+    assert (bias["value"], bias["value_unit"]) == (part["bias"][0], "deg/s")
+    assert bias["expanded_uncertainty"] == part["expanded_uncertainty"]["bias"][0]
+    assert bias["coverage_factor"] == part["coverage_factor"]["bias"][0]
+    errors = campaign.errors.query("sensor == 'accelerometer'")
+    assert errors["step"].tolist() == [s["name"] for s in unit.validation["accelerometer"]["steps"]]
+    assert set(errors["unit"]) == {"U1"}
+    assert errors["rms_error"].tolist() == [s["rms_error"] for s in unit.validation["accelerometer"]["steps"]]
+    verdicts = campaign.diagnosis.set_index("sensor")["verdict"]
+    assert verdicts.to_dict() == {s: part["verdict"] for s, part in unit.diagnosis.items()}
+    assert campaign.effects.query("selected")["effect"].tolist() == ["quadratic_nonlinearity"]
+
+
+def test_one_unit_is_its_documents_and_a_failed_one_names_its_cause(unit: Unit, results: Path) -> None:
+    campaign = pipeline.load_campaign(str(results))
+    assert campaign.unit("U1").diagnosis == unit.diagnosis
+    assert repr(campaign.unit("U1")) == "<unit U1: accelerometer missing_effect, gyroscope nothing_missing>"
+    assert campaign.unit("007").validation is None
+    assert repr(campaign.unit("007")) == "<unit 007: failed, bad_input: 'x' is no number>"
+
+
+def test_what_does_not_exist_is_refused_with_what_does(results: Path) -> None:
+    with pytest.raises(MissingInputError, match=r"dem: .*there are .*results/demo"):
+        pipeline.load_campaign(results.with_name("dem"))
+    with pytest.raises(InputError, match="'U2'; there are U1"):
+        pipeline.load_campaign(results).unit("U2")
+
+
+def run_cell(source: str, names: dict[str, Any]) -> Any:
+    """Execute a cell as a notebook does and return the value of its last expression."""
+    body = ast.parse(source).body
+    last = body.pop() if isinstance(body[-1], ast.Expr) else None
+    exec(compile(ast.Module(body, []), "cell", "exec"), names)  # noqa: S102  (our own notebook)
+    return eval(compile(ast.Expression(last.value), "cell", "eval"), names) if last else None  # noqa: S307
+
+
+def test_the_notebook_runs_and_gives_tables_with_the_columns_that_it_shows(
+    results: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    work = results.parents[1]
+    (work / "configs").symlink_to(ROOT / "configs")
+    monkeypatch.chdir(work)
+    names: dict[str, Any] = {}
+    cells = json.loads((ROOT / "docs" / "notebook.ipynb").read_text())["cells"]
+    frames = 0
+    for cell in (c for c in cells if c["cell_type"] == "code"):
+        value = run_cell("".join(cell["source"]), names)
+        if isinstance(value, pd.DataFrame):
+            shown = "".join(cell["outputs"][0]["data"]["text/plain"])
+            assert all(str(column) in shown for column in value.columns)
+            assert len(value) > 0
+            frames += 1
+    assert frames == 4

@@ -1,0 +1,53 @@
+"""Parameters with their uncertainties, read from a sensor's part of a calibration."""
+
+import numpy as np
+import pytest
+
+from pipeline.records import FittedEffect, SensorCalibration
+from pipeline.report.comparison_units import unit_figures
+from pipeline.report.parameters import fitted_parameters, reading_errors
+
+
+def part_with_unequal_freedom() -> dict:
+    """Return a fit whose bias has 4 and whose effect has 400 effective degrees of freedom."""
+    freedom = np.array([4.0] * 3 + [400.0] * 10)
+    k = {4.0: 2.776445, 400.0: 1.965912}  # Student's t, 95 %, of published tables
+    effect = FittedEffect("scale_factor_asymmetry", {"c_x": {"value": 0.01, "unit": "1", "expanded_uncertainty": 0.0}})
+    covariance = np.diag(np.full(13, 1e-6))
+    fit = SensorCalibration("gyroscope", effects=(effect,), covariance=covariance, freedom=freedom)
+    budget = {
+        "parameters": fit.parameter_names(),
+        "coverage_factor": [k[f] for f in freedom.tolist()],
+        "contributions": [],
+    }
+    part = fit.to_json() | {"uncertainty_budget": budget}
+    part["effects"][0]["parameters"]["c_x"]["expanded_uncertainty"] = k[400.0] * 1e-3
+    return part
+
+
+def test_each_parameter_has_its_own_coverage_factor_not_that_of_the_bias() -> None:
+    part = part_with_unequal_freedom()
+    found = {p.name: p for p in fitted_parameters(part)}
+    assert list(found) == part["covariance"]["parameters"]
+    assert found["bias_x"].coverage_factor == pytest.approx(2.776445, rel=1e-6)
+    assert found["scale_factor_asymmetry.c_x"].coverage_factor == pytest.approx(1.965912, rel=1e-6)
+    held_out = {"steps": [{"rms_error": 1.0}]}
+    compared = unit_figures({"gyroscope": part}, {"gyroscope": held_out}, None)["gyroscope"].parameters
+    assert compared["scale factor asymmetry: c_x"].standard_uncertainty == pytest.approx(1e-3, rel=1e-6)
+    assert compared["bias x"].standard_uncertainty == pytest.approx(1e-3, rel=1e-6)
+
+
+def test_the_uncertainty_of_the_inverse_is_that_of_drawn_matrices() -> None:
+    rng = np.random.default_rng(3)
+    matrix = np.eye(3) + 0.05 * rng.standard_normal((3, 3))
+    root = 1e-4 * rng.standard_normal((9, 9))
+    covariance = np.zeros((12, 12))
+    covariance[3:, 3:] = root @ root.T
+    part = SensorCalibration("gyroscope", matrix=matrix, covariance=covariance).to_json()
+    drawn = matrix + (root @ rng.standard_normal((9, 20_000))).T.reshape(-1, 3, 3)
+    K = np.linalg.inv(drawn)
+    for p in reading_errors(part):
+        kind, axes = p.name.rsplit("_", 1)
+        i, j = "xyz".index(axes[0]), "xyz".index(axes[-1])
+        assert p.value == pytest.approx(np.linalg.inv(matrix)[i, j] - (kind == "scale_factor_error"))
+        assert p.standard_uncertainty == pytest.approx(K[:, i, j].std(), rel=0.03)
