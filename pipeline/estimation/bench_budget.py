@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.estimation.budget import candidate_covariances, combined, quantisation
 from pipeline.estimation.table_inputs import table_contributions
 from pipeline.estimation.trials import Errors, beside_trials, trials_of
-from pipeline.records.calibration import UNITS
+from pipeline.records import SENSOR_UNITS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -18,8 +18,7 @@ if TYPE_CHECKING:
 
     from pipeline.estimation.serial_noise import SerialNoise
     from pipeline.estimation.table_inputs import Reference
-    from pipeline.records import SensorCalibration
-    from pipeline.records.budget import Contribution
+    from pipeline.records import Contribution, SensorCalibration
 
     Values = NDArray[np.float64]
 
@@ -52,7 +51,7 @@ def budgeted(  # noqa: PLR0917  (what a fit on a table is)
     sensor = calibration.sensor
     lines, missing = list(contributions), {"temperature": TEMPERATURE, "time base": TIME_BASE}
     sheet = (settings.get("sensor") or {}).get(sensor) or {}
-    rounded = quantisation(noise, reference.fit, sheet.get("counts_per_unit"), UNITS[sensor])
+    rounded = quantisation(noise, reference.fit, sheet.get("counts_per_unit"), SENSOR_UNITS[sensor])
     if isinstance(rounded, str):
         missing["quantisation"] = rounded
     else:
@@ -64,7 +63,7 @@ def budgeted(  # noqa: PLR0917  (what a fit on a table is)
         return complete
     first = reference.fit.first()
     stated = table_contributions(replace(reference, fit=first))[0]
-    again = quantisation(noise, first, sheet.get("counts_per_unit"), UNITS[sensor])
+    again = quantisation(noise, first, sheet.get("counts_per_unit"), SENSOR_UNITS[sensor])
     stated += [] if isinstance(again, str) else [again]
     errors = Errors(noise.weight, candidate_covariances(noise, first), noise.spare, stated)
     return beside_trials(complete, errors.through(results), trials, contributions[1:])

@@ -21,8 +21,7 @@ import numpy as np
 
 from pipeline.estimation.averaged_covariance import averaged
 from pipeline.estimation.propagation import effective_degrees_of_freedom
-from pipeline.records.budget import NORMAL, RECTANGULAR, Contribution, finite
-from pipeline.records.calibration import coverage_factors
+from pipeline.records import NORMAL, RECTANGULAR, Contribution, coverage_factor, finite
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -207,7 +206,7 @@ def with_uncertainty(
         ``source`` and ``reason``.
     """
     u = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
-    factors = coverage_factors(freedom)
+    factors = coverage_factor(freedom)
     known = freedom[u > 0.0]
     document = {
         **budget,

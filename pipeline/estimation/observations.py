@@ -119,7 +119,7 @@ class Rows:
             motion,
             **means,
             still=motion.still[self.kept[self.first]],
-            followed=None,
+            reference_valid=None,
             at_offset=None if trajectory is None else partial(self._at, trajectory),
             at_lag=None if motion.at_lag is None else partial(self._at, motion.at_lag),
         )
@@ -273,8 +273,8 @@ def _part(sensor: str, recording: Recording, gravity: float, earth: NDArray[np.f
     filtered = recording.filter["name"] != "none"
     if filtered:
         sure = remembered(motion, recording) if sensor == "gyroscope" else followed(motion)
-        motion = replace(through_filter(motion, recording), followed=sure)
-    sound = np.logical_and(np.all(np.isfinite(reading), axis=1), recording.sound)
+        motion = replace(through_filter(motion, recording), reference_valid=sure)
+    sound = np.logical_and(np.all(np.isfinite(reading), axis=1), recording.valid)
     rows = rows_of(motion, sound, together=not filtered).settled(reading)
     if len(rows.first) == 0:
         return None
@@ -298,9 +298,9 @@ def _part(sensor: str, recording: Recording, gravity: float, earth: NDArray[np.f
 def _shared(recording: Recording, motion: Motion, rows: Rows) -> Motion:
     """Return the motion at the rows; both sensors of a recording mostly have the same."""
     key = "rows", id(motion.specific_force), rows.kept.tobytes(), rows.first.tobytes()  # it is kept as well
-    if key not in recording.kept:
-        recording.kept[key] = rows.motion(motion)
-    found: Motion = recording.kept[key]
+    if key not in recording.cache:
+        recording.cache[key] = rows.motion(motion)
+    found: Motion = recording.cache[key]
     return found
 
 
@@ -411,8 +411,8 @@ def followed(motion: Motion) -> NDArray[np.bool_]:
     Both intervals beside a sample of a turn must be explained; with an attitude log, the rate must be the cubic through
     its four neighbours, and theirs too, to 0.05 deg/s and 0.1 %.
     """
-    if motion.followed is not None:
-        return motion.followed
+    if motion.reference_valid is not None:
+        return motion.reference_valid
     rate, time = motion.angular_rate, motion.time
     bend = np.full(len(time), np.inf)
     if len(time) >= 5:

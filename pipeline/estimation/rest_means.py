@@ -189,4 +189,4 @@ def sound_samples(recording: Recording, sensor: str) -> NDArray[np.bool_]:
     reading = recording.reading(sensor)
     if reading is None:
         return np.zeros(recording.samples, bool)
-    return np.asarray(np.isfinite(reading).all(axis=1) & recording.sound)
+    return np.asarray(np.isfinite(reading).all(axis=1) & recording.valid)

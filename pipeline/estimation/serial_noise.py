@@ -35,7 +35,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import NotObservableError
-from pipeline.records.neighbours import noise_of_steps
+from pipeline.records import noise_of_steps
 from pipeline.signal.noise import noise_of
 
 if TYPE_CHECKING:

@@ -22,8 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.estimation.budget import type_b, with_uncertainty
-from pipeline.records.budget import NORMAL, RECTANGULAR
-from pipeline.records.calibration import UNITS
+from pipeline.records import NORMAL, RECTANGULAR, SENSOR_UNITS
 from pipeline.signal.temperature import temperature_of
 
 if TYPE_CHECKING:
@@ -31,8 +30,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.records import Recording, SensorCalibration
-    from pipeline.records.budget import Contribution
+    from pipeline.records import Contribution, Recording, SensorCalibration
 
     Values = NDArray[np.float64]
 
@@ -82,7 +80,7 @@ def _repeatability(
         if u is None:
             lacking.append(f"sensor.{calibration.sensor}.{key}")
         elif u:
-            unit = UNITS[calibration.sensor] if name == "bias" else "1"
+            unit = SENSOR_UNITS[calibration.sensor] if name == "bias" else "1"
             lines.append(type_b(f"repeatability ({name.replace('_', ' ')})", NORMAL, float(u), unit, effect))
     return lines, {"repeatability": f"{NOT_STATED} {' and '.join(lacking)}"} if lacking else {}
 
@@ -97,7 +95,7 @@ def _temperature(
     warmth = np.concatenate([temperature_of(r) for r in own])
     spread = float(np.ptp(warmth)) / np.sqrt(12.0)
     lines, size = [], len(calibration.parameter_names())
-    unit = UNITS[calibration.sensor]
+    unit = SENSOR_UNITS[calibration.sensor]
     for name, effect in (("bias", _of_bias(size)), ("scale_factor", _of_scale(calibration.matrix, size))):
         fitted = next((e for e in calibration.effects if e.name in FITTED[name]), None)
         limit = limits.get(f"{name}_temperature")

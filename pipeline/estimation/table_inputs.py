@@ -27,8 +27,7 @@ from pipeline.model.effects import effect
 from pipeline.model.effects.base import truth
 from pipeline.model.kinematics import earth_rate
 from pipeline.model.rotation import ABOUT
-from pipeline.records.budget import NORMAL
-from pipeline.records.neighbours import noise_of_steps
+from pipeline.records import NORMAL, noise_of_steps
 from pipeline.signal.rests import RATE_AT_REST_DPS
 
 if TYPE_CHECKING:
@@ -37,8 +36,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.estimation.sample_blocks import Blocks
-    from pipeline.records import Motion
-    from pipeline.records.budget import Contribution
+    from pipeline.records import Contribution, Motion
 
     Values = NDArray[np.float64]
 

@@ -29,8 +29,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.records import SensorCalibration
-    from pipeline.records.budget import Contribution
+    from pipeline.records import Contribution, SensorCalibration
 
     Values = NDArray[np.float64]
 

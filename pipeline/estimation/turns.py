@@ -109,7 +109,7 @@ def parts_of(recordings: Sequence[Recording], sensor: str, table: Mapping[str, A
     for recording in own:
         motion = table_motion(replace(recording, temperature=None), table)  # bias and matrix do not ask for it
         if motion is not None:
-            parts.append(Part(recording, motion, recording.sound))
+            parts.append(Part(recording, motion, recording.valid))
     if not parts:
         lack = "none of them logs the table's angle" if own else f"no recording of role {sensor} holds its readings"
         raise CannotCalibrateError(

@@ -23,9 +23,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.io.quality_flags import GAP, UNIT_NAMES
-from pipeline.records.attitude import conjugate_product, continuous, level_in_body
-from pipeline.records.median import median
-from pipeline.records.neighbours import noise_of_steps
+from pipeline.records import conjugate_product, continuous, level_in_body, noise_of_steps
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -65,7 +63,7 @@ def leave_out_disturbances(
     if silent or largest_share == 0 or recording.samples < 4 * FEWEST_AROUND:
         return recording
     excess, where = disturbed(recording)
-    excess[~recording.sound] = 0.0  # no fit looks at them
+    excess[~recording.valid] = 0.0  # no fit looks at them
     rows = np.flatnonzero(np.any(excess > 0, axis=1))
     if not rows.size:
         return recording
@@ -125,7 +123,7 @@ def disturbed(recording: Recording) -> tuple[Array, list[tuple[str, str]]]:
         for n in _beside(jumps, recording.samples):
             window, resting = motion.around(n)
             around = values[window, column]
-            middle = float(median(around))
+            middle = float(np.median(around))
             scatter = usual if resting and usual is not None else _scatter(around)
             scatter = max(float(noise[column]), scatter)
             off = abs(float(values[n, column]) - middle) - BEYOND * scatter - ALLOWED * float(allowed[n])
@@ -142,7 +140,7 @@ def _noise(step: Array) -> Array:
 
 
 def _scatter(values: Array) -> float:
-    return MEDIAN_SIZE * float(median(np.abs(values - median(values))))
+    return MEDIAN_SIZE * float(np.median(np.abs(values - np.median(values))))
 
 
 def _beside(jumps: NDArray[np.intp], samples: int) -> NDArray[np.intp]:
@@ -202,7 +200,7 @@ class _Motion:
             return np.append(rate, rate[-1])[:, None]
         if self._static():
             return np.zeros((r.samples, 1))
-        return None if r.gyroscope is None else r.gyroscope - median(r.gyroscope)
+        return None if r.gyroscope is None else r.gyroscope - np.median(r.gyroscope, axis=0)
 
     def unexplained(self, sensor: str, reading: Array) -> Array:
         """Return what the log does not explain of a sensor's readings: (n, 3) array."""

@@ -19,7 +19,6 @@ from pipeline.io.checks import Checks
 from pipeline.io.quality_flags import mark_clipped, mark_gaps, mark_stuck
 from pipeline.io.timestamps import time_error
 from pipeline.io.units import ATTITUDE, DEGREES, TRIADS
-from pipeline.records.median import median
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -99,7 +98,7 @@ def _check_times(table: ChannelTable) -> None:
 def _check_rate(table: ChannelTable, checks: Checks) -> None:
     if checks.rate_hz is None:
         return
-    interval_us = float(median(np.diff(table.time_ns))) / 1e3
+    interval_us = float(np.median(np.diff(table.time_ns))) / 1e3
     ratio = interval_us * checks.rate_hz / 1e6
     if abs(ratio - 1.0) <= RATE_TOLERANCE:
         return
@@ -127,7 +126,7 @@ def _check_force(table: ChannelTable) -> None:
         return
     stride = -(-len(table.time_ns) // ENOUGH)
     squares = np.asarray(sum(table.values[c][::stride] ** 2 for c in TRIADS["accelerometer"]))
-    usual = float(np.sqrt(median(squares)))
+    usual = float(np.sqrt(np.median(squares)))
     low, high = FORCE_RANGE_G
     if low <= usual <= high:
         return
@@ -171,7 +170,7 @@ def _check_turn_rate(table: ChannelTable) -> None:
         if turning.sum() < 20:
             return
         size = np.sqrt(sum(table.values[c][::stride][turning] ** 2 for c in TRIADS["gyroscope"]))
-        ratio = float(median(size / rate[turning]))
+        ratio = float(np.median(size / rate[turning]))
         seen = f"while the table turns the angular rate is {ratio:.3g} times the table's"
     else:
         from pipeline.io.gravity_rotation import declared_scale  # noqa: PLC0415  (imported where there is no table)

@@ -17,7 +17,6 @@ import numpy as np
 
 from pipeline.errors import IngestError
 from pipeline.io.units import TRIADS
-from pipeline.records.median import median
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -49,7 +48,7 @@ def mark_gaps(table: ChannelTable, flags: NDArray[np.uint16], checks: Checks) ->
         If more time is missing than ``checks.missing_time`` allows.
     """
     steps = np.diff(table.time_ns)
-    usual = float(median(steps))
+    usual = float(np.median(steps))
     limit = GAP_INTERVALS * usual
     if int(steps.max()) <= limit:
         return _irregular(table, steps, usual)

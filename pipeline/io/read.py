@@ -23,8 +23,7 @@ from pipeline.io.plausibility import examine
 from pipeline.io.shaken_rests import leave_out_shaken_rests
 from pipeline.io.table_log import unwrapped
 from pipeline.io.units import ATTITUDE, TABLE_CHANNELS, TRIADS
-from pipeline.records import Note, Recording
-from pipeline.records.attitude import rate_of_attitude
+from pipeline.records import Note, Recording, rate_of_attitude
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

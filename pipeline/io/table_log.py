@@ -17,7 +17,7 @@ import numpy as np
 
 from pipeline.errors import IngestError
 from pipeline.io.units import ATTITUDE
-from pipeline.records.attitude import conjugate_product, continuous, level_in_body
+from pipeline.records import conjugate_product, continuous, level_in_body
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -15,8 +15,7 @@ import numpy as np
 
 from pipeline.errors import ConfigurationError, InputError, MissingInputError
 from pipeline.model.user_effects import effect_of
-from pipeline.records import SENSORS, FittedEffect, SensorCalibration
-from pipeline.records.calibration import UNITS
+from pipeline.records import SENSOR_UNITS, SENSORS, FittedEffect, SensorCalibration
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -101,8 +100,8 @@ def sensor_of(document: dict[str, Any], sensor: str, file: Path) -> SensorCalibr
         return None
     if not isinstance(part, dict):
         _refuse(file, f"{sensor} is {_shown(part)}; expected an object or null")
-    if part.get("unit") != UNITS[sensor]:
-        _refuse(file, f"{sensor}.unit is {_shown(part.get('unit'))}; expected {UNITS[sensor]!r}")
+    if part.get("unit") != SENSOR_UNITS[sensor]:
+        _refuse(file, f"{sensor}.unit is {_shown(part.get('unit'))}; expected {SENSOR_UNITS[sensor]!r}")
     _numbers(file, f"{sensor}.bias", part.get("bias"), (3,))
     matrix = _numbers(file, f"{sensor}.matrix", part.get("matrix"), (3, 3))
     _check_matrix(file, f"{sensor}.matrix", matrix)

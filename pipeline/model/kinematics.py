@@ -28,8 +28,7 @@ import numpy as np
 from pipeline.errors import InputError
 from pipeline.model.rotation import ABOUT, attitude_matrix, turn_about_axis
 from pipeline.model.turn_log import TurnLog
-from pipeline.records import AXES, Motion
-from pipeline.records.attitude import conjugate_product, continuous
+from pipeline.records import AXES, Motion, conjugate_product, continuous
 from pipeline.signal.rests import RATE_AT_REST_DPS, still_samples
 from pipeline.signal.temperature import temperature_of
 
@@ -96,8 +95,8 @@ def reference_motion(
         return None
     key = (gravity_g, None if earth_rate_level is None else earth_rate_level.tobytes())
     kept = not np.any(offset)
-    if kept and key in recording.kept:
-        found: Motion = recording.kept[key]
+    if kept and key in recording.cache:
+        found: Motion = recording.cache[key]
         return found
     if recording.samples < 6:
         raise InputError(
@@ -108,7 +107,7 @@ def reference_motion(
     motion = build(recording, gravity_g, earth_rate_level, offset, temperature)
     motion = _labelled(recording, motion)
     if kept:
-        recording.kept[key] = motion
+        recording.cache[key] = motion
     return motion
 
 
@@ -187,7 +186,7 @@ def _turn(  # noqa: PLR0917  (bound one by one for the motion at an offset)
         at_offset=partial(_turn, log, axis, home, gravity_g, earth, still, temperature),
         at_lag=partial(_turn, log, axis, home, gravity_g, earth, still, temperature),
         level=level,
-        followed=log.followed_samples,
+        reference_valid=log.followed_samples,
     )
 
 

@@ -27,8 +27,7 @@ import numpy as np
 from pipeline.errors import ConfigurationError
 from pipeline.model.effect_limits import parameter_limits
 from pipeline.model.user_effects import effect_of
-from pipeline.records import AXES, FittedEffect
-from pipeline.records.calibration import UNITS
+from pipeline.records import AXES, SENSOR_UNITS, FittedEffect
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -87,7 +86,7 @@ def implausible(sensor: str, part: Mapping[str, Any], sheet: Mapping[str, Any]) 
     scale = _scale_cause(sensor, np.diag(P))
     for i, a in enumerate(AXES):
         judge(
-            f"bias_{a}", float(part["bias"][i]), float(spread["bias"][i]), UNITS[sensor], sheet["bias"],
+            f"bias_{a}", float(part["bias"][i]), float(spread["bias"][i]), SENSOR_UNITS[sensor], sheet["bias"],
             LOW_COST_BIAS[sensor] * sheet["full_scale"],
             "an offset of raw counts that is not taken off, another column, or a damaged axis",
         )  # fmt: skip

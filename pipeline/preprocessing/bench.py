@@ -126,7 +126,7 @@ def off_at_rest(recording: Recording, bench: Bench) -> float | None:
     angle, force = recording.table_angle, recording.accelerometer
     if angle is None or force is None:
         return None
-    still = still_samples(recording.time, np.gradient(angle, recording.time)) & recording.sound
+    still = still_samples(recording.time, np.gradient(angle, recording.time)) & recording.valid
     if np.sum(still) < FEWEST_AT_REST:
         return None
     up, across = UP_AT_ZERO[AXES.index(bench.axis)], ACROSS[AXES.index(bench.axis)]

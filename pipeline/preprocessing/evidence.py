@@ -22,10 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import IngestError
-from pipeline.records import AXES, SENSORS
-from pipeline.records.attitude import conjugate_product, continuous
-from pipeline.records.median import median
-from pipeline.records.neighbours import noise_of_steps
+from pipeline.records import AXES, SENSORS, conjugate_product, continuous, noise_of_steps
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -197,9 +194,9 @@ def gravity_turned(recording: Recording, axis: int) -> Array | None:
     if recording.accelerometer is None:
         return None
     key = ("gravity_turned", axis)
-    if key not in recording.kept:
-        recording.kept[key] = _gravity_turned(recording, recording.accelerometer, axis)
-    found: Array | None = recording.kept[key]
+    if key not in recording.cache:
+        recording.cache[key] = _gravity_turned(recording, recording.accelerometer, axis)
+    found: Array | None = recording.cache[key]
     return found
 
 
@@ -207,7 +204,7 @@ def _gravity_turned(recording: Recording, force: Array, axis: int) -> Array | No
     across = force[:, [(axis + 1) % 3, (axis + 2) % 3]]
     low, high = quantiles(across, 0.01, 0.99)
     centred = across - np.where(high - low > 3.0 * LEAST_SWING_G, (low + high) / 2.0, 0.0)
-    if float(median(np.hypot(*centred.T))) < LEAST_SWING_G:
+    if float(np.median(np.hypot(*centred.T))) < LEAST_SWING_G:
         return None
     phase = np.degrees(np.unwrap(np.arctan2(centred[:, 1], centred[:, 0])))
     turned = np.diff(phase)
@@ -228,7 +225,7 @@ def of_gravity(recording: Recording, turned: Array, channels: Sequence[Channel])
 
 def slope_of(y: Array, rate: Array) -> tuple[float, float] | None:
     """Return gain and bias of a gyroscope's axis against a table's rate; None where the rate hardly changes."""
-    dr, dy = rate - median(rate), y - median(y)
+    dr, dy = rate - np.median(rate), y - np.median(y)
     size = np.abs(dr)
     weight = np.minimum(size, np.partition(size, -max(len(size) // 100, 1))[-max(len(size) // 100, 1)])
     if float(weight.max()) < LEAST_RATE_DPS:
@@ -240,7 +237,7 @@ def slope_of(y: Array, rate: Array) -> tuple[float, float] | None:
     gain = float(ratio[order[np.searchsorted(total, 0.5 * total[-1])]])
     if gain == 0.0:
         return None
-    return gain, float(median(y - gain * rate))
+    return gain, float(np.median(y - gain * rate))
 
 
 def rate_of_turn(recording: Recording) -> Array | None:

@@ -39,7 +39,6 @@ from pipeline.preprocessing.reference_scale import (
     doubt_of_scale,
 )
 from pipeline.records import Note
-from pipeline.records.median import median
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -145,7 +144,7 @@ class Gyroscope:
                 gain, bias = np.array(known).T
                 found[axis].append((float(quantiles(np.abs(rate), 0.9)[0]), gain, bias))
         gains = [abs(gain[a]) for a, turned in found.items() for _, gain, _ in turned]
-        self.usual = float(median(np.array(gains))) if len(gains) > 2 else 1.0
+        self.usual = float(np.median(np.array(gains))) if len(gains) > 2 else 1.0
         self.matrix = self.usual * np.eye(3)
         for axis, turned in found.items():
             fitting = [f for f in turned if abs(abs(f[1][axis]) / self.usual - 1.0) <= SAME]
@@ -167,7 +166,7 @@ class Gyroscope:
         if max(gains) > HALF > gains[axis]:
             return None  # another axis turns: a matter of the mounting
         gain = self.matrix[axis, axis]
-        bias = median(recording.gyroscope[:, axis] - gain * rate) if self.bias is None else self.bias[axis]
+        bias = np.median(recording.gyroscope[:, axis] - gain * rate) if self.bias is None else self.bias[axis]
         return np.asarray((recording.gyroscope[:, axis] - float(bias)) / gain)
 
     def vector(self, recording: Recording) -> Array | None:
@@ -180,9 +179,9 @@ class Gyroscope:
 def _slopes(recording: Recording, rate: Array) -> list[tuple[float, float] | None]:
     """Return gain and bias of each axis of a turn's gyroscope against the table's rate; kept with the recording."""
     assert recording.gyroscope is not None  # noqa: S101
-    if "slopes" not in recording.kept:
-        recording.kept["slopes"] = [slope_of(recording.gyroscope[:, i], rate) for i in range(3)]
-    found: list[tuple[float, float] | None] = recording.kept["slopes"]
+    if "slopes" not in recording.cache:
+        recording.cache["slopes"] = [slope_of(recording.gyroscope[:, i], rate) for i in range(3)]
+    found: list[tuple[float, float] | None] = recording.cache["slopes"]
     return found
 
 
@@ -200,7 +199,7 @@ def _check_turn(recording: Recording, gyroscope: Gyroscope, limits: Limits, sett
         channels.append(alike(angle, channels[0]) if channels else angle)
     seen = gyroscope.along(recording, axis_index(recording))
     if seen is not None:
-        channels.append(of_rate(recording, "gyroscope", seen, recording.sound))
+        channels.append(of_rate(recording, "gyroscope", seen, recording.valid))
     phase = gravity_turned(recording, axis_index(recording))
     if phase is not None and recording.table_angle is not None:
         channels.append(of_gravity(recording, phase, channels))
@@ -223,7 +222,7 @@ def _check_motion(recording: Recording, gyroscope: Gyroscope, limits: Limits, se
     if recording.table_attitude is not None:
         channels.append(of_attitude(recording, recording.table_attitude))
     if size is not None:
-        channels.append(of_rate(recording, "gyroscope", size, recording.sound))
+        channels.append(of_rate(recording, "gyroscope", size, recording.valid))
     found = _compare(recording, channels, limits, settings)
     if vector is not None and recording.table_attitude is not None:
         _check_directions(recording, vector, limits, settings)
@@ -288,12 +287,13 @@ def _check_directions(recording: Recording, vector: Array, limits: Limits, setti
     off, size = np.linalg.norm(turned - seen, axis=1), np.linalg.norm(seen, axis=1)
     change = np.linalg.norm(np.diff(vector, axis=0), axis=1) / recording.interval
     allowed = (limits.gain + limits.rate) * size + limits.late_s * change + limits.offset_dps
-    if float(median(off)) <= float(median(allowed)) + 0.5 * float(median(size)):
+    usual_off, usual_size = float(np.median(off)), float(np.median(size))
+    if usual_off <= float(np.median(allowed)) + 0.5 * usual_size:
         return
     raise refusal(
         recording,
         "reference_contradiction",
         f"{column(recording, 'table_attitude', settings)} turns about other body axes than the gyroscope reads: their "
-        f"angular rates differ by {float(median(off)):.3g} deg/s at the median, at {float(median(size)):.3g} deg/s",
+        f"angular rates differ by {usual_off:.3g} deg/s at the median, at {usual_size:.3g} deg/s",
         "is it the attitude of this recording, from body to level, in the order w, x, y, z?",
     )

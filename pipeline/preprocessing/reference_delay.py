@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.preprocessing.evidence import column, refusal
-from pipeline.records.median import median
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -79,10 +78,10 @@ def check_delays(found: Sequence[tuple[Recording, float]], limits: Limits) -> No
     delay = np.array([d for _, d in found])
     one, two = np.triu_indices(len(time), 1)
     apart = time[two] - time[one]
-    slope = float(median((delay[two] - delay[one]) / np.where(apart == 0.0, np.inf, apart)))
+    slope = float(np.median((delay[two] - delay[one]) / np.where(apart == 0.0, np.inf, apart)))
     rate = float(np.clip(slope, -limits.clock, limits.clock))
     offset = delay - rate * time
-    usual = float(median(offset))
+    usual = float(np.median(offset))
     for (recording, late), tau in zip(found, offset, strict=True):
         room = limits.late_s + QUARTER * max(recording.interval, FINEST_S)
         if abs(tau) > room and (abs(tau - usual) > room or abs(usual) > room):

@@ -23,8 +23,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.records.median import median
-
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -86,7 +84,7 @@ class Comparison:
 
     def __init__(self, channels: Sequence[Channel], dt: Array, limits: Limits) -> None:
         self.channels, self.dt, self.limits = channels, dt, limits
-        self.interval = float(median(dt))
+        self.interval = float(np.median(dt))
         n = len(dt)
         self.sizes = sorted({SHORT, max(n // LONG, SHORT)})
         self.starts = {size: np.arange(0, max(n - size // 2, 1), size) for size in self.sizes}

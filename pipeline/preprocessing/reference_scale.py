@@ -35,7 +35,6 @@ from pipeline.preprocessing.evidence import (
     place,
     refusal,
 )
-from pipeline.records.median import median
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -131,7 +130,7 @@ def check_scale_of_motion(
     if recording.table_attitude is not None:
         found["attitude"] = of_attitude(recording, recording.table_attitude).turned
     if size is not None:
-        found["gyro"] = of_rate(recording, "gyroscope", size, recording.sound).turned
+        found["gyro"] = of_rate(recording, "gyroscope", size, recording.valid).turned
     blocks = {k: _in_blocks(v) for k, v in found.items()}
     rate, attitude, gyro = (blocks.get(k) for k in ("rate", "attitude", "gyro"))
     tolerance = limits.rate + limits.gain
@@ -172,8 +171,8 @@ def doubt_of_scale(recording: Recording, limits: Limits, settings: Mapping[str, 
     name, time = (column(recording, c, settings) for c in ("table_rate", "time"))
     if recording.table_angle is not None:
         found = rate[1:][even] * dt[even] / np.diff(recording.table_angle)[even]
-        ratio = float(median(found))
-        spread = MEDIAN_SIZE * float(median(np.abs(found - ratio))) / np.sqrt(len(found))
+        ratio = float(np.median(found))
+        spread = MEDIAN_SIZE * float(np.median(np.abs(found - ratio))) / np.sqrt(len(found))
         against, least = column(recording, "table_angle", settings), QUARTZ
     else:
         fit = _against_phase(recording, rate, dt, even)
@@ -211,7 +210,7 @@ def check_intervals(recordings: list[Recording], settings: Mapping[str, Any]) ->
     usual = {r.name: r.interval for r in recordings if r.samples > 1}
     if len(usual) < 3:
         return
-    middle = float(median(np.array(list(usual.values()))))
+    middle = float(np.median(np.array(list(usual.values()))))
     for recording in recordings:
         factor = usual.get(recording.name, middle) / middle
         for unit, what in TIMES:
@@ -238,7 +237,7 @@ def _turned(recording: Recording) -> dict[str, Array]:
         still = reading
         if recording.table_rate is not None:
             still = reading[np.abs(recording.table_rate) <= np.min(np.abs(recording.table_rate))]
-        found["gyroscope"] = of_rate(recording, "gyroscope", reading - median(still), recording.sound).turned
+        found["gyroscope"] = of_rate(recording, "gyroscope", reading - np.median(still, axis=0), recording.valid).turned
     phase = gravity_turned(recording, axis)
     if phase is not None:
         found["gravity"] = phase

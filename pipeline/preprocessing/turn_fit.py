@@ -108,7 +108,7 @@ def fit_turn(recording: Recording) -> TurnFit:
     if angle is None or recording.accelerometer is None:
         missing = "angle of the table" if angle is None else "accelerometer"
         return TurnFit(None, None, None, gain, 0.0, 0.0, f"the log holds no {missing}")
-    keep = recording.sound
+    keep = recording.valid
     A, reading = np.radians(angle[keep]), recording.accelerometer[keep]
     arc = float(np.ptp(angle)) if len(angle) else 0.0
     mean_rate = 0.0 if slope is None else float(np.mean(slope))
@@ -143,7 +143,7 @@ def _of_rate(rate: NDArray[np.float64] | None, keep: NDArray[np.bool_]) -> NDArr
 def _gain(recording: Recording, rate: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
     if recording.gyroscope is None or rate is None:
         return None
-    keep = recording.sound
+    keep = recording.valid
     rate, gyro = rate[keep], recording.gyroscope[keep]
     changing = float(np.std(rate)) > CHANGING * float(np.max(np.abs(rate), initial=0.0))
     if changing:

@@ -1,13 +1,34 @@
-"""What flows between the stages: frozen dataclasses with units in their names or docstrings, and their files."""
+"""The data that stages pass to each other: recordings, motions, noise and calibrations (frozen dataclasses)."""
 
-from pipeline.records.calibration import FittedEffect, SensorCalibration, StageResult
-from pipeline.records.motion import Motion
-from pipeline.records.noise import Noise
+from pipeline.records.calibration import (
+    NORMAL,
+    RECTANGULAR,
+    SENSOR_UNITS,
+    Contribution,
+    FittedEffect,
+    SensorCalibration,
+    StageResult,
+    coverage_factor,
+    finite,
+)
+from pipeline.records.motion import (
+    Motion,
+    conjugate_product,
+    continuous,
+    level_in_body,
+    motion_at_rest,
+    rate_of_attitude,
+)
+from pipeline.records.noise import Noise, noise_of_steps
 from pipeline.records.recording import AXES, SENSORS, Encoding, Note, Recording
 
 __all__ = [
     "AXES",
+    "NORMAL",
+    "RECTANGULAR",
     "SENSORS",
+    "SENSOR_UNITS",
+    "Contribution",
     "Encoding",
     "FittedEffect",
     "Motion",
@@ -16,4 +37,12 @@ __all__ = [
     "Recording",
     "SensorCalibration",
     "StageResult",
+    "conjugate_product",
+    "continuous",
+    "coverage_factor",
+    "finite",
+    "level_in_body",
+    "motion_at_rest",
+    "noise_of_steps",
+    "rate_of_attitude",
 ]

@@ -1,21 +1,21 @@
-"""The calibration of one sensor, as it grows stage by stage, and its JSON form.
+"""The calibration of one sensor after each stage of a fit, its uncertainty budget, and their JSON form.
 
-``reading = bias + matrix^-1 @ truth + effects + noise``, so ``truth = matrix @ (reading - bias - effects)``.
+reading = bias + matrix^-1 @ truth + effects + noise
+truth   = matrix @ (reading - bias - effects)
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from pipeline.records.budget import finite
-
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
 
-UNITS = {"accelerometer": "g", "gyroscope": "deg/s"}
+SENSOR_UNITS = {"accelerometer": "g", "gyroscope": "deg/s"}
+NORMAL, RECTANGULAR = "normal", "rectangular"
 
 
 @dataclass(frozen=True)
@@ -30,10 +30,10 @@ class StageResult:
     residual_rms : float or None
         Of the fit's own error measure after this stage, unit of the sensor.
     correction : dict or None
-        How readings are corrected up to and including this stage, where that is not yet (or not only) matrix and
-        bias; what it means is known to the method's module in ``pipeline.estimation``.
+        How readings are corrected up to and including this stage, where matrix and bias alone do not say it; the
+        method's module in ``pipeline.estimation`` defines its keys.
     details : dict
-        Free figures for the report (condition number, samples used, iterations ...).
+        Values for the report (condition number, samples used, iterations ...).
     """
 
     name: str
@@ -53,8 +53,8 @@ class FittedEffect:
     parameters : dict
         Name to ``{"value", "unit", "expanded_uncertainty"}``.
     definition : dict or None
-        Of an effect of the user's own, what it is made from, so that the calibration says all that is needed to
-        apply it; None for a built-in one.
+        Content of the file of a user's effect, so that the calibration can be applied without that file; None for a
+        built-in effect.
     """
 
     name: str
@@ -69,7 +69,7 @@ class FittedEffect:
 
 @dataclass(frozen=True)
 class SensorCalibration:
-    """What is known of one sensor after a stage.
+    """Calibration of one sensor after a stage.
 
     Attributes
     ----------
@@ -80,18 +80,18 @@ class SensorCalibration:
     stages : tuple of StageResult
     effects : tuple of FittedEffect
     covariance : (12, 12) array or None
-        Of (bias_x..z, matrix_xx, matrix_xy .. matrix_zz), then each effect's parameters (then larger than 12); of all
-        that the uncertainty budget includes.
+        Of (bias_x..z, matrix_xx, matrix_xy .. matrix_zz), then each effect's parameters (then larger than 12). It
+        includes every line of the uncertainty budget.
     degrees_of_freedom : float
         The smallest of the parameters.
     converged : bool
     freedom : (p,) array or None
         Effective degrees of freedom of each parameter; None: ``degrees_of_freedom`` for all.
     budget : dict or None
-        The uncertainty budget as its file holds it; see ``pipeline.estimation.budget``.
+        The uncertainty budget as published; see ``pipeline.estimation.budget``.
     convergence : dict or None
-        What shows that the estimate is a minimum: ``cosine``, the largest between the residual and a column of the
-        Jacobian, with ``condition`` and ``rank`` of its scaled columns, and ``parameters``, their number.
+        Evidence that the estimate is a minimum: ``cosine``, the largest between the residual and a column of the
+        Jacobian; ``condition`` and ``rank`` of its scaled columns; ``parameters``, their number.
     """
 
     sensor: str
@@ -116,10 +116,10 @@ class SensorCalibration:
         size = len(self.parameter_names())
         covariance = np.zeros((size, size)) if self.covariance is None else self.covariance
         freedom = np.full(size, self.degrees_of_freedom) if self.freedom is None else self.freedom
-        factors = coverage_factors(freedom)
+        factors = coverage_factor(freedom)
         standard = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
         return {
-            "unit": UNITS[self.sensor],
+            "unit": SENSOR_UNITS[self.sensor],
             "bias": self.bias.tolist(),
             "matrix": self.matrix.tolist(),
             "standard_uncertainty": _shaped(standard),
@@ -128,16 +128,7 @@ class SensorCalibration:
             "degrees_of_freedom": self.degrees_of_freedom if np.isfinite(self.degrees_of_freedom) else None,
             "effective_degrees_of_freedom": finite(freedom),
             "covariance": {"parameters": self.parameter_names(), "values": covariance.tolist()},
-            "stages": [
-                {
-                    "name": s.name,
-                    "parameters": s.parameters,
-                    "residual_rms": s.residual_rms,
-                    "correction": s.correction,
-                    "details": s.details,
-                }
-                for s in self.stages
-            ],
+            "stages": [dict(vars(s)) for s in self.stages],
             "effects": [
                 {"name": e.name, "parameters": e.parameters} | ({"definition": e.definition} if e.definition else {})
                 for e in self.effects
@@ -171,29 +162,94 @@ def _shaped(values: NDArray[np.float64]) -> dict[str, Any]:
     return {"bias": values[:3].tolist(), "matrix": values[3:12].reshape(3, 3).tolist()}
 
 
-def coverage_factor(degrees_of_freedom: float, probability: float = 0.95) -> float:
-    """Return the two-sided coverage factor k of Student's t.
+def coverage_factor(degrees_of_freedom: ArrayLike, probability: float = 0.95) -> NDArray[np.float64]:
+    """Return the two-sided coverage factor k of Student's t, of the shape of its argument.
 
     k solves ``P(|t_nu| <= k) = probability`` (JCGM 100:2008, annex G); for infinite ``nu`` it is the normal quantile.
-
-    Parameters
-    ----------
-    degrees_of_freedom : float
-    probability : float
-
-    Returns
-    -------
-    float
     """
-    return float(coverage_factors(np.array([degrees_of_freedom]), probability)[0])
+    from scipy.special import ndtri, stdtrit  # noqa: PLC0415  (0.1 s, needed where uncertainties are written only)
 
-
-def coverage_factors(degrees_of_freedom: NDArray[np.float64], probability: float = 0.95) -> NDArray[np.float64]:
-    """Return ``coverage_factor`` of each of (n,) degrees of freedom."""
-    from scipy.special import ndtri, stdtrit  # noqa: PLC0415  (0.1 s that only writers of uncertainties pay)
-
-    upper, known = 0.5 + probability / 2.0, np.isfinite(degrees_of_freedom)
-    factors: NDArray[np.float64] = np.where(
-        known, stdtrit(np.where(known, degrees_of_freedom, 1.0), upper), ndtri(upper)
-    )
+    nu, upper = np.asarray(degrees_of_freedom, float), 0.5 + probability / 2.0
+    known = np.isfinite(nu)
+    factors: NDArray[np.float64] = np.where(known, stdtrit(np.where(known, nu, 1.0), upper), ndtri(upper))[()]
     return factors
+
+
+@dataclass(frozen=True)
+class Contribution:
+    """One line of an uncertainty budget: the share of one source (JCGM 100:2008, 8 and annex H).
+
+    Attributes
+    ----------
+    source : str
+    kind : str
+        ``A`` (from the scatter of these recordings) or ``B`` (from any other knowledge).
+    distribution : str
+        Assumed distribution of the input.
+    covariance : (p, p) array
+        Of the parameters, from this source only.
+    degrees_of_freedom : (p,) array
+    input_uncertainty : float or None
+        Standard uncertainty of the input; None where the source is not a single quantity.
+    input_unit : str
+    independent : int
+        How many independent quantities of this uncertainty the input stands for (stops of a table, axes).
+    parts : dict of str to (p,) array
+        Standard uncertainties that the contribution consists of, where they are known separately.
+    remark : str
+    """
+
+    source: str
+    kind: str
+    distribution: str
+    covariance: NDArray[np.float64]
+    degrees_of_freedom: NDArray[np.float64]
+    input_uncertainty: float | None = None
+    input_unit: str = ""
+    independent: int = 1
+    parts: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+    remark: str = ""
+
+    @property
+    def standard_uncertainty(self) -> NDArray[np.float64]:
+        """Its share of each parameter's standard uncertainty: (p,) array."""
+        return np.sqrt(np.clip(np.diag(self.covariance), 0.0, None))
+
+    def with_freedom(self, degrees_of_freedom: NDArray[np.float64]) -> Contribution:
+        """Return the contribution with other degrees of freedom."""
+        return replace(self, degrees_of_freedom=degrees_of_freedom)
+
+    def of(self, kept: slice) -> Contribution:
+        """Return the contribution to some of the parameters."""
+        parts = {name: values[kept] for name, values in self.parts.items()}
+        freedom = self.degrees_of_freedom[kept]
+        return replace(self, covariance=self.covariance[kept, kept], degrees_of_freedom=freedom, parts=parts)
+
+    def placed(self, place: NDArray[np.float64]) -> Contribution:
+        """Return the contribution to q parameters that include these p: ``place`` is (q, p), zeros and ones."""
+        parts = {name: place @ values for name, values in self.parts.items()}
+        freedom = np.full(len(place), np.inf)
+        freedom[np.argmax(place, axis=0)] = self.degrees_of_freedom
+        return replace(self, covariance=place @ self.covariance @ place.T, degrees_of_freedom=freedom, parts=parts)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the line as published; the sensitivity is contribution / input uncertainty."""
+        contribution, u = self.standard_uncertainty, self.input_uncertainty
+        return {
+            "source": self.source,
+            "type": self.kind,
+            "distribution": self.distribution,
+            "standard_uncertainty": u,
+            "unit": self.input_unit,
+            "independent_inputs": self.independent,
+            "sensitivity": (contribution / u).tolist() if u else None,
+            "contribution": contribution.tolist(),
+            "degrees_of_freedom": finite(self.degrees_of_freedom),
+            "parts": {name: values.tolist() for name, values in self.parts.items()},
+            "remark": self.remark,
+        }
+
+
+def finite(values: NDArray[np.float64]) -> list[float | None]:
+    """Return a list for JSON, with None for infinite values."""
+    return [float(v) if np.isfinite(v) else None for v in values]

@@ -1,4 +1,10 @@
-"""The noise of one sensor: white noise and bias wander."""
+"""The noise of one sensor: white noise and a wandering bias.
+
+    noise[n] = white * w[n] + wander * m[n]
+
+with ``w`` independent standard normal and ``m`` a stationary first-order Gauss-Markov process of unit variance and
+autocorrelation ``exp(-|t| / correlation_time)``.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +16,12 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+MEDIAN_STEP = 0.9539  # median of |w[n+1] - w[n]| of white noise with standard deviation 1: 0.67449 sqrt(2)
+
 
 @dataclass(frozen=True)
 class Noise:
-    """White noise of a sample and a first-order Gauss-Markov bias wander, per axis.
-
-    ``noise[n] = white * w[n] + wander * m[n]``, with ``w`` independent standard normal and ``m`` stationary with unit
-    variance and autocorrelation ``exp(-|t| / correlation_time)``.
+    """White noise of a sample and Gauss-Markov bias wander, per axis.
 
     Attributes
     ----------
@@ -26,11 +31,10 @@ class Noise:
         Stationary standard deviation of the bias wander; 0 where none was seen.
     correlation_time : float, s
     source : str
-        ``static`` (a long rest), ``rests`` (rest parts of the recordings), ``residual`` (what a fit left) or
-        ``data_sheet``.
+        ``static`` (a long rest), ``rests`` (rests in the recordings), ``residual`` (of a fit) or ``data_sheet``.
     length : float, s
-        Of the static rest that told it; 0 where none did. It bounds how well the wander is known: its standard
-        deviation has a relative uncertainty of about ``sqrt(correlation_time / length)``.
+        Duration of the static rest that it was estimated from, else 0. The relative uncertainty of the wander is about
+        ``sqrt(correlation_time / length)``.
     """
 
     white: NDArray[np.float64]
@@ -47,3 +51,18 @@ class Noise:
     def from_json(cls, data: dict[str, Any]) -> Self:
         """Read back what ``to_json`` wrote."""
         return cls(**{**data, "white": np.array(data["white"]), "wander": np.array(data["wander"])})
+
+
+def noise_of_steps(step: NDArray[np.float64], axis: int = 0, *, keepdims: bool = False) -> NDArray[np.float64]:
+    """Return the standard deviation of white noise, ``median |x[n+1] - x[n]| / 0.9539``, along an axis.
+
+    Slow signals and outliers hardly change it.
+
+    Parameters
+    ----------
+    step : array
+        Absolute differences of successive samples, ``|x[n+1] - x[n]|``.
+    axis, keepdims
+        As of ``numpy.median``.
+    """
+    return np.asarray(np.median(step, axis, keepdims=keepdims) / MEDIAN_STEP)

@@ -1,7 +1,7 @@
-"""A recording: one file's samples, in the units of the house.
+"""A recording: the samples of one file.
 
 Units: time in integer nanoseconds since power-on, specific force in g (9.80665 m/s^2), angular rate in deg/s,
-angles in deg, temperature in degC. A channel that the file does not hold is ``None``.
+angles in deg, temperature in degC. A channel that the file does not contain is ``None``.
 """
 
 from __future__ import annotations
@@ -12,15 +12,13 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from pipeline.records.median import median
-
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 AXES = ("x", "y", "z")
 SENSORS = ("accelerometer", "gyroscope")
 NANOSECONDS = 1_000_000_000
-CLIPPED_OR_STUCK = 0b110  # bits of the flags
+CLIPPED_OR_STUCK = 0b110  # bits 1 and 2 of ``Recording.flags``
 
 
 @dataclass(frozen=True)
@@ -137,16 +135,16 @@ class Recording:
     @cached_property
     def interval(self) -> float:
         """Median sampling interval, s."""
-        return float(median(np.diff(self.time_ns))) / NANOSECONDS if self.samples > 1 else float("nan")
+        return float(np.median(np.diff(self.time_ns))) / NANOSECONDS if self.samples > 1 else float("nan")
 
     @cached_property
-    def kept(self) -> dict[Any, Any]:
-        """What was worked out of it once, for both sensors and all steps: its smoothed temperature, its motions."""
+    def cache(self) -> dict[Any, Any]:
+        """Results computed from this recording that several steps use: smoothed temperature, reference motions."""
         return {}
 
     @property
-    def sound(self) -> NDArray[np.bool_]:
-        """Which samples ingest did not mark as clipped or stuck (one after a gap is as good as any): (n,) array."""
+    def valid(self) -> NDArray[np.bool_]:
+        """Which samples ingest did not flag as clipped or stuck: (n,) array. A sample after a gap is valid."""
         if self.flags is None:
             return np.ones(self.samples, bool)
         return np.asarray((self.flags & CLIPPED_OR_STUCK) == 0)

@@ -20,7 +20,6 @@ import numpy as np
 from pipeline.model.kinematics import earth_rate, reference_motion
 from pipeline.model.measurement import predicted_reading
 from pipeline.records import FittedEffect, SensorCalibration
-from pipeline.records.median import median
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -108,7 +107,7 @@ def white_noise(error: NDArray[np.float64]) -> NDArray[np.float64]:
 
     ``1.4826 median |e[n+1] - e[n]| / sqrt(2)``; slow errors and outliers do not move it.
     """
-    sigma: NDArray[np.float64] = 1.4826 * median(np.abs(np.diff(error, axis=0))) / np.sqrt(2.0)
+    sigma: NDArray[np.float64] = 1.4826 * np.median(np.abs(np.diff(error, axis=0)), axis=0) / np.sqrt(2.0)
     return sigma
 
 

@@ -114,14 +114,14 @@ def along_gravity(time: Values, force: Values) -> tuple[Values, bool]:
 def creep_in(recording: Recording, start: int, stop: int) -> Creep:
     """Return how a unit tilts in the samples ``start <= n < stop`` of a recording, without marked or missing ones."""
     key = "creep", start, stop
-    if key not in recording.kept:
+    if key not in recording.cache:
         force = recording.accelerometer
         assert force is not None  # noqa: S101
-        good = (recording.sound[start:stop]) & np.isfinite(force[start:stop]).all(axis=1)
+        good = (recording.valid[start:stop]) & np.isfinite(force[start:stop]).all(axis=1)
         count = np.array([max(int(good.sum()), 1)])
         share = float(variance_of_mean(filter_autocovariance(recording), count)[0])
-        recording.kept[key] = creep_of(recording.time[start:stop][good], force[start:stop][good], share)
-    found: Creep = recording.kept[key]
+        recording.cache[key] = creep_of(recording.time[start:stop][good], force[start:stop][good], share)
+    found: Creep = recording.cache[key]
     return found
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.records.neighbours import noise_of_steps
+from pipeline.records import noise_of_steps
 from pipeline.signal.filter_noise import filter_autocovariance
 from pipeline.signal.rests import find_rests, rests_from_table, runs
 
@@ -36,7 +36,7 @@ def stretches_of(recording: Recording, mask: NDArray[np.bool_]) -> list[tuple[in
 
 def usable(recording: Recording, values: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return which samples are neither missing nor marked by ingest: (n,) array."""
-    return np.asarray(np.isfinite(values).all(axis=1) & recording.sound)
+    return np.asarray(np.isfinite(values).all(axis=1) & recording.valid)
 
 
 def rest_readings(recording: Recording, sensor: str, *, everything: bool) -> list[Rest]:

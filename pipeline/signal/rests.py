@@ -216,7 +216,7 @@ def _spoilt(recording: Recording, size: int) -> NDArray[np.bool_]:
     """Return the windows with a clipped, stuck or missing reading, or over a gap as long as a window."""
     assert recording.accelerometer is not None  # noqa: S101
     bad = np.logical_not(np.all(np.isfinite(recording.accelerometer), axis=1))
-    bad |= ~recording.sound
+    bad |= ~recording.valid
     if recording.gyroscope is not None:
         bad |= np.logical_not(np.all(np.isfinite(recording.gyroscope), axis=1))
     bad[1:] |= np.diff(recording.time_ns) > size * _interval(recording) * 1e9

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import InputError
-from pipeline.records import AXES, Note
-from pipeline.records.attitude import rate_of_attitude
+from pipeline.records import AXES, Note, rate_of_attitude
 from pipeline.signal.rests import RATE_AT_REST_DPS, runs
 from pipeline.signal.table_moves import NEAR_A_MOVE_S, Move, find_moves, groups_of, handled_samples, rate_of_table
 

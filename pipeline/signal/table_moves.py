@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.records.attitude import rate_of_attitude
+from pipeline.records import rate_of_attitude
 from pipeline.signal.rests import RATE_AT_REST_DPS, runs
 
 if TYPE_CHECKING:

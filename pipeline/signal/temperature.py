@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.records.neighbours import noise_of_steps
+from pipeline.records import noise_of_steps
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -71,9 +71,9 @@ def smooth_temperature(
 def temperature_of(recording: Recording) -> NDArray[np.float64]:
     """Return the smoothed temperature of a recording that logs it: (n,) array, degC; shared."""
     assert recording.temperature is not None  # noqa: S101
-    if "temperature" not in recording.kept:
-        recording.kept["temperature"] = smooth_temperature(recording.time, recording.temperature)
-    found: NDArray[np.float64] = recording.kept["temperature"]
+    if "temperature" not in recording.cache:
+        recording.cache["temperature"] = smooth_temperature(recording.time, recording.temperature)
+    found: NDArray[np.float64] = recording.cache["temperature"]
     return found
 
 

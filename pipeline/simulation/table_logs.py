@@ -19,8 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import ConfigurationError
-from pipeline.records import Recording
-from pipeline.records.attitude import continuous
+from pipeline.records import Recording, continuous
 from pipeline.simulation.trajectory import Turn
 
 if TYPE_CHECKING:

@@ -27,7 +27,7 @@ import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.model.compensation import Compensation
-from pipeline.records.attitude import level_in_body
+from pipeline.records import level_in_body
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

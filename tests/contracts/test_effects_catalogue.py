@@ -119,7 +119,7 @@ def test_columns_are_the_central_differences_of_the_reading(name: str, sensor: s
     scale = 0.0
     for motion in motions:
         # at a bend of the rate the derivative jumps, and a difference across it is neither side's
-        smooth = motion.followed & np.roll(motion.followed, 1) & np.roll(motion.followed, -1)
+        smooth = motion.reference_valid & np.roll(motion.reference_valid, 1) & np.roll(motion.reference_valid, -1)
         smooth &= np.abs(np.gradient(motion.angular_acceleration[:, motion.axis])) < 1e-6
         columns = effect.columns(sensor, motion, K[sensor], values)[smooth]
         scale = max(scale, np.abs(columns).max())

@@ -8,7 +8,7 @@ import pytest
 from pipeline.estimation.least_squares import solve_linear
 from pipeline.estimation.monte_carlo import compare, numerical_tolerance, propagate_distributions
 from pipeline.estimation.propagation import correlation, effective_degrees_of_freedom, means, propagate
-from pipeline.records.calibration import coverage_factor
+from pipeline.records import coverage_factor
 
 # H.2: five simultaneous observations of V (V), I (mA) and phase angle (rad).
 VOLTAGE = [5.007, 4.994, 5.005, 4.990, 4.999]

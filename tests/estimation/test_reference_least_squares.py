@@ -9,8 +9,7 @@ from table_turns import Bench, run_stages, settings, specific_force
 from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.model.kinematics import reference_motion
 from pipeline.model.rotation import attitude_matrix
-from pipeline.records import Recording, SensorCalibration
-from pipeline.records.calibration import coverage_factors
+from pipeline.records import Recording, SensorCalibration, coverage_factor
 from pipeline.signal.filters import apply_filter
 
 K = np.eye(3) + np.array([[0.004, 0.011, -0.006], [-0.009, -0.012, 0.003], [0.007, -0.002, 0.018]])
@@ -164,7 +163,7 @@ def test_stated_uncertainty_covers_the_truth_under_bias_wander(wander: float, un
         found = calibrate("accelerometer", bench.stop_and_go(15.0, 1.2))
         error = np.concatenate([found.bias - bench.bias, (found.matrix - MATRIX).ravel()])
         u = np.sqrt(np.diag(found.covariance))
-        hits.append(np.abs(error) <= coverage_factors(found.freedom) * u)
+        hits.append(np.abs(error) <= coverage_factor(found.freedom) * u)
         details = found.stages[0].details
         naive.append(np.abs(error[:3]) <= 1.96 * np.array(details["residual_rms"]) / np.sqrt(details["samples_used"]))
     assert 0.92 < np.mean(hits) < 0.985

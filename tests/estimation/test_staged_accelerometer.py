@@ -9,8 +9,7 @@ from table_turns import Bench, run_stages, settings, specific_force, stepped_ang
 from pipeline.errors import CannotCalibrateError, ConfigurationError, NotObservableError
 from pipeline.estimation.accelerometer.scale_factor import fit as fit_scale_factor
 from pipeline.estimation.correction import apply_correction
-from pipeline.records import SensorCalibration, StageResult
-from pipeline.records.calibration import coverage_factor
+from pipeline.records import SensorCalibration, StageResult, coverage_factor
 from pipeline.signal.filters import apply_filter
 
 STAGES = ["orthogonality", "misalignment", "bias", "scale_factor"]

@@ -10,8 +10,7 @@ from pipeline.errors import CannotCalibrateError, ConfigurationError, NotObserva
 from pipeline.estimation.correction import apply_correction
 from pipeline.estimation.gyroscope.scale_factor import fit as fit_scale_factor
 from pipeline.model.kinematics import earth_rate
-from pipeline.records import SensorCalibration, StageResult
-from pipeline.records.calibration import coverage_factors
+from pipeline.records import SensorCalibration, StageResult, coverage_factor
 from pipeline.signal.filters import apply_filter
 
 STAGES = ["bias", "orthogonality_and_misalignment", "scale_factor"]
@@ -135,7 +134,7 @@ def test_stated_uncertainty_covers_the_truth() -> None:
         found = fit_scale_factor(bench.turns_at([100.0, -100.0]), before, settings())
         error = np.concatenate([found.bias - BIAS, (found.matrix - M.T).ravel()])
         u = np.sqrt(np.diag(found.covariance))
-        hits.append(np.abs(error) <= coverage_factors(found.freedom) * u)
+        hits.append(np.abs(error) <= coverage_factor(found.freedom) * u)
     assert 0.92 < np.mean(hits) < 0.985
     assert np.all(np.mean(hits, axis=0) > 0.86)
 

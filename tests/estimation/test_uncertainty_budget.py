@@ -10,7 +10,7 @@ import pytest
 from table_turns import Bench, run_stages, settings, specific_force
 
 from pipeline.estimation.propagation import effective_degrees_of_freedom
-from pipeline.records.calibration import coverage_factor
+from pipeline.records import coverage_factor
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -15,7 +15,7 @@ def motion(program: Program, *, decimals: int = 4) -> tuple[Motion, np.ndarray]:
     angle, rate, _, _ = program.at(time_ns * 1e-9)
     found = reference_motion(Recording("turn", "gyroscope", "x", time_ns, table_angle=angle.round(decimals)))
     assert found is not None
-    assert found.followed is not None
+    assert found.reference_valid is not None
     return found, rate
 
 
@@ -37,9 +37,9 @@ def turns() -> Program:
 def test_the_rate_is_right_wherever_it_is_said_to_be_followed(program: Program) -> None:
     found, rate = motion(program)
     assert found.rate is not None
-    assert found.followed is not None
-    assert np.abs(found.rate - rate)[found.followed].max() < 0.01
-    assert found.followed[found.still].mean() > 0.7  # not the last sample before a move
+    assert found.reference_valid is not None
+    assert np.abs(found.rate - rate)[found.reference_valid].max() < 0.01
+    assert found.reference_valid[found.still].mean() > 0.7  # not the last sample before a move
 
 
 @pytest.mark.parametrize("program", [stop_and_go(), turns()], ids=["stop-and-go", "turns"])
@@ -52,7 +52,7 @@ def test_rests_are_seen_in_the_angle_alone(program: Program) -> None:
 def test_corners_of_ramps_are_said_to_be_vague() -> None:
     found, rate = motion(turns())
     assert found.rate is not None
-    assert found.followed is not None
+    assert found.reference_valid is not None
     wrong = np.abs(found.rate - rate) > 0.1
     assert wrong.sum() >= 8
-    assert not found.followed[wrong].any()
+    assert not found.reference_valid[wrong].any()

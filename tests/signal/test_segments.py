@@ -14,7 +14,7 @@ from pipeline.io.channel_table import ChannelTable
 from pipeline.io.checks import Checks
 from pipeline.io.read import to_recording
 from pipeline.io.table_log import unwrapped
-from pipeline.records.attitude import rate_of_attitude
+from pipeline.records import rate_of_attitude
 from pipeline.signal.segments import cut
 from pipeline.simulation.campaign import course_of, simulate_unit
 from pipeline.simulation.description import UnitDescription

@@ -11,7 +11,7 @@ import yaml
 
 from pipeline.errors import ConfigurationError
 from pipeline.io.commanded_motion import at, knots_of, moves_of
-from pipeline.records.attitude import rate_of_attitude
+from pipeline.records import rate_of_attitude
 from pipeline.simulation.campaign import simulate_unit, write_campaign
 from pipeline.simulation.description import UnitDescription, description_from
 from pipeline.simulation.procedures import Course, plan

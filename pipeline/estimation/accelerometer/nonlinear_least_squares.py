@@ -44,8 +44,7 @@ from pipeline.estimation.serial_noise import assess_noise, prior_of
 from pipeline.estimation.table_inputs import Reference, disturbance
 from pipeline.estimation.trials import Errors, beside_trials, quadratic_results, trials_of, without_trials
 from pipeline.estimation.turns import Factors, table_motion
-from pipeline.records import SensorCalibration, StageResult
-from pipeline.records.calibration import coverage_factor
+from pipeline.records import SensorCalibration, StageResult, coverage_factor
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -55,8 +54,7 @@ if TYPE_CHECKING:
     from pipeline.estimation.accelerometer.magnitude import Ellipsoid
     from pipeline.estimation.accelerometer.orientations import Orientations
     from pipeline.estimation.serial_noise import Prior, SerialNoise
-    from pipeline.records import Motion, Recording
-    from pipeline.records.budget import Contribution
+    from pipeline.records import Contribution, Motion, Recording
 
     Values = NDArray[np.float64]
 

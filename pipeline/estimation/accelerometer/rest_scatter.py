@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.estimation.serial_noise import Prior
-    from pipeline.records.budget import Contribution
+    from pipeline.records import Contribution
 
     Values = NDArray[np.float64]
 

@@ -44,8 +44,7 @@ if TYPE_CHECKING:
     from pipeline.estimation.accelerometer.extremes import Turn
     from pipeline.estimation.serial_noise import Prior, SerialNoise
     from pipeline.estimation.turns import Sinusoid
-    from pipeline.records import Recording
-    from pipeline.records.budget import Contribution
+    from pipeline.records import Contribution, Recording
 
 STAGES = ("orthogonality", "misalignment", "bias", "scale_factor")
 REPLICATES = 60

@@ -21,8 +21,7 @@ import numpy as np
 from pipeline.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.sample_blocks import make_blocks
 from pipeline.estimation.turns import steady_turns
-from pipeline.records import AXES
-from pipeline.records.motion import motion_at_rest
+from pipeline.records import AXES, motion_at_rest
 from pipeline.signal.rests import runs
 
 if TYPE_CHECKING:
@@ -122,7 +121,7 @@ def samples_of(parts: Sequence[Part], recordings: Sequence[Recording]) -> Sample
     if all(np.any(rate, axis=1).all() for rate in rates):
         for recording in recordings:
             if recording.role == "static" and recording.gyroscope is not None:
-                keep = recording.sound
+                keep = recording.valid
                 readings.append(recording.gyroscope[keep])
                 rates.append(np.zeros((int(keep.sum()), 3)))
                 chosen.append((recording, keep))

@@ -9,7 +9,7 @@ import numpy as np
 from pipeline.estimation.budget import combined, gravity_contribution, scatter_contribution, type_b
 from pipeline.estimation.multi_position.trials import tried_by_hand
 from pipeline.estimation.trials import trials_of
-from pipeline.records.budget import NORMAL
+from pipeline.records import NORMAL
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -21,8 +21,7 @@ if TYPE_CHECKING:
 
     from pipeline.estimation.multi_position.fit import HandFit
     from pipeline.estimation.multi_position.model import Model
-    from pipeline.records import SensorCalibration
-    from pipeline.records.budget import Contribution
+    from pipeline.records import Contribution, SensorCalibration
 
     Values = NDArray[np.float64]
 

@@ -13,8 +13,7 @@ from pipeline.estimation.accelerometer.magnitude import derivative_of, error_of
 from pipeline.estimation.accelerometer.nonlinear_least_squares import fit
 from pipeline.estimation.correction import apply_correction
 from pipeline.estimation.rest_means import held_out_rests, rest_means
-from pipeline.records import Recording, SensorCalibration, StageResult
-from pipeline.records.calibration import coverage_factor, coverage_factors
+from pipeline.records import Recording, SensorCalibration, StageResult, coverage_factor
 
 DATA = Path(__file__).parents[3] / "../shared/data"
 needs_data = pytest.mark.skipif(not DATA.exists(), reason="reference data not beside the repository")
@@ -140,7 +139,7 @@ def test_the_truth_lies_within_the_expanded_uncertainty_in_its_share_of_hand_hel
     for seed in range(25):
         recording = _by_hand(_spread(24), np.random.default_rng(seed), between=between)
         calibration = fit([recording], None, settings)
-        factors = coverage_factors(calibration.freedom[FITTED])
+        factors = coverage_factor(calibration.freedom[FITTED])
         inside.append(np.abs(_vector(calibration) - TRUTH) < factors * _uncertainty(calibration))
     assert 0.90 < np.mean(inside) < 0.99
 

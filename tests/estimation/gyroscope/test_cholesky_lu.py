@@ -11,8 +11,7 @@ from pipeline.errors import CannotCalibrateError, ConfigurationError, NotObserva
 from pipeline.estimation.correction import apply_correction
 from pipeline.estimation.gyroscope import bias as bias_stage
 from pipeline.estimation.gyroscope.cholesky_lu import factorise, fit
-from pipeline.records import Recording, SensorCalibration
-from pipeline.records.calibration import coverage_factor
+from pipeline.records import Recording, SensorCalibration, coverage_factor
 
 INTERVAL = 0.12
 S = np.array([1.01, 0.98, 1.03])
