@@ -1,6 +1,6 @@
 """The verdict on one sensor: what its selection found, against the error on held-out motion.
 
-The held-out error of a calibration that lacks nothing lies in the interval of ``pipeline.validation.expected``. What
+The held-out error of a calibration that lacks nothing lies in the interval of ``pipeline.validation.expected_error``. What
 says otherwise decides, the first that applies:
 
     reference_in_doubt  a check of the recordings says so (note ``N-REFERENCE``), or the fit is explained to its noise

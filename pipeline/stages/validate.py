@@ -8,8 +8,7 @@ from pipeline.io.parquet import load_recordings
 from pipeline.stages.batch import parse_job, run_batch, write_json
 from pipeline.stages.fits import load_fits
 from pipeline.stages.noises import require_noises
-from pipeline.validation.attitude import attitude
-from pipeline.validation.gravity_direction import gravity_direction
+from pipeline.validation.attitude import attitude, gravity_direction
 from pipeline.validation.heldout import validate
 
 if TYPE_CHECKING:

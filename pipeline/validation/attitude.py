@@ -1,46 +1,61 @@
 """What a calibration is worth in an attitude: its drift on held-out motion, before and after.
 
-Gyroscope alone, from the table's attitude at the start:
+With a logged attitude. Gyroscope alone, from the table's attitude at the start:
 
     q[n+1] = q[n] exp(a[n] / 2)
     a[n] = dt (13 w[n] + 13 w[n+1] - w[n-1] - w[n+2]) / 24 + dt^2 (w[n] x w[n+1]) / 12
 
 where
 
-    q : attitude, body to level, unit quaternion
+    q : attitude, body to level
     w : angular rate, rad/s
-    a : rotation vector over one interval, of rates that run through four samples as a cubic. Source: A. Iserles et al.,
-        Lie-group methods, Acta Numerica 9 (2000), 215-365, section 4 (Magnus expansion)
+    a : rotation vector over one interval, of rates interpolated by a cubic through four samples. Source: A. Iserles et
+        al., Lie-group methods, Acta Numerica 9 (2000), 215-365, section 4 (Magnus expansion)
 
-The drift after one minute is the angle between what the integral and what the table say that the sensor turned in any
-minute of the recording, root mean square over its starts. With the accelerometer an attitude is fused by the
-complementary filter of x-io Technologies' Fusion (``imufusion``; S. Madgwick, AHRS algorithms and calibration
-solutions, PhD thesis, Bristol 2014, chapter 7); its tilt, the angle between the verticals, is what gravity keeps from
-drifting.
+The drift after one minute is the angle between integrated and logged rotation over any minute of the recording, root
+mean square over its starts. With the accelerometer an attitude is fused by the complementary filter of x-io
+Technologies' Fusion (``imufusion``; S. Madgwick, AHRS algorithms and calibration solutions, PhD thesis, Bristol 2014,
+chapter 7); its tilt is the angle between the verticals, where gravity bounds the drift.
+
+By hand. Each held-out move is integrated, from the rest before it to the rest after it:
+
+    error = angle(A u_before, u_after)
+
+with the direction u of gravity by the calibrated accelerometer and the rotation A by the gyroscope
+(``pipeline.estimation.multi_position.moves``).
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pipeline.errors import InputError
+from pipeline.estimation.design import Term
+from pipeline.estimation.multi_position.gyroscope import HandHeldGyroscope
+from pipeline.estimation.multi_position.model import State
+from pipeline.estimation.multi_position.moves import moves_of
+from pipeline.estimation.multi_position.observed import observed_rests
+from pipeline.estimation.multi_position.rests import HELD_OUT, ROLE, by_hand
 from pipeline.model.compensation import Compensation
-from pipeline.records import level_in_body
+from pipeline.model.effects import effect
+from pipeline.records import continuous, level_in_body
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
+    from scipy.spatial.transform import Rotation
 
-    from pipeline.records import Recording, SensorCalibration
+    from pipeline.records import Noise, Recording, SensorCalibration
 
     Array = NDArray[np.float64]
 
 MINUTE = 60.0
 STARTS = 60  # of the minutes over which a drift is averaged
-SHORTEST = 10.0  # s of a recording that is worth a drift
+SHORTEST = 10.0  # s: a drift over less than that is mostly noise
 CURVE = 120  # points of the published curves
 STEP_S, STEP_DEG = 0.1, 5.0  # of the complementary filter, which integrates to first order
 GAIN = 0.5  # of the complementary filter: its library's default
@@ -70,7 +85,7 @@ def attitude(
         return {"reason": "no held-out recording logs the table's attitude"}
     if recording.gyroscope is None or gyroscope is None:
         return {"reason": "the gyroscope is not calibrated"}
-    known, reference = _beside_table(recording)
+    known, logged = _with_reference(recording)
     if known.samples < 2 or known.time[-1] - known.time[0] < SHORTEST:
         return {"reason": f"recording {recording.name} is shorter than {SHORTEST:g} s"}
     try:
@@ -79,6 +94,9 @@ def attitude(
         )
     except InputError as error:
         return {"reason": str(error)}
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415  (as in integrate)
+
+    reference = Rotation.from_quat(logged, scalar_first=True)
     found: dict[str, Any] = {"reason": None, "recording": recording.name}
     found["seconds"] = float(min(MINUTE, known.time[-1] - known.time[0]))
     found |= {"drift_deg": {}, "tilt_rms_deg": {} if accelerometer and known.accelerometer is not None else None}
@@ -95,50 +113,62 @@ def attitude(
         found["curve"][f"drift_{name}"] = _rounded(angle_between(alone, reference)[shown])
         if found["tilt_rms_deg"] is not None:
             assert force is not None  # noqa: S101
-            at, fused = fuse(known.time, force, alone)
-            tilt, since = tilt_between(fused, reference[at]), known.time[at] - known.time[0]
+            at, fused = _fuse(known.time, force, alone)
+            tilt, since = _tilt_between(fused, reference[at].as_quat(scalar_first=True)), known.time[at] - known.time[0]
             found["tilt_rms_deg"][name] = float(np.sqrt(np.mean(tilt[since >= min(SETTLED, 0.5 * since[-1])] ** 2)))
             found["curve"][f"tilt_{name}"] = _rounded(np.interp(known.time[shown] - known.time[0], since, tilt))
     return found
 
 
-def integrate(time: Array, rate: Array, start: Array) -> Array:
-    """Return the attitude that angular rates add up to: (n, 4) array, the first of them ``start``.
+def integrate(time: Array, rate: Array, start: Rotation) -> Rotation:
+    """Return the attitude that angular rates add up to: n rotations, the first of them ``start``.
 
     Parameters
     ----------
     time : (n,) array, s
     rate : (n, 3) array, deg/s
-    start : (4,) array
+    start : Rotation
     """
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415  (0.2 s that only units with a logged attitude pay)
+
     w, dt = np.radians(rate), np.diff(time)[:, None]
     mean = 0.5 * (w[:-1] + w[1:])
     mean[1:-1] += (w[1:-2] + w[2:-1] - w[:-3] - w[3:]) / 24.0
-    half = 0.5 * (dt * mean + dt**2 / 12.0 * np.cross(w[:-1], w[1:]))
-    size = np.linalg.norm(half, axis=1, keepdims=True)
-    q = np.concatenate([start[None], np.hstack([np.cos(size), np.sinc(size / np.pi) * half])])
-    step = 1
-    while step < len(q):  # products of 2, 4, 8 ... neighbours: a running product in log2 n passes
-        q[step:] = product(q[:-step], q[step:])
+    turns = Rotation.from_rotvec(dt * mean + dt**2 / 12.0 * np.cross(w[:-1], w[1:]))
+    total, step = Rotation.concatenate([start, turns]), 1
+    while step < len(time):  # products of 2, 4, 8 ... neighbours: a running product in log2 n passes
+        total = Rotation.concatenate([total[:step], total[:-step] * total[step:]])
         step *= 2
-    normed: NDArray[np.float64] = q / np.linalg.norm(q, axis=1, keepdims=True)
-    return normed
+    return total
 
 
-def fuse(time: Array, force: Array, alone: Array) -> tuple[NDArray[np.int64], Array]:
-    """Return the attitude of the complementary filter, at samples about 0.1 s or 5 deg apart.
+def drift(time: Array, estimate: Rotation, reference: Rotation, seconds: float) -> float:
+    """Return by how much an attitude is off after so many seconds, root mean square over starts, deg.
 
     Parameters
     ----------
     time : (n,) array, s
-    force : (n, 3) array, g
-    alone : (n, 4) array
-        Attitude of the gyroscope alone, whose turns between those samples are the rates that the filter is fed with.
+    estimate, reference : Rotation
+        n each.
+    seconds : float
+    """
+    last = int(np.searchsorted(time, time[-1] - seconds + 1e-6, "right")) - 1
+    start = np.unique(np.linspace(0, max(last, 0), STARTS).astype(int))
+    interval = float(np.median(np.diff(time)))
+    stop = np.minimum(np.searchsorted(time, time[start] + seconds - 0.5 * interval), len(time) - 1)
+    turned, known = (q[start].inv() * q[stop] for q in (estimate, reference))
+    return float(np.sqrt(np.mean(angle_between(turned, known) ** 2)))
 
-    Returns
-    -------
-    (m,) array of int, (m, 4) array
-        The samples, and the attitude at them; the first is that of the gyroscope alone.
+
+def angle_between(p: Rotation, q: Rotation) -> Array:
+    """Return the angle of the rotation from one attitude to another: (n,) array, deg."""
+    return np.degrees((p.inv() * q).magnitude())
+
+
+def _fuse(time: Array, force: Array, alone: Rotation) -> tuple[NDArray[np.int64], Array]:
+    """Return samples about 0.1 s or 5 deg apart, and the attitude of the complementary filter there.
+
+    Its rates are those of the attitude ``alone`` of the gyroscope between these samples; the first attitude is given.
     """
     import imufusion  # noqa: PLC0415  (only units with a logged attitude pay for it)
 
@@ -146,7 +176,7 @@ def fuse(time: Array, force: Array, alone: Array) -> tuple[NDArray[np.int64], Ar
     within = min(STEP_S / float(np.median(np.diff(time))), STEP_DEG / max(float(turns.max()), 1e-9))
     at = np.arange(0, len(time), max(1, int(within)))
     intervals = np.diff(time[at])
-    rates = rotation_vector(product(conjugate(alone[at[:-1]]), alone[at[1:]])) / intervals[:, None]
+    rates = np.degrees((alone[at[:-1]].inv() * alone[at[1:]]).as_rotvec()) / intervals[:, None]
     settings = imufusion.AhrsSettings(
         sample_rate=float(1.0 / np.median(intervals)),
         convention=imufusion.CONVENTION_NWU,
@@ -156,78 +186,27 @@ def fuse(time: Array, force: Array, alone: Array) -> tuple[NDArray[np.int64], Ar
         magnetic_rejection=0.0,
         rejection_timeout=0.0,
     )
-    fusion = imufusion.Ahrs().set_settings(settings).skip_startup().set_quaternion(alone[0])
     q = np.empty((len(at), 4))
-    q[0] = alone[0]
-    # The filter holds the force against the attitude before its step.
-    for n, (interval, rate, felt) in enumerate(zip(intervals.tolist(), rates, force[at[:-1]], strict=True), 1):
+    q[0] = alone[0].as_quat(scalar_first=True)
+    fusion = imufusion.Ahrs().set_settings(settings).skip_startup().set_quaternion(q[0])
+    # The filter compares the force with the attitude before its step.
+    for n, (interval, rate, reading) in enumerate(zip(intervals.tolist(), rates, force[at[:-1]], strict=True), 1):
         fusion.set_sample_period(interval)
-        fusion.update_no_magnetometer(rate, felt)
+        fusion.update_no_magnetometer(rate, reading)
         q[n] = fusion.get_quaternion()
     return at, q
 
 
-def drift(time: Array, estimate: Array, reference: Array, seconds: float) -> float:
-    """Return by how much an attitude is off after so many seconds, root mean square over starts, deg.
-
-    Parameters
-    ----------
-    time : (n,) array, s
-    estimate, reference : (n, 4) array
-    seconds : float
-    """
-    last = int(np.searchsorted(time, time[-1] - seconds + 1e-6, "right")) - 1
-    start = np.unique(np.linspace(0, max(last, 0), STARTS).astype(int))
-    interval = float(np.median(np.diff(time)))
-    stop = np.minimum(np.searchsorted(time, time[start] + seconds - 0.5 * interval), len(time) - 1)
-    turned = [product(conjugate(q[start]), q[stop]) for q in (estimate, reference)]
-    return float(np.sqrt(np.mean(angle_between(*turned) ** 2)))
-
-
-def angle_between(p: Array, q: Array) -> Array:
-    """Return the angle of the rotation from one attitude to another: (n,) array, deg."""
-    angle: NDArray[np.float64] = np.linalg.norm(rotation_vector(product(conjugate(p), q)), axis=1)
-    return angle
-
-
-def rotation_vector(q: Array) -> Array:
-    """Return axis times angle of rotations by less than 180 deg: (n, 3) array, deg."""
-    size = np.linalg.norm(q[:, 1:], axis=1)
-    angle = np.degrees(2.0 * np.arctan2(size, np.abs(q[:, 0])))
-    vector: NDArray[np.float64] = (np.sign(q[:, 0]) * angle / np.maximum(size, 1e-300))[:, None] * q[:, 1:]
-    return vector
-
-
-def tilt_between(p: Array, q: Array) -> Array:
-    """Return the angle between the verticals of two attitudes: (n,) array, deg."""
+def _tilt_between(p: Array, q: Array) -> Array:
+    """Return the angle between the verticals of two attitudes, quaternions (n, 4): (n,) array, deg."""
     up, other = level_in_body(p), level_in_body(q)
     across = np.linalg.norm(np.cross(up, other), axis=1)
-    angle: NDArray[np.float64] = np.degrees(np.arctan2(across, np.einsum("ij,ij->i", up, other)))
+    angle: Array = np.degrees(np.arctan2(across, np.einsum("ij,ij->i", up, other)))
     return angle
 
 
-def product(p: Array, q: Array) -> Array:
-    """Return the products of quaternions: (n, 4) array."""
-    (a, b, c, d), (w, x, y, z) = p.T, q.T
-    return np.stack(
-        [
-            a * w - b * x - c * y - d * z,
-            a * x + b * w + c * z - d * y,
-            a * y - b * z + c * w + d * x,
-            a * z + b * y - c * x + d * w,
-        ],
-        1,
-    )
-
-
-def conjugate(q: Array) -> Array:
-    """Return the inverse rotations: (n, 4) array."""
-    inverse: NDArray[np.float64] = q * np.array([1.0, -1.0, -1.0, -1.0])
-    return inverse
-
-
-def _beside_table(recording: Recording) -> tuple[Recording, Array]:
-    """Return the samples whose readings and attitude are known, and the table's attitude, as late as the readings."""
+def _with_reference(recording: Recording) -> tuple[Recording, Array]:
+    """Return the samples whose readings and attitude are known, and the attitude (n, 4) a filter delay before."""
     q = recording.table_attitude
     assert q is not None  # noqa: S101
     readings = [v for v in (recording.accelerometer, recording.gyroscope) if v is not None]
@@ -235,11 +214,62 @@ def _beside_table(recording: Recording) -> tuple[Recording, Array]:
     clock, q = recording.time[logged], q[logged]
     late = recording.time - float(recording.filter.get("delay_s", 0.0))
     known &= (late >= clock[:1].sum()) & bool(len(clock))
-    same = np.concatenate([[1.0], np.cumprod(np.where(np.einsum("ij,ij->i", q[:-1], q[1:]) < 0.0, -1.0, 1.0))])
-    smooth = np.stack([np.interp(late[known], clock, c) for c in (q * same[: len(q), None]).T], 1)
-    normed: NDArray[np.float64] = smooth / np.linalg.norm(smooth, axis=1, keepdims=True)
-    return recording.select(known), normed
+    if not known.any():
+        return recording.select(known), np.zeros((0, 4))
+    return recording.select(known), np.stack([np.interp(late[known], clock, c) for c in continuous(q).T], 1)
 
 
 def _rounded(values: Array) -> list[float]:
     return [float(f"{v:.4g}") for v in values]
+
+
+def gravity_direction(
+    accelerometer: SensorCalibration | None,
+    gyroscope: SensorCalibration | None,
+    recordings: Sequence[Recording],
+    noise: Noise | None,
+    settings: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Return the part ``gravity_direction`` of ``validations/<unit>.json``.
+
+    Parameters
+    ----------
+    accelerometer, gyroscope : SensorCalibration or None
+    recordings : sequence of Recording
+    noise : Noise or None
+        Of the gyroscope.
+    settings : mapping
+        Section ``procedure``.
+
+    Returns
+    -------
+    dict
+        ``reason`` (why there is none, else None), ``moves`` (how many), ``mean_deg``, ``rms_deg`` and ``max_deg`` (each
+        ``before`` and ``after`` the gyroscope's calibration), ``noise_floor_deg`` (the mean that white noise alone
+        gives) and ``creeping_rests`` (in which the unit went on turning).
+    """
+    if not by_hand("gyroscope", recordings):
+        return {"reason": "not recorded by hand"}
+    if accelerometer is None or gyroscope is None:
+        return {"reason": "both sensors have to be calibrated"}
+    role = HELD_OUT if any(r.role == HELD_OUT for r in recordings) else ROLE
+    observed = observed_rests(recordings, accelerometer, settings, role)
+    if observed is None:
+        return {"reason": "no rest is held out"}
+    rests, gravity = observed
+    judged = replace(rests, held_out=~rests.held_out)
+    model = HandHeldGyroscope(judged, moves_of(recordings, judged), gravity, noise, fewest=1)
+    if model.moves is None:
+        return {"reason": "no move is held out"}
+    terms = tuple(Term(effect(e.name), e.values) for e in gyroscope.effects)
+    before = model.missed(State(np.zeros(3), np.eye(3)))[0]
+    after, floor = model.missed(State(gyroscope.bias, gyroscope.matrix, terms))
+    return {
+        "reason": None,
+        "moves": model.moves.count,
+        "mean_deg": {"before": float(np.mean(before)), "after": float(np.mean(after))},
+        "rms_deg": {name: float(np.sqrt(np.mean(e**2))) for name, e in (("before", before), ("after", after))},
+        "max_deg": {"before": float(np.max(before)), "after": float(np.max(after))},
+        "noise_floor_deg": float(np.mean(floor)),
+        "creeping_rests": int(np.count_nonzero(gravity.creeping)),
+    }

@@ -1,9 +1,19 @@
 """Held-out errors: what a calibration leaves on samples that no fit has seen, beside what noise alone would leave.
 
-See ``pipeline.validation.ladder`` for the errors, ``pipeline.validation.floor`` for the floor and
-``pipeline.validation.expected`` for the interval in which the last error should lie. Held out are the
-recordings of role ``validation``; without one, every third rest (``procedure.holdout_every``) of a recording of rests.
-Where nothing is held out, the samples of the fit are judged, and the result says so.
+Held out are the recordings of role ``validation``; without one, every third rest (``procedure.holdout_every``) of a
+recording of rests. Where nothing is held out, the samples of the fit are judged, and the result says so.
+
+Noise alone leaves, with D the variance of a sample's noise and M the calibration's matrix,
+
+    noise_floor = sqrt(mean E(|t + M n| - |t|)^2),    vector_noise_floor = sqrt(mean tr(M D M^T))
+
+Whether a calibration does harm follows from its squared errors against those of the raw readings, in pairs over B
+stretches of the held-out samples (rests count one by one),
+
+    d_b = mean over stretch b of (e_calibrated^2 - e_raw^2),    t = mean(d) sqrt(B) / s(d)
+
+It does harm where Student's t with B - 1 degrees of freedom exceeds that of probability ``LEVEL``, and its error is
+above the interval in which it is expected (``pipeline.validation.expected_error``).
 """
 
 from __future__ import annotations
@@ -12,17 +22,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.errors import ConfigurationError
 from pipeline.estimation.rest_means import held_out_rests, split_rests
 from pipeline.model.effects.base import truth, unit_of
 from pipeline.model.inversion import linear_truth
 from pipeline.model.kinematics import EARTH_RATE_DPS
-from pipeline.validation.expected import expected_rms_error
-from pipeline.validation.floor import squared_norm_errors, squared_vector_errors
-from pipeline.validation.ladder import ladder, last_step
-from pipeline.validation.limits import check_limits
+from pipeline.validation.error_breakdown import error_breakdown, last_step
+from pipeline.validation.expected_error import expected_rms_error, linearized
+from pipeline.validation.norm_error import squared_norm_errors
 from pipeline.validation.samples import samples_of_motion, samples_of_rests
-from pipeline.validation.sensitivity import judged
-from pipeline.validation.worse import worse_than_raw
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -33,6 +41,8 @@ if TYPE_CHECKING:
     from pipeline.signal.rests import Rest
     from pipeline.validation.samples import Samples
 
+LEVEL = 1e-3  # probability that a calibration as good as none is refused
+STRETCHES, FEWEST = 20, 5  # a stretch of a recording of minutes is longer than the correlation time of most wander
 FIGURES = ("mean_abs_error", "sum_abs_error", "max_error", "min_error", "rms_error", "change_percent")
 
 
@@ -64,8 +74,13 @@ def validate(
         ``unit, samples, expected_rms_error`` (None where an effect is left out), ``noise_floor, vector_noise_floor,
         steps`` of the published file, and ``held_out`` (false: judged on the samples of the fit), ``reason`` (why),
         ``reference_rms`` (of the reference's magnitude), ``noise``, ``notes``, ``worse_than_raw`` (why the
-        calibration does harm, or None; ``pipeline.validation.worse``), ``limits`` and ``pass``.
-        ``vector_rms_error`` is the root of the mean squared length of the difference to the reference.
+        calibration does harm, or None), ``limits`` and ``pass``. ``vector_rms_error`` is the root of the mean squared
+        length of the difference to the reference.
+
+    Raises
+    ------
+    ConfigurationError
+        If a limit's name is unknown.
     """
     samples, reason = _choose(calibration.sensor, recordings, noise, settings)
     part: dict[str, Any] = {
@@ -88,44 +103,18 @@ def validate(
     else:
         part["noise_floor"], part["vector_noise_floor"] = noise_floors(calibration, samples)
         part["reference_rms"] = float(np.sqrt(np.nanmean(np.concatenate([s.magnitude for s in samples]) ** 2)))
-        part["steps"], part["notes"] = ladder(calibration, samples, other)
+        part["steps"], part["notes"] = error_breakdown(calibration, samples, other)
         part["expected_rms_error"], lack = _expected(
             calibration, samples, noise, settings, other, fitted_s=_length(calibration.sensor, recordings)
         )
         part["notes"] += lack
         part["worse_than_raw"] = (
-            worse_than_raw(calibration, samples, part["expected_rms_error"], other) if part["held_out"] else None
+            _worse_than_raw(calibration, samples, part["expected_rms_error"], other) if part["held_out"] else None
         )
-    part["limits"], part["pass"] = check_limits(
-        calibration, part, (settings.get("limits") or {}).get(calibration.sensor)
+    part["limits"], part["pass"] = _check_limits(
+        calibration, part["steps"][-1], (settings.get("limits") or {}).get(calibration.sensor) or {}
     )
     return part
-
-
-def final_error(part: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the figures of a summary: of the first step and of the last.
-
-    Parameters
-    ----------
-    part : mapping
-        What ``validate`` returned.
-
-    Returns
-    -------
-    dict
-        ``before`` and ``after`` (``rms_error`` of the first and last step), ``mean_abs_error_before`` and ``_after``,
-        ``change_percent``, ``noise_floor``, ``step`` (name of the last).
-    """
-    first, last = part["steps"][0], part["steps"][-1]
-    return {
-        "before": first["rms_error"],
-        "after": last["rms_error"],
-        "mean_abs_error_before": first["mean_abs_error"],
-        "mean_abs_error_after": last["mean_abs_error"],
-        "change_percent": last["change_percent"],
-        "noise_floor": part["noise_floor"],
-        "step": last["name"],
-    }
 
 
 def _expected(
@@ -141,7 +130,7 @@ def _expected(
 
     Earth's rotation, where it is left out of a magnitude, changes the rms error by its rate at most.
     """
-    parts = [judged(calibration, s, _truth(calibration, s), other) for s in samples if s.known.any()]
+    parts = [linearized(calibration, s, _truth(calibration, s), other) for s in samples if s.known.any()]
     known = [p for p in parts if p is not None]
     if len(known) < len(parts):
         return None, []
@@ -205,7 +194,7 @@ def noise_floors(calibration: SensorCalibration, samples: Sequence[Samples]) -> 
     floor = float(np.sqrt(np.mean(np.concatenate(squares))))
     if any(s.motion is None for s in samples):
         return floor, None
-    vectors = np.concatenate([squared_vector_errors(calibration.matrix, s.variance[s.known]) for s in samples])
+    vectors = np.concatenate([s.variance[s.known] @ np.sum(calibration.matrix**2, axis=0) for s in samples])
     return floor, float(np.sqrt(np.mean(vectors)))
 
 
@@ -256,3 +245,62 @@ def _choose(
 def _logs_table(recording: Recording) -> bool:
     logs = (recording.table_attitude, recording.table_rate, recording.table_angle)
     return any(log is not None for log in logs)
+
+
+def _worse_than_raw(
+    calibration: SensorCalibration,
+    samples: Sequence[Samples],
+    expected: Sequence[float] | None,
+    other: SensorCalibration | None,
+) -> str | None:
+    """Return why a calibration must not be used, as one sentence; None where it may, or no interval is known."""
+    found = [last_step(calibration, held, other) for held in samples]
+    after = [
+        (np.linalg.norm(step[0], axis=1) - step[1])[s.known] for step, s in zip(found, samples, strict=True) if step
+    ]
+    if expected is None or len(after) < len(samples):
+        return None
+    raw = np.concatenate([(np.linalg.norm(s.reading, axis=1) - s.magnitude)[s.known] for s in samples])
+    left = np.concatenate(after)
+    sizes = [float(np.sqrt(np.mean(e**2))) for e in (raw, left)]
+    if sizes[1] <= max(sizes[0], expected[1]) or len(raw) < FEWEST:
+        return None
+    pieces = np.array_split(left**2 - raw**2, min(STRETCHES, len(raw)))
+    means = np.array([piece.mean() for piece in pieces])
+    from scipy.special import stdtrit  # noqa: PLC0415  (only where the calibration seems to do harm)
+
+    limit = stdtrit(len(means) - 1, 1.0 - LEVEL) * float(means.std(ddof=1))
+    if means.mean() * np.sqrt(len(means)) <= limit:
+        return None
+    unit = unit_of(calibration.sensor)
+    return (
+        f"the calibration makes held-out motion worse: {sizes[0]:.3g} {unit} rms before it, {sizes[1]:.3g} {unit} "
+        f"after, where noise and stated uncertainties leave at most {expected[1]:.3g} {unit}. Check that fit and "
+        "held-out recordings are of this unit in the same mounting, and what the table logged"
+    )
+
+
+def _check_limits(
+    calibration: SensorCalibration, last: Mapping[str, Any], limits: Mapping[str, float | None]
+) -> tuple[list[dict[str, Any]], bool | None]:
+    """Return each limit beside its figure, and whether all are kept (None: there is no limit).
+
+    A limit that is null is not checked; a figure that is not known does not pass.
+    """
+    ends = [abs(v) for v in (last["max_error"], last["min_error"]) if v is not None]
+    figures = {
+        "held_out_rms_error": last["rms_error"],
+        "held_out_mean_abs_error": last["mean_abs_error"],
+        "held_out_max_abs_error": max(ends, default=None),
+        "bias": float(np.max(np.abs(calibration.bias))),
+        "scale_factor": float(np.max(np.abs(np.diag(calibration.matrix) - 1.0))),
+    }
+    checks = []
+    for name, limit in limits.items():
+        if name not in figures:
+            raise ConfigurationError(f"limits.{calibration.sensor}.{name} is unknown; known: {', '.join(figures)}")
+        if limit is not None:
+            value = figures[name]
+            kept = value is not None and bool(value <= limit)
+            checks.append({"name": name, "limit": float(limit), "value": value, "pass": kept})
+    return checks, (all(c["pass"] for c in checks) if checks else None)

@@ -10,7 +10,7 @@ changed by ``|omega + Omega| - |omega|``, which the gyroscope sees too.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -85,20 +85,6 @@ class Samples:
         """Whether reading and reference of each sample are there: (n,) array."""
         return np.asarray(np.isfinite(self.reading).all(axis=1) & np.isfinite(self.magnitude))
 
-    def select(self, index: NDArray[np.int64]) -> Samples:
-        """Return some of the samples, without motion, temperature and the other sensor."""
-        return replace(
-            self,
-            time=self.time[index],
-            reading=self.reading[index],
-            magnitude=self.magnitude[index],
-            white=self.white[index],
-            wander=self.wander[index],
-            motion=None,
-            other=None,
-            temperature=None,
-        )
-
 
 def samples_of_motion(
     sensor: str, recording: Recording, noise: Noise, table: Mapping[str, Any], *, smoothed: bool = False
@@ -141,8 +127,8 @@ def samples_of_motion(
         recording.time,
         reading,
         magnitude,
-        np.broadcast_to(white_variance(recording, noise), (n, 3)),
-        np.broadcast_to(wander_share(recording) * noise.wander**2, (n, 3)),
+        np.broadcast_to(_white_variance(recording, noise), (n, 3)),
+        np.broadcast_to(_wander_share(recording) * noise.wander**2, (n, 3)),
         motion,
         recording.reading(OTHER[sensor]),
         temperature,
@@ -179,7 +165,7 @@ def samples_of_rests(
     other, _ = rest_means(recording, rests, OTHER[sensor])
     share = variance_of_mean(filter_autocovariance(recording), counts)
     averaged = variance_of_average(counts.astype(np.float64) * recording.interval, noise.correlation_time)
-    wander = wander_share(recording) * noise.wander**2
+    wander = _wander_share(recording) * noise.wander**2
     gravity = float(table.get("gravity_g") or 1.0) if sensor == "accelerometer" else 0.0
     time = means(recording.time)
     assert time is not None  # noqa: S101
@@ -215,13 +201,13 @@ def _creep(
     return rate, seen[:, None] * (1.0 - upward) + about**2 * nearest
 
 
-def white_variance(recording: Recording, noise: Noise) -> NDArray[np.float64]:
+def _white_variance(recording: Recording, noise: Noise) -> NDArray[np.float64]:
     """Return the variance of white noise behind the recording's filter: (3,) array."""
     variance: NDArray[np.float64] = (float(recording.filter.get("noise_gain", 1.0)) * noise.white) ** 2
     return variance
 
 
-def wander_share(recording: Recording) -> float:
+def _wander_share(recording: Recording) -> float:
     """Return how much of the variance of a slow wander passes the filter: 1, or 0 of a high-pass."""
     covariance = filter_autocovariance(recording)
     return float(np.clip(2.0 * covariance.sum() - covariance[0], 0.0, 1.0))

@@ -15,7 +15,7 @@ from pipeline.model.kinematics import earth_rate, reference_motion
 from pipeline.model.measurement import predicted_reading
 from pipeline.records import FittedEffect, Noise, Recording, SensorCalibration, StageResult
 from pipeline.signal.filters import apply_filter
-from pipeline.validation.heldout import final_error, validate
+from pipeline.validation.heldout import validate
 
 DT = 0.05
 SENSORS = ("accelerometer", "gyroscope")
@@ -359,15 +359,6 @@ def test_an_unknown_limit_is_refused() -> None:
     settings = {**SETTINGS, "limits": {"accelerometer": {"beauty": 1.0}}}
     with pytest.raises(ConfigurationError, match=r"limits\.accelerometer\.beauty"):
         validate(c, [read(held_out(100), accelerometer=c)], noise_of("accelerometer"), settings)
-
-
-def test_final_error_is_the_first_and_the_last_step() -> None:
-    c = calibration("accelerometer")
-    part = validate(c, [read(held_out(300), 1.0, accelerometer=c)], noise_of("accelerometer"), SETTINGS)
-    found = final_error(part)
-    assert (found["before"], found["after"]) == (part["steps"][0]["rms_error"], part["steps"][-1]["rms_error"])
-    assert found["step"] == "calibrated"
-    assert found["noise_floor"] == part["noise_floor"]
 
 
 def test_missing_readings_are_not_in_the_floor() -> None:

@@ -16,7 +16,7 @@ from pipeline.io.read import read_recordings
 from pipeline.model.inversion import compensate
 from pipeline.signal.noise import estimate_noise
 from pipeline.simulation.description import read_config
-from pipeline.validation.gravity_direction import gravity_direction
+from pipeline.validation.attitude import gravity_direction
 
 if TYPE_CHECKING:
     from pipeline.records import Recording, SensorCalibration

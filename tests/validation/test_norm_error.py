@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.validation.floor import squared_norm_errors, squared_vector_errors
+from pipeline.validation.norm_error import squared_norm_errors
 
 MATRIX = np.array([[1.03, 0.02, -0.01], [-0.015, 0.97, 0.03], [0.01, -0.02, 1.05]])
 VARIANCE = np.array([0.9, 1.2, 2.5]) ** 2
@@ -41,7 +41,3 @@ def test_samples_of_different_variance_are_kept_apart() -> None:
 
 def test_no_noise_gives_no_error() -> None:
     assert squared_norm_errors(np.zeros((2, 3)), MATRIX, np.zeros((2, 3))).tolist() == [0.0, 0.0]
-
-
-def test_vector_errors_are_the_trace() -> None:
-    assert squared_vector_errors(MATRIX, VARIANCE[None])[0] == pytest.approx(np.trace(MATRIX * VARIANCE @ MATRIX.T))

@@ -6,16 +6,15 @@ before anything (``raw``), after each stage of the fit, with matrix and bias, an
 
     corrected = matrix @ (reading - bias - sum of effects)
 
-where the effects are those of the reference motion, if the attitude is known. Then effects of timing move the reference
-to what the sensor felt, and the vector error is ``sqrt(mean |corrected - truth|^2)``; it contains a misalignment
-between unit and table, unless the fit was against the same table. Without a known attitude, effects are
-those of the log's own calibrated signals, by fixed point, and effects of timing move the logged rate.
+Where the attitude is logged, effects are those of the reference motion, effects of timing move the reference, and the
+vector error is ``sqrt(mean |corrected - truth|^2)``; it contains a misalignment between unit and table, unless the fit
+was against the same table. Without an attitude, effects are those of the log's own calibrated signals, by fixed point,
+and effects of timing move the logged rate.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,20 +29,19 @@ from pipeline.records import Motion
 from pipeline.validation.samples import OTHER
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
     from pipeline.records import FittedEffect, SensorCalibration
     from pipeline.validation.samples import Samples
 
-    Corrected = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64] | None]
-    Step = Callable[[Samples], Corrected]
+    Corrected = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64] | None]  # vector, magnitude, truth
 
 DEGREE = 3  # of the spline through a rate: 40 deg/s that change in 5 s are followed to 1e-4 deg/s at 0.12 s
 
 
-def ladder(
+def error_breakdown(
     calibration: SensorCalibration, samples: Sequence[Samples], other: SensorCalibration | None
 ) -> tuple[list[dict[str, Any]], list[str]]:
     """Return the figures of every step, and notes on effects that the samples cannot show.
@@ -53,15 +51,14 @@ def ladder(
     calibration : SensorCalibration
     samples : sequence of Samples
     other : SensorCalibration or None
-        Of the other sensor, for effects that look at it.
+        Of the other sensor, for effects that need its signal.
     """
-    steps: list[tuple[str, Step]] = [("raw", partial(_with, partial(apply_correction, None)))]
-    steps += [
-        (f"stage:{stage.name}", partial(_with, partial(apply_correction, stage.correction)))
-        for stage in calibration.stages
-        if stage.correction is not None
+    stages = [(f"stage:{stage.name}", stage.correction) for stage in calibration.stages if stage.correction is not None]
+    figures = [
+        _figures(name, [_uncorrected(s, apply_correction(correction, s.reading)) for s in samples])
+        for name, correction in [("raw", None), *stages]
     ]
-    steps.append(("calibrated", partial(_with, partial(linear_truth, calibration))))
+    figures.append(_figures("calibrated", [_with_effects(calibration, (), other, s) for s in samples]))
     shown: list[FittedEffect] = []
     notes = []
     for fitted in calibration.effects:
@@ -69,9 +66,8 @@ def ladder(
         if lack:
             notes.append(f"{fitted.name} is left out: {lack}")
         else:
-            shown = [*shown, fitted]
-        steps.append((f"+ {fitted.name}", partial(_with_effects, calibration, tuple(shown), other)))
-    figures = [_figures(name, [step(s) for s in samples]) for name, step in steps]
+            shown.append(fitted)
+        figures.append(_figures(f"+ {fitted.name}", [_with_effects(calibration, shown, other, s) for s in samples]))
     raw = figures[0]["mean_abs_error"]
     for row in figures:
         row["change_percent"] = 100.0 * (raw - row["mean_abs_error"]) / raw if raw else None
@@ -89,14 +85,12 @@ def last_step(calibration: SensorCalibration, samples: Samples, other: SensorCal
     """
     if any(_lack(calibration, fitted, samples) for fitted in calibration.effects):
         return None
-    if not calibration.effects:
-        return _with(partial(linear_truth, calibration), samples)
     return _with_effects(calibration, calibration.effects, other, samples)
 
 
-def _with(correct: Callable[[NDArray[np.float64]], NDArray[np.float64]], samples: Samples) -> Corrected:
-    known = None if samples.motion is None else truth(samples.sensor, samples.motion)
-    return correct(samples.reading), samples.magnitude, known
+def _uncorrected(samples: Samples, readings: NDArray[np.float64]) -> Corrected:
+    """Return readings beside the reference as it was logged."""
+    return readings, samples.magnitude, None if samples.motion is None else truth(samples.sensor, samples.motion)
 
 
 def _figures(name: str, corrected: Sequence[Corrected]) -> dict[str, Any]:
@@ -142,6 +136,9 @@ def _lack(calibration: SensorCalibration, fitted: FittedEffect, samples: Samples
 def _with_effects(
     calibration: SensorCalibration, effects: Sequence[FittedEffect], other: SensorCalibration | None, samples: Samples
 ) -> Corrected:
+    """Return calibrated readings, magnitude and vector of the reference with some effects."""
+    if not effects:
+        return _uncorrected(samples, linear_truth(calibration, samples.reading))
     if samples.motion is None:
         own = [fitted for fitted in effects if not effect_of(fitted).moves]
         moves = [fitted for fitted in effects if effect_of(fitted).moves]
@@ -153,16 +150,16 @@ def _with_effects(
     for fitted in effects:
         if not effect_of(fitted).moves:
             rest = rest - effect_of(fitted).reading(sensor, motion, K, fitted.values)
-    felt, stamped = truth(sensor, motion), truth(sensor, samples.motion)
-    change = np.linalg.norm(felt, axis=1) - np.linalg.norm(stamped, axis=1)
-    return linear_truth(calibration, rest), samples.magnitude + change, felt
+    moved, logged = truth(sensor, motion), truth(sensor, samples.motion)
+    change = np.linalg.norm(moved, axis=1) - np.linalg.norm(logged, axis=1)
+    return linear_truth(calibration, rest), samples.magnitude + change, moved
 
 
 def _moved_magnitude(samples: Samples, effects: Sequence[FittedEffect]) -> NDArray[np.float64]:
-    """Return the reference's magnitude as the sensor felt it, by effects that move the motion in time.
+    """Return the reference's magnitude with effects that move the motion in time.
 
-    That of a specific force is gravity at any time, that of a rest is 0. That of a rate is moved by a cubic spline
-    through the log; beyond its ends by more than an interval the log's end holds.
+    That of a specific force is gravity at any time, that of a rest is 0. That of a rate is interpolated by a cubic
+    spline; more than an interval beyond the log its last value holds.
     """
     if not effects or samples.sensor == "accelerometer" or samples.resting:
         return samples.magnitude
@@ -187,7 +184,7 @@ def _moved_magnitude(samples: Samples, effects: Sequence[FittedEffect]) -> NDArr
 def _from_own_signals(
     calibration: SensorCalibration, effects: Sequence[FittedEffect], samples: Samples, other: SensorCalibration | None
 ) -> NDArray[np.float64]:
-    """Take effects off by the log's own calibrated signals."""
+    """Return calibrated readings whose effects follow from the log's own calibrated signals."""
     sensor = calibration.sensor
     readings = {sensor: samples.reading}
     parts = {sensor: Part.of(calibration, effects)}
@@ -198,7 +195,7 @@ def _from_own_signals(
     used = fields_used(sensor, effects)
     nothing = np.zeros_like(samples.reading)
 
-    def felt(truths: dict[str, NDArray[np.float64]], _number: int) -> Motion:
+    def motion_of(truths: dict[str, NDArray[np.float64]], _number: int) -> Motion:
         force, rate = truths.get("accelerometer", nothing), truths.get("gyroscope", nothing)
         if samples.resting:
             rate = nothing
@@ -212,4 +209,4 @@ def _from_own_signals(
         )
         return replace(found, specific_force_rate=nothing, angular_acceleration=nothing) if samples.resting else found
 
-    return solve(parts, readings, felt)[sensor]
+    return solve(parts, readings, motion_of)[sensor]

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.records import Noise, SensorCalibration
-from pipeline.validation.expected import Judged, expected_rms_error
-from pipeline.validation.samples import Samples
+from pipeline.validation.expected_error import LinearizedSamples, expected_rms_error
 
 UNITS, SAMPLES, INTERVAL = 2000, 300, 0.2
 WHITE, TAU = 0.01, 20.0
@@ -55,9 +54,8 @@ def interval(truth: np.ndarray, noise: Noise, bias: float, freedom: float = np.i
     J = np.zeros((SAMPLES, 3, 12))
     J[:, :, :3] = -np.eye(3)
     spread = [np.broadcast_to(v**2, (SAMPLES, 3)) for v in (noise.white, noise.wander)]
-    size = np.linalg.norm(truth, axis=1)
-    samples = Samples("gyroscope", INTERVAL * np.arange(SAMPLES), truth, size, *spread, None, None, None)
-    return expected_rms_error(found, [Judged(samples, truth, J, SAMPLES)], noise, {})
+    held_out = LinearizedSamples(INTERVAL * np.arange(SAMPLES), *spread, truth, J, SAMPLES)
+    return expected_rms_error(found, [held_out], noise, {})
 
 
 def test_what_is_less_known_widens_the_interval() -> None:

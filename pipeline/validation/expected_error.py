@@ -1,0 +1,387 @@
+"""The interval in which the held-out rms error lies with 99 % probability, if model, noise and uncertainties are right.
+
+A calibrated reading of held-out sample n, whose truth is t_n, is off by
+
+    x_n = M w_n + M m_n + J_n d
+
+where
+
+    M : the calibration's matrix
+    w : white noise behind the filter
+    m : bias wander: a Gauss-Markov process, and the slower drift that data sheet and residuals of the fit allow
+    d : errors of the calibration's parameters, and of the scale of the table's rate, which is counted once: in the
+        calibration's covariance where its budget has such a line, else as a parameter of its own
+    J : derivative of the calibrated reading with respect to d
+
+The squared error of the magnitude has the mean ``tr(W S)`` (``pipeline.validation.norm_error``), and its mean over
+samples is a quadratic form in Gaussians, with the cumulants
+
+    k_1 = tr Q,   k_2 = 2 tr Q^2,   k_3 = 8 tr Q^3,      Q = A C
+
+where C is the covariance of all w, m and d, and A the form. A shifted chi-square with the same cumulants takes its
+place (J. P. Imhof, Biometrika 48 (1961), 419-426, section 4). Wander and parameters are summed over blocks of samples,
+so that the size of Q does not depend on the number of samples. A finite recording does not determine the noise exactly,
+so the interval is that of a mixture over factors of the variances:
+
+    wander      exp(2 s z), z standard normal, s = sqrt(correlation time / length of static rest and fit)
+    drift       z^2: its size is hardly known
+    parameters  nu / chi^2(nu), nu the degrees of freedom of the calibration
+
+and the variance of white noise has the relative uncertainty ``sqrt(2 / n)`` of the n samples that determined it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.estimation.budget import DITHERED
+from pipeline.estimation.selection import INFLATED
+from pipeline.estimation.serial_noise import DEFAULT_TIME_S, SHARPEST_WIDTH, SHEET_WIDTH
+from pipeline.model.inversion import inverse_of
+from pipeline.signal.wander import block_covariance
+from pipeline.validation.error_breakdown import last_step
+from pipeline.validation.norm_error import mean_squares
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.records import Noise, SensorCalibration
+    from pipeline.validation.samples import Samples
+
+    Values = NDArray[np.float64]
+
+LACK_OF_FIT = "lack of fit"  # the part of a budget's line that no noise explains: 0 in a model that is right
+TAIL = 0.005  # probability on each side of a 99 % interval
+# Probabilities at which the factors are taken; each stands for the probability up to the middle of its neighbours.
+LEVELS = np.array([0.0005, 0.004, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.98, 0.996, 0.9995])
+WEIGHTS = np.diff(np.concatenate([[0.0], 0.5 * (LEVELS[1:] + LEVELS[:-1]), [1.0]]))
+BLOCKS = 40  # of all held-out recordings; wander within a block counts as noise with its correlation time
+NARROWEST = 0.5  # s of a wander of minutes, which may be a random walk (blind study, family null_random_walk)
+REST_SAMPLES = 300  # that determine the white noise where there is no static recording: a few rests of seconds
+EXACT_FREEDOM = 1e4  # degrees of freedom beyond which nu / chi^2(nu) is 1 to 1.4 %
+NORMAL_FREEDOM = 1e6  # beyond which a chi-square is normal to 1e-3
+ENOUGH = 2000  # samples of a recording that stand for all: its directions and rates change slowly
+
+
+@dataclass(frozen=True)
+class LinearizedSamples:
+    """Held-out samples of one recording with the derivative of their calibrated readings.
+
+    Attributes
+    ----------
+    time : (n,) array, s
+    white, wander : (n, 3) arrays
+        Variances of white noise and wander, per reading axis.
+    truth : (n, 3) array, g or deg/s
+    derivative : (n, 3, p) array
+        J, of the parameters of the calibration's covariance.
+    number : int
+        Samples of the recording, of which these are some.
+    alike : float
+        How many samples share one value of the white noise, by the filter.
+    """
+
+    time: Values
+    white: Values
+    wander: Values
+    truth: Values
+    derivative: Values
+    number: int
+    alike: float = 1.0
+
+
+def linearized(
+    calibration: SensorCalibration, samples: Samples, truth: Values, other: SensorCalibration | None
+) -> LinearizedSamples | None:
+    """Return held-out samples with their derivative; None where they hold nothing, or an effect is left out of them.
+
+    ``calibrated = M (reading - b - z)`` gives ``d/db = -M`` and ``d/dM_ij = e_i (M^-1 calibrated)_j``. Parameters of
+    effects take a difference quotient over one standard uncertainty; where an effect moves the reference in time, the
+    change of its magnitude counts along the truth with the opposite sign.
+
+    Parameters
+    ----------
+    calibration : SensorCalibration
+    samples : Samples
+    truth : (n, 3) array
+        Of the reference.
+    other : SensorCalibration or None
+        Of the other sensor.
+    """
+    found = last_step(calibration, samples, other)
+    known = np.flatnonzero(samples.known)
+    if found is None or len(known) == 0:
+        return None
+    vector, magnitude, _ = found
+    shown = known[np.unique(np.linspace(0, len(known) - 1, ENOUGH).astype(int))]
+    along = truth[shown] / np.maximum(np.linalg.norm(truth[shown], axis=1, keepdims=True), 1e-300)
+    J = np.zeros((len(shown), 3, len(calibration.parameter_names())))
+    J[:, :, :3] = -calibration.matrix
+    before = vector[shown] @ inverse_of(calibration).T
+    for i in range(3):
+        J[:, i, 3 + 3 * i : 6 + 3 * i] = before
+    for column, changed, step in _changed_parameters(calibration):
+        moved = last_step(changed, samples, other)
+        assert moved is not None  # noqa: S101  (the same effects)
+        shift = along * (moved[1] - magnitude)[shown, None]
+        J[:, :, column] = (moved[0][shown] - vector[shown] - shift) / step
+    noise = samples.white[shown], samples.wander[shown]
+    return LinearizedSamples(
+        samples.time[shown], *noise, truth[shown], np.nan_to_num(J), len(known), alike=samples.alike
+    )
+
+
+def _changed_parameters(calibration: SensorCalibration) -> Iterator[tuple[int, SensorCalibration, float]]:
+    """Yield each parameter of an effect: its column, the calibration with it changed, and by how much."""
+    if calibration.covariance is None:
+        return
+    column = 12
+    for n, effect in enumerate(calibration.effects):
+        for name, parameter in effect.parameters.items():
+            step = float(np.sqrt(max(calibration.covariance[column, column], 0.0)))
+            if step > 0.0:
+                parameters = {**effect.parameters, name: {**parameter, "value": parameter["value"] + step}}
+                effects = list(calibration.effects)
+                effects[n] = replace(effect, parameters=parameters)
+                yield column, replace(calibration, effects=tuple(effects)), step
+            column += 1
+
+
+@dataclass(frozen=True)
+class _Uncertain:
+    """What is random beside the white noise.
+
+    Attributes
+    ----------
+    covariance : (p + 1, p + 1) array
+        Of the parameters and of the scale of the table's rate.
+    noise : Noise
+    coarse : (3,) array
+        Variance of rounding that is no part of the white noise.
+    drift : (3,) array
+        Variance of a drift beside the wander.
+    drift_time : float, s
+    """
+
+    covariance: Values
+    noise: Noise
+    coarse: Values
+    drift: Values
+    drift_time: float
+
+
+def expected_rms_error(
+    calibration: SensorCalibration,
+    held_out: Sequence[LinearizedSamples],
+    noise: Noise,
+    settings: Mapping[str, Any],
+    fitted_s: float = 0.0,
+) -> tuple[float, float]:
+    """Return the interval in which the rms error lies with 99 % probability, g or deg/s.
+
+    Parameters
+    ----------
+    calibration : SensorCalibration
+        With its covariance; without one, its parameters count as exact.
+    held_out : sequence of LinearizedSamples
+    noise : Noise
+    settings : mapping
+        Sections ``table`` (``rate_accuracy``) and ``sensor`` (``bias_wander``, ``wander_time_s``, ``counts_per_unit``).
+    fitted_s : float, s
+        Length of the recordings of the fit.
+    """
+    sheet = (settings.get("sensor") or {}).get(calibration.sensor) or {}
+    step = 1.0 / float(sheet["counts_per_unit"]) if sheet.get("counts_per_unit") else 0.0
+    found = [s.details["bias_wander"] for s in calibration.stages if "bias_wander" in s.details]
+    residual_wander = np.array(found[-1]) if found else None  # that the residuals of the fit show: (3,)
+    time = float(sheet.get("wander_time_s") or DEFAULT_TIME_S)
+    uncertain = _Uncertain(
+        _covariance(calibration, settings.get("table") or {}),
+        noise,
+        np.where(noise.white < DITHERED * step, step**2 / 12.0, 0.0),
+        _drift(residual_wander, noise, float(sheet.get("bias_wander") or 0.0), time),
+        time,
+    )
+    form = _form(calibration.matrix, held_out, uncertain)
+    if form.cumulants(np.ones((4, 1)))[0, 0] <= 0.0:
+        return 0.0, 0.0
+    watched = noise.length + (fitted_s if residual_wander is not None else 0.0)
+    factors = [_factors(calibration, noise, watched, upper=upper) for upper in (False, True)]
+    low, high = (_quantile(form, *f, p) for f, p in zip(factors, (TAIL, 1.0 - TAIL), strict=True))
+    return float(np.sqrt(low)), float(np.sqrt(high))
+
+
+def _drift(residual_wander: Values | None, noise: Noise, size: float, time: float) -> Values:
+    """Return the variance of a drift beside the wander: (3,) array.
+
+    It is the data sheet's wander (``size``, ``time``) beyond the wander that was seen, and what the residuals of the
+    fit, which last longer than a rest, show beyond it. A residual may hold a missing effect, so at most ``INFLATED``
+    times the expected wander counts.
+    """
+    slow = noise.wander**2 * min(1.0, noise.correlation_time / time)
+    most = INFLATED**2 * np.maximum(noise.wander**2, size**2)
+    fitted = noise.wander**2 if residual_wander is None else np.minimum(residual_wander**2, most)
+    return np.asarray(np.maximum(size**2 - slow, 0.0) + np.maximum(fitted - noise.wander**2, 0.0))
+
+
+def _covariance(calibration: SensorCalibration, table: Mapping[str, Any]) -> Values:
+    """Return the covariance of the parameters, without lack of fit, and of the scale of the table's rate."""
+    size = len(calibration.parameter_names())
+    lines = (calibration.budget or {}).get("contributions", ())
+    out = np.zeros((size + 1, size + 1))
+    if calibration.covariance is not None:
+        total = np.diag(calibration.covariance)
+        lack = np.sum([np.square(line["parts"][LACK_OF_FIT]) for line in lines if LACK_OF_FIT in line["parts"]], axis=0)
+        kept = np.sqrt(np.clip(1.0 - lack / np.where(total > 0.0, total, 1.0), 0.0, 1.0)) * np.ones(size)
+        out[:size, :size] = calibration.covariance * kept[:, None] * kept
+    if calibration.sensor == "gyroscope" and not any(line["source"] == "table rate" for line in lines):
+        out[size, size] = float(table.get("rate_accuracy") or 0.0) ** 2
+    return out
+
+
+@dataclass(frozen=True)
+class _QuadraticForm:
+    """Traces of the form of the mean squared error.
+
+    Attributes
+    ----------
+    white, within : (2,) arrays
+        ``tr Q`` and ``tr Q^2`` of white noise, and of wander within blocks.
+    doubt : float
+        One over the number of samples that determined the white noise.
+    first, second, third : (3,), (3, 3) and (3, 3, 3) arrays
+        Traces of products of the Q of parameters, of wander and of drift.
+    """
+
+    white: Values
+    within: Values
+    doubt: float
+    first: Values
+    second: Values
+    third: Values
+
+    def cumulants(self, factor: Values) -> Values:
+        """Return k_1 to k_3, (3, k), for factors of the variances of parameters, wander, drift, white noise: (4, k)."""
+        f, white, within = factor[:3], factor[3] * self.white[0], factor[1] * self.within[0]
+        one = self.first @ f
+        two = np.einsum("ij,ik,jk->k", self.second, f, f)
+        three = np.einsum("ijl,ik,jk,lk->k", self.third, f, f, f)
+        share, share_within = (t[1] / t[0] ** 2 if t[0] > 0.0 else 0.0 for t in (self.white, self.within))
+        w, v = white * share, within * share_within  # eigenvalues of one independent value
+        squares = two + 2.0 * w * one + white**2 * (share + self.doubt) + within**2 * share_within
+        cubes = three + 3.0 * w * two + 3.0 * w**2 * one + white * w**2 + within * v**2
+        return np.stack([one + white + within, 2.0 * squares, 8.0 * cubes])
+
+
+def _form(M: Values, held_out: Sequence[LinearizedSamples], uncertain: _Uncertain) -> _QuadraticForm:
+    noise, q = uncertain.noise, len(uncertain.covariance)
+    total = sum(each.number for each in held_out)
+    white, within, size = np.zeros(2), np.zeros(2), q
+    of_parameters, of_blocks = np.zeros((q, q)), []
+    for each in held_out:
+        n, share = len(each.truth), each.number / total
+        count = max(1, min(n, round(BLOCKS * share)))
+        label = np.arange(n) * count // n
+        first = np.searchsorted(label, np.arange(count))
+        interval = (each.time[-1] - each.time[0]) / max(n - 1, 1) if n > 1 else 1.0
+        start = each.time[first]
+        length = np.maximum(np.diff(start, append=each.time[-1] + interval), 1e-6)
+        B = block_covariance(start, length, noise.correlation_time)
+        W = _weights(M, each, uncertain)
+        J = np.concatenate([each.derivative, -each.truth[:, :, None]], axis=2)
+        WJ, MWM = W @ J, M.T @ W @ M
+        of_parameters += share / n * np.tensordot(J, WJ, ([0, 1], [0, 1]))
+        own = np.add.reduceat(MWM, first, axis=0) * share / n
+        across = np.add.reduceat(np.swapaxes(WJ, 1, 2) @ M, first, axis=0) * share / n
+        of_blocks.append((own, across, B, block_covariance(start, length, uncertain.drift_time)))
+        size += 3 * count
+        Q = MWM * (each.white + uncertain.coarse)[:, None, :]
+        white = white + _traces_of(Q) * [share, share**2 * each.alike / each.number]
+        left = np.clip(each.wander - np.diag(B)[label, None] * noise.wander**2, 0.0, None)
+        correlated = np.clip(noise.correlation_time / interval, 1.0, n / count) / n
+        within = within + _traces_of(MWM * left[:, None, :]) * [share, share**2 * correlated]
+    A, covariances = np.zeros((size, size)), np.zeros((3, size, size))
+    A[:q, :q], covariances[0, :q, :q], at = of_parameters, uncertain.covariance, q
+    for own, across, B, slow in of_blocks:
+        for b, (form, mixed) in enumerate(zip(own, across, strict=True)):
+            mine = slice(at + 3 * b, at + 3 * b + 3)
+            A[mine, mine], A[:q, mine], A[mine, :q] = form, mixed, mixed.T
+        mine = slice(at, at + 3 * len(own))
+        covariances[1, mine, mine] = np.kron(B, np.diag(noise.wander**2))
+        covariances[2, mine, mine] = np.kron(slow, np.diag(uncertain.drift))
+        at = mine.stop
+    Q = A @ covariances
+    flat, transposed = Q.reshape(3, -1), np.swapaxes(Q, 1, 2).reshape(3, -1)
+    pairs = (Q[:, None] @ Q[None]).reshape(9, -1)
+    determined = noise.length / interval if noise.length > 0.0 else REST_SAMPLES
+    first_order, second_order = np.trace(Q, axis1=1, axis2=2), flat @ transposed.T
+    third_order = (pairs @ transposed.T).reshape(3, 3, 3)
+    return _QuadraticForm(white, within, 1.0 / determined, first_order, second_order, third_order)
+
+
+def _traces_of(Q: Values) -> Values:
+    """Return the means of ``tr Q`` and ``tr Q^2`` over samples: (2,) array."""
+    return np.array([np.trace(Q, axis1=1, axis2=2).mean(), np.sum(Q * np.swapaxes(Q, 1, 2), axis=(1, 2)).mean()])
+
+
+def _weights(M: Values, each: LinearizedSamples, uncertain: _Uncertain) -> Values:
+    """Return W of each sample: (n, 3, 3) array."""
+    J, own = each.derivative, uncertain.covariance[:-1, :-1]
+    noise = each.white + each.wander + uncertain.drift + uncertain.coarse
+    of_parameters = np.einsum("nip,pq,njq->ij", J, own, J, optimize=True) / len(J)
+    mean = np.einsum("ij,j,kj->ik", M, noise.mean(axis=0), M) + of_parameters
+    size = np.linalg.norm(each.truth, axis=1)
+    u = each.truth / np.where(size > 0.0, size, 1.0)[:, None]
+    g = mean_squares(each.truth, mean)[1][:, None, None]
+    return np.asarray((1.0 - g) * u[:, :, None] * u[:, None, :] + g * np.eye(3))
+
+
+def _factors(calibration: SensorCalibration, noise: Noise, watched: float, *, upper: bool) -> tuple[Values, Values]:
+    """Return the factors that are mixed, (4, k), and their probabilities (k,).
+
+    The lower end leaves out drift and errors of parameters, and takes the wander as the data sheet states it: none of
+    these need have occurred in this recording.
+    """
+    from scipy.special import gammaincinv, ndtri  # noqa: PLC0415  (0.1 s that other stages do not pay)
+
+    z = ndtri(LEVELS)
+    width = SHEET_WIDTH
+    if upper and watched > 0.0:
+        minutes = min(1.0, noise.correlation_time / DEFAULT_TIME_S)
+        width = np.sqrt(max(noise.correlation_time / watched, NARROWEST**2 * minutes))
+        width = float(np.clip(width, SHARPEST_WIDTH, SHEET_WIDTH))
+    wander = np.exp(2.0 * width * z)
+    drift = 2.0 * gammaincinv(0.5, LEVELS) if upper else np.zeros(len(z))
+    white = np.ones(len(z)) if noise.source != "data_sheet" else np.exp(2.0 * SHEET_WIDTH * z)
+    nu = max(calibration.degrees_of_freedom, 1.0)
+    parameters, weights = np.full(1, float(upper)), np.ones(1)
+    if upper and nu < EXACT_FREEDOM:
+        parameters, weights = 0.5 * nu / gammaincinv(0.5 * nu, 1.0 - LEVELS), WEIGHTS
+    shape = (len(parameters), len(z))
+    slow = [np.broadcast_to(values, shape).ravel() for values in (wander, drift, white)]
+    return np.stack([np.repeat(parameters, len(z)), *slow]), np.outer(weights, WEIGHTS).ravel()
+
+
+def _quantile(form: _QuadraticForm, factor: Values, weight: Values, probability: float) -> float:
+    """Return a quantile of the mean squared error, mixed over factors (4, k) of probabilities (k,)."""
+    from scipy.optimize import brentq  # noqa: PLC0415  (as in _factors)
+    from scipy.special import gammainc, ndtr  # noqa: PLC0415
+
+    one, two, three = form.cumulants(factor)
+    spread = np.sqrt(two)
+    h = np.minimum(8.0 * two**3 / np.maximum(three, 1e-300) ** 2, NORMAL_FREEDOM)
+
+    def excess(logarithm: float) -> float:
+        z = (np.exp(logarithm) - one) / spread
+        chi_square = gammainc(0.5 * h, np.clip(0.5 * (h + z * np.sqrt(2.0 * h)), 0.0, None))
+        return float(weight @ np.where(h < NORMAL_FREEDOM, chi_square, ndtr(z))) - probability
+
+    low, high = np.log(1e-6 * one.min()), np.log(float(np.max(one + 60.0 * spread)))
+    if excess(low) >= 0.0:
+        return float(np.exp(low))
+    return float(np.exp(brentq(excess, low, high, xtol=1e-12)))
