@@ -12,15 +12,16 @@ from typing import TYPE_CHECKING, Any
 from pipeline.errors import ConfigurationError
 from pipeline.model.effect_files import read_effect_files
 from pipeline.model.effects import register
-from pipeline.planning.plan import best_changes, plan_of
-from pipeline.planning.words import helps_most, in_words, side_by_side
+from pipeline.planning.changes import best_changes
+from pipeline.planning.plan import plan_of
+from pipeline.planning.plan_text import helps_most, in_words, side_by_side
 from pipeline.simulation.description import UnitDescription, read_description
 from pipeline.simulation.options import add_recording_options, described
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.planning.plan import Gain
+    from pipeline.planning.changes import Gain
 
 FILE = "simulation.yaml"
 EPILOG = """\

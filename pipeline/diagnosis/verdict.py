@@ -1,7 +1,7 @@
 """The verdict on one sensor: what its selection found, against the error on held-out motion.
 
-The held-out error of a calibration that lacks nothing lies in the interval of ``pipeline.validation.expected_error``. What
-says otherwise decides, the first that applies:
+The held-out error of a complete calibration lies in the interval of ``pipeline.validation.expected_error``. The first
+that applies:
 
     reference_in_doubt  a check of the recordings says so (note ``N-REFERENCE``), or the fit is explained to its noise
                         and the held-out motion is not: the recordings contradict each other

@@ -4,7 +4,7 @@
 
 Each draw of w goes with signs d of its own through the likelihoods of ``estimation.multi_position``, at any size a
 without a new simulation, as all sums of squares are polynomials in a. Equations are few by hand, and their noise is not
-known beforehand, so that the large-sample formulas of ``pipeline.planning.expectation`` do not hold here.
+known beforehand, so that the large-sample formulas of ``pipeline.planning.detection_limits`` do not hold here.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from pipeline.estimation.multi_position.likelihood import beside
 from pipeline.estimation.multi_position.result import model_of
 from pipeline.estimation.multi_position.selection import select
 from pipeline.estimation.selection import GATE_BIC, GATE_P
-from pipeline.planning.detection import ALIKE, ALMOST_SURE, PARTLY, Detection, limits_or_none, smallest
+from pipeline.planning.detection_limits import ALIKE, ALMOST_SURE, PARTLY, Detection, limits_or_none, smallest
 from pipeline.records import SensorCalibration
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from pipeline.estimation.multi_position.likelihood import Beside
     from pipeline.estimation.multi_position.selection import HandSelection
-    from pipeline.planning.rehearsal import Rehearsal
+    from pipeline.planning.plan import SimulatedProcedure
     from pipeline.records import Noise
 
     Values = NDArray[np.float64]
@@ -40,8 +40,8 @@ if TYPE_CHECKING:
 DRAWS = 64
 
 
-def select_by_hand(sensor: str, rehearsal: Rehearsal) -> HandSelection:
-    """Return what the selection makes of a rehearsal by hand, in which there is nothing to find.
+def select_by_hand(sensor: str, simulated: SimulatedProcedure) -> HandSelection:
+    """Return what the selection makes of a simulated procedure by hand, in which there is nothing to find.
 
     Raises
     ------
@@ -49,23 +49,23 @@ def select_by_hand(sensor: str, rehearsal: Rehearsal) -> HandSelection:
         If bias and matrix cannot be determined, or there are no rests.
     """
     settings: Mapping[str, Any] = {
-        "sensor": rehearsal.sheets,
-        "table": rehearsal.table,
-        "procedure": rehearsal.procedure,
+        "sensor": simulated.sheets,
+        "table": simulated.table,
+        "procedure": simulated.procedure,
         "effects": {"accelerometer": [], "gyroscope": []},
     }
-    noise = rehearsal.noise[sensor]
-    start = nonlinear_least_squares.fit(rehearsal.recordings, None, settings)
+    noise = simulated.noise[sensor]
+    start = nonlinear_least_squares.fit(simulated.recordings, None, settings)
     other = None
     if sensor == "gyroscope":
         start, other = SensorCalibration(sensor), start
     try:
-        model = model_of(rehearsal.recordings, start, noise, settings, other)
+        model = model_of(simulated.recordings, start, noise, settings, other)
     except CannotCalibrateError as lack:
         raise NotObservableError(lack.message) from lack
     if model is None:
         raise NotObservableError(f"no recording holds a rest with readings of the {sensor}")
-    return select(model, start, [], noise, rehearsal.sheets[sensor])
+    return select(model, start, [], noise, simulated.sheets[sensor])
 
 
 class HandExpectation:
@@ -74,7 +74,7 @@ class HandExpectation:
     Parameters
     ----------
     selection : HandSelection
-        Of a rehearsal.
+        Of a simulated.
     noise : Noise
         That the readings will have.
     """

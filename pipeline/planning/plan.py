@@ -12,7 +12,7 @@ Sizes are those that half of the units would show. An effect that would pass onl
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,24 +24,27 @@ from pipeline.estimation.multi_position.rests import by_hand
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import unselected
 from pipeline.model.effects import effect
-from pipeline.model.effects.base import Owner
-from pipeline.planning.expectation import Expectation
-from pipeline.planning.extra import changes
-from pipeline.planning.rehearsal import limits_broken, rehearse
-from pipeline.records import SENSORS
-from pipeline.simulation.campaign import course_of
+from pipeline.model.effects.base import unit_of
+from pipeline.planning.detection_limits import Expectation
+from pipeline.records import SENSORS, Noise, Recording
+from pipeline.simulation.campaign import course_of, simulate_unit
+from pipeline.simulation.description import read_config
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.planning.by_hand import HandExpectation
-    from pipeline.planning.detection import Detection
-    from pipeline.planning.extra import Change
-    from pipeline.planning.rehearsal import Rehearsal
+    from pipeline.planning.detection_limits import Detection
     from pipeline.simulation.description import UnitDescription
     from pipeline.simulation.planned import Planned
 
-UNITS = {"accelerometer": "g", "gyroscope": "deg/s"}
+SEED = 0
+# The middle of what is drawn at random for a simulated unit: it warms up by some degrees in a room that changes little.
+ROOM: dict[str, Any] = {
+    "ambient": 25.0, "warm_up": 4.5, "warm_up_time": 300.0, "drift": 0.3,
+    "periods": np.array([3000.0, 5000.0]), "phases": np.zeros(2),
+}  # fmt: skip
+FAULTLESS: dict[str, Any] = {"angle_accuracy_deg": 0.0, "rate_error": [0.0] * 3, "direction_deg": np.zeros((3, 2))}
 Document = dict[str, Any]
 
 
@@ -62,17 +65,17 @@ def plan_of(unit: UnitDescription, extra: Sequence[Planned] = (), *, half_only: 
     ConfigurationError
         If a name is not known or the course cannot be run.
     """
-    rehearsal = rehearse(unit, extra)
+    simulated = simulate_procedure(unit, extra)
     return {
         "sensor": unit.sensor,
         "table": unit.table,
         "procedure": unit.procedure,
         "course": {name: _plain(value) for name, value in asdict(course_of(unit)).items()},
-        "at_a_table": rehearsal.table["motion"] != "none",
-        "minutes": rehearsal.minutes,
-        "samples": sum(r.samples for r in rehearsal.recordings),
-        "warnings": limits_broken(rehearsal),
-        **{sensor: of_sensor(sensor, rehearsal, half_only=half_only) for sensor in SENSORS},
+        "at_a_table": simulated.table["motion"] != "none",
+        "minutes": simulated.minutes,
+        "samples": sum(r.samples for r in simulated.recordings),
+        "warnings": _warnings(simulated),
+        **{sensor: of_sensor(sensor, simulated, half_only=half_only) for sensor in SENSORS},
     }
 
 
@@ -80,18 +83,18 @@ def _plain(value: Any) -> Any:  # noqa: ANN401  (a setting)
     return list(value) if isinstance(value, tuple) else value
 
 
-def of_sensor(sensor: str, rehearsal: Rehearsal, *, half_only: bool = False) -> Document:
-    """Return the plan of one sensor: what it would find in the recordings of a rehearsal."""
-    noise = rehearsal.noise[sensor]
+def of_sensor(sensor: str, simulated: SimulatedProcedure, *, half_only: bool = False) -> Document:
+    """Return the plan of one sensor."""
+    noise = simulated.noise[sensor]
     document: Document = {
-        "unit": UNITS[sensor],
+        "unit": unit_of(sensor),
         "noise": {"white": float(noise.white[0]), "wander": float(noise.wander[0])},
         "effects": [],
         "not_observable": [],
         "reason": None,
     }
     try:
-        expectation, hidden = _expectation(sensor, rehearsal)
+        expectation, hidden = _expectation(sensor, simulated)
     except NotObservableError as error:
         return {**document, "reason": error.message}
     for name in sorted(set(expectation.names) - set(hidden)):
@@ -106,16 +109,16 @@ def of_sensor(sensor: str, rehearsal: Rehearsal, *, half_only: bool = False) -> 
     return document
 
 
-def _expectation(sensor: str, rehearsal: Rehearsal) -> tuple[Expectation | HandExpectation, dict[str, str]]:
-    """Return what a selection is expected to see, and the effects that it cannot, each with the reason."""
-    noise, sheet = rehearsal.noise[sensor], rehearsal.sheets[sensor]
-    if by_hand(sensor, rehearsal.recordings):
+def _expectation(sensor: str, simulated: SimulatedProcedure) -> tuple[Expectation | HandExpectation, dict[str, str]]:
+    """Return what a selection is expected to find, and the effects that it cannot find, each with the reason."""
+    noise, sheet = simulated.noise[sensor], simulated.sheets[sensor]
+    if by_hand(sensor, simulated.recordings):
         from pipeline.planning.by_hand import HandExpectation, select_by_hand  # noqa: PLC0415  (by hand alone)
 
-        selected = select_by_hand(sensor, rehearsal)
+        selected = select_by_hand(sensor, simulated)
         hand = HandExpectation(selected, noise)
         return hand, hidden_effects(selected, [])
-    selection = unselected(observe(sensor, rehearsal.recordings, rehearsal.table), [], noise, sheet)
+    selection = unselected(observe(sensor, simulated.recordings, simulated.table), [], noise, sheet)
     return Expectation(selection, noise), not_observable(selection, [])
 
 
@@ -149,72 +152,74 @@ def _faint(sensor: str, found: Detection) -> str:
 
 
 @dataclass(frozen=True)
-class Gain:
-    """What a change would bring.
+class SimulatedProcedure:
+    """What a procedure would record with a faultless sensor and table, the configurations, and the sheets' noise."""
 
-    Attributes
-    ----------
-    change : Change
-    minutes : float
-        More at the table.
-    shown : tuple of str
-        ``sensor.effect`` that become observable; one of the table only if neither sensor showed it.
-    told : tuple of str
-        Those that would no longer be taken for a look-alike.
-    factor : float
-        Geometric mean of the new smallest sizes over the old ones, of effects that are observable in both.
-    """
-
-    change: Change
-    minutes: float
-    shown: tuple[str, ...]
-    told: tuple[str, ...]
-    factor: float
+    recordings: list[Recording]
+    sheets: Mapping[str, Any]
+    table: Mapping[str, Any]
+    procedure: Mapping[str, Any]
+    noise: dict[str, Noise]
+    minutes: float  # from power-on to the end of the last recording
 
 
-def best_changes(unit: UnitDescription, before: Document) -> list[Gain]:
-    """Return what each change would bring, the most helpful first.
-
-    First goes the change that shows most effects for each minute that it takes (at least one: nothing is set up in
-    less); of those that show nothing new, the one that lowers the smallest sizes most, as a logarithm a minute.
+def simulate_procedure(unit: UnitDescription, extra: Sequence[Planned] = ()) -> SimulatedProcedure:
+    """Simulate a procedure in memory, without the unit's effects and the table's imperfections.
 
     Parameters
     ----------
     unit : UnitDescription
-    before : dict
-        Its plan.
+    extra : sequence of Planned
+        Further recordings after those of the procedure.
+
+    Raises
+    ------
+    ConfigurationError
+        If sensor, table or procedure are not known, or the course cannot be run.
     """
-    if all(before[sensor]["reason"] for sensor in SENSORS):
-        return []
-    gains = [_gain(change, before, plan_of(change.unit, change.extra, half_only=True)) for change in changes(unit)]
-    return sorted(gains, key=_worth)
-
-
-def _worth(gain: Gain) -> tuple[float, float]:
-    """Return what sorts the most helpful change first."""
-    minutes = max(gain.minutes, 1.0)
-    return -len(gain.shown) / minutes, float(np.log(gain.factor)) / minutes
-
-
-def _gain(change: Change, before: Document, after: Document) -> Gain:
-    old, new = _entries(before), _entries(after)
-    both = old.keys() & new.keys()
-    ratios = [np.log(new[key]["smallest"] / old[key]["smallest"]) for key in sorted(both)]
-    return Gain(
-        change,
-        after["minutes"] - before["minutes"],
-        tuple(key for key in new if key not in old and not _shared(key, old)),
-        tuple(key for key in new if key in both and old[key]["taken_for"] and not new[key]["taken_for"]),
-        float(np.exp(np.mean(ratios))) if ratios else 1.0,
+    faultless = replace(
+        unit, effects={}, imperfections=FAULTLESS, held_out={}, temperature={**ROOM, **unit.temperature}
     )
+    recordings, _ = simulate_unit(faultless, SEED, 0, extra)
+    sheets, table = read_config("sensor", unit.sensor), read_config("table", unit.table)
+    long_rest = any(recording.role == "static" for recording in recordings)
+    noise = {s: noise_of_sheet(sheets[s], unit.interval_s, long_rest=long_rest) for s in ("accelerometer", "gyroscope")}
+    minutes = max(float(r.time[-1]) for r in recordings) / 60.0
+    return SimulatedProcedure(recordings, sheets, table, read_config("procedure", unit.procedure), noise, minutes)
 
 
-def _shared(key: str, old: Mapping[str, Any]) -> bool:
-    """Return whether an effect is the table's and the other sensor shows it already."""
-    name = key.partition(".")[2]
-    return effect(name).owner == Owner.TABLE and any(other.partition(".")[2] == name for other in old)
+def noise_of_sheet(sheet: Mapping[str, Any], interval: float, *, long_rest: bool) -> Noise:
+    """Return the noise of a sensor by its data sheet.
+
+        white^2 = noise_density^2 / (2 dt) + (1 / counts_per_unit)^2 / 12
+
+    with the sampling interval dt in s, the one-sided density in unit/sqrt(Hz), and the quantisation.
+
+    Parameters
+    ----------
+    sheet : mapping
+        The sensor's section of the configuration.
+    interval : float, s
+    long_rest : bool
+        Whether the noise will be estimated from a long rest.
+    """
+    variance = sheet["noise_density"] ** 2 * 0.5 / interval + 1.0 / (12.0 * sheet["counts_per_unit"] ** 2)
+    wander = float(sheet.get("bias_wander") or 0.0)
+    source = "static" if long_rest else "rests"
+    return Noise(np.full(3, np.sqrt(variance)), np.full(3, wander), float(sheet.get("wander_time_s") or 100.0), source)
 
 
-def _entries(document: Mapping[str, Any]) -> dict[str, Document]:
-    """Return the observable effects by ``sensor.effect``."""
-    return {f"{s}.{entry['effect']}": entry for s in SENSORS for entry in document[s]["effects"]}
+def _warnings(simulated: SimulatedProcedure) -> list[str]:
+    """Return what sensor or table cannot do of the procedure, as sentences."""
+    full = float(simulated.sheets["gyroscope"]["full_scale"])
+    rates = [float(np.abs(r.table_rate).max()) for r in simulated.recordings if r.table_rate is not None]
+    fastest, found = max(rates, default=0.0), []
+    if fastest > full:
+        found.append(f"the fastest turn, {fastest:g} deg/s, is beyond the gyroscope's full scale of {full:g} deg/s")
+    if simulated.table["motion"] == "commanded":
+        angle = float(simulated.table["angle_accuracy_deg"])
+        found.append(
+            f"the table logs its program, not what it did: angle errors of {angle:g} deg read as "
+            f"{1000.0 * np.radians(angle):.2g} mg, and sizes below that are only found if they repeat from stop to stop"
+        )
+    return found

@@ -14,9 +14,8 @@ from pipeline.estimation.ranking import Ranking
 from pipeline.estimation.selection import GATE_BIC, GATE_P, select
 from pipeline.estimation.wandering import Cells, Setting, settings_for
 from pipeline.model.effects import catalogue, effect
-from pipeline.planning.expectation import noise_sums
-from pipeline.planning.plan import plan_of
-from pipeline.planning.rehearsal import FAULTLESS, ROOM, noise_of_sheet
+from pipeline.planning.detection_limits import noise_sums
+from pipeline.planning.plan import FAULTLESS, ROOM, noise_of_sheet, plan_of
 from pipeline.records import SENSORS
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, read_config

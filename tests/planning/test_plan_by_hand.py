@@ -8,9 +8,8 @@ import numpy as np
 
 from pipeline.estimation.selection import GATE_BIC
 from pipeline.planning.by_hand import select_by_hand
-from pipeline.planning.extra import changes
-from pipeline.planning.plan import of_sensor
-from pipeline.planning.rehearsal import ROOM, rehearse
+from pipeline.planning.changes import changes
+from pipeline.planning.plan import ROOM, of_sensor, simulate_procedure
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription
 
@@ -20,7 +19,7 @@ UNITS, MOST, FACTOR = 12, 10, 1.5  # were only half of the units found, 10 of 12
 
 
 def test_half_of_the_units_are_found_within_a_factor_of_the_planned_size_by_hand() -> None:
-    rehearsal = rehearse(POSITIONS)
+    rehearsal = simulate_procedure(POSITIONS)
     planned = {e["effect"]: e for e in of_sensor("accelerometer", rehearsal)["effects"]}
     sizes = np.array(list(planned["quadratic_nonlinearity"]["sizes"].values()))
     found = {FACTOR: 0, 1.0 / FACTOR: 0}
@@ -36,7 +35,7 @@ def test_half_of_the_units_are_found_within_a_factor_of_the_planned_size_by_hand
 
 
 def test_by_hand_no_table_and_no_lever_arm_can_be_seen() -> None:
-    part = of_sensor("accelerometer", rehearse(POSITIONS))
+    part = of_sensor("accelerometer", simulate_procedure(POSITIONS))
     reasons = {entry["effect"]: entry["reason"] for entry in part["not_observable"]}
     assert reasons["table_tilt"] == "there is no table"
     assert "by hand nobody knows" in reasons["lever_arm"]
@@ -44,6 +43,6 @@ def test_by_hand_no_table_and_no_lever_arm_can_be_seen() -> None:
 
 
 def test_six_positions_show_no_nonlinearity_and_more_positions_are_proposed() -> None:
-    part = of_sensor("accelerometer", rehearse(SIX))
+    part = of_sensor("accelerometer", simulate_procedure(SIX))
     assert "quadratic_nonlinearity" in {entry["effect"] for entry in part["not_observable"]}
     assert "--procedure multi_position" in [change.options for change in changes(SIX)]

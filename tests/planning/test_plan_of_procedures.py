@@ -8,10 +8,9 @@ from typing import Any
 import pytest
 
 from pipeline.errors import ConfigurationError
-from pipeline.planning.extra import changes
-from pipeline.planning.plan import best_changes, of_sensor, plan_of
-from pipeline.planning.rehearsal import rehearse
-from pipeline.planning.words import helps_most
+from pipeline.planning.changes import best_changes, changes
+from pipeline.planning.plan import of_sensor, plan_of, simulate_procedure
+from pipeline.planning.plan_text import helps_most
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription
 
@@ -33,7 +32,7 @@ def _sizes(part: dict[str, Any]) -> dict[str, float]:
 
 
 def test_stop_and_go_shows_no_lever_arm_and_no_delay() -> None:
-    rehearsal = rehearse(replace(ONE_WAY, course={**ONE_WAY.course, "step_deg": 1.0}))
+    rehearsal = simulate_procedure(replace(ONE_WAY, course={**ONE_WAY.course, "step_deg": 1.0}))
     stops = [r for r in rehearsal.recordings if r.role != "gyroscope"]
     part = of_sensor("accelerometer", replace(rehearsal, recordings=stops))
     reasons = _reasons(part)

@@ -9,7 +9,7 @@ from pipeline.records import SENSORS
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.planning.plan import Gain
+    from pipeline.planning.changes import Gain
 
 CLEARLY_LARGER = 1.2
 CLEARLY_SMALLER = 99.5  # per cent

@@ -1,4 +1,4 @@
-"""What could be recorded beside a procedure: one change at a time.
+"""What could be recorded in addition to a procedure, and what each change would bring.
 
 Each change is a further course of the same unit, and is planned like the procedure itself. Those with options can be
 planned and simulated by them; the others are further recordings, to be named in the procedure's configuration.
@@ -11,6 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.model.effects import effect
+from pipeline.model.effects.base import Owner
+from pipeline.planning.plan import plan_of
+from pipeline.records import SENSORS
 from pipeline.simulation.campaign import course_of
 from pipeline.simulation.description import read_config
 from pipeline.simulation.gimbals import Gimbals, random_gimbals
@@ -18,8 +22,9 @@ from pipeline.simulation.planned import Planned
 from pipeline.simulation.procedures import TABLE_PROCEDURES, plan
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
+    from pipeline.planning.plan import Document
     from pipeline.simulation.description import UnitDescription
     from pipeline.simulation.procedures import Course
 
@@ -120,3 +125,75 @@ def _anywhere(unit: UnitDescription, course: Course) -> Iterator[Change]:
     if course.static_s < LONG_REST_S:
         what = f"a long rest of {LONG_REST_S / 60.0:g} min, to pin the noise"
         yield _with(unit, what, f"--static {LONG_REST_S:g}", static_s=LONG_REST_S)
+
+
+@dataclass(frozen=True)
+class Gain:
+    """What a change would bring.
+
+    Attributes
+    ----------
+    change : Change
+    minutes : float
+        More at the table.
+    shown : tuple of str
+        ``sensor.effect`` that become observable; one of the table only if neither sensor showed it.
+    told : tuple of str
+        Those that would no longer be taken for a look-alike.
+    factor : float
+        Geometric mean of the new smallest sizes over the old ones, of effects that are observable in both.
+    """
+
+    change: Change
+    minutes: float
+    shown: tuple[str, ...]
+    told: tuple[str, ...]
+    factor: float
+
+
+def best_changes(unit: UnitDescription, before: Document) -> list[Gain]:
+    """Return what each change would bring, the most helpful first.
+
+    First goes the change that shows most effects for each minute that it takes (at least one: nothing is set up in
+    less); of those that show nothing new, the one that lowers the smallest sizes most, as a logarithm a minute.
+
+    Parameters
+    ----------
+    unit : UnitDescription
+    before : dict
+        Its plan.
+    """
+    if all(before[sensor]["reason"] for sensor in SENSORS):
+        return []
+    gains = [_gain(change, before, plan_of(change.unit, change.extra, half_only=True)) for change in changes(unit)]
+    return sorted(gains, key=_worth)
+
+
+def _worth(gain: Gain) -> tuple[float, float]:
+    """Return what sorts the most helpful change first."""
+    minutes = max(gain.minutes, 1.0)
+    return -len(gain.shown) / minutes, float(np.log(gain.factor)) / minutes
+
+
+def _gain(change: Change, before: Document, after: Document) -> Gain:
+    old, new = _entries(before), _entries(after)
+    both = old.keys() & new.keys()
+    ratios = [np.log(new[key]["smallest"] / old[key]["smallest"]) for key in sorted(both)]
+    return Gain(
+        change,
+        after["minutes"] - before["minutes"],
+        tuple(key for key in new if key not in old and not _shared(key, old)),
+        tuple(key for key in new if key in both and old[key]["taken_for"] and not new[key]["taken_for"]),
+        float(np.exp(np.mean(ratios))) if ratios else 1.0,
+    )
+
+
+def _shared(key: str, old: Mapping[str, Any]) -> bool:
+    """Return whether an effect is the table's and the other sensor shows it already."""
+    name = key.partition(".")[2]
+    return effect(name).owner == Owner.TABLE and any(other.partition(".")[2] == name for other in old)
+
+
+def _entries(document: Mapping[str, Any]) -> dict[str, Document]:
+    """Return the observable effects by ``sensor.effect``."""
+    return {f"{s}.{entry['effect']}": entry for s in SENSORS for entry in document[s]["effects"]}
