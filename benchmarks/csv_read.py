@@ -53,14 +53,14 @@ def write_log(path: Path, rows: int) -> None:
 
 def read_ours(path: Path) -> tuple[int, list[float]]:
     from pipeline.io.csv_read import read_csv  # noqa: PLC0415  (a process loads its own reader only)
-    from pipeline.io.csv_settings import csv_formats  # noqa: PLC0415
+    from pipeline.io.ingest_settings import csv_formats  # noqa: PLC0415
 
     table = read_csv([path], csv_formats(yaml.safe_load(PROFILE.read_text())))
     return len(table.time_ns), [float(table.time_ns[-1]) / 1e9, *(float(v[-1]) for v in table.values.values())]
 
 
 def read_marked(path: Path) -> tuple[int, list[float]]:
-    from pipeline.io.checks import Checks  # noqa: PLC0415
+    from pipeline.io.ingest_settings import Checks  # noqa: PLC0415
     from pipeline.io.read import read_table, to_recording  # noqa: PLC0415
 
     ingest = yaml.safe_load(PROFILE.read_text())

@@ -16,8 +16,8 @@ from pipeline.atomic import write_atomically
 from pipeline.config.campaign import load_campaign
 from pipeline.config.compose import CONFIGS, Composer, Problem
 from pipeline.errors import ConfigurationError, IngestError, PipelineError
-from pipeline.io.checks import checks_of
 from pipeline.io.files import FILE, candidate_files
+from pipeline.io.ingest_settings import checks_of
 from pipeline.io.read import read_table, to_recording
 from pipeline.preprocessing.checks import check_recordings
 from pipeline.profile_detection.mcap_topics import topic_lines

@@ -26,7 +26,7 @@ from pipeline.config.references import check_references, with_references
 from pipeline.config.schema import SECTIONS, Unit
 from pipeline.config.user_effects import ONLY_FROM_THE_COMMAND_LINE, PYTHON, UserEffects, load_user_effects
 from pipeline.errors import ConfigurationError
-from pipeline.io.settings import check_ingest
+from pipeline.io.ingest_settings import check_ingest
 from pipeline.io.yaml_file import read_yaml
 
 if TYPE_CHECKING:

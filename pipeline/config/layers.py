@@ -12,6 +12,7 @@ where
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from pipeline.config.sheet import Sheet
 
 DEVICES = "devices"
+BETWEEN_OVERRIDES = re.compile(r';(?=(?:[^"]*"[^"]*")*[^"]*$)')  # a semicolon outside double quotes
 
 
 class Layer(NamedTuple):
@@ -62,7 +64,7 @@ class Layers:
     def of(self, unit: str) -> list[Layer]:
         """Return a unit's overrides, weakest first."""
         row, line = self.sheet.rows[unit], f"units.csv line {self.sheet.lines[unit]}"
-        own = [o for o in map(str.strip, row.get("overrides", "").split(";")) if o]
+        own = [o for o in map(str.strip, BETWEEN_OVERRIDES.split(row.get("overrides", ""))) if o]
         lot = row.get("lot", "")
         above = [
             *_from(f"campaign.yaml, lots, {lot}", self.campaign.lots.get(lot, ())),

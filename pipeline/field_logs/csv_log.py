@@ -16,7 +16,7 @@ from pipeline.errors import InputError, PipelineError
 from pipeline.field_logs.output import replacing, require_apart
 from pipeline.field_logs.profile import EPOCH_AFTER_S, LogProfile
 from pipeline.io.csv_cells import digits, lines_of, read_head, text_blocks
-from pipeline.io.csv_settings import csv_formats
+from pipeline.io.ingest_settings import csv_formats
 from pipeline.io.units import COUNTS, TRIADS, UNITS, decode, to_house_unit
 from pipeline.model.compensation import SMOOTHING_S
 from pipeline.records import SENSORS, Encoding
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from pipeline.field_logs.doubts import Doubts
     from pipeline.io.csv_cells import TextBlock
-    from pipeline.io.csv_settings import Column
+    from pipeline.io.ingest_settings import Column
     from pipeline.model.compensation import Compensation
 
 SIGNALS = {**TRIADS, "temperature": ("temperature",), "time": ("time",)}

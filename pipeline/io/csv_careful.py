@@ -13,18 +13,17 @@ from pipeline.io.csv_fault import KIND_OF_SETTING, find_faults, quoted_numbers, 
 from pipeline.io.csv_layout import find_layout
 from pipeline.io.csv_parse import all_finite, parse
 from pipeline.io.csv_rows import Rows
-from pipeline.io.csv_settings import DROP, GAP
 from pipeline.io.csv_time import EXACT_BELOW_S, LONGEST_S, exact_times, seconds_per_unit
+from pipeline.io.ingest_settings import DROP, GAP
 from pipeline.io.text_file import load_text
 from pipeline.records import Note
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from pipeline.io.checks import Checks
     from pipeline.io.csv_fault import Fault
     from pipeline.io.csv_layout import Layout
-    from pipeline.io.csv_settings import CsvFormat
+    from pipeline.io.ingest_settings import Checks, CsvFormat
 
 
 def read_carefully(path: Path, settings: CsvFormat, checks: Checks) -> Rows:

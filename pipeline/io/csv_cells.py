@@ -17,7 +17,7 @@ from pyarrow import csv as arrow_csv
 
 from pipeline.errors import InputError
 from pipeline.io.csv_layout import DELIMITERS, fields, single_blanks
-from pipeline.io.csv_settings import AUTO, COMMENTED, WHITESPACE
+from pipeline.io.ingest_settings import AUTO, COMMENTED, WHITESPACE
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.io.csv_settings import CsvFormat
+    from pipeline.io.ingest_settings import CsvFormat
 
 LONGEST_LINE = 1 << 20
 DECIMALS = 12  # far below any sensor's resolution, above the rounding of a double

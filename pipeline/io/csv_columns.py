@@ -10,7 +10,7 @@ from pipeline.errors import IngestError
 from pipeline.io.units import TRIADS, UNITS
 
 if TYPE_CHECKING:
-    from pipeline.io.csv_settings import Column, CsvFormat
+    from pipeline.io.ingest_settings import Column, CsvFormat
 
 NUMBER = re.compile(rb"\s*[+-]?(\d+[.,]?\d*|[.,]\d+)([eE][+-]?\d+)?\s*")
 BRACKETS = re.compile(r"[\[(]([^\])]*)[\])]\s*$")

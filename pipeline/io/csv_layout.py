@@ -15,14 +15,14 @@ import numpy as np
 
 from pipeline.errors import IngestError
 from pipeline.io.csv_columns import find_columns, refuse_twice
-from pipeline.io.csv_settings import AUTO, COMMENTED, WHITESPACE
+from pipeline.io.ingest_settings import AUTO, COMMENTED, WHITESPACE
 from pipeline.io.units import TRIADS
 from pipeline.records import Note
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from pipeline.io.csv_settings import Column, CsvFormat
+    from pipeline.io.ingest_settings import Column, CsvFormat
     from pipeline.io.text_file import TextFile
 
 DELIMITERS = ",;\t|"

@@ -16,8 +16,8 @@ from pipeline.records import Note
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from pipeline.io.checks import Checks
     from pipeline.io.csv_rows import Rows
+    from pipeline.io.ingest_settings import Checks
 
 REPAIRED = np.uint16(8)
 RESET_INTERVALS = 5

@@ -19,8 +19,8 @@ from pipeline.io.csv_columns import find_columns, refuse_twice
 from pipeline.io.csv_layout import LineNumbers, column_notes, fields
 from pipeline.io.csv_parse import all_finite, parse
 from pipeline.io.csv_rows import Rows
-from pipeline.io.csv_settings import AUTO, COMMENTED, WHITESPACE
 from pipeline.io.csv_time import EXACT_BELOW_S, exact_times, seconds_per_unit
+from pipeline.io.ingest_settings import AUTO, COMMENTED, WHITESPACE
 from pipeline.io.text_file import unchanged
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.io.csv_settings import Column, CsvFormat
+    from pipeline.io.ingest_settings import Column, CsvFormat
     from pipeline.records import Note
 
 BLOCK_BYTES = 1 << 20

@@ -14,11 +14,11 @@ import numpy as np
 
 from pipeline.errors import IngestError
 from pipeline.io.channel_table import ChannelTable
-from pipeline.io.checks import Checks
 from pipeline.io.csv_careful import read_carefully
 from pipeline.io.csv_order import in_order
 from pipeline.io.csv_quick import read_quickly
 from pipeline.io.csv_time import LONGEST_S, refuse_coarse, seconds_per_unit, whole_times
+from pipeline.io.ingest_settings import Checks
 from pipeline.io.units import COUNTS, UNITS, decode, to_house_unit
 from pipeline.records import Encoding, Note
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.io.csv_rows import Rows
-    from pipeline.io.csv_settings import Column, CsvFormat
+    from pipeline.io.ingest_settings import Column, CsvFormat
 
 TABLE_TIME = "table_time"
 

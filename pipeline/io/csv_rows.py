@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.io.csv_layout import LineNumbers
-    from pipeline.io.csv_settings import Column
+    from pipeline.io.ingest_settings import Column
     from pipeline.records import Note
 
 

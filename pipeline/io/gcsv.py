@@ -23,7 +23,7 @@ from fractions import Fraction
 from typing import TYPE_CHECKING
 
 from pipeline.errors import IngestError
-from pipeline.io.csv_settings import Column, CsvFormat
+from pipeline.io.ingest_settings import Column, CsvFormat
 from pipeline.io.text_file import refuse_foreign, unchanged
 from pipeline.io.units import ATTITUDE, COUNTS, DEGREES, TRIADS
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from pipeline.io.channel_table import ChannelTable
-    from pipeline.io.checks import Checks
+    from pipeline.io.ingest_settings import Checks
 
 FIRST_LINES = (b"GYROFLOW IMU LOG", b"CAMERA IMU LOG")
 LONGEST_HEADER = 1 << 16
@@ -108,18 +108,17 @@ def _format(names: list[str], facts: dict[str, str], skip: int, path: Path) -> C
         raise IngestError(
             f"version {version} of .gcsv is not known; known are 1 to {LAST_VERSION}", str(path), fault="gcsv"
         )
-    tick = Fraction(_number(facts, "tscale", path)) * 1_000_000_000
-    columns = [Column("time", names[0], "s")]
+    rate = 1.0 / float(Fraction(_number(facts, "tscale", path)))
+    columns = [Column(channel="time", column=names[0], unit=COUNTS, counts_per_unit=rate)]
     for sensor, letter, scale, factor in (("gyroscope", "g", "gscale", DEGREES), ("accelerometer", "a", "ascale", 1.0)):
-        present = [f"{letter}{axis}" for axis in "xyz" if f"{letter}{axis}" in names]
-        if present:
+        if any(f"{letter}{axis}" in names for axis in "xyz"):
             per_unit = 1.0 / (float(Fraction(_number(facts, scale, path))) * factor)
             columns += [
-                Column(channel, f"{letter}{channel[-1]}", COUNTS, counts_per_unit=per_unit)
+                Column(channel=channel, column=f"{letter}{channel[-1]}", unit=COUNTS, counts_per_unit=per_unit)
                 for channel in TRIADS[sensor]
             ]
-    columns += [Column(channel, name, unit, optional=True) for name, (channel, unit) in EXTRA.items()]
-    return CsvFormat(",", header=True, skip_lines=skip, rate_hz=None, columns=tuple(columns), tick_ns=tick)
+    columns += [Column(channel=c, column=name, unit=unit, optional=True) for name, (c, unit) in EXTRA.items()]
+    return CsvFormat(skip_lines=skip, columns=tuple(columns))
 
 
 def _number(facts: dict[str, str], key: str, path: Path) -> str:

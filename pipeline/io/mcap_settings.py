@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import ConfigurationError
 from pipeline.io.field_path import FieldPath
-from pipeline.io.setting_checks import is_number, refuse_unknown
+from pipeline.io.ingest_settings import is_number, refuse_unknown
 from pipeline.io.units import ATTITUDE, COUNTS, TRIADS, UNITS
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import IngestError
-from pipeline.io.checks import Checks
+from pipeline.io.ingest_settings import Checks
 from pipeline.io.quality_flags import mark_clipped, mark_gaps, mark_stuck
 from pipeline.io.timestamps import time_error
 from pipeline.io.units import ATTITUDE, DEGREES, TRIADS

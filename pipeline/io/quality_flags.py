@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.io.channel_table import ChannelTable
-    from pipeline.io.checks import Checks
+    from pipeline.io.ingest_settings import Checks
     from pipeline.records import Note
 
 GAP, CLIPPED, STUCK = np.uint16(1), np.uint16(2), np.uint16(4)

@@ -16,9 +16,9 @@ import numpy as np
 
 from pipeline.errors import IngestError, MissingInputError
 from pipeline.io.axes import STRAIGHT, axis_maps, to_body_axes
-from pipeline.io.checks import checks_of
 from pipeline.io.disturbances import leave_out_disturbances
 from pipeline.io.files import candidate_files, recording_files
+from pipeline.io.ingest_settings import checks_of
 from pipeline.io.plausibility import examine
 from pipeline.io.shaken_rests import leave_out_shaken_rests
 from pipeline.io.table_log import unwrapped
@@ -32,8 +32,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.io.channel_table import ChannelTable
-    from pipeline.io.checks import Checks
-    from pipeline.io.csv_settings import CsvFormat
+    from pipeline.io.ingest_settings import Checks, CsvFormat
 
 EPOCH_AFTER_NS = 100_000_000 * 1_000_000_000  # 3 years: no sensor has been on for longer
 
@@ -91,7 +90,7 @@ def table_reader(ingest: Mapping[str, Any]) -> Callable[[Sequence[Path]], Channe
 
     @cache
     def csv_layouts() -> list[CsvFormat]:
-        from pipeline.io.csv_settings import csv_formats  # noqa: PLC0415
+        from pipeline.io.ingest_settings import csv_formats  # noqa: PLC0415
 
         return csv_formats(ingest)
 

@@ -39,6 +39,15 @@ def test_a_plain_string_is_one_override(tmp_path: Path) -> None:
     assert load(directory, overrides="table.gravity_g=0.998").units["U1"].config["table"]["gravity_g"] == 0.998
 
 
+def test_a_semicolon_in_quotes_does_not_separate_overrides(tmp_path: Path) -> None:
+    cell = '"ingest.csv.delimiter="";"";filter.cutoff_hz=3"'
+    directory = campaign(tmp_path, f"unit,overrides\nU1,{cell}\nU2,ingest.csv.delimiter=semicolon\n")
+    units = load(directory).units
+    assert units["U1"].config["ingest"]["csv"]["delimiter"] == ";"
+    assert units["U1"].config["filter"]["cutoff_hz"] == 3
+    assert units["U2"].config["ingest"]["csv"]["delimiter"] == "semicolon"
+
+
 def test_defaults_follow_the_procedure_and_the_table(tmp_path: Path) -> None:
     sheet = "unit,procedure,table\nA,,\nB,multi_position,\nC,,hand\nD,six_positions,acutronic\n"
     units = load(campaign(tmp_path, sheet)).units

@@ -12,9 +12,9 @@ from bad_logs import FILE, TABLE_ANGLE, VALUES, Case, cases
 from sample_logs import SENSOR, procedure
 
 from pipeline.errors import ConfigurationError, InputError, MissingInputError
+from pipeline.io.ingest_settings import check_ingest
 from pipeline.io.parquet import load_recordings, save_recordings
 from pipeline.io.read import read_recordings
-from pipeline.io.settings import check_ingest
 from pipeline.preprocessing.checks import check_recordings
 from pipeline.report.campaign_page import render
 from pipeline.stages.gather import same_files

@@ -15,8 +15,8 @@ from sample_logs import SENSOR, assert_same_bits, make_recording, procedure, pro
 
 from pipeline.io.csv_read import read_csv
 from pipeline.io.csv_write import write_canonical_csv
+from pipeline.io.ingest_settings import csv_formats
 from pipeline.io.read import read_recordings
-from pipeline.io.settings import csv_formats
 from pipeline.records import Recording
 
 if TYPE_CHECKING:
@@ -166,6 +166,15 @@ def test_columns_are_found_by_name_in_any_order_and_others_are_noted(tmp_path: P
         ("N-ORDER", 6, f"axes stand in the order {order} and were taken by their names"),
         ("N-IGNORED", 1, "columns not used: comment"),
     ]
+
+
+@pytest.mark.parametrize(("name", "character"), [("semicolon", ";"), ("tab", "\t"), ("comma", ",")])
+def test_a_delimiter_may_be_given_by_name(tmp_path: Path, canonical: dict[str, Any], name: str, character: str) -> None:
+    write_canonical_csv(tmp_path / "accel_x.csv", make_recording())
+    text = (tmp_path / "accel_x.csv").read_text()
+    (tmp_path / "accel_x.csv").write_text(text.replace(",", character))
+    canonical["csv"]["delimiter"] = name
+    assert_same_bits(read_back(tmp_path, canonical), make_recording())
 
 
 def test_axis_map_turns_readings_and_their_counts_into_body_axes(tmp_path: Path) -> None:

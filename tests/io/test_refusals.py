@@ -14,8 +14,8 @@ from sample_logs import SENSOR, make_recording, procedure, profile
 from pipeline.errors import ConfigurationError, InputError, MissingInputError
 from pipeline.io.csv_write import write_canonical_csv
 from pipeline.io.files import recording_files
+from pipeline.io.ingest_settings import check_ingest
 from pipeline.io.read import read_recordings
-from pipeline.io.settings import check_ingest
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -264,6 +264,7 @@ def change(ingest: dict[str, Any], key: str, value: Any) -> None:
         ("csv/rate_hz", 100.0, "needs either a time column"),
         ("csv/rate_hz", -1, "rate_hz is -1; it is a positive number"),
         ("csv/delimiter", ";;", "delimiter is ';;'; it is one character, or whitespace"),
+        ("csv/delimiter", "", "delimiter is ''; it is one character, or whitespace, auto, comma, semicolon"),
         ("csv/header", "yes", "header is 'yes'; it is true or false"),
         ("csv/header", False, "it is an index from 0, for header is false"),
         ("csv/skip_lines", -1, "skip_lines is -1; it is a number of lines"),

@@ -12,9 +12,8 @@ from loggers import GRAVITY, LOGGERS, Logger, motion
 
 from pipeline.config.compose import Composer
 from pipeline.errors import IngestError
-from pipeline.io.checks import Checks
 from pipeline.io.csv_read import read_csv
-from pipeline.io.csv_settings import csv_formats
+from pipeline.io.ingest_settings import Checks, csv_formats
 from pipeline.io.text_file import load_text
 from pipeline.profile_detection.profile_text import as_yaml
 from pipeline.profile_detection.proposal import Proposal, propose

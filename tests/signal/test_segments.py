@@ -11,7 +11,7 @@ import pytest
 
 from pipeline.errors import InputError
 from pipeline.io.channel_table import ChannelTable
-from pipeline.io.checks import Checks
+from pipeline.io.ingest_settings import Checks
 from pipeline.io.read import to_recording
 from pipeline.io.table_log import unwrapped
 from pipeline.records import rate_of_attitude

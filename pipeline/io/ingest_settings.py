@@ -1,0 +1,282 @@
+"""The settings of an ingest profile for text logs, and the limits that hold for logs of any kind.
+
+``configs/ingest/canonical_csv.yaml`` explains every key. A profile states what a file holds: names, units, separators
+and the order of columns are never guessed from the file.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Iterable, Mapping
+from fractions import Fraction
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
+
+from pipeline.errors import ConfigurationError
+from pipeline.io.files import candidate_files
+from pipeline.io.units import ACCELEROMETER, COUNTS, GYROSCOPE, TRIADS, UNITS
+
+WHITESPACE, AUTO, COMMENTED = "whitespace", "auto", "commented"
+REFUSE, DROP, GAP = "refuse", "drop", "gap"
+DELIMITER_NAMES = {"comma": ",", "semicolon": ";", "tab": "\t", "pipe": "|", "space": " "}
+
+Share = Annotated[float, Field(ge=0, le=1, description="a share between 0 and 1")]
+Rate = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+class Section(BaseModel):
+    """A section of an ingest profile. The description of a field says what a refused value should be."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+
+class Checks(Section):
+    """Limits of what is repaired or tolerated (``ingest.checks``).
+
+    ``repaired_rows``: share of a file's rows that may be dropped or sorted. ``missing_time``: share of the duration in
+    gaps. ``disturbed_rows``: share of samples left out as disturbances; 0 keeps all. ``rate_hz``: rate that the times
+    keep within 20 %; None: not known.
+    """
+
+    repaired_rows: Share = 1e-3
+    missing_time: Share = 1e-2
+    disturbed_rows: Share = 2e-2
+    rate_hz: Rate | None = Field(default=None, description="a positive number in Hz, or null")
+
+
+class Column(Section):
+    """The column of a channel: its name (or index from 0), its unit, and the scale of counts."""
+
+    channel: str
+    column: str | int = Field(default="", validate_default=True)
+    unit: str = Field(default="", validate_default=True)
+    optional: bool = Field(default=False, description="true or false")
+    counts_per_unit: float = Field(default=1.0, description="a number other than 0")
+    offset: float = Field(default=0.0, description="a number of counts")
+
+    @field_validator("column")
+    @classmethod
+    def _names_a_column(cls, value: str | int, info: ValidationInfo) -> str | int:
+        header = (info.context or {}).get("header", True)
+        if (isinstance(value, str) and value) if header else (isinstance(value, int) and value >= 0):
+            return value
+        raise ValueError(f"it is {'a name of the header' if header else 'an index from 0, for header is false'}")
+
+    @field_validator("unit", mode="before")
+    @classmethod
+    def _is_a_unit_of_the_channel(cls, value: object, info: ValidationInfo) -> str:
+        channel = info.data["channel"]
+        allowed = [*UNITS[channel], *([COUNTS] if channel == "time" else [])]
+        if str(value) not in allowed:
+            raise ValueError(f"allowed are {', '.join(allowed)}")
+        return str(value)
+
+    @model_validator(mode="after")
+    def _scales_counts_only(self) -> Column:
+        scaled = "counts_per_unit" in self.model_fields_set
+        if self.unit == COUNTS and (not scaled or self.counts_per_unit == 0):
+            value = self.counts_per_unit if scaled else None
+            raise ValueError(f"counts_per_unit is {value!r}; counts need a number other than 0")
+        if self.unit != COUNTS and (scaled or self.offset):
+            raise ValueError(f"counts_per_unit and offset belong to the unit counts; this is {self.unit}")
+        if self.channel == "time" and self.offset:
+            raise ValueError(f"offset is {self.offset!r}; a time has none")
+        return self
+
+
+class CsvFormat(Section):
+    """The layout of one text file (``ingest.csv``).
+
+    ``comment``: start of lines that are no data. ``header``: ``commented`` where the last comment names the columns.
+    ``rate_hz``: sampling rate of a file without a time column. ``session``: which part, from 1, of a log that was
+    restarted. ``own_clock``: the times are those of the table's clock.
+    """
+
+    delimiter: str = Field(default=",", description="a character")
+    decimal: Literal[".", ","] = Field(default=".", description="'.' or ','")
+    comment: str | None = Field(default=None, description="a text, or null", pattern=r"\S")
+    header: bool | Literal["commented"] = Field(default=True, description=f"true or false, or {COMMENTED}")
+    skip_lines: int = Field(default=0, ge=0, description="a number of lines, 0 or more")
+    bad_rows: Literal["refuse", "drop"] = Field(default="refuse", description=f"{REFUSE} or {DROP}")
+    nan: Literal["refuse", "gap"] = Field(default="refuse", description=f"{REFUSE} or {GAP}")
+    session: int | None = Field(default=None, ge=1, description="a number counted from 1, or null")
+    rate_hz: Rate | None = Field(default=None, description="a positive number in Hz, or null")
+    own_clock: bool = False
+    columns: tuple[Column, ...] = ()
+
+    @field_validator("delimiter", mode="before")
+    @classmethod
+    def _is_a_delimiter(cls, value: object) -> object:
+        if isinstance(value, str):
+            if value in DELIMITER_NAMES:
+                return DELIMITER_NAMES[value]
+            if value in (WHITESPACE, AUTO) or (len(value) == 1 and value.isascii() and value not in '\r\n"'):
+                return value
+        names = ", ".join(DELIMITER_NAMES)
+        raise ValueError(
+            f"it is one character, or {WHITESPACE}, {AUTO}, {names} (write semicolon in units.csv, where ; separates "
+            "overrides)"
+        )
+
+    @model_validator(mode="after")
+    def _agrees_with_itself(self) -> CsvFormat:
+        if self.decimal == self.delimiter:
+            raise ValueError(f"decimal and ingest.csv.delimiter are both {self.delimiter!r}")
+        if self.header == COMMENTED and self.comment is None:
+            raise ValueError(f"header is {COMMENTED}; ingest.csv.comment has to say how comments start")
+        return self
+
+    @property
+    def tick_ns(self) -> Fraction | None:
+        """Duration of one count of the time in ns, None where the time has a unit."""
+        time = next((c for c in self.columns if c.channel == "time" and c.unit == COUNTS), None)
+        return None if time is None else 1_000_000_000 / Fraction(repr(time.counts_per_unit))
+
+
+class _Part(Section):
+    """One file of a recording that a logger writes in several."""
+
+    file: str = Field(min_length=1, description="the name of a file")
+    own_clock: bool = Field(default=False, description="true or false")
+    columns: Any = None
+
+
+S = TypeVar("S", bound=Section)
+
+
+def validated(model: type[S], section: Mapping[str, Any], where: str, **context: object) -> S:
+    """Return a section as its model.
+
+    Raises
+    ------
+    ConfigurationError
+        Naming the key below ``where``, its value and what is allowed.
+    """
+    refuse_unknown(where, section, tuple(model.model_fields))
+    try:
+        return model.model_validate(dict(section), context=context)
+    except ValidationError as error:
+        first = error.errors()[0]
+    key = str(first["loc"][0]) if first["loc"] else ""
+    said = str(first["ctx"]["error"]) if first["type"] == "value_error" else ""
+    if not key:
+        raise ConfigurationError(f"{where}.{said}")
+    expected = said or f"it is {model.model_fields[key].description or 'required'}"
+    raise ConfigurationError(f"{where}.{key} is {section.get(key)!r}; {expected}")
+
+
+def refuse_unknown(where: str, entries: Mapping[str, Any], allowed: tuple[str, ...]) -> None:
+    """Refuse an unknown key, with the nearest known one."""
+    if not isinstance(entries, Mapping):
+        raise ConfigurationError(f"{where} is {entries!r}; it is a mapping with {', '.join(allowed)}")
+    for key in entries:
+        if key not in allowed:
+            near = difflib.get_close_matches(str(key), allowed, 1)
+            hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(allowed)}"
+            raise ConfigurationError(f"{where}.{key} is unknown; {hint}")
+
+
+def is_number(value: object) -> bool:
+    """Return whether a value is a finite number."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def checks_of(ingest: Mapping[str, Any]) -> Checks:
+    """Return the limits that an ingest profile sets (``ingest.checks``)."""
+    return validated(Checks, ingest.get("checks") or {}, "ingest.checks")
+
+
+def csv_formats(ingest: Mapping[str, Any]) -> list[CsvFormat]:
+    """Return the layout of each text file of a recording: one, or one for each of the profile's ``parts``.
+
+    Raises
+    ------
+    ConfigurationError
+        Naming the key, its value and what is allowed.
+    """
+    csv: Mapping[str, Any] = ingest.get("csv") or {}
+    own = tuple(k for k in CsvFormat.model_fields if k != "own_clock")
+    refuse_unknown("ingest.csv", csv, (*own, "parts"))
+    shared = {k: v for k, v in csv.items() if k not in ("parts", "columns")}
+    header = validated(CsvFormat, shared, "ingest.csv").header
+    formats = []
+    for where, part in _parts(csv):
+        columns = _columns(f"{where}.columns", part.columns or {}, header=bool(header))
+        settings = {**shared, "own_clock": part.own_clock, "columns": columns}
+        formats.append(validated(CsvFormat, settings, "ingest.csv"))
+    _check_channels(formats)
+    return formats
+
+
+def _parts(csv: Mapping[str, Any]) -> list[tuple[str, _Part]]:
+    """Return each file of a recording with the place of its settings."""
+    if not csv.get("parts"):
+        return [("ingest.csv", _Part(file="{file}", columns=csv.get("columns")))]
+    places = [f"ingest.csv.parts[{index}]" for index in range(len(csv["parts"]))]
+    return [(place, validated(_Part, part, place)) for place, part in zip(places, csv["parts"], strict=True)]
+
+
+def _columns(where: str, columns: Mapping[str, Any], *, header: bool) -> tuple[Column, ...]:
+    refuse_unknown(where, columns, tuple(UNITS))
+    out = []
+    for channel, entry in columns.items():
+        if entry is not None:
+            refuse_unknown(f"{where}.{channel}", entry, tuple(k for k in Column.model_fields if k != "channel"))
+            stated = {k: v for k, v in entry.items() if v is not None or k in ("column", "unit")}
+            out.append(validated(Column, {"channel": channel, **stated}, f"{where}.{channel}", header=header))
+    return tuple(out)
+
+
+def _check_channels(formats: Iterable[CsvFormat]) -> None:
+    """Refuse a profile without time, without a sensor, or with an incomplete one."""
+    seen: set[str] = set()
+    readings = {*ACCELEROMETER, *GYROSCOPE}
+    for layout in formats:
+        channels = {c.channel for c in layout.columns}
+        if layout.own_clock and (channels & readings or "time" not in channels):
+            raise ConfigurationError(
+                "ingest.csv.parts: a part with own_clock is a table's log with its time; it holds "
+                f"{', '.join(sorted(channels & readings)) or 'no time'}"
+            )
+        if ("time" in channels) == (layout.rate_hz is not None):
+            raise ConfigurationError(
+                "ingest.csv needs either a time column (columns.time) or the sampling rate (rate_hz), in every part"
+            )
+        twice = seen & channels - {"time"}
+        if twice:
+            raise ConfigurationError(f"ingest.csv.parts: {', '.join(sorted(twice))} stands in two parts")
+        seen |= channels
+    for sensor, triad in TRIADS.items():
+        missing = [c for c in triad if c not in seen]
+        if 0 < len(missing) < 3:
+            raise ConfigurationError(f"ingest.csv.columns: {', '.join(missing)} of the {sensor} is not described")
+    if not seen & readings:
+        raise ConfigurationError("ingest.csv.columns describes neither an accelerometer nor a gyroscope")
+
+
+def check_ingest(ingest: Mapping[str, Any], procedure: Mapping[str, Any] | None = None) -> None:
+    """Refuse an ingest profile that no file could be read with, or whose parts do not suit the procedure.
+
+    Raises
+    ------
+    ConfigurationError
+        Naming the key, its value and what is allowed.
+    """
+    from pipeline.io.mcap_settings import mcap_format  # noqa: PLC0415  (it uses the checks of this module)
+
+    mcap_format(ingest)
+    checks_of(ingest)
+    if ingest.get("csv"):
+        csv_formats(ingest)
+    if procedure is not None:
+        candidate_files(procedure, ingest)
