@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.preprocessing.evidence import Channel
+    from pipeline.preprocessing.reference_delay import Delay
     from pipeline.preprocessing.reference_rows import Contradiction
     from pipeline.records import Recording
 
@@ -59,8 +60,8 @@ SAME = 0.1  # relative: gains of two turns that are of one gyroscope
 
 def check_turns(
     recordings: Sequence[Recording], settings: Mapping[str, Any]
-) -> tuple[list[Recording], dict[str, float]]:
-    """Return the recordings with notes on the reference of their turns, and how late the sensor is in each, s.
+) -> tuple[list[Recording], dict[str, Delay]]:
+    """Return the recordings with notes on the reference of their turns, and how late the sensor is in each.
 
     Signs and directions do not count: this goes before the mounting, which wrong units would hide.
 
@@ -93,7 +94,7 @@ def _turns(recordings: Sequence[Recording]) -> list[Recording]:
 
 
 def check_motion(
-    recordings: Sequence[Recording], delays: Mapping[str, float], settings: Mapping[str, Any]
+    recordings: Sequence[Recording], delays: Mapping[str, Delay], settings: Mapping[str, Any]
 ) -> list[Recording]:
     """Return the recordings with notes on the reference of held-out motion.
 
@@ -101,7 +102,7 @@ def check_motion(
     ----------
     recordings : sequence of Recording
         All of a unit, their turns as they are mounted.
-    delays : mapping of str to float, s
+    delays : mapping of str to Delay
         Of the turns.
     settings : mapping
         Sections ``sensor``, ``table`` and ``ingest``.
@@ -123,10 +124,10 @@ def check_motion(
 
 @dataclass(frozen=True)
 class Found:
-    """What was found on one recording: notes, and how late its sensor is, s; None where it does not tell."""
+    """What was found on one recording: notes, and how late its sensor is; None where it does not tell."""
 
     notes: tuple[Note, ...] = ()
-    delay: float | None = None
+    delay: Delay | None = None
 
 
 class Gyroscope:
@@ -234,7 +235,7 @@ def _compare(recording: Recording, channels: Sequence[Channel], limits: Limits, 
     if len([c for c in channels if c.name != "gravity"]) < 2:
         return Found()
     delay = delay_of(recording, channels, limits, settings)
-    late = abs(delay or 0.0)
+    late = abs(delay.nearest(0.0)) if delay else 0.0
     if late > limits.late_s:  # a clock that runs off: what it adds is about the same all through the recording
         limits = replace(limits, late_s=late + limits.late_s)
     comparison = Comparison(channels, np.diff(recording.time), limits)

@@ -1,13 +1,23 @@
-"""How late the sensor and the channels of a table's log are against each other.
+"""Delay between the sensor and the channels of a table's log.
 
-The delay is that at which the mean rates over steps of a twentieth of a second or more differ least; where equal steps
-of a table make several delays alike, the smallest of them. Within one recording ``time_offset`` and ``low_pass_lag``
-allow a delay, and ``clock_rate`` what the sensor's clock has run off since power-on; all recordings of a unit share
-one offset and one clock.
+The delay d minimises the variance S(d) of the difference of two rates, both averaged over steps of at least a twentieth
+of a second; where equal steps of a table give several such minima, the smallest |d| is taken. The recording determines
+d to the interval in which
+
+    n log(S(d) / S_min) <= 5 sqrt(4 d_max)
+
+where n is the number of steps and d_max the largest delay tried, in steps: a window that is moved by d_max exchanges
+2 d_max differences at each end, whose sum of squares has the standard deviation ``sqrt(4 d_max)`` in units of S_min.
+A turn at one rate determines no delay: its interval covers every delay tried.
+
+The effects ``time_offset`` and ``low_pass_lag`` allow a delay, and ``clock_rate`` what the sensor's clock gains after
+power-on. All recordings of a unit have one offset and one clock. A recording is refused only where its whole interval
+contradicts this.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,17 +36,36 @@ if TYPE_CHECKING:
 
 FURTHEST, FURTHEST_S = 25, 10.0  # samples of delay that are tried at least, and s at most
 FINEST_S = 0.05  # step in which delays are tried; a parabola finds what lies between
-FEWEST_DELAYS = 4  # recordings, of which one alone may be late
+CLOCKS = 4001  # rates of the clock that are tried: 5 us in 1 s where it may be off by 1 %
 HALF = 0.5  # of an interval, between a rate at its end and the mean over it
 QUARTER = 0.25  # of an interval, within which a delay between samples is known
 BETTER = 0.5  # share of its power that a signal has to keep where it is no other's
 NEARLY = 0.1  # share of the power by which one delay has to be better than a smaller one
+SURE = 5.0  # standard deviations of what the ends of the window add
+
+
+@dataclass(frozen=True)
+class Delay:
+    """How late a sensor is, s, and the interval to which its recording determines that.
+
+    Attributes
+    ----------
+    best, low, high : float, s
+    """
+
+    best: float
+    low: float
+    high: float
+
+    def nearest(self, value: float) -> float:
+        """Return the delay of the interval that is nearest to a value, s."""
+        return min(max(value, self.low), self.high)
 
 
 def delay_of(
     recording: Recording, channels: Sequence[Channel], limits: Limits, settings: Mapping[str, Any]
-) -> float | None:
-    """Return how late the sensor is against the table's log, s; refuse what no effect explains.
+) -> Delay | None:
+    """Return how late the sensor is against the table's log; refuse what no effect explains.
 
     Between two channels of the table ``time_offset`` and ``low_pass_lag`` allow a delay; the sensor's clock, which runs
     off by ``clock_rate`` since power-on, adds to that of the sensor.
@@ -49,16 +78,20 @@ def delay_of(
         step, one, two = _thinned(first, other, recording)
         furthest = min(max(int(np.ceil(min(allowed, FURTHEST_S) / step)), FURTHEST), len(one) // 4)
         windows = np.lib.stride_tricks.sliding_window_view(two, len(two) - 2 * furthest)
-        squares = np.mean((windows - one[furthest : len(one) - furthest]) ** 2, axis=1)
+        squares = np.var(windows - one[furthest : len(one) - furthest], axis=1)
         power = min(float(np.var(one)), float(np.var(two)))
         if float(squares.min()) >= BETTER * power:
             continue  # nothing moves, or they are not alike at any delay
-        delay = (_nearest_minimum(squares, NEARLY * power) - furthest) * step
-        if abs(delay) > max(allowed, HALF * step) + QUARTER * step:
+        interval = _interval(squares, NEARLY * power, windows.shape[1])
+        if interval is None:
+            continue
+        best, low, high = ((d - furthest) * step for d in interval)
+        delay = Delay(best, low, high)
+        if abs(delay.nearest(0.0)) > max(allowed, HALF * step) + QUARTER * step:
             raise refusal(
                 recording,
                 "reference_contradiction",
-                f"{column(recording, first.name, settings)} runs {abs(delay):.3g} s {'late' if delay < 0 else 'early'} "
+                f"{column(recording, first.name, settings)} runs {abs(best):.3g} s {'late' if best < 0 else 'early'} "
                 f"against {column(recording, other.name, settings)}; the limits of time_offset, low_pass_lag"
                 f"{' and clock_rate' if of_sensor else ''} allow {allowed:.3g} s",
                 "align the table's log with the sensor's rows, or give it a time column of its own (ingest=table_log)",
@@ -67,32 +100,46 @@ def delay_of(
     return found
 
 
-def check_delays(found: Sequence[tuple[Recording, float]], limits: Limits) -> None:
-    """Refuse a recording whose delay is not that of one offset and one clock, as all recordings of a unit share them.
+def check_delays(found: Sequence[tuple[Recording, Delay]], limits: Limits) -> None:
+    """Refuse a recording whose delay is not that of the one offset and the one clock that a unit's recordings share.
 
-    d = tau + e t, |tau| <= time_offset + low_pass_lag, |e| <= clock_rate; e by the median of the slopes between pairs.
+    Some tau and e with ``|tau| <= time_offset + low_pass_lag`` and ``|e| <= clock_rate`` have to lie, as ``tau + e t``,
+    in the interval of every recording at some time t of it. Otherwise the recording is refused without which this is so.
     """
-    if len(found) < FEWEST_DELAYS or not all(r.clock_shared for r, _ in found):
+    if len(found) < 2 or not all(r.clock_shared for r, _ in found):
         return
-    time = np.array([float(r.time[r.samples // 2]) for r, _ in found])
-    delay = np.array([d for _, d in found])
-    one, two = np.triu_indices(len(time), 1)
-    apart = time[two] - time[one]
-    slope = float(np.median((delay[two] - delay[one]) / np.where(apart == 0.0, np.inf, apart)))
-    rate = float(np.clip(slope, -limits.clock, limits.clock))
-    offset = delay - rate * time
-    usual = float(np.median(offset))
-    for (recording, late), tau in zip(found, offset, strict=True):
-        room = limits.late_s + QUARTER * max(recording.interval, FINEST_S)
-        if abs(tau) > room and (abs(tau - usual) > room or abs(usual) > room):
-            raise refusal(
-                recording,
-                "reference_contradiction",
-                f"the table's log and the gyroscope are {abs(late):.3g} s apart, and {usual + rate * time.min():.3g} s "
-                f"at the beginning of the unit's recordings; time_offset and low_pass_lag allow {limits.late_s:.3g} s, "
-                f"and a clock would run off evenly",
-                "align the table's log with the sensor's rows, or give it a time column of its own (ingest=table_log)",
-            )
+    known = QUARTER * np.array([max(r.interval, FINEST_S) for r, _ in found])
+    intervals = np.array([[r.time[0], r.time[-1], d.low, d.high] for r, d in found])
+    intervals[:, 2:] += np.outer(known, [-1.0, 1.0])
+    if _of_one_clock(intervals, limits):
+        return
+    alone = [i for i in range(len(found)) if _of_one_clock(np.delete(intervals, i, axis=0), limits)]
+    recording, late = found[alone[0] if alone else int(np.argmax([abs(d.nearest(0.0)) for _, d in found]))]
+    others = [d.best for r, d in found if r is not recording]
+    raise refusal(
+        recording,
+        "reference_contradiction",
+        f"the sensor is {late.best:.3g} s late against the table's log ({late.low:.3g} to {late.high:.3g} s), and "
+        f"{min(others):.3g} to {max(others):.3g} s in the other recordings of the unit; one offset of at most "
+        f"{limits.late_s:.3g} s (time_offset, low_pass_lag) and one clock_rate of at most {limits.clock:.3g} do not "
+        "explain both",
+        "align the table's log with the sensor's rows, or give it a time column of its own (ingest=table_log)",
+    )
+
+
+def _of_one_clock(intervals: Array, limits: Limits) -> bool:
+    """Return whether one offset and one clock within their limits explain all recordings.
+
+    Parameters
+    ----------
+    intervals : (r, 4) array, s
+        First and last time of each recording, least and largest delay. The delay is that of some time in between.
+    """
+    start, end, low, high = intervals.T
+    run_off = np.linspace(-limits.clock, limits.clock, CLOCKS)[:, None, None] * np.stack([start, end])
+    least = np.maximum((low - run_off.max(axis=1)).max(axis=1), -limits.late_s)
+    most = np.minimum((high - run_off.min(axis=1)).min(axis=1), limits.late_s)
+    return bool(np.any(least <= most))
 
 
 def _thinned(first: Channel, other: Channel, recording: Recording) -> tuple[float, Array, Array]:
@@ -105,6 +152,19 @@ def _thinned(first: Channel, other: Channel, recording: Recording) -> tuple[floa
         count = len(one) // size
         one, two = (v[: count * size].reshape(count, size).mean(axis=1) for v in (one, two))
     return size * recording.interval, one, two
+
+
+def _interval(squares: Array, room: float, steps: int) -> tuple[float, float, float] | None:
+    """Return the place of the minimum, and of the first and the last delay that the steps do not exclude.
+
+    None where they exclude neither the first nor the last of all delays tried.
+    """
+    best = _nearest_minimum(squares, room)
+    least = max(float(squares.min()), float(np.finfo(float).tiny))
+    open_to = np.flatnonzero(steps * np.log(np.maximum(squares, least) / least) <= SURE * np.sqrt(2.0 * len(squares)))
+    if open_to[0] == 0 and open_to[-1] == len(squares) - 1:
+        return None
+    return best, min(best, float(open_to[0])), max(best, float(open_to[-1]))
 
 
 def _nearest_minimum(squares: Array, room: float) -> float:

@@ -230,7 +230,9 @@ def cases() -> dict[str, Case]:
         ),
         "52 rate late": Case(at("gyro_x", of(rate, late(1))), wrong, r"runs 0.12\d* s late against table_angle_deg"),
         "52 one recording late": Case(
-            at("validation", both(of(rate, late(3)), of("table_attitude", late(3)))), wrong, "0.36 s apart"
+            at("validation", both(of(rate, late(3)), of("table_attitude", late(3)))),
+            wrong,
+            "sensor is -0.36 s late against",
         ),
         "53 moved at the end": Case(
             at("static", knocked(850, 900)), note="only rows 1 to", file="static.csv", code="N-MOVED"

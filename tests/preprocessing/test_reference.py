@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +15,8 @@ from pipeline.errors import IngestError
 from pipeline.preprocessing.at_rest import check_static
 from pipeline.preprocessing.checks import check_recordings
 from pipeline.records import Recording
+from pipeline.simulation.campaign import simulate_unit
+from pipeline.simulation.description import read_config, read_description
 from pipeline.study.bench import recordings_of
 from pipeline.study.cases import FAMILIES, draw
 
@@ -61,6 +64,15 @@ def test_the_page_tells_the_codes_of_each_bad_unit(number: str) -> None:
 def test_sound_units_are_left_alone_whatever_is_hidden_in_them(effects: str) -> None:
     unit = list(sound(6, effects))
     assert not notes_of(unit, check_recordings(unit, SETTINGS))
+
+
+@pytest.mark.parametrize("name", ["sweep_rates", "sweep_duration", "sweep_sampling", "thermal_ramp"])
+def test_slow_short_and_warm_turns_of_the_shipped_campaigns_are_not_refused(name: str) -> None:
+    description = read_description(Path(__file__).parents[2] / "data" / name / "simulation.yaml")
+    for number, unit in list(enumerate(description.units, 1))[::3]:
+        settings = SETTINGS | {g: read_config(g, getattr(unit, g)) for g in ("sensor", "table")}
+        recordings, _ = simulate_unit(unit, description.seed, number)
+        check_recordings([replace(r, source={"file": r.name}) for r in recordings], settings)
 
 
 def test_no_family_of_the_blind_study_is_refused_or_noted() -> None:
