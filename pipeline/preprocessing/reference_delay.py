@@ -104,7 +104,7 @@ def check_delays(found: Sequence[tuple[Recording, Delay]], limits: Limits) -> No
     """Refuse a recording whose delay is not that of the one offset and the one clock that a unit's recordings share.
 
     Some tau and e with ``|tau| <= time_offset + low_pass_lag`` and ``|e| <= clock_rate`` have to lie, as ``tau + e t``,
-    in the interval of every recording at some time t of it. Otherwise the recording is refused without which this is so.
+    in the interval of every recording at some time t of it. Otherwise that recording is refused without which they do.
     """
     if len(found) < 2 or not all(r.clock_shared for r, _ in found):
         return
