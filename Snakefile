@@ -48,8 +48,8 @@ onstart:
 
 
 onsuccess:
-    say_outcome()
+    print_outcome()
 
 
 onerror:
-    say_verdict()
+    print_verdict()

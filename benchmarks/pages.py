@@ -19,14 +19,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.diagnosis.words import in_words
+from pipeline.files import read_json
 from pipeline.io.parquet import load_recordings
 from pipeline.records import SENSORS
 from pipeline.report import campaign_page, certificate_page
 from pipeline.report.certificate import certificate
 from pipeline.report.session import sensor_temperature
 from pipeline.report.unit_page import render
-from pipeline.stages.batch import read_json, together
-from pipeline.stages.fits import load_fits
+from pipeline.stages.batch import merge_common
+from pipeline.stages.unit_files import load_fits
 from pipeline.validation.attitude import attitude
 
 if TYPE_CHECKING:
@@ -61,7 +62,7 @@ def unit_costs(results: Path, runs: int) -> dict[str, float]:
     batch = next(results.glob(f"batches/*/report/{UNIT}.html")).parents[1]
     parts: dict[str, Any] = {}
     for file in results.glob("configs/report-*.json"):
-        parts |= together(json.loads(file.read_text()))["units"]
+        parts |= merge_common(json.loads(file.read_text()))["units"]
     part = parts[UNIT]
     documents = [read_json(batch / stage / f"{UNIT}.json") for stage in ("calibration", "validate", "diagnose")]
     recordings = load_recordings(batch / "filter" / f"{UNIT}.parquet")

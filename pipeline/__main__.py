@@ -1,4 +1,4 @@
-"""The command line: ``python -m pipeline <stage or command>``; a command is imported only when it is asked for."""
+"""The command line: ``imu-calibration COMMAND ...``, or ``python -m pipeline COMMAND ...`` in a clone."""
 
 from __future__ import annotations
 
@@ -11,43 +11,51 @@ from pathlib import Path
 for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(threads, "1")  # a job is one core; set before numpy is imported
 
+COMMANDS = (
+    "new", "check", "plan", "explain", "add", "remove", "apply", "simulate", "config", "study", "thesis",
+)  # fmt: skip
 STAGES = (
     "ingest", "filter", "fit", "validate", "diagnose", "calibration", "export", "report", "gather", "verdict",
 )  # fmt: skip
 HERE = Path(__file__).parent
+PROGRAM = "imu-calibration" if Path(sys.argv[0]).name == "imu-calibration" else "python -m pipeline"
 
 
-def commands() -> dict[str, str]:
-    """Return every command and the module that runs it."""
-    people = sorted(f.stem for f in (HERE / "commands").glob("*.py") if f.stem != "__init__")
-    return {name: f"pipeline.commands.{name}" for name in people} | {n: f"pipeline.stages.{n}" for n in STAGES}
-
-
-def summary(module: str) -> str:
+def _summary(module: str) -> str:
     """Return the first line of a module's docstring, without importing it."""
-    source = HERE.joinpath(*module.split(".")[1:]).with_suffix(".py").read_text(encoding="utf-8")
+    source = HERE.joinpath(*module.split(".")).with_suffix(".py").read_text(encoding="utf-8")
     return (ast.get_docstring(ast.parse(source)) or "").splitlines()[0]
 
 
-def main(argv: list[str]) -> int:
+def _help() -> str:
+    lines = [f"usage: {PROGRAM} COMMAND ... (COMMAND --help says more; --version)", "", "commands:"]
+    lines += [f"  {name:<12} {_summary(f'commands.{name}')}" for name in COMMANDS]
+    lines += ["", "stages, which the rules of the workflow call:"]
+    lines += [f"  {name:<12} {_summary(f'stages.{name}').partition(': ')[2]}" for name in STAGES]
+    return "\n".join(lines)
+
+
+def main(argv: list[str] | None = None) -> int:
     """Run a command; a user error is one line and exit code 2."""
-    known = commands()
-    if not argv or argv[0] in ("-h", "--help"):
-        print("usage: python -m pipeline COMMAND ... (COMMAND --help says more)\n")
-        for name, module in known.items():
-            if name == STAGES[0]:
-                print("\nstages, which the rules of the workflow call:\n")
-            print(f"  {name:<12} {summary(module)}")
+    command, *rest = (sys.argv[1:] if argv is None else argv) or ["--help"]
+    if command in ("-h", "--help", "--version"):
+        from pipeline import __version__  # noqa: PLC0415  (nothing of the package is needed before)
+
+        print(f"imu-calibration {__version__}" if command == "--version" else _help())
         return 0
-    if argv[0] not in known:
-        print(f"python -m pipeline: no command {argv[0]!r}; known: {', '.join(known)}", file=sys.stderr)
+    if command not in (*COMMANDS, *STAGES):
+        known = ", ".join((*COMMANDS, *STAGES))
+        print(f"{PROGRAM}: no command {command!r}; known: {known}", file=sys.stderr)
         return 2
-    from pipeline.errors import PipelineError  # noqa: PLC0415  (nothing of the package is needed before)
+    from pipeline.errors import PipelineError  # noqa: PLC0415
 
     try:
-        return int(import_module(known[argv[0]]).main(argv[1:]))
+        if command in COMMANDS or command == "verdict":
+            package = "commands" if command in COMMANDS else "stages"
+            return int(import_module(f"pipeline.{package}.{command}").main(rest))
+        return int(import_module("pipeline.stages.batch").main(command, rest))
     except PipelineError as error:
-        print(f"python -m pipeline {argv[0]}: {error}", file=sys.stderr)
+        print(f"{PROGRAM} {command}: {error}", file=sys.stderr)
         return 2
     except BrokenPipeError:
         sys.stderr.close()
@@ -55,4 +63,4 @@ def main(argv: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())

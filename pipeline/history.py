@@ -20,9 +20,8 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
-from pipeline.atomic import write_atomically
 from pipeline.errors import InputError
-from pipeline.json_text import json_text
+from pipeline.files import write_json
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -143,7 +142,7 @@ def record(results: Path, units: Mapping[str, JSON], settings: Mapping[str, Any]
         number = entries[-1]["run"] + 1 if entries else 1
         now = datetime.now(UTC).isoformat(timespec="seconds")
         entry = {"run": number, "time": now, "settings": dict(settings), "units": changed, "gone": gone}
-        write_atomically(results / FOLDER / f"{number:04d}.json", json_text(entry) + "\n")
+        write_json(results / FOLDER / f"{number:04d}.json", entry)
         entries.append(entry)
     return entries
 

@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from pipeline.atomic import write_atomically
-from pipeline.command_lines import run_command
 from pipeline.config.campaign import find_campaign, load_layers
 from pipeline.config.campaign_file import as_list
-from pipeline.config.compose import CONFIGS, Composer
+from pipeline.config.compose import Composer
 from pipeline.config.devices import edit_effects, sensor_and_effect
 from pipeline.config.user_effects import PYTHON
 from pipeline.errors import ConfigurationError, MissingInputError
+from pipeline.files import SHIPPED, write_atomically
+from pipeline.outcome import run_command
 from pipeline.records import SENSORS
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def change(arguments: argparse.Namespace, *, remove: bool) -> int:
     print(f"runs: {command}", flush=True)
     words = [f"campaign={arguments.campaign}", *arguments.config]
     words += [f"results={arguments.results}"] * ("results" in settings)
-    rules = ["--cores", arguments.cores, "--snakefile", str(CONFIGS.parent / "Snakefile"), "--config", *words]
+    rules = ["--cores", arguments.cores, "--snakefile", str(SHIPPED / "Snakefile"), "--config", *words]
     return subprocess.run([sys.executable, "-m", "snakemake", *rules], check=False).returncode  # noqa: S603  (the user's own run)
 
 

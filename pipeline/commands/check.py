@@ -12,10 +12,10 @@ from pathlib import Path
 from shutil import copyfile
 from typing import TYPE_CHECKING, Any
 
-from pipeline.atomic import write_atomically
 from pipeline.config.campaign import load_campaign
-from pipeline.config.compose import CONFIGS, Composer, Problem
+from pipeline.config.compose import Composer, Problem
 from pipeline.errors import ConfigurationError, IngestError, PipelineError
+from pipeline.files import CONFIGS, write_atomically
 from pipeline.io.files import FILE, candidate_files
 from pipeline.io.ingest_settings import checks_of
 from pipeline.io.read import read_table, to_recording

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from pipeline.command_lines import run_command
 from pipeline.errors import ConfigurationError, InputError
+from pipeline.files import CONFIGS
+from pipeline.outcome import run_command
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 GROUPS = ("sensor", "table", "procedure", "method", "filter", "ingest", "certificate")
 HEADER = "unit,serial,lot,date,sensor,table,procedure,overrides"
 SETTINGS = """\

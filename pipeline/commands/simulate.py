@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from pipeline.command_lines import run_command
 from pipeline.errors import ConfigurationError
 from pipeline.model.effect_files import read_effect_files
 from pipeline.model.effects import register
+from pipeline.outcome import run_command
 from pipeline.simulation.campaign import write_campaign
 from pipeline.simulation.description import FORMATS, description_from, read_description
 from pipeline.simulation.options import add_recording_options, described

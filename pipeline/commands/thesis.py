@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.atomic import write_atomically
+from pipeline.files import write_atomically
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

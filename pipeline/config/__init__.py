@@ -5,6 +5,6 @@ Only this package knows Hydra; jobs read the JSON files that it writes.
 
 from pipeline.config.campaign import Campaign, UnitRow, load_campaign
 from pipeline.config.code import code_digest
-from pipeline.config.parts import part_file
+from pipeline.config.stage_settings import settings_file
 
-__all__ = ["Campaign", "UnitRow", "code_digest", "load_campaign", "part_file"]
+__all__ = ["Campaign", "UnitRow", "code_digest", "load_campaign", "settings_file"]

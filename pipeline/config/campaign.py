@@ -12,17 +12,17 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.config.campaign_file import as_list, read_campaign_file, split_run_settings
 from pipeline.config.comparisons import resolve_comparisons
-from pipeline.config.compose import CONFIGS, Composer, Problem, default_of_run, nearest, parse
+from pipeline.config.compose import Composer, Problem, default_of_run, nearest, parse
 from pipeline.config.layers import Layers, check_models_and_lots, read_devices, unit_overrides
-from pipeline.config.parts import config_sha256
 from pipeline.config.sheet import read_sheet
+from pipeline.config.stage_settings import config_sha256
 from pipeline.config.user_effects import PYTHON
 from pipeline.errors import ConfigurationError
+from pipeline.files import SHIPPED
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-SHIPPED = CONFIGS.parent / "data"
 SMALLEST_BATCH, LARGEST_BATCH = 10, 160
 
 
@@ -89,7 +89,7 @@ class Campaign:
 
         A campaign that ships is named, however it was given, so that the same run has the same settings.
         """
-        ships = self.directory.parent == SHIPPED.resolve()
+        ships = self.directory.parent == (SHIPPED / "data")
         given: dict[str, Any] = {"campaign": self.name if ships else str(self.settings.get("campaign", self.name))}
         given |= {k: v for k, v in self.settings.items() if k not in ("campaign", "results") and v}
         if unit is not None and "unit_overrides" in given:
@@ -175,10 +175,10 @@ def load_layers(directory: Path, settings: Mapping[str, Any], composer: Composer
 
 def find_campaign(name: str) -> Path:
     """Return the directory of a campaign: one that ships, by name, or any directory with a ``units.csv``."""
-    for directory in (SHIPPED / name, Path(name)):
+    for directory in (SHIPPED / "data" / name, Path(name)):
         if os.path.lexists(directory / "units.csv"):
             return directory.resolve()
-    shipped = [d.parent.name for d in SHIPPED.glob("*/units.csv")]
+    shipped = [d.parent.name for d in SHIPPED.glob("data/*/units.csv")]
     raise ConfigurationError(
         f"campaign {name!r}: neither data/{name} nor {name} holds a units.csv{nearest(name, shipped)}"
     )

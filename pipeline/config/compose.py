@@ -11,7 +11,6 @@ import difflib
 import json
 import re
 from functools import cache, lru_cache
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hydra import compose, initialize_config_dir
@@ -26,14 +25,15 @@ from pipeline.config.references import check_references, with_references
 from pipeline.config.schema import SECTIONS, Unit
 from pipeline.config.user_effects import ONLY_FROM_THE_COMMAND_LINE, PYTHON, UserEffects, load_user_effects
 from pipeline.errors import ConfigurationError
+from pipeline.files import CONFIGS
 from pipeline.io.ingest_settings import check_ingest
 from pipeline.io.yaml_file import read_yaml
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
+    from pathlib import Path
 
 GROUPS = ("sensor", "table", "procedure", "method", "filter", "ingest", "certificate")
-CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 RUN_SETTINGS = ("batch_size",)
 NOT_WANTED = "not_wanted"  # stage of a sensor whose method is null
 LARGEST_CONFIG = 10_000  # values of a group's option; the largest that ships has 160

@@ -9,7 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from pipeline.config.compose import CONFIGS, GROUPS, default_option, parse, read_option
+from pipeline.config.compose import GROUPS, default_option, parse, read_option
+from pipeline.files import CONFIGS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -11,7 +11,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.atomic import write_atomically
+from pipeline.files import write_atomically
 
 if TYPE_CHECKING:
     from types import ModuleType

@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING, Any
 
-from pipeline.command_lines import run_command
+from pipeline.outcome import run_command
 from pipeline.records import SENSORS
 from pipeline.report.figure import AXES
 

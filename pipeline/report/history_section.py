@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.command_lines import add_command
 from pipeline.history import Change, difference, dropped, of_units
+from pipeline.outcome import add_command
 from pipeline.records import SENSORS
 from pipeline.report.bars import Bar, bars
 from pipeline.report.figure import JSON, UNITS, Figure, plain

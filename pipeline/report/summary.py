@@ -11,7 +11,7 @@ import io
 from pathlib import Path
 from typing import Any
 
-from pipeline.atomic import write_atomically
+from pipeline.files import write_atomically
 from pipeline.records import SENSORS
 from pipeline.report.limits import final_step, verdict
 

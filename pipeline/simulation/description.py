@@ -21,16 +21,18 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, field, fields
 from functools import cache
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import ConfigurationError, MissingInputError
+from pipeline.files import CONFIGS
 from pipeline.io.unit_name import wrong_name
 from pipeline.io.yaml_file import read_yaml
 from pipeline.simulation.procedures import ONE_RECORDING, TABLE_PROCEDURES, Course
 from pipeline.simulation.table_logs import table_log_of
 
-CONFIGS = Path(__file__).parents[2] / "configs"
+if TYPE_CHECKING:
+    from pathlib import Path
+
 FORMATS = ("csv", "mcap")
 UNITS_OF_A_LOT = 25
 

@@ -1,1 +1,1 @@
-"""One thin module per stage: read files, call one library function, write files."""
+"""One module per stage: read the files of a unit, call the library, write files; ``batch`` runs a stage on a batch."""

@@ -13,44 +13,48 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline import __version__
 from pipeline.errors import CannotCalibrateError
+from pipeline.files import read_json, write_json
 from pipeline.io.axes import axis_maps
 from pipeline.io.parquet import load_recordings
 from pipeline.model.plausible import implausible
 from pipeline.records import SENSORS
-from pipeline.stages.batch import parse_job, read_json, run_batch, write_json
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
     from pathlib import Path
+
+    from pipeline.stages.batch import Job
 
 LIBRARIES = ("numpy", "scipy", "pyarrow", "mcap")
 
 
-def main(argv: Sequence[str]) -> int:
-    """Run the stage."""
-    job = parse_job("calibration", argv, ["ingest", "accelerometer", "gyroscope", "validate"])
+def process_unit(job: Job, unit: str, settings: dict[str, Any]) -> None:
+    """Write the calibration document of a unit.
 
-    def work(unit: str, part: dict[str, Any]) -> None:
-        fits = {sensor: read_json(job.inputs[sensor] / f"{unit}.json") for sensor in SENSORS}
-        validation = read_json(job.inputs["validate"] / f"{unit}.json")
-        reasons = {s: f["not_calibrated"] for s, f in fits.items() if "not_calibrated" in f}
-        if not part["method"]["as_printed"]:  # printed errata are shown as they are; the verdict is left_by_method
-            parts = {s: validation[s] for s in SENSORS if s not in reasons}
-            reasons |= {s: p["worse_than_raw"] for s, p in parts.items() if p and p["worse_than_raw"]}
-        if len(reasons) == len(SENSORS):
-            told = "; ".join(f"{sensor}: {reason}" for sensor, reason in reasons.items())
-            raise CannotCalibrateError(f"no sensor could be calibrated. {told}")
-        document = header(unit, part) | {
-            "status": "ok",
-            "error": None,
-            "log": {"ingest": part["ingest"], "axis_map": {s: list(m) for s, m in axis_maps(part["sensor"]).items()}},
-            "inputs": inputs(job.inputs["ingest"] / f"{unit}.parquet"),
-            "not_calibrated": reasons,
-        }
-        document |= {s: None if s in reasons else judged(s, f, part["sensor"][s]) for s, f in fits.items()}
-        write_json(job.output / f"{unit}.json", document)
-
-    return run_batch(job, work)
+    Raises
+    ------
+    CannotCalibrateError
+        If no sensor is calibrated.
+    """
+    fits = {sensor: read_json(job.inputs[sensor] / f"{unit}.json") for sensor in SENSORS}
+    validation = read_json(job.inputs["validate"] / f"{unit}.json")
+    reasons = {s: f["not_calibrated"] for s, f in fits.items() if "not_calibrated" in f}
+    if not settings["method"]["as_printed"]:  # printed errata are shown as they are; the verdict is left_by_method
+        fitted = {s: validation[s] for s in SENSORS if s not in reasons}
+        reasons |= {s: v["worse_than_raw"] for s, v in fitted.items() if v and v["worse_than_raw"]}
+    if len(reasons) == len(SENSORS):
+        told = "; ".join(f"{sensor}: {reason}" for sensor, reason in reasons.items())
+        raise CannotCalibrateError(f"no sensor could be calibrated. {told}")
+    axes = {s: list(m) for s, m in axis_maps(settings["sensor"]).items()}
+    document = header(unit, settings) | {
+        "status": "ok",
+        "error": None,
+        "log": {"ingest": settings["ingest"], "axis_map": axes},
+        "inputs": inputs(job.inputs["ingest"] / f"{unit}.parquet"),
+        "not_calibrated": reasons,
+    }
+    for sensor, fit in fits.items():
+        document[sensor] = None if sensor in reasons else judged(sensor, fit, settings["sensor"][sensor])
+    write_json(job.output / f"{unit}.json", document)
 
 
 def judged(sensor: str, fit: dict[str, Any], sheet: dict[str, Any]) -> dict[str, Any]:
@@ -60,16 +64,16 @@ def judged(sensor: str, fit: dict[str, Any], sheet: dict[str, Any]) -> dict[str,
     return fit | {"implausible": [] if accepted else found, "implausible_accepted": found if accepted else []}
 
 
-def header(unit: str, part: dict[str, Any]) -> dict[str, Any]:
+def header(unit: str, settings: dict[str, Any]) -> dict[str, Any]:
     """Return what a calibration document says of a unit before anything of it is fitted."""
     return {
         "schema_version": 1,
         "unit": unit,
         "status": None,
         "error": None,
-        **{group: part[group]["name"] for group in ("sensor", "table", "procedure", "method")},
-        "methods": {sensor: part["method"][sensor] for sensor in SENSORS},
-        "config_sha256": part["config_sha256"],
+        **{group: settings[group]["name"] for group in ("sensor", "table", "procedure", "method")},
+        "methods": {sensor: settings["method"][sensor] for sensor in SENSORS},
+        "config_sha256": settings["config_sha256"],
         "software": dict(_software()),
     }
 

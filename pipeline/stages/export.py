@@ -1,23 +1,17 @@
-"""Stage export: the calibration in the formats of those who use it."""
+"""Stage export: the calibration in the formats of other tools."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
 from pipeline.exports import export_all
-from pipeline.stages.batch import parse_job, read_json, run_batch
+from pipeline.files import read_json
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from pipeline.stages.batch import Job
 
 
-def main(argv: Sequence[str]) -> int:
-    """Run the stage."""
-    job = parse_job("export", argv, ["calibration", "validate"])
-
-    def work(unit: str, part: dict[str, Any]) -> None:
-        calibration = read_json(job.inputs["calibration"] / f"{unit}.json")
-        validation = read_json(job.inputs["validate"] / f"{unit}.json")
-        export_all(calibration, part, job.output / unit, validation)
-
-    return run_batch(job, work)
+def process_unit(job: Job, unit: str, settings: dict[str, Any]) -> None:
+    """Write every format into the unit's folder."""
+    calibration, validation = (read_json(job.inputs[stage] / f"{unit}.json") for stage in ("calibration", "validate"))
+    export_all(calibration, settings, job.output / unit, validation)

@@ -8,15 +8,13 @@ from __future__ import annotations
 
 import os
 import shutil
-import traceback
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.atomic import flushed_together, write_atomically
 from pipeline.errors import PipelineError
+from pipeline.files import flushed_together, read_json, write_atomically, write_json
 from pipeline.history import of_units, record, unit_state
-from pipeline.publish import PUBLISHED, finish_publishing, publish_all
 from pipeline.report.campaign_page import render
 from pipeline.report.comparison_page import section
 from pipeline.report.comparison_units import unit_figures
@@ -25,7 +23,8 @@ from pipeline.report.fleet_statistics import fleet_statistics, parameters
 from pipeline.report.fleet_table import write_parameters
 from pipeline.report.history_section import runs_data, times_of, with_history
 from pipeline.report.summary import summary_row, write_summary
-from pipeline.stages.batch import FAILED, note_written, parse_job, read_json, write_json
+from pipeline.results_folder import PUBLISHED, finish_publishing, publish_all
+from pipeline.stages.batch import FAILED, failure_of, record_output
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -50,9 +49,8 @@ class Gathered:
     fitted: dict[str, tuple[float, float | None, str]] = field(default_factory=dict)
 
 
-def main(argv: Sequence[str]) -> int:
-    """Run the stage; ``--output`` is the mark that all is published: the list of failures."""
-    job = parse_job("gather", argv, [])
+def process_batch(job: Job) -> None:
+    """Publish all units; the output, the list of failures, is written last."""
     finish_publishing(job.results)
     new = job.results / NEW
     shutil.rmtree(new, ignore_errors=True)
@@ -65,9 +63,8 @@ def main(argv: Sequence[str]) -> int:
         units = {u: _gather_unit(job, job.results / "batches" / batch_of[u], row, new) for u, row in rows.items()}
         _write_campaign(job, units, new)
     publish_all(new, job.results)
-    note_written(job, job.results, PUBLISHED)
+    record_output(job, job.results, PUBLISHED)
     write_json(job.output, [u.failure for u in units.values() if u.failure])
-    return 0
 
 
 def _write_campaign(job: Job, units: Mapping[str, Gathered], new: Path) -> None:
@@ -111,8 +108,7 @@ def _gather_unit(job: Job, batch: Path, sheet_row: dict[str, str], new: Path) ->
     """Publish the files of one unit; one whose files cannot be gathered has failed."""
     try:
         found = _read_unit(job, batch, sheet_row)
-    except Exception as error:  # noqa: BLE001  (one unit never stops the campaign; the traceback is in the log)
-        traceback.print_exc()
+    except Exception as error:  # noqa: BLE001  (one unit never stops the campaign)
         found = _failed_unit(batch, sheet_row, error, new)
     overrides = job.run["overrides"].get(sheet_row["unit"], {})
     found.state = unit_state(found.calibration, found.documents["validate"], found.documents["diagnose"], overrides)
@@ -159,11 +155,7 @@ def _read_unit(job: Job, batch: Path, sheet_row: dict[str, str]) -> Gathered:
 def _failed_unit(batch: Path, sheet_row: dict[str, str], error: Exception, new: Path) -> Gathered:
     """Return a unit that fails here, its page and its document written."""
     unit = sheet_row["unit"]
-    code, message = "internal_error", f"{type(error).__name__}: {error} (a bug; see the log)"
-    file = None
-    if isinstance(error, PipelineError):
-        code, message, file = error.code, error.message, error.file
-    failure = {"unit": unit, "stage": "gather", "code": code, "message": message, "file": file}
+    failure = failure_of(error, unit, "gather")
     keys = ("schema_version", "sensor", "table", "procedure", "method", "config_sha256", "software")
     try:
         known = read_json(batch / "calibration" / f"{unit}.json")

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.config import Campaign, load_campaign
-from pipeline.config.parts import part
+from pipeline.config.stage_settings import select_settings
 from pipeline.errors import ConfigurationError
 
 
@@ -162,10 +162,10 @@ def test_a_stage_sees_its_own_settings_only(tmp_path: Path) -> None:
     same = [
         s
         for s in ("ingest", "filter", "fit", "diagnose", "export")
-        if part(base, s, "gyroscope") == part(changed, s, "gyroscope")
+        if select_settings(base, s, "gyroscope") == select_settings(changed, s, "gyroscope")
     ]
     assert same == ["ingest", "filter", "fit", "diagnose", "export"]
-    assert part(base, "validate") != part(changed, "validate")
+    assert select_settings(base, "validate") != select_settings(changed, "validate")
 
 
 def test_a_campaigns_own_configs_are_options(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.config import load_campaign
-from pipeline.config.parts import config_sha256
+from pipeline.config.stage_settings import config_sha256
 from pipeline.errors import ConfigurationError
 
 

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from pipeline.__main__ import main
 from pipeline.config import Campaign, load_campaign
 from pipeline.config.compose import _parse_with_hydra, parse
-from pipeline.config.parts import in_common, part
+from pipeline.config.stage_settings import in_common, select_settings
 from pipeline.errors import ConfigurationError
-from pipeline.stages.batch import together
+from pipeline.stages.batch import merge_common
 
 SHEET = """unit,serial,lot,sensor,filter,overrides
 U1,S1,L1,mpu6050,,
@@ -56,7 +56,7 @@ def test_sheet_and_device_state_the_mounting(fleet: Path) -> None:
     (fleet / "devices" / "U1.yaml").write_text(
         "overrides:\n- table.sense=-1\n- procedure.recordings.gyro_z.up=-z\n- sensor.gyroscope.axis_map=[+x,-y,-z]\n"
     )
-    found = part(load(fleet).units["U1"].config, "ingest")
+    found = select_settings(load(fleet).units["U1"].config, "ingest")
     assert found["table"]["sense"] == -1
     assert found["procedure"]["recordings"]["gyro_z"]["up"] == "-z"
     assert found["sensor"]["gyroscope"]["axis_map"] == ["+x", "-y", "-z"]
@@ -186,4 +186,4 @@ PART = st.dictionaries(st.sampled_from("abcd"), JSON, max_size=4)
 def test_what_units_have_in_common_is_told_once_and_put_together_again(parts: dict[str, Any]) -> None:
     common, own = in_common(parts)
     told = json.loads(json.dumps({"common": common, "units": own}))
-    assert together(told) == {"units": parts}
+    assert merge_common(told) == {"units": parts}

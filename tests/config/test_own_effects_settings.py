@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from pipeline.config import Campaign, load_campaign
-from pipeline.config.parts import part_file
+from pipeline.config.stage_settings import settings_file
 from pipeline.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def load(bench: Path, **settings: object) -> Campaign:
 
 
 def carried(campaign: Campaign, stage: str, sensor: str = "") -> tuple[list[str], int]:
-    content: dict[str, Any] = json.loads(part_file(campaign, stage, list(campaign.units), sensor).content)
+    content: dict[str, Any] = json.loads(settings_file(campaign, stage, list(campaign.units), sensor).content)
     part = content.get("user_effects", {"formulas": [], "python": []})
     return [d["name"] for d in part["formulas"]], len(part["python"])
 
@@ -89,7 +89,8 @@ def test_a_changed_formula_or_python_file_changes_the_parts_that_hold_it(bench: 
     def parts() -> list[str]:
         found = load(bench, overrides="effects.gyroscope=[bend]", python_effects=[str(bench.parent / "mine.py")])
         return [
-            part_file(found, stage, ["U1"], s).path.name for stage, s in (("effects", "gyroscope"), ("diagnose", ""))
+            settings_file(found, stage, ["U1"], s).path.name
+            for stage, s in (("effects", "gyroscope"), ("diagnose", ""))
         ]
 
     before = parts()

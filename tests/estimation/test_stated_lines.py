@@ -14,8 +14,8 @@ from pipeline.estimation.gyroscope import reference_least_squares
 from pipeline.estimation.stated import with_stated
 from pipeline.io.parquet import save_recordings
 from pipeline.records import FittedEffect
-from pipeline.stages import fit as fit_stage
-from pipeline.stages.noises import save_noises
+from pipeline.stages import batch
+from pipeline.stages.unit_files import save_noises
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -113,7 +113,7 @@ def test_a_chain_of_stages_counts_what_is_stated_once(tmp_path: Path) -> None:
     for stage, previous, last in zip(stages, ["", str(stages[0])], ["no", "yes"], strict=True):
         chosen = ["--sensor", "gyroscope", "--stage", stage.name, "--previous", previous, "--last", last]
         folders = ["--config", str(tmp_path / "part.json"), "--filter", str(filtered), "--output", str(stage)]
-        fit_stage.main([*folders, *chosen])
+        batch.main("fit", [*folders, *chosen])
     first, last_one = (json.loads((stage / "U.json").read_text()) for stage in stages)
     u = [np.sqrt(np.diag(np.array(found["covariance"]["values"])))[:3] for found in (first, last_one)]
     assert u[0].max() < 0.005  # the bias of the rest, without what is stated

@@ -7,7 +7,7 @@ from hand_session import hand_held
 
 from pipeline.config.compose import Composer
 from pipeline.io.parquet import save_recordings
-from pipeline.stages import report
+from pipeline.stages import batch
 
 
 def test_a_unit_that_fails_in_the_fit_shows_its_files_and_rests(tmp_path: Path) -> None:
@@ -21,7 +21,7 @@ def test_a_unit_that_fails_in_the_fit_shows_its_files_and_rests(tmp_path: Path) 
     failure = {"unit": "U1", "stage": "fit/accelerometer", "code": "not_observable", "message": "alike", "file": None}
     (folders["calibration"] / "U1.failed.json").write_text(json.dumps(failure))
     arguments = [word for name, folder in folders.items() for word in (f"--{name}", str(folder))]
-    report.main(["--config", str(tmp_path / "part.json"), *arguments, "--output", str(tmp_path / "report")])
+    batch.main("report", ["--config", str(tmp_path / "part.json"), *arguments, "--output", str(tmp_path / "report")])
     document = json.loads((tmp_path / "report" / "U1.calibration.json").read_text())
     assert [i["recording"] for i in document["inputs"]] == ["recording"]
     used, held = (document["rests"][f"rests_{use}"] for use in ("used", "held_out"))

@@ -10,7 +10,7 @@ from bench_session import Session, record
 from pipeline.config.compose import Composer
 from pipeline.io.parquet import save_recordings
 from pipeline.records import SENSORS, SensorCalibration
-from pipeline.stages import calibration
+from pipeline.stages import batch
 
 HARM = "the calibration makes held-out motion worse"
 
@@ -30,7 +30,9 @@ def documents(folder: Path, harmed: list[str], absent: list[str], *, as_printed:
     said = {s: None if s in absent else {"worse_than_raw": HARM if s in harmed else None} for s in SENSORS}
     (folders["validate"] / "U1.json").write_text(json.dumps(said))
     given = [word for name, each in folders.items() for word in (f"--{name}", str(each))]
-    assert calibration.main(["--config", str(folder / "part.json"), *given, "--output", str(folder / "out")]) == 0
+    assert (
+        batch.main("calibration", ["--config", str(folder / "part.json"), *given, "--output", str(folder / "out")]) == 0
+    )
     return {file.name: json.loads(file.read_text()) for file in (folder / "out").iterdir()}
 
 

@@ -4,14 +4,14 @@ import csv
 import json
 import shutil
 from collections.abc import Callable
-from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from pipeline import publish
-from pipeline.config import load_campaign, part_file
+from pipeline import results_folder
+from pipeline.config import load_campaign, settings_file
 from pipeline.config.campaign import Campaign
 from pipeline.stages import batch, gather
 from pipeline.stages import report as report_stage
@@ -28,10 +28,10 @@ def run_stages(campaign: Campaign) -> None:
     fits = {sensor: f"fit/{sensor}/{stages[-1]}" for sensor, stages in campaign.chains[name].items()}
 
     def stage(module: str, output: str, inputs: dict[str, str], *more: str, sensor: str = "") -> None:
-        part = part_file(campaign, module if module != "fit" else "fit-x", units, sensor).write()
+        part = settings_file(campaign, module if module != "fit" else "fit-x", units, sensor).write()
         given = [word for i, of in inputs.items() for word in (f"--{i}", str(folder / of))]
         arguments = ["--config", part, *given, *more, "--output", str(folder / output)]
-        assert import_module(f"pipeline.stages.{module}").main(arguments) == 0
+        assert batch.main(module, arguments) == 0
 
     stage("ingest", "ingest", {})
     stage("filter", "filter", {"ingest": "ingest"})
@@ -58,12 +58,12 @@ def published(tmp_path_factory: pytest.TempPathFactory, simulated: Path) -> tupl
     campaign = load_campaign({"campaign": str(directory), "results": str(directory.parent / "results")})
     run_unit, read_unit, render = batch._run_unit, gather._read_unit, report_stage.render
 
-    def faulty(job: batch.Job, unit: str, part: dict[str, Any], work: Callable[[str, dict[str, Any]], None]) -> None:
-        def fails(unit: str, part: dict[str, Any]) -> None:
-            work(unit, part)
+    def faulty(module: Any, job: batch.Job, unit: str, settings: dict[str, Any]) -> None:
+        def fails(job: batch.Job, unit: str, settings: dict[str, Any]) -> None:
+            module.process_unit(job, unit, settings)
             raise MemoryError(f"no room for {unit}") if job.stage == "export" else RuntimeError(f"fault at {unit}")
 
-        run_unit(job, unit, part, fails if unit == f"at_{job.stage}" else work)
+        run_unit(SimpleNamespace(process_unit=fails) if unit == f"at_{job.stage}" else module, job, unit, settings)
 
     def faulty_gather(job: batch.Job, folder: Path, row: dict[str, str]) -> gather.Gathered:
         if row["unit"] == "at_gather":
@@ -108,7 +108,7 @@ def test_a_fault_in_any_stage_fails_its_unit_alone(published: tuple[Campaign, Pa
 
 def contents(results: Path) -> dict[str, bytes]:
     """Return every published file."""
-    files = [results / name for name in publish.PUBLISHED if "." in name]
+    files = [results / name for name in results_folder.PUBLISHED if "." in name]
     files += [f for folder in FOLDERS for f in (results / folder).rglob("*") if f.is_file()]
     return {str(f.relative_to(results)): f.read_bytes() for f in files}
 
@@ -117,7 +117,7 @@ def test_the_published_files_are_those_of_one_run_wherever_it_is_stopped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def make(name: str, folder: Path) -> None:
-        for published in publish.PUBLISHED:
+        for published in results_folder.PUBLISHED:
             path = folder / published / "U1.json" if "." not in published else folder / published
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(f"{name} {published}")
@@ -141,23 +141,23 @@ def test_the_published_files_are_those_of_one_run_wherever_it_is_stopped(
             return step
 
         with monkeypatch.context() as patch:
-            patch.setattr(publish, "exchange", stopping(publish.exchange))
+            patch.setattr(results_folder, "exchange", stopping(results_folder.exchange))
             patch.setattr(Path, "rename", stopping(Path.rename))
             patch.setattr(Path, "unlink", stopping(Path.unlink))
             try:
-                publish.publish_all(results / ".new", results)
+                results_folder.publish_all(results / ".new", results)
                 break
             except StoppedError:
                 pass
         now = contents(results)
         assert now.keys() == old.keys()
         assert all(now[k] in (old[k], new[k]) for k in now)
-        begun = (results / publish.COMPLETE).exists()
-        publish.finish_publishing(results)
+        begun = (results / results_folder.COMPLETE).exists()
+        results_folder.finish_publishing(results)
         assert contents(results) == (new if begun else old)
-        assert not (results / publish.COMPLETE).exists()
+        assert not (results / results_folder.COMPLETE).exists()
     assert contents(results) == new
-    assert stop > len(publish.PUBLISHED)
+    assert stop > len(results_folder.PUBLISHED)
 
 
 def test_what_a_killed_gather_leaves_is_the_old_set(published: tuple[Campaign, Path]) -> None:
@@ -174,5 +174,5 @@ def test_what_a_killed_gather_leaves_is_the_old_set(published: tuple[Campaign, P
 
 
 def run_gather(campaign: Campaign) -> None:
-    part = part_file(campaign, "gather", list(campaign.units)).write()
-    gather.main(["--config", part, "--output", str(campaign.results / "batches" / "gathered.json")])
+    part = settings_file(campaign, "gather", list(campaign.units)).write()
+    batch.main("gather", ["--config", part, "--output", str(campaign.results / "batches" / "gathered.json")])

@@ -10,7 +10,7 @@ rule calibration:
     log:
         f"{LOG}/calibration.log",
     params:
-        config=part("calibration"),
+        config=settings_of("calibration"),
         code=code_digest("pipeline.stages.calibration"),
     shell:
         "{RUN} calibration --config {params.config:q} --ingest {input.ingest:q} --accelerometer {input.accelerometer:q}"

@@ -1,4 +1,4 @@
-# The campaign, resolved and checked before any job; and what every rule has in common.
+# The campaign, resolved and checked before any job; and what every rule uses.
 import atexit
 import gc
 import hashlib
@@ -10,21 +10,22 @@ import time
 from pathlib import Path
 
 from snakemake.exceptions import WorkflowError
+from snakemake.logging import logger
 from snakemake.settings.types import Quietness
 
-sys.path.insert(0, workflow.basedir)
-# Jobs run this copy of the package, from any working directory, and find what the user's own path holds.
-os.environ["PYTHONPATH"] = os.pathsep.join(
-    filter(None, [workflow.basedir, os.environ.get("PYTHONPATH")])
-)
+if Path(workflow.basedir, "pipeline").is_dir():
+    # A clone: jobs run this copy of the package from any working directory, and keep the user's own path.
+    sys.path.insert(0, workflow.basedir)
+    os.environ["PYTHONPATH"] = os.pathsep.join(
+        filter(None, [workflow.basedir, os.environ.get("PYTHONPATH")])
+    )
 
-from pipeline.config import code_digest, load_campaign, part_file
+from pipeline.config import code_digest, load_campaign, settings_file
 from pipeline.errors import PipelineError
 from pipeline.io.files import recording_files
 from pipeline.outcome import outcome
-from pipeline.publish import finish_publishing
-from pipeline.run_watch import Watch
-from pipeline.written import times_again
+from pipeline.results_folder import finish_publishing, repetitions
+from pipeline.run_progress import Monitor
 
 try:
     CAMPAIGN = load_campaign(config)
@@ -54,20 +55,19 @@ BATCH = f"{RESULTS}/batches/{{batch}}"
 LOG = f"{RESULTS}/logs/{{batch}}"
 SENSORS = ["accelerometer", "gyroscope"]
 STARTED = time.time()
-WAITING = {}  # parts of the configuration: written where jobs are run, not in a dry run
-AGAIN = (
-    {}
-)  # output to how often it has been made again, because files of it were changed or deleted
-CHANGED = []  # those files and folders
+WAITING = {}  # settings files, written when jobs are run, not in a dry run
+AGAIN = {}  # output to how often it has been repeated because files of it were edited
+EDITED = []  # those files and folders
 RUNNING = not workflow.is_main_process
 if RUNNING:
     # A job group on another machine: the main process has looked at the files before any job.
     seen = Path(RESULTS, "configs", "again.json")
     AGAIN = json.loads(seen.read_text()) if seen.is_file() else {}
 else:
-    WATCH = Watch(
-        str(CAMPAIGN.results),
+    MONITOR = Monitor(
+        CAMPAIGN.results,
         {batch: len(units) for batch, units in CAMPAIGN.batches.items()},
+        logger,
     )
 
 
@@ -77,21 +77,21 @@ wildcard_constraints:
     stage="[a-z0-9_]+",
 
 
-def part(stage):
-    """Return the function of a rule's params that names the stage's part of the configuration."""
-    return lambda wildcards: name_part(
+def settings_of(stage):
+    """Return the function of a rule's params that names the settings file of the stage."""
+    return lambda wildcards: settings_path(
         stage,
         CAMPAIGN.batches[wildcards.batch],
         f"batches/{wildcards.batch}/{stage}",
     )
 
 
-def name_part(stage, units, output, sensor=""):
-    """Return the path of a stage's part of the configuration, which is there once jobs are run."""
+def settings_path(stage, units, output, sensor=""):
+    """Return the path of a stage's settings file; it exists once jobs are run."""
     if output not in AGAIN and not RUNNING:
-        AGAIN[output], changed = times_again(Path(RESULTS), output)
-        CHANGED.extend(changed)
-    file = part_file(CAMPAIGN, stage, units, sensor, AGAIN.get(output, 0))
+        AGAIN[output], edited = repetitions(Path(RESULTS), output)
+        EDITED.extend(edited)
+    file = settings_file(CAMPAIGN, stage, units, sensor, AGAIN.get(output, 0))
     path = f"{RESULTS}/configs/{file.path.name}"
     if RUNNING:
         file.write()
@@ -101,22 +101,22 @@ def name_part(stage, units, output, sensor=""):
 
 
 def begin_run():
-    """Hold the results, begin to tell how far the run is, and write what jobs read of the configuration."""
+    """Hold the results, start to print the progress, and write the settings files of the jobs."""
     global RUNNING
     if RUNNING:
         return
-    told = workflow.output_settings
-    silent = {Quietness.ALL, Quietness.PROGRESS} & set(told.quiet or ())
+    output = workflow.output_settings
+    silent = {Quietness.ALL, Quietness.PROGRESS} & set(output.quiet or ())
     try:
-        WATCH.begin(
+        MONITOR.begin(
             quiet=bool(silent),
-            plain=told.verbose or told.printshellcmds,
+            plain=output.verbose or output.printshellcmds,
         )
         RUNNING = True
         finish_publishing(CAMPAIGN.results)
         for file in WAITING.values():
             file.write()
-        WATCH.tell_changed(CHANGED)
+        MONITOR.print_edited(EDITED)
         Path(RESULTS, "configs", "again.json").write_text(json.dumps(AGAIN))
     except PipelineError as error:
         raise WorkflowError(str(error)) from None
@@ -137,9 +137,9 @@ def of_batches(stage):
     return [f"{RESULTS}/batches/{batch}/{stage}" for batch in CAMPAIGN.batches]
 
 
-def say_at_the_end(text):
-    """Print after Snakemake's own last words."""
-    WATCH.ended.set()
+def print_at_the_end(text):
+    """Print after Snakemake's last message."""
+    MONITOR.ended.set()
     atexit.register(print, f"\n{text}", file=sys.stderr, end="")
 
 
@@ -148,31 +148,31 @@ def written_in_this_run(path):
     return os.path.exists(path) and os.path.getmtime(path) >= STARTED - 1
 
 
-def say_outcome(failures=""):
-    """Say at the very end of the terminal output what was found, how to continue, and which units have failed."""
+def print_outcome(failures=""):
+    """Print at the end of the terminal output what was found, how to continue, and which units have failed."""
     if not os.path.exists(f"{RESULTS}/summary.csv"):
         return
     try:
         recorded = max(Path(RESULTS, "history").glob("*.json"), default="")
-        told = outcome(
+        text = outcome(
             CAMPAIGN.results,
             CAMPAIGN.run_settings(),
             of_this_run=written_in_this_run(recorded),
         )
     except (OSError, PipelineError) as error:
-        told = f"the results cannot be summed up: {error}\n"
-    say_at_the_end(told + failures)
+        text = f"the results cannot be summed up: {error}\n"
+    print_at_the_end(text + failures)
 
 
-def say_verdict():
-    """Say what was found where units have failed; a run that broke before its end has no outcome."""
+def print_verdict():
+    """Print what was found where units have failed; a run that stopped before its end has no outcome."""
     log = f"{RESULTS}/logs/verdict.log"
     if written_in_this_run(log):
         with open(log) as stream:
-            say_outcome(stream.read())
+            print_outcome(stream.read())
 
 
 if not RUNNING:
-    WATCH.idle = (
-        say_outcome  # where there is nothing to be done, Snakemake calls no handler
+    MONITOR.nothing_to_do = (
+        print_outcome  # Snakemake calls no handler where nothing is to be done
     )

@@ -10,7 +10,7 @@ rule diagnose:
     log:
         f"{LOG}/diagnose.log",
     params:
-        config=part("diagnose"),
+        config=settings_of("diagnose"),
         code=code_digest("pipeline.stages.diagnose"),
     shell:
         "{RUN} diagnose --config {params.config:q} --filter {input.filter:q} --accelerometer {input.accelerometer:q}"

@@ -8,7 +8,7 @@ rule export:
     log:
         f"{LOG}/export.log",
     params:
-        config=part("export"),
+        config=settings_of("export"),
         code=code_digest("pipeline.stages.export"),
     shell:
         "{RUN} export --config {params.config:q} --calibration {input.calibration:q} --validate {input.validate:q}"

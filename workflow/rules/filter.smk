@@ -7,7 +7,7 @@ rule filter:
     log:
         f"{LOG}/filter.log",
     params:
-        config=part("filter"),
+        config=settings_of("filter"),
         code=code_digest("pipeline.stages.filter"),
     shell:
         "{RUN} filter --config {params.config:q} --ingest {input.ingest:q} --output {output:q} > {log:q} 2>&1"

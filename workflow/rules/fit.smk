@@ -5,10 +5,10 @@ def stage_before(wildcards):
     return f"{BATCH}/fit/{{sensor}}/{chain[i - 1]}".format(**wildcards) if i else []
 
 
-def part_of_fit(wildcards):
+def settings_of_fit(wildcards):
     stage = "effects" if wildcards.stage == "effects" else f"fit-{wildcards.stage}"
     output = "batches/{batch}/fit/{sensor}/{stage}".format(**wildcards)
-    return name_part(stage, CAMPAIGN.batches[wildcards.batch], output, wildcards.sensor)
+    return settings_path(stage, CAMPAIGN.batches[wildcards.batch], output, wildcards.sensor)
 
 
 def code_of_fit(wildcards):
@@ -33,7 +33,7 @@ rule fit:
     log:
         f"{LOG}/fit-{{sensor}}-{{stage}}.log",
     params:
-        config=part_of_fit,
+        config=settings_of_fit,
         code=code_of_fit,
         last=is_last_stage,
     shell:

@@ -1,7 +1,7 @@
 # Every unit's files under their stable paths, the summary and the campaign page; `snakemake --report` shows the pages.
 #
 # The published files are no output of the rule: Snakemake would delete them before the job, and when it fails. The stage
-# replaces them by a complete new set; what is changed or deleted by hand is found by `pipeline.written`.
+# replaces them by a complete new set; what is changed or deleted by hand is found by `pipeline.results_folder`.
 rule gather:
     input:
         of_batches("report"),
@@ -11,7 +11,7 @@ rule gather:
     log:
         f"{RESULTS}/logs/gather.log",
     params:
-        config=lambda wildcards: name_part("gather", list(CAMPAIGN.units), ""),
+        config=lambda wildcards: settings_path("gather", list(CAMPAIGN.units), ""),
         code=code_digest("pipeline.stages.gather"),
     shell:
         "{RUN} gather --config {params.config:q} --output {output:q} > {log:q} 2>&1"

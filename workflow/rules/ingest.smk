@@ -23,7 +23,7 @@ rule ingest:
     log:
         f"{LOG}/ingest.log",
     params:
-        config=part("ingest"),
+        config=settings_of("ingest"),
         recordings=recordings,
         code=code_digest("pipeline.stages.ingest"),
     shell:

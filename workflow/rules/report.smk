@@ -11,7 +11,7 @@ rule report:
     log:
         f"{LOG}/report.log",
     params:
-        config=part("report"),
+        config=settings_of("report"),
         code=code_digest("pipeline.stages.report"),
     shell:
         "{RUN} report --config {params.config:q} --filter {input.filter:q} --calibration {input.calibration:q}"

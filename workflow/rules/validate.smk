@@ -9,7 +9,7 @@ rule validate:
     log:
         f"{LOG}/validate.log",
     params:
-        config=part("validate"),
+        config=settings_of("validate"),
         code=code_digest("pipeline.stages.validate"),
     shell:
         "{RUN} validate --config {params.config:q} --filter {input.filter:q} --accelerometer {input.accelerometer:q}"

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
-from pipeline.atomic import write_atomically
 from pipeline.config.user_effects import effects_for
+from pipeline.files import write_atomically
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -125,7 +125,7 @@ def config_sha256(config: Mapping[str, Any]) -> str:
     return hashlib.sha256(_canonical({k: v for k, v in config.items() if k != "certificate"})).hexdigest()
 
 
-def part(config: Mapping[str, Any], stage: str, sensor: str = "") -> dict[str, Any]:
+def select_settings(config: Mapping[str, Any], stage: str, sensor: str = "") -> dict[str, Any]:
     """Return what a stage reads of a unit's configuration.
 
     Parameters
@@ -155,7 +155,7 @@ def _paths(stage: str, sensor: str) -> list[list[str]]:
 
 
 @dataclass(frozen=True)
-class PartFile:
+class SettingsFile:
     """A stage's part of the configuration of some units, as a file that is named after its content."""
 
     path: Path
@@ -168,7 +168,9 @@ class PartFile:
         return str(self.path)
 
 
-def part_file(campaign: Campaign, stage: str, units: Sequence[str], sensor: str = "", again: int = 0) -> PartFile:
+def settings_file(
+    campaign: Campaign, stage: str, units: Sequence[str], sensor: str = "", again: int = 0
+) -> SettingsFile:
     """Return a stage's part of the configuration of some units.
 
     Parameters
@@ -180,14 +182,14 @@ def part_file(campaign: Campaign, stage: str, units: Sequence[str], sensor: str 
     sensor : str
         The sensor of a stage of a fit.
     again : int
-        How often the job is repeated because what it wrote has been changed (``pipeline.written``).
+        How often the job is repeated because what it wrote has been changed (``pipeline.results_folder``).
     """
     if stage == "gather":
         content = _of_gather(campaign)
     else:
         rows = [campaign.units[u] for u in units]
         digests = [{"config_sha256": r.config_sha256} if stage in WITH_DIGEST else {} for r in rows]
-        parts = {r.name: part(r.config | d, stage, sensor) for r, d in zip(rows, digests, strict=True)}
+        parts = {r.name: select_settings(r.config | d, stage, sensor) for r, d in zip(rows, digests, strict=True)}
         if stage == "report":
             for unit, each in parts.items():
                 row = campaign.units[unit].row
@@ -204,13 +206,13 @@ def part_file(campaign: Campaign, stage: str, units: Sequence[str], sensor: str 
     text = _canonical(content)
     name = f"{stage}-{sensor}" if sensor else stage
     path = campaign.results / "configs" / f"{name}-{hashlib.sha256(text).hexdigest()[:16]}.json"
-    return PartFile(path, text)
+    return SettingsFile(path, text)
 
 
 def in_common(parts: Mapping[str, dict[str, Any]]) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
     """Split the parts of units in what all of them have, and what each has beside it.
 
-    ``pipeline.stages.batch.together`` puts them together again.
+    ``pipeline.stages.batch.merge_common`` puts them together again.
     """
     if len(parts) < 2:
         return {}, dict(parts)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from snakemake.cli import parse_config
 
-from pipeline.command_lines import add_command, once_command, run_command
+from pipeline.outcome import add_command, once_command, run_command
 
 TEXT = st.text(
     st.characters(codec="utf-8", exclude_characters="\0\n\r\x85\u2028\u2029", exclude_categories=("Cc", "Cs"))

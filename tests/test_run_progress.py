@@ -5,10 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline import locks
-from pipeline.locks import BusyError, hold_as_job, jobs_at_work, take_run
-from pipeline.progress import Progress, duration
-from pipeline.run_watch import _cause
+from pipeline import results_folder
+from pipeline.results_folder import BusyError, hold_as_job, jobs_at_work, take_run
+from pipeline.run_progress import Progress, _cause, duration
 
 
 def test_the_line_names_the_unit_at_work_the_units_done_and_the_time_left(tmp_path: Path) -> None:
@@ -61,16 +60,16 @@ def test_the_cause_of_a_broken_job_is_the_end_of_its_log(tmp_path: Path, log: st
 
 
 def test_results_are_held_by_one_run_and_jobs_are_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(locks, "HELD", [])
+    monkeypatch.setattr(results_folder, "HELD", [])
     take_run(tmp_path)
     with pytest.raises(BusyError, match=r"another run works on these results \(process [0-9]+ on"):
         take_run(tmp_path)
     assert not jobs_at_work(tmp_path)
     hold_as_job(tmp_path)
     assert jobs_at_work(tmp_path)
-    for stream in locks.HELD:
+    for stream in results_folder.HELD:
         stream.close()
     assert not jobs_at_work(tmp_path)
-    locks.HELD.clear()
+    results_folder.HELD.clear()
     take_run(tmp_path)
-    locks.HELD[0].close()
+    results_folder.HELD[0].close()

@@ -1,28 +1,34 @@
-"""The noise of a unit's sensors, found by the stage filter and read by those after it."""
+"""Files of a unit that several stages read: the fit of each sensor and its noise."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from pipeline.records import SENSORS, Noise
+from pipeline.files import read_json, write_json
+from pipeline.records import SENSORS, Noise, SensorCalibration
 from pipeline.signal.noise import estimate_noise, noise_of
-from pipeline.stages.batch import read_json, write_json
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-    from pipeline.records import Recording, SensorCalibration
+    from pipeline.records import Recording
+
+
+def load_fits(folders: Mapping[str, Path], unit: str) -> dict[str, SensorCalibration | None]:
+    """Return each sensor's calibration, None for one that could not be calibrated."""
+    found = {sensor: read_json(folders[sensor] / f"{unit}.json") for sensor in SENSORS}
+    return {s: None if "not_calibrated" in data else SensorCalibration.from_json(s, data) for s, data in found.items()}
 
 
 def save_noises(folder: Path, unit: str, recordings: list[Recording], settings: dict[str, Any]) -> None:
-    """Estimate and write the noise of each sensor, null where nothing tells it."""
+    """Estimate and write the noise of each sensor, null where neither recordings nor data sheet determine it."""
     found = {sensor: noise_of(sensor, recordings, settings) for sensor in SENSORS}
     write_json(folder / f"{unit}.noise.json", {sensor: noise and noise.to_json() for sensor, noise in found.items()})
 
 
 def load_noises(folder: Path, unit: str) -> dict[str, Noise | None]:
-    """Read the noise of each sensor, None where nothing tells it."""
+    """Read the noise of each sensor, as ``save_noises`` wrote it."""
     found = read_json(folder / f"{unit}.noise.json")
     return {sensor: data and Noise.from_json(data) for sensor, data in found.items()}
 
@@ -34,12 +40,12 @@ def require_noises(
     sheets: dict[str, dict[str, Any]],
     fits: Mapping[str, SensorCalibration | None],
 ) -> dict[str, Noise]:
-    """Read the noise of each sensor that is calibrated.
+    """Read the noise of each calibrated sensor.
 
     Raises
     ------
     ConfigurationError
-        If nothing tells it; what is lacking is found by looking once more.
+        If nothing determines it; ``estimate_noise`` names what is missing.
     """
     found = load_noises(folder, unit)
     return {s: found[s] or estimate_noise(s, recordings, sheets[s]) for s, fit in fits.items() if fit is not None}

@@ -1,0 +1,114 @@
+"""Files that are complete or absent, however a run ends; JSON documents; and where the shipped files are.
+
+A file is written under a temporary name and then renamed. ``fsync`` makes it survive a power failure; it takes some
+milliseconds, so a job that writes many files flushes them together at its end.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.errors import DamagedFileError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+_PACKAGE = Path(__file__).resolve().parent
+SHIPPED = _PACKAGE / "shipped" if (_PACKAGE / "shipped").is_dir() else _PACKAGE.parent  # of a wheel, of a clone
+CONFIGS = SHIPPED / "configs"
+_flushed_at_end: list[Path] = []  # folders whose files are flushed together
+
+
+def write_atomically(path: Path, content: str | bytes) -> None:
+    """Write a file under a temporary name in its folder, flush it to the disk, then rename it.
+
+    Parameters
+    ----------
+    path : Path
+        Its folder is created if it does not exist.
+    content : str or bytes
+        Text is written as UTF-8; line ends are not changed.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        stream = temporary.open("wb")
+    except FileNotFoundError:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        stream = temporary.open("wb")
+    with stream:
+        stream.write(content.encode() if isinstance(content, str) else content)
+        if not _flushed_at_end:
+            stream.flush()
+            os.fsync(stream.fileno())
+    temporary.replace(path)
+
+
+def read_json(path: Path) -> Any:  # noqa: ANN401  (any JSON value)
+    """Read a JSON file that an earlier stage of a run wrote.
+
+    Raises
+    ------
+    DamagedFileError
+        If it does not exist or is not JSON.
+    """
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        reason = f"cannot be read, it is missing or damaged ({error}); the same command once more makes it again"
+        raise DamagedFileError(reason, str(path)) from None
+
+
+def json_text(value: Any) -> str:  # noqa: ANN401
+    """Return a value as JSON with indents; raises ``ValueError`` for a number that is not finite."""
+    return json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False)
+
+
+def write_json(path: Path, value: Any) -> None:  # noqa: ANN401
+    """Write a JSON file atomically, as ``json_text`` formats it."""
+    write_atomically(path, json_text(value) + "\n")
+
+
+def exchange(one: Path, other: Path) -> None:
+    """Exchange two files or folders of one file system in one step, so that both names always exist.
+
+    Where the system has no such step (``renameat2`` is Linux's), three renames do it.
+    """
+    at_cwd, rename_exchange = -100, 2  # AT_FDCWD of fcntl.h, RENAME_EXCHANGE of linux/fs.h
+    system = ctypes.CDLL(None, use_errno=True)
+    names = os.fsencode(one), os.fsencode(other)
+    if not hasattr(system, "renameat2") or system.renameat2(at_cwd, names[0], at_cwd, names[1], rename_exchange) != 0:
+        between = one.with_name(f".{one.name}.{os.getpid()}.tmp")
+        other.rename(between)
+        one.rename(other)
+        between.rename(one)
+
+
+@contextmanager
+def flushed_together(folder: Path) -> Iterator[None]:
+    """Flush the files written within the block together at its end; they lie on the file system of the folder."""
+    _flushed_at_end.append(folder)
+    try:
+        yield
+    finally:
+        _flushed_at_end.pop()
+    flush_file_system(folder)
+
+
+def flush_file_system(folder: Path) -> None:
+    """Write to the disk what the system buffers for the file system of a folder; raises ``OSError`` on failure."""
+    system = ctypes.CDLL(None, use_errno=True)
+    if not hasattr(system, "syncfs"):  # not Linux
+        os.sync()
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        if system.syncfs(descriptor) != 0:
+            number = ctypes.get_errno()
+            raise OSError(number, os.strerror(number), str(folder))
+    finally:
+        os.close(descriptor)

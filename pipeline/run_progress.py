@@ -1,0 +1,293 @@
+"""What the terminal shows of a run beside Snakemake's log: progress, time left, failed jobs, the command that recovers.
+
+    time left = sum over stages of (units left * seconds a unit) / jobs at a time
+
+where
+
+    seconds a unit : mean of the stage's jobs in this run so far; for a stage that has not run yet ``COST``, scaled by
+                     the ratio of measured times to ``COST`` of the other stages
+    jobs at a time : seconds that jobs have worked / seconds since the first was started
+
+A job handles a batch of units and writes to its log which one it is at: ``stage: unit (3 of 50)``.
+
+On a terminal one line is redrawn each second in place of Snakemake's blocks for each job (``--printshellcmds`` and
+``--verbose`` keep those, and Snakemake's log file always has them). Elsewhere a line is printed each half minute, with
+``--quiet`` none.
+"""
+
+from __future__ import annotations
+
+import atexit
+import logging
+import os
+import re
+import shlex
+import sys
+import threading
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, TextIO
+
+from pipeline.results_folder import jobs_at_work, take_run
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+COST = {"ingest": 2.0, "diagnose": 4.0, "report": 2.0}  # relative to the other stages, by benchmarks/fleet.py
+PER_BATCH = ("ingest", "filter", "fit", "validate", "diagnose", "calibration", "export", "report")
+AT_UNIT = re.compile(r"^[\w-]+: (\S+) \((\d+) of (\d+)\)$", re.MULTILINE)
+LAST_STAGE = "report"  # its units are counted as done
+NAMED_JOBS = 2
+INTERVAL = {True: 1.0, False: 30.0}  # s between lines, by whether it is a terminal
+CLEAR_LINE = "\r\x1b[K"
+BLOCKS = ("JOB_INFO", "JOB_STARTED", "JOB_FINISHED", "PROGRESS", "SHELLCMD", "RUN_INFO", "RESOURCES_INFO", "GROUP_INFO")
+SCHEDULER_MESSAGES = ("Select jobs to execute", "Execute ")
+REFUSALS = ("LockException", "ProtectedOutputException")  # of Snakemake, before any job
+INTERRUPTED = ("Terminating processes on user request", "Shutting down, this might take")  # Ctrl-C; SIGTERM
+
+
+@dataclass
+class Job:
+    """A job of Snakemake: rule, displayed name, number of units, log, and start time in s."""
+
+    rule: str
+    name: str
+    units: int
+    log: Path
+    since: float
+
+    def at(self) -> tuple[str, int] | None:
+        """Return the unit that the job is at, and its number; None before the first."""
+        try:
+            with self.log.open("rb") as stream:
+                stream.seek(max(os.fstat(stream.fileno()).st_size - 2000, 0))
+                found = AT_UNIT.findall(stream.read().decode(errors="replace"))
+            of_this_job = self.log.stat().st_mtime >= self.since - 1.0
+        except OSError:
+            return None
+        return (found[-1][0], int(found[-1][1])) if found and of_this_job else None
+
+
+@dataclass
+class Progress:
+    """The jobs of a run.
+
+    Attributes
+    ----------
+    batches : mapping of str to int
+        Batch to its number of units.
+    wanted : dict of str to int
+        Rule to the number of its jobs in this run.
+    running, done : dict of int to Job, list of Job
+    seconds : dict of str to list of float
+        Rule to seconds a unit of each job that is done.
+    """
+
+    batches: Mapping[str, int]
+    wanted: dict[str, int] = field(default_factory=dict)
+    running: dict[int, Job] = field(default_factory=dict)
+    done: list[Job] = field(default_factory=list)
+    seconds: dict[str, list[float]] = field(default_factory=dict)
+    worked: float = 0.0
+    started: float = 0.0
+
+    def start(self, number: int, rule: str, wildcards: Mapping[str, str], log: Path) -> None:
+        """Note that a job has been started."""
+        self.started = self.started or time.monotonic()
+        name = " ".join([rule, *(wildcards[w] for w in ("sensor", "stage") if w in wildcards)]).replace("_", " ")
+        self.running[number] = Job(rule, name, self.batches.get(wildcards.get("batch", ""), 1), log, time.time())
+
+    def finish(self, number: int, *, failed: bool = False) -> None:
+        """Note that a job has ended."""
+        job = self.running.pop(number, None)
+        if job is None:
+            return
+        seconds = time.time() - job.since
+        self.worked += seconds
+        if not failed:
+            self.done.append(job)
+            self.seconds.setdefault(job.rule, []).append(seconds / job.units)
+
+    def text(self) -> str:
+        """Return the state of the run in one line."""
+        at = {number: job.at() for number, job in list(self.running.items())}
+        units_done = sum(job.units for job in self.done if job.rule == LAST_STAGE)
+        units = round(self.wanted.get(LAST_STAGE, 0) * self._mean_batch())
+        parts = [f"{len(self.done)} of {sum(self.wanted.values())} jobs"]
+        parts += [f"{units_done} of {units} units done"] * bool(units)
+        known = [(self.running[n], where) for n, where in at.items() if where and n in self.running]
+        for job, (unit, number) in sorted(known, key=lambda k: -k[0].since)[:NAMED_JOBS]:
+            parts.append(f"{job.name}: {unit} ({number} of {job.units})")
+        left = self.seconds_left(at)
+        return " | ".join([*parts, *([f"about {duration(left)} left"] if left else [])])
+
+    def seconds_left(self, at: Mapping[int, tuple[str, int] | None]) -> float | None:
+        """Return the time that the rest will take, s; None until two jobs are done."""
+        mean = {rule: sum(values) / len(values) for rule, values in self.seconds.items() if rule in self.wanted}
+        if sum(len(v) for v in self.seconds.values()) < 2:
+            return None
+        scale = sum(mean.values()) / sum(COST.get(rule, 1.0) for rule in mean)
+        left = 0.0
+        for rule, jobs in self.wanted.items():
+            done = sum(job.units for job in self.done if job.rule == rule)
+            begun = sum(w[1] - 1 for n, w in at.items() if w and n in self.running and self.running[n].rule == rule)
+            size = self._mean_batch() if rule in PER_BATCH or jobs > 1 else 1.0
+            left += max(jobs * size - done - begun, 0.0) * mean.get(rule, scale * COST.get(rule, 1.0))
+        working = sum(time.time() - job.since for job in self.running.values())
+        jobs_at_a_time = (self.worked + working) / max(time.monotonic() - self.started, 1e-3)
+        return left / max(jobs_at_a_time, 1.0)
+
+    def _mean_batch(self) -> float:
+        return sum(self.batches.values()) / max(len(self.batches), 1)
+
+
+def duration(seconds: float) -> str:
+    """Return a duration, rounded as it is read."""
+    if seconds < 90:
+        return f"{max(5 * round(seconds / 5), 5)} s"
+    if seconds < 5400:
+        return f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.1f} h"
+
+
+class Monitor(logging.Handler):
+    """Follows the log records of Snakemake and prints the progress of a run.
+
+    Snakemake's interface for logger plugins is not used: it needs a top-level package of its own, which Snakemake does
+    not find in an editable installation.
+
+    Parameters
+    ----------
+    results : Path
+        Of the campaign.
+    batches : mapping of str to int
+        Batch to its number of units.
+    logger : logging.Logger
+        Of Snakemake.
+    """
+
+    def __init__(self, results: Path, batches: Mapping[str, int], logger: logging.Logger) -> None:
+        super().__init__()
+        self.results = results
+        self.progress = Progress(batches)
+        self.logger = logger
+        self.failed: list[tuple[str, Path]] = []
+        self.refused = ""
+        self.interrupted = False
+        self.ended = threading.Event()
+        self.nothing_to_do: Callable[[], None] = lambda: None
+        self.stream: TextIO = sys.stderr
+        logger.addHandler(self)
+        atexit.register(self.print_recovery)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Note a record of Snakemake."""
+        event, fields = _event(record), vars(record)
+        if event == "RUN_INFO":
+            self.progress.wanted = {k: v for k, v in fields["stats"].items() if k != "total"}
+        elif event == "JOB_INFO":
+            log = Path((fields["log"] or [os.devnull])[0])
+            self.progress.start(fields["jobid"], fields["rule_name"], dict(fields["wildcards"] or {}), log)
+        elif event == "JOB_FINISHED":
+            self.progress.finish(fields["job_id"])
+        elif event == "JOB_ERROR":
+            self.progress.finish(fields.get("jobid", -1), failed=True)
+            if fields.get("rule_name") != "verdict":
+                self.failed.append((str(fields.get("rule_name")), Path((fields.get("log") or [os.devnull])[0])))
+        elif str(record.msg).startswith("Nothing to be done"):
+            self.nothing_to_do()
+        elif str(record.msg).startswith(INTERRUPTED):
+            self.interrupted = True
+        elif record.levelno >= logging.ERROR:
+            self.refused = next((name for name in REFUSALS if name in str(record.msg)), self.refused)
+
+    def begin(self, *, quiet: bool, plain: bool) -> None:
+        """Hold the results, wait for jobs that a killed run has left, and start to print the progress.
+
+        Raises
+        ------
+        BusyError
+            If another run holds the results.
+        """
+        take_run(self.results)
+        while jobs_at_work(self.results):
+            print("Waiting for jobs that a killed run has left at work ...", file=self.stream, flush=True)
+            time.sleep(2)
+        terminal = self.stream.isatty() and not plain
+        if terminal or quiet:
+            self._filter_job_blocks(CLEAR_LINE if terminal and not quiet else "")
+        if not quiet:
+            threading.Thread(target=self._print_progress, kwargs={"terminal": terminal}, daemon=True).start()
+
+    def print_edited(self, edited: Sequence[str]) -> None:
+        """Print which files were edited or deleted since they were made, and are made again."""
+        if edited:
+            more = [f"  and {len(edited) - 10} more"] * (len(edited) > 10)
+            lines = ["Changed or deleted since the last run, made again:", *(f"  {c}" for c in edited[:10]), *more]
+            print("\n".join(lines), file=self.stream, flush=True)
+
+    def print_recovery(self) -> None:
+        """Print, after Snakemake's last message, what failed and the command that recovers."""
+        self.ended.set()
+        command = shlex.join(["snakemake", *sys.argv[1:]])
+        lines = []
+        if self.refused == "ProtectedOutputException":
+            lines += [f"\n{self.results} cannot be written; make it writable, and then:", f"  {command}"]
+        if self.refused == "LockException":
+            unlock = shlex.join(["snakemake", "--unlock", *sys.argv[1:]])
+            lines += [
+                "\nAnother run works in this directory, or one was killed here. Wait until it has ended, and then:"
+            ]
+            lines += [f"  {command}", "If none is at work:", f"  {unlock} && {command}"]
+        if self.interrupted or getattr(sys, "last_type", None) is KeyboardInterrupt:
+            lines += ["\nThe run was interrupted. Finished jobs are kept, others begin anew. To continue:"]
+            lines += [f"  {command}"]
+        elif self.failed:
+            lines += [f"\n{len(self.failed)} jobs broke; what they had begun is removed, all others are done:"]
+            lines += [f"  {rule}: {_cause(log)} (all of it: {log})" for rule, log in self.failed[:10]]
+            lines += [f"  and {len(self.failed) - 10} more"] * (len(self.failed) > 10)
+            lines += ["Mend the cause, then run the same command again:", f"  {command}"]
+        if lines:
+            print("\n".join(lines), file=self.stream)
+
+    def _filter_job_blocks(self, clear: str) -> None:
+        """Suppress Snakemake's block for each job on the terminal, and clear our line before its other messages."""
+
+        def passes(record: logging.LogRecord) -> bool:
+            if _event(record) in BLOCKS or str(record.msg).startswith(SCHEDULER_MESSAGES):
+                return False
+            self.stream.write(clear)
+            return True
+
+        for handler in self.logger.handlers:
+            if getattr(handler, "stream", None) in (sys.stdout, sys.stderr) and handler is not self:
+                handler.addFilter(passes)
+
+    def _print_progress(self, *, terminal: bool) -> None:
+        start = time.monotonic()
+        while not self.ended.wait(INTERVAL[terminal]):
+            minutes, seconds = divmod(round(time.monotonic() - start), 60)
+            line = f"[{minutes}:{seconds:02d}] {self.progress.text()}"
+            if terminal:
+                line = CLEAR_LINE + line[: (os.get_terminal_size(self.stream.fileno()).columns or 80) - 1]
+            self.stream.write(line + "\n" * (not terminal))
+            self.stream.flush()
+        if terminal:
+            self.stream.write(CLEAR_LINE)
+            self.stream.flush()
+
+
+def _event(record: logging.LogRecord) -> str:
+    return str(getattr(getattr(record, "event", None), "name", ""))
+
+
+def _cause(log: Path) -> str:
+    """Return the last line of a job's log."""
+    try:
+        lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    except OSError as error:
+        return f"its log cannot be read ({error.strerror})"
+    last = next((line for line in reversed(lines) if line.strip()), "")
+    at = AT_UNIT.findall(last)
+    return f"killed at unit {at[-1][0]}" if at else last or "killed, or could not be started"
