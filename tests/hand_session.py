@@ -11,7 +11,7 @@ import numpy as np
 from pipeline.diagnosis.diagnose import diagnose
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.gyroscope import rests_and_moves
-from pipeline.signal.noise import estimate_noise
+from pipeline.estimation.noise import estimate_noise
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, read_config
 

@@ -10,7 +10,7 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from pipeline.estimation.wandering import Cells
+    from pipeline.estimation.gauss_markov import Blocks
 
     Values = NDArray[np.float64]
 
@@ -65,25 +65,22 @@ class Bins:
         means: Values = sums[: len(self.weight)] / self.weight
         return means
 
-    def wander_of_means(self, cells: Cells, cell_of_row: NDArray[np.intp], time: float) -> Values:
-        """Return the variance that a bias wander of unit variance gives the means: (b,) array.
+    def bias_of_means(self, blocks: Blocks, time: float) -> Values:
+        """Return the variance that a Gauss-Markov bias of unit variance gives the means: (b,) array.
 
-        ``a^T R a``, with a the shares of a bin in the cells of time and R the wander's correlation.
+        ``a^T B a``, with a the shares of a bin in the blocks and B the covariance of the bias.
 
         Parameters
         ----------
-        cells : Cells
-        cell_of_row : (n,) array of int
+        blocks : Blocks
         time : float, s
             Its correlation time.
         """
-        bins, count = len(self.weight), len(cells.first)
-        sums = np.bincount(self.cell * count + cell_of_row, self.row_weight, (bins + 1) * count)
+        bins, count = len(self.weight), len(blocks.first)
+        index = self.cell * count + blocks.label(len(self.cell))
+        sums = np.bincount(index, self.row_weight, (bins + 1) * count)
         share: Values = sums.reshape(bins + 1, count)[:bins] / self.weight[:, None]
-        clock = np.concatenate([[0], np.cumsum(~cells.joined)])
-        apart = np.abs(cells.time[:, None] - cells.time[None, :])
-        R = np.where(clock[:, None] == clock[None, :], np.exp(-apart / time), 0.0)
-        variance: Values = np.einsum("bi,bi->b", share @ R, share)
+        variance: Values = np.einsum("bi,bi->b", share @ blocks.covariance(time), share)
         return variance
 
     def document(self, values: Values, variance: Values) -> dict[str, list[float]]:

@@ -7,7 +7,7 @@ Of each axis c, with base and chosen effects in the columns B_c and the curves i
 
 where
 
-    C    : white noise plus a bias wander, ``pipeline.estimation.wandering``
+    C    : white noise plus a bias wander, ``pipeline.estimation.gauss_markov``
     W    : (q, r) weights: which combinations of the curves make up a shape
     drop : by how much they lower the whitened sum of squares
 
@@ -33,8 +33,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.estimation.design import Term, motions_of
-from pipeline.estimation.ranking import WHITE, projection
-from pipeline.estimation.wandering import Whitened
+from pipeline.estimation.gauss_markov import WHITE, Products
+from pipeline.estimation.ranking import projection
 from pipeline.model.effects.base import Layout, truth
 
 if TYPE_CHECKING:
@@ -99,12 +99,11 @@ class Leftover:
         A, known, own = _columns(selection, curves, beside)
         weight = observations.weight
         self.size = np.sqrt(np.einsum("i,ij,ij->j", weight, A, A))[own[0]]
-        whitened = Whitened(observations.cells, weight, A)
         self.settings = list(selection.settings)
-        stacked, logarithms = zip(*(whitened.products(s) for s in (WHITE, *self.settings)), strict=True)
+        stacked, logarithms = Products(observations.blocks, weight, A).products([WHITE, *self.settings])
         priors = np.array([setting.prior for setting in self.settings])
-        self.penalty = 1.5 * np.array(logarithms[1:]) - priors
-        self._reduce(np.array(stacked), known, own)
+        self.penalty = 1.5 * logarithms[1:] - priors
+        self._reduce(stacked, known, own)
 
     def _reduce(self, products: Values, known: Sequence[NDArray[np.intp]], own: Sequence[NDArray[np.intp]]) -> None:
         """Take what is known out of curves and readings: their products inner, cross and left, by noise and axis."""

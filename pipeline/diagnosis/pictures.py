@@ -26,7 +26,7 @@ from pipeline.diagnosis.bins import Bins, rounded
 from pipeline.diagnosis.regression import OWN, Regression
 from pipeline.diagnosis.shapes import columns_of, signals_of
 from pipeline.estimation.design import BASE
-from pipeline.estimation.wandering import Setting
+from pipeline.estimation.gauss_markov import Setting
 from pipeline.model.effects.base import Layout, truth, unit_of
 from pipeline.model.formula import parse
 
@@ -95,12 +95,14 @@ def _added_variable(regression: Regression, selection: Selection) -> JSON:
     products = regression.all_products(selection.start.scale, fit.setting)
     chosen = _clearest(regression, term, at, np.abs(term.values) / uncertainty, sensor)
     left_of = [regression.left_of_column(c, at + j, products) for c, j in chosen]
-    told = np.array([regression.weight @ x**2 / sigma[c] ** 2 for (c, _), x in zip(chosen, left_of, strict=True)])
+    told = np.array(
+        [regression.observations.weight @ x**2 / sigma[c] ** 2 for (c, _), x in zip(chosen, left_of, strict=True)]
+    )
     panels = []
     for (c, j), left, share in zip(chosen, left_of, told / told.sum(), strict=True):
         if term.effect.layout == Layout.SHARED and share < LEAST_SHARE:
             continue
-        value, bins = float(term.values[j]), Bins.of(left, regression.weight)
+        value, bins = float(term.values[j]), Bins.of(left, regression.observations.weight)
         coefficient = {"parameter": described[j].name, "unit": described[j].unit, "value": value}
         panels.append(
             {"axis": "xyz"[c], **coefficient, "standard_uncertainty": float(uncertainty[j])}
@@ -132,12 +134,12 @@ def _unexplained(regression: Regression, selection: Selection, entry: Mapping[st
     signal, given = _signal_and_shape(selection, entry)
     setting, values = _expected(noise), _values(selection, signal)
     sigma = regression.white_noise(regression.residual - regression.wander(selection.fit.setting))
-    bins = Bins.of(values[:, 0], regression.weight)
+    bins = Bins.of(values[:, 0], regression.observations.weight)
     wander = _wander_of_means(bins, regression, noise)
     panels = []
     for c, (shape, coefficients) in enumerate(given):
         if c > 0 and signal == "u":
-            bins = Bins.of(values[:, c], regression.weight)
+            bins = Bins.of(values[:, c], regression.observations.weight)
             wander = _wander_of_means(bins, regression, noise)
         residual = regression.left_of(c, regression.residual[:, c] - shape, setting) + shape
         panels.append({"axis": "xyz"[c]} | bins.document(residual, sigma[c] ** 2 / bins.weight + wander[c]))
@@ -158,7 +160,7 @@ def _wander_of_means(bins: Bins, regression: Regression, noise: Noise | None) ->
     """Return the variance of binned means by the expected bias wander: (3, b) array."""
     if noise is None or not np.any(noise.wander > 0):
         return np.zeros((3, len(bins.weight)))
-    unit = bins.wander_of_means(regression.cells, regression.cell_of_row(), noise.correlation_time)
+    unit = bins.bias_of_means(regression.observations.blocks, noise.correlation_time)
     return np.outer(noise.wander**2, unit)
 
 

@@ -6,7 +6,7 @@ where
 
     X_c : (n, 4 + p) columns of an axis: 1, what K acts on, and every parameter of every effect at its value
     r   : residual of the fit of base, configured and selected effects
-    C   : white noise plus bias wander, ``pipeline.estimation.wandering``
+    C   : white noise plus bias wander, ``pipeline.estimation.gauss_markov``
     w   : the wander that residuals tell, ``E[wander | r] = wander covariance C^-1 r``; ``r - w`` is white
 """
 
@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.estimation.design import BASE, Term, motions_of
-from pipeline.estimation.wandering import Whitened
+from pipeline.estimation.gauss_markov import Products
 from pipeline.model.effects.base import Layout, truth
 
 if TYPE_CHECKING:
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from pipeline.estimation.gauss_markov import Setting
     from pipeline.estimation.observations import Observations, Part
     from pipeline.estimation.selection import Selection
-    from pipeline.estimation.wandering import Cells, Setting
 
     Values = NDArray[np.float64]
 
@@ -46,15 +46,11 @@ class Regression:
         Of each axis.
     residual : (n, 3) array, unit of the sensor
     observations : Observations
-    cells : Cells
-    weight : (n,) array
     """
 
     columns: list[Values]
     residual: Values
     observations: Observations
-    cells: Cells
-    weight: Values
 
     @classmethod
     def of(cls, selection: Selection) -> Regression:
@@ -64,11 +60,15 @@ class Regression:
         pieces = [_of_part(selection, part, terms) for part in observations.parts]
         base, effects, residual = (np.concatenate([piece[k] for piece in pieces]) for k in range(3))
         columns = [np.concatenate([base, effects[:, c]], axis=1) for c in range(3)]
-        return cls(columns, residual, observations, observations.cells, observations.weight)
+        return cls(columns, residual, observations)
 
     def products(self, columns: Values, setting: Setting) -> Values:
         """Return ``A^T C^-1 A`` of columns, with the white noise as unit."""
-        return Whitened(self.cells, self.weight, columns.copy()).products(setting)[0]
+        products: Values = self._columns(columns).products([setting])[0][0]
+        return products
+
+    def _columns(self, columns: Values) -> Products:
+        return Products(self.observations.blocks, self.observations.weight, columns)
 
     def all_products(self, scale: Values, setting: Setting) -> Values:
         """Return the products of all parameters' columns: 12 of the base, then those of the effects."""
@@ -81,25 +81,11 @@ class Regression:
 
     def wander(self, setting: Setting) -> Values:
         """Return the bias wander that the residual tells under a noise: (n, 3) array."""
-        if setting.ratio == 0.0:
-            return np.zeros_like(self.residual)
-        from scipy.linalg.lapack import dpttrs  # noqa: PLC0415  (0.1 s that only fits pay)
-
-        d, e, _ = self.cells.factor(setting)
-        sums = np.add.reduceat(self.weight[:, None] * self.residual, self.cells.first, axis=0)
-        solved, info = dpttrs(d, e, sums)
-        assert info == 0  # noqa: S101
-        told: Values = solved[self.cell_of_row()]
-        return told
-
-    def cell_of_row(self) -> NDArray[np.intp]:
-        """Return in which cell of time each row lies: (n,) array of int."""
-        rows = np.diff(np.append(self.cells.first, len(self.weight)))
-        return np.repeat(np.arange(len(rows)), rows)
+        return self._columns(self.residual).bias(setting)
 
     def white_noise(self, white: Values) -> Values:
         """Return the standard deviation of a sample on each axis, of a residual without its wander: (3,) array."""
-        squares = np.einsum("i,ij->j", self.weight, white**2) + self.observations.scatter
+        squares = np.einsum("i,ij->j", self.observations.weight, white**2) + self.observations.scatter
         return np.asarray(np.sqrt(squares / self.observations.samples), np.float64)
 
     def left_of_column(self, c: int, j: int, products: Values) -> Values:

@@ -27,7 +27,7 @@ import numpy as np
 
 from pipeline.diagnosis.leftover import Leftover
 from pipeline.diagnosis.shapes import Span
-from pipeline.estimation.wandering import settings_for
+from pipeline.estimation.gauss_markov import selection_grid
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -68,7 +68,7 @@ def dependences(selection: Selection, beside: Curves | None = None) -> list[tupl
         found = {k: v for k, v in found.items() if v[0] > least or k not in ("temperature", "time")}
     if found and any(setting.prior for setting in selection.settings):
         least = min(setting.prior for setting in selection.settings)
-        free = [replace(setting, prior=least) for setting in settings_for(None)]
+        free = [replace(setting, prior=least) for setting in selection_grid(None)]
         freely = _significant(replace(selection, settings=[*selection.settings, *free]), beside)
         found = {name: values for name, values in freely.items() if name in found}
     return [(name, p) for name, (_, p) in sorted(found.items(), key=lambda item: -item[1][0])]

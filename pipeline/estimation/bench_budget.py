@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from pipeline.estimation.serial_noise import SerialNoise
+    from pipeline.estimation.residual_noise import ResidualNoise
     from pipeline.estimation.table_inputs import Reference
     from pipeline.records import Contribution, SensorCalibration
 
@@ -29,7 +29,7 @@ TIME_BASE = "the table logs angle and rate itself, so that a wrong clock changes
 def budgeted(  # noqa: PLR0917  (what a fit on a table is)
     calibration: SensorCalibration,
     reference: Reference,
-    noise: SerialNoise,
+    noise: ResidualNoise,
     contributions: Sequence[Contribution],
     settings: Mapping[str, Any],
     results: Callable[[Values], Values],
@@ -40,7 +40,7 @@ def budgeted(  # noqa: PLR0917  (what a fit on a table is)
     ----------
     calibration : SensorCalibration
     reference : Reference
-    noise : SerialNoise
+    noise : ResidualNoise
     contributions : sequence of Contribution
         Those of the readings' scatter.
     settings : mapping

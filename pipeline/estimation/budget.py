@@ -3,7 +3,7 @@
     U = sum over sources of U_s,    nu_eff by Welch and Satterthwaite,    expanded uncertainty = k(nu_eff) u
 
 The noise of the readings is of type A: white noise and bias wander as the residuals show them
-(``pipeline.estimation.serial_noise``), so that a lack of fit is in it, as slow errors are. Its parts are told apart:
+(``pipeline.estimation.residual_noise``), so that a lack of fit is in it, as slow errors are. Its parts are told apart:
 
     white noise : as scattered within short stretches
     bias wander : as large as the static recording or the data sheet lets expect
@@ -28,8 +28,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from pipeline.estimation.gauss_markov import Prior
     from pipeline.estimation.linear_map import LinearMap
-    from pipeline.estimation.serial_noise import Prior, SerialNoise
+    from pipeline.estimation.residual_noise import ResidualNoise
     from pipeline.records import SensorCalibration
 
     Values = NDArray[np.float64]
@@ -61,12 +62,12 @@ def type_b(  # noqa: PLR0917  (the columns of a budget's line)
     return Contribution(source, "B", distribution, covariance, freedom, u, unit, effect.shape[1], remark=remark)
 
 
-def noise_contribution(noise: SerialNoise, fit: LinearMap, prior: Prior) -> Contribution:
+def noise_contribution(noise: ResidualNoise, fit: LinearMap, prior: Prior) -> Contribution:
     """Return what white noise, bias wander and lack of fit contribute.
 
     Parameters
     ----------
-    noise : SerialNoise
+    noise : ResidualNoise
         As the residuals tell it.
     fit : LinearMap
     prior : Prior
@@ -77,7 +78,7 @@ def noise_contribution(noise: SerialNoise, fit: LinearMap, prior: Prior) -> Cont
     for A, J, s in zip(fit.weights, fit.derivative, noise.white, strict=True):
         if id(A) not in unit:
             a = noise.blocks.sums(A.T)
-            unit[id(A)] = A @ A.T, a.T @ noise.expected_correlation(prior) @ a
+            unit[id(A)] = A @ A.T, a.T @ noise.blocks.covariance(prior.time) @ a
         alone, slow = unit[id(A)]
         white += s**2 * np.einsum("pi,ij,pj->p", J, alone, J)
         wander += prior.wander**2 * np.einsum("pi,ij,pj->p", J, slow, J)
@@ -87,7 +88,7 @@ def noise_contribution(noise: SerialNoise, fit: LinearMap, prior: Prior) -> Cont
     )
 
 
-def candidate_covariances(noise: SerialNoise, fit: LinearMap) -> Values:
+def candidate_covariances(noise: ResidualNoise, fit: LinearMap) -> Values:
     """Return the covariance of a fit's results under each candidate of the noise: (k, p, p) array."""
     unit: dict[int, Values] = {}
     total = np.zeros((len(noise.weight), fit.parameters, fit.parameters))
@@ -109,7 +110,7 @@ def _parts(total: Values, white: Values, wander: Values) -> dict[str, Values]:
     }
 
 
-def quantisation(noise: SerialNoise, fit: LinearMap, counts_per_unit: float | None, unit: str) -> Contribution | str:
+def quantisation(noise: ResidualNoise, fit: LinearMap, counts_per_unit: float | None, unit: str) -> Contribution | str:
     """Return what rounding to whole counts contributes, or why it is no line of its own.
 
     White noise of half a count and more makes the rounding errors of the samples independent of each other, of variance
@@ -118,7 +119,7 @@ def quantisation(noise: SerialNoise, fit: LinearMap, counts_per_unit: float | No
 
     Parameters
     ----------
-    noise : SerialNoise
+    noise : ResidualNoise
     fit : LinearMap
     counts_per_unit : float or None
     unit : str
@@ -129,9 +130,10 @@ def quantisation(noise: SerialNoise, fit: LinearMap, counts_per_unit: float | No
     step = 1.0 / float(counts_per_unit)
     if np.all(noise.white >= DITHERED * step):
         return f"contained in the {NOISE}, which reach {float(noise.white.min()) / step:.1f} counts or more"
-    ones = np.ones((len(noise.blocks.label), 3))
+    label = noise.blocks.label(int(noise.blocks.weight.sum()))
+    ones = np.ones((len(label), 3))
     rough = np.where(noise.white < DITHERED * step, 1.0, 0.0)
-    effects = [fit.of_groups(ones * rough * axis, noise.blocks.label, len(noise.blocks.count)) for axis in np.eye(3)]
+    effects = [fit.of_groups(ones * rough * axis, label, len(noise.blocks.weight)) for axis in np.eye(3)]
     return type_b(QUANTISATION, RECTANGULAR, step / np.sqrt(12.0), unit, np.concatenate(effects, axis=1))
 
 

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.errors import NotObservableError
+from pipeline.estimation.gauss_markov import Products
 from pipeline.estimation.linear_map import LinearMap
-from pipeline.estimation.wandering import Whitened
 from pipeline.model.effects.base import Layout, truth
 
 if TYPE_CHECKING:
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from pipeline.estimation.gauss_markov import Setting
     from pipeline.estimation.observations import Observations, Part
-    from pipeline.estimation.wandering import Setting
     from pipeline.model.effects.base import Effect
     from pipeline.records import Motion, Noise
 
@@ -199,7 +199,7 @@ class Design:
             Q, R = np.linalg.qr(root * A[:, :4])
             inner = Q.T @ (root * A[:, 4:])
             A[:, 4:] -= A[:, :4] @ np.linalg.solve(R, inner)
-        self.whitened = Whitened(observations.cells, weight, A)
+        self.columns = Products(observations.blocks, weight, A)
 
     def _place(self, sensor: str, terms: Sequence[Term]) -> None:
         """Lay out the columns: where each lies in A, and which of all parameters it belongs to, for each axis."""
@@ -250,20 +250,24 @@ class Design:
                 for c in range(3):
                     A[:, places[c]] = regressors[:, c]
 
-    def products(self, setting: Setting) -> tuple[NDArray[np.float64], float]:
-        """Return all products of parameters' columns and, last, the readings; and log det C, up to a constant."""
-        local, logarithm = self.whitened.products(setting)
-        total = np.zeros((self.count + 1) ** 2)
+    def products(self, settings: Sequence[Setting]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return all products of parameters' columns and, last, the readings, (g, p + 1, p + 1); and log det C, (g,).
+
+        The determinant is known up to a constant.
+        """
+        local, logarithm = self.columns.products(settings)
+        total = np.zeros((len(settings), (self.count + 1) ** 2))
+        flat = local.reshape(len(settings), -1)
         for c in range(3):
-            total[self._to[c]] += local.ravel()[self._from[c]] / self.scale[c] ** 2
-        return total.reshape(self.count + 1, self.count + 1), 3.0 * logarithm
+            total[:, self._to[c]] += flat[:, self._from[c]] / self.scale[c] ** 2
+        return total.reshape(-1, self.count + 1, self.count + 1), 3.0 * logarithm
 
     def linear_map(self, setting: Setting) -> LinearMap:
         """Return what small changes of the readings do to the parameters, solved under a noise setting."""
-        gram = self.products(setting)[0][:-1, :-1]
+        gram = self.products([setting])[0][0, :-1, :-1]
         size = np.where(self.sizes()[:-1] > 0, self.sizes()[:-1], 1.0)
         inverse = np.linalg.pinv(gram / np.outer(size, size), rcond=1e-12, hermitian=True) / np.outer(size, size)
-        influence = self.whitened.influence(setting)
+        influence = self.columns.influence(setting)
         weights = [influence[index[:-1]] for index in self._local]
         back = [inverse[:, index[:-1]] / s**2 for index, s in zip(self._total, self.scale, strict=True)]
         return LinearMap((weights[0], weights[1], weights[2]), (back[0], back[1], back[2]))

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.estimation.joint import fit_joint
 from pipeline.estimation.multi_position.rests import by_hand
+from pipeline.estimation.noise import noise_of
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import select
 from pipeline.records import SensorCalibration
-from pipeline.signal.noise import noise_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -7,7 +7,7 @@ where
 
     u  : truth by the table, at the time t' that effects of timing lead to
     J  : derivative of the model with respect to beta; r: readings less the model
-    C  : white noise plus a bias wander, ``pipeline.estimation.wandering``
+    C  : white noise plus a bias wander, ``pipeline.estimation.gauss_markov``
     s  : standard deviation of one sample, from the residual
 
 Nearly everything is linear; time offsets, lags and time constants take a few Gauss-Newton rounds. The noise is the one
@@ -25,11 +25,11 @@ from pipeline.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.bench_budget import TEMPERATURE, TIME_BASE
 from pipeline.estimation.budget import combined, scatter_contribution
 from pipeline.estimation.design import BASE, BASE_NAMES, Design, Start, Term, motions_of, ordinary_base
+from pipeline.estimation.gauss_markov import WHITE, Setting, selection_grid
 from pipeline.estimation.least_squares import certified
 from pipeline.estimation.observations import observe, weighted
 from pipeline.estimation.table_inputs import Reference, table_contributions
 from pipeline.estimation.trials import Errors, beside_trials, trials_of
-from pipeline.estimation.wandering import Setting, settings_for
 from pipeline.model.effects import effect
 from pipeline.model.effects.base import Layout, truth
 from pipeline.model.setups import OWN
@@ -48,7 +48,6 @@ ROUNDS = 25
 SMALL_STEP = 1e-3  # of a standard uncertainty
 RATIOS = (0.01, 0.03, 0.1, 0.2, 0.3, 0.5, 1.0, 3.0)
 TIMES = (30.0, 100.0, 300.0, 1000.0)
-WHITE = Setting(0.0, 1.0)
 SCATTER = "white noise and bias wander, averaged over the wanders by their likelihood; lack of fit included"
 NOT_INCLUDED = {
     "quantisation": "contained in the noise of the readings",
@@ -228,8 +227,7 @@ def _solve(design: Design, observations: Observations, settings: Sequence[Settin
     size = np.where(size > 0, size, 1.0)
     spare = max(n - design.count, 1.0)
     scores, steps, covariances, conditions, cosines = [], [], [], [], []
-    for setting in settings:
-        products, logarithm = design.products(setting)
+    for setting, products, logarithm in zip(settings, *design.products(settings), strict=True):
         gram, rhs = products[:-1, :-1] / np.outer(size, size), products[:-1, -1] / size
         unit = np.sqrt(np.maximum(np.diag(gram), 1e-30))
         values, vectors = np.linalg.eigh(gram / np.outer(unit, unit))
@@ -339,7 +337,7 @@ def require_observable(observations: Observations, fit: Fit, scale: NDArray[np.f
     design = _at(observations, fit.terms, fit.bias, fit.K, scale)
     names = [*BASE_NAMES, *parameter_names(observations.sensor, [t.effect for t in fit.terms])]
     size = design.sizes()[:-1]
-    products = design.products(WHITE)[0][:-1, :-1] / np.outer(*[np.where(size > 0, size, 1.0)] * 2)
+    products = design.products([WHITE])[0][0, :-1, :-1] / np.outer(*[np.where(size > 0, size, 1.0)] * 2)
     values, vectors = np.linalg.eigh(products)
     weak = [name for name, s in zip(names, size, strict=True) if s == 0]
     for value, vector in zip(values, vectors.T, strict=True):
@@ -429,7 +427,7 @@ def fit_joint(  # noqa: PLR0917  (the interface that the stages and the diagnosi
     observations = weighted(observe(sensor, recordings, settings["table"]), noise)
     base = ordinary_base(observations, noise)
     _require_available(observations, effects)
-    grid = settings_for(noise, RATIOS, TIMES)
+    grid = selection_grid(noise, RATIOS, TIMES)
     fit = fit_best(observations, combinations, base, grid)
     require_observable(observations, fit, base.scale)
     return calibration_of(sensor, fit, observations, start, settings)

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.estimation.wandering import Cells, cells_of, information
+from pipeline.estimation.gauss_markov import Blocks, information
 from pipeline.model.effects.base import turning_direction
 from pipeline.model.kinematics import earth_rate, reference_motion
 from pipeline.signal.filters import apply_filter
@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
 ROLES = ("accelerometer", "gyroscope", "static")
 MEAN_S = 1.0
+BLOCKS = 300  # of the bias: their length is below a tenth of the shortest correlation time of the grid
+SHORTEST_BLOCK_S = 4.0
 FORGOTTEN, FORGOTTEN_DPS = 1e-5, 1e-4  # share of the largest rate that a filter may still hold of a doubtful one
 LONGEST_RESPONSE = 400  # samples
 MEDIAN_OF_DIFFERENCES = 0.9099  # median of (w[n+1] - w[n])^2 of white noise of variance 1: 2 times that of chi-square
@@ -207,14 +209,37 @@ class Observations:
         return float(sum(part.weight.sum() for part in self.parts))
 
     @cached_property
-    def cells(self) -> Cells:
-        """Short stretches of time in which the bias wander is taken as constant."""
-        return cells_of(self.parts)
+    def blocks(self) -> Blocks:
+        """Short stretches of time in which the bias is taken as constant, new ones for each recording."""
+        span = sum(float(np.ptp(part.motion.time)) for part in self.parts)
+        length = max(SHORTEST_BLOCK_S, span / BLOCKS)
+        first, times, weights, clocks, row, clock = [], [], [], [], 0, 0
+        for before, part in zip([None, *self.parts], self.parts, strict=False):
+            block = np.floor((part.motion.time - part.motion.time[0]) / length)
+            start = np.flatnonzero(np.concatenate([[True], np.diff(block) != 0]))
+            weight = np.add.reduceat(part.weight, start)
+            clock += not _follows(before, part)
+            first.append(start + row)
+            times.append(np.add.reduceat(part.weight * part.motion.time, start) / weight)
+            weights.append(weight)
+            clocks.append(np.full(len(start), clock))
+            row += len(part.motion.time)
+        time = np.concatenate(times)
+        return Blocks(np.concatenate(first), np.concatenate(weights), time, np.zeros(len(time)), np.concatenate(clocks))
 
     @property
     def clock_shared(self) -> bool:
         """Whether the time between the recordings is known."""
         return all(part.clock_shared for part in self.parts) or len(self.parts) == 1
+
+
+def _follows(before: Part | None, part: Part) -> bool:
+    """Return whether the time from the recording before is known: one clock for all, or one session in order."""
+    if before is None:
+        return False
+    if before.clock_shared and part.clock_shared:
+        return True
+    return before.motion.setup == part.motion.setup != "" and bool(before.motion.time[-1] < part.motion.time[0])
 
 
 def weighted(observations: Observations, noise: Noise | None) -> Observations:
@@ -224,7 +249,7 @@ def weighted(observations: Observations, noise: Noise | None) -> Observations:
     ----------
     observations : Observations
     noise : Noise or None
-        See ``pipeline.estimation.wandering.information``.
+        See ``pipeline.estimation.gauss_markov.information``.
     """
     parts = []
     for part in observations.parts:

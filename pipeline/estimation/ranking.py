@@ -15,16 +15,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.estimation.design import BASE, Design, Term
-from pipeline.estimation.wandering import Setting
+from pipeline.estimation.gauss_markov import WHITE
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
 
+    from pipeline.estimation.gauss_markov import Setting
     from pipeline.estimation.observations import Observations
 
-WHITE = Setting(0.0, 1.0)
 EXCITED = 1e-3  # share of a column's norm that the base leaves
 NEW = 1e-4  # share of the variance of a candidate's weakest direction that the chosen effects leave
 RIDGE = 1e-11
@@ -97,12 +97,10 @@ class Ranking:
         self.samples = 3.0 * observations.samples
         self.within = float(np.sum(observations.scatter / scale**2))
         design = Design(observations, [*configured, *candidates], K, scale, project=True)
-        stacked, logarithms = zip(*(design.products(setting) for setting in self.settings), strict=True)
-        self.penalty = np.array(
-            [0.5 * log - setting.prior for log, setting in zip(logarithms, self.settings, strict=True)]
-        )
+        stacked, logarithms = design.products(self.settings)
+        self.penalty = 0.5 * logarithms - np.array([setting.prior for setting in self.settings])
         known = BASE + sum(s.stop - s.start for s in design.slices[: len(configured)])
-        products = without(np.array(stacked), np.arange(known))[:, known:, known:]
+        products = without(stacked, np.arange(known))[:, known:, known:]
         self._reduce(products, design.sizes()[known:], [s.start - known for s in design.slices[len(configured) :]])
 
     def _reduce(self, products: NDArray[np.float64], sizes: NDArray[np.float64], starts: Sequence[int]) -> None:

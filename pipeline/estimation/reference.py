@@ -18,7 +18,7 @@ its attenuation and in every ramp. A filter that this cannot rebuild leaves the 
 The accelerometer of a table that stops and goes is fitted to its settled rests, otherwise to all samples; the gyroscope
 to all samples, but where the table's rate is only the derivative of its logged angle the ramps are left out.
 
-The covariance allows for a bias wander (``pipeline.estimation.serial_noise``) and for the table's stated accuracies
+The covariance allows for a bias wander (``pipeline.estimation.residual_noise``) and for the table's stated accuracies
 (``pipeline.estimation.table_inputs``); that of the matrix follows from ``dM = -M dK M``.
 """
 
@@ -32,10 +32,11 @@ import numpy as np
 from pipeline.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.bench_budget import budgeted
 from pipeline.estimation.budget import noise_contribution
+from pipeline.estimation.gauss_markov import blocks_of_samples
 from pipeline.estimation.least_squares import certificate
 from pipeline.estimation.linear_map import LinearMap
-from pipeline.estimation.sample_blocks import make_blocks
-from pipeline.estimation.serial_noise import assess_noise, prior_of
+from pipeline.estimation.noise import prior_of
+from pipeline.estimation.residual_noise import assess_noise
 from pipeline.estimation.table_inputs import Reference, disturbance
 from pipeline.estimation.turns import Factors, parts_of, settled
 from pipeline.model.effects.base import truth
@@ -93,7 +94,7 @@ def fit_reference(
     factors = Factors.of(X)
     beta = factors.solve(y)
     residuals = y - X @ beta
-    blocks = make_blocks([(part.recording, part.keep) for part in parts])
+    blocks = blocks_of_samples([(part.recording, part.keep) for part in parts])
     prior = prior_of(sensor, recordings, settings)
     bias, K = beta[0], beta[1:].T
     matrix = np.asarray(np.linalg.solve(K, np.eye(3)), float)

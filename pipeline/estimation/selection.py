@@ -25,10 +25,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.estimation.design import BASE, Start, Term, ordinary_base
+from pipeline.estimation.gauss_markov import selection_grid
 from pipeline.estimation.joint import Fit, fit_best, fit_terms, starts_of
 from pipeline.estimation.observations import weighted
 from pipeline.estimation.ranking import Ranking, Score
-from pipeline.estimation.wandering import settings_for
 from pipeline.model.effect_limits import parameter_limits
 from pipeline.model.effects import catalogue, effect
 
@@ -37,8 +37,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from pipeline.estimation.gauss_markov import Setting
     from pipeline.estimation.observations import Observations
-    from pipeline.estimation.wandering import Setting
     from pipeline.model.effects.base import Effect
     from pipeline.records import Noise, SensorCalibration
 
@@ -192,7 +192,7 @@ class _Search:
         observations = weighted(observations, noise)
         self.observations = observations
         self.start = ordinary_base(observations, noise)
-        self.settings = settings_for(noise)
+        self.settings = selection_grid(noise)
         self.noise, self.sheet = noise, sheet
         self.limits = limits_of(observations.sensor, sheet)
         combinations_ = starts_of(configured, observations.sensor, known)

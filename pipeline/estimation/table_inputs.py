@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.estimation.sample_blocks import Blocks
+    from pipeline.estimation.gauss_markov import Blocks
     from pipeline.records import Contribution, Motion
 
     Values = NDArray[np.float64]
@@ -162,10 +162,10 @@ def disturbance(reference: Reference, residuals: Values, blocks: Blocks) -> Valu
         Channel by channel.
     """
     white = float(noise_of_steps(np.abs(np.diff(residuals, axis=0))).min())
-    if not 0.0 < white < _largest(reference) * np.sqrt(blocks.count.max()):
+    if not 0.0 < white < _largest(reference) * np.sqrt(blocks.weight.max()):
         return None
-    sums = np.zeros((len(blocks.count), len(residuals)))
-    sums[blocks.label, np.arange(len(residuals))] = 1.0
+    sums = np.zeros((len(blocks.weight), len(residuals)))
+    sums[blocks.label(len(residuals)), np.arange(len(residuals))] = 1.0
     x, y, z = np.eye(3 * len(sums)).reshape(3, len(sums), -1).transpose(0, 2, 1)
     contributions, _ = table_contributions(replace(reference, fit=LinearMap((sums, sums, sums), (x, y, z))))
     return np.sum([c.covariance for c in contributions], axis=0) if contributions else None

@@ -34,18 +34,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.estimation.gauss_markov import GaussMarkov, Setting
 from pipeline.estimation.ranking import RIDGE
 from pipeline.estimation.selection import DELAYS, GATE_BIC, GATE_P
-from pipeline.estimation.wandering import Setting
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
+    from pipeline.estimation.gauss_markov import Blocks
     from pipeline.estimation.ranking import Ranking
     from pipeline.estimation.selection import Selection
-    from pipeline.estimation.wandering import Cells
     from pipeline.model.effects.base import Effect
     from pipeline.records import Noise
 
@@ -131,8 +131,8 @@ class Expectation:
         kinds = [term.effect for term in self.ranking.candidates]
         self.limits = limits_or_none(kinds, selection.observations.sensor, selection.limits)
         true = Setting(float(np.sqrt(np.mean((noise.wander / noise.white) ** 2))), noise.correlation_time)
-        cells, samples = selection.observations.cells, selection.observations.samples
-        self.noise_sum = 3.0 * noise_sums(cells, samples, self.ranking.settings, true)
+        blocks, samples = selection.observations.blocks, selection.observations.samples
+        self.noise_sum = 3.0 * noise_sums(blocks, samples, self.ranking.settings, true)
         self._solved: dict[int, Values] = {}
         self.names = list(dict.fromkeys(term.effect.name for term in self.ranking.candidates))
         at_rest = self._log_likelihood(np.zeros(len(self.noise_sum)))
@@ -295,31 +295,18 @@ class Expectation:
         return found
 
 
-def noise_sums(cells: Cells, samples: float, settings: Sequence[Setting], true: Setting) -> Values:
-    """Return ``tr(C_t^-1 C) s^2`` of one channel, by the matrix inversion lemma of ``wandering``: (t,) array.
+def noise_sums(blocks: Blocks, samples: float, settings: Sequence[Setting], true: Setting) -> Values:
+    """Return ``tr(C_t^-1 C) s^2`` of one channel: that of the block means, and one for each sample beyond: (t,) array.
 
     Parameters
     ----------
-    cells : Cells
+    blocks : Blocks
     samples : float
-        Of one channel, those within the rows included.
+        Of one channel.
     settings : sequence of Setting
         Those of C_t.
     true : Setting
         That of C.
     """
-    from scipy.linalg.lapack import dpttrs  # noqa: PLC0415  (as in Cells.factor)
-
-    weight, q = cells.weight, true.ratio**2
-    piece = np.concatenate([[0], np.cumsum(~cells.joined)])
-    apart = np.abs(np.subtract.outer(cells.time, cells.time))
-    R = np.where(np.equal.outer(piece, piece), np.exp(-apart / true.time), 0.0)
-    found = np.full(len(settings), samples + q * weight.sum())
-    for t, setting in enumerate(settings):
-        if setting.ratio == 0.0:
-            continue
-        d, e, _ = cells.factor(setting)
-        inverse, info = dpttrs(d, e, np.eye(len(weight)))
-        assert info == 0  # noqa: S101
-        found[t] -= weight @ np.diag(inverse) + q * (weight @ (R * inverse) @ weight)
-    return found
+    trace = GaussMarkov(blocks, settings).trace_with(GaussMarkov(blocks, [true]))
+    return np.asarray(samples - len(blocks.weight) + trace)

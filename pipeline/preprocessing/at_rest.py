@@ -43,7 +43,7 @@ LOUDER = 4.0  # the scatter of 16 samples of white noise is so large in fewer th
 QUARTER_SIZE, UNUSUAL, WIDEST = 0.6745, 5.0, 0.4  # quartile of a normal distribution; its standard deviations
 OF_RESTS, OF_SHEET = 2.0, 4.0  # a bench that runs is louder than a unit on a desk; data sheets state typical noise
 SIGNIFICANT = 6.0  # standard deviations, as in pipeline.signal.rests
-FEWEST_SAMPLES = 60  # as of pipeline.signal.noise, which tells no noise by fewer
+FEWEST_SAMPLES = 60  # as of pipeline.estimation.noise, which tells no noise by fewer
 SHORTEST_S = 10.0  # in which a wander of 100 s changes by a third of its size
 UNKNOWN_DEGC = 5.0  # change of temperature in some minutes of a room, where none is logged
 

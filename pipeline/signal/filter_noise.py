@@ -29,3 +29,21 @@ def filter_autocovariance(recording: Recording) -> NDArray[np.float64]:
     covariance: NDArray[np.float64] = np.fft.irfft(np.abs(spectrum) ** 2)[:IMPULSE_SAMPLES]
     far = np.flatnonzero(np.abs(covariance) > 1e-9 * covariance[0])[-1]
     return covariance[: far + 1]
+
+
+def variance_of_mean(covariance: NDArray[np.float64], count: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the variance of the mean of ``count`` successive samples of a stationary sequence.
+
+    ``v_n = (r_0 + 2 sum_{l<n} (1 - l/n) r_l) / n``.
+
+    Parameters
+    ----------
+    covariance : (l,) array
+        Autocovariance from lag 0; 0 beyond its end.
+    count : (b,) array of int
+    """
+    kinds, which = np.unique(count, return_inverse=True)
+    lag = np.arange(len(covariance))
+    weight = np.clip(1.0 - lag / kinds[:, None], 0.0, None) * np.where(lag == 0, 1.0, 2.0)
+    variance: NDArray[np.float64] = (weight @ covariance / kinds)[which]
+    return variance

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from pipeline.estimation.noise import estimate_noise, noise_of
 from pipeline.files import read_json, write_json
 from pipeline.records import SENSORS, Noise, SensorCalibration
-from pipeline.signal.noise import estimate_noise, noise_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

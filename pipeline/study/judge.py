@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any
 from pipeline.config import load_campaign
 from pipeline.diagnosis.diagnose import diagnose
 from pipeline.estimation.effects_stage import fit_effects
+from pipeline.estimation.noise import estimate_noise
 from pipeline.model.effects import leaving_out
 from pipeline.records import SENSORS
-from pipeline.signal.noise import estimate_noise
 from pipeline.study.bench import recordings_of
 from pipeline.study.cases import REFERENCE
 from pipeline.validation.heldout import validate

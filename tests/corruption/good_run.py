@@ -20,11 +20,11 @@ from typing import Any
 
 from pipeline.diagnosis.diagnose import diagnose
 from pipeline.errors import CannotCalibrateError, PipelineError
+from pipeline.estimation.noise import noise_of
 from pipeline.estimation.stated import with_stated
 from pipeline.model.effects import leaving_out
 from pipeline.preprocessing.checks import check_recordings
 from pipeline.records import SENSORS
-from pipeline.signal.noise import noise_of
 from pipeline.study.bench import recordings_of
 from pipeline.study.cases import FAMILIES, Case, draw
 from pipeline.study.figures import wilson

@@ -15,9 +15,9 @@ from bench_session import CONTINUOUS, ONE_WAY, SIZE, STOP_AND_GO, THESIS, Course
 from pipeline.diagnosis.diagnose import diagnose
 from pipeline.diagnosis.words import in_words
 from pipeline.estimation.gyroscope import effects as gyroscope_stage
+from pipeline.estimation.noise import estimate_noise
 from pipeline.records import Recording, SensorCalibration
 from pipeline.signal.filters import apply_filter
-from pipeline.signal.noise import estimate_noise
 
 SHEET = yaml.safe_load((Path(__file__).parents[2] / "configs/sensor/mpu6050.yaml").read_text(encoding="utf-8"))
 TABLE = {"gravity_g": 1.0, "latitude_deg": None, "azimuth_deg": None}

@@ -20,14 +20,14 @@ from pipeline.diagnosis.leftover import Leftover
 from pipeline.diagnosis.shapes import columns_of, harmonics
 from pipeline.diagnosis.words import in_words
 from pipeline.estimation.design import Term
+from pipeline.estimation.gauss_markov import Setting
 from pipeline.estimation.joint import fit_terms
+from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import Selection, select
-from pipeline.estimation.wandering import Setting
 from pipeline.model.effects import forget_registered, register
 from pipeline.model.user_effects import effect_from
 from pipeline.records import Recording, SensorCalibration
-from pipeline.signal.noise import estimate_noise
 from pipeline.signal.temperature import smooth_temperature
 from pipeline.study.cases import draw
 from pipeline.study.judge import judge

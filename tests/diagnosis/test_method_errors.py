@@ -14,8 +14,8 @@ from bench_session import BIAS, CONTINUOUS, STOP_AND_GO, Course, K, Session, rec
 
 from pipeline.diagnosis.diagnose import diagnose
 from pipeline.diagnosis.words import in_words
+from pipeline.estimation.noise import estimate_noise
 from pipeline.signal.filters import apply_filter
-from pipeline.signal.noise import estimate_noise
 from pipeline.validation.heldout import validate
 
 if TYPE_CHECKING:

@@ -15,9 +15,9 @@ from bench_session import STOP_AND_GO, Session, record, values_of
 
 from pipeline.diagnosis.bins import Bins
 from pipeline.diagnosis.diagnose import diagnose
-from pipeline.estimation.wandering import Cells
+from pipeline.estimation.gauss_markov import Blocks
+from pipeline.estimation.noise import estimate_noise
 from pipeline.records import Recording, SensorCalibration
-from pipeline.signal.noise import estimate_noise
 
 SHEET = yaml.safe_load((Path(__file__).parents[2] / "configs/sensor/mpu6050.yaml").read_text(encoding="utf-8"))
 TABLE = {"gravity_g": 1.0, "latitude_deg": None, "azimuth_deg": None}
@@ -118,12 +118,12 @@ def test_pictures_are_small_and_there_are_none_where_nothing_is_missing() -> Non
 
 def test_a_bin_holds_as_much_wander_as_its_cells_of_time_have_in_common() -> None:
     weight = np.ones(6)
-    cells = Cells(np.array([0, 2, 4]), np.array([0.0, 100.0, 900.0]), np.array([True, False]), np.full(3, 2.0))
-    cell_of_row = np.array([0, 0, 1, 1, 2, 2])
+    times = np.array([0.0, 100.0, 900.0])
+    blocks = Blocks(np.array([0, 2, 4]), np.full(3, 2.0), times, np.zeros(3), np.array([0, 0, 1]))
     values = np.array([0.0, 1.0, 0.0, 2.0, 0.0, np.nan])
     bins = Bins.of(values, weight)
     np.testing.assert_allclose(bins.weight, [3.0, 1.0, 1.0])
     together = np.exp(-100.0 / 200.0)
     expected = [(3.0 + 2.0 * together) / 9.0, 1.0, 1.0]  # the third recording has a clock of its own
-    np.testing.assert_allclose(bins.wander_of_means(cells, cell_of_row, 200.0), expected)
+    np.testing.assert_allclose(bins.bias_of_means(blocks, 200.0), expected)
     np.testing.assert_allclose(bins.mean(np.array([1.0, 7.0, 3.0, 5.0, 5.0, 99.0])), [3.0, 7.0, 5.0])

@@ -12,10 +12,10 @@ import yaml
 from bench_session import CONTINUOUS, STOP_AND_GO, WHITE, Session, record
 
 from pipeline.diagnosis.unknown import dependences
+from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import select
 from pipeline.signal.filters import apply_filter
-from pipeline.signal.noise import estimate_noise
 
 if TYPE_CHECKING:
     from pipeline.records import Recording

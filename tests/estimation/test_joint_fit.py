@@ -12,9 +12,9 @@ from scipy.special import stdtrit
 
 from pipeline.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.accelerometer import effects as accelerometer_stage
+from pipeline.estimation.gauss_markov import Products, Setting
 from pipeline.estimation.joint import fit_joint
 from pipeline.estimation.observations import observe
-from pipeline.estimation.wandering import Setting, Whitened
 from pipeline.model.effects import effect
 from pipeline.records import SensorCalibration
 from pipeline.signal.filters import apply_filter
@@ -124,15 +124,14 @@ def test_a_list_that_makes_no_sense_is_refused(names: list[str], message: str) -
 
 def test_products_under_wander_are_those_of_the_whole_covariance() -> None:
     observations = observe("gyroscope", record(Session(6)), TABLE)
-    cells, weight = observations.cells, observations.weight
+    blocks, weight = observations.blocks, observations.weight
     rng, setting = np.random.default_rng(0), Setting(0.4, 80.0)
     columns = rng.standard_normal((len(weight), 4))
-    ends = np.append(cells.first[1:], len(weight))
-    member = np.repeat(np.arange(len(ends)), ends - cells.first)
-    wander = setting.ratio**2 * np.exp(-np.abs(cells.time[:, None] - cells.time) / setting.time)
+    member = blocks.label(len(weight))
+    wander = setting.ratio**2 * np.exp(-np.abs(blocks.start[:, None] - blocks.start) / setting.time)
     covariance = np.diag(1.0 / weight) + wander[np.ix_(member, member)]
     expected = columns.T @ np.linalg.solve(covariance, columns)
-    found, logarithm = Whitened(cells, weight, columns.copy()).products(setting)
+    (found,), (logarithm,) = Products(blocks, weight, columns).products([setting])
     np.testing.assert_allclose(found, expected, rtol=1e-8)
     assert logarithm == pytest.approx(np.linalg.slogdet(covariance)[1] + np.log(weight).sum(), rel=1e-9)
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from pipeline.estimation.design import Term, ordinary_base
+from pipeline.estimation.gauss_markov import Blocks, Setting, selection_grid
 from pipeline.estimation.observations import observe
 from pipeline.estimation.ranking import Ranking
 from pipeline.estimation.selection import GATE_BIC, GATE_P, select
-from pipeline.estimation.wandering import Cells, Setting, settings_for
 from pipeline.model.effects import catalogue, effect
 from pipeline.planning.detection_limits import noise_sums
 from pipeline.planning.plan import FAULTLESS, ROOM, noise_of_sheet, plan_of
@@ -58,7 +58,7 @@ def _found(planned: dict[str, dict[str, Any]], names: dict[str, str], factor: fl
             observations = observe(sensor, recordings, table)
             start = ordinary_base(observations, noise)
             term = Term(effect(name), np.zeros(len(hidden[f"{sensor}.{name}"])))
-            ranking = Ranking(observations, [], [term], start.K, start.scale, settings_for(noise))
+            ranking = Ranking(observations, [], [term], start.K, start.scale, selection_grid(noise))
             score = ranking.scores([], {})[0]
             found[sensor] += score.delta_bic > GATE_BIC and score.p_value * len(catalogue()) < GATE_P
     return found
@@ -105,11 +105,10 @@ def test_the_expected_sum_of_squares_is_the_trace_of_two_covariances() -> None:
     rng = np.random.default_rng(5)
     cells, each = 12, 4
     time = np.sort(rng.uniform(0.0, 300.0, cells))
-    joined = np.ones(cells - 1, bool)
-    joined[6] = False
+    clock = np.repeat([0, 1], [7, cells - 7])
     weight = rng.integers(1, 5, cells * each).astype(float)
     of = np.repeat(np.arange(cells), each)
-    grouped = Cells(np.arange(0, cells * each, each), time, joined, np.bincount(of, weight))
+    grouped = Blocks(np.arange(0, cells * each, each), np.bincount(of, weight), time, np.zeros(cells), clock)
 
     def covariance(setting: Setting) -> np.ndarray:
         R = np.exp(-np.abs(np.subtract.outer(time, time)) / setting.time)

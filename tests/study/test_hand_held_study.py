@@ -17,7 +17,7 @@ from hand_simulator import Hand, draw, one_sensor
 
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.gyroscope import rests_and_moves
-from pipeline.signal.noise import estimate_noise
+from pipeline.estimation.noise import estimate_noise
 from pipeline.validation.heldout import validate
 
 CASES: dict[str, tuple[Hand, int]] = {  # and how many of each

@@ -8,7 +8,7 @@ orientations need not be known. See ``pipeline.estimation.accelerometer.magnitud
 
 A misalignment that the orientations do not determine, as in six positions, is left at zero, and the result says so. On
 a table the errors of the rows are correlated by the bias wander, whose covariance is that of
-``pipeline.estimation.serial_noise``; by hand that of ``pipeline.estimation.accelerometer.rest_scatter``.
+``pipeline.estimation.residual_noise``; by hand that of ``pipeline.estimation.accelerometer.rest_scatter``.
 """
 
 from __future__ import annotations
@@ -35,12 +35,13 @@ from pipeline.estimation.budget import (
     noise_contribution,
     scatter_contribution,
 )
+from pipeline.estimation.gauss_markov import blocks_of_samples
 from pipeline.estimation.least_squares import certified
 from pipeline.estimation.linear_map import LinearMap
+from pipeline.estimation.noise import prior_of
+from pipeline.estimation.residual_noise import assess_noise
 from pipeline.estimation.rest_means import describe_rests
-from pipeline.estimation.sample_blocks import make_blocks
 from pipeline.estimation.scaled_columns import estimate_weights, factorise
-from pipeline.estimation.serial_noise import assess_noise, prior_of
 from pipeline.estimation.table_inputs import Reference, disturbance
 from pipeline.estimation.trials import Errors, beside_trials, quadratic_results, trials_of, without_trials
 from pipeline.estimation.turns import Factors, table_motion
@@ -53,7 +54,8 @@ if TYPE_CHECKING:
 
     from pipeline.estimation.accelerometer.magnitude import Ellipsoid
     from pipeline.estimation.accelerometer.orientations import Orientations
-    from pipeline.estimation.serial_noise import Prior, SerialNoise
+    from pipeline.estimation.gauss_markov import Prior
+    from pipeline.estimation.residual_noise import ResidualNoise
     from pipeline.records import Contribution, Motion, Recording
 
     Values = NDArray[np.float64]
@@ -299,7 +301,7 @@ def _serial_scatter(
 
 def _table_noise(
     orientations: Orientations, found: Ellipsoid, prior: Prior, table: Mapping[str, Any]
-) -> tuple[SerialNoise, Values]:
+) -> tuple[ResidualNoise, Values]:
     """Return the noise on the table, and ``n^T L`` of each row: (m, 3) array."""
     L = found.matrix
     truth = (orientations.mean - found.bias) @ L.T
@@ -307,7 +309,7 @@ def _table_noise(
     motions = [_motion(recording, table).select(keep) for recording, keep in orientations.parts]
     u = np.concatenate([motion.specific_force for motion in motions])
     X, reading = np.column_stack([np.ones(len(u)), u]), orientations.reading()
-    factors, blocks = Factors.of(X), make_blocks(orientations.parts)
+    factors, blocks = Factors.of(X), blocks_of_samples(orientations.parts)
     beta, A, every = factors.solve(reading), factors.weights(), np.eye(4)
     residuals = reading - X @ beta
     reference = Reference("accelerometer", motions, LinearMap((A, A, A), (every, every, every)), beta[1:].T, table)

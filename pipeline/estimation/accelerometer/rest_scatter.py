@@ -12,8 +12,8 @@ where
 
 Rests that follow each other share the wander: taken for independent, they would claim too small an uncertainty of the
 bias. Nobody knows s, w and tau, so each point of a grid is weighted by its restricted likelihood (Patterson & Thompson,
-Biometrika 58, 1971) times what is believed of the wander, as in ``pipeline.estimation.serial_noise``. For one s and tau
-one eigendecomposition gives every w.
+Biometrika 58, 1971) times what is believed of the wander, as in ``pipeline.estimation.residual_noise``. For one s and
+tau one eigendecomposition gives every w.
 """
 
 from __future__ import annotations
@@ -25,13 +25,12 @@ import numpy as np
 
 from pipeline.estimation.averaged_covariance import averaged
 from pipeline.estimation.budget import scatter_contribution
-from pipeline.estimation.serial_noise import SURE
-from pipeline.signal.wander import block_covariance
+from pipeline.estimation.gauss_markov import SURE, block_covariance
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from pipeline.estimation.serial_noise import Prior
+    from pipeline.estimation.gauss_markov import Prior
     from pipeline.records import Contribution
 
     Values = NDArray[np.float64]

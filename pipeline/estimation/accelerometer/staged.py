@@ -26,10 +26,11 @@ from pipeline.estimation.accelerometer.extremes import (
 from pipeline.estimation.bench_budget import budgeted
 from pipeline.estimation.budget import combined, noise_contribution, scatter_contribution
 from pipeline.estimation.correction import apply_correction
+from pipeline.estimation.gauss_markov import blocks_of_samples
 from pipeline.estimation.least_squares import certificate, certified
 from pipeline.estimation.linear_map import LinearMap
-from pipeline.estimation.sample_blocks import make_blocks
-from pipeline.estimation.serial_noise import assess_noise, prior_of
+from pipeline.estimation.noise import prior_of
+from pipeline.estimation.residual_noise import assess_noise
 from pipeline.estimation.table_inputs import Reference, disturbance
 from pipeline.estimation.turns import Factors, parts_of
 from pipeline.model.effects.scale_factor_asymmetry import EFFECT
@@ -42,7 +43,8 @@ if TYPE_CHECKING:
 
     from pipeline.estimation.accelerometer.chain import Chain
     from pipeline.estimation.accelerometer.extremes import Turn
-    from pipeline.estimation.serial_noise import Prior, SerialNoise
+    from pipeline.estimation.gauss_markov import Prior
+    from pipeline.estimation.residual_noise import ResidualNoise
     from pipeline.estimation.turns import Sinusoid
     from pipeline.records import Contribution, Recording
 
@@ -125,7 +127,7 @@ def _parameters(chain: Chain, covariance: NDArray[np.float64]) -> dict[str, dict
     }
 
 
-def _details(turns: Sequence[Turn], noise: SerialNoise, freedom: float) -> dict[str, Any]:
+def _details(turns: Sequence[Turn], noise: ResidualNoise, freedom: float) -> dict[str, Any]:
     used = sum(len(turn.angle) for turn in turns)
     total = sum(recording.samples for turn in turns for recording, _ in turn.used)
     return {
@@ -183,7 +185,7 @@ def _moved(sinusoids: Sequence[Sequence[Sinusoid]], errors: NDArray[np.float64])
     return moved
 
 
-def _noise(turns: Sequence[Turn], fit: LinearMap, prior: Prior, table: Mapping[str, Any]) -> SerialNoise:
+def _noise(turns: Sequence[Turn], fit: LinearMap, prior: Prior, table: Mapping[str, Any]) -> ResidualNoise:
     """Return what all turns together say of the noise: the residuals of ``y = b + K u + C |u|``.
 
     A sinusoid of its own for each turn and channel would take up the wander from turn to turn.
@@ -192,7 +194,7 @@ def _noise(turns: Sequence[Turn], fit: LinearMap, prior: Prior, table: Mapping[s
     u = np.concatenate([motion.specific_force for motion in motions])
     reading = np.concatenate([turn.reading for turn in turns])
     X = np.column_stack([np.ones(len(u)), u, np.abs(u)])
-    blocks = make_blocks([used for turn in turns for used in turn.used])
+    blocks = blocks_of_samples([used for turn in turns for used in turn.used])
     beta = Factors.of(X).solve(reading)
     residuals = reading - X @ beta
     disturbed = disturbance(Reference("accelerometer", motions, fit, beta[1:4].T, table), residuals, blocks)
@@ -228,7 +230,10 @@ def _linear_map(sinusoids: Sequence[Sequence[Sinusoid]], run: Callable[[Extremes
 
 
 def _resampled(
-    turns: Sequence[Turn], sinusoids: Sequence[Sequence[Sinusoid]], noise: SerialNoise, run: Callable[[Extremes], Chain]
+    turns: Sequence[Turn],
+    sinusoids: Sequence[Sequence[Sinusoid]],
+    noise: ResidualNoise,
+    run: Callable[[Extremes], Chain],
 ) -> Contribution:
     """Return the scatter of ``Chain.vector`` over synthetic turns."""
     rng = np.random.default_rng(SEED)

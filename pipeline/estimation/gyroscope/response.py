@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import ConfigurationError, NotObservableError
-from pipeline.estimation.sample_blocks import make_blocks
+from pipeline.estimation.gauss_markov import blocks_of_samples
 from pipeline.estimation.turns import steady_turns
 from pipeline.records import AXES, motion_at_rest
 from pipeline.signal.rests import runs
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.estimation.sample_blocks import Blocks
+    from pipeline.estimation.gauss_markov import Blocks
     from pipeline.estimation.turns import Part
     from pipeline.records import Motion, Recording
 
@@ -127,7 +127,7 @@ def samples_of(parts: Sequence[Part], recordings: Sequence[Recording]) -> Sample
                 chosen.append((recording, keep))
                 motions.append(motion_at_rest(recording.time[keep]))
     total = sum(recording.samples for recording, _ in chosen)
-    return Samples(np.concatenate(readings), np.concatenate(rates), make_blocks(chosen), total, tuple(motions))
+    return Samples(np.concatenate(readings), np.concatenate(rates), blocks_of_samples(chosen), total, tuple(motions))
 
 
 def _memory(recording: Recording) -> float:
@@ -136,7 +136,7 @@ def _memory(recording: Recording) -> float:
     if applied["name"] == "none":
         return 0.0
     try:
-        from pipeline.signal.noise import filter_autocovariance  # noqa: PLC0415  (only filtered recordings pay for it)
+        from pipeline.signal.filter_noise import filter_autocovariance  # noqa: PLC0415  (only filtered recordings pay for it)
 
         covariance = np.abs(filter_autocovariance(recording))
     except (ConfigurationError, KeyError):

@@ -23,9 +23,8 @@ from pipeline.estimation.multi_position.model import State
 from pipeline.estimation.multi_position.observed import model_of
 from pipeline.estimation.multi_position.outlying import described, fit_robustly
 from pipeline.estimation.multi_position.rests import ROLE, by_hand
-from pipeline.estimation.serial_noise import prior_of
+from pipeline.estimation.noise import noise_of, prior_of
 from pipeline.records import AXES, SensorCalibration, StageResult
-from pipeline.signal.noise import noise_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -22,7 +22,8 @@ from pipeline.estimation.correction import apply_correction
 from pipeline.estimation.gyroscope.response import Response, samples_of, weights_of
 from pipeline.estimation.least_squares import certified
 from pipeline.estimation.linear_map import LinearMap
-from pipeline.estimation.serial_noise import assess_noise, prior_of
+from pipeline.estimation.noise import prior_of
+from pipeline.estimation.residual_noise import assess_noise
 from pipeline.estimation.table_inputs import Reference, disturbance
 from pipeline.estimation.turns import parts_of
 from pipeline.records import SensorCalibration, StageResult

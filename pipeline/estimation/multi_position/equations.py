@@ -28,16 +28,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.estimation.serial_noise import SURE
-from pipeline.estimation.wandering import settings_for
-from pipeline.signal.wander import block_covariance
+from pipeline.estimation.gauss_markov import SURE, block_covariance, selection_grid
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from pipeline.estimation.serial_noise import Prior
+    from pipeline.estimation.gauss_markov import Prior
     from pipeline.records import Noise
 
     Values = NDArray[np.float64]
@@ -161,7 +159,7 @@ def noises_for(noise: Noise | None, kinds: int) -> list[HandNoise]:
     kinds : int
         Of scatter: that of rests, and that of moves.
     """
-    wanders = settings_for(noise)
+    wanders = selection_grid(noise)
     if kinds > 1:  # beside two kinds of scatter, a wander far from that of a static rest tells nothing more
         wanders = [s for s in wanders if s.prior > UNLIKELY]
     levels: Sequence[tuple[float, ...]] = list(product(*LEVELS[:kinds]))

@@ -24,9 +24,8 @@ from pipeline.estimation.multi_position.model import motion_of
 from pipeline.estimation.rest_means import rest_means
 from pipeline.model.effects import effect
 from pipeline.model.inversion import compensate
-from pipeline.signal.noise import filter_autocovariance
+from pipeline.signal.filter_noise import filter_autocovariance, variance_of_mean
 from pipeline.signal.rests import Rest
-from pipeline.signal.wander import variance_of_mean
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

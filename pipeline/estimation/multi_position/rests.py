@@ -12,9 +12,8 @@ import numpy as np
 
 from pipeline.estimation.rest_means import holdout_interval, rest_means, sound_samples, split_rests
 from pipeline.signal.creep import believed_rates, creep_in
-from pipeline.signal.noise import filter_autocovariance
+from pipeline.signal.filter_noise import filter_autocovariance, variance_of_mean
 from pipeline.signal.temperature import smooth_temperature
-from pipeline.signal.wander import variance_of_mean
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

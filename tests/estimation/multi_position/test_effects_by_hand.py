@@ -15,7 +15,7 @@ from pipeline.estimation.effects_stage import fit_effects
 from pipeline.estimation.multi_position.accelerometer import model_of
 from pipeline.estimation.multi_position.equations import noises_for
 from pipeline.estimation.multi_position.selection import fit_configured, limits_of
-from pipeline.signal.noise import estimate_noise
+from pipeline.estimation.noise import estimate_noise
 from pipeline.validation.heldout import validate
 
 if TYPE_CHECKING:

@@ -11,10 +11,10 @@ import pytest
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.effects_stage import fit_effects
 from pipeline.estimation.gyroscope import rests_and_moves
+from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.rest_means import split_rests
 from pipeline.io.read import read_recordings
 from pipeline.model.inversion import compensate
-from pipeline.signal.noise import estimate_noise
 from pipeline.simulation.description import read_config
 from pipeline.validation.attitude import gravity_direction
 

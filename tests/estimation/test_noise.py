@@ -8,10 +8,12 @@ import pytest
 from scipy.signal import lfilter
 
 from pipeline.errors import ConfigurationError
+from pipeline.estimation.gauss_markov import block_covariance, variance_of_average
+from pipeline.estimation.noise import estimate_noise
 from pipeline.records import Recording
+from pipeline.signal.allan import allan_deviation
+from pipeline.signal.filter_noise import filter_autocovariance
 from pipeline.signal.filters import apply_filter
-from pipeline.signal.noise import allan_deviation, estimate_noise, filter_autocovariance
-from pipeline.signal.wander import block_covariance, variance_of_average
 
 SHEET = {"noise_density": 4e-4, "bias_wander": 1e-4, "wander_time_s": 100.0}
 NO_WANDER = {"noise_density": 4e-4, "bias_wander": 0.0, "wander_time_s": 100.0}

@@ -27,24 +27,27 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import ConfigurationError, InputError
+from pipeline.estimation.gauss_markov import DEFAULT_TIME_S, SHARPEST_WIDTH, SHEET_WIDTH, Prior
+from pipeline.estimation.rest_blocks import (
+    RATIOS,
+    Likelihood,
+    Rest,
+    RestBlocks,
+    blocks_of,
+    likelihood,
+    with_scatter,
+)
 from pipeline.records import Noise, Recording
-from pipeline.signal.allan import allan_deviation
 from pipeline.signal.creep import along_gravity, creep_of
-from pipeline.signal.filter_noise import filter_autocovariance
+from pipeline.signal.filter_noise import filter_autocovariance, variance_of_mean
 from pipeline.signal.rest_readings import rest_readings, stretches_of, usable
 from pipeline.signal.temperature import temperature_of
-from pipeline.signal.wander import RATIOS, Blocks, Likelihood, blocks_of, likelihood, variance_of_mean, with_scatter
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    Rest = tuple[NDArray[np.float64], NDArray[np.float64]]
-
-__all__ = ["allan_deviation", "estimate_noise", "filter_autocovariance", "noise_of"]
-
-WANDER_TIME_S = 100.0  # where the data sheet gives none
 TIMES = np.exp2(np.arange(-6.0, 4.0))  # correlation times tried, in those of the data sheet
 SHORTEST_BLOCK = 8
 FEWEST_SAMPLES = 60
@@ -72,15 +75,15 @@ def estimate_noise(sensor: str, recordings: list[Recording], data_sheet: dict[st
     """
     known = [r for r in recordings if r.role != "validation" and r.reading(sensor) is not None and r.samples > 1]
     static = [r for r in known if r.role == "static"]
-    rests = [rest for r in known if r.role != "static" for rest in rest_readings(r, sensor, everything=False)]
-    long_rests = [rest for r in static for rest in rest_readings(r, sensor, everything=True)]
+    rests = _rests_of([r for r in known if r.role != "static"], sensor, everything=False)
+    long_rests = _rests_of(static, sensor, everything=True)
     for source, found, more in (("static", long_rests, rests), ("rests", rests, [])):
-        if sum(len(time) for time, _ in found) >= FEWEST_SAMPLES:
+        if sum(len(rest.time) for rest in found) >= FEWEST_SAMPLES:
             if sensor == "accelerometer" and source == "rests" and _by_hand(known):
                 return _noise_along_gravity(found, known, data_sheet)
             chosen = static if source == "static" else known
             noise = _noise_of_rests(found, more, chosen, data_sheet, source)
-            length = sum(float(time[-1] - time[0]) for time, _ in found) if source == "static" else 0.0
+            length = sum(float(rest.time[-1] - rest.time[0]) for rest in found) if source == "static" else 0.0
             return replace(noise, length=length)
     white = _white_of_turns(known, sensor)
     return _with_sheet_wander(white, data_sheet, "residual") if white is not None else _of_sheet(known, data_sheet)
@@ -105,6 +108,37 @@ def noise_of(sensor: str, recordings: Sequence[Recording], settings: Mapping[str
         return None
 
 
+def prior_of(sensor: str, recordings: Sequence[Recording], settings: Mapping[str, Any]) -> Prior:
+    """Return what a static recording tells of the bias instability, or else the data sheet.
+
+    A standard deviation from a rest of length T, about ``T / (2 tau)`` independent values, has the relative uncertainty
+    ``sqrt(tau / T)``.
+
+    Parameters
+    ----------
+    sensor : str
+    recordings : sequence of Recording
+    settings : mapping
+        Section ``sensor``.
+    """
+    sheet = settings.get("sensor", {}).get(sensor) or {}
+    static = [r for r in recordings if r.role == "static" and r.reading(sensor) is not None and r.samples > 1]
+    found = noise_of(sensor, recordings, settings) if static and sheet else None
+    if found and found.source == "static":
+        width = float(np.clip(np.sqrt(found.correlation_time / found.length), SHARPEST_WIDTH, SHEET_WIDTH))
+        return Prior(float(np.sqrt(np.mean(found.wander**2))), found.correlation_time, width)
+    return Prior(float(sheet.get("bias_wander") or 0.0), _wander_time(sheet))
+
+
+def _rests_of(recordings: Sequence[Recording], sensor: str, *, everything: bool) -> list[Rest]:
+    """Return the rests of recordings; those of recordings that share a clock share their time."""
+    return [
+        Rest(time, reading, 0 if recording.clock_shared else number)
+        for number, recording in enumerate(recordings, start=1)
+        for time, reading in rest_readings(recording, sensor, everything=everything)
+    ]
+
+
 def _by_hand(recordings: list[Recording]) -> bool:
     logged = any(r.table_angle is not None or r.table_rate is not None for r in recordings)
     return any(r.role == "rests" for r in recordings) and not logged
@@ -112,13 +146,13 @@ def _by_hand(recordings: list[Recording]) -> bool:
 
 def _noise_along_gravity(rests: list[Rest], chosen: list[Recording], sheet: dict[str, Any]) -> Noise:
     """Return the noise of an accelerometer that may creep: see the module, 2."""
-    found = [along_gravity(time, values) for time, values in rests]
-    along = [(time, values[:, None]) for (time, _), (values, _) in zip(rests, found, strict=True)]
+    found = [along_gravity(rest.time, rest.reading) for rest in rests]
+    along = [replace(rest, reading=values[:, None]) for rest, (values, _) in zip(rests, found, strict=True)]
     noise = _noise_of_rests(along, [], chosen, sheet, "rests", creeping=[k for k, (_, c) in enumerate(found) if c])
     covariance = filter_autocovariance(chosen[0])
-    creeps = [creep_of(time, values) for time, values in rests]
-    lost = [len(time) - creep.freedom for (time, _), creep in zip(rests, creeps, strict=True)]
-    counts = np.array([len(time) for time, _ in rests])
+    creeps = [creep_of(rest.time, rest.reading) for rest in rests]
+    lost = [len(rest.time) - creep.freedom for rest, creep in zip(rests, creeps, strict=True)]
+    counts = np.array([len(rest.time) for rest in rests])
     free = np.sum(counts * covariance[0] - np.array(lost) * counts * variance_of_mean(covariance, counts))
     white = np.sqrt(np.sum([creep.squares for creep in creeps], axis=0) / float(free))
     wander = np.full(3, float(noise.wander[0]))
@@ -150,7 +184,7 @@ def _noise_of_rests(
 
 
 def _nuisance(
-    blocks: Blocks, chosen: list[Recording], source: str, creeping: Sequence[int] = ()
+    blocks: RestBlocks, chosen: list[Recording], source: str, creeping: Sequence[int] = ()
 ) -> NDArray[np.float64]:
     """Return a constant for each rest, and a line where the unit creeps; for a static one temperature and warm-up."""
     rest, centre = blocks.rest[blocks.cut], (blocks.start + blocks.length / 2.0)[blocks.cut]
@@ -207,7 +241,7 @@ def _unseen(found: Likelihood, row: int, sheet: dict[str, Any], source: str) -> 
 
 
 def _wander_time(sheet: dict[str, Any]) -> float:
-    return float(sheet.get("wander_time_s") or WANDER_TIME_S)
+    return float(sheet.get("wander_time_s") or DEFAULT_TIME_S)
 
 
 def _with_sheet_wander(white: NDArray[np.float64], sheet: dict[str, Any], source: str) -> Noise:

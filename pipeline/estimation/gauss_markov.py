@@ -1,0 +1,417 @@
+"""White noise plus a Gauss-Markov bias: the noise model of every fit, with likelihoods in O(n).
+
+The readings of a channel are cut into m blocks of consecutive samples. Their means have the covariance
+
+    s^2 C,    C = diag(v) + q B(tau),    B_jk = exp(-gap_jk / tau) h_j h_k  (j != k),   h(x) = (1 - exp(-x)) / x
+
+where
+
+    s   : standard deviation of the white noise of one sample
+    v   : (m,) variance of a block's mean by white noise of unit variance: 1 / samples without a filter
+    q   : variance of the bias over s^2 (``Setting.ratio`` is its root)
+    tau : correlation time of the bias, s
+    B   : covariance of the averages of a unit first-order Gauss-Markov process over the blocks, ``x = length / tau``;
+          0 between blocks whose distance in time is unknown
+
+The differences ``w_k = y_k / h_k - phi_k y_(k-1) / h_(k-1)`` with ``phi_k = exp(-(start_k - start_(k-1)) / tau)`` are
+correlated with their neighbours only. Their covariance T is tridiagonal and positive definite for every q, so that
+``A^T C^-1 A`` and ``log det C`` follow from one factorisation of T (LAPACK ``pttrf``), with all settings of a grid side
+by side. Block means and the scatter within the blocks are independent, so that products over samples are those
+within the blocks, formed once, plus those of the means.
+
+Sources: IEEE Std 952-1997, annex C (the process); Rybicki & Press, Phys. Rev. Lett. 74, 1995 (its inverse); Patterson &
+Thompson, Biometrika 58, 1971 (restricted likelihood).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.records import Noise, Recording
+
+    Values = NDArray[np.float64]
+
+DEFAULT_TIME_S = 100.0  # correlation time where the data sheet gives none: of MEMS sensors, by IEEE Std 952 examples
+SHEET_WIDTH = float(np.log(3.0))  # of the logarithm of a bias instability that a data sheet gives: a factor of three
+SHARPEST_WIDTH = 0.15  # of the same logarithm, however long the static recording
+STATIC_WIDTH = (0.35, 1.1)  # the same for the coarse grid of ``selection_grid``, whose steps are factors of two
+FARTHEST = 3.0  # widths of the prior beyond which the residuals alone decide
+SURE = 9.0  # odds of no bias instability at all where none is stated
+TIME_FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)  # correlation times tried, in those of the prior
+TIME_PRIOR = (0.1, 0.2, 0.4, 0.2, 0.1)
+RATIOS = np.append(0.0, 10.0 ** np.arange(-2.4, 0.85, 0.1))  # ratios tried of the bias to the white noise of a sample
+RANDOM_WALK = 8.0  # times the correlation time seen, with the same variance of short differences
+BLOCKS = 100  # of a fit's samples: enough to resolve correlation times down to a hundredth of the recordings
+FAST_S = 25.0  # correlation time below which ``information`` replaces the model, as its blocks last seconds
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One noise hypothesis: ratio of bias to white noise, correlation time in s, and prior log weight."""
+
+    ratio: float
+    time: float
+    prior: float = 0.0
+
+
+WHITE = Setting(0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is known of the bias instability before the residuals are seen.
+
+    Attributes
+    ----------
+    wander : float, unit of the sensor
+        Its standard deviation; 0 where nothing is known.
+    time : float, s
+        Its correlation time.
+    width : float
+        Standard deviation of the logarithm of ``wander``.
+    """
+
+    wander: float = 0.0
+    time: float = DEFAULT_TIME_S
+    width: float = SHEET_WIDTH
+
+    def log_belief(self, wander: Values) -> Values:
+        """Return the log prior, up to a constant, of (m,) standard deviations of which the first is 0.
+
+        Where none is stated, the first has ``SURE`` times the weight of all others together.
+        """
+        if self.wander <= 0.0:
+            return np.append(np.log(SURE * (len(wander) - 1)), np.zeros(len(wander) - 1))
+        far = np.abs(np.log(wander[1:] / self.wander)) / self.width
+        return np.append(-np.inf, -0.5 * np.minimum(far, FARTHEST) ** 2)
+
+    def grid(self, white: float) -> list[Setting]:
+        """Return the hypotheses over which a covariance is averaged, for white noise of ``white`` per sample."""
+        belief = self.log_belief(RATIOS * white)
+        return [
+            Setting(float(ratio), factor * self.time, float(log + np.log(share)))
+            for factor, share in zip(TIME_FACTORS, TIME_PRIOR, strict=True)
+            for ratio, log in zip(RATIOS, belief, strict=True)
+            if np.isfinite(log)
+        ]
+
+
+def selection_grid(
+    noise: Noise | None,
+    ratios: Sequence[float] = (0.03, 0.1, 0.3, 1.0, 3.0),
+    times: Sequence[float] = (60.0, 600.0),
+) -> list[Setting]:
+    """Return the hypotheses over which the likelihoods of models are maximised.
+
+    A static recording pins them: its ratio, its half, double and fourfold with a log-normal weight, and random walks
+    that look alike over the recording and keep growing after it. Otherwise they span the sensors of the field.
+    """
+    pinned = noise is not None and noise.source == "static" and not fast(noise)
+    if noise is not None and pinned and np.any(noise.wander > 0) and np.all(noise.white > 0):
+        known = float(np.sqrt(np.mean((noise.wander / noise.white) ** 2)))
+        factors = np.array([0.5, 1.0, 2.0, 4.0])
+        least, most = STATIC_WIDTH
+        width = np.clip(np.sqrt(noise.correlation_time / noise.length), least, most) if noise.length > 0 else least
+        pairs = list(zip(known * factors, -0.5 * (np.log(factors) / width) ** 2, strict=True))
+        walk = RANDOM_WALK**0.5
+        return [Setting(r, noise.correlation_time * f, p) for r, p in pairs for f in (0.5, 2.0)] + [
+            Setting(r * walk, noise.correlation_time * RANDOM_WALK, p - 1.0) for r, p in pairs
+        ]
+    return [WHITE] + [Setting(ratio, time) for ratio in ratios for time in times]
+
+
+def fast(noise: Noise | None) -> bool:
+    """Return whether a static recording shows noise correlated over seconds: it then counts as fewer samples."""
+    return noise is not None and noise.source == "static" and noise.correlation_time < FAST_S
+
+
+def information(noise: Noise | None, interval: float) -> float:
+    """Return the effective information per sample, relative to white noise: ``1 / (1 + 2 q tau / dt)``.
+
+    Parameters
+    ----------
+    noise : Noise or None
+    interval : float, s
+        dt.
+    """
+    if noise is None or not fast(noise) or not np.all(noise.white > 0):
+        return 1.0
+    ratio = float(np.mean((noise.wander / noise.white) ** 2))
+    return 1.0 / (1.0 + 2.0 * ratio * noise.correlation_time / interval)
+
+
+def variance_of_average(length: Values, tau: float | Values) -> Values:
+    """Return the variance of a unit Gauss-Markov process averaged over ``length``: ``2 (x - 1 + exp(-x)) / x^2``."""
+    x = length / tau
+    large = np.where(x < 1e-3, 1.0, x)  # the series errs by x^3 / 60, the closed form by rounding / x^2
+    variance: Values = np.where(x < 1e-3, 1.0 - x / 3.0 + x * x / 12.0, 2.0 * (large + np.expm1(-large)) / large**2)
+    return variance
+
+
+def _half_average(length: Values, tau: float | Values) -> Values:
+    """Return ``h(x) = (1 - exp(-x)) / x`` with ``x = length / tau``."""
+    x = np.maximum(length / tau, 1e-12)
+    half: Values = -np.expm1(-x) / x
+    return half
+
+
+def block_covariance(start: Values, length: Values, tau: float) -> Values:
+    """Return B of blocks that do not overlap, all on one clock: (m, m) array."""
+    half = _half_average(length, tau)
+    centre = start + length / 2.0
+    gap = np.abs(centre[:, None] - centre) - (length[:, None] + length) / 2.0
+    B: Values = np.exp(-np.maximum(gap, 0.0) / tau) * half[:, None] * half
+    np.fill_diagonal(B, variance_of_average(length, tau))
+    return B
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """Blocks of consecutive rows.
+
+    Attributes
+    ----------
+    first : (m,) array of int
+        First row of each; a block ends where the next begins.
+    weight : (m,) array
+        Samples of each, ``1 / v``.
+    start, length : (m,) arrays, s
+        A block of length 0 counts as one instant: the bias does not change within it.
+    clock : (m,) array of int
+        Blocks of the same number have a known distance in time.
+    """
+
+    first: NDArray[np.intp]
+    weight: Values
+    start: Values
+    length: Values
+    clock: NDArray[np.int64]
+
+    @cached_property
+    def order(self) -> NDArray[np.intp]:
+        """Return the blocks in the order of time on each clock."""
+        return np.lexsort((self.start, self.clock))
+
+    def label(self, rows: int) -> NDArray[np.intp]:
+        """Return the block of each of n rows: (n,) array."""
+        return np.repeat(np.arange(len(self.first)), np.diff(np.append(self.first, rows)))
+
+    def sums(self, columns: Values) -> Values:
+        """Return the sums of (n, p) columns over each block: (m, p) array."""
+        total: Values = np.add.reduceat(columns, self.first, axis=0)
+        return total
+
+    def covariance(self, tau: float) -> Values:
+        """Return B: (m, m) array."""
+        covariance: Values = block_covariance(self.start, self.length, tau) * (self.clock[:, None] == self.clock)
+        return covariance
+
+
+def blocks_of_samples(parts: Sequence[tuple[Recording, NDArray[np.bool_]]]) -> Blocks:
+    """Cut the chosen samples of recordings, stacked in their order, into about ``BLOCKS`` blocks of equal size.
+
+    Parameters
+    ----------
+    parts : sequence of (Recording, (n,) array of bool)
+        Each recording and which of its samples are used.
+    """
+    used = [int(keep.sum()) for _, keep in parts]
+    size = max(1, -(-sum(used) // BLOCKS))
+    first, start, length, clock, row = [], [], [], [], 0
+    known: dict[str, tuple[int, float]] = {}
+    for number, ((recording, keep), samples) in enumerate(zip(parts, used, strict=True), start=1):
+        if samples == 0:
+            continue
+        time = recording.time[keep]
+        begin = np.arange(0, samples, size)
+        first.append(begin + row)
+        start.append(time[begin])
+        length.append(time[np.minimum(begin + size, samples) - 1] - time[begin] + recording.interval)
+        clock.append(np.full(len(begin), 0 if recording.clock_shared else _clock(recording, number, known)))
+        row += samples
+    firsts = np.concatenate(first)
+    weight = np.diff(np.append(firsts, row)).astype(float)
+    return Blocks(firsts, weight, np.concatenate(start), np.concatenate(length), np.concatenate(clock))
+
+
+def _clock(recording: Recording, number: int, known: dict[str, tuple[int, float]]) -> int:
+    """Return the clock of a recording: its own, or that of its session's recording before; ``known`` holds those."""
+    before, end = known.get(recording.setup, (number, np.inf))
+    clock = before if recording.setup and recording.time[0] > end else number
+    known[recording.setup] = clock, float(recording.time[-1])
+    return clock
+
+
+class GaussMarkov:
+    """C at the settings of a grid: solutions, products, log determinant, traces and draws.
+
+    Parameters
+    ----------
+    blocks : Blocks
+    settings : sequence of Setting
+    variance : (m,) array, optional
+        v; without it ``1 / weight``.
+    """
+
+    def __init__(self, blocks: Blocks, settings: Sequence[Setting], variance: Values | None = None) -> None:
+        from scipy.linalg.lapack import dpttrf  # noqa: PLC0415  (0.1 s that only fits pay)
+
+        self._order = order = blocks.order
+        v = (1.0 / blocks.weight if variance is None else variance)[order]
+        start, length, clock = blocks.start[order], blocks.length[order], blocks.clock[order]
+        tau = np.array([s.time for s in settings])[:, None]
+        self._q = q = np.array([s.ratio for s in settings])[:, None] ** 2
+        self._half = h = _half_average(length, tau)
+        same, step = clock[1:] == clock[:-1], np.maximum(np.diff(start), length[:-1])
+        self._near = near = np.where(same, np.exp(-(step - length[:-1]) / tau), 0.0)
+        self._phi = phi = np.where(same, np.exp(-step / tau), 0.0)
+        self._own = own = (v + q * variance_of_average(length, tau)) / h**2
+        diagonal = own.copy()
+        diagonal[:, 1:] += phi * (phi * own[:, :-1] - 2.0 * q * near)
+        beside = np.zeros_like(own)
+        beside[:, :-1] = q * near - phi * own[:, :-1]
+        self._d, self._e, info = dpttrf(diagonal.ravel(), beside.ravel()[:-1])
+        assert info == 0  # noqa: S101  (T is a covariance)
+        self.log_determinant: Values = np.sum(np.log(self._d.reshape(h.shape)) + 2.0 * np.log(h), axis=1)
+
+    def _differences(self, columns: Values) -> tuple[Values, Values]:
+        """Return w of (m, p) columns and ``T^-1 w``, at every setting: (p, g, m) arrays."""
+        from scipy.linalg.lapack import dpttrs  # noqa: PLC0415  (as above)
+
+        w = columns.T[:, None, self._order] / self._half
+        w[:, :, 1:] -= self._phi * w[:, :, :-1]
+        solved, info = dpttrs(self._d, self._e, w.reshape(len(w), -1).T)
+        assert info == 0  # noqa: S101
+        return w, np.asarray(solved.T).reshape(w.shape)
+
+    def products(self, columns: Values) -> Values:
+        """Return ``A^T C^-1 A`` of (m, p) columns: (g, p, p) array."""
+        w, solved = self._differences(columns)
+        found: Values = w.transpose(1, 0, 2) @ solved.transpose(1, 2, 0)
+        return found
+
+    def solve(self, columns: Values) -> Values:
+        """Return ``C^-1 A`` of (m, p) columns: (g, m, p) array."""
+        _, solved = self._differences(columns)
+        solved[:, :, :-1] -= self._phi * solved[:, :, 1:]
+        found = np.empty((*self._half.shape, len(solved)))
+        found[:, self._order] = (solved / self._half).transpose(1, 2, 0)
+        return found
+
+    def restricted(self, design: Values, values: Values) -> tuple[Values, Values]:
+        """Return the terms of the restricted likelihood of (m, c) values beside the columns of a design.
+
+        Parameters
+        ----------
+        design : (m, p) array
+            Of full rank, see ``orthonormal``.
+        values : (m, c) array
+
+        Returns
+        -------
+        log_determinant : (g,) array
+            ``log det C + log det(X^T C^-1 X)``.
+        squares : (g, c) array
+            ``y^T P y``, the weighted sum of squared residuals of each channel.
+        """
+        p = design.shape[1]
+        products = self.products(np.concatenate([design, values], axis=1))
+        inner, cross = products[:, :p, :p], products[:, :p, p:]
+        squares = np.einsum("gcc->gc", products[:, p:, p:]) - np.sum(cross * np.linalg.solve(inner, cross), axis=1)
+        logarithm: Values = self.log_determinant + np.linalg.slogdet(inner)[1]
+        return logarithm, np.maximum(squares, 0.0)
+
+    def trace_with(self, true: GaussMarkov) -> Values:
+        """Return ``tr(C^-1 C0)`` with the covariance C0 of one other setting of the same blocks: (g,) array.
+
+        Off the diagonal both ``T^-1`` and C0 are products of one factor per block between, so that sums over all
+        pairs follow by one recursion.
+        """
+        shape = self._half.shape
+        d, e = self._d.reshape(shape), np.append(self._e, 0.0).reshape(shape)[:, :-1]
+        inverse = 1.0 / d  # diagonal of T^-1
+        for k in range(shape[1] - 2, -1, -1):
+            inverse[:, k] += e[:, k] ** 2 * inverse[:, k + 1]
+        own, lower, phi = inverse.copy(), inverse.copy(), self._phi
+        own[:, :-1] += (2.0 * phi * e + phi**2) * inverse[:, 1:]
+        lower[:, :-1] += phi * e * inverse[:, 1:]
+        ratio = true._half / self._half
+        total: Values = np.sum(own * true._own * ratio**2, axis=1)
+        across = np.zeros(shape[0])
+        for k in range(shape[1] - 1):
+            across = -e[:, k] * true._phi[0, k] * across - (e[:, k] + phi[:, k]) * ratio[:, k] * true._near[0, k]
+            total += 2.0 * true._q[0] * across * lower[:, k + 1] * ratio[:, k + 1]
+        return total
+
+    def draw(self, rng: np.random.Generator, count: int) -> Values:
+        """Return block means drawn from C at the first setting: (m, count) array."""
+        m = self._half.shape[1]
+        own = np.sqrt(self._d[:m, None]) * rng.standard_normal((m, count))
+        drawn = own.copy()
+        drawn[1:] += self._e[: m - 1, None] * own[:-1]
+        for k in range(1, m):
+            drawn[k] += self._phi[0, k - 1] * drawn[k - 1]
+        out: Values = np.empty(drawn.shape)
+        out[self._order] = self._half[0, :, None] * drawn
+        return out
+
+
+class Products:
+    """Products of (n, p) columns of samples under every setting.
+
+    Parameters
+    ----------
+    blocks : Blocks
+    weight : (n,) array
+        Samples of each row.
+    columns : (n, p) array
+    """
+
+    def __init__(self, blocks: Blocks, weight: Values, columns: Values) -> None:
+        self.blocks, self.weight, self.columns = blocks, weight, columns
+        weighted = weight[:, None] * columns
+        self.white: Values = columns.T @ weighted
+        self.means = blocks.sums(weighted) / blocks.weight[:, None]
+
+    def products(self, settings: Sequence[Setting]) -> tuple[Values, Values]:
+        """Return ``A^T C^-1 A``, (g, p, p), and ``log det C`` of one channel, (g,), up to that of the weights."""
+        model = GaussMarkov(self.blocks, settings)
+        within = self.white - self.means.T @ (self.blocks.weight[:, None] * self.means)
+        found = within + model.products(self.means)
+        for g in (g for g, setting in enumerate(settings) if setting.ratio == 0.0):
+            found[g] = self.white
+        return found, model.log_determinant + np.sum(np.log(self.blocks.weight))
+
+    def influence(self, setting: Setting) -> Values:
+        """Return ``A^T C^-1``: (p, n) array."""
+        label = self.blocks.label(len(self.weight))
+        solved = GaussMarkov(self.blocks, [setting]).solve(self.means)[0] / self.blocks.weight[:, None]
+        rows: Values = (self.weight[:, None] * (self.columns + (solved - self.means)[label])).T
+        return rows
+
+    def bias(self, setting: Setting) -> Values:
+        """Return ``E[bias | columns]`` of each row: (n, p) array."""
+        solved = GaussMarkov(self.blocks, [setting]).solve(self.means)[0]
+        told: Values = (self.means - solved / self.blocks.weight[:, None])[self.blocks.label(len(self.weight))]
+        return told
+
+
+def orthonormal(design: Values, variance: Values, tolerance: float) -> Values:
+    """Return columns that span a design, orthonormal in the metric ``1/variance``: (m, r) array.
+
+    Directions of the unit columns whose singular value is below ``tolerance`` of the largest are left out.
+    """
+    root = np.sqrt(variance)[:, None]
+    scaled = design / root
+    u, s, _ = np.linalg.svd(scaled / np.maximum(np.linalg.norm(scaled, axis=0), 1e-300), full_matrices=False)
+    basis: Values = root * u[:, : int(np.sum(s > tolerance * s[0]))]
+    return basis

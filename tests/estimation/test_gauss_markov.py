@@ -1,0 +1,113 @@
+"""White noise plus Gauss-Markov bias: the recursions against the dense covariance."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import dblquad
+
+from pipeline.estimation.gauss_markov import (
+    Blocks,
+    GaussMarkov,
+    Prior,
+    Products,
+    Setting,
+    block_covariance,
+    orthonormal,
+    variance_of_average,
+)
+
+SETTINGS = [Setting(0.0, 1.0), Setting(0.1, 2.0), Setting(0.7, 60.0), Setting(5.0, 900.0), Setting(1.0, 0.3)]
+
+
+def shuffled_blocks(seed: int = 0, count: int = 40) -> Blocks:
+    """Return blocks of irregular length with gaps, in no order, on two clocks."""
+    rng = np.random.default_rng(seed)
+    length = rng.uniform(0.0, 9.0, count)
+    length[::5] = 0.0
+    start = np.cumsum(rng.uniform(0.0, 5.0, count) + np.append(0.0, length[:-1]))
+    clock = np.repeat([0, 1], [25, count - 25])
+    order = rng.permutation(count)
+    rows = np.cumsum(np.append(0, rng.integers(1, 5, count - 1)))
+    return Blocks(rows, rng.uniform(1.0, 50.0, count), start[order], length[order], clock[order])
+
+
+def dense(blocks: Blocks, setting: Setting) -> np.ndarray:
+    return np.diag(1.0 / blocks.weight) + setting.ratio**2 * blocks.covariance(setting.time)
+
+
+def test_the_covariance_of_averages_is_the_integral_over_both_blocks() -> None:
+    start, length, tau = np.array([0.0, 5.0]), np.array([3.0, 8.0]), 4.0
+    B = block_covariance(start, length, tau)
+    for j in range(2):
+        for k in range(2):
+            inner = dblquad(
+                lambda s, t: np.exp(-abs(s - t) / tau),
+                start[j],
+                start[j] + length[j],
+                start[k],
+                start[k] + length[k],
+            )[0]
+            assert B[j, k] == pytest.approx(inner / (length[j] * length[k]), rel=1e-6)
+    assert variance_of_average(np.array([0.0, 1e-4]), 1.0) == pytest.approx([1.0, 1.0 - 1e-4 / 3.0], abs=1e-9)
+
+
+def test_products_solutions_and_determinants_are_those_of_the_dense_covariance() -> None:
+    blocks = shuffled_blocks()
+    columns = np.random.default_rng(1).standard_normal((len(blocks.weight), 4))
+    model = GaussMarkov(blocks, SETTINGS)
+    for found, solved, logarithm, setting in zip(
+        model.products(columns), model.solve(columns), model.log_determinant, SETTINGS, strict=True
+    ):
+        C = dense(blocks, setting)
+        np.testing.assert_allclose(found, columns.T @ np.linalg.solve(C, columns), rtol=1e-9)
+        np.testing.assert_allclose(solved, np.linalg.solve(C, columns), rtol=1e-8)
+        assert logarithm == pytest.approx(np.linalg.slogdet(C)[1], rel=1e-10)
+
+
+def test_the_restricted_likelihood_is_that_of_the_projected_values() -> None:
+    blocks = shuffled_blocks(2)
+    rng = np.random.default_rng(3)
+    values = rng.standard_normal((len(blocks.weight), 2))
+    design = orthonormal(rng.standard_normal((len(values), 3)), 1.0 / blocks.weight, 1e-3)
+    logarithm, squares = GaussMarkov(blocks, SETTINGS).restricted(design, values)
+    Q = np.linalg.qr(design, mode="complete")[0][:, 3:]
+    reference = [np.linalg.slogdet(Q.T @ dense(blocks, s) @ Q)[1] for s in SETTINGS]
+    expected = [
+        np.einsum("ic,ij,jc->c", Q.T @ values, np.linalg.inv(Q.T @ dense(blocks, s) @ Q), Q.T @ values)
+        for s in SETTINGS
+    ]
+    np.testing.assert_allclose(squares, expected, rtol=1e-8)
+    np.testing.assert_allclose(logarithm - logarithm[0], np.array(reference) - reference[0], atol=1e-8)
+
+
+def test_traces_with_another_setting_and_draws_have_the_dense_covariance() -> None:
+    blocks, true = shuffled_blocks(4), Setting(0.4, 33.0)
+    other = GaussMarkov(blocks, [true])
+    expected = [np.trace(np.linalg.solve(dense(blocks, s), dense(blocks, true))) for s in SETTINGS]
+    assert GaussMarkov(blocks, SETTINGS).trace_with(other) == pytest.approx(expected, rel=1e-10)
+    drawn = other.draw(np.random.default_rng(5), 40_000)
+    assert np.cov(drawn) == pytest.approx(dense(blocks, true), abs=0.02)
+
+
+def test_products_of_samples_and_the_expected_bias_are_those_of_all_rows() -> None:
+    blocks = shuffled_blocks(6)
+    rng = np.random.default_rng(7)
+    weight = rng.uniform(0.5, 2.0, blocks.first[-1] + 3)
+    blocks = Blocks(blocks.first, blocks.sums(weight[:, None])[:, 0], blocks.start, blocks.length, blocks.clock)
+    columns, label, setting = rng.standard_normal((len(weight), 3)), blocks.label(len(weight)), SETTINGS[2]
+    bias = setting.ratio**2 * blocks.covariance(setting.time)[np.ix_(label, label)]
+    C = np.diag(1.0 / weight) + bias
+    held = Products(blocks, weight, columns)
+    (found,), (logarithm,) = held.products([setting])
+    np.testing.assert_allclose(found, columns.T @ np.linalg.solve(C, columns), rtol=1e-9)
+    assert logarithm == pytest.approx(np.linalg.slogdet(C)[1] + np.sum(np.log(weight)), rel=1e-9)
+    np.testing.assert_allclose(held.influence(setting), np.linalg.solve(C, columns).T, atol=1e-10)
+    np.testing.assert_allclose(held.bias(setting), bias @ np.linalg.solve(C, columns), atol=1e-10)
+
+
+def test_a_stated_instability_leaves_no_hypothesis_without_any() -> None:
+    assert min(s.ratio for s in Prior(1e-3, 50.0).grid(1e-2)) > 0.0
+    free = Prior().grid(1e-2)
+    none = sum(np.exp(s.prior) for s in free if s.ratio == 0.0)
+    assert none / sum(np.exp(s.prior) for s in free) == pytest.approx(0.9)
