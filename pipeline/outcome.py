@@ -12,6 +12,7 @@ import re
 import shlex
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from pipeline.files import INSTALLED
 from pipeline.history import SENSORS, difference, dropped, of_units, read_history
 
 if TYPE_CHECKING:
@@ -211,13 +212,15 @@ def _named(units: Sequence[str]) -> str:
 
 
 def run_command(settings: Mapping[str, Any]) -> str:
-    """Return the command of a run.
+    """Return the command of a run: ``snakemake`` in a clone, ``imu-calibration run`` where the wheel is installed.
 
     Parameters
     ----------
     settings : mapping
         As given by ``--config``: ``campaign``, ``overrides``, ``unit_overrides``, ``results`` ...
     """
+    if INSTALLED:
+        return _pipeline("run", settings, [], str(settings.get("results") or RESULTS))
     words = [shlex.quote(f"{key}={_flow(value, top=True)}") for key, value in settings.items() if value]
     return " ".join(["snakemake", "--cores 2", *(["--config"] * bool(words)), *words])
 
@@ -274,7 +277,8 @@ def once_command(settings: Mapping[str, Any], unit: str, override: str, results:
 def _pipeline(command: str, settings: Mapping[str, Any], words: Sequence[str], results: str) -> str:
     rest = dict(settings)
     campaign = str(rest.pop("campaign", "demo"))
-    parts = ["python", "-m", "pipeline", command, campaign.rstrip("/") if command == "explain" else campaign, *words]
+    program = ["imu-calibration"] if INSTALLED else ["python", "-m", "pipeline"]
+    parts = [*program, command, campaign.rstrip("/") if command == "explain" else campaign, *words]
     parts += ["--results", results] * (results != RESULTS)
     given = [f"{key}={_flow(value, top=True)}" for key, value in rest.items() if value and key != "results"]
     return shlex.join([*parts, *(["--config"] * bool(given)), *given])

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import argparse
-import csv
-import subprocess
-import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import yaml
 
+from pipeline.commands.run import add_run_options, run_snakemake
 from pipeline.config.campaign import find_campaign, load_layers
 from pipeline.config.campaign_file import as_list
 from pipeline.config.compose import Composer
 from pipeline.config.devices import edit_effects, sensor_and_effect
 from pipeline.config.user_effects import PYTHON
 from pipeline.errors import ConfigurationError, MissingInputError
-from pipeline.files import SHIPPED, write_atomically
-from pipeline.outcome import run_command
+from pipeline.files import write_atomically
+from pipeline.outcome import RESULTS, read_summary, run_command
 from pipeline.records import SENSORS
 
 if TYPE_CHECKING:
@@ -64,17 +63,14 @@ def change(arguments: argparse.Namespace, *, remove: bool) -> int:
     for edit in edits:
         _apply(edit)
     settings = {"campaign": arguments.campaign, **given}
-    if arguments.results != Path("results"):
-        settings["results"] = str(arguments.results)
+    if arguments.results != RESULTS:
+        settings["results"] = arguments.results
     command = run_command(settings).replace("--cores 2", f"--cores {arguments.cores}", 1)
     if arguments.no_run:
         print(f"then: {command}")
         return 0
     print(f"runs: {command}", flush=True)
-    words = [f"campaign={arguments.campaign}", *arguments.config]
-    words += [f"results={arguments.results}"] * ("results" in settings)
-    rules = ["--cores", arguments.cores, "--snakefile", str(SHIPPED / "Snakefile"), "--config", *words]
-    return subprocess.run([sys.executable, "-m", "snakemake", *rules], check=False).returncode  # noqa: S603  (the user's own run)
+    return run_snakemake(arguments, arguments.config)
 
 
 def parser_of(command: str, description: str | None) -> argparse.ArgumentParser:
@@ -88,12 +84,8 @@ def parser_of(command: str, description: str | None) -> argparse.ArgumentParser:
     parser.add_argument("campaign", metavar="CAMPAIGN", help="a campaign's name or directory")
     parser.add_argument("unit", metavar="UNIT", nargs="?", help="a unit of units.csv")
     parser.add_argument("effects", metavar="SENSOR.EFFECT", nargs="*", help="for example gyroscope.g_sensitivity")
-    parser.add_argument("--cores", default="2", metavar="N", help="of the run (2)")
     parser.add_argument("--no-run", action="store_true", help="write the files only")
-    parser.add_argument("--results", type=Path, default=Path("results"), metavar="DIR", help="of the run (results)")
-    parser.add_argument(
-        "--config", nargs="+", default=[], metavar="KEY=VALUE", help="further settings of the run, as for snakemake"
-    )
+    add_run_options(parser)
     return parser
 
 
@@ -106,12 +98,11 @@ def _wanted(arguments: argparse.Namespace, campaign: str) -> dict[str, list[tupl
         return {arguments.unit: [sensor_and_effect(text) for text in arguments.effects]}
     if arguments.unit:
         raise ConfigurationError("--missing takes its units from the results of the last run: leave out the unit")
-    file = arguments.results / campaign / "summary.csv"
+    folder = Path(arguments.results) / campaign
+    file = folder / "summary.csv"
     if not file.is_file():
         raise MissingInputError("does not exist: run the campaign first", str(file))
-    with file.open(encoding="utf-8", newline="") as stream:
-        rows = list(csv.DictReader(stream))
-    found = {row["unit"]: _missing(row, missing) for row in rows}
+    found = {row["unit"]: _missing(row, missing) for row in read_summary(folder)}
     found = {unit: effects for unit, effects in found.items() if effects}
     if not found:
         raise ConfigurationError(f"no unit misses {missing or 'an effect'}", str(file))
@@ -144,6 +135,8 @@ def _apply(edit: Edit) -> None:
     try:
         if edit.text is None:
             edit.file.unlink(missing_ok=True)
+            with suppress(OSError):  # other files are in it, or it does not exist
+                edit.file.parent.rmdir()
         else:
             write_atomically(edit.file, edit.text)
     except OSError as error:

@@ -108,6 +108,7 @@ def _recordings(name: str, procedure: dict[str, Any]) -> str:
     optional = "temperature_degc, table_angle_deg, table_rate_dps, table_qw, table_qx, table_qy, table_qz"
     lines += ["", f"Columns of a canonical CSV: {columns}, and where known {optional}.", ""]
     lines += ["Other columns, units and raw counts: describe them in an ingest config.", ""]
+    lines += ["Which face points up at table angle 0 and which way the angle counts: docs/mounting.md.", ""]
     return "\n".join(lines)
 
 

@@ -66,6 +66,7 @@ def test_what_was_added_is_removed_and_the_file_is_as_before(
     assert "has g_sensitivity already" in capsys.readouterr().out
     assert remove.main(words) == 0
     assert not file.exists()
+    assert (campaign / "devices").exists()  # S3.yaml is in it
 
     file.write_text("# the first of its lot\noverrides:\n  - filter.order=1  # as measured\n")
     before = file.read_text()

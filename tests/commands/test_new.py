@@ -20,6 +20,7 @@ def test_the_table_is_named_with_its_accuracy_and_other_ranges_are_set_as_the_co
         "unit,serial,lot,date,sensor,table,procedure,overrides",
         "U1,,,,mpu6050,mark2,three_axis_turns,",
     ]
+    assert "docs/mounting.md" in (directory / "raw" / "U1" / "README.md").read_text()
     settings = directory / "campaign.yaml"
     text = settings.read_text()
     first = text.index("# models:")
