@@ -1,6 +1,4 @@
-"""Least squares, linear and nonlinear, with a certificate.
-
-The estimate minimises the sum of squares of the residuals:
+"""Least squares, linear and nonlinear, with a certificate of the minimum.
 
     x = argmin |r(x)|^2,    covariance = sigma^2 (J^T J)^-1
 
@@ -10,12 +8,11 @@ where
     J     : (n, p) derivative of r with respect to x
     sigma : standard deviation of one residual: given, or sqrt(|r|^2 / (n - p))
 
-Each step is solved by QR of the columns scaled to unit norm (``pipeline.estimation.scaled_columns``). The nonlinear
-problem is approached by a trust region (Branch, Coleman & Li, SIAM J. Sci. Comput. 21, 1999) and finished by
-Gauss-Newton steps, halved while they do not help.
-
-A success flag proves nothing; the largest cosine between the residual and a column of the Jacobian does: at a minimum
-the residual is orthogonal to all of them (Bates & Watts, Nonlinear Regression Analysis, 1988, section 2.2.3).
+Columns are scaled to unit norm d, so that units do not matter, and factorised as ``A = Q U diag(s) V^T diag(d)``; the
+singular values s show what the data determine. The nonlinear problem is solved by Gauss-Newton steps, halved while they
+do not help. Where they fail, a trust region approaches the minimum from the same start (Branch, Coleman & Li, SIAM J.
+Sci. Comput. 21, 1999). A success flag proves nothing; the largest cosine between the residual and a column of the
+Jacobian does: it is zero at a minimum (Bates & Watts, Nonlinear Regression Analysis, 1988, section 2.2.3).
 """
 
 from __future__ import annotations
@@ -26,21 +23,85 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.complex_step import complex_step_jacobian
-from pipeline.estimation.scaled_columns import factorise
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
-    from pipeline.estimation.scaled_columns import ScaledColumns
+    Values = NDArray[np.float64]
+    Function = Callable[[Values], Values]
 
-    Function = Callable[[NDArray[np.float64]], NDArray[np.float64]]
-
-COSINE_AT_MINIMUM = 1e-7
-STEP_AT_MINIMUM = 1e-10
+RANK_TOLERANCE = 1e-11  # of the largest singular value of unit columns: 1e5 times the rounding of a double
+PART_OF_NULL_SPACE = 1e-3  # of a unit vector of it, from which on a parameter is named as not determined
+COMPLEX_STEP = 1e-30  # there is no difference, so that nothing cancels (Squire & Trapp, SIAM Review 40, 1998)
+COSINE_AT_MINIMUM = 1e-7  # the root of rounding, about 1e-8, with a factor for sums over many residuals
+STEP_AT_MINIMUM = 1e-10  # relative; well below any uncertainty, well above rounding
 ROUNDING = 1e-10  # relative, of a sum of squares of small differences of large values
+
+
+@dataclass(frozen=True)
+class ScaledColumns:
+    """The factors of (n, p) columns: ``basis`` Q U, ``singular`` s (falling), ``Vt`` V^T and ``scale`` d."""
+
+    basis: Values
+    singular: Values
+    Vt: Values
+    scale: Values
+
+    @classmethod
+    def of(cls, A: Values) -> ScaledColumns:
+        """Factorise (n, p) columns; n may be smaller than p."""
+        n, p = A.shape
+        scale = np.linalg.norm(A, axis=0)
+        scale[scale == 0] = 1.0
+        Q, R = np.linalg.qr(A / scale)
+        U, s, Vt = np.linalg.svd(R, full_matrices=n < p)
+        singular, basis = np.zeros(p), np.zeros((n, p))
+        singular[: len(s)] = s
+        basis[:, : len(s)] = Q @ U
+        return cls(basis, singular, Vt, scale)
+
+    @property
+    def rank(self) -> int:
+        """Number of parameters, or combinations of them, that are determined."""
+        return int(np.sum(self.singular > RANK_TOLERANCE * self.singular[0]))
+
+    @property
+    def condition(self) -> float:
+        """Condition number of the scaled columns."""
+        return float(self.singular[0] / self.singular[-1]) if self.singular[-1] > 0 else float("inf")
+
+    def solve(self, y: Values) -> Values:
+        """Return x that minimises ``|y - A x|``, of least norm where several do: (n,) or (n, m) to (p,) or (p, m)."""
+        keep = slice(self.rank)
+        x: Values = ((self.Vt[keep].T / self.singular[keep]) @ (self.basis.T @ y)[keep]).T / self.scale
+        return x.T
+
+    def weights(self) -> Values:
+        """Return the pseudo-inverse for full rank, ``solve(y) = weights @ y``: (p, n) array."""
+        inverse: Values = (self.Vt.T / self.singular / self.scale[:, None]) @ self.basis.T
+        return inverse
+
+    def covariance(self) -> Values:
+        """Return ``(A^T A)^-1``, for full rank: (p, p) array."""
+        half: Values = self.Vt.T / self.singular / self.scale[:, None]
+        return half @ half.T
+
+    def require_full_rank(self, names: Sequence[str] | None = None) -> None:
+        """Raise ``NotObservableError`` with the names of the parameters that the data do not determine."""
+        p = len(self.scale)
+        if self.rank < p:
+            share = np.linalg.norm(self.Vt[self.rank :], axis=0)
+            missing = [
+                name
+                for name, part in zip(names or [f"x[{j}]" for j in range(p)], share, strict=True)
+                if part > PART_OF_NULL_SPACE
+            ]
+            raise NotObservableError(
+                f"the data determine {self.rank} of {p} parameters; not determined, or only in combination with each "
+                f"other: {', '.join(missing)}. Record motion that changes these independently, or fix some of them"
+            )
 
 
 @dataclass(frozen=True)
@@ -53,8 +114,6 @@ class LeastSquaresResult:
     covariance : (p, p) array
     residual : (n,) array
         As minimised, that is weighted where weights were given.
-    sigma : float
-        Standard deviation of one residual, as used for the covariance.
     degrees_of_freedom : int
         n - p.
     rank : int
@@ -64,37 +123,35 @@ class LeastSquaresResult:
         Largest |cosine| between the residual and a column of the Jacobian.
     converged : bool
         Whether the residual is orthogonal to the columns, or the next step is below the rounding of x.
-    evaluations : int
-        Of the residual function.
     """
 
-    x: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-    residual: NDArray[np.float64]
-    sigma: float
+    x: Values
+    covariance: Values
+    residual: Values
     degrees_of_freedom: int
     rank: int
     condition: float
     cosine: float
     converged: bool
-    evaluations: int
 
     @property
-    def standard_uncertainty(self) -> NDArray[np.float64]:
+    def standard_uncertainty(self) -> Values:
         """Standard uncertainty of each parameter: (p,) array."""
         return np.sqrt(np.diag(self.covariance))
 
-    @property
-    def residual_rms(self) -> float:
-        """Root mean square of the residuals."""
-        return float(np.sqrt(np.mean(self.residual**2)))
+
+def complex_step_jacobian(function: Function) -> Function:
+    """Return the derivative of an analytic function (no abs, no comparison), ``Im f(x + i h e_j) / h``."""
+
+    def jacobian(x: Values) -> Values:
+        columns = [function(x + 1j * COMPLEX_STEP * e) for e in np.eye(len(x))]
+        return np.stack([np.imag(column) / COMPLEX_STEP for column in columns], axis=1)
+
+    return jacobian
 
 
 def solve_linear(
-    A: NDArray[np.float64],
-    y: NDArray[np.float64],
-    sigma: float | None = None,
-    names: Sequence[str] | None = None,
+    A: Values, y: Values, sigma: float | None = None, names: Sequence[str] | None = None
 ) -> LeastSquaresResult:
     """Solve ``min |y - A x|``.
 
@@ -107,32 +164,28 @@ def solve_linear(
     names : sequence of str, optional
         Names of the parameters, for the message where they are not determined.
 
-    Returns
-    -------
-    LeastSquaresResult
-
     Raises
     ------
     NotObservableError
         If the columns are linearly dependent or fewer equations than parameters are given.
     """
-    factors = factorise(A)
+    factors = ScaledColumns.of(A)
     factors.require_full_rank(names)
     x = factors.solve(y)
-    residual = y - A @ x
-    x += factors.solve(residual)  # one refinement recovers the digits that ill-conditioned columns cost
-    return _result(x, y - A @ x, A, factors, sigma=sigma, evaluations=1)
+    x += factors.solve(y - A @ x)  # one refinement recovers the digits that ill-conditioned columns cost
+    return _result(x, y - A @ x, A, factors, sigma)
 
 
 def solve_nonlinear(
     residuals: Function,
-    start: NDArray[np.float64],
+    start: Values,
     jacobian: Function | None = None,
     *,
     sigma: float | None = None,
     names: Sequence[str] | None = None,
+    iterations: int = 50,
 ) -> LeastSquaresResult:
-    """Minimise ``|residuals(x)|`` from a start that may be far off.
+    """Minimise ``|residuals(x)|``.
 
     Parameters
     ----------
@@ -140,9 +193,11 @@ def solve_nonlinear(
         (p,) to (n,).
     start : (p,) array
     jacobian : callable, optional
-        (p,) to (n, p). None differentiates by a complex step, for which ``residuals`` must be analytic (no abs).
+        (p,) to (n, p). None differentiates by a complex step, for which ``residuals`` must be analytic.
     sigma, names
         As in ``solve_linear``.
+    iterations : int
+        Limit on the number of Gauss-Newton steps.
 
     Returns
     -------
@@ -154,81 +209,72 @@ def solve_nonlinear(
     NotObservableError
         If the data do not determine all parameters.
     """
-    from scipy.optimize import least_squares  # noqa: PLC0415  (0.5 s that only starts from far off need)
-
     jacobian = jacobian or complex_step_jacobian(residuals)
-    with np.errstate(all="ignore"):  # steps that overflow are refused by the trust region
-        approach = least_squares(
-            residuals,
-            start,
-            jac=jacobian,
-            method="trf",
-            x_scale="jac",
-            ftol=1e-15,
-            xtol=1e-15,
-            gtol=1e-15,
-            max_nfev=5000,
-        )
-    return refine(residuals, approach.x, jacobian, sigma=sigma, names=names, spent=int(approach.nfev))
+    with np.errstate(all="ignore"):  # steps that overflow do not lower the sum of squares
+        first = residuals(start), jacobian(start)
+        if not all(np.all(np.isfinite(values)) for values in first):
+            raise NotObservableError(
+                "residuals or their derivatives are not finite at the start: give a start nearer the solution, or "
+                "check the readings for values that are not finite"
+            )
+        x, r, J, factors = _gauss_newton(residuals, jacobian, np.array(start, float), iterations)
+        if factors.rank < len(x) or not _certified(x, r, J, factors):
+            from scipy.optimize import least_squares  # noqa: PLC0415  (0.5 s that only starts from far off need)
 
-
-def refine(
-    residuals: Function,
-    start: NDArray[np.float64],
-    jacobian: Function | None = None,
-    *,
-    sigma: float | None = None,
-    names: Sequence[str] | None = None,
-    iterations: int = 50,
-    spent: int = 0,
-) -> LeastSquaresResult:
-    """Minimise ``|residuals(x)|`` from a good start by Gauss-Newton steps, each halved while it does not help.
-
-    Parameters
-    ----------
-    residuals, start, jacobian, sigma, names
-        As in ``solve_nonlinear``.
-    iterations : int
-        Limit on the number of steps.
-    spent : int
-        Evaluations already used, for the record.
-
-    Returns
-    -------
-    LeastSquaresResult
-
-    Raises
-    ------
-    NotObservableError
-        If the data do not determine all parameters.
-    """
-    jacobian = jacobian or complex_step_jacobian(residuals)
-    x = np.array(start, float)
-    with np.errstate(all="ignore"):
-        r = residuals(x)
-        J = jacobian(x)
-        _require_finite(r, J)
-        factors = factorise(J)
-        size = np.inf
-        for _ in range(iterations):
-            step = -factors.solve(r)
-            x_new, r_new, tried = _halved(residuals, x, r, step)
-            spent += tried
-            if x_new is None or r_new is None:
-                break
-            small = bool(np.all(np.abs(x_new - x) <= STEP_AT_MINIMUM * np.abs(x_new)))
-            size, before = float(np.linalg.norm(step * factors.scale)), size
-            stalled = size > 0.5 * before and r_new @ r_new >= (1.0 - ROUNDING) * (r @ r)
-            x, r = x_new, r_new
-            J = jacobian(x)
-            factors = factorise(J)
-            if small or stalled:
-                break
+            far = least_squares(
+                residuals,
+                start,
+                jac=jacobian,
+                method="trf",
+                x_scale="jac",
+                ftol=1e-15,
+                xtol=1e-15,
+                gtol=1e-15,
+                max_nfev=100 * iterations,
+            )
+            x, r, J, factors = _gauss_newton(residuals, jacobian, far.x, iterations)
     factors.require_full_rank(names)
-    return _result(x, r, J, factors, sigma=sigma, evaluations=spent)
+    return _result(x, r, J, factors, sigma)
 
 
-def certificate(A: NDArray[np.float64], residual: NDArray[np.float64], condition: float, rank: int) -> dict[str, Any]:
+def _gauss_newton(
+    residuals: Function, jacobian: Function, x: Values, iterations: int
+) -> tuple[Values, Values, Values, ScaledColumns]:
+    """Return x, r, J and its factors after Gauss-Newton steps, each halved while it does not help."""
+    r, J = residuals(x), jacobian(x)
+    factors, size = ScaledColumns.of(J), np.inf
+    for _ in range(iterations):
+        x_new, r_new = _halved(residuals, x, r, -factors.solve(r))
+        if x_new is None or r_new is None:
+            break
+        J_new = jacobian(x_new)
+        if not np.all(np.isfinite(J_new)):
+            break
+        small = bool(np.all(np.abs(x_new - x) <= STEP_AT_MINIMUM * np.abs(x_new)))
+        size, before = float(np.linalg.norm((x_new - x) * factors.scale)), size
+        stalled = size >= before and r_new @ r_new >= (1.0 - ROUNDING) * (r @ r)
+        x, r, J = x_new, r_new, J_new
+        factors = ScaledColumns.of(J)
+        if small or stalled:
+            break
+    return x, r, J, factors
+
+
+def _halved(residuals: Function, x: Values, r: Values, step: Values) -> tuple[Values | None, Values | None]:
+    """Return x and r after the first of step, step/2, ... that lowers ``|r|``, or None where none does.
+
+    Near the minimum the sum of squares is flat to rounding while the step still has digits: there it may stay the same.
+    """
+    before = r @ r
+    for tried in range(30):
+        x_new = x + step * 0.5**tried
+        r_new = residuals(x_new)
+        if r_new @ r_new < before * (1.0 + (ROUNDING if tried == 0 else 0.0)):
+            return x_new, r_new
+    return None, None
+
+
+def certificate(A: Values, residual: Values, condition: float, rank: int) -> dict[str, Any]:
     """Return what shows that a linear estimate is a minimum, as ``SensorCalibration.convergence`` holds it.
 
     Parameters
@@ -258,55 +304,29 @@ def certified(cosine: float, condition: float, rank: int, parameters: int) -> di
     }
 
 
-def _halved(
-    residuals: Function, x: NDArray[np.float64], r: NDArray[np.float64], step: NDArray[np.float64]
-) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None, int]:
-    """Return the first of step, step/2, ... that lowers |r|, or None where none does.
-
-    Near the minimum the sum of squares is flat to rounding while the step still has digits: there it may stay the same.
-    """
-    before = r @ r
-    for tried in range(1, 31):
-        x_new = x + step * 0.5 ** (tried - 1)
-        r_new = residuals(x_new)
-        if r_new @ r_new < before * (1.0 + (ROUNDING if tried == 1 else 0.0)):
-            return x_new, r_new, tried
-    return None, None, 30
-
-
-def _require_finite(r: NDArray[np.float64], J: NDArray[np.float64]) -> None:
-    if not (np.all(np.isfinite(r)) and np.all(np.isfinite(J))):
-        raise NotObservableError(
-            "residuals or their derivatives are not finite at the start: give a start nearer the solution, or check "
-            "the readings for values that are not finite"
-        )
-
-
-def _result(
-    x: NDArray[np.float64],
-    r: NDArray[np.float64],
-    J: NDArray[np.float64],
-    factors: ScaledColumns,
-    *,
-    sigma: float | None,
-    evaluations: int,
-) -> LeastSquaresResult:
-    dof = len(r) - len(x)
+def _cosine(r: Values, J: Values, factors: ScaledColumns) -> float:
+    """Return the largest |cosine| between the residual and a column of the Jacobian."""
     norm = float(np.linalg.norm(r))
+    return float(np.max(np.abs(J.T @ r) / factors.scale) / norm) if norm > 0 else 0.0
+
+
+def _certified(x: Values, r: Values, J: Values, factors: ScaledColumns) -> bool:
+    """Return whether the residual is orthogonal to the columns, or the next step below the rounding of x."""
+    settled = bool(np.all(np.abs(factors.solve(r)) <= STEP_AT_MINIMUM * np.abs(x)))
+    return settled or _cosine(r, J, factors) <= COSINE_AT_MINIMUM
+
+
+def _result(x: Values, r: Values, J: Values, factors: ScaledColumns, sigma: float | None) -> LeastSquaresResult:
+    dof = len(r) - len(x)
     if sigma is None:
-        sigma = norm / np.sqrt(dof) if dof > 0 else 0.0
-    cosine = float(np.max(np.abs(J.T @ r) / factors.scale) / norm) if norm > 0 else 0.0
-    step = np.abs(factors.solve(r))
-    settled = bool(np.all(step <= STEP_AT_MINIMUM * np.abs(x)))
+        sigma = float(np.linalg.norm(r)) / np.sqrt(dof) if dof > 0 else 0.0
     return LeastSquaresResult(
         x=x,
         covariance=sigma**2 * factors.covariance(),
         residual=r,
-        sigma=float(sigma),
         degrees_of_freedom=dof,
         rank=factors.rank,
         condition=factors.condition,
-        cosine=cosine,
-        converged=cosine <= COSINE_AT_MINIMUM or settled,
-        evaluations=evaluations,
+        cosine=_cosine(r, J, factors),
+        converged=_certified(x, r, J, factors),
     )

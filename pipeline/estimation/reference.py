@@ -33,12 +33,12 @@ from pipeline.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.bench_budget import budgeted
 from pipeline.estimation.budget import noise_contribution
 from pipeline.estimation.gauss_markov import blocks_of_samples
-from pipeline.estimation.least_squares import certificate
+from pipeline.estimation.least_squares import ScaledColumns, certificate
 from pipeline.estimation.linear_map import LinearMap
 from pipeline.estimation.noise import prior_of
 from pipeline.estimation.residual_noise import assess_noise
 from pipeline.estimation.table_inputs import Reference, disturbance
-from pipeline.estimation.turns import Factors, parts_of, settled
+from pipeline.estimation.turns import parts_of, settled
 from pipeline.model.effects.base import truth
 from pipeline.records import AXES, SensorCalibration, StageResult
 
@@ -91,7 +91,7 @@ def fit_reference(
     u = np.concatenate([_reference(sensor, part)[part.keep] for part in parts])
     X = np.column_stack([np.ones(len(u)), u])
     condition, rank = _require_observable(sensor, X), X.shape[1]
-    factors = Factors.of(X)
+    factors = ScaledColumns.of(X)
     beta = factors.solve(y)
     residuals = y - X @ beta
     blocks = blocks_of_samples([(part.recording, part.keep) for part in parts])

@@ -22,11 +22,12 @@ and no one sinusoid holds both.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pipeline.errors import CannotCalibrateError, NotObservableError
+from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.model.kinematics import earth_rate, reference_motion
 from pipeline.signal.rests import runs
 
@@ -223,8 +224,7 @@ def fit_sinusoid(angle_deg: NDArray[np.float64], reading: NDArray[np.float64], *
         coefficients = factors.solve(reading)
         if abs(np.arctan2(coefficients[2], coefficients[1]) - phase) < SAME_PHASE:
             break
-    condition = float(np.linalg.cond(factors.R))
-    return Sinusoid(coefficients, columns, factors.weights(), reading - columns @ coefficients, condition)
+    return Sinusoid(coefficients, columns, factors.weights(), reading - columns @ coefficients, factors.condition)
 
 
 def wrap(angle_deg: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -232,38 +232,11 @@ def wrap(angle_deg: NDArray[np.float64]) -> NDArray[np.float64]:
     return (angle_deg + 180.0) % 360.0 - 180.0
 
 
-@dataclass(frozen=True)
-class Factors:
-    """Columns scaled to unit norm, in factors: ``columns = Q R diag(scale)``."""
-
-    Q: NDArray[np.float64]
-    R: NDArray[np.float64]
-    scale: NDArray[np.float64]
-
-    @classmethod
-    def of(cls, columns: NDArray[np.float64]) -> Self:
-        """Factorise (n, p) columns."""
-        scale = np.linalg.norm(columns, axis=0)
-        scale[scale == 0] = 1.0
-        Q, R = np.linalg.qr(columns / scale)
-        return cls(Q, R, scale)
-
-    def solve(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the least-squares coefficients of (n,) or (n, m) readings."""
-        found: NDArray[np.float64] = (np.linalg.solve(self.R, self.Q.T @ y).T / self.scale).T
-        return found
-
-    def weights(self) -> NDArray[np.float64]:
-        """Return the pseudo-inverse: (p, n) array, with ``solve(y) = weights @ y``."""
-        inverse: NDArray[np.float64] = np.linalg.solve(self.R, self.Q.T) / self.scale[:, None]
-        return inverse
-
-
-def _factors(columns: NDArray[np.float64], where: str) -> Factors:
+def _factors(columns: NDArray[np.float64], where: str) -> ScaledColumns:
     n, p = columns.shape
     if n >= p:
-        factors = Factors.of(columns)
-        if np.linalg.svd(factors.R, compute_uv=False)[-1] > WEAKEST_DIRECTION:
+        factors = ScaledColumns.of(columns)
+        if factors.singular[-1] > WEAKEST_DIRECTION:
             return factors
     raise NotObservableError(
         f"{where} does not show a sinusoid: {n} samples over too few angles; turn the table once around, stopping at "

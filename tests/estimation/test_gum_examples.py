@@ -49,7 +49,7 @@ def test_h3_calibration_line_of_a_thermometer() -> None:
     assert [round(found.x[0], 4), round(u[0], 4)] == [-0.1712, 0.0029]
     assert [round(found.x[1], 5), round(u[1], 5)] == [0.00218, 0.00067]
     assert round(correlation(found.covariance)[0, 1], 3) == -0.930
-    assert round(found.sigma, 4) == 0.0035
+    assert round(float(np.sqrt(found.residual @ found.residual / found.degrees_of_freedom)), 4) == 0.0035
     value, covariance, _ = propagate(lambda y: np.array([y[0] + 10.0 * y[1]]), found.x, found.covariance)
     assert [round(value[0], 4), round(float(np.sqrt(covariance[0, 0])), 4)] == [-0.1494, 0.0041]
     assert found.degrees_of_freedom == 9

@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.least_squares import refine, solve_linear
+from pipeline.estimation.least_squares import solve_linear, solve_nonlinear
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -157,7 +157,7 @@ def _weighted_fit(y: Values, target: Values, weight: Values, start: Values, free
         return weight[:, None] * derivative_of(y, _insert(start, free, x))[:, free]
 
     names = [name for name, is_free in zip(NAMES, free, strict=True) if is_free]
-    return refine(residuals, start[free], jacobian, sigma=1.0, names=names)
+    return solve_nonlinear(residuals, start[free], jacobian, sigma=1.0, names=names)
 
 
 def _insert(values: Values, free: Mask, x: Values) -> Values:

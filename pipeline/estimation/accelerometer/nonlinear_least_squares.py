@@ -36,15 +36,14 @@ from pipeline.estimation.budget import (
     scatter_contribution,
 )
 from pipeline.estimation.gauss_markov import blocks_of_samples
-from pipeline.estimation.least_squares import certified
+from pipeline.estimation.least_squares import ScaledColumns, certified
 from pipeline.estimation.linear_map import LinearMap
 from pipeline.estimation.noise import prior_of
 from pipeline.estimation.residual_noise import assess_noise
 from pipeline.estimation.rest_means import describe_rests
-from pipeline.estimation.scaled_columns import estimate_weights, factorise
 from pipeline.estimation.table_inputs import Reference, disturbance
 from pipeline.estimation.trials import Errors, beside_trials, quadratic_results, trials_of, without_trials
-from pipeline.estimation.turns import Factors, table_motion
+from pipeline.estimation.turns import table_motion
 from pipeline.records import SensorCalibration, StageResult, coverage_factor
 
 if TYPE_CHECKING:
@@ -232,7 +231,7 @@ def _outlier(orientations: Orientations, found: Ellipsoid) -> dict[int, str]:
     if not orientations.by_hand or m < FEWEST_TO_JUDGE or left_out >= OUTLIER_SHARE * (m + left_out):
         return {}
     J = derivative_of(orientations.mean, found.values)[:, found.free]
-    rest = 1.0 - np.sum(factorise(found.weight[:, None] * J).basis ** 2, axis=1)
+    rest = 1.0 - np.sum(ScaledColumns.of(found.weight[:, None] * J).basis ** 2, axis=1)
     r, spare = found.weight * found.error, m - int(found.free.sum()) - 1
     others = np.maximum(np.sum(r**2) - r**2 / np.maximum(rest, 1e-9), 1e-12 * np.sum(r**2)) / spare
     t = np.abs(r) / np.sqrt(others * np.maximum(rest, 1e-9))
@@ -252,7 +251,7 @@ def _scatter(orientations: Orientations, found: Ellipsoid, prior: Prior, table: 
         return _serial_scatter(orientations, found, prior, table)
     place = np.eye(9)[:, found.free]
     J = derivative_of(orientations.mean, found.values)[:, found.free]
-    gain = estimate_weights(J, found.weight)
+    gain = _gain(J, found.weight)
     if spare > 1 and orientations.rests:
         return rest_scatter(_errors(orientations, found, J), gain, prior).placed(place)
     # Too few rests to show a scatter of their own: what is believed of the bias wander stands in.
@@ -261,6 +260,13 @@ def _scatter(orientations: Orientations, found: Ellipsoid, prior: Prior, table: 
     parts = {"white noise": np.sqrt(np.diag(white)), "bias wander": np.sqrt(np.diag(covariance - white))}
     freedom = float(3 * np.sum(orientations.count - 1))
     return scatter_contribution(covariance, freedom, parts).placed(place)
+
+
+def _gain(J: Values, weight: Values) -> Values:
+    """Return the weights of the readings in the estimate, ``(J^T W J)^-1 J^T W`` with W = diag(weight^2)."""
+    factors = ScaledColumns.of(weight[:, None] * J)
+    factors.require_full_rank()
+    return factors.weights() * weight
 
 
 def _errors(orientations: Orientations, found: Ellipsoid, J: Values) -> RestErrors:
@@ -293,7 +299,7 @@ def _serial_scatter(
     row = orientations.row
     J = derivative_of(orientations.mean, found.values)[:, found.free]
     noise, along = _table_noise(orientations, found, prior, table)
-    per_sample = (estimate_weights(J, found.weight) / orientations.count)[:, row]
+    per_sample = (_gain(J, found.weight) / orientations.count)[:, row]
     weights_x, weights_y, weights_z = (per_sample * along[row, c] for c in range(3))
     place = np.eye(9)[:, found.free]
     return noise_contribution(noise, LinearMap((weights_x, weights_y, weights_z), (place, place, place)), prior)
@@ -309,7 +315,7 @@ def _table_noise(
     motions = [_motion(recording, table).select(keep) for recording, keep in orientations.parts]
     u = np.concatenate([motion.specific_force for motion in motions])
     X, reading = np.column_stack([np.ones(len(u)), u]), orientations.reading()
-    factors, blocks = Factors.of(X), blocks_of_samples(orientations.parts)
+    factors, blocks = ScaledColumns.of(X), blocks_of_samples(orientations.parts)
     beta, A, every = factors.solve(reading), factors.weights(), np.eye(4)
     residuals = reading - X @ beta
     reference = Reference("accelerometer", motions, LinearMap((A, A, A), (every, every, every)), beta[1:].T, table)
@@ -351,6 +357,5 @@ def _details(orientations: Orientations, found: Ellipsoid, freedom: float) -> di
         "largest_error": float(np.max(np.abs(found.error))),
         "condition": found.fit.condition,
         "cosine": found.fit.cosine,
-        "evaluations": found.fit.evaluations,
         "degrees_of_freedom": freedom,
     }

@@ -27,12 +27,12 @@ from pipeline.estimation.bench_budget import budgeted
 from pipeline.estimation.budget import combined, noise_contribution, scatter_contribution
 from pipeline.estimation.correction import apply_correction
 from pipeline.estimation.gauss_markov import blocks_of_samples
-from pipeline.estimation.least_squares import certificate, certified
+from pipeline.estimation.least_squares import ScaledColumns, certificate, certified
 from pipeline.estimation.linear_map import LinearMap
 from pipeline.estimation.noise import prior_of
 from pipeline.estimation.residual_noise import assess_noise
 from pipeline.estimation.table_inputs import Reference, disturbance
-from pipeline.estimation.turns import Factors, parts_of
+from pipeline.estimation.turns import parts_of
 from pipeline.model.effects.scale_factor_asymmetry import EFFECT
 from pipeline.records import FittedEffect, SensorCalibration, StageResult
 
@@ -195,7 +195,7 @@ def _noise(turns: Sequence[Turn], fit: LinearMap, prior: Prior, table: Mapping[s
     reading = np.concatenate([turn.reading for turn in turns])
     X = np.column_stack([np.ones(len(u)), u, np.abs(u)])
     blocks = blocks_of_samples([used for turn in turns for used in turn.used])
-    beta = Factors.of(X).solve(reading)
+    beta = ScaledColumns.of(X).solve(reading)
     residuals = reading - X @ beta
     disturbed = disturbance(Reference("accelerometer", motions, fit, beta[1:4].T, table), residuals, blocks)
     return assess_noise(residuals, X, blocks, prior, disturbed)
