@@ -50,13 +50,32 @@ LEVELS = ((0.0, 2.0, 6.0, 20.0), (0.0, 4.0, 16.0))  # of rests, and of moves
 
 @dataclass(frozen=True)
 class HandNoise:
-    """One noise: wander over white noise, its correlation time in s, scatter of each kind, prior log weight, and c."""
+    """One noise: wander over white noise, its correlation time in s, scatter of each kind, log weight, c; see ``prior``."""
 
     ratio: float
     time: float
     scatter: tuple[float, ...]
-    prior: float
+    belief: float
     direction: float = 0.0
+    none: float = 0.0
+
+    @property
+    def prior(self) -> float:
+        """Prior log weight: that of the wander, and ``none`` for each kind without scatter."""
+        return self.belief + self.none * self.scatter.count(0.0)
+
+    @property
+    def levels(self) -> tuple[float, ...]:
+        """Scatter of each kind, and c."""
+        return *self.scatter, self.direction
+
+    def at(self, levels: Sequence[float]) -> HandNoise:
+        """Return the noise at other levels."""
+        return replace(self, scatter=tuple(levels[:-1]), direction=levels[-1])
+
+    def scaled(self, j: int, factor: float) -> HandNoise:
+        """Return the noise with one of its levels multiplied."""
+        return self.at([level * (factor if i == j else 1.0) for i, level in enumerate(self.levels)])
 
 
 @dataclass(frozen=True)
@@ -185,7 +204,7 @@ def noises_about(prior: Prior, white: float, kinds: int) -> list[HandNoise]:
     pairs = zip((wander / white).tolist(), prior.log_belief(wander).tolist(), strict=True)
     believed = [(ratio, belief) for ratio, belief in pairs if np.isfinite(belief)]
     none = float(np.log(SURE * (len(FINE) - 1)))  # as nobody states a scatter, none at all is believed before any
-    levels = [(level, none * level.count(0.0)) for level in product(FINE, repeat=kinds)]
-    noises = [HandNoise(ratio, prior.time, level, belief + b) for ratio, belief in believed for level, b in levels]
+    levels = list(product(FINE, repeat=kinds))
+    noises = [HandNoise(ratio, prior.time, level, b, none=none) for ratio, b in believed for level in levels]
     beside = [n for n in noises if kinds > 1 and n.scatter[1] in BESIDE]
     return noises + [replace(n, direction=c) for n in beside for c in FINE[2:]]

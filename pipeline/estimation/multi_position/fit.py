@@ -17,6 +17,7 @@ weight is the square of uncertainty over limit.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -43,6 +44,9 @@ STALLED = 0.1
 HALVINGS = 12
 ROUNDING = 1e-9
 NONE = 1e-8  # share of its columns below which a combination of parameters is not determined
+STEPS = (3.0**0.5, 3.0**0.25, 3.0**0.125)  # factors of a scatter, on the way to its maximum
+SHARP = 0.5  # standard deviation of a scatter's logarithm, half a step of the grid's
+RARE = 1e-3  # weight of a level below which it is none of the average's
 FAR = 12.0  # of log L below the best, where a noise is not believed
 
 
@@ -189,9 +193,7 @@ def _lowered(  # noqa: PLR0917  (they are the problem)
 def _assessed(
     state: State, equations: Equations, noises: Sequence[HandNoise], limits: Limits, how: tuple[int, bool]
 ) -> HandFit:
-    found = beside(equations, noises)
-    scores = found.log_likelihood(np.sum(found.residual**2, axis=1))
-    noises = [noise for noise, score in zip(noises, scores, strict=True) if score > scores.max() - FAR]
+    noises, likelihood = refined(equations, noises, limits)
     every = [solve(equations, noise, limits) for noise in noises]
     best = int(np.argmax([s.log_likelihood for s in every]))
     restricted = np.array([s.restricted for s in every])
@@ -202,7 +204,7 @@ def _assessed(
     return HandFit(
         state,
         covariance,
-        every[best].log_likelihood,
+        likelihood,
         noises[best],
         freedom,
         equations.residual,
@@ -214,6 +216,51 @@ def _assessed(
         tuple((noise, float(w), s.scale) for noise, w, s in zip(noises, weight, every, strict=True)),
         limits.precision,
     )
+
+
+def refined(equations: Equations, noises: Sequence[HandNoise], limits: Limits) -> tuple[list[HandNoise], float]:
+    """Return the noises that are believed, with levels of scatter as close as their uncertainty asks for.
+
+    A scatter of many moves is known to a tenth or so, where a grid of factors of 3 or 4 would give a covariance that is
+    wrong by up to as much. So each scatter is led to the maximum of the restricted likelihood, by ever smaller factors;
+    where its logarithm has a standard deviation s there that is less than half a step of the grid, its levels are
+    ``exp(0, +-s, +-2 s)`` times the maximum, and otherwise those of the grid that are believed.
+
+    Returns
+    -------
+    list of HandNoise
+    float
+        The largest log likelihood over the given noises.
+    """
+    found = beside(equations, noises)
+    scores = found.log_likelihood(np.sum(found.residual**2, axis=1))
+    noises = [noise for noise, score in zip(noises, scores, strict=True) if score > scores.max() - FAR]
+
+    def restricted(noise: HandNoise) -> float:
+        return solve(equations, noise, limits).restricted
+
+    weight = np.array([restricted(noise) for noise in noises])
+    best, top = noises[int(np.argmax(weight))], float(weight.max())
+    weight = np.exp(weight - top)
+    for factor in STEPS:
+        for j in np.flatnonzero(best.levels):
+            for other in (best.scaled(j, factor), best.scaled(j, 1.0 / factor)):
+                score = restricted(other)
+                if score > top:
+                    best, top = other, score
+    levels = []
+    for j, level in enumerate(best.levels):
+        given = np.array([noise.levels[j] for noise in noises])
+        kinds = np.unique(given)
+        believed = [float(k) for k in kinds if weight[given == k].sum() > RARE * weight.sum()]
+        if level > 0.0:
+            around = [restricted(best.scaled(j, factor)) for factor in (STEPS[-1], 1.0 / STEPS[-1])]
+            bend = (2.0 * top - sum(around)) / np.log(STEPS[-1]) ** 2
+            if bend > SHARP**-2:
+                believed = (level * np.exp(np.arange(-2.0, 3.0) / np.sqrt(bend))).tolist()
+        levels.append(believed)
+    wanders = {(n.ratio, n.time): n for n in noises}.values()
+    return [n.at(level) for n in wanders for level in product(*levels)], float(scores.max())
 
 
 def solve(equations: Equations, noise: HandNoise, limits: Limits) -> Solved:

@@ -44,10 +44,10 @@ if TYPE_CHECKING:
 LONGEST_S = 60.0
 GAP = 3.5  # intervals without a sample, over which a rate is not interpolated
 LEAST_TURN_DEG = 5.0
-FEWEST_STEPS = 100
-EQUAL_S = 2e-9
-MOSTLY = 0.9  # share of equal steps
-ROUNDED = 0.1  # of a step
+ENVELOPE = 10  # samples, of which one at least is stamped without delay
+DROPPED = 0.5  # of an interval, by which a dropped sample makes at least one half of the stamps late
+ROUNDED = 0.1  # of an interval, by which digits of a file take stamps off a regular clock
+CLEAR = 20.0  # gain of twice a log likelihood by another clock
 SMOOTH = 4
 UNTOLD = 0.12
 BENT = 8.0  # second difference over white noise, 2.4 of which is the noise's own
@@ -110,19 +110,24 @@ def moves_of(recordings: Sequence[Recording], rests: Rests) -> Moves | None:
         found.append((i, j, span))
     if not found:
         return None
-    clocks = {int(i): regular_time(recordings[i].time) for i in np.unique(rests.recording)}
+    index = np.array([int(rests.recording[j]) for _, j, _ in found])
+    clocks: dict[int, Values] = {}
+    for i in np.unique(index):
+        rows, recording = np.flatnonzero(index == i), recordings[i]
+        values = recording.gyroscope
+        assert values is not None  # noqa: S101
+        spans = [found[row][2] for row in rows]
+        own = clocks_of(recording.time, values, spans, rests.white)
+        clocks |= dict(zip(rows.tolist(), own, strict=True))
     longest = max(span.stop - span.start for _, _, span in found)
     shape = (len(found), longest)
     reading, time, weight = np.zeros((*shape, 3)), np.zeros(shape), np.zeros(shape)
     for row, (_, j, span) in enumerate(found):
-        recording = recordings[rests.recording[j]]
-        n = span.stop - span.start
-        values = recording.gyroscope
+        n, values = span.stop - span.start, recordings[rests.recording[j]].gyroscope
         assert values is not None  # noqa: S101
         reading[row, :n], reading[row, n:] = values[span], values[span.stop - 1]
-        clock = clocks[int(rests.recording[j])]
-        time[row, :n], time[row, n:] = clock[span], clock[span.stop - 1]
-        step = np.diff(clock[span])
+        time[row, :n], time[row, n:] = clocks[row], clocks[row][-1]
+        step = np.diff(clocks[row])
         weight[row, : n - 1] += step / 2.0
         weight[row, 1:n] += step / 2.0
     taken, doubt = _bends(reading, weight, BENT * float(np.linalg.norm(rests.white)))
@@ -172,19 +177,51 @@ def _bends(reading: Values, weight: Values, least: float) -> tuple[Values, Value
     return taken, UNTOLD * interval[:, :, None] * np.where(left[:, :, None], second, 0.0)
 
 
-def regular_time(time: Values) -> Values:
-    """Return stamps without the rounding of a regular clock: (n,) array, s; other stamps as they are.
+def _regular_stamps(time: Values) -> Values | None:
+    """Return the stamps that a regular clock gives the samples: (s,) array; None where one was dropped.
 
-    A file that keeps six digits of a clock that ticks every 9.999 ms holds steps of 10 ms and now and then one of 9 ms,
-    over which 200 deg/s would be integrated wrongly by 0.2 deg. Nearly all steps are equal then, and all stamps lie
-    on a straight line to within a small part of a step; stamps of an irregular clock, or with a gap, do not.
+    Stamps by arrival are late, each by an amount of its own. A dropped sample makes all that follow late: then the
+    lower envelope of the stamps, less a straight line, has a step.
     """
-    steps = np.diff(time)
-    if len(steps) < FEWEST_STEPS or np.mean(np.abs(steps - np.median(steps)) < EQUAL_S) < MOSTLY:
-        return time
     n = np.arange(len(time)) - 0.5 * (len(time) - 1)
     line = time.mean() + n * float(n @ time) / float(n @ n)
-    return line if np.abs(time - line).max() <= ROUNDED * np.median(steps) else time
+    windows = np.lib.stride_tricks.sliding_window_view(time - line, min(ENVELOPE, len(time)))
+    return line if np.ptp(windows.min(axis=1)) <= DROPPED * (line[1] - line[0]) else None
+
+
+def _roughness(time: Values, rate: Values, white: Values) -> float:
+    """Return the squares by which each reading departs from a line between its neighbours, over white noise."""
+    share = ((time[1:-1] - time[:-2]) / np.maximum(time[2:] - time[:-2], 1e-9))[:, None]
+    apart = rate[1:-1] - (1.0 - share) * rate[:-2] - share * rate[2:]
+    return float(np.nansum(apart**2 / (white**2 * (1.0 + share**2 + (1.0 - share) ** 2))))
+
+
+def clocks_of(time: Values, rate: Values, moves: Sequence[slice], white: Values) -> list[Values]:
+    """Return the time of each move's samples: as stamped, or regular where the readings are much smoother with that.
+
+    The regular clock is that of the whole recording, or of each move where that one drifts or a sample was dropped.
+    Stamps that only a file's digits take off it are regular unless the readings contradict: a file that keeps six
+    digits of a clock that ticks every 9.999 ms holds steps of 10 ms and now and then one of 9 ms, over which 200 deg/s
+    would be integrated wrongly by 0.2 deg.
+
+    Parameters
+    ----------
+    time : (n,) array, s
+    rate : (n, 3) array, deg/s
+    moves : sequence of slice
+    white : (3,) array, deg/s
+        White noise of a sample.
+    """
+    whole = _regular_stamps(time)
+    if whole is not None:
+        rounded = np.abs(time - whole).max() <= ROUNDED * (whole[1] - whole[0])
+        gain = _roughness(time, rate, white) - _roughness(whole, rate, white)
+        return [(whole if gain > (-CLEAR if rounded else CLEAR) else time)[span] for span in moves]
+    regular = [_regular_stamps(time[span]) for span in moves]
+    pairs = [(span, line) for span, line in zip(moves, regular, strict=True) if line is not None]
+    gain = sum(_roughness(time[s], rate[s], white) - _roughness(line, rate[s], white) for s, line in pairs)
+    known = zip(moves, regular, strict=True)
+    return [time[span] if line is None or gain <= CLEAR else line for span, line in known]
 
 
 def _sound(recording: Recording, span: slice) -> bool:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.estimation.multi_position.gravity import gravity_of
-from pipeline.estimation.multi_position.moves import regular_time
+from pipeline.estimation.multi_position.moves import clocks_of
 from pipeline.estimation.multi_position.rests import rests_of
 from pipeline.records import Recording, SensorCalibration
 
@@ -48,19 +48,21 @@ def test_the_mean_is_kept_where_the_unit_rests() -> None:
     assert np.array_equal(found.at_start, found.at_end)
 
 
-def test_a_regular_clock_that_the_file_rounds_is_regular_again() -> None:
-    true = 0.009999 * np.arange(40_000)
-    rounded = np.round(true, 3)
-    assert np.diff(rounded).min() < 0.0095
-    assert np.abs(regular_time(rounded) - true).max() < 2e-4
-    assert np.abs(np.diff(regular_time(rounded)) - 0.009999).max() < 1e-8
+def turning(time: np.ndarray) -> np.ndarray:
+    """Return the readings of a turn at 100 deg/s that swells and fades with the true time, and white noise."""
+    noise = NOISE * np.random.default_rng(2).standard_normal((len(time), 3))
+    return np.outer(100.0 * np.sin(np.pi * time / time[-1]) ** 2, [1.0, 0.5, 0.0]) + noise
 
 
-@pytest.mark.parametrize("kind", ["jitter", "gap"])
-def test_irregular_stamps_stay_as_they_are(kind: str) -> None:
-    time = 0.01 * np.arange(2000)
-    if kind == "jitter":
-        time += 2e-4 * np.random.default_rng(1).standard_normal(2000)
+@pytest.mark.parametrize("kind", ["rounded", "late", "irregular", "dropped"])
+def test_the_readings_tell_whether_stamps_or_a_regular_clock_are_right(kind: str) -> None:
+    rng, regular = np.random.default_rng(1), 0.009999 * np.arange(400)
+    true = regular + 2e-3 * rng.random(400) if kind == "irregular" else regular
+    true = np.delete(true, 200) if kind == "dropped" else true
+    late = 3e-3 * rng.random(len(true)) * (np.arange(len(true)) % 3 != 2)
+    stamps = {"rounded": np.round(true, 3), "late": true + late}.get(kind, true)
+    (found,) = clocks_of(stamps, turning(true), [slice(0, len(true))], np.full(3, NOISE))
+    if kind in {"irregular", "dropped"}:
+        assert np.array_equal(found, stamps)
     else:
-        time[1000:] += 0.05
-    assert regular_time(time) is time
+        assert np.abs(np.diff(found) - 0.009999).max() < 1e-5
