@@ -50,7 +50,7 @@ LEVELS = ((0.0, 2.0, 6.0, 20.0), (0.0, 4.0, 16.0))  # of rests, and of moves
 
 @dataclass(frozen=True)
 class HandNoise:
-    """One noise: wander over white noise, its correlation time in s, scatter of each kind, log weight, c; see ``prior``."""
+    """One noise: wander over white noise, its correlation time in s, scatter of each kind, log weight, and c."""
 
     ratio: float
     time: float

@@ -243,7 +243,7 @@ def refined(equations: Equations, noises: Sequence[HandNoise], limits: Limits) -
     best, top = noises[int(np.argmax(weight))], float(weight.max())
     weight = np.exp(weight - top)
     for factor in STEPS:
-        for j in np.flatnonzero(best.levels):
+        for j in (j for j, level in enumerate(best.levels) if level > 0.0):
             for other in (best.scaled(j, factor), best.scaled(j, 1.0 / factor)):
                 score = restricted(other)
                 if score > top:
