@@ -11,13 +11,12 @@ from scipy.signal import lfilter
 from pipeline.model.effects import effect
 from pipeline.model.effects.base import truth
 from pipeline.records import AXES, Recording
-from pipeline.simulation.alterations import ALTERATIONS, alter
-from pipeline.simulation.environment import Environment
 from pipeline.simulation.procedures import Course, plan
-from pipeline.simulation.scene import Scene
+from pipeline.simulation.scene import ALTERATIONS, Scene, alter
+from pipeline.simulation.sensor import Environment
 
 if TYPE_CHECKING:
-    from pipeline.simulation.planned import Planned
+    from pipeline.simulation.trajectory import Planned
 
 STOP_AND_GO = Course(step_deg=5.0, dwell_s=2.0, rates_dps=(30.0, 100.0), both_directions=True, turns=1, rest_s=5.0)
 THESIS = replace(STOP_AND_GO, step_deg=1.0, dwell_s=1.0)

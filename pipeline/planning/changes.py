@@ -17,9 +17,8 @@ from pipeline.planning.plan import plan_of
 from pipeline.records import SENSORS
 from pipeline.simulation.campaign import course_of
 from pipeline.simulation.description import read_config
-from pipeline.simulation.gimbals import Gimbals, random_gimbals
-from pipeline.simulation.planned import Planned
 from pipeline.simulation.procedures import TABLE_PROCEDURES, plan
+from pipeline.simulation.trajectory import Gimbals, Planned, random_gimbals
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from pipeline.planning.by_hand import HandExpectation
     from pipeline.planning.detection_limits import Detection
     from pipeline.simulation.description import UnitDescription
-    from pipeline.simulation.planned import Planned
+    from pipeline.simulation.trajectory import Planned
 
 SEED = 0
 # The middle of what is drawn at random for a simulated unit: it warms up by some degrees in a room that changes little.

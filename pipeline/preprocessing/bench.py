@@ -1,4 +1,4 @@
-"""How the bench holds the unit in a turn: as stated in the configuration, and as found in the recording.
+"""Mounting of the unit in one turn: as stated in the configuration, and as found in the recording.
 
     A' = s (A - zero) + face
 
@@ -9,11 +9,32 @@ s    : +1 where it counts right-handed about the body axis that the procedure na
 zero : what the table logs while the upward face points up
 face : 0, 90, 180 or 270 deg, the angle at which that face points up by the convention of ``pipeline``
 A'   : angle by the convention, with which everything after ingest works
+
+The mounting is found before any calibration. In a turn about a level axis the accelerometer reads
+
+    f(A) = c + p cos A + q sin A,    p = K u,   q = K (u x a),   c = b + K (component of gravity along a) + d(r)
+
+where
+
+d : what goes with the rate r: lever arms (r^2), vibration (|r|), dependence on the rate (r), in a turn between rests;
+    taken off by least squares with 1, r, |r| and r^2
+A : table angle, counted right-handed about body axis a
+u : body axis that points up at A = 0
+K : inverse of the calibration matrix, the unit matrix to a few percent; b: bias
+
+so ``q x p`` points along the turn axis, and p and q give the upward face and the zero. An angle that counts the other
+way turns the sign of q. The gyroscope's gain against the table's rate r in the same rows,
+
+    k = sum((w - mean w) (r - mean r)) / sum((r - mean r)^2)
+
+points along the turn axis as well. Means are taken off since a bias of some deg/s may exceed a slow table's rate; where
+the rate does not change, they stay, and only a rate beyond any bias tells something.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,7 +48,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.preprocessing.turn_fit import TurnFit
     from pipeline.records import Recording
 
 FEWEST_AT_REST = 10
@@ -171,3 +191,130 @@ def nearest_axis(direction: NDArray[np.float64]) -> str:
 def off_axis_deg(direction: NDArray[np.float64]) -> float:
     """Return the angle between a direction and the signed axis that it is nearest to, deg."""
     return float(np.degrees(np.arccos(np.clip(np.max(np.abs(direction)) / np.linalg.norm(direction), -1.0, 1.0))))
+
+
+# Smallest eigenvalue of the mean square of (cos A, sin A) beside a constant: reached by an arc of 110 deg. Below, a
+# nonlinearity of 0.5 % (MPU-6050 product specification 3.4) would turn p by more than 3 deg.
+LEAST_COVERAGE = 0.017
+SMALLEST_SHARE = 1e-6  # of the largest eigenvalue, below which a function of the rate is one of the others
+LARGEST_UNCERTAINTY = 0.02  # g, of p and q: 1 deg
+CHANGING = 0.1  # standard deviation over largest rate, from which a rate changes enough to be followed
+SLOWEST_DPS = 0.1  # standard deviation of a rate that can be followed
+LARGEST_BIAS_DPS = 20.0  # zero-rate output of consumer MEMS (MPU-6050 product specification)
+ALIKE = 0.9  # correlation of a gyroscope axis with the rate from which its gain is evidence
+
+
+@dataclass(frozen=True)
+class TurnFit:
+    """Evidence of one recording.
+
+    Attributes
+    ----------
+    constant, cosine, sine : (3,) array or None, g
+        c, p and q above; None where the angle does not cover enough.
+    gain : (3,) array or None
+        k above, deg/s per deg/s of the table's angle; None where the rate does not tell.
+    mean_rate : float, deg/s
+        Mean rate of the angle over the samples; with a time offset it is a part of the zero.
+    arc : float, deg
+        What the angle covers.
+    unknown : str
+        Why gravity tells nothing; empty where it does.
+    """
+
+    constant: NDArray[np.float64] | None
+    cosine: NDArray[np.float64] | None
+    sine: NDArray[np.float64] | None
+    gain: NDArray[np.float64] | None
+    mean_rate: float
+    arc: float
+    unknown: str = ""
+
+    @cached_property
+    def turn_axis(self) -> NDArray[np.float64] | None:
+        """Unit vector about which the unit turns as the angle grows, by gravity: (3,) array, or None."""
+        if self.cosine is None or self.sine is None or self.vertical is not None:
+            return None
+        return _unit(np.cross(self.sine, self.cosine))
+
+    @cached_property
+    def vertical(self) -> NDArray[np.float64] | None:
+        """Direction of gravity's reaction where the turn leaves it as it is (a vertical axis): (3,) array, or None."""
+        if self.constant is None or self.cosine is None or self.sine is None:
+            return None
+        turning = float(np.hypot(np.linalg.norm(self.cosine), np.linalg.norm(self.sine)))
+        staying = float(np.linalg.norm(self.constant))
+        return _unit(self.constant) if turning < 0.25 * staying else None
+
+
+def fit_turn(recording: Recording) -> TurnFit:
+    """Return what the rows of a turn recording tell of its mounting.
+
+    Parameters
+    ----------
+    recording : Recording
+        In body axes, with the table's angle, its rate, or both.
+    """
+    angle = recording.table_angle
+    rate = recording.table_rate
+    slope = None if angle is None or recording.samples < 2 else np.gradient(angle, recording.time)
+    gain = None
+    if rate is not None or slope is not None:
+        used = rate if rate is not None else slope
+        gain = _gain(recording, used)
+        if gain is not None and rate is not None and slope is not None and float(rate @ slope) < 0.0:
+            gain = -gain  # the rate counts against the angle: compared with gravity here, and refused as a reference
+    if angle is None or recording.accelerometer is None:
+        missing = "angle of the table" if angle is None else "accelerometer"
+        return TurnFit(None, None, None, gain, 0.0, 0.0, f"the log holds no {missing}")
+    keep = recording.valid
+    A, reading = np.radians(angle[keep]), recording.accelerometer[keep]
+    arc = float(np.ptp(angle)) if len(angle) else 0.0
+    mean_rate = 0.0 if slope is None else float(np.mean(slope))
+    other = _of_rate(rate if rate is not None else slope, keep)
+    # Normal equations of both, those of the rate eliminated.
+    columns = np.column_stack([other, np.cos(A), np.sin(A), reading])
+    products, m = columns.T @ columns, other.shape[1]
+    inverse = np.linalg.pinv(products[:m, :m], rcond=SMALLEST_SHARE, hermitian=True)
+    left = products[m:, m:] - products[m:, :m] @ inverse @ products[:m, m:]
+    normal = left[:2, :2]
+    if len(A) < 10 or np.linalg.eigvalsh(normal / len(A))[0] < LEAST_COVERAGE:
+        return TurnFit(None, None, None, gain, mean_rate, arc, f"the table angle covers {arc:.3g} deg only")
+    found = np.linalg.solve(normal, left[:2, 2:])
+    residual = np.diag(left[2:, 2:] - left[2:, :2] @ found) / len(A)
+    scatter = float(np.sqrt(np.max(residual.clip(0.0)) * np.max(np.diag(np.linalg.inv(normal)))))
+    if scatter > LARGEST_UNCERTAINTY:
+        return TurnFit(None, None, None, gain, mean_rate, arc, "the accelerometer does not follow the table angle")
+    constant = np.mean(reading, axis=0) - np.mean(columns[:, m : m + 2], axis=0) @ found
+    return TurnFit(constant, found[0], found[1], gain, mean_rate, arc)
+
+
+def _of_rate(rate: NDArray[np.float64] | None, keep: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return 1, r, |r| and r^2, with the largest |r| as unit: (n, at most 4) array."""
+    ones = np.ones(int(keep.sum()))
+    largest = 0.0 if rate is None else float(np.max(np.abs(rate), initial=0.0))
+    if rate is None or largest == 0.0:
+        return ones[:, None]
+    r = rate[keep] / largest
+    return np.column_stack([ones, r, np.abs(r), r * r])
+
+
+def _gain(recording: Recording, rate: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+    if recording.gyroscope is None or rate is None:
+        return None
+    keep = recording.valid
+    rate, gyro = rate[keep], recording.gyroscope[keep]
+    changing = float(np.std(rate)) > CHANGING * float(np.max(np.abs(rate), initial=0.0))
+    if changing:
+        rate, gyro = rate - np.mean(rate), gyro - np.mean(gyro, axis=0)
+    power = float(rate @ rate)
+    if power <= len(rate) * (SLOWEST_DPS if changing else LARGEST_BIAS_DPS) ** 2:
+        return None
+    gain = rate @ gyro / power
+    other = int(np.argmax(np.abs(gain)))
+    alike = abs(gain[other]) * np.sqrt(power / max(float(gyro[:, other] @ gyro[:, other]), 1e-30))
+    return np.asarray(gain) if alike >= ALIKE else None
+
+
+def _unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(vector / max(float(np.linalg.norm(vector)), 1e-30))

@@ -3,20 +3,38 @@
 Checks of a single file are in ``pipeline.io``. The order is: the reference of the turns (do angle, rate,
 gyroscope, gravity and time agree in size), mounting (which direction was up, which way the table turned), then the
 reference of held-out motion, then shared samples.
+
+Shared samples mean that held-out motion is not held out. The rows of all recordings are compared as the numbers of
+their sensor channels, rounded to ten digits so that another
+unit of the file does not hide them. Where recordings hold different numbers of decimals, they are compared again at the
+coarser ones, so that a rounded copy is found. A row counts where it occurs once in its own recording: rests of a
+coarse sensor repeat rows. Two recordings share samples where at least 20 such rows follow each other in both, each
+within 8 rows of the one before; by chance that is as improbable as
+
+    (8 c / n)^19,   c : rows that occur in both,   n : rows of the longer recording
+
+for which 10^-6 is the limit, as for stuck readings (``pipeline.io.quality_flags``). So whole copies are found, shifted
+in rows or time, cut, or with rows left out.
 """
 
 from __future__ import annotations
 
+import itertools
 from typing import TYPE_CHECKING, Any
 
-from pipeline.preprocessing.at_rest import check_static
-from pipeline.preprocessing.dead_axes import check_axes
+import numpy as np
+
+from pipeline.io.quality_flags import BY_CHANCE
+from pipeline.preprocessing.at_rest import check_axes, check_static
+from pipeline.preprocessing.evidence import place, refusal
 from pipeline.preprocessing.mounting import check_mounting
 from pipeline.preprocessing.reference import check_motion, check_turns
-from pipeline.preprocessing.shared_rows import check_shared_rows
+from pipeline.records import SENSORS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
 
     from pipeline.records import Recording
 
@@ -40,3 +58,109 @@ def check_recordings(recordings: Sequence[Recording], settings: Mapping[str, Any
     check_axes(recordings)
     turns, delays = check_turns(check_static(recordings, settings), settings)
     return check_motion(check_mounting(turns, settings), delays, settings)
+
+
+FEWEST, APART = 20, 8
+DIGITS = 10  # of 16 bits of counts in any unit, 5 are significant; twice that
+OF_DECIMALS = 200  # samples by which the decimals are told: a finer reading ends in a zero in a tenth of them
+MIX = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio (Knuth, TAOCP 3, 6.4): spreads sums of bit patterns
+
+
+def check_shared_rows(recordings: Sequence[Recording]) -> None:
+    """Refuse two recordings that hold the same samples.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+        All of a unit.
+
+    Raises
+    ------
+    IngestError
+        Naming both, and the rows.
+    """
+    decimals = [_decimals(r) for r in recordings]
+    pairs = {tuple(min(a, b) for a, b in zip(x, y, strict=True)) for x, y in itertools.combinations(decimals, 2)}
+    for coarse in sorted(pairs, reverse=True):
+        _check_at(recordings, coarse)
+
+
+def _decimals(recording: Recording) -> tuple[int, ...]:
+    """Return the decimals of each sensor's readings, by its first samples; ``DIGITS`` for an absent sensor."""
+    out = []
+    for sensor in SENSORS:
+        reading = recording.reading(sensor)
+        part = np.zeros((0, 3)) if reading is None else reading[:OF_DECIMALS]
+        part = part[np.isfinite(part).all(axis=1)]
+        exact = (d for d in range(1, DIGITS) if len(part) and np.all(np.abs(part - np.round(part, d)) < 10.0**-DIGITS))
+        out.append(next(exact, DIGITS))
+    return tuple(out)
+
+
+def _check_at(recordings: Sequence[Recording], decimals: Sequence[int]) -> None:
+    """Refuse two recordings that hold the same samples, rounded to the decimals of each sensor."""
+    keys = [_keys(r, decimals) for r in recordings]
+    if not any(len(k) for k in keys):
+        return
+    value = np.concatenate(keys)
+    owner = np.repeat(np.arange(len(keys)), [len(k) for k in keys])
+    row = np.concatenate([np.arange(len(k)) for k in keys])
+    order = np.argsort(value, kind="stable")  # equal rows beside each other, in the order of recordings
+    value, owner, row = value[order], owner[order], row[order]
+    same = value[1:] == value[:-1]
+    if np.count_nonzero(same) < FEWEST - 1:
+        return
+    within = same & (owner[1:] == owner[:-1])
+    single = ~(np.append(within, False) | np.append(False, within))
+    value, owner, row = value[single], owner[single], row[single]
+    for step in range(1, len(keys)):  # a row may be in several recordings: each pair lies at most so far apart
+        twin = np.flatnonzero(value[step:] == value[:-step])
+        if twin.size < FEWEST:
+            break
+        for pair in np.unique(owner[twin] * len(keys) + owner[twin + step]):
+            chosen = twin[owner[twin] * len(keys) + owner[twin + step] == pair]
+            one, two = divmod(int(pair), len(keys))
+            _check_pair(recordings[one], recordings[two], row[chosen], row[chosen + step])
+
+
+def _keys(recording: Recording, decimals: Sequence[int]) -> NDArray[np.uint64]:
+    """Return a number for each row's readings; rows with equal readings have equal numbers."""
+    pairs = zip(SENSORS, decimals, strict=True)
+    found = [np.round(r, d) for s, d in pairs if (r := recording.reading(s)) is not None]
+    if not found:
+        return np.zeros(0, np.uint64)
+    values = np.ascontiguousarray(np.concatenate(found, axis=1) + 0.0)  # no negative zero
+    bits = values.view(np.uint64)
+    key = np.zeros(len(bits), np.uint64)
+    for column in range(bits.shape[1]):
+        key = (key ^ bits[:, column]) * MIX
+        key ^= key >> np.uint64(29)
+    return key
+
+
+def _check_pair(one: Recording, two: Recording, first: NDArray[np.intp], second: NDArray[np.intp]) -> None:
+    """Refuse two recordings whose common rows follow each other in both."""
+    order = np.argsort(first)
+    first, second = first[order], second[order]
+    common, longest = len(first), max(one.samples, two.samples)
+    ahead = (np.diff(first) <= APART) & (np.diff(second) > 0) & (np.diff(second) <= APART)
+    edges = np.flatnonzero(np.diff(ahead, prepend=False, append=False))
+    if not edges.size:
+        return
+    lengths = edges[1::2] - edges[::2] + 1
+    best = int(np.argmax(lengths))
+    count = int(lengths[best])
+    chance = APART * common / longest
+    if count < FEWEST or (count < common / 2 and chance < 1.0 and chance ** (count - 1) > BY_CHANCE):
+        return
+    a, b = int(edges[2 * best]), int(edges[2 * best + 1])
+    late, early = (two, one) if two.role == "validation" or one.role != "validation" else (one, two)
+    spans = {one.name: (first[a], first[b]), two.name: (second[a], second[b])}
+    own, other = (place(r, int(spans[r.name][0]), int(spans[r.name][1])) for r in (late, early))
+    held_out = "; held-out motion would not be held out" if late.role == "validation" else ""
+    raise refusal(
+        late,
+        "shared_rows",
+        f"{own} are those of recording {early.name}, {other} ({common} rows are the same){held_out}",
+        "record each by itself, or remove the copy",
+    )

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.io.gravity_rotation import Move
-    from pipeline.preprocessing.turn_fit import TurnFit
+    from pipeline.preprocessing.bench import TurnFit
     from pipeline.records import Recording
 
     Matrix = NDArray[np.float64]

@@ -1,4 +1,4 @@
-"""Sensors and effects of a unit: as described, and where nothing is described at random from the data sheet.
+"""Parameters of simulated sensors and effects: as described, otherwise drawn at random within the data sheet.
 
     matrix = R_m^T T diag(S),   T = [[1, 0, 0], [n_yx, 1, 0], [n_zx, n_zy, 1]]
 
@@ -9,6 +9,15 @@ n   : non-orthogonality, rad
 R_m : mounting, which takes body vectors to the sensor's axes: turns about x, then y, then z
 
 Data-sheet limits are taken for three standard deviations; the mounting lies within 1 deg (Sudsanguan 2019, chapter 3).
+
+A description may also hide an effect by a formula that is not in the catalogue:
+
+    effects:
+      gyroscope.gear_mesh: {terms: {A: {formula: "cos(5 * radians(angle))", unit: deg/s}}, values: [0.03, 0.03, 0.03]}
+
+The keys are those of an effect's file (``pipeline.model.effect_definition``), of which only ``terms`` is needed, and
+``values``: of the parameters, one size, or nothing where there are ``limits``. It does not enter the catalogue: a
+diagnosis meets it as something unknown.
 """
 
 from __future__ import annotations
@@ -20,8 +29,9 @@ import numpy as np
 from pipeline.errors import ConfigurationError
 from pipeline.model.effect_limits import parameter_limits
 from pipeline.model.effects import effect
+from pipeline.model.user_effects import effect_from
 from pipeline.records import SENSORS
-from pipeline.simulation.alterations import ALTERATIONS
+from pipeline.simulation.scene import ALTERATIONS
 from pipeline.simulation.sensor import SimulatedSensor
 from pipeline.simulation.trajectory import rotation_about
 
@@ -174,3 +184,34 @@ def _values(
             f"{sensor}.{name}: the sensor's configuration has no limit of this effect, so no typical size; give one"
         )
     return np.asarray(drawn)
+
+
+def inline_effects(specification: Mapping[str, Any]) -> tuple[dict[str, Effect], dict[str, Any]]:
+    """Return the effects that are defined where they are hidden, and what is hidden with their values alone.
+
+    Parameters
+    ----------
+    specification : mapping
+        ``effects`` of a unit's description.
+
+    Returns
+    -------
+    effects : dict of str to Effect
+    specification : dict
+
+    Raises
+    ------
+    ConfigurationError
+        If a definition is not as it should be.
+    """
+    found: dict[str, Effect] = {}
+    values: dict[str, Any] = {}
+    for key, given in specification.items():
+        values[key] = given
+        if isinstance(given, dict):
+            sensor, _, name = str(key).rpartition(".")
+            usual = {"owner": "table", "sensors": [sensor] if sensor else list(SENSORS), "meaning": "Hidden."}
+            definition = {"name": name, **usual, **{k: v for k, v in given.items() if k != "values"}}
+            found[name] = effect_from(definition, f"effects: {key}")
+            values[key] = given.get("values")
+    return found, values

@@ -20,12 +20,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.simulation.attitudes import axis_and_angle
-from pipeline.simulation.gimbals import Gimbals
-from pipeline.simulation.planned import Planned
-from pipeline.simulation.program import ProgramBuilder
+from pipeline.simulation.rate_table import ProgramBuilder
 from pipeline.simulation.table_logs import logged
-from pipeline.simulation.trajectory import Moves
+from pipeline.simulation.trajectory import Gimbals, Moves, Planned, axis_and_angle
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -17,17 +17,25 @@ import numpy as np
 
 from pipeline.errors import ConfigurationError
 from pipeline.records import AXES
-from pipeline.simulation.attitudes import axis_and_angle, orientations_24, random_attitudes, six_positions
-from pipeline.simulation.gimbals import random_gimbals
 from pipeline.simulation.one_session import with_transits
-from pipeline.simulation.planned import Planned
-from pipeline.simulation.program import ProgramBuilder
-from pipeline.simulation.trajectory import Moves, Turn, rotation_about
+from pipeline.simulation.rate_table import ProgramBuilder
+from pipeline.simulation.trajectory import (
+    Moves,
+    Planned,
+    Turn,
+    axis_and_angle,
+    orientations_24,
+    random_attitudes,
+    random_gimbals,
+    rotation_about,
+    six_positions,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from numpy.typing import NDArray
+
 
 ONE_RECORDING = "one_recording"
 TABLE_PROCEDURES = ("three_axis_turns", "thermal_ramp", ONE_RECORDING)

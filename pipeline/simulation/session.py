@@ -13,12 +13,10 @@ import numpy as np
 
 from pipeline.model.kinematics import earth_rate
 from pipeline.records import AXES, SENSORS, Recording
-from pipeline.simulation.alterations import ALTERATIONS, alter
-from pipeline.simulation.gimbals import Gimbals
-from pipeline.simulation.scene import Scene
+from pipeline.simulation.rate_table import random_errors
+from pipeline.simulation.scene import ALTERATIONS, Scene, alter
 from pipeline.simulation.sensor import bias_wander
-from pipeline.simulation.table_errors import random_errors
-from pipeline.simulation.trajectory import Moves, Turn, rotation_about
+from pipeline.simulation.trajectory import Gimbals, Moves, Turn, rotation_about
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -26,9 +24,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.records import Motion
-    from pipeline.simulation.environment import Environment
-    from pipeline.simulation.planned import Planned
-    from pipeline.simulation.sensor import SimulatedSensor
+    from pipeline.simulation.sensor import Environment, SimulatedSensor
+    from pipeline.simulation.trajectory import Planned
 
 STREAMS = ("unit", "effects", "motion", "table", "accelerometer", "gyroscope", "temperature", "link", "bench", "room")
 NANOSECONDS = 1_000_000_000

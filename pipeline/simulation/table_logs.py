@@ -1,4 +1,4 @@
-"""What the table's computer writes down: in the sensor's rows, in a file with a clock of its own, or nothing.
+"""The log of the table: in the sensor's rows, in a file with a clock of its own, or only the commanded program.
 
     tau = t + d + k t
 
@@ -7,8 +7,7 @@ where
     t, tau : the sensor's and the table's clock, s
     d, k   : offset and drift of the table's clock, s and 1
 
-A log in a file is as fine as the table's computer is, not the sensor. A table without encoders writes nothing: then its
-program is known, and nothing else.
+A file has the sampling interval of the table's computer. For a table without encoders only the program is known.
 """
 
 from __future__ import annotations
@@ -27,8 +26,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.simulation.planned import Planned
-    from pipeline.simulation.program import Program
+    from pipeline.simulation.rate_table import Program
+    from pipeline.simulation.trajectory import Planned
 
 KINDS = ("rows", "file", "program")
 BESIDE_S = 2.0  # that the table's computer begins earlier and ends later

@@ -29,7 +29,7 @@ from pipeline.model.kinematics import reference_motion
 from pipeline.records import SENSORS
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, read_config
-from pipeline.simulation.environment import random_environment
+from pipeline.simulation.sensor import random_environment
 from pipeline.simulation.session import Streams
 from pipeline.study.cases import COURSES, OF_TEMPERATURE
 

@@ -18,7 +18,7 @@ from pipeline.simulation.table_logs import as_program
 from pipeline.simulation.trajectory import Turn
 
 if TYPE_CHECKING:
-    from pipeline.simulation.program import Program
+    from pipeline.simulation.rate_table import Program
 
 BIAS, SCALE = np.array([1.3, -0.4, 0.2]), 1.01
 COURSE = Course(step_deg=30.0, rates_dps=(30.0, 60.0), both_directions=True, validation_s=0.0, static_s=0.0)

@@ -5,7 +5,7 @@ import pytest
 
 from pipeline.model.kinematics import reference_motion
 from pipeline.records import Motion, Recording
-from pipeline.simulation.program import Program, ProgramBuilder
+from pipeline.simulation.rate_table import Program, ProgramBuilder
 
 INTERVAL = 0.12
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.model.turn_log import TurnLog, nearest_slope
-from pipeline.simulation.program import Program, ProgramBuilder
+from pipeline.simulation.rate_table import Program, ProgramBuilder
 
 
 @pytest.fixture(scope="module")

@@ -17,8 +17,7 @@ from pipeline.estimation.accelerometer import reference_least_squares as acceler
 from pipeline.estimation.gyroscope import reference_least_squares as gyroscope_fit
 from pipeline.model.kinematics import reference_motion
 from pipeline.preprocessing.checks import check_recordings
-from pipeline.preprocessing.departures import words
-from pipeline.preprocessing.mounting import check_mounting
+from pipeline.preprocessing.mounting import check_mounting, words
 from pipeline.records import Recording
 
 LEVEL = [

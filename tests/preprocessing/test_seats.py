@@ -10,9 +10,8 @@ import pytest
 from benches import Setup, recordings_of, settings_of
 from scipy.spatial.transform import Rotation
 
-from pipeline.preprocessing.bench import signed_axis
+from pipeline.preprocessing.bench import fit_turn, signed_axis
 from pipeline.preprocessing.mounting import check_mounting
-from pipeline.preprocessing.turn_fit import fit_turn
 from pipeline.study.bench import recordings_of as recordings_of_case
 from pipeline.study.cases import FAMILIES, draw
 

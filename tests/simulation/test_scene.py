@@ -8,12 +8,9 @@ import pytest
 from pipeline.model.effects import catalogue, effect
 from pipeline.model.effects.base import Owner, truth
 from pipeline.model.kinematics import earth_rate
-from pipeline.simulation.alterations import ALTERATIONS, alter
-from pipeline.simulation.gimbals import random_gimbals
-from pipeline.simulation.program import ProgramBuilder
-from pipeline.simulation.scene import STANDARD_GRAVITY, Scene
-from pipeline.simulation.table_errors import TurnErrors
-from pipeline.simulation.trajectory import Turn
+from pipeline.simulation.rate_table import ProgramBuilder, TurnErrors
+from pipeline.simulation.scene import ALTERATIONS, STANDARD_GRAVITY, Scene, alter
+from pipeline.simulation.trajectory import Turn, random_gimbals
 
 SIZES = {
     "lever_arm": 0.05, "time_offset": 1e-4, "clock_rate": 1.0, "low_pass_lag": 1e-4, "earth_rotation": 4e-3,

@@ -5,9 +5,9 @@ import pytest
 
 from pipeline.records import Motion
 from pipeline.simulation.description import read_config
-from pipeline.simulation.gimbals import random_gimbals
 from pipeline.simulation.scene import Scene
 from pipeline.simulation.sensor import SimulatedSensor, bias_wander
+from pipeline.simulation.trajectory import random_gimbals
 
 SHEETS = read_config("sensor", "mpu6050")
 

@@ -8,12 +8,9 @@ import pytest
 
 from pipeline.model.kinematics import UP_AT_ZERO
 from pipeline.model.rotation import attitude_matrix, turn_about_axis
-from pipeline.simulation.attitudes import axis_and_angle
-from pipeline.simulation.gimbals import random_gimbals
 from pipeline.simulation.procedures import Course, plan
-from pipeline.simulation.program import Program, ProgramBuilder
-from pipeline.simulation.table_errors import TurnErrors
-from pipeline.simulation.trajectory import Moves, Turn, rotation_about
+from pipeline.simulation.rate_table import Program, ProgramBuilder, TurnErrors
+from pipeline.simulation.trajectory import Moves, Turn, axis_and_angle, random_gimbals, rotation_about
 
 STEP = 1e-5
 
