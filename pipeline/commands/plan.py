@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import ConfigurationError
-from pipeline.model.effect_files import read_effect_files
+from pipeline.model.effects.files import read_effect_files
 from pipeline.model.effects import register
 from pipeline.planning.changes import best_changes
 from pipeline.planning.plan import plan_of

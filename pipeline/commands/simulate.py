@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from pipeline.errors import ConfigurationError
-from pipeline.model.effect_files import read_effect_files
+from pipeline.model.effects.files import read_effect_files
 from pipeline.model.effects import register
 from pipeline.outcome import run_command
 from pipeline.simulation.campaign import write_campaign

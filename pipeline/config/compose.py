@@ -37,7 +37,7 @@ GROUPS = ("sensor", "table", "procedure", "method", "filter", "ingest", "certifi
 RUN_SETTINGS = ("batch_size",)
 NOT_WANTED = "not_wanted"  # stage of a sensor whose method is null
 LARGEST_CONFIG = 10_000  # values of a group's option; the largest that ships has 160
-OF_A_SETUP = ("mounting", "bias")  # effects that exist as one setup's own alone (pipeline.model.setups)
+OF_A_SETUP = ("mounting", "bias")  # effects that exist as one setup's own alone (pipeline.model.sessions)
 NUMBER = re.compile(r"([a-z_][a-z_0-9]*(?:\.[A-Za-z_][A-Za-z_0-9]*)*)=(-?(?:0|[1-9][0-9]*)(\.[0-9]+)?)")
 
 

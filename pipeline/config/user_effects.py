@@ -76,7 +76,7 @@ def load_user_effects(campaign: Path, configs: Iterable[Path], python: Sequence[
     files = {folder: [f for f in sorted(folder.glob("*.yaml")) if _holds(f, what)] for folder, what in folders}
     if not any(files.values()) and not python:
         return UserEffects()
-    from pipeline.model.effect_files import load_python_effect, read_effect_files  # noqa: PLC0415  (imports numpy)
+    from pipeline.model.effects.files import load_python_effect, read_effect_files  # noqa: PLC0415  (imports numpy)
 
     for folder, those in files.items():
         try:

@@ -25,7 +25,7 @@ from pipeline.diagnosis.unknown import SLOW, dependences
 from pipeline.estimation.selection import FAR_ABOVE, select
 from pipeline.model.effects import catalogue, forget, register
 from pipeline.model.effects.base import unit_of
-from pipeline.model.user_effects import effect_from
+from pipeline.model.effects.files import effect_from
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence

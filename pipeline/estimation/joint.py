@@ -32,7 +32,7 @@ from pipeline.estimation.table_inputs import Reference, table_contributions
 from pipeline.estimation.trials import Errors, beside_trials, trials_of
 from pipeline.model.effects import effect
 from pipeline.model.effects.base import Layout, truth
-from pipeline.model.setups import OWN
+from pipeline.model.sessions import OWN
 from pipeline.records import FittedEffect, SensorCalibration, StageResult
 
 if TYPE_CHECKING:

@@ -13,22 +13,23 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from pipeline.exports import c_template as text
-from pipeline.exports.c_terms import fields_of, number, terms_of
 from pipeline.exports.sensors import before_use, bench_effects, calibrations, final_errors, missing
 from pipeline.model.compensation import SMOOTHING_S
 from pipeline.model.compensation_stream import OF_THE_PAST, OF_THE_ROOM
+from pipeline.model.effects import effect_of, owner_of
 from pipeline.model.effects.base import REFERENCE_TEMPERATURE, Owner
-from pipeline.model.user_effects import owner_of
+from pipeline.model.formula import c_number
+from pipeline.model.log_motion import SIGNALS
 from pipeline.records import SENSORS
 
 if TYPE_CHECKING:
-    from pipeline.records import FittedEffect, SensorCalibration
+    from pipeline.records import SensorCalibration
 
 FILE_NAME = "calibration.h"
 ROUNDS = 12  # of the fixed point; each gains about two digits
 BAR = "\n * "
 IN_PYTHON = "it is in Python; python -m pipeline apply --python-effect takes it off"
-NOT_IN_C = "no log of a sensor holds what it needs"
+NOT_IN_C = "its equation has no form in C; python -m pipeline apply takes it off"
 ACROSS = {"accelerometer": {"specific_force"}, "gyroscope": {"angular_rate", "angular_acceleration", "direction"}}
 
 
@@ -91,9 +92,15 @@ def _plan(calibration: SensorCalibration) -> _Plan:
     """Sort the effects of a sensor: those that look at time and temperature alone go first."""
     plan = _Plan()
     for fitted in (e for e in calibration.effects if owner_of(e) == Owner.SENSOR):
-        terms, fields = terms_of(fitted), fields_of(calibration.sensor, fitted) if _in_c(fitted) else None
-        if terms is None or fields is None or "specific_force_rate" in fields:
-            plan.left_out.append(f"{fitted.name} ({NOT_IN_C if _in_c(fitted) else IN_PYTHON})")
+        if fitted.definition and "python" in fitted.definition:
+            plan.left_out.append(f"{fitted.name} ({IN_PYTHON})")
+            continue
+        effect = effect_of(fitted)
+        terms, fields = effect.in_c(fitted.values), effect.fields(calibration.sensor, fitted.values)
+        unknown = sorted((fields - set(SIGNALS)) | (fields & {"specific_force_rate"}))
+        if terms is None or unknown:
+            why = f"it needs {', '.join(unknown)}, which this header does not know" if unknown else NOT_IN_C
+            plan.left_out.append(f"{fitted.name} ({why})")
             continue
         alone = not fields & ({"time"} | OF_THE_PAST)
         lines = [f"{'' if alone else 'if (!m->alone) '}r[{i}] -= {t}; /* {fitted.name} */" for i, t in enumerate(terms)]
@@ -104,10 +111,6 @@ def _plan(calibration: SensorCalibration) -> _Plan:
         if not alone:
             plan.of_the_time.append(fitted.name)
     return plan
-
-
-def _in_c(fitted: FittedEffect) -> bool:
-    return not (fitted.definition and "python" in fitted.definition)
 
 
 def _remarks(
@@ -140,7 +143,7 @@ def _effects(sensor: str, kind: str, lines: list[str]) -> str:
         kind=kind,
         which=which,
         own="f" if sensor == "accelerometer" else "w",
-        reference=number(REFERENCE_TEMPERATURE),
+        reference=c_number(REFERENCE_TEMPERATURE),
         lines="\n".join(f"    {line}" for line in lines),
     )
 
@@ -148,8 +151,8 @@ def _effects(sensor: str, kind: str, lines: list[str]) -> str:
 def _tables(sensor: str, calibration: SensorCalibration | None) -> str:
     bias = [0.0] * 3 if calibration is None else calibration.bias.tolist()
     rows = [[float(i == j) for j in range(3)] for i in range(3)] if calibration is None else calibration.matrix.tolist()
-    matrix = ",\n    ".join("{" + ", ".join(map(number, row)) + "}" for row in rows)
-    numbers = ", ".join(map(number, bias))
+    matrix = ",\n    ".join("{" + ", ".join(map(c_number, row)) + "}" for row in rows)
+    numbers = ", ".join(map(c_number, bias))
     return (
         f"static const imu_real imu_{sensor}_bias[3] = {{{numbers}}};\n"
         f"static const imu_real imu_{sensor}_matrix[3][3] = {{\n    {matrix}}};\n"

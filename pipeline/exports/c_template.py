@@ -82,24 +82,16 @@ static inline double imu_band(double x, double low, double high)
     return x >= low && x <= high ? 1 : 0;
 }
 """,
-    "imu_lever": """\
-/* Specific force, g, of axis c at a place from the turn axes, m. */
-static inline imu_real imu_lever(const imu_motion *m, int c, imu_real x, imu_real y, imu_real z)
+    "imu_square": """\
+static inline imu_real imu_square(imu_real x)
 {
-    const imu_real radian = (imu_real)0.017453292519943295, g = (imu_real)9.80665;
-    const int before = (c + 2) % 3, after = (c + 1) % 3;
-    imu_real o[3], row[3];
-    int i;
-    for (i = 0; i < 3; ++i)
-        o[i] = m->w[i] * radian;
-    for (i = 0; i < 3; ++i)
-        row[i] = o[c] * o[i];
-    row[c] -= o[0] * o[0] + o[1] * o[1] + o[2] * o[2];
-    row[before] += m->alpha[after] * radian;
-    row[after] -= m->alpha[before] * radian;
-    for (i = 0; i < 3; ++i)
-        row[i] /= g;
-    return row[0] * x + row[1] * y + row[2] * z;
+    return x * x;
+}
+""",
+    "imu_cube": """\
+static inline imu_real imu_cube(imu_real x)
+{
+    return x * x * x;
 }
 """,
 }

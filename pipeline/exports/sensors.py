@@ -10,7 +10,7 @@ import yaml
 from pipeline.io.axes import STRAIGHT, maps_of_log
 from pipeline.model.effects.base import Owner
 from pipeline.model.plausible import sentences
-from pipeline.model.user_effects import owner_of
+from pipeline.model.effects import owner_of
 from pipeline.records import SENSORS, SensorCalibration
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import numpy as np
 
 from pipeline.errors import ConfigurationError, InputError, MissingInputError
-from pipeline.model.user_effects import effect_of
+from pipeline.model.effects import effect_of
 from pipeline.records import SENSOR_UNITS, SENSORS, FittedEffect, SensorCalibration
 
 if TYPE_CHECKING:

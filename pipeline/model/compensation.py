@@ -106,7 +106,7 @@ def load(path: str | Path, python_effects: Sequence[str | Path] = ()) -> Compens
         If an effect is not known, or is one in Python whose file is not given.
     """
     if python_effects:
-        from pipeline.model.effect_files import load_python_effect  # noqa: PLC0415  (only where there are any)
+        from pipeline.model.effects.files import load_python_effect  # noqa: PLC0415  (only where there are any)
 
         for python_file in python_effects:
             register(load_python_effect(python_file))

@@ -1,11 +1,11 @@
-"""Formulas in named signals, as a user writes them: parsed against a white list, never run as Python.
+"""Formulas in named signals: parsed against a white list, compiled to numpy and to C, never run as Python.
 
     formula  := sum of products and powers of numbers, pi, signals and functions of formulas
-    a ** b   :  b is a number, at most 20 in size
+    a ** b   :  b is a number, at most 20 in size; ** 2 and ** 3 are products, so that numpy and C agree to the last bit
 
-where a signal is one of ``SIGNALS`` and a function one of ``FUNCTIONS``. Python's own parser reads the text; the tree
-that it gives is translated, node by node, into calls of numpy. Nothing else has a meaning here: a name that is not
-known, an attribute, an index, a text, a keyword or a comparison is refused with its place.
+where a signal is one of ``SIGNALS`` and a function one of ``FUNCTIONS``. Python's own parser reads the text. The tree
+is translated node by node; a name that is not known, an attribute, an index, a text, a keyword or a comparison is refused
+with its place.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import warnings
 from dataclasses import dataclass
 from functools import partial
 from itertools import accumulate
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -30,46 +30,99 @@ if TYPE_CHECKING:
     Signals = Mapping[str, NDArray[np.float64]]
     Evaluate = Callable[[Signals], Any]
 
+LONGEST, DEEPEST, MOST_NODES, LARGEST_POWER = 500, 40, 200, 20.0  # far above any formula of physics; bound the cost
+
+
+class Signal(NamedTuple):
+    """A signal: its meaning, the field of ``Motion`` that holds it, where in it, and its name in ``calibration.h``.
+
+    No field: it is the sensor's own truth. No name in C: the log of a sensor does not hold it.
+    """
+
+    meaning: str
+    field: str
+    place: tuple[int, ...] = ()
+    c: str = ""
+
+
+def _vector(prefix: str, field: str, meaning: str, c: str) -> dict[str, Signal]:
+    """Return the three components of a vector."""
+    return {
+        f"{prefix}{a}": Signal(meaning.format(axis=f"body {a}"), field, (i,), c.format(i)) for i, a in enumerate("xyz")
+    }
+
+
 SIGNALS = {
-    "u": "what this axis of the sensor should read, g or deg/s",
-    "fx": "specific force along body x, g",
-    "fy": "specific force along body y, g",
-    "fz": "specific force along body z, g",
-    "wx": "angular rate about body x, deg/s",
-    "wy": "angular rate about body y, deg/s",
-    "wz": "angular rate about body z, deg/s",
-    "alphax": "angular acceleration about body x, deg/s^2",
-    "alphay": "angular acceleration about body y, deg/s^2",
-    "alphaz": "angular acceleration about body z, deg/s^2",
-    "speed": "magnitude of the angular rate, deg/s",
-    "temperature": "temperature, degC",
-    "time": "time since power-on, s",
-    "rate": "rate of the table about its turn axis, deg/s",
-    "angle": "angle of the table about its turn axis, deg",
+    "u": Signal("what this axis of the sensor should read, g or deg/s", "", (), "u[{axis}]"),
+    **_vector("f", "specific_force", "specific force along {axis}, g", "f[{}]"),
+    **_vector("w", "angular_rate", "angular rate about {axis}, deg/s", "w[{}]"),
+    **_vector("alpha", "angular_acceleration", "angular acceleration about {axis}, deg/s^2", "m->alpha[{}]"),
+    **_vector("e", "direction", "{axis} component of the unit vector of this or the last turn", "m->direction[{}]"),
+    "speed": Signal("magnitude of the angular rate, deg/s", "angular_rate", (), "imu_length(w)"),
+    "temperature": Signal("temperature, degC", "temperature", (), "m->temperature"),
+    "time": Signal("time since power-on, s", "time", (), "m->time"),
+    "rate": Signal("rate of the table about its turn axis, deg/s", "rate"),
+    "angle": Signal("angle of the table about its turn axis, deg", "angle"),
+    **{
+        f"level_{a}{b}": Signal(f"body {b} component of the level frame's {a} axis", "level", (i, j))
+        for i, a in enumerate("xyz")
+        for j, b in enumerate("xyz")
+    },
 }
-FUNCTIONS: dict[str, tuple[int, Callable[..., Any]]] = {
-    **{f.__name__: (1, f) for f in (np.sin, np.cos, np.tan, np.tanh, np.exp, np.log, np.sqrt, np.sign, np.radians)},
-    "abs": (1, np.abs),
-    "minimum": (2, np.minimum),
-    "maximum": (2, np.maximum),
-    "step": (1, lambda x: np.where(np.isnan(x), x, np.heaviside(x, 1.0))),
-    "band": (3, lambda x, low, high: np.where(np.isnan(x), x, np.logical_and(x >= low, x <= high))),
+OF_THE_MOTION = {name for name, signal in SIGNALS.items() if signal.field.startswith("angular_")} | {"rate"}
+
+
+class Function(NamedTuple):
+    """A function: how many values it takes, what numpy and what C call."""
+
+    takes: int
+    numpy: Callable[..., Any]
+    c: str
+
+
+def _cube(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    return x * x * x
+
+
+def _step(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.where(np.isnan(x), x, np.heaviside(x, 1.0))
+
+
+def _band(x: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.where(np.isnan(x), x, np.logical_and(x >= low, x <= high))
+
+
+_OF_THE_LIBRARY = (np.sin, np.cos, np.tan, np.tanh, np.exp, np.log, np.sqrt)
+FUNCTIONS = {
+    **{f.__name__: Function(1, f, f"(imu_real){f.__name__}({{}})") for f in _OF_THE_LIBRARY},
+    "sign": Function(1, np.sign, "(imu_real)imu_sign({})"),
+    "radians": Function(1, np.radians, f"({{}} * (imu_real){np.pi / 180.0!r})"),
+    "abs": Function(1, np.abs, "(imu_real)fabs({})"),
+    "minimum": Function(2, np.minimum, "(imu_real)imu_minimum({}, {})"),
+    "maximum": Function(2, np.maximum, "(imu_real)imu_maximum({}, {})"),
+    "step": Function(1, _step, "(imu_real)imu_step({})"),
+    "band": Function(3, _band, "(imu_real)imu_band({}, {}, {})"),
 }
 CONSTANTS = {"pi": np.pi}
-OPERATORS: dict[type[ast.operator], Callable[..., Any]] = {
-    ast.Add: np.add,
-    ast.Sub: np.subtract,
-    ast.Mult: np.multiply,
-    ast.Div: np.divide,
+OPERATORS: dict[type[ast.operator], tuple[Callable[..., Any], str]] = {
+    ast.Add: (np.add, "+"),
+    ast.Sub: (np.subtract, "-"),
+    ast.Mult: (np.multiply, "*"),
+    ast.Div: (np.divide, "/"),
 }
-LONGEST, DEEPEST, MOST_NODES, LARGEST_POWER = 500, 40, 200, 20.0
+POWERS: dict[float, tuple[Callable[..., Any], str, str]] = {  # in C of a name, and of what is longer
+    2.0: (np.square, "({0} * {0})", "imu_square({0})"),
+    3.0: (_cube, "({0} * {0} * {0})", "imu_cube({0})"),
+}
+IN_C_ONCE = {f"(m->temperature - (imu_real){25.0!r})": "dt"}  # calibration.h has a name for it
+SIMPLE_IN_C = re.compile(r"[\w\[\]{}>-]+")  # a name: written out twice it costs nothing
 STRANGE = re.compile(r"[^A-Za-z0-9_ .+\-*/(),]")
 HINTS = {
     "^": "; write ** for a power",
     "=": "; a formula has no names of its own",
     "<": "; use step(x) or band(x, low, high)",
+    ">": "; use step(x) or band(x, low, high)",
 }
-HINTS[">"] = HINTS["<"]
 REFUSED: dict[type[ast.AST], str] = {
     ast.Attribute: "an attribute (a name after a dot)",
     ast.Subscript: "an index",
@@ -103,6 +156,7 @@ class Formula:
     text: str
     signals: frozenset[str]
     _evaluate: Evaluate
+    _c: str
 
     def __call__(self, signals: Signals) -> NDArray[np.float64]:
         """Return the value: an array of the shape that the signals broadcast to, 0-d where it names none.
@@ -111,6 +165,10 @@ class Formula:
         """
         with np.errstate(all="ignore"):
             return np.asarray(self._evaluate(signals), np.float64)
+
+    def in_c(self, axis: int) -> str:
+        """Return the formula for one axis as a C expression of type ``imu_real``, in the names of ``calibration.h``."""
+        return self._c.format(axis=axis)
 
 
 def parse(text: str, where: str | None = None) -> Formula:
@@ -147,42 +205,45 @@ def parse(text: str, where: str | None = None) -> Formula:
         raise _refusal(line, (error.offset or 1) - 1, f"this is no formula ({error.msg})", where) from None
     except (ValueError, RecursionError, MemoryError) as error:
         raise _refusal(line, 0, f"this is no formula ({error})", where) from None
-    return _Reader(line, where).read(tree.body)
+    reader = _Reader(line, where)
+    evaluate, c = reader.read(tree.body, 1)
+    return Formula(line, frozenset(reader.signals), evaluate, c)
 
 
 class _Reader:
-    """Translates a tree of one formula, and notes its signals."""
+    """Translates the tree of one formula into a function of numpy arrays and a C expression; notes its signals."""
 
     def __init__(self, text: str, where: str | None) -> None:
         self.text, self.where = text, where
         self.signals: set[str] = set()
         self.nodes = 0
 
-    def read(self, tree: ast.expr) -> Formula:
-        evaluate = self._node(tree, 1)
-        return Formula(self.text, frozenset(self.signals), evaluate)
-
-    def _node(self, node: ast.expr, depth: int) -> Evaluate:
+    def read(self, node: ast.expr, depth: int) -> tuple[Evaluate, str]:
         self.nodes += 1
         if depth > DEEPEST or self.nodes > MOST_NODES:
             raise self._refused(node, "the formula is nested too deeply or has too many parts; use several terms")
         if isinstance(node, ast.Constant):
-            return partial(_constant, self._number(node))
+            return self._number(self._value(node))
         if isinstance(node, ast.Name):
             return self._name(node)
         if isinstance(node, ast.Call):
             return self._call(node, depth)
         if isinstance(node, ast.UnaryOp) and isinstance(node.op, (ast.USub, ast.UAdd)):
-            inner = self._node(node.operand, depth + 1)
-            return partial(_apply, np.negative, (inner,)) if isinstance(node.op, ast.USub) else inner
+            inner, c = self.read(node.operand, depth + 1)
+            return (partial(_apply, np.negative, (inner,)), f"(-{c})") if isinstance(node.op, ast.USub) else (inner, c)
         if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow):
-            return partial(_apply, np.power, (self._node(node.left, depth + 1), self._exponent(node.right)))
+            return self._power(node, depth)
         if isinstance(node, ast.BinOp) and type(node.op) in OPERATORS:
-            parts = self._node(node.left, depth + 1), self._node(node.right, depth + 1)
-            return partial(_apply, OPERATORS[type(node.op)], parts)
+            function, sign = OPERATORS[type(node.op)]
+            (left, c_left), (right, c_right) = self.read(node.left, depth + 1), self.read(node.right, depth + 1)
+            c = f"({c_left} {sign} {c_right})"
+            return partial(_apply, function, (left, right)), IN_C_ONCE.get(c, c)
         raise self._refused(node, f"{REFUSED.get(type(node), 'this')} has no place in a formula")
 
-    def _number(self, node: ast.Constant) -> float:
+    def _number(self, value: float) -> tuple[Evaluate, str]:
+        return partial(_constant, value), c_number(value)
+
+    def _value(self, node: ast.Constant) -> float:
         if isinstance(node.value, bool) or not isinstance(node.value, (int, float)):
             raise self._refused(node, f"{node.value!r} has no place in a formula")
         try:
@@ -193,37 +254,54 @@ class _Reader:
             raise self._refused(node, "this number is too large")
         return value
 
-    def _name(self, node: ast.Name) -> Evaluate:
+    def _name(self, node: ast.Name) -> tuple[Evaluate, str]:
         if node.id in CONSTANTS:
-            return partial(_constant, CONSTANTS[node.id])
+            return self._number(CONSTANTS[node.id])
         if node.id not in SIGNALS:
             function = f"; {node.id} is a function: write {node.id}(...)" if node.id in FUNCTIONS else ""
             known = f"signals: {', '.join(SIGNALS)}; functions: {', '.join(FUNCTIONS)}"
             raise self._refused(node, f"no signal is called {node.id!r}{function}; {known}")
         self.signals.add(node.id)
-        return partial(_signal, node.id)
+        return partial(_signal, node.id), SIGNALS[node.id].c
 
-    def _call(self, node: ast.Call, depth: int) -> Evaluate:
+    def _call(self, node: ast.Call, depth: int) -> tuple[Evaluate, str]:
         name = node.func.id if isinstance(node.func, ast.Name) else None
         if name not in FUNCTIONS:
             shown = f"no function is called {name!r}" if name else "this cannot be called"
             known = f"functions: {', '.join(FUNCTIONS)}; signals: {', '.join(SIGNALS)}"
             raise self._refused(node.func, f"{shown}; {known}")
-        count, function = FUNCTIONS[name]
+        count, function, c = FUNCTIONS[name]
         if node.keywords or len(node.args) != count:
             raise self._refused(node, f"{name} takes {count} value{'s' * (count > 1)} in brackets, without names")
-        return partial(_apply, function, tuple(self._node(argument, depth + 1) for argument in node.args))
+        values, in_c = zip(*(self.read(argument, depth + 1) for argument in node.args), strict=True)
+        if name == "abs" and SIMPLE_IN_C.fullmatch(in_c[0]):
+            c = "({0} < 0 ? -{0} : {0})"
+        return partial(_apply, function, values), c.format(*in_c)
 
-    def _exponent(self, node: ast.expr) -> Evaluate:
+    def _power(self, node: ast.BinOp, depth: int) -> tuple[Evaluate, str]:
+        base, c_base = self.read(node.left, depth + 1)
+        exponent = self._exponent(node.right)
+        if exponent not in POWERS:
+            c = f"(imu_real)pow({c_base}, {c_number(exponent)})"
+            return partial(_apply, np.power, (base, partial(_constant, exponent))), c
+        function, short, c = POWERS[exponent]
+        return partial(_apply, function, (base,)), (short if SIMPLE_IN_C.fullmatch(c_base) else c).format(c_base)
+
+    def _exponent(self, node: ast.expr) -> float:
         sign, number = 1.0, node
         if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
             sign, number = -1.0, node.operand
-        if not isinstance(number, ast.Constant) or abs(self._number(number)) > LARGEST_POWER:
+        if not isinstance(number, ast.Constant) or abs(self._value(number)) > LARGEST_POWER:
             raise self._refused(node, f"an exponent is a number from -{LARGEST_POWER:g} to {LARGEST_POWER:g}")
-        return partial(_constant, sign * self._number(number))
+        return sign * self._value(number)
 
     def _refused(self, node: ast.expr, reason: str) -> ConfigurationError:
         return _refusal(self.text, node.col_offset, reason, self.where)
+
+
+def c_number(value: float) -> str:
+    """Return a number as C writes it."""
+    return f"(imu_real){float(value)!r}"
 
 
 def _constant(value: float, signals: Signals) -> np.float64:

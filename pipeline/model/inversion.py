@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 
 from pipeline.errors import ConvergenceError
+from pipeline.model.effects import effect_of, owner_of
 from pipeline.model.effects.base import Owner
-from pipeline.model.user_effects import effect_of, owner_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence

@@ -8,14 +8,14 @@ cut into blocks of any size gives what it gives in one piece.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.errors import ConfigurationError, InputError
+from pipeline.model.effects import effect_of
 from pipeline.model.effects.base import turning_direction
-from pipeline.model.user_effects import FormulaEffect, effect_of
 from pipeline.records import Motion
 
 if TYPE_CHECKING:
@@ -36,7 +36,6 @@ SIGNALS = {
     "angular_acceleration": {"gyroscope", "time"},
     "direction": {"gyroscope"},
 }
-FIELDS = tuple(f.name for f in fields(Motion))
 
 
 @dataclass(frozen=True)
@@ -116,44 +115,14 @@ def fields_used(sensor: str, effects: Iterable[FittedEffect]) -> set[str]:
     """
     seen: set[str] = set()
     for fitted in effects:
-        looked_at: set[str] = set()
-        found = effect_of(fitted)
-        if isinstance(found, FormulaEffect):
-            looked_at = found.fields(sensor)
-        else:
-            found.reading(sensor, _watched(looked_at), np.eye(3), fitted.values)
-        seen |= looked_at | set(found.needs)
-        strange = sorted((looked_at | set(found.needs)) - set(SIGNALS))
+        looked_at = effect_of(fitted).fields(sensor, fitted.values)
+        seen |= looked_at
+        strange = sorted(looked_at - set(SIGNALS))
         if strange:
             raise ConfigurationError(
                 f"effect {fitted.name} needs {', '.join(strange)}, which a field log does not hold"
             )
     return seen
-
-
-def _watched(seen: set[str]) -> Motion:
-    """Return a motion that notes which of its fields are read."""
-
-    class Watched(Motion):
-        def __getattribute__(self, name: str) -> Any:  # noqa: ANN401
-            if name in FIELDS:
-                seen.add(name)
-            return super().__getattribute__(name)
-
-    time, vector = np.arange(2.0), np.ones((2, 3))
-    return Watched(
-        time=time,
-        specific_force=vector,
-        angular_rate=vector,
-        angular_acceleration=vector,
-        specific_force_rate=vector,
-        temperature=np.full(2, 25.0),
-        angle=time,
-        rate=time,
-        axis=0,
-        still=np.ones(2, bool),
-        direction=vector,
-    )
 
 
 def _difference(time: NDArray[np.float64], values: NDArray[np.float64], before: Known | None) -> NDArray[np.float64]:

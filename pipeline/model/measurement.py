@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.model.effects import effect_of
 from pipeline.model.effects.base import truth
-from pipeline.model.user_effects import effect_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

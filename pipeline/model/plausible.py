@@ -26,7 +26,7 @@ import numpy as np
 
 from pipeline.errors import ConfigurationError
 from pipeline.model.effect_limits import parameter_limits
-from pipeline.model.user_effects import effect_of
+from pipeline.model.effects import effect_of
 from pipeline.records import AXES, SENSOR_UNITS, FittedEffect
 
 if TYPE_CHECKING:

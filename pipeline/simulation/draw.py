@@ -15,7 +15,7 @@ A description may also hide an effect by a formula that is not in the catalogue:
     effects:
       gyroscope.gear_mesh: {terms: {A: {formula: "cos(5 * radians(angle))", unit: deg/s}}, values: [0.03, 0.03, 0.03]}
 
-The keys are those of an effect's file (``pipeline.model.effect_definition``), of which only ``terms`` is needed, and
+The keys are those of an effect's file (``pipeline.model.effects.declaration``), of which only ``terms`` is needed, and
 ``values``: of the parameters, one size, or nothing where there are ``limits``. It does not enter the catalogue: a
 diagnosis meets it as something unknown.
 """
@@ -29,7 +29,7 @@ import numpy as np
 from pipeline.errors import ConfigurationError
 from pipeline.model.effect_limits import parameter_limits
 from pipeline.model.effects import effect
-from pipeline.model.user_effects import effect_from
+from pipeline.model.effects.files import effect_from
 from pipeline.records import SENSORS
 from pipeline.simulation.scene import ALTERATIONS
 from pipeline.simulation.sensor import SimulatedSensor

@@ -110,7 +110,7 @@ def parse_job(stage: str, argv: Sequence[str]) -> Job:
     hold_as_job(results)
     content = merge_common(read_json(config))
     if "user_effects" in content:
-        from pipeline.model.effect_files import register_user_effects  # noqa: PLC0415  (numpy, where there are any)
+        from pipeline.model.effects import register_user_effects  # noqa: PLC0415  (numpy, where there are any)
 
         register_user_effects(content["user_effects"])
     units, output = content.pop("units"), arguments.pop("output")

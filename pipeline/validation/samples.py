@@ -19,7 +19,7 @@ from pipeline.estimation.gauss_markov import variance_of_average
 from pipeline.estimation.observations import through_filter
 from pipeline.estimation.rest_means import rest_means, split_rests
 from pipeline.model.effects.base import truth
-from pipeline.model.effects.time_offset import shifted
+from pipeline.model.effects.timing import shifted
 from pipeline.model.kinematics import earth_rate, reference_motion
 from pipeline.signal.creep import believed_rates, creep_in
 from pipeline.signal.filter_noise import filter_autocovariance, variance_of_mean

@@ -26,7 +26,7 @@ from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import Selection, select
 from pipeline.model.effects import forget_registered, register
-from pipeline.model.user_effects import effect_from
+from pipeline.model.effects.files import effect_from
 from pipeline.records import Recording, SensorCalibration
 from pipeline.signal.temperature import smooth_temperature
 from pipeline.study.cases import draw

@@ -16,7 +16,7 @@ from pipeline.model.effects import catalogue
 from pipeline.model.effects.base import Owner
 from pipeline.model.fading_line import FadingLine
 from pipeline.model.measurement import predicted_reading
-from pipeline.model.user_effects import effect_from
+from pipeline.model.effects.files import effect_from
 from pipeline.records import SENSORS, FittedEffect, Motion, SensorCalibration
 
 SIZE = {"accelerometer": 2e-3, "gyroscope": 1e-5}

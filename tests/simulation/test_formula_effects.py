@@ -12,7 +12,7 @@ import yaml
 from pipeline.commands.simulate import main
 from pipeline.errors import ConfigurationError
 from pipeline.model.effects import catalogue, forget_registered, register
-from pipeline.model.user_effects import effect_from
+from pipeline.model.effects.files import effect_from
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription
 

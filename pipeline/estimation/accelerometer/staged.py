@@ -33,7 +33,7 @@ from pipeline.estimation.noise import prior_of
 from pipeline.estimation.residual_noise import assess_noise
 from pipeline.estimation.table_inputs import Reference, disturbance
 from pipeline.estimation.turns import parts_of
-from pipeline.model.effects.scale_factor_asymmetry import EFFECT
+from pipeline.model.effects import effect
 from pipeline.records import FittedEffect, SensorCalibration, StageResult
 
 if TYPE_CHECKING:
@@ -140,12 +140,12 @@ def _details(turns: Sequence[Turn], noise: ResidualNoise, freedom: float) -> dic
 
 
 def _asymmetry(chain: Chain) -> FittedEffect:
-    names = EFFECT.parameters("accelerometer")
+    asymmetry = effect("scale_factor_asymmetry")
     return FittedEffect(
-        EFFECT.name,
+        asymmetry.name,
         {
             parameter.name: {"value": float(value), "unit": parameter.unit}
-            for parameter, value in zip(names, chain.c, strict=True)
+            for parameter, value in zip(asymmetry.parameters("accelerometer"), chain.c, strict=True)
         },
     )
 

@@ -1,42 +1,38 @@
-"""The catalogue of physical effects: every module of this package that defines one is part of it.
+"""The catalogue of physical effects: every file of ``configs/effect/`` that ships is one.
 
-There is no list to extend: ``catalogue()`` finds the modules on disk. Effects of a user's own are registered beside
-them (``pipeline.model.user_effects`` makes them from formulas); they are known to this process alone.
+There is no list to extend: ``catalogue()`` finds the files. Effects of a user's own, of the same schema, are registered
+beside them; they are known to this process alone.
 """
 
 from __future__ import annotations
 
+import json
 from contextlib import contextmanager
-from functools import cache
-from importlib import import_module
-from pathlib import Path
-from typing import TYPE_CHECKING
+from functools import cache, lru_cache
+from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import ConfigurationError
+from pipeline.model.effects.files import built_in_files, effect_from, load_python_effect, read_effect_file
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable, Iterator, Mapping
 
     from pipeline.model.effects.base import Effect
+    from pipeline.records import FittedEffect
 
 _registered: dict[str, Effect] = {}
 _left_out: set[str] = set()
 
 
-@cache
 def built_in() -> dict[str, Effect]:
     """Return every built-in effect by name, in alphabetical order."""
-    found: dict[str, Effect] = {}
-    for file in sorted(Path(__file__).parent.glob("*.py")):
-        if file.stem not in ("__init__", "base"):
-            found[file.stem] = import_module(f"{__name__}.{file.stem}").EFFECT
-    return found
+    return {name: _built_in(name) for name in built_in_files()}
 
 
 def catalogue() -> dict[str, Effect]:
     """Return every effect by name: the built-in ones in alphabetical order, then the registered ones."""
     every = {**built_in(), **_registered}
-    return {name: this for name, this in every.items() if name not in _left_out} if _left_out else every
+    return {name: this for name, this in every.items() if name not in _left_out}
 
 
 @contextmanager
@@ -58,9 +54,23 @@ def register(effect: Effect) -> None:
     ConfigurationError
         If a built-in effect has that name.
     """
-    if effect.name in built_in():
+    if effect.name in built_in_files():
         raise ConfigurationError(f"effect {effect.name}: a built-in effect is called so; give yours another name")
     _registered[effect.name] = effect
+
+
+def register_user_effects(section: Mapping[str, Any]) -> None:
+    """Register the effects that a job's configuration carries: ``formulas`` and ``python`` (paths and hashes).
+
+    Raises
+    ------
+    ConfigurationError
+        If one is not as it should be.
+    """
+    for definition in section.get("formulas", ()):
+        register(effect_from(definition, f"effect {definition.get('name')} of the campaign"))
+    for entry in section.get("python", ()):
+        register(load_python_effect(entry["path"], entry["sha256"]))
 
 
 def forget(name: str) -> None:
@@ -73,26 +83,67 @@ def forget_registered() -> None:
     _registered.clear()
 
 
-@cache
-def _in_setup(name: str) -> Effect | None:
-    """Return ``<effect>@<setup>``, or None where the name is no such thing."""
-    base, separator, setup = name.partition("@")
-    if not separator or not setup:
-        return None
-    from pipeline.model.setups import OWN, in_setup  # noqa: PLC0415  (it needs this module's own)
-
-    return in_setup(name, OWN.get(base) or effect(base))
-
-
 def effect(name: str) -> Effect:
-    """Return one effect by name; ``<effect>@<setup>`` is that of one setup (``pipeline.model.setups``).
+    """Return one effect by name; ``<effect>@<setup>`` is that of one session (``pipeline.model.sessions``).
 
     Raises
     ------
     ConfigurationError
         If there is none of that name.
     """
-    found = _registered.get(name) or built_in().get(name) or _in_setup(name)
-    if found is None:
+    if name in _registered:
+        return _registered[name]
+    if name in built_in_files():
+        return _built_in(name)
+    base, _, session = name.partition("@")
+    if not session:
         raise ConfigurationError(f"no effect is called {name!r}; known: {', '.join(catalogue())}")
+    return _in_session(name)
+
+
+def effect_of(fitted: FittedEffect) -> Effect:
+    """Return the effect that was fitted: from its own definition where it carries one, else from the catalogue.
+
+    Raises
+    ------
+    ConfigurationError
+        If it was defined in Python and the file has not been named, or has changed.
+    """
+    if fitted.definition is None:
+        return effect(fitted.name)
+    if "python" not in fitted.definition:
+        return _defined(json.dumps(fitted.definition, sort_keys=True))
+    found = _registered.get(fitted.name)
+    if found is None or found.definition != fitted.definition:
+        state = "is not loaded" if found is None else "has another content than the one that was fitted"
+        raise ConfigurationError(
+            f"the effect {fitted.name} was fitted with the Python file {fitted.definition['python']} (sha256 "
+            f"{str(fitted.definition.get('sha256'))[:16]}...), which {state}; name that file: --python-effect FILE, or "
+            "in Python load_calibration(path, python_effects=[FILE])"
+        )
     return found
+
+
+def owner_of(fitted: FittedEffect) -> str:
+    """Return whose a fitted effect is; a Python file need not be loaded for that."""
+    if fitted.definition and "owner" in fitted.definition:
+        return str(fitted.definition["owner"])
+    return effect_of(fitted).owner
+
+
+@cache
+def _built_in(name: str) -> Effect:
+    return read_effect_file(built_in_files()[name], built_in=True)
+
+
+@lru_cache(maxsize=256)
+def _defined(definition: str) -> Effect:
+    return effect_from(json.loads(definition), "a calibration's own definition")
+
+
+@cache
+def _in_session(name: str) -> Effect:
+    from pipeline.model.sessions import OWN, in_session  # noqa: PLC0415  (it needs this package)
+
+    base = name.partition("@")[0]
+    return in_session(name, OWN.get(base) or effect(base))

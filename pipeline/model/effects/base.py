@@ -14,19 +14,19 @@ what the sensor felt at the sample's time stamp (``Effect.moved``).
 from __future__ import annotations
 
 import abc
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any, ClassVar
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.errors import InputError
-from pipeline.records import SENSORS
+from pipeline.records import SENSORS, Motion
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from collections.abc import Mapping
 
-    from pipeline.records import Motion
+    from numpy.typing import NDArray
 
 REFERENCE_TEMPERATURE = 25.0
 STANDARD_GRAVITY = 9.80665
@@ -69,14 +69,18 @@ class Effect(abc.ABC):
         The sensors to which it applies.
     layout : Layout
     needs : tuple of str
-        What the recording must hold beside a motion: ``temperature``, ``angle``, ``level``.
+        What the recording must hold beside a motion: ``temperature``, ``angle``, ``rate``, ``level``.
     needs_clock : bool
         Whether the time between the recordings must be known.
+    needs_motion : bool
+        Whether it adds nothing while the body rests.
+    needs_both_directions : bool
+        Whether turns in one direction show it as a part of bias and matrix.
     nonlinear : tuple of str
         Parameters in which the reading is not linear.
     contains : tuple of str
         Effects of which this is a generalisation; the two are never fitted together.
-    unseen : dict of str to str
+    unseen : mapping of str to str
         Sensor to the reason why the effect never changes its readings.
     meaning : str
         One sentence for the reader of a report.
@@ -90,19 +94,21 @@ class Effect(abc.ABC):
         Of an effect of the user's own, what it was made from; it goes with every calibration that has the effect.
     """
 
-    name: ClassVar[str]
-    owner: ClassVar[Owner]
-    layout: ClassVar[Layout]
-    sensors: ClassVar[tuple[str, ...]] = SENSORS
-    needs: ClassVar[tuple[str, ...]] = ()
-    needs_clock: ClassVar[bool] = False
-    nonlinear: ClassVar[tuple[str, ...]] = ()
-    contains: ClassVar[tuple[str, ...]] = ()
-    unseen: ClassVar[dict[str, str]] = {}
-    meaning: ClassVar[str]
-    excitation: ClassVar[str]
-    experiment: ClassVar[str]
-    source: ClassVar[str]
+    name: str
+    owner: Owner
+    layout: Layout
+    sensors: tuple[str, ...] = SENSORS
+    needs: tuple[str, ...] = ()
+    needs_clock: bool = False
+    needs_motion: bool = False
+    needs_both_directions: bool = False
+    nonlinear: tuple[str, ...] = ()
+    contains: tuple[str, ...] = ()
+    unseen: Mapping[str, str] = MappingProxyType({})
+    meaning: str
+    excitation: str
+    experiment: str
+    source: str
     definition: dict[str, Any] | None = None
 
     @abc.abstractmethod
@@ -176,6 +182,17 @@ class Effect(abc.ABC):
         """Return ``values + step``, as far as the parameters may go in one round of a nonlinear fit."""
         return values + step
 
+    def fields(self, sensor: str, values: NDArray[np.float64]) -> set[str]:
+        """Return the fields of ``Motion`` that the reading depends on: those that are read while it is computed."""
+        seen: set[str] = set()
+        self.reading(sensor, _watched(seen), np.eye(3), values)
+        return seen | set(self.needs)
+
+    def in_c(self, values: NDArray[np.float64]) -> list[str] | None:
+        """Return what is added to the three axes as C expressions, in the names of ``calibration.h``; None: not in C."""
+        del values
+        return None
+
     def limits(self, sensor: str) -> dict[str, float]:
         """Return the largest plausible sizes that the effect brings itself, keyed as those of the data sheet."""
         del sensor
@@ -186,6 +203,21 @@ class Effect(abc.ABC):
         return all(getattr(motion, need) is not None for need in self.needs)
 
 
+def _watched(seen: set[str]) -> Motion:
+    """Return a motion of two samples that notes which of its fields are read."""
+    names = {f.name for f in fields(Motion)}
+
+    class Watched(Motion):
+        def __getattribute__(self, name: str) -> Any:  # noqa: ANN401
+            if name in names:
+                seen.add(name)
+            return super().__getattribute__(name)
+
+    time, vector = np.arange(2.0), np.ones((2, 3))
+    at_rest = (vector, vector, vector, vector, np.full(2, 25.0), time, time, 0, np.ones(2, bool))
+    return Watched(time, *at_rest, direction=vector)
+
+
 def truth(sensor: str, motion: Motion) -> NDArray[np.float64]:
     """Return what an ideal sensor would read: (n, 3) array, specific force in g or angular rate in deg/s."""
     return motion.specific_force if sensor == "accelerometer" else motion.angular_rate
@@ -194,22 +226,6 @@ def truth(sensor: str, motion: Motion) -> NDArray[np.float64]:
 def truth_rate(sensor: str, motion: Motion) -> NDArray[np.float64]:
     """Return the time derivative of ``truth``: (n, 3) array, g/s or deg/s^2."""
     return motion.specific_force_rate if sensor == "accelerometer" else motion.angular_acceleration
-
-
-def temperature_difference(motion: Motion) -> NDArray[np.float64]:
-    """Return the temperature above the reference of 25 degC: (n,) array, degC.
-
-    Raises
-    ------
-    InputError
-        If the recording holds no temperature.
-    """
-    if motion.temperature is None:
-        raise InputError(
-            "an effect of temperature is asked for, but the recording holds no temperature; "
-            "record one, or take the effect out of the configuration"
-        )
-    return motion.temperature - REFERENCE_TEMPERATURE
 
 
 def length(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -267,17 +283,6 @@ def axis_parameters(symbol: str, unit: str, meaning: str) -> tuple[Parameter, ..
     return tuple(Parameter(f"{symbol}_{a}", unit, f"{meaning}, {a} axis") for a in "xyz")
 
 
-def matrix_parameters(symbol: str, unit: str, meaning: str) -> tuple[Parameter, ...]:
-    """Return nine parameters ``<symbol>_xx, <symbol>_xy .. <symbol>_zz``: of the first axis, along the second."""
-    return tuple(Parameter(f"{symbol}_{a}{b}", unit, f"{meaning}, {a} axis, along {b}") for a in "xyz" for b in "xyz")
-
-
 def unit_of(sensor: str) -> str:
     """Return the unit of a sensor's readings."""
     return "g" if sensor == "accelerometer" else "deg/s"
-
-
-def per_unit_of(sensor: str, power: int = 1) -> str:
-    """Return the unit of one over a power of a sensor's readings: ``1/g``, ``1/(deg/s)^2``."""
-    unit = "g" if sensor == "accelerometer" else "(deg/s)"
-    return f"1/{unit}" if power == 1 else f"1/{unit}^{power}"

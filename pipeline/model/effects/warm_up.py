@@ -11,34 +11,25 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.model.effects.base import Effect, Layout, Owner, Parameter, axis_parameters, every_axis, unit_of
+from pipeline.model.effects.base import Layout, every_axis
+from pipeline.model.effects.formula_effect import DeclaredEffect
+from pipeline.model.formula import c_number
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.records import Motion
 
-STARTS_S = (60.0, 180.0, 500.0, 1500.0)
-SHORTEST_S, LONGEST_S = 1.0, 1e5
+STARTS_S = (60.0, 180.0, 500.0, 1500.0)  # of a part of some grams to a box of some kilograms, in steps of three
+SHORTEST_S, LONGEST_S = 1.0, 1e5  # beyond these it is a step at the start, or a drift
 
 
-class WarmUp(Effect):
+class WarmUp(DeclaredEffect):
     """Exponential settling of the bias: one amplitude an axis and one time constant."""
 
-    name = "warm_up"
-    owner = Owner.SENSOR
     layout = Layout.EVERY_AXIS
     needs_clock = True
     nonlinear = ("time_constant",)
-    meaning = "The bias settles after power-on."
-    excitation = "recordings on one clock that begin within minutes of power-on"
-    experiment = "repeat the sequence once the unit is warm, and return to the first pose at the end"
-    source = "IEEE Std 952-2020, turn-on transient; exponential settling of first order"
-
-    def parameters(self, sensor: str) -> tuple[Parameter, ...]:
-        """Return A, axis by axis, and tau."""
-        amplitudes = axis_parameters("A", unit_of(sensor), "bias at power-on above its final value")
-        return (*amplitudes, Parameter("time_constant", "s", "time in which it falls to 37 %"))
 
     def starts(self, sensor: str) -> list[NDArray[np.float64]]:
         """Return a small grid of time constants."""
@@ -75,5 +66,7 @@ class WarmUp(Effect):
         """Return ``A exp(-t / tau)``."""
         return self.regressors(sensor, motion, K, values) * values[:3]
 
-
-EFFECT = WarmUp()
+    def in_c(self, values: NDArray[np.float64]) -> list[str]:
+        """Return ``A exp(-t / tau)`` of each axis as C expressions."""
+        decay = f"(imu_real)exp(-m->time / {c_number(values[3])})" if values[3] > 0 else "0"
+        return [f"{c_number(a)} * {decay}" for a in values[:3]]

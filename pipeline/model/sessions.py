@@ -86,30 +86,41 @@ class _Bias(Effect):
 OWN: dict[str, Effect] = {effect.name: effect for effect in (_Mounting(), _Bias())}
 
 
-class InSetup(Effect):
-    """An effect in one setup."""
+class InSession(Effect):
+    """An effect in one session, linear in its parameters.
 
-    base: Effect
-    setup: str
+    Parameters
+    ----------
+    name : str
+        ``<base>@<session>``.
+    base : Effect
+    """
+
+    def __init__(self, name: str, base: Effect) -> None:
+        self.name, self.base, self.session = name, base, name.partition(SEPARATOR)[2]
+        self.owner, self.layout, self.sensors, self.unseen = base.owner, base.layout, base.sensors, base.unseen
+        self.needs, self.needs_clock, self.needs_motion = base.needs, base.needs_clock, base.needs_motion
+        self.needs_both_directions, self.meaning = base.needs_both_directions, base.meaning
+        self.excitation, self.experiment, self.source = base.excitation, base.experiment, base.source
 
     def parameters(self, sensor: str) -> tuple[Parameter, ...]:
         """Return those of the effect."""
         return self.base.parameters(sensor)
 
     def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
-        """Return those of the effect in its setup, zeros elsewhere."""
+        """Return those of the effect in its session, zeros elsewhere."""
         found = self.base.regressors(sensor, motion, K, values)
-        return found if motion.setup == self.setup else np.zeros_like(found)
+        return found if motion.setup == self.session else np.zeros_like(found)
 
     def reading(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
-        """Return what the effect adds in its setup, zeros elsewhere."""
-        if motion.setup == self.setup:
+        """Return what the effect adds in its session, zeros elsewhere."""
+        if motion.setup == self.session:
             return self.base.reading(sensor, motion, K, values)
         return np.zeros((len(motion.time), 3))
 
 
-def in_setup(name: str, base: Effect) -> Effect:
-    """Return the effect ``<base>@<setup>``.
+def in_session(name: str, base: Effect) -> Effect:
+    """Return the effect ``<base>@<session>``.
 
     Raises
     ------
@@ -120,8 +131,4 @@ def in_setup(name: str, base: Effect) -> Effect:
         raise ConfigurationError(
             f"effect {name}: {base.name} cannot be one setup's own, as the fit is not linear in it; name {base.name}"
         )
-    fields = ("owner", "layout", "sensors", "needs", "needs_clock", "unseen", "meaning", "excitation", "experiment")
-    contents = {field: getattr(base, field) for field in (*fields, "source")}
-    setup = name.partition(SEPARATOR)[2]
-    found: Effect = type("InSetup", (InSetup,), contents | {"name": name, "base": base, "setup": setup})()
-    return found
+    return InSession(name, base)

@@ -1,0 +1,203 @@
+"""Effects from files: YAML with formulas, and Python where the user names it on the command line.
+
+A YAML file is data, also that of a stranger: it is read within limits, and its formulas are parsed. A Python file is
+code, and is run; nothing but the command line leads to one.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import sys
+from functools import cache, partial
+from importlib import import_module
+from importlib.abc import ExecutionLoader
+from importlib.util import decode_source
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+import yaml
+
+from pipeline.errors import ConfigurationError, MissingInputError, PipelineError
+from pipeline.io.file_access import read_text
+from pipeline.io.yaml_file import load_yaml
+from pipeline.model.effects.base import Effect
+from pipeline.model.effects.declaration import read_declaration
+from pipeline.model.effects.formula_effect import FormulaEffect
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+FOLDER = Path(__file__).resolve().parents[3] / "configs" / "effect"
+BUILT_IN = re.compile(r"^built_in: true", re.MULTILINE)
+LARGEST_BYTES, LARGEST_SIZE = 16384, 1000  # of one file; the largest that ships has 2 kB and 70 values
+OF_PYTHON = ("name", "owner", "layout", "meaning", "excitation", "experiment", "source")
+
+
+@cache
+def built_in_files() -> dict[str, Path]:
+    """Return the file of each effect that ships, by name; a file of the user's in the same folder is not one."""
+    files = sorted(FOLDER.glob("*.yaml"))
+    return {f.stem: f for f in files if BUILT_IN.search(f.read_text(encoding="utf-8", errors="replace"))}
+
+
+def read_effect_files(files: Iterable[Path]) -> dict[str, Effect]:
+    """Return the effects of YAML files, by name.
+
+    Raises
+    ------
+    ConfigurationError
+        With a line for each file that is not as it should be.
+    """
+    found: dict[str, Effect] = {}
+    problems = []
+    for file in files:
+        try:
+            found[file.stem] = read_effect_file(file)
+        except ConfigurationError as error:
+            problems.append(str(error))
+    if problems:
+        raise ConfigurationError("\n".join(problems))
+    return found
+
+
+def read_effect_file(file: Path, *, built_in: bool = False) -> Effect:
+    """Return the effect of one YAML file.
+
+    Raises
+    ------
+    ConfigurationError
+        If it is not as it should be, with its line.
+    """
+    text = read_text(file, LARGEST_BYTES, "an effect")
+    given = load_yaml(text, str(file), LARGEST_SIZE)
+    if not isinstance(given, dict):
+        raise ConfigurationError("an effect is expected: name, owner, sensors, meaning, terms", str(file))
+    lines = partial(_lines, text)
+    made = effect_from(given, str(file), lines, built_in=built_in)
+    if made.name != file.stem:
+        place = f"{file}:{lines().get(('name',), 1)}"
+        raise ConfigurationError(f"the effect is called {made.name}, the file {file.stem}: give both one name", place)
+    return made
+
+
+def effect_from(
+    definition: Mapping[str, Any],
+    where: str,
+    lines: Any = dict,  # noqa: ANN401  (a function that returns the line of each key)
+    *,
+    built_in: bool = False,
+) -> Effect:
+    """Return the effect that a definition describes (``pipeline.model.effects.declaration``).
+
+    Parameters
+    ----------
+    definition : mapping
+    where : str
+        The file, for messages.
+    lines : callable, optional
+        Returns the keys from the top with their line in the file.
+    built_in : bool
+        Whether it ships with the package.
+
+    Raises
+    ------
+    ConfigurationError
+        If anything in it is not as it should be.
+    """
+    declared = read_declaration(dict(definition), where, lines, built_in=built_in)
+    if built_in:
+        if declared.python is None:
+            return FormulaEffect(declared)
+        module, _, name = declared.python.partition(".")
+        made: Effect = getattr(import_module(f"pipeline.model.effects.{module}"), name)(declared)
+        return made
+    if declared.name in built_in_files():
+        place = f"{where}:{line}" if (line := lines().get(("name",))) else where
+        raise ConfigurationError(f"name: a built-in effect is called {declared.name}; give yours another name", place)
+    own = declared.model_copy(update={"source": declared.source or f"the user's own, {where}"})
+    source = {**definition, "sensors": list(declared.sensors)}
+    return FormulaEffect(own, source | ({"axes": list(declared.axes)} if "axes" in definition else {}))
+
+
+def load_python_effect(path: str | Path, sha256: str | None = None) -> Effect:
+    """Run a Python file that the user has named, and return its ``EFFECT``.
+
+    Parameters
+    ----------
+    path : str or Path
+    sha256 : str, optional
+        Of the content that is expected.
+
+    Raises
+    ------
+    MissingInputError
+        If there is no such file.
+    ConfigurationError
+        If it has another content, fails, or holds no effect of the file's name.
+    """
+    file = Path(path)
+    if file.suffix != ".py" or not file.is_file():
+        raise MissingInputError("there is no such Python file (.py) with an effect", str(file))
+    content = file.read_bytes()
+    digest = hashlib.sha256(content).hexdigest()
+    if sha256 is not None and digest != sha256:
+        raise ConfigurationError("the file has changed since the run began; start the run again", str(file))
+    name = f"imu_calibration_user_effect_{file.stem}"
+    module = ModuleType(name)
+    module.__file__ = str(file)
+    sys.modules[name] = module  # dataclasses and pickle look a class up there
+    try:
+        _ThisContent(file, content).exec_module(module)
+    except PipelineError:
+        raise
+    except Exception as error:
+        raise ConfigurationError(f"cannot be run: {type(error).__name__}: {error}", str(file)) from error
+    return _checked(getattr(module, "EFFECT", None), file, digest)
+
+
+class _ThisContent(ExecutionLoader):
+    """Loads the very bytes that were hashed; no cache of compiled code is read or written."""
+
+    def __init__(self, file: Path, content: bytes) -> None:
+        self.file, self.content = file, content
+
+    def get_source(self, fullname: str) -> str:
+        del fullname
+        return decode_source(self.content)
+
+    def get_filename(self, fullname: str) -> str:
+        del fullname
+        return str(self.file)
+
+
+def _checked(found: Any, file: Path, digest: str) -> Effect:  # noqa: ANN401  (whatever the file calls EFFECT)
+    if not isinstance(found, Effect):
+        raise ConfigurationError(
+            "holds no effect: EFFECT = MyEffect() is expected, of a class derived from "
+            "pipeline.model.effects.base.Effect (see docs/effects_of_your_own.md)",
+            str(file),
+        )
+    lacking = [name for name in OF_PYTHON if not hasattr(found, name)]
+    if lacking:
+        raise ConfigurationError(f"its EFFECT lacks {', '.join(lacking)}", str(file))
+    if found.name != file.stem:
+        raise ConfigurationError(
+            f"its EFFECT is called {found.name!r}; give it the file's name, {file.stem}", str(file)
+        )
+    if found.name in built_in_files():
+        raise ConfigurationError(f"a built-in effect is called {found.name}; give yours another name", str(file))
+    found.definition = {"python": file.name, "sha256": digest, "owner": str(found.owner)}
+    return found
+
+
+def _lines(text: str) -> dict[tuple[str, ...], int]:
+    """Return the line of each key of a YAML text, by the keys from the top."""
+    found: dict[tuple[str, ...], int] = {}
+    todo: list[tuple[tuple[str, ...], yaml.Node | None]] = [((), yaml.compose(text, yaml.SafeLoader))]
+    for path, node in todo:  # the list grows while it is walked
+        for key, value in node.value if isinstance(node, yaml.MappingNode) else ():
+            found[*path, str(key.value)] = key.start_mark.line + 1
+            todo.append(((*path, str(key.value)), value))
+    return found

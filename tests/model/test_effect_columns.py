@@ -1,0 +1,69 @@
+"""Every built-in effect computes what it computed when its equation was written out in Python, before it was a formula.
+
+``data/columns_of_effects.npz`` holds columns and readings of that code at random motions: five samples of every signal,
+three turn axes, K and parameters at random.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.model.effects import built_in
+from pipeline.records import Motion
+
+STORED = np.load(Path(__file__).parent / "data" / "columns_of_effects.npz")
+CASES = sorted({tuple(key.split(".")[:3]) for key in STORED.files if key.endswith(".columns")})
+
+
+def motion(seed: int, n: int = 5) -> Motion:
+    rng = np.random.default_rng(seed)
+    level = np.linalg.qr(rng.standard_normal((n, 3, 3)))[0]
+    return Motion(
+        time=np.sort(rng.uniform(0, 3600, n)),
+        specific_force=rng.uniform(-2, 2, (n, 3)),
+        angular_rate=rng.uniform(-300, 300, (n, 3)),
+        angular_acceleration=rng.uniform(-500, 500, (n, 3)),
+        specific_force_rate=rng.uniform(-3, 3, (n, 3)),
+        temperature=rng.uniform(-30, 80, n),
+        angle=rng.uniform(-400, 400, n),
+        rate=rng.uniform(-200, 200, n),
+        axis=int(rng.integers(3)),
+        still=np.zeros(n, bool),
+        level=level,
+        direction=np.linalg.qr(rng.standard_normal((n, 3, 3)))[0][:, 0],
+    )
+
+
+@pytest.mark.parametrize(("name", "sensor", "seed"), CASES)
+def test_columns_and_readings_are_those_of_the_equation_in_python(name: str, sensor: str, seed: str) -> None:
+    effect = built_in()[name]
+    rng = np.random.default_rng(7)
+    K = np.eye(3) + 0.05 * rng.standard_normal((3, 3))
+    values = rng.uniform(0.1, 1.0, len(effect.parameters(sensor)))
+    for what, found in (
+        ("columns", effect.columns(sensor, motion(int(seed)), K, values)),
+        ("reading", effect.reading(sensor, motion(int(seed)), K, values)),
+    ):
+        expected = STORED[f"{name}.{sensor}.{seed}.{what}"]
+        np.testing.assert_allclose(found, expected, rtol=1e-14, atol=1e-14 * np.abs(expected).max())
+
+
+def test_names_and_units_of_parameters_are_those_of_published_calibrations() -> None:
+    for key in STORED.files:
+        name, what = key.split(".")[0], key.rpartition(".")[2]
+        if what == "parameters":
+            effect = built_in()[name]
+            found = [f"{s} {p.name} {p.unit}" for s in effect.sensors for p in effect.parameters(s)]
+            assert found == STORED[key].tolist(), name
+
+
+def test_owner_needs_and_texts_are_those_of_published_reports() -> None:
+    for key in STORED.files:
+        if key.endswith(".says"):
+            e = built_in()[key.split(".")[0]]
+            needs = ["needs", *e.needs, str(e.needs_clock), "nonlinear", *e.nonlinear, "contains", *e.contains]
+            texts = [e.meaning, e.excitation, e.experiment, e.source]
+            assert [str(e.owner), str(e.layout), *e.sensors, *needs, *texts] == STORED[key].tolist(), e.name
