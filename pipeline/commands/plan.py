@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import ConfigurationError
-from pipeline.model.effects.files import read_effect_files
 from pipeline.model.effects import register
+from pipeline.model.effects.files import read_effect_files
 from pipeline.planning.changes import best_changes
 from pipeline.planning.plan import plan_of
 from pipeline.planning.plan_text import helps_most, in_words, side_by_side

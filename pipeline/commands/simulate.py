@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from pipeline.errors import ConfigurationError
-from pipeline.model.effects.files import read_effect_files
 from pipeline.model.effects import register
+from pipeline.model.effects.files import read_effect_files
 from pipeline.outcome import run_command
 from pipeline.simulation.campaign import write_campaign
 from pipeline.simulation.description import FORMATS, description_from, read_description

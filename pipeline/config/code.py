@@ -16,14 +16,15 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 PACKAGE = Path(__file__).resolve().parents[1]
+EFFECTS = PACKAGE.parent / "configs" / "effect"  # what pipeline.model.effects.files reads
 
 
 @cache
 def code_digest(module: str) -> str:
     """Return a digest of a module's source and of every module of the package that it imports, at any depth.
 
-    A package counts with all that lies beside its ``__init__`` where it finds its modules on disk (effects, exports), a
-    module that imports jinja2 with the ``templates`` beside it.
+    A package counts with all that lies beside its ``__init__`` where it finds its modules on disk (exports), a module
+    that imports jinja2 with the ``templates`` beside it, the effects with their files in ``configs/effect/``.
 
     Parameters
     ----------
@@ -32,7 +33,7 @@ def code_digest(module: str) -> str:
     """
     digest = hashlib.sha256()
     for file in sorted(_closure(module)):
-        digest.update(str(file.relative_to(PACKAGE)).encode() + b"\0" + file.read_bytes())
+        digest.update(str(file.relative_to(PACKAGE.parent)).encode() + b"\0" + file.read_bytes())
     return digest.hexdigest()[:16]
 
 
@@ -56,6 +57,9 @@ def _imports(file: Path) -> tuple[Path, ...]:
     found: list[Path | None] = []
     if file.name == "__init__.py" and b"import_module(" in source:
         found += [f for f in file.parent.rglob("*") if f.is_file() and f.suffix != ".pyc"]
+    if file == PACKAGE / "model" / "effects" / "files.py":
+        found += [*file.parent.glob("*.py")]  # classes that the files name
+        found += [f for f in sorted(EFFECTS.glob("*.yaml")) if b"\nbuilt_in: true" in f.read_bytes()]
     for node in _statements(ast.parse(source).body):
         if isinstance(node, ast.Import):
             found += [_file_of(alias.name) for alias in node.names]

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from pipeline.model.effects.base import Effect
 
 PYTHON = "python_effects"
-HAS_TERMS = r"^terms[ \t]*:"  # the files of built-in effects have none
+BUILT_IN = r"(?m)^built_in: true"  # a file of configs/effect/ that ships
 ONLY_FROM_THE_COMMAND_LINE = (
     "an effect in Python is code, and is loaded only where the command line names it: "
     "--config 'python_effects=[path/to/my_effect.py]'"
@@ -72,8 +72,12 @@ def load_user_effects(campaign: Path, configs: Iterable[Path], python: Sequence[
                 problems.append(f"{place}: the effect {name} is also in {places[name]}; name one of them otherwise")
             found[name], places[name] = each, str(place)
 
-    folders = [(campaign / "effects", ".*"), *((root / "effect", HAS_TERMS) for root in configs)]
-    files = {folder: [f for f in sorted(folder.glob("*.yaml")) if _holds(f, what)] for folder, what in folders}
+    folders = [campaign / "effects", *(root / "effect" for root in configs)]
+    own = campaign.resolve()
+    files = {
+        folder: [f for f in sorted(folder.glob("*.yaml")) if not _ships(f) or f.resolve().is_relative_to(own)]
+        for folder in folders
+    }
     if not any(files.values()) and not python:
         return UserEffects()
     from pipeline.model.effects.files import load_python_effect, read_effect_files  # noqa: PLC0415  (imports numpy)
@@ -122,11 +126,12 @@ def effects_for(stage: str, sensor: str, configs: Iterable[Mapping[str, Any]]) -
     return {"user_effects": section} if section["formulas"] or section["python"] else {}
 
 
-def _holds(file: Path, what: str) -> bool:
+def _ships(file: Path) -> bool:
+    """Return whether a file is that of a built-in effect."""
     try:
         other = not_regular(file)
         if other:
             raise ConfigurationError(other, str(file))
-        return re.search(what, file.read_text(encoding="utf-8", errors="replace"), re.MULTILINE) is not None
+        return re.search(BUILT_IN, file.read_text(encoding="utf-8", errors="replace")) is not None
     except OSError as error:
         raise ConfigurationError(f"cannot be read: {error}", str(file)) from None

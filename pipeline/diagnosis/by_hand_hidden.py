@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.diagnosis.advice import UNKNOWN
-from pipeline.diagnosis.observability import LEAST_SPAN_DEGC, MOVING
+from pipeline.diagnosis.observability import LEAST_SPAN_DEGC
 from pipeline.estimation.multi_position.model import refusal
 from pipeline.estimation.selection import GATE_BIC
 from pipeline.model.effects import catalogue
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from pipeline.estimation.ranking import Score
     from pipeline.model.effects.base import Effect
 
-ONLY_MOVING = {*MOVING, "hysteresis"}
 FEWEST = 3  # equations beyond bias and matrix, from which on an effect of one coefficient can be judged
 WORTH = 0.25  # share of the residual's mean square, of what could be its cause
 MOST_NAMED = 3
@@ -70,7 +69,7 @@ def _reason(this: Effect, selection: HandSelection) -> str:
     if "temperature" in this.needs and span < LEAST_SPAN_DEGC:
         return f"the temperature changes by no more than {span:.2g} degC; it needs {this.excitation}"
     score = selection.first.scores.get(this.name)
-    if score is None and model.kinds == 1 and this.name in ONLY_MOVING:
+    if score is None and model.kinds == 1 and this.needs_motion:
         return "at rest nothing moves, and it adds nothing"
     base = selection.fits[0]
     few = len(base.residual) - base.rank < FEWEST

@@ -15,8 +15,8 @@ import numpy as np
 
 from pipeline.estimation.design import Start
 from pipeline.estimation.joint import fit_terms
-from pipeline.model.effects.base import truth
 from pipeline.model.effects import effect_of
+from pipeline.model.effects.base import truth
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -28,18 +28,7 @@ if TYPE_CHECKING:
     from pipeline.records import Motion
 
 LEAST_SPAN_DEGC = 1.0
-MOVING = {
-    "lever_arm",
-    "inner_lever_arms",
-    "vibration_rectification",
-    "rate_dependence",
-    "time_offset",
-    "low_pass_lag",
-    "clock_rate",
-    "table_rate_ripple",
-}
 OF_A_TABLE = {"angle": "no angle of a table", "rate": "no rate of a table", "level": "nothing that tells the heading"}
-BOTH_WAYS = {"scale_factor_asymmetry", "vibration_rectification", "table_backlash", "rate_dependence"}
 
 
 @dataclass(frozen=True)
@@ -145,11 +134,11 @@ def _faint(this: Effect, selection: Selection) -> str:
 
 
 def _unexcited(this: Effect, facts: Facts) -> str:
-    if this.name in MOVING and not facts.moving:
+    if this.needs_motion and not facts.moving:
         return "the table never moved while it was sampled"
     if "temperature" in this.needs:
         return _steady(facts)
-    if this.name in BOTH_WAYS and facts.one_way:
+    if this.needs_both_directions and facts.one_way:
         return "every turn goes in one direction, in which it looks exactly like a part of bias and matrix"
     return "bias and matrix explain all that it would add in this motion"
 

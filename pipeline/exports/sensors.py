@@ -8,9 +8,9 @@ import numpy as np
 import yaml
 
 from pipeline.io.axes import STRAIGHT, maps_of_log
+from pipeline.model.effects import owner_of
 from pipeline.model.effects.base import Owner
 from pipeline.model.plausible import sentences
-from pipeline.model.effects import owner_of
 from pipeline.records import SENSORS, SensorCalibration
 
 if TYPE_CHECKING:

@@ -4,8 +4,8 @@
     a ** b   :  b is a number, at most 20 in size; ** 2 and ** 3 are products, so that numpy and C agree to the last bit
 
 where a signal is one of ``SIGNALS`` and a function one of ``FUNCTIONS``. Python's own parser reads the text. The tree
-is translated node by node; a name that is not known, an attribute, an index, a text, a keyword or a comparison is refused
-with its place.
+is translated node by node; an unknown name, an attribute, an index, a text, a keyword or a comparison is refused with
+its place.
 """
 
 from __future__ import annotations
@@ -69,7 +69,8 @@ SIGNALS = {
         for j, b in enumerate("xyz")
     },
 }
-OF_THE_MOTION = {name for name, signal in SIGNALS.items() if signal.field.startswith("angular_")} | {"rate"}
+MOVING = ("angular_rate", "angular_acceleration", "direction", "rate")
+OF_THE_MOTION = {name for name, signal in SIGNALS.items() if signal.field in MOVING}  # 0 while nothing moves
 
 
 class Function(NamedTuple):
@@ -93,7 +94,7 @@ def _band(x: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.flo
 
 
 _OF_THE_LIBRARY = (np.sin, np.cos, np.tan, np.tanh, np.exp, np.log, np.sqrt)
-FUNCTIONS = {
+FUNCTIONS: dict[str, Function] = {
     **{f.__name__: Function(1, f, f"(imu_real){f.__name__}({{}})") for f in _OF_THE_LIBRARY},
     "sign": Function(1, np.sign, "(imu_real)imu_sign({})"),
     "radians": Function(1, np.radians, f"({{}} * (imu_real){np.pi / 180.0!r})"),

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.files import json_text
+from pipeline.model.effects import effect_of
 from pipeline.model.inversion import compensate, linear_truth, sensor_effects
 from pipeline.model.kinematics import reference_motion
 from pipeline.model.plausible import sentences
-from pipeline.model.effects import effect_of
 from pipeline.outcome import commands_of, place, run_command
 from pipeline.records import SENSORS, SensorCalibration
 from pipeline.report import figures, tables

@@ -25,10 +25,14 @@ limits: {k: 1e-3}
 """
 TIP = BEND.replace("bend", "tip").replace("Bends", "Tips").replace("gyroscope", "accelerometer")
 CODE = """\
-from pipeline.model.effects.quadratic_nonlinearity import QuadraticNonlinearity
-class Mine(QuadraticNonlinearity):
-    name = "mine"
-    sensors = ("gyroscope",)
+from pipeline.model.effects.base import Effect, Layout, Owner, axis_parameters, truth
+class Mine(Effect):
+    name, owner, layout, sensors = "mine", Owner.SENSOR, Layout.PER_AXIS, ("gyroscope",)
+    meaning = excitation = experiment = source = "mine"
+    def parameters(self, sensor):
+        return axis_parameters("K2", "1/(deg/s)", "mine")
+    def regressors(self, sensor, motion, K, values):
+        return truth(sensor, motion)[:, :, None] ** 2
 EFFECT = Mine()
 """
 
@@ -66,7 +70,6 @@ def test_a_file_beside_the_campaign_is_an_effect_with_its_limits(bench: Path) ->
 def test_a_configuration_directory_of_the_campaign_may_hold_formulas_too(bench: Path) -> None:
     (bench / "configs" / "effect").mkdir(parents=True)
     (bench / "configs" / "effect" / "third.yaml").write_text(BEND.replace("bend", "third"))
-    (bench / "configs" / "effect" / "warm_up.yaml").write_text("name: warm_up\n")
     assert load(bench, overrides="effects.gyroscope=[third]").units["U1"].config["effects"]["gyroscope"] == ["third"]
     (bench / "configs" / "effect" / "bend.yaml").write_text(BEND)
     with pytest.raises(ConfigurationError, match="the effect bend is also in"):
@@ -110,7 +113,7 @@ def test_every_wrong_file_is_named_with_its_line_before_any_job(bench: Path) -> 
     with pytest.raises(ConfigurationError) as caught:
         load(bench)
     assert "bend.yaml:6: terms.k.formula: formula \"__import__('os')\", position 12" in str(caught.value)
-    assert "tip.yaml:2: owner: 'nobody': one of sensor, recording, mounting, table" in str(caught.value)
+    assert "tip.yaml:2: owner: 'nobody': one of 'sensor', 'recording', 'mounting' or 'table'" in str(caught.value)
 
 
 def test_an_effect_is_refused_for_a_sensor_that_it_does_not_name(bench: Path) -> None:

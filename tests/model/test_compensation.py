@@ -14,9 +14,9 @@ from pipeline.model.compensation import Compensation, compensate, load
 from pipeline.model.compensation_stream import BLOCK
 from pipeline.model.effects import catalogue
 from pipeline.model.effects.base import Owner
+from pipeline.model.effects.files import effect_from
 from pipeline.model.fading_line import FadingLine
 from pipeline.model.measurement import predicted_reading
-from pipeline.model.effects.files import effect_from
 from pipeline.records import SENSORS, FittedEffect, Motion, SensorCalibration
 
 SIZE = {"accelerometer": 2e-3, "gyroscope": 1e-5}

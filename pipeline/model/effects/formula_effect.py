@@ -156,7 +156,9 @@ class FormulaEffect(DeclaredEffect):
         if name == "speed":
             return length(motion.angular_rate)
         field, place = SIGNALS[name].field, SIGNALS[name].place
-        found: NDArray[np.float64] | None = turning_direction(motion) if field == "direction" else getattr(motion, field)
+        found: NDArray[np.float64] | None = (
+            turning_direction(motion) if field == "direction" else getattr(motion, field)
+        )
         if found is None:
             if name in OF_THE_TURN:
                 return None
@@ -164,7 +166,9 @@ class FormulaEffect(DeclaredEffect):
                 f"effect {self.name} looks at the {name}, but the recording{_of(motion, '')} holds none; "
                 "record one, or take the effect out of the configuration"
             )
-        return found[(slice(None), *place)] if place else found
+        for i in place:
+            found = found[:, i]
+        return found
 
     def _value(
         self, formula: Formula, signals: list[dict[str, Any]], motion: Motion, axis: int = 0

@@ -1,12 +1,12 @@
 """Errors of the table: in turns about its axes, and its level.
 
-With K the inverse of the calibration matrix, f the specific force, g, A the table angle, e_a the unit vector of the turn
-axis a, and the parameters of ``configs/effect/`` (angles in deg):
+With K the inverse of the calibration matrix, f the specific force, g, A the table angle, e_a the unit vector of turn axis
+a, and the parameters of ``configs/effect/`` (angles in deg):
 
     table_tilt:            accelerometer: z = K R^T |f| (pi/180) (-d_y, d_x, 0), R the rotation from body to level
 
     turns about axis a:
-    table_axis_nonorthogonality, d_a how far the axis leans along the other two body axes at angle 0, R_a(A) a turn about it
+    table_axis_nonorthogonality, d_a how far the axis leans along the other two body axes at angle 0, R_a a turn
                            accelerometer: z = K [theta x f - R_a(-A) (theta x f_0)] (pi/180),  theta = e_a x d_a
                            gyroscope:     z = K (pi/180) d_a dA/dt
     table_backlash, the angle is behind by B_a in the direction s = +1 or -1 of this or the last turn
