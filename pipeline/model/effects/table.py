@@ -1,7 +1,7 @@
 """Errors of the table: in turns about its axes, and its level.
 
-With K the inverse of the calibration matrix, f the specific force, g, A the table angle, e_a the unit vector of turn axis
-a, and the parameters of ``configs/effect/`` (angles in deg):
+With K the inverse of the calibration matrix, f the specific force, g, A the table angle, e_a the unit vector of axis a,
+and the parameters of ``configs/effect/`` (angles in deg):
 
     table_tilt:            accelerometer: z = K R^T |f| (pi/180) (-d_y, d_x, 0), R the rotation from body to level
 
