@@ -95,8 +95,7 @@ def effect(name: str) -> Effect:
         return _registered[name]
     if name in built_in_files():
         return _built_in(name)
-    base, _, session = name.partition("@")
-    if not session:
+    if not name.partition("@")[2]:
         raise ConfigurationError(f"no effect is called {name!r}; known: {', '.join(catalogue())}")
     return _in_session(name)
 

@@ -189,7 +189,7 @@ class Effect(abc.ABC):
         return seen | set(self.needs)
 
     def in_c(self, values: NDArray[np.float64]) -> list[str] | None:
-        """Return what is added to the three axes as C expressions, in the names of ``calibration.h``; None: not in C."""
+        """Return what is added to each axis as C expressions in the names of ``calibration.h``; None: not in C."""
         del values
         return None
 

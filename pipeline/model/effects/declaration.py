@@ -69,7 +69,7 @@ def _some_of(known: tuple[str, ...]) -> Callable[[object], tuple[str, ...]]:
 
 
 class Formulas(NamedTuple):
-    """The formula of each axis, or of ``""`` where the axes have one; shared: they are a vector with one coefficient."""
+    """The formula of each axis, or of ``""`` for all axes; shared: they are a vector with one coefficient."""
 
     of: dict[str, Formula]
     shared: bool

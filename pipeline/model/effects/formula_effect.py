@@ -3,9 +3,9 @@
     z_c = sum over terms of p_tc h_t(signals)          (a coefficient for each axis c in ``axes``)
         + sum over vector terms of p_t h_tc(signals)   (one coefficient for all axes)
 
-where p are the coefficients, which are fitted, and h formulas in the signals of ``pipeline.model.formula``; those of the
-table's angle and rate count 0 in a recording without a turn axis. With ``adds_to: truth`` the terms change what the body
-feels, and the reading changes by K times that, K the inverse of the calibration matrix.
+where p are the coefficients, which are fitted, and h formulas in the signals of ``pipeline.model.formula``; those of
+the table's angle and rate count 0 in a recording without a turn axis. With ``adds_to: truth`` the terms change the
+specific force or the rate itself; the reading changes by K times that, K the inverse of the calibration matrix.
 """
 
 from __future__ import annotations
