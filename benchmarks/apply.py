@@ -79,8 +79,7 @@ def write_mcap(path: Path, samples: int) -> None:
     """Write what a recorder writes: quantised readings in zstd chunks, and a temperature ten times a second."""
     from mcap.writer import Writer  # noqa: PLC0415
 
-    from pipeline.io.mcap_write import _Template, imu_table  # noqa: PLC0415
-    from pipeline.io.ros2 import DEFINITIONS, IMU, TEMPERATURE  # noqa: PLC0415
+    from pipeline.io.ros2_messages import DEFINITIONS, IMU, TEMPERATURE, _Template, imu_table  # noqa: PLC0415  # noqa: PLC0415
 
     generator = np.random.default_rng(1)
     warm = _Template("imu")
@@ -118,48 +117,40 @@ def csv_unchanged(log: Path, out: Path, _calibration: Path) -> int:
 
 
 def csv_applied(log: Path, out: Path, calibration: Path) -> int:
-    from pipeline.field_logs.csv_log import compensate_csv  # noqa: PLC0415
+    from pipeline.field_logs.compensate import compensate_log  # noqa: PLC0415
     from pipeline.model.compensation import load  # noqa: PLC0415
 
-    return compensate_csv(load(calibration), log, out)[0]
+    return compensate_log(load(calibration), log, out).samples
 
 
 def mcap_unchanged(log: Path, out: Path, _calibration: Path) -> int:
     import zstandard  # noqa: PLC0415
+    from mcap.opcode import Opcode  # noqa: PLC0415
+    from mcap.records import Chunk  # noqa: PLC0415
 
-    from pipeline.io.mcap_copy import CopyingWalk, McapCopy  # noqa: PLC0415
+    from pipeline.io.mcap_copy import McapCopy  # noqa: PLC0415
+    from pipeline.io.mcap_reader import McapReader  # noqa: PLC0415
+    from pipeline.io.mcap_records import RECORD_HEAD, bytes_of, parsed  # noqa: PLC0415
 
-    class Again(McapCopy):
-        """Packs every chunk again."""
-
-        def _write(self, *parts: bytes | memoryview) -> None:
-            if len(parts) == 2 and parts[0][0] == 6 and self.unpacked is not None:
-                head = parts[1][: len(parts[1]) - self.chunks[-1].compressed_size]
-                parts = (parts[0], head, zstandard.compress(self.unpacked))
-            super()._write(*parts)
-
-        unpacked: bytes | None = None
-
-    class Reader(CopyingWalk):
-        def absorb(self, *parts: bytes) -> None:
-            if self._chunk is not None:
-                self.copy.unpacked = self._chunk.data
-            super().absorb(*parts)
-
-    count = 0
     with log.open("rb") as stream, out.open("wb") as target:
-        walk = Reader(stream, str(log), Again(target), lambda _rows: None)
-        for rows in walk.rows():
-            count += len(rows.starts)
-        walk.copy.finish(walk.found.schemas.values(), walk.found.channels.values())
-    return count
+        reader, copy = McapReader(stream, str(log)), McapCopy(target)
+        for run in reader.runs():
+            for i, (head, content) in enumerate(run.records):
+                if head[0] == Opcode.CHUNK:
+                    chunk = parsed(Chunk, content)
+                    chunk.data = zstandard.compress(run.data)
+                    packed = bytes_of([chunk])
+                    run.records[i] = (packed[:RECORD_HEAD], packed[RECORD_HEAD:])
+            copy.copy(run)
+        copy.finish(list(reader.schemas.values()), list(reader.channels.values()))
+    return reader.count
 
 
 def mcap_applied(log: Path, out: Path, calibration: Path) -> int:
-    from pipeline.field_logs.mcap_log import compensate_mcap  # noqa: PLC0415
+    from pipeline.field_logs.compensate import compensate_log  # noqa: PLC0415
     from pipeline.model.compensation import load  # noqa: PLC0415
 
-    return compensate_mcap(load(calibration), log, out).messages
+    return compensate_log(load(calibration), log, out).samples
 
 
 def mcap_official(log: Path, out: Path, _calibration: Path, most: int = 200_000) -> int:

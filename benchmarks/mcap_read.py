@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
-from pipeline.io.ros2 import DEFINITIONS, IMU
+from pipeline.io.ros2_messages import DEFINITIONS, IMU
 
 CHUNK = 1 << 20  # bytes
 LSB = 1 / 16384

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.errors import ConfigurationError, InputError
-from pipeline.field_logs.doubts import Doubts
+from pipeline.field_logs.compensate import compensate_log
 from pipeline.field_logs.output import Progress, require_apart
 from pipeline.field_logs.profile import LogProfile
 from pipeline.model.calibration_file import read_calibration
@@ -44,33 +44,18 @@ def main(argv: Sequence[str]) -> int:
             "the output would overwrite the calibration; choose another file for -o", str(arguments.output)
         )
     profile = _profile(arguments.calibration, arguments.ingest)
-    progress, doubts = Progress(arguments.log), Doubts()
-    if arguments.log.suffix.lower() == ".mcap":
-        from pipeline.field_logs.mcap_log import compensate_mcap  # noqa: PLC0415  (each log needs one of the two)
-
-        done = compensate_mcap(
-            compensation, arguments.log, arguments.output, profile,
-            topic=arguments.topic, smoothing=arguments.smoothing, progress=progress, doubts=doubts,
-        )  # fmt: skip
-        rows, sensors, what = done.messages, done.sensors, f"messages compensated on {done.topic}"
-        notes = done.notes
-    else:
-        from pipeline.field_logs.csv_log import compensate_csv  # noqa: PLC0415
-
-        rows, sensors = compensate_csv(
-            compensation, arguments.log, arguments.output, profile,
-            smoothing=arguments.smoothing, progress=progress, doubts=doubts,
-        )  # fmt: skip
-        what, notes = "rows compensated", []
+    progress = Progress(arguments.log)
+    result = compensate_log(
+        compensation, arguments.log, arguments.output, profile,
+        topic=arguments.topic, smoothing=arguments.smoothing, progress=progress,
+    )  # fmt: skip
     progress.end()
-    for sensor in sensors:
-        if compensation.calibration(sensor) is None:
-            notes = [*notes, f"{arguments.calibration} holds no {sensor}; its readings are unchanged"]
-    for doubt in doubts.said({s for s in sensors if compensation.calibration(s) is not None}):
-        print(f"warning: {doubt}", file=sys.stderr)
-    for note in notes:
+    for warning in result.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
+    for note in result.notes:
         print(f"note: {note}", file=sys.stderr)
-    print(f"{rows} {what} with unit {compensation.unit}: {arguments.output}", file=sys.stderr)
+    what = f"messages compensated on {result.topic}" if result.topic else "rows compensated"
+    print(f"{result.samples} {what} with unit {result.unit}: {arguments.output}", file=sys.stderr)
     return 0
 
 

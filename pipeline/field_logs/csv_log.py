@@ -1,7 +1,7 @@
-"""Compensation of a text log, block by block.
+"""A text log with calibrated readings.
 
 The columns that the profile names as readings are replaced by calibrated ones in g and deg/s, under the canonical names
-``accel_x_g`` .. ``gyro_z_dps``; every other cell, and what stands before the data, is written as it stands.
+``accel_x_g`` .. ``gyro_z_dps``. Every other cell, and the lines before the data, are written unchanged.
 """
 
 from __future__ import annotations
@@ -12,104 +12,36 @@ import numpy as np
 import pyarrow as pa
 from pyarrow import compute as pc
 
-from pipeline.errors import InputError, PipelineError
-from pipeline.field_logs.output import replacing, require_apart
-from pipeline.field_logs.profile import EPOCH_AFTER_S, LogProfile
+from pipeline.errors import InputError
+from pipeline.field_logs.compensate import Block
+from pipeline.field_logs.profile import EPOCH_AFTER_S
 from pipeline.io.csv_cells import digits, lines_of, read_head, text_blocks
 from pipeline.io.ingest_settings import csv_formats
 from pipeline.io.units import COUNTS, TRIADS, UNITS, decode, to_house_unit
-from pipeline.model.compensation import SMOOTHING_S
 from pipeline.records import SENSORS, Encoding
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Iterator
     from pathlib import Path
 
     from numpy.typing import NDArray
 
-    from pipeline.field_logs.doubts import Doubts
-    from pipeline.io.csv_cells import TextBlock
+    from pipeline.field_logs.compensate import Readings, Result
+    from pipeline.field_logs.log_checks import LogChecks
+    from pipeline.field_logs.output import Output
+    from pipeline.field_logs.profile import LogProfile
+    from pipeline.io.csv_cells import Head, TextBlock
     from pipeline.io.ingest_settings import Column
-    from pipeline.model.compensation import Compensation
 
 SIGNALS = {**TRIADS, "temperature": ("temperature",), "time": ("time",)}
 CANONICAL = {c: f"{c}_{'g' if s == 'accelerometer' else 'dps'}" for s in SENSORS for c in TRIADS[s]}
-BLOCK_BYTES = 1 << 21
 NANOSECONDS = 1e9
 
 
-def compensate_csv(
-    compensation: Compensation,
-    source: Path,
-    target: Path,
-    profile: LogProfile | None = None,
-    *,
-    smoothing: float = SMOOTHING_S,
-    block_bytes: int = BLOCK_BYTES,
-    progress: Callable[[int, int], None] | None = None,
-    doubts: Doubts | None = None,
-) -> tuple[int, list[str]]:
-    """Compensate a text log.
+class CsvLog:
+    """A text log; see ``pipeline.field_logs.compensate.Log``."""
 
-    Parameters
-    ----------
-    compensation : Compensation
-    source, target : Path
-    profile : LogProfile, optional
-        How the log is laid out; the canonical CSV by default.
-    smoothing : float, s
-        As of ``Compensation.apply``.
-    block_bytes : int
-        Size of the blocks that are read.
-    progress : callable, optional
-        Called with the rows done and the bytes read.
-    doubts : Doubts, optional
-        Takes in what speaks against compensating this log.
-
-    Returns
-    -------
-    rows : int
-    sensors : list of str
-        Those whose columns the log holds.
-
-    Raises
-    ------
-    InputError
-        If the log cannot be read as it is, or the output would overwrite it.
-    """
-    require_apart(source, target)
-    log = _Log(source, profile or LogProfile())
-    stream = compensation.stream(smoothing)
-    rows = 0
-    with source.open("rb") as raw:
-        head = read_head(raw, log.settings, source)
-        log.find(head.names, f"{source}:{len(head.lines) + 1}")
-        with replacing(target) as out:
-            out.write(head.text(log.new_names(head.names)).encode())
-            for block in text_blocks(raw, head, log.settings, block_bytes, source):
-                signals = log.signals(block, rows)
-                try:
-                    found = stream.apply(**signals)
-                except PipelineError as error:
-                    raise type(error)(error.message, f"{source}:{block.line_of(0)}") from None
-                if doubts is not None:
-                    if rows == 0:
-                        doubts.look_at([block.columns[i] for i in log.readings], log.settings.decimal)
-                    after = {s: getattr(found, s) for s in SENSORS if s in signals}
-                    doubts.take({s: signals[s] for s in after}, after, signals.get("time"), rows)
-                for sensor in (s for s in SENSORS if s in signals):
-                    log.replace(block.columns, sensor, getattr(found, sensor), signals[sensor])
-                out.write(lines_of(block.columns, head.delimiter, quoted=block.quoted))
-                rows += block.rows
-                if progress is not None:
-                    progress(rows, raw.tell())
-    return rows, [sensor for sensor in SENSORS if sensor in log.places]
-
-
-class _Log:
-    """Where the signals of a text log stand, and how its cells become numbers."""
-
-    def __init__(self, source: Path, profile: LogProfile) -> None:
+    def __init__(self, source: Path, out: Output, profile: LogProfile, smoothing: float, block_bytes: int) -> None:
         formats = csv_formats(profile.ingest)
         if len(formats) > 1:
             raise InputError(
@@ -117,15 +49,49 @@ class _Log:
                 "or choose another profile by --ingest",
                 str(source),
             )
-        self.source, self.profile, self.settings = source, profile, formats[0]
+        self.source, self.out, self.profile, self.settings = source, out, profile, formats[0]
+        self.smoothing, self.block_bytes = smoothing, block_bytes
         self.columns = {c.channel: c for c in self.settings.columns}
-        self.places: dict[str, list[int]] = {}
-        self.names: list[str] = []
+        self.places: dict[str, list[int]] = {}  # of the columns of each signal
         self.origin = 0.0
 
-    def find(self, names: list[str], where: str) -> None:
+    def blocks(self, _needs: set[str], checks: LogChecks) -> Iterator[Block]:
+        """Yield the samples, and write the lines before them."""
+        with self.source.open("rb") as raw:
+            head = read_head(raw, self.settings, self.source)
+            self._find(head.names, f"{self.source}:{len(head.lines) + 1}")
+            self.out.write(head.text(self._new_names(head.names)).encode())
+            rows = 0
+            for block in text_blocks(raw, head, self.settings, self.block_bytes, self.source):
+                if rows == 0:
+                    readings = [block.columns[i] for s in SENSORS for i in self.places.get(s, [])]
+                    checks.check_decimals(readings, self.settings.decimal)
+                signals = self._signals(block, head, rows)
+                yield Block(signals, f"{self.source}:{block.line_of(0)}", "", raw.tell(), (block, head))
+                rows += block.rows
+
+    def write(self, block: Block, readings: Readings, _changed: set[str]) -> None:
+        """Write the block with calibrated numbers in place of the raw ones; missing ones stay as they were written."""
+        text_block: TextBlock
+        head: Head
+        text_block, head = block.content
+        columns = text_block.columns
+        for sensor, values in readings.items():
+            for k, i in enumerate(self.places[sensor]):
+                text = digits(values[:, k], self.settings.decimal)
+                missing = ~np.isfinite(values[:, k])
+                if missing.any():
+                    written = pa.array(~np.isfinite(block.signals[sensor][:, k]))
+                    text = pc.if_else(pa.array(missing), pc.if_else(written, columns[i], ""), text)
+                columns[i] = text
+        self.out.write(lines_of(columns, head.delimiter, quoted=text_block.quoted))
+
+    def finish(self, result: Result) -> None:
+        """Name the sensors of a log without rows too."""
+        result.sensors = [sensor for sensor in SENSORS if sensor in self.places]
+
+    def _find(self, names: list[str], where: str) -> None:
         """Find the columns of each signal."""
-        self.names = names
         for signal, channels in SIGNALS.items():
             wanted = [self.columns[c] for c in channels if c in self.columns]
             present = [c for c in wanted if _index(c, names) is not None]
@@ -146,12 +112,7 @@ class _Log:
             expected = ", ".join(str(self.columns[c].column) for s in SENSORS for c in TRIADS[s] if c in self.columns)
             raise InputError(f"no column of a sensor; expected {expected}, got {', '.join(names)[:200]}; {told}", where)
 
-    @property
-    def readings(self) -> list[int]:
-        """Columns of the readings."""
-        return [i for sensor in SENSORS for i in self.places.get(sensor, [])]
-
-    def new_names(self, names: list[str]) -> list[str]:
+    def _new_names(self, names: list[str]) -> list[str]:
         """Return the names of the columns of the output."""
         new = list(names)
         for sensor in (s for s in SENSORS if s in self.places):
@@ -159,11 +120,11 @@ class _Log:
                 new[i] = CANONICAL[channel]
         return new
 
-    def signals(self, block: TextBlock, rows: int) -> dict[str, Any]:
-        """Return the signals of a block in the units of the house, the readings in body axes."""
+    def _signals(self, block: TextBlock, head: Head, rows: int) -> dict[str, Any]:
+        """Return the signals of a block in g, deg/s, degC and s, the readings in body axes."""
         out: dict[str, Any] = {}
         for signal, where in self.places.items():
-            numbers = block.numbers(where, self.settings.decimal, self.names, self.source)
+            numbers = block.numbers(where, self.settings.decimal, head.names, self.source)
             columns = [self.columns[c] for c in SIGNALS[signal]]
             for k, column in enumerate(columns):
                 numbers[:, k] = _in_house_unit(column, numbers[:, k])
@@ -175,18 +136,6 @@ class _Log:
                 self.origin = float(out["time"][0])
             out["time"] = out["time"] - self.origin
         return out
-
-    def replace(
-        self, columns: list[pa.Array], sensor: str, after: NDArray[np.float64], before: NDArray[np.float64]
-    ) -> None:
-        """Put calibrated numbers in the place of the raw ones; what is missing stays as it was written."""
-        for k, i in enumerate(self.places[sensor]):
-            text = digits(after[:, k], self.settings.decimal)
-            missing = ~np.isfinite(after[:, k])
-            if missing.any():
-                written = pa.array(~np.isfinite(before[:, k]))
-                text = pc.if_else(pa.array(missing), pc.if_else(written, columns[i], ""), text)
-            columns[i] = text
 
 
 def _index(column: Column, names: list[str]) -> int | None:

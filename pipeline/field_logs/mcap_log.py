@@ -1,41 +1,40 @@
-"""Compensation of an MCAP log, chunk by chunk: every message is kept, and a topic of calibrated ones is added.
+"""An MCAP log with a topic of calibrated messages added; every message of the log is kept byte for byte.
 
-Readings in ``sensor_msgs/Imu`` (ROS 2 or ROS 1) give messages of the same kind, each a copy of its original in which
-six numbers are replaced: stamp, frame, orientation and covariances stay. Readings that the profile maps from the fields
-of other messages (protobuf, JSON, own types) give ROS 2 ``sensor_msgs/Imu``. A temperature on a topic of its own is
-taken as it comes: a message knows those that stand before it in the file (``pipeline.model.fading_line``).
+Readings in ``sensor_msgs/Imu`` (ROS 2 or ROS 1) give messages of the same kind: copies of the originals in which six
+numbers are replaced; stamp, frame, orientation and covariances stay. Readings that the profile maps from the fields of
+other messages (protobuf, JSON, own types) give ROS 2 ``sensor_msgs/Imu``.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+import numpy as np
 from mcap.records import Channel, Metadata, Schema
 
-from pipeline.errors import InputError, PipelineError
-from pipeline.field_logs.doubts import Doubts
-from pipeline.field_logs.mcap_input import Readings, Temperatures
-from pipeline.field_logs.mcap_output import new_imu, replaced
-from pipeline.field_logs.output import replacing, require_apart
-from pipeline.field_logs.profile import EPOCH_AFTER_S, LogProfile
-from pipeline.io.mcap_copy import CopyingWalk, McapCopy
+from pipeline.errors import IngestError, InputError
+from pipeline.field_logs.compensate import Block
+from pipeline.field_logs.mcap_messages import new_imu, replaced
+from pipeline.field_logs.profile import EPOCH_AFTER_S
+from pipeline.field_logs.temperatures import Temperatures
+from pipeline.io.mcap_channels import MAPPED, TopicDecoder, kind_of
+from pipeline.io.mcap_copy import McapCopy
+from pipeline.io.mcap_reader import McapReader
 from pipeline.io.mcap_settings import mcap_format
-from pipeline.io.record_stream import check_magic
-from pipeline.io.ros2 import DEFINITIONS, IMU
-from pipeline.model.compensation import SMOOTHING_S
-from pipeline.records import SENSORS
+from pipeline.io.ros2_messages import DEFINITIONS, IMU
+from pipeline.io.units import TRIADS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Iterator
     from pathlib import Path
 
     from mcap.records import McapRecord
 
-    from pipeline.field_logs.mcap_input import Batch
+    from pipeline.field_logs.compensate import Readings, Result
+    from pipeline.field_logs.log_checks import LogChecks
+    from pipeline.field_logs.output import Output
+    from pipeline.field_logs.profile import LogProfile
     from pipeline.io.mcap_chunk import Rows
-    from pipeline.io.mcap_container import Container
-    from pipeline.model.compensation import Compensation
 
 LAST_ID = 0xFFFF  # ids of added definitions count down from here, those of recorders up from 0
 SUFFIX = "_calibrated"
@@ -43,180 +42,159 @@ METADATA = "imu_calibration"
 NANOSECONDS = 1e9
 
 
-@dataclass
-class Done:
-    """What compensating a log has made: messages, the sensors in them, their topic, and what is to be said."""
+class McapLog:
+    """An MCAP log; see ``pipeline.field_logs.compensate.Log``."""
 
-    messages: int = 0
-    sensors: list[str] = field(default_factory=list)
-    topic: str = ""
-    notes: list[str] = field(default_factory=list)
+    smoothing = 0.0  # ``Temperatures`` smooths
 
-
-def compensate_mcap(
-    compensation: Compensation,
-    source: Path,
-    target: Path,
-    profile: LogProfile | None = None,
-    *,
-    topic: str | None = None,
-    smoothing: float = SMOOTHING_S,
-    progress: Callable[[int, int], None] | None = None,
-    doubts: Doubts | None = None,
-) -> Done:
-    """Add calibrated messages to a log.
-
-    Parameters
-    ----------
-    compensation : Compensation
-    source, target : Path
-    profile : LogProfile, optional
-        Which topics and fields hold the readings; the only Imu topic by default.
-    topic : str, optional
-        Of the calibrated messages; that of the readings and ``_calibrated`` by default.
-    smoothing : float, s
-        Memory of the line through the temperature's past; 0 takes the last one as it is.
-    progress : callable, optional
-        Called with the messages done and the bytes read.
-    doubts : Doubts, optional
-        Takes in what speaks against compensating this log; the output's metadata ``imu_calibration`` says it.
-
-    Raises
-    ------
-    InputError
-        If the log is damaged, or does not hold what it should; then no output is left.
-    """
-    require_apart(source, target)
-    profile = profile or LogProfile()
-    with source.open("rb") as stream, replacing(target) as out:
-        check_magic(stream.read(64), str(source))
-        work = _Work(compensation, source, profile, smoothing, topic, doubts or Doubts())
-        work.walk = CopyingWalk(
-            stream, str(source), McapCopy(out), work.take, allow_truncated=mcap_format(profile.ingest).allow_truncated
-        )
-        for _ in work.walk.rows():
-            if progress is not None:
-                progress(work.done.messages, work.walk.position)
-        work.finish()
-    return work.done
-
-
-class _Work:
-    """One log on its way."""
-
-    walk: CopyingWalk
-
-    def __init__(  # noqa: PLR0917  (they are the task)
-        self,
-        compensation: Compensation,
-        source: Path,
-        profile: LogProfile,
-        smoothing: float,
-        topic: str | None,
-        doubts: Doubts,
-    ) -> None:
-        self.doubts = doubts
-        settings = mcap_format(profile.ingest)
+    def __init__(self, source: Path, out: Output, profile: LogProfile, topic: str | None, smoothing: float) -> None:
         self.source, self.profile, self.topic = source, profile, topic
-        self.compensation, self.stream = compensation, compensation.stream(0.0)
-        self.readings = Readings(settings, str(source))
-        warm = "temperature" in self.stream.needs
-        self.temperatures = Temperatures(settings, source, smoothing) if warm else None
+        self.settings, self.copy = mcap_format(profile.ingest), McapCopy(out)
+        self.temperature_smoothing = smoothing
+        self.temperatures: Temperatures | None = None
+        self.readings: TopicDecoder | None = None
         self.channels: dict[int, Channel] = {}  # of the readings' channels, those of the calibrated messages
-        self.schema: Schema | None = None
+        self.schema: Schema | None = None  # of the calibrated messages, where it is added
         self.origin_ns: int | None = None
-        self.done = Done()
 
-    def take(self, run: list[Rows]) -> None:
-        """Compensate the messages of a run, and write them behind it."""
-        found = self.walk.found
-        if self.temperatures is not None:
-            self.temperatures.take(run, found)
-        for rows in run:
-            batch = self.readings.read(rows, found)
-            if batch is not None:
-                self._compensate(rows, batch)
+    def blocks(self, needs: set[str], checks: LogChecks) -> Iterator[Block]:
+        """Yield the readings run by run, and copy the runs."""
+        topic = self._named_topic()
+        if "temperature" in needs:
+            self.temperatures = Temperatures(self.settings, self.source, topic, self.temperature_smoothing)
+        with self.source.open("rb") as stream:
+            self.reader = McapReader(stream, str(self.source), allow_truncated=self.settings.allow_truncated)
+            for run in self.reader.runs():
+                self.copy.copy(run)
+                if self.temperatures is not None:
+                    self.temperatures.take(run.rows, self.reader)
+                for rows in run.rows:
+                    if self._holds_readings(rows, topic):
+                        yield self._block(rows)
+        self._check_topic(checks)
 
-    def _compensate(self, rows: Rows, batch: Batch) -> None:
+    def _named_topic(self) -> str | None:
+        """Return the topic that the profile names; None for the only Imu topic."""
+        if not self.settings.topics:
+            return self.settings.imu_topic
+        sensors = {c for triad in TRIADS.values() for c in triad}
+        found = [t for t, fields in self.settings.topics.items() if sensors & set(fields)]
+        if len(found) != 1:
+            raise IngestError(
+                f"the profile takes the readings from {len(found)} topics ({', '.join(found)}); apply needs both "
+                "sensors in the same messages",
+                str(self.source),
+                fault="unsupported",
+            )
+        return found[0]
+
+    def _holds_readings(self, rows: Rows, topic: str | None) -> bool:
+        """Return whether messages are the readings; the first Imu topic is them where the profile names none."""
+        channel = self.reader.channels[rows.channel]
+        is_imu = kind_of(channel.topic, self.reader.schemas.get(channel.schema_id), self.settings) == IMU
+        if self.readings is None and (channel.topic == topic or (topic is None and is_imu)):
+            kind = MAPPED if self.settings.topics else IMU
+            self.readings = TopicDecoder(channel.topic, kind, self.settings, str(self.source))
+        if self.readings is None or channel.topic == self.readings.topic:
+            return self.readings is not None
+        if is_imu and topic is None:
+            raise IngestError(
+                f"2 topics are of type {IMU}: {self.readings.topic}, {channel.topic}; choose one in "
+                "ingest.mcap.imu_topic",
+                str(self.source),
+                fault="ambiguous",
+            )
+        return False
+
+    def _block(self, rows: Rows) -> Block:
+        assert self.readings is not None  # noqa: S101  (``_holds_readings``)
+        batch = self.readings.read(rows, self.reader)
+        time_ns = rows.heads["log_time"].astype(np.int64) if batch.time_ns is None else batch.time_ns
         if self.origin_ns is None:
-            first = int(batch.time_ns[0])
-            self.origin_ns = first if first > EPOCH_AFTER_S * NANOSECONDS else 0
-        time_ns = batch.time_ns - self.origin_ns
-        time = time_ns // 10**9 + (time_ns % 10**9) / NANOSECONDS
-        given = {s: self.profile.to_body(s, v) for s, v in batch.values.items()}
-        warmth = batch.temperature
+            self.origin_ns = int(time_ns[0]) if time_ns[0] > EPOCH_AFTER_S * NANOSECONDS else 0
+        since = time_ns - self.origin_ns
+        signals = {"time": since // 10**9 + (since % 10**9) / NANOSECONDS}
+        turned: set[str] = set()  # sensors whose axes are not the body's
+        for sensor, triad in TRIADS.items():
+            if triad[0] in batch.values:
+                values = np.column_stack([batch.values[c] for c in triad])
+                signals[sensor] = self.profile.to_body(sensor, values)
+                turned |= {sensor} if signals[sensor] is not values else set()
+        warmth = batch.values.get("temperature")
         if self.temperatures is not None:
-            warmth = self.temperatures.at(rows, time, batch, self.origin_ns)
-        try:
-            found = self.stream.apply(**given, time=time, temperature=warmth)
-        except PipelineError as error:
-            raise type(error)(f"{error.message} ({rows.run.name})", str(self.source)) from None
-        truths = {s: v for s in SENSORS if (v := getattr(found, s)) is not None}
-        self.doubts.take(given, truths, time, self.done.messages)
+            warmth = self.temperatures.at(rows.starts, signals["time"], warmth, self.origin_ns)
+        if warmth is not None:
+            signals["temperature"] = warmth
+        return Block(signals, str(self.source), f" ({rows.place})", self.reader.position, (rows, time_ns, turned))
+
+    def write(self, block: Block, readings: Readings, changed: set[str]) -> None:
+        """Add the calibrated messages of a block after its run."""
+        assert self.readings is not None  # noqa: S101  (it read the block)
+        rows, time_ns, turned = block.content
         channel, before = self._channel(rows.channel)
-        changed = {s: v for s, v in truths.items() if self.compensation.calibration(s) or v is not batch.values[s]}
-        decoder = self.readings.decoders[rows.channel]
-        messages = (
-            new_imu(rows, truths, channel.id, batch.time_ns)
-            if self.readings.mapped
-            else replaced(rows, decoder, changed, channel.id)
-        )
-        self.walk.copy.add(messages, before, channel.id)
-        self.done.messages += len(rows.starts)
-        self.done.sensors = sorted({*self.done.sensors, *truths})
+        if self.readings.kind == MAPPED:
+            self.copy.add(new_imu(rows, readings, channel.id, time_ns), before, channel.id)
+        else:
+            truths = {s: v for s, v in readings.items() if s in changed | turned}
+            copies = replaced(rows, self.readings.decoders[rows.channel], truths, channel.id)
+            self.copy.add(copies, before, channel.id)
 
     def _channel(self, source: int) -> tuple[Channel, list[McapRecord]]:
         """Return the channel of the calibrated messages, and the definitions that still have to be written."""
         if source in self.channels:
             return self.channels[source], []
-        known = self.walk.found.channels[source]
+        known = self.reader.channels[source]
         topic = self.topic or f"{known.topic}{SUFFIX}"
-        if any(c.topic == topic for c in self.walk.found.channels.values()):
+        if any(c.topic == topic for c in self.reader.channels.values()):
             raise InputError(f"the log has a topic {topic} already; choose another by --topic", str(self.source))
         before: list[McapRecord] = []
-        schema_id, encoding = known.schema_id, known.message_encoding
-        if self.readings.mapped:
-            encoding = "cdr"
+        used = {*self.reader.channels, *(c.id for c in self.channels.values())}
+        channel = Channel(
+            id=next(i for i in range(LAST_ID, 0, -1) if i not in used), topic=topic, schema_id=known.schema_id,
+            message_encoding=known.message_encoding, metadata=dict(known.metadata),
+        )  # fmt: skip
+        if self.settings.topics:
             if self.schema is None:
                 self.schema = Schema(id=LAST_ID, name=IMU, encoding="ros2msg", data=DEFINITIONS[IMU].encode())
                 before.append(self.schema)
-            schema_id = self.schema.id
-        used = {*self.walk.found.channels, *(c.id for c in self.channels.values())}
-        channel = Channel(
-            id=next(i for i in range(LAST_ID, 0, -1) if i not in used), topic=topic,
-            message_encoding=encoding, schema_id=schema_id,
-            metadata=dict(known.metadata) if not self.readings.mapped else {},
-        )  # fmt: skip
+            channel.schema_id, channel.message_encoding, channel.metadata = self.schema.id, "cdr", {}
         self.channels[source] = channel
-        self.done.topic = topic
         return channel, [*before, channel]
 
-    def finish(self) -> None:
-        """Write the summary."""
-        found = self.walk.found
-        self.readings.require_messages(found)
-        added = list(self.channels.values())
-        schemas = [*found.schemas.values(), *([self.schema] if self.schema else [])]
-        own = {self.schema.id} & set(found.schemas) if self.schema else set()
-        taken = own | {c.id for c in added} & set(found.channels)
+    def _check_topic(self, checks: LogChecks) -> None:
+        """Refuse a log without readings, and note readings that this command has made."""
+        if self.readings is None:
+            schemas, channels = self.reader.schemas, self.reader.channels.values()
+            kinds = {c.topic: schemas[c.schema_id].name if c.schema_id in schemas else "no type" for c in channels}
+            listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(kinds.items()))
+            named = self._named_topic() or f"a topic of type {IMU}"
+            raise IngestError(
+                f"no messages on {named}; the file has {listed or 'none'}",
+                str(self.source),
+                fault="missing_topic",
+                hint="ingest.mcap.topics of a profile (--ingest) reads other types by their fields",
+            )
+        topic = self.readings.topic
+        made = {m.metadata.get("topic"): m.metadata.get("unit") for m in self.reader.metadata if m.name == METADATA}
+        if topic in made:
+            checks.compensated = f"topic {topic} was made by this command with unit {made[topic]}"
+        elif topic.endswith(SUFFIX):
+            checks.compensated = f"topic {topic} has the name of one that this command makes"
+
+    def finish(self, result: Result) -> None:
+        """Write what was compensated with what, and what contradicts it, as metadata; then the summary."""
+        assert self.readings is not None  # noqa: S101  (``_check_topic``)
+        reader, added = self.reader, list(self.channels.values())
+        schemas = [*reader.schemas.values(), *([self.schema] if self.schema else [])]
+        taken = {c.id for c in added} & set(reader.channels)
+        taken |= {self.schema.id} & set(reader.schemas) if self.schema else set()
         if taken:
             raise InputError(f"the log uses the id {min(taken)} itself, which the added topic needs", str(self.source))
-        self._say(found)
-        self.walk.copy.finish(schemas, [*found.channels.values(), *added])
-        if found.truncated:
-            self.done.notes.append(f"{found.truncated}; the output holds these")
+        result.topic = added[-1].topic
+        entries = {"unit": result.unit, "topic": result.topic, "readings": self.readings.topic}
+        self.copy.note(Metadata(name=METADATA, metadata={**entries, "warnings": "\n".join(result.warnings)}))
+        self.copy.finish(schemas, [*reader.channels.values(), *added])
+        if reader.truncated:
+            result.notes.append(f"{reader.truncated}; the output holds these")
         if self.temperatures is not None:
-            self.done.notes += self.temperatures.notes()
-
-    def _say(self, found: Container) -> None:
-        """Write what was compensated with what, and what speaks against it, into the output's metadata."""
-        made = {m.metadata.get("topic"): m.metadata.get("unit") for m in found.metadata if m.name == METADATA}
-        topic = self.readings.topic or ""
-        if topic in made:
-            self.doubts.compensated = f"topic {topic} was made by this command with unit {made[topic]}"
-        elif topic.endswith(SUFFIX):
-            self.doubts.compensated = f"topic {topic} has the name of one that this command makes"
-        held = {s for s in SENSORS if self.compensation.calibration(s) is not None}
-        said = "\n".join(self.doubts.said(held))
-        entries = {"unit": self.compensation.unit, "topic": self.done.topic, "readings": topic, "warnings": said}
-        self.walk.copy.note(Metadata(name=METADATA, metadata=entries))
+            result.notes += self.temperatures.notes()

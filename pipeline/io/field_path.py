@@ -13,7 +13,7 @@ from decimal import Decimal
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from pipeline.io.message_template import Place, Template
+    from pipeline.io.message_layout import MessageLayout, Place
 
 ONLY = "*"
 NAMES = "name"
@@ -67,24 +67,24 @@ class FieldPath:
         return FieldPath(base, base, None)
 
 
-def place_of(path: FieldPath, template: Template) -> tuple[int, str] | None:
-    """Return the byte and the type of a number in a template; None if it stands in an empty list.
+def place_of(path: FieldPath, layout: MessageLayout) -> tuple[int, str] | None:
+    """Return the byte and the type of a number in a layout; None if it belongs to an empty list.
 
     Raises
     ------
     ValueError
         If the message has no such number.
     """
-    place: Place | None = template.places.get(path.base)
+    place: Place | None = layout.places.get(path.base)
     if place is None:
-        raise ValueError(f"it has no number {path.base}; it has {', '.join(template.places)}")
+        raise ValueError(f"it has no number {path.base}; it has {', '.join(layout.places)}")
     if place.count is None or path.index is None:
         if place.count is not None or path.index is not None:
             raise ValueError(f"{path.text} is {'one number' if place.count is None else 'a list, and needs an index'}")
         return place.offset, place.code
     index = path.index
     if isinstance(index, str):
-        found = _named(path, place.count, template.texts.get(path.names.base))
+        found = _named(path, place.count, layout.texts.get(path.names.base))
         if found is None:
             return None
         index = found

@@ -10,7 +10,7 @@ import difflib
 import math
 from collections.abc import Iterable, Mapping
 from fractions import Fraction
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 from pydantic import (
     BaseModel,
@@ -54,35 +54,29 @@ class Checks(Section):
     rate_hz: Rate | None = Field(default=None, description="a positive number in Hz, or null")
 
 
-class Column(Section):
-    """The column of a channel: its name (or index from 0), its unit, and the scale of counts."""
+class ChannelSource(Section):
+    """Where a channel comes from: its unit, and the scale of counts."""
 
     channel: str
-    column: str | int = Field(default="", validate_default=True)
     unit: str = Field(default="", validate_default=True)
-    optional: bool = Field(default=False, description="true or false")
     counts_per_unit: float = Field(default=1.0, description="a number other than 0")
     offset: float = Field(default=0.0, description="a number of counts")
 
-    @field_validator("column")
     @classmethod
-    def _names_a_column(cls, value: str | int, info: ValidationInfo) -> str | int:
-        header = (info.context or {}).get("header", True)
-        if (isinstance(value, str) and value) if header else (isinstance(value, int) and value >= 0):
-            return value
-        raise ValueError(f"it is {'a name of the header' if header else 'an index from 0, for header is false'}")
+    def units(cls, channel: str) -> list[str]:
+        """Return the units that are allowed for a channel."""
+        return list(UNITS[channel])
 
     @field_validator("unit", mode="before")
     @classmethod
     def _is_a_unit_of_the_channel(cls, value: object, info: ValidationInfo) -> str:
-        channel = info.data["channel"]
-        allowed = [*UNITS[channel], *([COUNTS] if channel == "time" else [])]
+        allowed = cls.units(info.data["channel"])
         if str(value) not in allowed:
             raise ValueError(f"allowed are {', '.join(allowed)}")
         return str(value)
 
     @model_validator(mode="after")
-    def _scales_counts_only(self) -> Column:
+    def _scales_counts_only(self) -> Self:
         scaled = "counts_per_unit" in self.model_fields_set
         if self.unit == COUNTS and (not scaled or self.counts_per_unit == 0):
             value = self.counts_per_unit if scaled else None
@@ -92,6 +86,26 @@ class Column(Section):
         if self.channel == "time" and self.offset:
             raise ValueError(f"offset is {self.offset!r}; a time has none")
         return self
+
+
+class Column(ChannelSource):
+    """The column of a channel: its name, or its index from 0. A time may be in counts."""
+
+    column: str | int = Field(default="", validate_default=True)
+    optional: bool = Field(default=False, description="true or false")
+
+    @classmethod
+    def units(cls, channel: str) -> list[str]:
+        """Return the units that are allowed for a channel."""
+        return [*UNITS[channel], *([COUNTS] if channel == "time" else [])]
+
+    @field_validator("column")
+    @classmethod
+    def _names_a_column(cls, value: str | int, info: ValidationInfo) -> str | int:
+        header = (info.context or {}).get("header", True)
+        if (isinstance(value, str) and value) if header else (isinstance(value, int) and value >= 0):
+            return value
+        raise ValueError(f"it is {'a name of the header' if header else 'an index from 0, for header is false'}")
 
 
 class CsvFormat(Section):

@@ -1,12 +1,12 @@
-"""Where the messages lie in a run of records (a chunk, or what stands between chunks), proven for every byte.
+"""Chunks of an MCAP file: unpacked, and cut into messages.
 
-A run is cut by following the lengths from record to record:
+A run of records (a chunk, or the messages between chunks) is cut by following the lengths from record to record:
 
     start_0 = 0,   start_{i+1} = start_i + 9 + length_i,   and the last record ends where the run ends
 
-Three ways find the same cuts. If all records look alike the starts are an arithmetic series; if the file has an index
-the starts are its offsets; else the lengths are followed one by one. The first two are guesses that numpy compares with
-the rule above for all records at once, so that neither a series nor an index is believed.
+Three ways give the same starts. If all records have one length, the starts are an arithmetic series; if the file has an
+index, they are its offsets; else the lengths are followed one by one. For the first two, numpy compares all starts at
+once with the rule above, so that a wrong index has no effect.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
+from mcap.opcode import Opcode
 from numpy.lib.stride_tricks import sliding_window_view
 
-from pipeline.io.mcap_records import MESSAGE, MESSAGE_HEAD, RECORD_HEAD, Cursor
+from pipeline.io.mcap_records import RECORD_HEAD
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from numpy.typing import NDArray
 
 LARGEST_CHUNK = 1 << 30  # bytes; recorders write about 1 MiB
 LARGEST_EXPANSION = 1000
 ALWAYS_ALLOWED = 1 << 24  # bytes; a small chunk of equal bytes packs better than any log
+MESSAGE_HEAD = 22  # bytes of a message before its data
 HEAD = np.dtype(
     {
         "names": ["opcode", "length", "channel", "sequence", "log_time", "publish_time"],
@@ -36,28 +36,7 @@ HEAD = np.dtype(
         "itemsize": RECORD_HEAD + MESSAGE_HEAD,
     }
 )
-_RECORD = struct.Struct("<BQ")
-
-
-@dataclass
-class Run:
-    """Records that lie one after the other.
-
-    Attributes
-    ----------
-    data : bytes
-    offset : int
-        Byte of the file at which they, or their chunk, begin.
-    name : str
-        For messages, ``chunk 3`` for example.
-    index : dict of int to (n,) array of int64
-        Channel to the offsets that the file's index gives; may be wrong.
-    """
-
-    data: bytes | memoryview
-    offset: int
-    name: str
-    index: dict[int, NDArray[np.int64]] = field(default_factory=dict)
+_RECORD, _HEAD = struct.Struct("<BQ"), struct.Struct("<BQH")
 
 
 @dataclass
@@ -68,16 +47,17 @@ class Rows:
     ----------
     channel : int
     data : (m,) array of uint8
-        The run.
+        All records of the run.
     heads : (n,) structured array
         Opcode, length, channel, sequence and times of each message.
-    starts : (n,) array of int64
-        Where the payload of each message begins in ``data``.
-    sizes : (n,) array of int64
-        Bytes of each payload.
+    starts, sizes : (n,) arrays of int64
+        Where the payload of each message begins in ``data``, and its bytes.
     stride : int
         Distance of the starts where it is the same for all, else 0.
-    run : Run
+    place : str
+        The run, for messages: ``chunk 3``.
+    offset : int
+        Byte of the file at which the run begins.
     """
 
     channel: int
@@ -86,41 +66,60 @@ class Rows:
     starts: NDArray[np.int64]
     sizes: NDArray[np.int64]
     stride: int
-    run: Run
+    place: str
+    offset: int
 
     def payload(self, row: int) -> bytes:
         """Return the data of one message."""
         start = int(self.starts[row])
         return self.data[start : start + int(self.sizes[row])].tobytes()
 
-    def payloads(self) -> Iterator[bytes]:
-        """Return the data of each message."""
-        return map(self.payload, range(len(self.starts)))
-
     def table(self, layout: np.dtype[np.void]) -> NDArray[np.void]:
-        """Return all messages, each as one item of a layout of their common size."""
+        """Return all messages, each as one item of a type of their common size."""
         if self.stride:
             return np.ndarray(len(self.starts), layout, self.data.data, int(self.starts[0]), (self.stride,))
         windows = sliding_window_view(self.data, layout.itemsize)[self.starts]
         return np.asarray(windows.view(layout)[:, 0])
 
 
-def unpack(content: bytes, expected: int, compression: str) -> bytes | memoryview:
-    """Return a chunk's records.
+@dataclass
+class Run:
+    """Records of the data section up to and with the messages of one chunk, or messages between chunks.
 
-    Parameters
+    Attributes
     ----------
-    content : bytes
-        As they lie in the file.
-    expected : int
-        How many bytes the chunk claims to hold.
-    compression : str
-        Empty, ``zstd`` or ``lz4``.
+    offset : int
+        Byte of the file at which the chunk, or the first message outside chunks, begins.
+    name : str
+        For messages: ``chunk 3``.
+    data : bytes
+        The chunk's records, or the messages.
+    loose : bool
+        Whether the messages lie outside chunks.
+    index : dict of int to (n,) array of int64
+        Channel to the offsets of its messages in ``data`` by the file's index, which may be wrong.
+    records : list of (head, content)
+        As they stand in the file, without messages outside chunks.
+    rows : list of Rows
+        The messages, one entry for each channel.
+    """
+
+    offset: int = 0
+    name: str = ""
+    data: bytes | memoryview = b""
+    loose: bool = False
+    index: dict[int, NDArray[np.int64]] = field(default_factory=dict)
+    records: list[tuple[bytes, bytes]] = field(default_factory=list)
+    rows: list[Rows] = field(default_factory=list)
+
+
+def unpack(content: bytes, expected: int, compression: str) -> bytes | memoryview:
+    """Return the records of a chunk, ``expected`` bytes by its head; compression is empty, ``zstd`` or ``lz4``.
 
     Raises
     ------
     ValueError
-        If the claim is too large for any log, before memory is taken, or not what the chunk holds.
+        If the size is too large for any log, before memory is allocated, or not what the chunk holds.
     """
     if expected > min(LARGEST_CHUNK, max(ALWAYS_ALLOWED, LARGEST_EXPANSION * len(content))):
         raise ValueError(f"a chunk claims to hold {expected} bytes, packed into {len(content)}: damaged, or no log")
@@ -147,13 +146,7 @@ def unpack(content: bytes, expected: int, compression: str) -> bytes | memoryvie
 
 
 def split(run: Run) -> tuple[list[tuple[int, memoryview]], list[Rows]]:
-    """Cut a run into its messages and its other records.
-
-    Returns
-    -------
-    others : list of (opcode, content)
-    rows : list of Rows
-        One for each channel.
+    """Return the other records (opcode, content) of a run, and its messages: one ``Rows`` for each channel.
 
     Raises
     ------
@@ -190,9 +183,9 @@ def _followed(
             raise ValueError(f"{end - start} bytes are left after the last record of a chunk")
         opcode, length = _RECORD.unpack_from(view, start)
         after = start + RECORD_HEAD + length
-        if after > end or opcode == 0 or (opcode == MESSAGE and length < MESSAGE_HEAD):
+        if after > end or opcode == 0 or (opcode == Opcode.MESSAGE and length < MESSAGE_HEAD):
             raise ValueError(f"a record of kind {opcode} with {length} bytes does not fit at byte {start} of a chunk")
-        if opcode == MESSAGE:
+        if opcode == Opcode.MESSAGE:
             starts.append(start)
             if stop_at_message:
                 break
@@ -204,17 +197,16 @@ def _followed(
 
 def _alike(run: Run, data: NDArray[np.uint8], first: int) -> Rows | None:
     """Return the messages if from the first one on all are of one channel and one length."""
-    cursor = Cursor(memoryview(run.data)[first + 1 :])
-    length, channel = cursor.number(8), cursor.number(2)
+    _, length, channel = _HEAD.unpack_from(run.data, first)
     stride = RECORD_HEAD + length
     count, rest = divmod(len(data) - first, stride)
     if rest:
         return None
     heads = np.ndarray(count, HEAD, data.data, first, (stride,))
-    if not ((heads["opcode"] == MESSAGE) & (heads["length"] == length) & (heads["channel"] == channel)).all():
+    if not ((heads["opcode"] == Opcode.MESSAGE) & (heads["length"] == length) & (heads["channel"] == channel)).all():
         return None
     starts = first + HEAD.itemsize + stride * np.arange(count, dtype=np.int64)
-    return Rows(channel, data, heads, starts, np.full(count, length - MESSAGE_HEAD), stride, run)
+    return Rows(channel, data, heads, starts, np.full(count, length - MESSAGE_HEAD), stride, run.name, run.offset)
 
 
 def _indexed(run: Run, data: NDArray[np.uint8], first: int) -> NDArray[np.int64] | None:
@@ -225,7 +217,7 @@ def _indexed(run: Run, data: NDArray[np.uint8], first: int) -> NDArray[np.int64]
     if not (len(starts) and starts[0] == first and starts[-1] + HEAD.itemsize <= len(data)):
         return None
     heads = _heads(data, starts)
-    fitting = (heads["opcode"] == MESSAGE) & (heads["length"] >= MESSAGE_HEAD) & (heads["length"] <= len(data))
+    fitting = (heads["opcode"] == Opcode.MESSAGE) & (heads["length"] >= MESSAGE_HEAD) & (heads["length"] <= len(data))
     ends = starts + RECORD_HEAD + heads["length"].astype(np.int64)
     return starts if fitting.all() and np.array_equal(ends, np.append(starts[1:], len(data))) else None
 
@@ -240,5 +232,5 @@ def _by_channel(run: Run, data: NDArray[np.uint8], starts: NDArray[np.int64]) ->
     for channel in np.unique(heads["channel"]).tolist():
         own = heads["channel"] == channel
         sizes = heads["length"][own].astype(np.int64) - MESSAGE_HEAD
-        rows.append(Rows(channel, data, heads[own], starts[own] + HEAD.itemsize, sizes, 0, run))
+        rows.append(Rows(channel, data, heads[own], starts[own] + HEAD.itemsize, sizes, 0, run.name, run.offset))
     return rows

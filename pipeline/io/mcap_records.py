@@ -1,143 +1,81 @@
-"""Records of an MCAP file, their bytes to values; no length that a record claims is believed.
+"""Records of an MCAP file, bytes to values and back, by the official library.
 
-    record = opcode (1 byte) | length (8 bytes) | content (length bytes)
-
-All numbers are little-endian; a string is its length (4 bytes) and UTF-8 text. Content may be longer than what is known
-of it (later versions of the format). The values are those of the official library, ``mcap.records``.
+The library returns short data where a length within a record is too large, ignores contradicting lengths, does not
+compare the checksum of attachments, and reads an index entry by entry. Here such records are refused, and an index is
+an array.
 """
 
 from __future__ import annotations
 
-import zlib
-from typing import TYPE_CHECKING
+import struct
+from io import BytesIO
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from mcap.records import Attachment, Channel, Footer, Header, Metadata, Schema, Statistics
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.records import Attachment, Chunk
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from mcap.records import McapRecord
     from numpy.typing import NDArray
 
 MAGIC = b"\x89MCAP0\r\n"
-HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = 1, 2, 3, 4, 5, 6, 7, 8
-ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA, METADATA_INDEX, SUMMARY_OFFSET, DATA_END = range(9, 16)
-IN_DATA = frozenset({HEADER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, ATTACHMENT, METADATA, DATA_END})
-IN_SUMMARY = frozenset(
-    {SCHEMA, CHANNEL, CHUNK_INDEX, ATTACHMENT_INDEX, STATISTICS, METADATA_INDEX, SUMMARY_OFFSET, FOOTER}
-)
 RECORD_HEAD = 9  # bytes of opcode and length
-MESSAGE_HEAD = 22  # bytes of a message before its data
 INDEX_ENTRY = 16  # bytes of a time and an offset
 
 
-class Cursor:
-    """Values of a record's content, one after the other.
+class _Content(ReadDataStream):
+    """The content of a record; the library's own stream returns less than asked for at its end."""
 
-    Raises ``ValueError`` where the content is too short or a text is no UTF-8.
+    def read(self, length: int) -> bytes:
+        data = self._stream.read(length)
+        if len(data) < length:
+            raise ValueError(f"{length} bytes are claimed where {len(data)} are left")
+        self._count += length
+        return data
+
+
+def parsed(kind: Any, content: bytes | memoryview) -> Any:  # noqa: ANN401  (a class of the library, its record)
+    """Return the record in a content, which may be longer: later versions of the format append to it.
+
+    Raises
+    ------
+    ValueError
+        If the content is too short, a text is not UTF-8, or the lengths in it contradict each other.
     """
-
-    def __init__(self, data: bytes | memoryview) -> None:
-        self.data = memoryview(data)
-        self.at = 0
-
-    def take(self, count: int) -> memoryview:
-        """Return the next bytes."""
-        end = self.at + count
-        if end > len(self.data):
-            raise ValueError(f"{count} bytes are claimed where {len(self.data) - self.at} are left")
-        part = self.data[self.at : end]
-        self.at = end
-        return part
-
-    def number(self, size: int) -> int:
-        """Return the next unsigned integer of so many bytes."""
-        return int.from_bytes(self.take(size), "little")
-
-    def text(self) -> str:
-        """Return the next string."""
-        return bytes(self.take(self.number(4))).decode("utf-8")
-
-    def texts(self) -> dict[str, str]:
-        """Return the next map of strings."""
-        inner = Cursor(self.take(self.number(4)))
-        found = {}
-        while inner.at < len(inner.data):
-            key = inner.text()
-            found[key] = inner.text()
-        return found
-
-
-def header(content: bytes) -> Header:
-    """Return the file's header."""
-    cursor = Cursor(content)
-    return Header(profile=cursor.text(), library=cursor.text())
-
-
-def schema(content: bytes | memoryview) -> Schema:
-    """Return a message definition."""
-    cursor = Cursor(content)
-    number, name, encoding = cursor.number(2), cursor.text(), cursor.text()
-    return Schema(id=number, name=name, encoding=encoding, data=bytes(cursor.take(cursor.number(4))))
-
-
-def channel(content: bytes | memoryview) -> Channel:
-    """Return a channel."""
-    cursor = Cursor(content)
-    number, definition, topic = cursor.number(2), cursor.number(2), cursor.text()
-    return Channel(
-        id=number, schema_id=definition, topic=topic, message_encoding=cursor.text(), metadata=cursor.texts()
-    )
+    record = kind.read(_Content(BytesIO(content)))
+    if kind is not Chunk and not bytes(content).startswith(bytes_of([record])[RECORD_HEAD:]):
+        raise ValueError(f"the lengths within a {kind.__name__} record contradict each other")
+    return record
 
 
 def attachment(content: bytes) -> Attachment:
-    """Return an attachment whose checksum is right (or 0, not given)."""
-    cursor = Cursor(content)
-    log_time, create_time, name, media_type = cursor.number(8), cursor.number(8), cursor.text(), cursor.text()
-    data = bytes(cursor.take(cursor.number(8)))
-    crc = zlib.crc32(cursor.data[: cursor.at])
-    if cursor.number(4) not in (0, crc):
-        raise ValueError(f"the checksum of attachment {name!r} is wrong")
-    return Attachment(create_time=create_time, log_time=log_time, name=name, media_type=media_type, data=data)
+    """Return an attachment; ``ValueError`` if its checksum is neither right nor 0 (not computed)."""
+    record: Attachment = Attachment.read(_Content(BytesIO(content)))
+    written = bytes_of([record])[RECORD_HEAD:]  # with the right checksum, in its last four bytes
+    body, crc = content[: len(written) - 4], content[len(written) - 4 : len(written)]
+    if body != written[:-4] or crc not in {bytes(4), written[-4:]}:
+        raise ValueError(f"the checksum of attachment {record.name!r} is wrong")
+    return record
 
 
-def metadata(content: bytes) -> Metadata:
-    """Return a record of free texts."""
-    cursor = Cursor(content)
-    return Metadata(name=cursor.text(), metadata=cursor.texts())
-
-
-def statistics(content: bytes) -> Statistics:
-    """Return what the summary says is in the file."""
-    cursor = Cursor(content)
-    sizes = {
-        "message_count": 8,
-        "schema_count": 2,
-        "channel_count": 4,
-        "attachment_count": 4,
-        "metadata_count": 4,
-        "chunk_count": 4,
-        "message_start_time": 8,
-        "message_end_time": 8,
-    }
-    numbers = {name: cursor.number(size) for name, size in sizes.items()}
-    inner = Cursor(cursor.take(cursor.number(4)))
-    counts = {}
-    while inner.at < len(inner.data):
-        key = inner.number(2)
-        counts[key] = inner.number(8)
-    return Statistics(channel_message_counts=counts, **numbers)
-
-
-def footer(content: bytes) -> Footer:
-    """Return the footer."""
-    cursor = Cursor(content)
-    return Footer(summary_start=cursor.number(8), summary_offset_start=cursor.number(8), summary_crc=cursor.number(4))
+def bytes_of(records: Iterable[McapRecord]) -> bytes:
+    """Return records as they stand in a file."""
+    builder = RecordBuilder()
+    for record in records:
+        record.write(builder)
+    return bytes(builder.end())  # type: ignore[no-untyped-call]
 
 
 def message_index(content: bytes) -> tuple[int, NDArray[np.int64]]:
-    """Return a channel and the offsets of its messages in the chunk before."""
-    cursor = Cursor(content)
-    number, size = cursor.number(2), cursor.number(4)
-    entries = np.frombuffer(cursor.take(size - size % INDEX_ENTRY), "<u8").reshape(-1, 2)
-    if size % INDEX_ENTRY or (entries[:, 1] > np.iinfo(np.int64).max).any():
+    """Return a channel and the offsets of its messages in the chunk before; ``ValueError`` if it is not an index."""
+    number, size = struct.unpack_from("<HI", content)
+    body = content[6 : 6 + size]
+    if len(body) < size or size % INDEX_ENTRY:
         raise ValueError("an index of messages is no list of times and offsets")
-    return number, entries[:, 1].astype(np.int64)
+    offsets = np.frombuffer(body, "<u8").reshape(-1, 2)[:, 1]
+    if (offsets > np.iinfo(np.int64).max).any():
+        raise ValueError("an index of messages has an offset beyond 63 bits")
+    return number, offsets.astype(np.int64)

@@ -6,10 +6,10 @@ from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import IngestError
-from pipeline.io.mcap_kinds import SHORT
-from pipeline.io.mcap_walk import Walk
-from pipeline.io.message_definition import short_name
-from pipeline.io.official_decoders import object_decoder, ros2_decoder
+from pipeline.io.mcap_channels import KINDS
+from pipeline.io.mcap_reader import McapReader
+from pipeline.io.message_decoder import object_decoder, ros_layouts
+from pipeline.io.message_layout import short_name
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -33,13 +33,12 @@ def topic_lines(path: Path, *, fields: bool) -> list[tuple[str, str]]:
     first: dict[int, bytes] = {}
     try:
         with path.open("rb") as stream:
-            walk = Walk(stream, str(path))
-            for rows in walk.rows():
+            found = McapReader(stream, str(path))
+            for rows in found.rows():
                 if rows.channel not in first:
-                    first[rows.channel] = bytes(next(iter(rows.payloads())))
+                    first[rows.channel] = rows.payload(0)
     except (IngestError, OSError):
         return []
-    found = walk.found
     library = f", written by {found.header.library}" if found.header and found.header.library else ""
     proof = "every checksum and count verified" if found.verified else "integrity: not_verifiable, without checksums"
     size = f"{counted(found.count, 'message')} in {counted(len(found.chunks), 'chunk')}"
@@ -48,7 +47,7 @@ def topic_lines(path: Path, *, fields: bool) -> list[tuple[str, str]]:
         schema = found.schemas.get(channel.schema_id)
         kind = f"{schema.name}, {channel.message_encoding}" if schema else channel.message_encoding or "no encoding"
         text = f"{channel.topic} ({kind}): {counted(found.counts[number], 'message')}"
-        if fields and number in first and not (schema and short_name(schema.name) in SHORT):
+        if fields and number in first and not (schema and short_name(schema.name) in KINDS):
             text += _fields(channel, schema, first[number])
         lines.append(("topic", text))
     return lines
@@ -62,16 +61,29 @@ def counted(number: int, what: str) -> str:
 def _fields(channel: Channel, schema: Schema | None, payload: bytes) -> str:
     """Return the paths of a message's numbers, for a map of fields."""
     try:
-        decode = ros2_decoder(schema) if channel.message_encoding == "cdr" else object_decoder(channel, schema)
-        paths = list(islice(_numbers(decode(payload), ""), MOST_FIELDS + 1))
+        paths = list(islice(_paths(channel, schema, payload), MOST_FIELDS + 1))
     except Exception:  # noqa: BLE001  (any decoder's trouble with a stranger's message: then nothing is listed)
         return ""
     more = " .." if len(paths) > MOST_FIELDS else ""
     return f", with {', '.join(paths[:MOST_FIELDS])}{more}" if paths else ""
 
 
+def _paths(channel: Channel, schema: Schema | None, payload: bytes) -> Iterator[str]:
+    """Yield the paths of the numbers in a message of any encoding."""
+    find_layout = ros_layouts(channel, schema)
+    if find_layout is None:
+        decode = object_decoder(channel, schema)
+        yield from _numbers(decode(payload) if decode else {}, "")
+        return
+    for path, place in find_layout(payload).places.items():
+        if place.count is None:
+            yield path
+        else:
+            yield from (f"{path}[{i}]" for i in range(min(place.count, LONGEST_LIST)))
+
+
 def _numbers(value: Any, path: str) -> Iterator[str]:  # noqa: ANN401  (a message of any decoder)
-    """Yield the paths of the numbers in a message."""
+    """Yield the paths of the numbers in a decoded message."""
     if isinstance(value, bool | str | bytes):
         return
     if hasattr(value, "__float__"):
@@ -81,8 +93,6 @@ def _numbers(value: Any, path: str) -> Iterator[str]:  # noqa: ANN401  (a messag
         children = {f.name: getattr(value, f.name) for f in value.DESCRIPTOR.fields}
     elif isinstance(value, dict):
         children = value
-    elif hasattr(value, "__slots__"):
-        children = {n: getattr(value, n) for n in value.__slots__ if not n.startswith("_")}
     elif hasattr(value, "__len__"):
         for index in range(min(len(value), LONGEST_LIST)):
             yield from _numbers(value[index], f"{path}[{index}]")

@@ -174,7 +174,7 @@ def _wanted(unit: UnitDescription, planned: list[Planned]) -> list[Planned]:
 def write_recording(folder: Path, recording: Recording, kind: str, sheets: dict[str, Any]) -> None:
     """Write one recording as ``<name>.csv`` or ``<name>.mcap``, in the axes of the unit's body."""
     if kind == "mcap":
-        from pipeline.io.mcap_write import write_mcap  # noqa: PLC0415  (needs the mcap library)
+        from pipeline.io.ros2_messages import write_mcap  # noqa: PLC0415  (needs the mcap library)
 
         write_mcap(folder / f"{recording.name}.mcap", recording)
         return

@@ -11,7 +11,7 @@ import pytest
 
 from pipeline.commands.apply import main
 from pipeline.errors import ConfigurationError, ConvergenceError, InputError, MissingInputError
-from pipeline.field_logs.csv_log import compensate_csv
+from pipeline.field_logs.compensate import compensate_log
 from pipeline.field_logs.profile import LogProfile
 from pipeline.model.compensation import load
 from pipeline.records import FittedEffect, SensorCalibration
@@ -110,9 +110,10 @@ def test_other_columns_are_kept_to_the_letter(calibration: Path, log: Path, tmp_
 def test_small_blocks_give_what_one_block_gives(calibration: Path, log: Path, tmp_path: Path, block_bytes: int) -> None:
     compensation = load(calibration)
     whole, cut = tmp_path / "whole.csv", tmp_path / "cut.csv"
-    assert compensate_csv(compensation, log, whole) == (500, ["accelerometer", "gyroscope"])
+    result = compensate_log(compensation, log, whole)
+    assert (result.samples, result.sensors) == (500, ["accelerometer", "gyroscope"])
     seen = []
-    compensate_csv(compensation, log, cut, block_bytes=block_bytes, progress=lambda rows, _: seen.append(rows))
+    compensate_log(compensation, log, cut, block_bytes=block_bytes, progress=lambda rows, _: seen.append(rows))
     assert len(seen) > 500 * 60 // block_bytes / 2
 
 
@@ -121,7 +122,7 @@ def test_cells_that_are_empty_stay_empty(calibration: Path, log: Path, tmp_path:
     cells = lines[20].split(",")
     lines[20] = ",".join([cells[0], "", *cells[2:]])
     log.write_text("\n".join(lines), encoding="utf-8")
-    compensate_csv(load(calibration), log, tmp_path / "out.csv")
+    compensate_log(load(calibration), log, tmp_path / "out.csv")
     table = columns(tmp_path / "out.csv")
     assert table["accel_x_g"][19] == ""
     assert all(table["accel_x_g"][:19] + table["accel_x_g"][20:])
@@ -138,12 +139,26 @@ def test_a_sensor_without_calibration_is_left_unchanged_and_said(
     assert vectors(columns(out), "accelerometer") == pytest.approx(vectors(columns(log), "accelerometer"))
 
 
+def test_a_calibrated_sensor_that_the_log_lacks_is_noted(calibration: Path, log: Path, tmp_path: Path) -> None:
+    document = json.loads(calibration.read_text(encoding="utf-8"))
+    document["accelerometer"]["effects"] = []  # they need the gyroscope
+    document["accelerometer"]["covariance"] = {"parameters": [], "values": []}
+    calibration.write_text(json.dumps(document), encoding="utf-8")
+    lines = [line.split(",") for line in log.read_text(encoding="utf-8").replace('"a, ""b"""', "ok").splitlines()]
+    log.write_text("\n".join(",".join(cells[:5]) for cells in lines), encoding="utf-8")
+    result = compensate_log(load(calibration), log, tmp_path / "out.csv")
+    assert (result.samples, result.sensors) == (500, ["accelerometer"])
+    assert [note for note in result.notes if "gyroscope" in note] == [
+        "the log holds no readings of the gyroscope, which is calibrated"
+    ]
+
+
 def test_a_byte_order_mark_and_windows_lines_are_read(calibration: Path, log: Path, tmp_path: Path) -> None:
     text = log.read_text(encoding="utf-8")
     plain, windows = tmp_path / "plain.csv", tmp_path / "windows.csv"
-    compensate_csv(load(calibration), log, plain)
+    compensate_log(load(calibration), log, plain)
     log.write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
-    compensate_csv(load(calibration), log, windows)
+    compensate_log(load(calibration), log, windows)
     assert windows.read_bytes() == plain.read_bytes()
 
 
@@ -192,7 +207,7 @@ def test_a_signal_that_an_effect_needs_is_named(calibration: Path, tmp_path: Pat
 
 def test_a_log_without_rows_gives_a_header(calibration: Path, log: Path, tmp_path: Path) -> None:
     log.write_text(HEADER + "\n", encoding="utf-8")
-    assert compensate_csv(load(calibration), log, tmp_path / "out.csv")[0] == 0
+    assert compensate_log(load(calibration), log, tmp_path / "out.csv").samples == 0
     assert (tmp_path / "out.csv").read_text(encoding="utf-8") == HEADER + "\n"
 
 
@@ -293,7 +308,7 @@ def test_a_log_of_other_dress_keeps_it(calibration: Path, tmp_path: Path, block_
     rows.insert(20, "# a pause")
     text = "Fs;100\n# made by hand\ntime_ms;ax;ay;az;gx;gy;gz\n" + "\n".join(rows) + "\n"
     (tmp_path / "log.txt").write_text(text)
-    compensate_csv(load(calibration), tmp_path / "log.txt", tmp_path / "out.txt", profile, block_bytes=block_bytes)
+    compensate_log(load(calibration), tmp_path / "log.txt", tmp_path / "out.txt", profile, block_bytes=block_bytes)
     lines = (tmp_path / "out.txt").read_text().splitlines()
     assert lines[:3] == ["Fs;100", "# made by hand", ";".join(["time_ms", *VALUES])]
     cells = [line.replace(",", ".").split(";") for line in lines[3:]]
@@ -304,7 +319,7 @@ def test_a_log_of_other_dress_keeps_it(calibration: Path, tmp_path: Path, block_
     (tmp_path / "log.txt").write_text(bad)
     line = 1 + next(i for i, row in enumerate(bad.splitlines()) if "x" in row and row.startswith("70"))
     with pytest.raises(InputError, match=rf"log\.txt:{line}: ax is"):
-        compensate_csv(load(calibration), tmp_path / "log.txt", tmp_path / "out.txt", profile, block_bytes=block_bytes)
+        compensate_log(load(calibration), tmp_path / "log.txt", tmp_path / "out.txt", profile, block_bytes=block_bytes)
 
 
 def test_blanks_between_columns_without_names_and_a_rate_for_the_time(calibration: Path, tmp_path: Path) -> None:
@@ -318,7 +333,7 @@ def test_blanks_between_columns_without_names_and_a_rate_for_the_time(calibratio
     text = "\n".join("  ".join(f"{v}" for v in row) + " " for row in values.tolist())
     (tmp_path / "log.txt").write_text(text)
     assert "effects" in data["gyroscope"]
-    compensate_csv(load(calibration), tmp_path / "log.txt", tmp_path / "out.txt", profile)
+    compensate_log(load(calibration), tmp_path / "log.txt", tmp_path / "out.txt", profile)
     found = np.loadtxt(tmp_path / "out.txt")
     expected = load(calibration).apply(values[:, :3], values[:, 3:6], values[:, 6], np.arange(40) / 50.0)
     np.testing.assert_allclose(found[:, :3], expected.accelerometer, atol=1e-12)
@@ -348,6 +363,6 @@ def test_a_profile_of_several_files_is_refused(calibration: Path, log: Path, tmp
     gyro = {c: v for c, v in part.items() if not c.startswith("accel")}
     parts = [{"file": "a.txt", "columns": accel}, {"file": "g.txt", "columns": gyro}]
     with pytest.raises(InputError, match="joins several files"):
-        compensate_csv(
+        compensate_log(
             load(calibration), log, tmp_path / "out.csv", LogProfile({"csv": {"parts": parts, "columns": {}}})
         )

@@ -17,9 +17,9 @@ from mcap_ros2.decoder import DecoderFactory
 
 from pipeline.commands.apply import main
 from pipeline.errors import InputError
-from pipeline.field_logs.mcap_log import compensate_mcap
+from pipeline.field_logs.compensate import compensate_log
 from pipeline.field_logs.profile import LogProfile
-from pipeline.io.ros2 import DEFINITIONS, IMU, TEMPERATURE
+from pipeline.io.ros2_messages import DEFINITIONS, IMU, TEMPERATURE
 from pipeline.model.compensation import load
 from pipeline.records import SENSORS, FittedEffect, SensorCalibration
 
@@ -185,7 +185,7 @@ def test_calibrated_messages_are_those_of_the_arrays_to_the_last_bit(calibration
 def test_messages_of_varying_length_are_compensated_alike(calibration: Path, tmp_path: Path) -> None:
     for name, varied in (("alike", False), ("varied", True)):
         write_log(tmp_path / f"{name}.mcap", varied=varied)
-        compensate_mcap(load(calibration), tmp_path / f"{name}.mcap", tmp_path / f"{name}_out.mcap")
+        compensate_log(load(calibration), tmp_path / f"{name}.mcap", tmp_path / f"{name}_out.mcap")
     alike, varied = (decoded(tmp_path / f"{n}_out.mcap", "/imu/data_calibrated") for n in ("alike", "varied"))
     assert {m.header.frame_id for m in varied} == {"imu", "another_imu"}
     np.testing.assert_array_equal(numbers(alike), numbers(varied))
@@ -193,7 +193,7 @@ def test_messages_of_varying_length_are_compensated_alike(calibration: Path, tmp
 
 def test_a_temperature_topic_is_followed_causally(calibration: Path, tmp_path: Path) -> None:
     log, out = write_log(tmp_path / "log.mcap"), tmp_path / "out.mcap"
-    done = compensate_mcap(load(calibration), log, out)
+    done = compensate_log(load(calibration), log, out)
     assert done.notes == ["11 messages stand before the first temperature; they were given that one"]
     stamps, _, _ = signals()
     force, rate = in_house_units(decoded(out, "/imu/data"))
@@ -203,7 +203,7 @@ def test_a_temperature_topic_is_followed_causally(calibration: Path, tmp_path: P
     np.testing.assert_allclose(found[50:], expected[50:], atol=1e-6, rtol=0)
     held = 25.0 + 1e-3 * np.maximum((np.arange(COUNT) - 11) // 20 * 20 + 10, 10)
     expected = load(calibration).apply(force, rate, held, smoothing=0.0).gyroscope
-    compensate_mcap(load(calibration), log, out, smoothing=0.0)
+    compensate_log(load(calibration), log, out, smoothing=0.0)
     found = np.degrees(numbers(decoded(out, "/imu/data_calibrated"))[1])
     np.testing.assert_allclose(found, expected, atol=1e-12, rtol=0)
 
@@ -211,7 +211,7 @@ def test_a_temperature_topic_is_followed_causally(calibration: Path, tmp_path: P
 def test_a_log_without_the_temperature_that_is_needed_is_refused(calibration: Path, tmp_path: Path) -> None:
     log = write_log(tmp_path / "log.mcap", temperature=False)
     with pytest.raises(InputError, match="effects of temperature, but the log holds no messages of sensor_msgs"):
-        compensate_mcap(load(calibration), log, tmp_path / "out.mcap")
+        compensate_log(load(calibration), log, tmp_path / "out.mcap")
     assert not (tmp_path / "out.mcap").exists()
 
 
@@ -227,15 +227,15 @@ def test_a_damaged_log_leaves_no_output(calibration: Path, tmp_path: Path) -> No
 
 def test_a_log_that_is_calibrated_already_is_not_calibrated_again(calibration: Path, tmp_path: Path) -> None:
     log, out = write_log(tmp_path / "log.mcap"), tmp_path / "out.mcap"
-    compensate_mcap(load(calibration), log, out)
+    compensate_log(load(calibration), log, out)
     with pytest.raises(InputError, match=r"topics are of type|has a topic /imu/data_calibrated already"):
-        compensate_mcap(load(calibration), out, tmp_path / "twice.mcap")
+        compensate_log(load(calibration), out, tmp_path / "twice.mcap")
 
 
 def test_a_topic_that_this_command_made_is_known_again(calibration: Path, tmp_path: Path) -> None:
     log, out, twice = write_log(tmp_path / "log.mcap"), tmp_path / "out.mcap", tmp_path / "twice.mcap"
     for topic, reason in (("/imu/clean", "was made by this command with unit U1"), (None, "has the name of one")):
-        compensate_mcap(load(calibration), log, out, topic=topic)
+        compensate_log(load(calibration), log, out, topic=topic)
         chosen = topic or "/imu/data_calibrated"
         profile = LogProfile({"mcap": {"imu_topic": chosen}})
         source = out
@@ -250,7 +250,7 @@ def test_a_topic_that_this_command_made_is_known_again(calibration: Path, tmp_pa
                     writer.add_message(channel, log_time, data, publish_time, sequence)
                 writer.finish()
             calibration.write_text(calibration.read_text().replace('"effects": [{', '"effects": [], "x": [{'))
-        compensate_mcap(load(calibration), source, twice, profile, topic="/imu/twice")
+        compensate_log(load(calibration), source, twice, profile, topic="/imu/twice")
         with twice.open("rb") as stream:
             made = [m.metadata for m in make_reader(stream).iter_metadata() if m.name == "imu_calibration"]
         assert (made[-1]["readings"], made[-1]["topic"]) == (chosen, "/imu/twice")
@@ -269,11 +269,11 @@ def test_a_truncated_log_is_compensated_where_the_profile_allows_it(calibration:
     log, out = write_log(tmp_path / "log.mcap"), tmp_path / "out.mcap"
     log.write_bytes(log.read_bytes()[: log.stat().st_size // 2])
     with pytest.raises(InputError, match="truncated"):
-        compensate_mcap(load(calibration), log, out)
+        compensate_log(load(calibration), log, out)
     profile = LogProfile({"mcap": {"allow_truncated": True}})
-    done = compensate_mcap(load(calibration), log, out, profile)
-    assert 0 < done.messages < COUNT
-    assert len(messages(out)["/imu/data_calibrated"]) == done.messages
+    done = compensate_log(load(calibration), log, out, profile)
+    assert 0 < done.samples < COUNT
+    assert len(messages(out)["/imu/data_calibrated"]) == done.samples
     assert any("truncated" in note for note in done.notes)
 
 
@@ -292,8 +292,8 @@ def test_readings_mapped_from_json_give_imu_messages(calibration: Path, tmp_path
     for i, a in enumerate("xyz"):
         fields[f"accel_{a}"] = {"field": f"a[{i}]", "unit": "counts", "counts_per_unit": 16384.0}
         fields[f"gyro_{a}"] = {"field": f"w[{i}]", "unit": "deg/s"}
-    done = compensate_mcap(load(calibration), log, out, LogProfile({"mcap": {"topics": {"/raw": fields}}}))
-    assert (done.messages, done.topic) == (300, "/raw_calibrated")
+    done = compensate_log(load(calibration), log, out, LogProfile({"mcap": {"topics": {"/raw": fields}}}))
+    assert (done.samples, done.topic) == (300, "/raw_calibrated")
     assert messages(out)["/raw"] == messages(log)["/raw"]
     found = decoded(out, "/raw_calibrated")
     expected = load(calibration).apply((force[:300] * 16384).round() / 16384, rate[:300], np.full(300, 30.0))
@@ -304,7 +304,7 @@ def test_readings_mapped_from_json_give_imu_messages(calibration: Path, tmp_path
 
 def test_the_sensors_axes_are_turned_to_the_bodys(calibration: Path, tmp_path: Path) -> None:
     log, out = write_log(tmp_path / "log.mcap"), tmp_path / "out.mcap"
-    compensate_mcap(load(calibration), log, out, LogProfile({}, dict.fromkeys(SENSORS, ("-y", "+x", "+z"))))
+    compensate_log(load(calibration), log, out, LogProfile({}, dict.fromkeys(SENSORS, ("-y", "+x", "+z"))))
     force, rate = in_house_units(decoded(out, "/imu/data"))
     turned = np.stack([force[:, 1], -force[:, 0], force[:, 2]], axis=1)  # body x is the reading's y, body y is -x
     expected = load(calibration).apply(turned, rate, np.zeros(COUNT), smoothing=0.0).accelerometer

@@ -12,7 +12,7 @@ import yaml
 
 from pipeline.__main__ import main
 from pipeline.io.csv_write import write_canonical_csv
-from pipeline.io.mcap_write import write_mcap
+from pipeline.io.ros2_messages import write_mcap
 from pipeline.records import Recording
 from pipeline.simulation.campaign import write_campaign
 from pipeline.simulation.description import description_from

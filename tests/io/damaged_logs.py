@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from dataclasses import dataclass, field
 from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mcap.reader import NonSeekingReader
+from mcap.records import Message
 from mcap.writer import CompressionType, Writer
 from sample_logs import make_recording
 
 from pipeline.errors import IngestError
-from pipeline.io.mcap import _Reader
-from pipeline.io.mcap_messages import read_container
+from pipeline.io.mcap import read_stream
+from pipeline.io.mcap_reader import McapReader
 from pipeline.io.mcap_settings import McapFormat
-from pipeline.io.mcap_write import write_mcap
+from pipeline.io.ros2_messages import write_mcap
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -34,9 +35,19 @@ RECORDERS: dict[str, dict[str, Any]] = {
 Messages = list[tuple[str, int, int, bytes]]
 
 
+def read_messages(data: bytes) -> tuple[McapReader, dict[int, list[Message]]]:
+    """Return a file's definitions, and the messages of each channel in the order of the file."""
+    reader, found = McapReader(BytesIO(data), "log"), defaultdict(list)
+    for rows in reader.rows():
+        columns = [rows.heads[n].tolist() for n in ("log_time", "publish_time", "sequence")]
+        for row, (log_time, publish_time, sequence) in enumerate(zip(*columns, strict=True)):
+            found[rows.channel].append(Message(rows.channel, log_time, rows.payload(row), publish_time, sequence))
+    return reader, dict(found)
+
+
 def copy_with(source: Path, target: Path, **options: Any) -> None:
     """Write the messages of a file once more, with other settings of the recorder."""
-    container = read_container(source.read_bytes(), "")
+    container, by_channel = read_messages(source.read_bytes())
     with target.open("wb") as stream:
         writer = Writer(stream, **options)
         writer.start(profile="ros2")
@@ -44,7 +55,7 @@ def copy_with(source: Path, target: Path, **options: Any) -> None:
             writer.register_schema(schema.name, schema.encoding, schema.data)
         for channel in container.channels.values():
             writer.register_channel(channel.topic, channel.message_encoding, channel.schema_id)
-        for messages in zip(*container.messages.values(), strict=True):
+        for messages in zip(*by_channel.values(), strict=True):
             for m in messages:
                 writer.add_message(m.channel_id, m.log_time, m.data, m.publish_time, m.sequence)
         writer.finish()
@@ -58,12 +69,12 @@ def log_of(recorder: str, folder: Path, samples: int = 12) -> bytes:
 
 
 def table_of(data: bytes, **settings: Any) -> ChannelTable:
-    return _Reader(BytesIO(data), "log", McapFormat(**settings)).table()
+    return read_stream(BytesIO(data), "log", McapFormat(**settings))
 
 
 def messages_of(data: bytes) -> Messages:
-    container = read_container(data, "log")
-    found = [(container.channels[c].topic, m) for c, messages in container.messages.items() for m in messages]
+    container, by_channel = read_messages(data)
+    found = [(container.channels[c].topic, m) for c, messages in by_channel.items() for m in messages]
     return sorted((topic, m.log_time, m.sequence, m.data) for topic, m in found)
 
 

@@ -13,7 +13,7 @@ from test_mcap_logs import header, imu, write_ros2
 from pipeline.errors import IngestError, InputError
 from pipeline.io.encoder_log import align
 from pipeline.io.read import read_recordings
-from pipeline.io.ros2 import IMU, JOINT_STATE
+from pipeline.io.ros2_messages import IMU, JOINT_STATE
 from pipeline.model.kinematics import reference_motion
 
 if TYPE_CHECKING:

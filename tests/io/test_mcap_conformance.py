@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Any
 
-from pipeline.io.mcap_messages import read_container
+from damaged_logs import read_messages
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -36,8 +36,8 @@ def test_conformance_files_hold_what_they_declare(reference: Path) -> None:
     files = sorted((reference / "mcap_conformance").rglob("*.mcap"))
     assert len(files) == 416
     for file in files:
-        container = read_container(file.read_bytes(), str(file))
-        messages = [m for channel in container.messages.values() for m in channel]
+        container, by_channel = read_messages(file.read_bytes())
+        messages = [m for channel in by_channel.values() for m in channel]
         assert found(messages) == declared(file, "Message"), file.name
         assert found(container.channels.values()) == distinct(declared(file, "Channel")), file.name
         assert found(container.schemas.values()) == distinct(declared(file, "Schema")), file.name

@@ -17,7 +17,7 @@ from pipeline.errors import ConfigurationError, IngestError
 from pipeline.io.mcap import read_mcap
 from pipeline.io.mcap_settings import mcap_format
 from pipeline.io.read import read_recordings
-from pipeline.io.ros2 import DEFINITIONS, IMU
+from pipeline.io.ros2_messages import DEFINITIONS, IMU
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -283,7 +283,7 @@ def test_profile_of_fields_reads_a_recording(tmp_path: Path) -> None:
     [
         ({"accel_x": {"field": "a.x", "unit": "furlong"}}, "accel_x.unit is 'furlong'; allowed are g"),
         ({"accel_x": {"field": "a..x", "unit": "g"}}, "'a..x' is no path to a field"),
-        ({"accel_x": {"field": "a.x", "unit": "counts"}}, "has counts_per_unit"),
+        ({"accel_x": {"field": "a.x", "unit": "counts"}}, "counts_per_unit is None"),
         ({"accel_x": None}, "accel_x is not described"),
         ({"time": None}, "/imu.time is missing"),
         ({"acel_x": {"field": "a"}}, "acel_x is unknown; did you mean accel_x"),

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from damaged_logs import copy_with
+from damaged_logs import copy_with, read_messages
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 from mcap_ros2.writer import Writer as Ros2Writer
@@ -17,11 +17,9 @@ from sample_logs import SENSOR, channels, make_recording, procedure
 
 from pipeline.errors import InputError
 from pipeline.io.csv_write import write_canonical_csv
-from pipeline.io.mcap_messages import read_container
-from pipeline.io.mcap_walk import Walk
-from pipeline.io.mcap_write import write_mcap
+from pipeline.io.mcap_reader import McapReader
 from pipeline.io.read import read_recordings
-from pipeline.io.ros2 import DEFINITIONS, IMU, JOINT_STATE, TEMPERATURE
+from pipeline.io.ros2_messages import DEFINITIONS, IMU, JOINT_STATE, TEMPERATURE, write_mcap
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -200,14 +198,14 @@ def test_message_of_another_type_than_its_definition_says_is_refused(tmp_path: P
 @pytest.mark.parametrize("extra", [-8, 8])
 def test_message_of_a_wrong_length_is_refused(tmp_path: Path, extra: int) -> None:
     write_mcap(tmp_path / "whole.mcap", make_recording(10))
-    container = read_container((tmp_path / "whole.mcap").read_bytes(), "")
+    _, by_channel = read_messages((tmp_path / "whole.mcap").read_bytes())
     with (tmp_path / "accel_x.mcap").open("wb") as stream:
         writer = Writer(stream)
         writer.start()
         channel = writer.register_channel(
             "/imu", "cdr", writer.register_schema(IMU, "ros2msg", DEFINITIONS[IMU].encode())
         )
-        for message in container.messages[1]:
+        for message in by_channel[1]:
             data = message.data + bytes(extra) if extra > 0 else message.data[:extra]
             writer.add_message(channel, message.log_time, data, message.log_time)
         writer.finish()
@@ -264,9 +262,9 @@ def test_lost_chunk_is_missed_by_the_summary(tmp_path: Path, lost: int, message:
     file = tmp_path / "accel_x.mcap"
     copy_with(tmp_path / "source.mcap", file, chunk_size=4000)
     whole = bytearray(file.read_bytes())
-    walk = Walk(BytesIO(whole), "")
-    list(walk.rows())
-    whole[walk.found.chunks[lost]] = 0x60  # no known kind of record: readers skip it
+    reader = McapReader(BytesIO(whole), "")
+    list(reader.rows())
+    whole[reader.chunks[lost]] = 0x60  # no known kind of record: readers skip it
     file.write_bytes(whole)
     with pytest.raises(InputError, match=message):
         read(tmp_path)

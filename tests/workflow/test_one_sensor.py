@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from pipeline.io.mcap_write import write_mcap
 from pipeline.io.parquet import load_recordings
+from pipeline.io.ros2_messages import write_mcap
 
 from .conftest import ROOT, Bench
 

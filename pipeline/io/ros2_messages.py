@@ -1,10 +1,10 @@
-"""Recordings to MCAP files of ROS 2 messages, as a recorder writes them: zstd chunks under checksums.
+"""The ROS 2 messages of a calibration log: their definitions, and recordings written as MCAP files of them.
 
     linear_acceleration [m/s^2] = specific force [g] * 9.80665
     angular_velocity [rad/s]    = angular rate [deg/s] * pi/180
 
-Headers carry the sample times. All messages of a topic have one length, so that a table of bytes is filled column by
-column and cut into messages.
+The stamps are the sample times. All messages of a topic have one length: a table of bytes is filled column by column,
+and its rows are the messages.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import Writer
 
 from pipeline.errors import InputError
-from pipeline.io.ros2 import DEFINITIONS, IMU, JOINT_STATE, QUATERNION_STAMPED, TEMPERATURE
 from pipeline.io.units import STANDARD_GRAVITY
 
 if TYPE_CHECKING:
@@ -28,6 +27,57 @@ if TYPE_CHECKING:
 
     from pipeline.records import Recording
 
+IMU = "sensor_msgs/msg/Imu"
+TEMPERATURE = "sensor_msgs/msg/Temperature"
+JOINT_STATE = "sensor_msgs/msg/JointState"
+QUATERNION_STAMPED = "geometry_msgs/msg/QuaternionStamped"
+
+_RULE = "=" * 80
+_HEADER = f"""{_RULE}
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+{_RULE}
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+"""
+_QUATERNION = f"""{_RULE}
+MSG: geometry_msgs/Quaternion
+float64 x 0
+float64 y 0
+float64 z 0
+float64 w 1
+"""
+_VECTOR = f"""{_RULE}
+MSG: geometry_msgs/Vector3
+float64 x
+float64 y
+float64 z
+"""
+DEFINITIONS = {
+    IMU: f"""std_msgs/Header header
+geometry_msgs/Quaternion orientation
+float64[9] orientation_covariance
+geometry_msgs/Vector3 angular_velocity
+float64[9] angular_velocity_covariance
+geometry_msgs/Vector3 linear_acceleration
+float64[9] linear_acceleration_covariance
+{_HEADER}{_QUATERNION}{_VECTOR}""",
+    TEMPERATURE: f"""std_msgs/Header header
+float64 temperature
+float64 variance
+{_HEADER}""",
+    JOINT_STATE: f"""std_msgs/Header header
+string[] name
+float64[] position
+float64[] velocity
+float64[] effort
+{_HEADER}""",
+    QUATERNION_STAMPED: f"""std_msgs/Header header
+geometry_msgs/Quaternion quaternion
+{_HEADER}{_QUATERNION}""",
+}
 TOPICS = {
     IMU: "/imu/data",
     TEMPERATURE: "/imu/temperature",
@@ -38,7 +88,7 @@ JOINT = "table"
 NANOSECONDS = 1_000_000_000
 
 
-class _Template:
+class _Message:
     """One message as CDR, with the places of its numbers."""
 
     def __init__(self, frame: str) -> None:
@@ -65,12 +115,8 @@ class _Template:
             self.places.append(len(self.data))
             self.data += bytes(8)
 
-    def fill(self, time_ns: NDArray[np.int64], numbers: NDArray[np.float64]) -> list[bytes]:
-        """Return a message for each time and row of numbers."""
-        return [row.tobytes() for row in self.table(time_ns, numbers)]
-
-    def table(self, time_ns: NDArray[np.int64], numbers: NDArray[np.float64]) -> NDArray[np.uint8]:
-        """Return the messages as rows of bytes."""
+    def fill(self, time_ns: NDArray[np.int64], numbers: NDArray[np.float64]) -> NDArray[np.uint8]:
+        """Return a message, a row of bytes, for each time and row of numbers."""
         table = np.tile(np.frombuffer(bytes(self.data), np.uint8), (len(time_ns), 1))
         stamps = np.stack([time_ns // NANOSECONDS, time_ns % NANOSECONDS], axis=1).astype("<u4")
         table[:, 4:12] = stamps.view(np.uint8)
@@ -107,51 +153,38 @@ def write_mcap(path: Path, recording: Recording) -> None:
             channels.append(writer.register_channel(TOPICS[kind], MessageEncoding.CDR, schema))
         for row, stamp in enumerate(time.tolist()):
             for channel, messages in zip(channels, streams.values(), strict=True):
-                writer.add_message(channel, stamp, messages[row], stamp, row)
+                writer.add_message(channel, stamp, messages[row].tobytes(), stamp, row)
         writer.finish()  # type: ignore[no-untyped-call]
     temporary.replace(path)
 
 
-def _streams(recording: Recording) -> dict[str, list[bytes]]:
-    """Return the messages of each type, one for each sample."""
+def _streams(recording: Recording) -> dict[str, NDArray[np.uint8]]:
+    """Return the messages of each type, a row of bytes for each sample."""
     time = recording.time_ns
-    streams = {IMU: _imu(recording)}
+    streams = {IMU: imu_table(time, recording.accelerometer, recording.gyroscope)}
     if recording.temperature is not None:
-        template = _Template("imu")
-        template.doubles(2)
+        message = _Message("imu")
+        message.doubles(2)
         numbers = np.stack([recording.temperature, np.zeros(len(time))], axis=1)
-        streams[TEMPERATURE] = template.fill(time, numbers)
+        streams[TEMPERATURE] = message.fill(time, numbers)
     if recording.table_angle is not None or recording.table_rate is not None:
         streams[JOINT_STATE] = _joint(recording)
     if recording.table_attitude is not None:
-        template = _Template("level")
-        template.doubles(4)
-        streams[QUATERNION_STAMPED] = template.fill(time, recording.table_attitude[:, [1, 2, 3, 0]])
+        message = _Message("level")
+        message.doubles(4)
+        streams[QUATERNION_STAMPED] = message.fill(time, recording.table_attitude[:, [1, 2, 3, 0]])
     return streams
-
-
-def _imu(recording: Recording) -> list[bytes]:
-    table = imu_table(recording.time_ns, recording.accelerometer, recording.gyroscope)
-    return [row.tobytes() for row in table]
 
 
 def imu_table(
     time_ns: NDArray[np.int64], accelerometer: NDArray[np.float64] | None, gyroscope: NDArray[np.float64] | None
 ) -> NDArray[np.uint8]:
-    """Return Imu messages: orientation, angular rate, acceleration, each with nine numbers of covariance.
+    """Return Imu messages, rows of bytes, of (n,) times and (n, 3) readings in g and deg/s.
 
-    Parameters
-    ----------
-    time_ns : (n,) array of int64, ns
-    accelerometer : (n, 3) array, g, or None
-    gyroscope : (n, 3) array, deg/s, or None
-
-    Returns
-    -------
-    (n, size) array of uint8
+    Orientation, angular rate and acceleration each have a covariance, whose first element is -1 for what is absent.
     """
     numbers = np.zeros((len(time_ns), 37))
-    numbers[:, 3] = 1.0  # identity, and absent:
+    numbers[:, 3] = 1.0  # the identity
     numbers[:, 4] = -1.0
     if gyroscope is None:
         numbers[:, 16] = -1.0
@@ -161,22 +194,22 @@ def imu_table(
         numbers[:, 28] = -1.0
     else:
         numbers[:, 25:28] = accelerometer * STANDARD_GRAVITY
-    template = _Template("imu")
-    template.doubles(37)
-    return template.table(time_ns, numbers)
+    message = _Message("imu")
+    message.doubles(37)
+    return message.fill(time_ns, numbers)
 
 
-def _joint(recording: Recording) -> list[bytes]:
+def _joint(recording: Recording) -> NDArray[np.uint8]:
     """Return JointState messages of the table's one joint."""
-    template = _Template("table")
-    template.count(1)
-    template.text(JOINT)
+    message = _Message("table")
+    message.count(1)
+    message.text(JOINT)
     columns = []
     for values in (recording.table_angle, recording.table_rate):
         present = values is not None
-        template.count(int(present))
-        template.doubles(int(present))
+        message.count(int(present))
+        message.doubles(int(present))
         if values is not None:
             columns.append(np.radians(values))
-    template.count(0)  # effort
-    return template.fill(recording.time_ns, np.stack(columns, axis=1))
+    message.count(0)  # effort
+    return message.fill(recording.time_ns, np.stack(columns, axis=1))

@@ -1,17 +1,17 @@
-"""What speaks against compensating a log with a calibration: said beside the result, which is written all the same.
+"""Checks whether a log suits the calibration that is applied to it. They only warn; the output is written.
 
-    rest  : a window of 100 samples whose scatter is at most twice that of the quietest tenth of the windows, and
-            twice that which successive differences have: nothing moves slowly either; gravity stands out of it
+    rest  : a window of 100 samples whose scatter is at most twice that of the quietest tenth of the windows, and at
+            most twice that of successive differences (no slow motion); its specific force is well above its scatter
     error : ||a| - 1 g| or |w| of a rest's mean reading, before and after compensation
 
-A calibration that fits brings rests nearer to 1 g and to zero rate. Where it takes them away from there, the log was
-compensated already, is of another unit or sensor, or is read with other axes or units; or the sensor has changed.
+The right calibration brings rests nearer to 1 g and to zero rate. If it does not, the log was compensated already,
+belongs to another unit or sensor, or is read with other axes or units; or the sensor has changed.
 
-Between two rests gravity turns in the body by at most the integral of the rate's size, from that at rest. A gyroscope
-that integrates to less than half of the turn is not read in deg/s.
+Between two rests gravity turns in the body by at most the integral of |w| (minus its value at rest). A gyroscope that
+integrates to less than half of the turn is not read in deg/s.
 
-``apply`` writes numbers rounded to 12 decimals, without zeros at their ends: 9 of 10 cells have 12 decimals. Fewer
-digits come from sensors, more from programs that write doubles.
+``apply`` writes numbers rounded to 12 decimals without trailing zeros: 9 of 10 cells have 12 decimals. Sensors give
+fewer digits, programs that write doubles give more.
 """
 
 from __future__ import annotations
@@ -49,8 +49,14 @@ CELLS, LEAST_CELLS, SHARE = 200, 10, 0.6  # of a column; the share of cells with
 WHOLE = 10  # different whole numbers that are no chance
 
 
-class Doubts:
-    """Statistics of a log on its way, in bounded memory."""
+class LogChecks:
+    """Statistics of a log, block by block, in bounded memory.
+
+    Attributes
+    ----------
+    compensated : str
+        Evidence that the log was compensated before; else empty.
+    """
 
     def __init__(self) -> None:
         self.samples = self.reversed = self.repeated = 0
@@ -60,8 +66,8 @@ class Doubts:
         self.whole: dict[str, bool] = {}
         self.compensated = ""
 
-    def look_at(self, columns: Sequence[pa.Array], decimal: str) -> None:
-        """Look at how the readings of a text log are written."""
+    def check_decimals(self, columns: Sequence[pa.Array], decimal: str) -> None:
+        """Check whether the readings of a text log have the decimals that ``apply`` writes."""
         cells = [str(cell) for column in columns for cell in column[:CELLS].to_pylist()]
         decimals = [cell.partition(decimal)[2] for cell in cells if "e" not in cell.lower()]
         full = sum(len(text) == DECIMALS for text in decimals)
@@ -72,23 +78,13 @@ class Doubts:
         ):
             self.compensated = f"the readings have {DECIMALS} decimals, as this command writes them"
 
-    def take(
-        self, raw: Mapping[str, Values], calibrated: Mapping[str, Values], time: Values | None, first_row: int
-    ) -> None:
-        """Take in a block.
-
-        Parameters
-        ----------
-        raw, calibrated : mapping of sensor to (n, 3) array, g or deg/s
-        time : (n,) array, s, or None
-        first_row : int
-            Samples of the log before it.
-        """
+    def add(self, raw: Mapping[str, Values], calibrated: Mapping[str, Values], time: Values | None) -> None:
+        """Add a block: (n, 3) readings of each sensor in g or deg/s, and (n,) times in s."""
         if time is not None and len(time):
             step = np.diff(time, prepend=self.last_time)
             back = np.flatnonzero(step < 0)
             if len(back) and not self.reversed:
-                self.first_reversed = f"sample {first_row + int(back[0]) + 1}, {time[back[0]]:.9g} s"
+                self.first_reversed = f"sample {self.samples + int(back[0]) + 1}, {time[back[0]]:.9g} s"
             self.reversed += len(back)
             self.repeated += int(np.count_nonzero(step == 0))
             self.last_time = float(time[-1])
@@ -99,10 +95,10 @@ class Doubts:
                 self.whole[sensor] = bool(np.all(known[:WINDOW] == np.round(known[:WINDOW]))) and (
                     sensor in self.whole or len(np.unique(known[: 10 * WINDOW])) >= WHOLE
                 )
-        self._cut(raw, calibrated, time)
+        self._add_windows(raw, calibrated, time)
 
-    def _cut(self, raw: Mapping[str, Values], calibrated: Mapping[str, Values], time: Values | None) -> None:
-        """Cut a block into windows, and keep their means and scatter."""
+    def _add_windows(self, raw: Mapping[str, Values], calibrated: Mapping[str, Values], time: Values | None) -> None:
+        """Keep means and scatter of the windows of a block."""
         count = min(len(next(iter(raw.values()), ())) // WINDOW, MOST_WINDOWS - sum(map(_count, self.windows)))
         if count <= 0:
             return
@@ -119,14 +115,8 @@ class Doubts:
             part["time"] = time[: count * WINDOW].reshape(count, WINDOW).mean(axis=1)
         self.windows.append(part)
 
-    def said(self, calibrated: set[str]) -> list[str]:
-        """Return what speaks against it, in words; empty where nothing does.
-
-        Parameters
-        ----------
-        calibrated : set of str
-            Sensors that the calibration holds.
-        """
+    def warnings(self, calibrated: set[str]) -> list[str]:
+        """Return what contradicts that the calibration of these sensors belongs to this log; often nothing."""
         found = [f"{self.compensated}: the log is compensated already"] if self.compensated else []
         if self.reversed:
             found.append(
@@ -151,7 +141,7 @@ class Doubts:
         return found
 
     def _units(self, table: Mapping[str, Values]) -> list[str]:
-        """Return what the size of gravity says of the accelerometer's unit."""
+        """Compare the median of |a| with 1 g."""
         if "accelerometer" not in table or self.whole.get("accelerometer"):
             return []
         size = float(np.median(table["accelerometer size"]))
@@ -163,7 +153,7 @@ class Doubts:
         return [f"{told}; --ingest names a profile with the unit of each column"]
 
     def _rests(self, table: Mapping[str, Values], calibrated: set[str]) -> list[str]:
-        """Return what the rests say."""
+        """Compare the errors of rests before and after compensation."""
         present = [s for s in SENSORS if s in table]
         still = np.ones(len(table[present[0]]), bool)
         for sensor in present:
@@ -194,7 +184,7 @@ class Doubts:
 
     @staticmethod
     def _turned(table: Mapping[str, Values], still: NDArray[np.bool_]) -> list[str]:
-        """Return what the turns of gravity between rests say of the gyroscope's unit."""
+        """Compare the turns of gravity between rests with the integrated rate."""
         if not {"accelerometer", "gyroscope", "time"} <= set(table):
             return []
         at = np.flatnonzero(still)

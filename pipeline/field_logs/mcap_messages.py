@@ -1,4 +1,4 @@
-"""Messages with calibrated numbers in them, as the records of an MCAP file."""
+"""Imu messages with calibrated readings, as the records of an MCAP file."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ import struct
 from typing import TYPE_CHECKING
 
 import numpy as np
+from mcap.opcode import Opcode
 
-from pipeline.io.mcap_chunk import HEAD
-from pipeline.io.mcap_kinds import VECTORS
-from pipeline.io.mcap_records import MESSAGE, MESSAGE_HEAD, RECORD_HEAD
-from pipeline.io.mcap_write import imu_table
+from pipeline.io.mcap_channels import VECTORS
+from pipeline.io.mcap_chunk import HEAD, MESSAGE_HEAD
+from pipeline.io.ros2_messages import imu_table
 from pipeline.io.units import STANDARD_GRAVITY, TRIADS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.io.mcap_chunk import Rows
-    from pipeline.io.mcap_decode import ChannelDecoder
-    from pipeline.io.message_template import Template
+    from pipeline.io.message_decoder import ChannelDecoder
+    from pipeline.io.message_layout import MessageLayout
 
     Truths = dict[str, NDArray[np.float64]]
 
@@ -27,16 +27,15 @@ SENSOR_OF = {channels: sensor for sensor, channels in TRIADS.items()}
 
 
 def replaced(rows: Rows, decoder: ChannelDecoder, truths: Truths, channel: int) -> NDArray[np.uint8] | list[bytes]:
-    """Return copies of Imu messages with calibrated numbers in them.
+    """Return copies of Imu messages in which the readings of some sensors are replaced.
 
     Parameters
     ----------
     rows : Rows
-        The messages as they are.
+        The messages, as ``decoder`` has read them last.
     decoder : ChannelDecoder
-        That has read them last.
     truths : dict of str to (n, 3) array, g or deg/s
-        Of the sensors whose numbers are to be replaced.
+        Sensor to its calibrated readings.
     channel : int
         Number of the channel of the new messages.
 
@@ -46,9 +45,9 @@ def replaced(rows: Rows, decoder: ChannelDecoder, truths: Truths, channel: int) 
         A record for each message.
     """
     numbers = _numbers(truths)
-    if decoder.template is not None:
-        return _alike(rows, decoder.template, numbers, channel)
-    return [_one(row, rows, decoder.template_of(row, rows), numbers, channel) for row in range(len(rows.starts))]
+    if decoder.layout is not None:
+        return _all_at_once(rows, decoder.layout, numbers, channel)
+    return [_one(row, rows, decoder.layout_of(row, rows), numbers, channel) for row in range(len(rows.starts))]
 
 
 def _numbers(truths: Truths) -> dict[str, NDArray[np.float64]]:
@@ -63,11 +62,13 @@ def _numbers(truths: Truths) -> dict[str, NDArray[np.float64]]:
     return found
 
 
-def _alike(rows: Rows, template: Template, numbers: dict[str, NDArray[np.float64]], channel: int) -> NDArray[np.uint8]:
+def _all_at_once(
+    rows: Rows, layout: MessageLayout, numbers: dict[str, NDArray[np.float64]], channel: int
+) -> NDArray[np.uint8]:
     """Copy all records at once, and replace their numbers."""
-    size = HEAD.itemsize + len(template.sample)
-    places = {path: template.places[path] for path in numbers}
-    layout = np.dtype(
+    size = HEAD.itemsize + len(layout.sample)
+    places = {path: layout.places[path] for path in numbers}
+    items = np.dtype(
         {
             "names": ["channel", *places],
             "formats": ["<u2", *(p.code for p in places.values())],
@@ -80,20 +81,20 @@ def _alike(rows: Rows, template: Template, numbers: dict[str, NDArray[np.float64
         whole = np.ndarray(len(starts), f"V{size}", rows.data.data, int(starts[0]), (rows.stride,)).copy()
     else:
         whole = np.ndarray(len(rows.data) - size + 1, f"V{size}", rows.data.data, 0, (1,))[starts]
-    records = whole.view(layout)
+    records = whole.view(items)
     records["channel"] = channel
     for path, column in numbers.items():
         records[path] = column
     return whole.view(np.uint8).reshape(len(starts), size)
 
 
-def _one(row: int, rows: Rows, template: Template, numbers: dict[str, NDArray[np.float64]], channel: int) -> bytes:
+def _one(row: int, rows: Rows, layout: MessageLayout, numbers: dict[str, NDArray[np.float64]], channel: int) -> bytes:
     """Copy one record, and replace its numbers."""
     start, end = int(rows.starts[row]) - HEAD.itemsize, int(rows.starts[row] + rows.sizes[row])
     record = bytearray(rows.data[start:end].tobytes())
     struct.pack_into("<H", record, CHANNEL_AT, channel)
     for path, column in numbers.items():
-        place = template.places[path]
+        place = layout.places[path]
         at = HEAD.itemsize + place.offset
         number = np.array([column[row]], place.code).tobytes()
         record[at : at + len(number)] = number
@@ -101,14 +102,14 @@ def _one(row: int, rows: Rows, template: Template, numbers: dict[str, NDArray[np
 
 
 def new_imu(rows: Rows, truths: Truths, channel: int, time_ns: NDArray[np.int64]) -> NDArray[np.uint8]:
-    """Return records of new ROS 2 Imu messages, with the heads of the originals; parameters as of ``replaced``."""
+    """Return records of new ROS 2 Imu messages with the times and numbers of the originals' records."""
     messages = imu_table(time_ns, truths.get("accelerometer"), truths.get("gyroscope"))
     count, size = messages.shape
     heads = np.zeros(count, HEAD)
     for name in ("sequence", "log_time", "publish_time"):
         heads[name] = rows.heads[name]
-    heads["opcode"], heads["channel"], heads["length"] = MESSAGE, channel, MESSAGE_HEAD + size
-    table = np.empty((count, RECORD_HEAD + MESSAGE_HEAD + size), np.uint8)
+    heads["opcode"], heads["channel"], heads["length"] = Opcode.MESSAGE, channel, MESSAGE_HEAD + size
+    table = np.empty((count, HEAD.itemsize + size), np.uint8)
     table[:, : HEAD.itemsize] = heads.view(np.uint8).reshape(count, HEAD.itemsize)
     table[:, HEAD.itemsize :] = messages
     return table

@@ -1,0 +1,298 @@
+"""The layout of ROS messages: their definitions parsed, and where the numbers of a message lie.
+
+A definition is the text of the message's own type, then that of each type in it, each after a line of ``=`` signs and a
+line ``MSG: package/Type``. A line is ``type name``, with an optional default value, or ``type NAME=value`` (a constant,
+which is not sent); ``#`` begins a comment. ``type[3]`` is an array, ``type[]`` and ``type[<=3]`` are sequences.
+
+    CDR (ROS 2): 4 bytes of encapsulation; a number of size s lies at a multiple of s, counted from after them;
+                 a text is a 4-byte length with its closing zero
+    ROS 1      : no alignment, no encapsulation, no closing zero
+
+Only texts and sequences move the numbers after them, and each sends its length first. A layout is found by following
+the definition through one message: the places of its numbers, and the bytes that fix them (the encapsulation, every
+length, every text). Another message of the same size that agrees in those bytes has its numbers in the same places.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    from pipeline.io.mcap_chunk import Rows
+
+NUMBERS = {
+    "bool": "u1",
+    "byte": "u1",
+    "char": "u1",
+    "int8": "i1",
+    "uint8": "u1",
+    "int16": "i2",
+    "uint16": "u2",
+    "int32": "i4",
+    "uint32": "u4",
+    "int64": "i8",
+    "uint64": "u8",
+    "float32": "f4",
+    "float64": "f8",
+}
+STRING = "string"
+_SECTION = re.compile(r"^={20,}\s*$", re.MULTILINE)
+_LINE = re.compile(r"([A-Za-z][\w/]*)(?:<=\d+)?(\[(?:<=)?\d*\])?\s+([A-Za-z]\w*)\s*(=)?.*")
+_SEQUENCE = -1
+ENCAPSULATION = 4
+LITTLE_ENDIAN = b"\x00\x01\x00\x00"
+BIG_ENDIAN = b"\x00\x00"
+DEEPEST = 32  # types within types
+MOST_FIELDS = 100_000  # of one message; a definition of arrays of arrays of nothing would have no end
+
+
+@dataclass(frozen=True)
+class Field:
+    """One field: its type (a number, ``string``, or the key of a definition) and its count.
+
+    The count is the length of an array, -1 for a sequence, whose length is sent, and None for a single value.
+    """
+
+    name: str
+    type: str
+    count: int | None = None
+
+    @property
+    def sequence(self) -> bool:
+        """Whether the number of values is sent before them."""
+        return self.count == _SEQUENCE
+
+
+Definitions = dict[str, tuple[Field, ...]]
+
+ROS2_TIME: Definitions = {
+    "builtin_interfaces/Time": (Field("sec", "int32"), Field("nanosec", "uint32")),
+    "builtin_interfaces/Duration": (Field("sec", "int32"), Field("nanosec", "uint32")),
+}
+ROS1_TIME: Definitions = {
+    "time": (Field("secs", "uint32"), Field("nsecs", "uint32")),
+    "duration": (Field("secs", "int32"), Field("nsecs", "int32")),
+}
+
+
+def short_name(name: str) -> str:
+    """Return ``package/Type`` of ``package/msg/Type``."""
+    return name.replace("/msg/", "/")
+
+
+def parse_definition(name: str, text: str, given: Definitions) -> Definitions:
+    """Return the definitions in the text of the message type ``name``, and those ``given`` that it may leave out.
+
+    Raises
+    ------
+    ValueError
+        Naming the line that is no field, or the type that is not defined.
+    """
+    sections = _SECTION.split(text)
+    bodies = {short_name(name): sections[0]}
+    for section in sections[1:]:
+        head, _, body = section.strip().partition("\n")
+        if not head.startswith("MSG:"):
+            raise ValueError(f"{head!r} stands where 'MSG: package/Type' is expected")
+        bodies[short_name(head.removeprefix("MSG:").strip())] = body
+    found = dict(given)
+    for key in bodies:
+        found[key] = ()
+    for key, body in bodies.items():
+        found[key] = tuple(_fields(key, body, found))
+    return found
+
+
+def _fields(owner: str, body: str, known: Definitions) -> list[Field]:
+    fields = []
+    for number, line in enumerate(body.splitlines(), 1):
+        stripped = line.partition("#")[0].strip()
+        if not stripped:
+            continue
+        match = _LINE.fullmatch(stripped)
+        if match is None:
+            raise ValueError(f"line {number} of {owner} is no field: {line.strip()!r}")
+        kind, array, name, constant = match.groups()
+        if constant:
+            continue
+        count = None
+        if array is not None:
+            inner = array[1:-1]
+            count = int(inner) if inner.isdigit() else _SEQUENCE
+        fields.append(Field(name, _resolve(kind, owner, known), count))
+    return fields
+
+
+def _resolve(kind: str, owner: str, known: Definitions) -> str:
+    if kind in NUMBERS or kind == STRING:
+        return kind
+    package = owner.rpartition("/")[0]
+    choices = (short_name(kind), f"{package}/{kind}", *(("std_msgs/Header",) if kind == "Header" else ()))
+    for choice in choices:
+        if choice in known:
+            return str(choice)
+    raise ValueError(f"type {kind} in {owner} is not defined")
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a number lies: byte of the message, numpy's type, and length of an array (None: a single number)."""
+
+    offset: int
+    code: str
+    count: int | None
+
+
+@dataclass
+class MessageLayout:
+    """The layout of one message.
+
+    Attributes
+    ----------
+    sample : bytes
+    places : dict of str to Place
+        By path, such as ``linear_acceleration.x``.
+    texts : dict of str to str or list of str
+        The sample's texts, by path.
+    fixed : list of (start, end)
+        Bytes that another message of this layout has in common with the sample.
+    """
+
+    sample: bytes
+    places: dict[str, Place] = field(default_factory=dict)
+    texts: dict[str, str | list[str]] = field(default_factory=dict)
+    fixed: list[tuple[int, int]] = field(default_factory=list)
+
+    def matches(self, rows: Rows) -> bool:
+        """Return whether all messages have their numbers where the sample has them."""
+        if not (rows.sizes == len(self.sample)).all():
+            return False
+        words = [word for span in self.fixed for word in _words(*span)]
+        table = rows.table(self._items({f"{at}": (at, f"<u{width}") for at, width in words}))
+        expected = {f"{at}": int.from_bytes(self.sample[at : at + width], "little") for at, width in words}
+        return all(bool((table[at] == number).all()) for at, number in expected.items())
+
+    def columns(self, rows: Rows, wanted: dict[str, tuple[int, str]]) -> dict[str, NDArray[np.generic]]:
+        """Return numbers of all messages: name to (offset, type) becomes name to column, a copy."""
+        table = rows.table(self._items(wanted))
+        return {name: table[name].copy() for name in wanted}
+
+    def number(self, place: tuple[int, str]) -> float:
+        """Return a number of the sample at (offset, type)."""
+        value: float = np.frombuffer(self.sample, place[1], 1, place[0])[0].item()
+        return value
+
+    def _items(self, places: dict[str, tuple[int, str]]) -> np.dtype[np.void]:
+        """Return the type of a message of which some places are read."""
+        offsets, codes = [p[0] for p in places.values()], [p[1] for p in places.values()]
+        return np.dtype({"names": [*places], "formats": codes, "offsets": offsets, "itemsize": len(self.sample)})
+
+
+def _words(start: int, end: int) -> Iterator[tuple[int, int]]:
+    """Yield offset and size of the words of up to 8 bytes that fill a span."""
+    while start < end:
+        width = next(w for w in (8, 4, 2, 1) if w <= end - start)
+        yield start, width
+        start += width
+
+
+def find_layout(root: str, definitions: Definitions, sample: bytes, *, cdr: bool) -> MessageLayout:
+    """Return the layout of one message of the type ``root``: CDR of either byte order, or ROS 1.
+
+    Raises
+    ------
+    ValueError
+        If the message does not have exactly the bytes that its definition needs.
+    """
+    finder = _LayoutFinder(definitions, sample, cdr=cdr)
+    finder.message(root, "", 0)
+    if finder.at != len(sample):
+        raise ValueError(f"it has {len(sample)} bytes where {root} needs {finder.at}")
+    return finder.layout
+
+
+class _LayoutFinder:
+    """Follows a definition through one message; depth and number of fields are bounded, lest it never end."""
+
+    def __init__(self, definitions: Definitions, sample: bytes, *, cdr: bool) -> None:
+        self.definitions, self.sample, self.cdr = definitions, sample, cdr
+        self.layout = MessageLayout(sample)
+        self.order, self.at, self.steps = "<", 0, 0
+        if not cdr:
+            return
+        self.take(ENCAPSULATION, fixed=True)
+        if sample[:2] == BIG_ENDIAN:
+            self.order = ">"
+        elif sample[:2] != LITTLE_ENDIAN[:2]:
+            raise ValueError(f"its encapsulation is {sample[:4].hex(' ')}; plain CDR (00 00 or 00 01) is supported")
+
+    def take(self, size: int, *, fixed: bool = False) -> bytes:
+        start, end = self.at, self.at + size
+        if end > len(self.sample):
+            raise ValueError(f"it has {len(self.sample)} bytes, and its content needs at least {end}")
+        if fixed:
+            self.layout.fixed.append((start, end))
+        self.at = end
+        return self.sample[start:end]
+
+    def align(self, size: int) -> None:
+        if self.cdr:
+            self.at += -(self.at - ENCAPSULATION) % size
+
+    def length(self) -> int:
+        self.align(4)
+        number: int = struct.unpack(f"{self.order}I", self.take(4, fixed=True))[0]
+        return number
+
+    def text(self) -> str:
+        content = self.take(self.length(), fixed=True)
+        if self.cdr and content[-1:] not in (b"\0", b""):
+            raise ValueError("a text in it does not end where its length says")
+        return (content[:-1] if self.cdr else content).decode("utf-8")
+
+    def numbers(self, path: str, kind: str, count: int | None) -> None:
+        code = NUMBERS[kind]
+        size, many = int(code[1:]), 1 if count is None else count
+        if many:
+            self.align(size)
+        self.layout.places[path] = Place(self.at, self.order + code, count)
+        self.take(size * many)
+
+    def count(self) -> None:
+        self.steps += 1
+        if self.steps > MOST_FIELDS:
+            raise ValueError(f"it has more than {MOST_FIELDS} fields")
+
+    def message(self, key: str, prefix: str, depth: int) -> None:
+        if depth > DEEPEST:
+            raise ValueError(f"{key} is defined by itself")
+        self.count()
+        fields = self.definitions[key]
+        if not fields and self.cdr:
+            self.take(1)  # an empty message is sent as one byte
+        for item in fields:
+            self.field(item, prefix + item.name, depth)
+
+    def field(self, item: Field, path: str, depth: int) -> None:
+        self.count()
+        count = self.length() if item.sequence else item.count
+        if count is not None and count > len(self.sample):
+            raise ValueError(f"{path} claims {count} elements in a message of {len(self.sample)} bytes")
+        if item.type in NUMBERS:
+            self.numbers(path, item.type, count)
+        elif item.type == STRING:
+            self.layout.texts[path] = self.text() if count is None else [self.text() for _ in range(count)]
+        elif count is None:
+            self.message(item.type, f"{path}.", depth + 1)
+        else:
+            for index in range(count):
+                self.message(item.type, f"{path}[{index}].", depth + 1)
