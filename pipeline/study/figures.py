@@ -1,8 +1,13 @@
-"""The figures of a study, each with n and a 95 % interval (Wilson, Journal of the ASA 22, 1927).
+"""Scores of a study: which diagnoses are right, and shares with n and a 95 % interval.
+
+The interval of a share is that of Wilson (Journal of the ASA 22, 1927):
 
     interval = (p + z^2 / 2n -+ z sqrt(p (1 - p) / n + z^2 / 4n^2)) / (1 + z^2 / n),   z = 1.96
 
 where p is the share of n cases; that of a mean is z standard errors to either side.
+
+An effect counts as named by its look-alike where the document declares that one reproduces over 95 % of the other's
+signal.
 """
 
 from __future__ import annotations
@@ -11,8 +16,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-
-from pipeline.study import verdicts
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -23,22 +26,102 @@ Z = 1.96
 OF_WHICH = "... of those in which each stands out (lambda >= 100)"
 IN_THE_CATALOGUE = ("single", "pairs", "triples", "one_axis")
 MAY_HIDE = ("single", "small", "tiny", "one_axis", "pairs", "pairs_wander", "triples")
+ALIKE = 0.95
+EXCESS = 0.05
+STANDS_OUT = 100.0
+DOUBTFUL = ("reference_in_doubt", "unexplained", "floor_in_doubt")
+
+
+def named(hidden: str, said: JSON, name: str) -> bool:
+    """Return whether a selected effect is the hidden one or declares that it looks like it."""
+    return name == hidden or said["look_alikes"].get(name, {}).get(hidden, 0.0) > ALIKE
+
+
+def first_is_right(truth: JSON, said: JSON) -> bool:
+    """Return whether the hidden effect, or its declared look-alike, was selected first."""
+    return bool(said["selected"]) and named(next(iter(truth["hidden"])), said, said["selected"][0])
+
+
+def exact(truth: JSON, said: JSON) -> bool:
+    """Return whether the hidden effects, or declared look-alikes, are exactly what was selected."""
+    hidden, selected = list(truth["hidden"]), list(said["selected"])
+    for name in [n for n in hidden if n in selected]:
+        hidden.remove(name)
+        selected.remove(name)
+    for name in list(hidden):
+        alike = next((s for s in selected if named(name, said, s)), None)
+        if alike is not None:
+            hidden.remove(name)
+            selected.remove(alike)
+    return not hidden and not selected
+
+
+def nothing_selected(truth: JSON, said: JSON) -> bool:
+    """Return whether nothing was selected."""
+    del truth
+    return not said["selected"]
+
+
+def not_seen(truth: JSON, said: JSON) -> bool:
+    """Return whether an effect that cannot be seen is listed as not observable, and was not selected."""
+    name = next(iter(truth["hidden"]))
+    return name in said["not_observable"] and name not in said["selected"]
+
+
+def warned(said: JSON) -> bool:
+    """Return whether a warning is said: a doubtful verdict, beyond the data sheet, or more wander than expected."""
+    return bool(said["verdict"] in DOUBTFUL or not said["plausible"] or said["inflated"])
+
+
+def not_silent(truth: JSON, said: JSON) -> bool:
+    """Return whether no effect was reported, or only with a warning; for what the catalogue does not hold."""
+    del truth
+    return not said["selected"] or warned(said)
+
+
+def said_so(truth: JSON, said: JSON) -> bool:
+    """Return whether physics that is not in the catalogue was called unexplained, or warned of."""
+    del truth
+    return warned(said)
+
+
+def hard_to_replace(truth: JSON, said: JSON) -> bool:
+    """Return whether the whole catalogue names the effect and no other one has a share of over 0.95 of it."""
+    name = truth["left_out"][0]
+    whole = said["whole"]
+    return bool(whole["selected"][:1] == [name]) and max(whole["look_alikes"][name].values(), default=0.0) <= ALIKE
+
+
+def excess_gone(said: JSON) -> float | None:
+    """Return the share of the held-out excess over the noise floor that is gone; None where it is under 5 %."""
+    held = said.get("held_out")
+    if not held or held["before"] < (1.0 + EXCESS) * held["floor"]:
+        return None
+    return float((held["before"] - held["after"]) / (held["before"] - held["floor"]))
+
+
+def stands_out(truth: JSON) -> bool:
+    """Return whether each hidden effect leaves a signal of lambda >= 100 beside the others; see ``signal_left``."""
+    left = truth.get("signal_left") or {}
+    return bool(left) and min(left.values()) >= STANDS_OUT
+
+
 # Family, what is counted, how it is judged, goal.
 PLAN: list[tuple[str, str, Callable[[JSON, JSON], bool], str]] = [
-    ("single", "one effect at its data sheet's size: named first", verdicts.first_is_right, ">= 98 %"),
-    ("single", "... and nothing else named", verdicts.exact, ""),
-    ("small", "one effect, x0.3: named first", verdicts.first_is_right, ""),
-    ("tiny", "one effect, x0.1: named first", verdicts.first_is_right, ""),
-    ("one_axis", "one effect on one axis: named first", verdicts.first_is_right, ""),
-    ("staged", "one effect, base calibrated stage by stage: named first", verdicts.first_is_right, ""),
-    ("lost", "one effect, a tenth of the samples lost: named first", verdicts.first_is_right, ""),
-    ("coarse", "one effect, temperature in steps of 0.5 degC: named first", verdicts.first_is_right, ""),
-    ("cold", "one effect, no temperature: named first", verdicts.first_is_right, ""),
-    ("pairs", "two effects: exactly these", verdicts.exact, ">= 95 %"),
-    ("pairs_wander", "two effects, five times the wander: exactly these", verdicts.exact, ">= 85 %"),
-    ("triples", "three effects: exactly these", verdicts.exact, ""),
-    ("unseen", "cannot be seen: said so, and not selected", verdicts.not_seen, "100 %"),
-    ("removed", "taken out of the catalogue: no other one without a warning", verdicts.not_silent, ">= 95 %"),
+    ("single", "one effect at its data sheet's size: named first", first_is_right, ">= 98 %"),
+    ("single", "... and nothing else named", exact, ""),
+    ("small", "one effect, x0.3: named first", first_is_right, ""),
+    ("tiny", "one effect, x0.1: named first", first_is_right, ""),
+    ("one_axis", "one effect on one axis: named first", first_is_right, ""),
+    ("staged", "one effect, base calibrated stage by stage: named first", first_is_right, ""),
+    ("lost", "one effect, a tenth of the samples lost: named first", first_is_right, ""),
+    ("coarse", "one effect, temperature in steps of 0.5 degC: named first", first_is_right, ""),
+    ("cold", "one effect, no temperature: named first", first_is_right, ""),
+    ("pairs", "two effects: exactly these", exact, ">= 95 %"),
+    ("pairs_wander", "two effects, five times the wander: exactly these", exact, ">= 85 %"),
+    ("triples", "three effects: exactly these", exact, ""),
+    ("unseen", "cannot be seen: said so, and not selected", not_seen, "100 %"),
+    ("removed", "taken out of the catalogue: no other one without a warning", not_silent, ">= 95 %"),
 ]
 
 
@@ -109,17 +192,15 @@ def all_figures(cases: Sequence[Pair]) -> list[Figure]:
     for family, name, right, goal in PLAN:
         pairs = by_family.get(family, [])
         if family == "removed":
-            pairs = [p for p in pairs if "error" in p[1] or verdicts.hard_to_replace(*p)]
+            pairs = [p for p in pairs if "error" in p[1] or hard_to_replace(*p)]
         found.append(share(name, pairs, right, goal))
-        able = [pair for pair in pairs if verdicts.stands_out(pair[0])]
+        able = [pair for pair in pairs if stands_out(pair[0])]
         if family in MAY_HIDE and len(able) < len(pairs):
             found.append(share(OF_WHICH, able, right, ""))
     for family, pairs in by_family.items():
         if is_null(pairs[0][0]):
             noise = family.removeprefix("null_")
-            found.append(
-                share(f"nothing hidden, {noise}: nothing selected", pairs, verdicts.nothing_selected, ">= 99 %")
-            )
+            found.append(share(f"nothing hidden, {noise}: nothing selected", pairs, nothing_selected, ">= 99 %"))
     return [figure for figure in found if figure.total]
 
 
@@ -143,7 +224,7 @@ class Mean:
 
 def mean_excess_gone(cases: Iterable[Pair]) -> Mean:
     """Return the mean over the units whose held-out excess is over 5 % of the noise floor."""
-    gone = [verdicts.excess_gone(said) for _, said in cases if "error" not in said]
+    gone = [excess_gone(said) for _, said in cases if "error" not in said]
     values = np.array([value for value in gone if value is not None])
     if len(values) < 2:
         return Mean(float("nan"), float("nan"), float("nan"), len(values))

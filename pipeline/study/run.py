@@ -1,28 +1,43 @@
-"""Run the cases of a study, in some processes, and keep what was said.
+"""Run the cases of a study in several processes, and store what the diagnosis says of each.
 
     <directory>/truth.jsonl      what is hidden in each case, and how far it stands out of the noise
     <directory>/results.jsonl    what the diagnosis said of it, and a digest of the code that said it
 
 A case whose result is there is not run again, so that a study can be interrupted and made larger.
+
+A result holds the diagnosis and the held-out error after adding what it selects. The diagnosis gets recordings and the configuration of a unit as the product composes it, never the truth; every step is
+the function that the stage of a run calls.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import time
 from concurrent.futures import ProcessPoolExecutor
+from functools import cache
+from importlib import import_module
 from multiprocessing import get_context
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-from pipeline.config import code_digest
+from pipeline.config import code_digest, load_campaign
+from pipeline.diagnosis.diagnose import diagnose
 from pipeline.errors import ConfigurationError
-from pipeline.study.cases import draw
-from pipeline.study.judge import judge
-from pipeline.study.signal_left import signals_left
+from pipeline.estimation.effects_stage import fit_effects
+from pipeline.estimation.noise import estimate_noise
+from pipeline.model.effects import leaving_out
+from pipeline.records import SENSORS
+from pipeline.study.bench import recordings_of, signals_left
+from pipeline.study.cases import REFERENCE, draw
+from pipeline.validation.heldout import validate
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
-    from pathlib import Path
+
+    from pipeline.records import Noise, Recording, SensorCalibration
+    from pipeline.study.cases import Case
 
 TRUTH, RESULTS = "truth.jsonl", "results.jsonl"
 JSON = dict[str, Any]
@@ -60,7 +75,7 @@ def run_study(
     directory.mkdir(parents=True, exist_ok=True)
     _refuse_another_seed(directory / TRUTH, seed)
     done = {line["key"] for line in read_lines(directory / RESULTS)}
-    code = code_digest("pipeline.study.judge")
+    code = code_digest("pipeline.study.run")
     planned: list[Planned] = [(family, number, seed) for number in range(count) for family in families]
     planned = [item for item in planned if draw(*item).key not in done]
     with (
@@ -108,3 +123,108 @@ def read_lines(path: Path) -> list[JSON]:
     if not path.is_file():
         return []
     return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line]
+
+
+HELD_OUT = ("single", "pairs", "triples", "one_axis", "shape", "cycle")
+
+
+def judge(case: Case) -> list[JSON]:
+    """Return what is said of a case: one entry, or one for each sensor where nothing is hidden.
+
+    Parameters
+    ----------
+    case : Case
+    """
+    recordings = recordings_of(case)
+    sensors = SENSORS if case.kind == "null" else (case.sensor,)
+    out = []
+    for sensor in sensors:
+        began = time.process_time()
+        said = say(recordings, case.model, sensor, case.left_out, case.method)
+        said |= {"key": case.key, "sensor": sensor, "cpu_s": time.process_time() - began}
+        if case.left_out:
+            said["whole"] = say(recordings, case.model, sensor, (), case.method)
+        if case.kind in HELD_OUT:
+            said["held_out"] = held_out(recordings, case.model, sensor, said["selected"], case.method)
+        out.append(said)
+    return out
+
+
+def say(
+    recordings: list[Recording], model: str, sensor: str, left_out: Sequence[str] = (), method: str = REFERENCE
+) -> JSON:
+    """Return the diagnosis of recordings, as far as a study judges it.
+
+    Parameters
+    ----------
+    recordings : list of Recording
+    model, sensor : str
+    left_out : sequence of str
+        Effects that the catalogue is left without.
+    method : str
+        By which the base is calibrated.
+    """
+    settings = settings_of(model, method)
+    noise = estimate_noise(sensor, recordings, settings["sensor"][sensor])
+    calibration = calibrated(recordings, sensor, settings)
+    with leaving_out(left_out):
+        document = diagnose(calibration, recordings, noise, settings)
+    entries = {entry["effect"]: entry for entry in document["ranking"]}
+    return {
+        "verdict": document["verdict"],
+        "selected": document["selected"],
+        "plausible": all(entries[name]["plausible"] for name in document["selected"]),
+        "inflated": bool((document["wander"] or {}).get("inflated")),
+        "look_alikes": {
+            name: {alike["effect"]: alike["share"] for alike in entries[name]["look_alikes"]}
+            for name in document["selected"]
+        },
+        "not_observable": [entry["effect"] for entry in document["not_observable"]],
+        "unexplained": [entry["covariate"] for entry in document["unexplained"]],
+        "residual_over_noise": document["residual_over_noise"],
+        "delta_bic": [entries[name]["delta_bic"] for name in document["selected"]],
+    }
+
+
+def calibrated(recordings: list[Recording], sensor: str, settings: JSON) -> SensorCalibration:
+    """Return the calibration after all stages of the configured method."""
+    found: SensorCalibration | None = None
+    for stage in settings["method"]["stages"][sensor]:
+        found = import_module(f"pipeline.estimation.{sensor}.{stage}").fit(recordings, found, settings)
+    assert found is not None  # noqa: S101  (every method has a stage)
+    return found
+
+
+def held_out(
+    recordings: list[Recording], model: str, sensor: str, names: Sequence[str], method: str = REFERENCE
+) -> JSON:
+    """Return the held-out error before and after the effects are added, and the floor.
+
+    The vector error where the attitude is logged, else that of the magnitude.
+    """
+    settings = settings_of(model, method)
+    noise = estimate_noise(sensor, recordings, settings["sensor"][sensor])
+    plain = calibrated(recordings, sensor, settings)
+    adding = {**settings, "effects": {**settings["effects"], sensor: list(names)}}
+    before, floor = _error(plain, recordings, noise, settings)
+    full = fit_effects(sensor, recordings, plain, adding)
+    after = _error(full, recordings, noise, adding)[0] if names else before
+    return {"before": before, "after": after, "floor": floor}
+
+
+def _error(
+    calibration: SensorCalibration, recordings: list[Recording], noise: Noise, settings: JSON
+) -> tuple[float, float]:
+    found = validate(calibration, recordings, noise, settings)
+    last = found["steps"][-1]
+    if last["vector_rms_error"] is not None and found["vector_noise_floor"] is not None:
+        return last["vector_rms_error"], found["vector_noise_floor"]
+    return last["rms_error"], found["noise_floor"]
+
+
+@cache
+def settings_of(model: str, method: str = REFERENCE) -> JSON:
+    """Return the configuration of a unit as a run composes and checks it; everything else is the default."""
+    with TemporaryDirectory() as folder:
+        (Path(folder) / "units.csv").write_text(f"unit,sensor,method\nU1,{model},{method}\n", encoding="utf-8")
+        return load_campaign({"campaign": folder}).units["U1"].config

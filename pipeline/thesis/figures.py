@@ -19,9 +19,8 @@ from pipeline.report.numbers import number
 from pipeline.report.shapes import Samples
 from pipeline.report.svg import Panel, chart
 from pipeline.thesis.conclusions import Errors
-from pipeline.thesis.recorded import CAUSES
 from pipeline.thesis.results import CONTINUOUS, DEVICES, RATES, STOPS, in_words, procedure_of
-from pipeline.thesis.seeds import device_of
+from pipeline.thesis.seeds import CAUSES, device_of
 from pipeline.thesis.tables import read_printed
 from pipeline.validation.samples import samples_of_motion
 
@@ -31,8 +30,8 @@ if TYPE_CHECKING:
 
     from pipeline.records import Noise
     from pipeline.report.shapes import Layer
+    from pipeline.thesis.agreement import Scatter
     from pipeline.thesis.results import Results
-    from pipeline.thesis.scatter import Scatter
     from pipeline.thesis.seeds import Row
 
 PROCEDURES = {"accelerometer": (*STOPS, *CONTINUOUS), "gyroscope": RATES}

@@ -28,7 +28,7 @@ from pipeline.records import SENSORS
 from pipeline.study.bench import recordings_of
 from pipeline.study.cases import FAMILIES, Case, draw
 from pipeline.study.figures import wilson
-from pipeline.study.judge import settings_of
+from pipeline.study.run import settings_of
 from pipeline.validation.heldout import validate
 
 DOUBTS = ("reference_in_doubt", "floor_in_doubt")

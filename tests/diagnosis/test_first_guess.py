@@ -30,7 +30,7 @@ from pipeline.model.effects.files import effect_from
 from pipeline.records import Recording, SensorCalibration
 from pipeline.signal.temperature import smooth_temperature
 from pipeline.study.cases import draw
-from pipeline.study.judge import judge
+from pipeline.study.run import judge
 
 SHEET = yaml.safe_load((Path(__file__).parents[2] / "configs/sensor/mpu6050.yaml").read_text(encoding="utf-8"))
 TABLE = {"gravity_g": 1.0, "latitude_deg": None, "azimuth_deg": None}

@@ -14,11 +14,9 @@ from pipeline.errors import ConfigurationError
 from pipeline.model.effects import catalogue
 from pipeline.records import SENSORS
 from pipeline.study.bench import recordings_of
-from pipeline.study.cases import FAMILIES, Case, draw
-from pipeline.study.judge import judge, say
-from pipeline.study.run import read_lines
-from pipeline.study.sizes import SIZES
-from pipeline.study.verdicts import exact, first_is_right, not_seen
+from pipeline.study.cases import FAMILIES, SIZES, Case, draw
+from pipeline.study.figures import exact, first_is_right, not_seen
+from pipeline.study.run import judge, read_lines, say
 
 if TYPE_CHECKING:
     from pathlib import Path

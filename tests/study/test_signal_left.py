@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipeline.study.bench import signals_left, whiten
 from pipeline.study.cases import Case, draw
-from pipeline.study.signal_left import signals_left, whiten
 
 WHITE, WANDER, TIME = 0.4, 0.3, 5.0
 

@@ -7,10 +7,19 @@ from typing import Any
 import pytest
 from scipy.stats import binomtest
 
-from pipeline.study.figures import all_figures, in_the_catalogue, joined, mean_excess_gone, wilson
-from pipeline.study.page import page
-from pipeline.study.tables import by_signal, confusions, found_at, instead, of_shapes
-from pipeline.study.verdicts import exact, excess_gone, first_is_right, hard_to_replace, not_silent
+from pipeline.study.figures import (
+    all_figures,
+    exact,
+    excess_gone,
+    first_is_right,
+    hard_to_replace,
+    in_the_catalogue,
+    joined,
+    mean_excess_gone,
+    not_silent,
+    wilson,
+)
+from pipeline.study.page import by_signal, confusions, found_at, instead, of_shapes, page
 
 
 def said(*selected: str, key: str = "single-00000", **more: Any) -> dict[str, Any]:

@@ -17,8 +17,8 @@ from pipeline.records import Noise, Recording, SensorCalibration, coverage_facto
 from pipeline.signal.filters import apply_filter
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import read_description
+from pipeline.thesis.agreement import TRUE_SCALE
 from pipeline.thesis.results import DEVICES, procedure_of, set_of
-from pipeline.thesis.scatter import TRUE_SCALE
 from pipeline.thesis.seeds import FOUND, read_rows, study
 from pipeline.thesis.tables import Cell, read_printed
 from pipeline.validation.samples import samples_of_motion

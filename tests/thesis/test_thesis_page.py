@@ -8,12 +8,10 @@ import pytest
 
 from pipeline.records import Recording
 from pipeline.signal.filters import apply_filter
-from pipeline.thesis.agreement import agreements
+from pipeline.thesis.agreement import agreements, scatters
 from pipeline.thesis.conclusions import CONFIRMED, REFUTED, conclusions, gain_of_filter
-from pipeline.thesis.explanations import EXPLANATIONS, key_of
-from pipeline.thesis.page import all_tables, render
+from pipeline.thesis.page import EXPLANATIONS, all_tables, key_of, render
 from pipeline.thesis.results import Results
-from pipeline.thesis.scatter import scatters
 from pipeline.thesis.seeds import INTERVAL_S, TIME_CONSTANT_S, read_rows, sets_of
 
 CAMPAIGN = Path(__file__).parents[2] / "data" / "thesis"
