@@ -27,9 +27,9 @@ where
     W : the whitening filter of the true white noise and bias wander (Kalman's, for a first-order Gauss-Markov process)
     P : the projection onto bias, truth and what each other hidden effect adds, all whitened
 
-A test with known noise and equation gains lambda in 2 log L on average, against the k log N + 10 (40 to 100) that a selection asks of k
-parameters. The rounding to whole counts differs between the two units and adds c^2 / 6 a sample on average, where c is
-one count; it is taken off.
+A test with known noise and equation gains lambda in 2 log L on average, against the k log N + 10 (40 to 100) that a
+selection asks of k parameters. The rounding to whole counts differs between the two units and adds c^2 / 6 a sample on
+average, where c is one count; it is taken off.
 """
 
 from __future__ import annotations

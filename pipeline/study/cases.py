@@ -14,9 +14,10 @@ Every case follows from its family, number and the study's seed. Families:
     cycle_<shape>        a form of the temperature's, in a room that warms and cools by some degrees
     staged               one effect, in a unit whose base is calibrated stage by stage
 
-Effects have the size of the data sheet. Sizes of the MPU-6050 are those of the MPU-6000/6050 product specification 3.4, of the STIM300 those of its data sheet
-TS1524 and of the STIM210's gyroscopes, both as far as they say; the others are engineering assumptions. One number is
-for all parameters, with random signs. A lag is at least the shortest that the register map knows.
+Effects have the size of the data sheet. Sizes of the MPU-6050 are those of the MPU-6000/6050 product specification 3.4,
+of the STIM300 those of its data sheet TS1524 and of the STIM210's gyroscopes, both as far as they say; the others are
+engineering assumptions. One number is for all parameters, with random signs. A lag is at least the shortest that the
+register map knows.
 """
 
 from __future__ import annotations

@@ -5,8 +5,9 @@
 
 A case whose result is there is not run again, so that a study can be interrupted and made larger.
 
-A result holds the diagnosis and the held-out error after adding what it selects. The diagnosis gets recordings and the configuration of a unit as the product composes it, never the truth; every step is
-the function that the stage of a run calls.
+A result holds the diagnosis and the held-out error after adding what it selects. The diagnosis gets recordings and the
+configuration of a unit as the product composes it, never the truth; every step is the function that the stage of a run
+calls.
 """
 
 from __future__ import annotations

@@ -10,7 +10,8 @@ other : the median of what was printed (accelerometer's bias: the printed ones d
     0.006 g), the true scale factors (O M S), the printed row (gyroscope), or the staged method on the same recordings
     (Cholesky and LU, as a share of the expanded uncertainty of the difference)
 
-The share of the printed scatter of O and S that follows from picking the largest samples: of a device, over its printed rows and the axes y and z (x is the reference of O),
+The share of the printed scatter of O and S that follows from picking the largest samples: of a device, over its printed
+rows and the axes y and z (x is the reference of O),
 
     D_O = sqrt(mean (1 - O)^2),    D_S = sqrt(mean (S M - S_0)^2)
 
