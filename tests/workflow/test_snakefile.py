@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from .conftest import ROOT, Bench
+from .schemas import validator, violations
 
 pytestmark = pytest.mark.workflow
 
@@ -73,6 +74,22 @@ def test_a_report_of_snakemake_holds_every_page(bench: Bench) -> None:
         text = report.read(index).decode()
     assert {"index.html", "summary.csv", "A1.html", "A2.html", "B1.html"} <= names
     assert all(re.search(rf'"unit": ?"{unit}"', text) for unit in ("A1", "A2", "B1"))
+
+
+def test_the_published_files_are_as_their_schemas_say_and_others_are_not(bench: Bench) -> None:
+    assert violations(bench.results) == []
+    calibration = json.loads((bench.results / "calibrations" / "A1.json").read_text())
+    for key, wrong in (("bias", [0.0, 0.0]), ("matrix", [[1.0]]), ("unit", "mg"), ("covariance", None)):
+        assert not validator("calibration").is_valid(
+            calibration | {"gyroscope": calibration["gyroscope"] | {key: wrong}}
+        )
+
+
+def test_lint_finds_nothing_but_what_the_workflows_readme_justifies(bench: Bench) -> None:
+    found = set(re.findall(r"^    \* (.+?):?(?: in line .*)?$", bench.snakemake("--lint").output, re.MULTILINE))
+    readme = (ROOT / "workflow" / "README.md").read_text()
+    assert found
+    assert not [finding for finding in found if finding.rstrip(".:") not in readme]
 
 
 def test_an_unchanged_second_run_does_nothing(bench: Bench) -> None:
@@ -140,6 +157,7 @@ def test_one_bad_unit_leaves_nine_calibrated_and_is_named_at_the_end(ten: Bench)
     assert [r["unit"] for r in rows if r["status"] == "ok"] == [f"U{i}" for i in range(10) if i != 3]
     failed = json.loads((ten.results / "calibrations" / "U3.json").read_text())
     assert failed["status"] == "failed"
+    assert violations(ten.results) == []
     assert failed["error"]["file"].endswith("gyro_y.csv:41")
     assert "broken" in failed["error"]["message"]
     assert "U3" in (ten.results / "index.html").read_text()

@@ -9,6 +9,10 @@ rule calibration:
         directory(f"{BATCH}/calibration"),
     log:
         f"{LOG}/calibration.log",
+    threads: 1
+    resources:
+        mem_mb=1000,
+        runtime=10,
     params:
         config=settings_of("calibration"),
         code=code_digest("pipeline.stages.calibration"),

@@ -16,9 +16,8 @@ from snakemake.settings.types import Quietness
 if Path(workflow.basedir, "pipeline").is_dir():
     # A clone: jobs run this copy of the package from any working directory, and keep the user's own path.
     sys.path.insert(0, workflow.basedir)
-    os.environ["PYTHONPATH"] = os.pathsep.join(
-        filter(None, [workflow.basedir, os.environ.get("PYTHONPATH")])
-    )
+    own = [workflow.basedir, os.getenv("PYTHONPATH", "")]
+    os.environ.update(PYTHONPATH=os.pathsep.join(filter(None, own)))
 
 from pipeline.config import code_digest, load_campaign, settings_file
 from pipeline.errors import PipelineError
@@ -130,6 +129,60 @@ def last_fit(sensor):
     return (
         lambda wildcards: f"{BATCH}/fit/{sensor}/{CAMPAIGN.chains[wildcards.batch][sensor][-1]}"
     )
+
+
+def stage_before(wildcards):
+    chain = CAMPAIGN.chains[wildcards.batch][wildcards.sensor]
+    i = chain.index(wildcards.stage)
+    return f"{BATCH}/fit/{{sensor}}/{chain[i - 1]}".format(**wildcards) if i else []
+
+
+def settings_of_fit(wildcards):
+    stage = "effects" if wildcards.stage == "effects" else f"fit-{wildcards.stage}"
+    output = "batches/{batch}/fit/{sensor}/{stage}".format(**wildcards)
+    return settings_path(
+        stage, CAMPAIGN.batches[wildcards.batch], output, wildcards.sensor
+    )
+
+
+def code_of_fit(wildcards):
+    modules = (
+        "pipeline.stages.fit",
+        f"pipeline.estimation.{wildcards.sensor}.{wildcards.stage}",
+    )
+    return "".join(code_digest(module) for module in modules)
+
+
+def is_last_stage(wildcards):
+    chain = CAMPAIGN.chains[wildcards.batch][wildcards.sensor]
+    return "yes" if wildcards.stage == chain[-1] else "no"
+
+
+def recordings(wildcards):
+    """Return a digest of which recordings a batch has, how large and how old: they are too many to be told one by one."""
+    digest = hashlib.sha256()
+    for unit in [] if CAMPAIGN.simulation else CAMPAIGN.batches[wildcards.batch]:
+        config = CAMPAIGN.units[unit].config
+        files = recording_files(
+            config["procedure"], config["ingest"], CAMPAIGN.folder(unit)
+        )
+        for path in sorted({path for paths in files.values() for path in paths}):
+            found = path.stat()
+            digest.update(f"{path}\0{found.st_size}\0{found.st_mtime_ns}\0".encode())
+    return digest.hexdigest()[:16]
+
+
+def pages(wildcards):
+    """Return the published pages that exist, for `snakemake --report`."""
+    shown = {
+        "index.html": dict(category="Campaign", labels={"page": "the campaign"}),
+        "summary.csv": dict(category="Campaign", labels={"page": "one row a unit"}),
+        "reports": dict(
+            patterns=["{unit}.html"], category="Units", labels={"unit": "{unit}"}
+        ),
+    }
+    paths = {f"{RESULTS}/{name}": options for name, options in shown.items()}
+    return [report(p, **o) for p, o in paths.items() if os.path.exists(p)]
 
 
 def of_batches(stage):

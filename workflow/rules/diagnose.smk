@@ -9,6 +9,10 @@ rule diagnose:
         directory(f"{BATCH}/diagnose"),
     log:
         f"{LOG}/diagnose.log",
+    threads: 1
+    resources:
+        mem_mb=1000,
+        runtime=10,
     params:
         config=settings_of("diagnose"),
         code=code_digest("pipeline.stages.diagnose"),

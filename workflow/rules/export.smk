@@ -7,6 +7,10 @@ rule export:
         directory(f"{BATCH}/export"),
     log:
         f"{LOG}/export.log",
+    threads: 1
+    resources:
+        mem_mb=1000,
+        runtime=10,
     params:
         config=settings_of("export"),
         code=code_digest("pipeline.stages.export"),

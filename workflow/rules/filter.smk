@@ -6,6 +6,10 @@ rule filter:
         directory(f"{BATCH}/filter"),
     log:
         f"{LOG}/filter.log",
+    threads: 1
+    resources:
+        mem_mb=1000,
+        runtime=10,
     params:
         config=settings_of("filter"),
         code=code_digest("pipeline.stages.filter"),

@@ -10,21 +10,12 @@ rule gather:
         f"{RESULTS}/batches/gathered.json",
     log:
         f"{RESULTS}/logs/gather.log",
+    threads: 1
+    resources:
+        mem_mb=1000,
+        runtime=10,
     params:
         config=lambda wildcards: settings_path("gather", list(CAMPAIGN.units), ""),
         code=code_digest("pipeline.stages.gather"),
     shell:
         "{RUN} gather --config {params.config:q} --output {output:q} > {log:q} 2>&1"
-
-
-def pages(wildcards):
-    """Return the published pages that exist, for `snakemake --report`."""
-    shown = {
-        "index.html": dict(category="Campaign", labels={"page": "the campaign"}),
-        "summary.csv": dict(category="Campaign", labels={"page": "one row a unit"}),
-        "reports": dict(
-            patterns=["{unit}.html"], category="Units", labels={"unit": "{unit}"}
-        ),
-    }
-    paths = {f"{RESULTS}/{name}": options for name, options in shown.items()}
-    return [report(p, **o) for p, o in paths.items() if os.path.exists(p)]

@@ -10,6 +10,10 @@ rule report:
         directory(f"{BATCH}/report"),
     log:
         f"{LOG}/report.log",
+    threads: 1
+    resources:
+        mem_mb=1000,
+        runtime=10,
     params:
         config=settings_of("report"),
         code=code_digest("pipeline.stages.report"),

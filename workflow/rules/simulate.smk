@@ -10,6 +10,10 @@ if CAMPAIGN.simulation:
             directory(SIMULATED),
         log:
             f"{RESULTS}/logs/simulate.log",
+        threads: 1
+        resources:
+            mem_mb=1000,
+            runtime=10,
         params:
             code=code_digest("pipeline.commands.simulate"),
         shell:

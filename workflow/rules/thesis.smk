@@ -24,6 +24,10 @@ if CAMPAIGN.page == "thesis":
             ),
         log:
             f"{RESULTS}/logs/thesis.log",
+        threads: 1
+        resources:
+            mem_mb=1000,
+            runtime=10,
         params:
             campaign=lambda wildcards: str(CAMPAIGN.directory),
             code=code_digest("pipeline.thesis.page"),

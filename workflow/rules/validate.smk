@@ -8,6 +8,10 @@ rule validate:
         directory(f"{BATCH}/validate"),
     log:
         f"{LOG}/validate.log",
+    threads: 1
+    resources:
+        mem_mb=1000,
+        runtime=10,
     params:
         config=settings_of("validate"),
         code=code_digest("pipeline.stages.validate"),

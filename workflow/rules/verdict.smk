@@ -7,6 +7,10 @@ rule verdict:
         f"{RESULTS}/complete.json",
     log:
         f"{RESULTS}/logs/verdict.log",
+    threads: 1
+    resources:
+        mem_mb=1000,
+        runtime=10,
     params:
         results=lambda wildcards: str(CAMPAIGN.results),
     shell:
