@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.diagnosis.advice import UNKNOWN
 from pipeline.diagnosis.observability import LEAST_SPAN_DEGC
+from pipeline.diagnosis.words import UNKNOWN
 from pipeline.estimation.multi_position.model import refusal
 from pipeline.estimation.selection import GATE_BIC
 from pipeline.model.effects import catalogue

@@ -1,7 +1,15 @@
 """Which physical effect is missing: a sensor's part of ``diagnoses/<unit>.json``.
 
 The selection itself is ``pipeline.estimation.selection``; here it becomes a document: the ranking of every candidate
-with what else would look alike, what cannot be seen in these recordings, what remains unexplained, and what to do next.
+with its look-alikes, what cannot be seen in these recordings, what remains unexplained, and what to do next.
+
+Held-out errors of the selection's own fits are the rms length of ``matrix (reading - model)`` where the attitude is
+logged, else the rms error of the magnitude, against the noise floor of ``pipeline.validation.heldout``.
+
+A noise model with bias wander can take up a missing effect. So the fitted wander, ``sigma = q s`` with its ratio q to
+the white noise s, is compared with that of the rests or the data sheet:
+
+    inflated:   sigma > 3 sigma_expected   and   log L(best) - max {log L(q, tau): q s <= 3 sigma_expected} > 5
 """
 
 from __future__ import annotations
@@ -11,22 +19,24 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.diagnosis.advice import next_experiment
-from pipeline.diagnosis.first_guess import select_beside, suggested_effect, unexplained
-from pipeline.diagnosis.held_out import held_out_error, held_out_floor
+from pipeline.diagnosis.functional_form_search import select_with_form, suggested_effect, unexplained
 from pipeline.diagnosis.method_errors import method_errors
 from pipeline.diagnosis.observability import facts_of, not_observable
-from pipeline.diagnosis.pictures import pictures
-from pipeline.diagnosis.verdict import evidence_of, judged
-from pipeline.diagnosis.wander import fitted_wander
+from pipeline.diagnosis.residual_plots import plots
+from pipeline.diagnosis.verdict import evidence_of, judged, verdict_of_selection
+from pipeline.diagnosis.words import next_experiment
 from pipeline.errors import NotObservableError
 from pipeline.estimation.design import Start, Term
 from pipeline.estimation.effects_stage import AUTO
 from pipeline.estimation.joint import calibration_of, fit_terms
 from pipeline.estimation.multi_position.rests import by_hand
 from pipeline.estimation.observations import observe
-from pipeline.estimation.selection import FAR_ABOVE, GATE_BIC, select
+from pipeline.estimation.selection import FAR_ABOVE, GATE_BIC, INFLATED, select
 from pipeline.model.effects import catalogue, effect
+from pipeline.records import Noise
+from pipeline.validation.error_breakdown import with_known_effects
+from pipeline.validation.heldout import noise_floors
+from pipeline.validation.samples import samples_of_motion
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -36,14 +46,13 @@ if TYPE_CHECKING:
     from pipeline.estimation.joint import Fit
     from pipeline.estimation.ranking import Score
     from pipeline.estimation.selection import Selection
-    from pipeline.records import Noise, Recording, SensorCalibration
+    from pipeline.records import Recording, SensorCalibration
+    from pipeline.validation.samples import Samples
 
-ALIKE = 0.8
-MOSTLY = 0.5
-BELIEVED = 3  # effects at once; a longer chain is what the catalogue makes of physics that it does not hold
-UNKNOWN_SHARE = 0.03  # of the gain in 2 log L by what was selected, above which what is left is worth naming
-WORSE = 0.3  # of the noise's mean square, that the held-out error's must not rise by with what was selected
+ALIKE = 0.8  # share of an effect's signal that another reproduces, from which on it is a look-alike
 CLOSE = 1.1  # mean square of a residual over that of noise, under which there is no excess to share
+EVIDENCE = 5.0  # difference in log L: a Bayes factor of 150, "very strong" (Kass and Raftery, JASA 90, 1995)
+LEAST_RATIO = 0.03  # of the white noise: the smallest wander of the selection's settings
 
 
 def diagnose(
@@ -77,8 +86,9 @@ def diagnose(
     dict
         ``verdict, reason`` (``pipeline.diagnosis.verdict``), ``residual_over_noise, selected, ranking, not_observable,
         unexplained, next_experiment, override``; beside these ``configured, suggested_effect``
-        (``pipeline.diagnosis.first_guess``), ``wander`` (``...wander``), ``held_out`` (``error_before, error_after,
-        floor``), ``pictures`` (``...pictures``) and ``method_errors`` (``...method_errors``).
+        (``pipeline.diagnosis.functional_form_search``), ``wander`` (``ratio, time_s, standard_deviation, expected,
+        inflated``), ``held_out`` (``error_before, error_after, floor``), ``pictures`` (``...residual_plots``) and
+        ``method_errors`` (``...method_errors``).
     """
     sensor = calibration.sensor
     if by_hand(sensor, recordings):
@@ -94,13 +104,13 @@ def diagnose(
         nothing = _nothing(sensor, configured, reason.message)
         return judged(nothing, evidence_of(nothing, sensor, recordings, noise, settings, validation))
     unknown = unexplained(selection)
-    beside = select_beside(selection, unknown, configured, noise, settings["sensor"][sensor])
-    document = _document(beside, unknown, configured, recordings, noise, table=settings["table"])
+    reported = select_with_form(selection, unknown, configured, noise, settings["sensor"][sensor])
+    document = _document(reported, unknown, configured, recordings, noise, table=settings["table"])
     document |= {
-        "suggested_effect": None if beside is selection else suggested_effect(unknown, sensor, catalogue()),
+        "suggested_effect": None if reported is selection else suggested_effect(unknown, sensor, catalogue()),
         "residual_over_noise": _over_noise(selection.base, recordings, noise),
-        "pictures": pictures(selection, unknown, noise, beside),
-        "method_errors": method_errors(calibration, beside, recordings, settings),
+        "pictures": plots(selection, unknown, noise, reported),
+        "method_errors": method_errors(calibration, reported, recordings, settings),
     }
 
     def fitted(fit: Fit) -> SensorCalibration:
@@ -150,11 +160,24 @@ def _document(
 ) -> dict[str, Any]:
     sensor, selected = selection.observations.sensor, selection.names
     hidden = not_observable(selection, configured)
-    ladder = _ladder(selection, recordings, table)
+    fits = _fits(selection)
+    held_out = _held_out(selection, fits, recordings, noise, table)
+    errors = [None] * len(fits) if held_out is None else held_out[0]
     explained = selection.first.explained([])
-    ranking = [_entry(selection, name, ladder, explained, noise) for name in _order(selection, hidden)]
-    held_out = _held_out(ladder, recordings, noise)
-    verdict = "unexplained" if _made_worse(held_out) else _verdict(selection, unknown, noise)
+    steps = list(zip(fits, errors, strict=True))
+    ranking = [_entry(selection, name, steps, explained, noise) for name in _order(selection, hidden)]
+    floor = None if noise is None else float(np.mean(noise.white**2 + noise.wander**2))
+    held = None
+    if held_out and noise is not None:
+        held = {"error_before": held_out[0][0], "error_after": held_out[0][-1], "floor": held_out[1]}
+    verdict = verdict_of_selection(
+        selected,
+        unknown,
+        _share(selection.base.residual_rms**2 - selection.fit.residual_rms**2, selection, noise),
+        2.0 * (selection.fit.log_likelihood - selection.base.log_likelihood),
+        above_noise=floor is not None and selection.fit.residual_rms**2 > FAR_ABOVE**2 * floor,
+        held_out=held,
+    )
     if not ranking and verdict == "nothing_missing" and len(hidden) > 0:
         verdict = "not_enough_data"
     adds = ",".join([*configured, *selected])
@@ -165,58 +188,64 @@ def _document(
         "not_observable": [{"effect": name, "reason": reason} for name, reason in hidden.items()],
         "unexplained": unknown,
         "next_experiment": next_experiment(
-            verdict,
-            ranking=ranking,
-            selected=selected,
-            hidden=hidden,
-            unknown=unknown,
-            facts=facts_of(selection.observations),
+            verdict, ranking, selected, hidden, unknown, one_way=facts_of(selection.observations).one_way
         ),
         "override": f"effects.{sensor}=[{adds}]" if selected else "",
         "configured": configured,
-        "wander": fitted_wander(selection, noise),
-        "held_out": held_out,
+        "wander": _fitted_wander(selection, noise),
+        "held_out": held,
     }
 
 
 def _held_out(
-    ladder: Sequence[tuple[Fit, float | None]], recordings: Sequence[Recording], noise: Noise | None
-) -> dict[str, float] | None:
-    """Return the held-out error without and with everything selected, beside that of noise alone."""
-    fit, after = ladder[-1]
-    before, floor = ladder[0][1], held_out_floor(fit, recordings, noise)
-    if before is None or after is None or floor is None:
+    selection: Selection,
+    fits: Sequence[Fit],
+    recordings: Sequence[Recording],
+    noise: Noise | None,
+    table: Mapping[str, Any],
+) -> tuple[list[float], float] | None:
+    """Return the held-out errors of some fits, and the noise floor of the last; None where nothing is held out."""
+    sensor, known = selection.observations.sensor, noise or Noise(np.zeros(3), np.zeros(3), 1.0, "none")
+    held = [r for r in recordings if r.role == "validation"] if selection.names else []
+    samples = [s for r in held if (s := samples_of_motion(sensor, r, known, table, smoothed=True)) is not None]
+    samples = [s for s in samples if s.known.any()]
+    if not samples:
         return None
-    return {"error_before": before, "error_after": after, "floor": floor}
+    calibrations = [calibration_of(sensor, fit, selection.observations, None) for fit in fits]
+    floor, vector_floor = noise_floors(calibrations[-1], samples)
+    return [_held_out_error(c, samples) for c in calibrations], floor if vector_floor is None else vector_floor
 
 
-def _made_worse(held_out: Mapping[str, float] | None) -> bool:
-    """Return whether what was selected does harm to motion that no fit has seen: then it is not what is missing."""
-    if held_out is None:
-        return False
-    more = held_out["error_after"] ** 2 - held_out["error_before"] ** 2
-    return more > WORSE * held_out["floor"] ** 2
+def _held_out_error(calibration: SensorCalibration, samples: Sequence[Samples]) -> float:
+    """Return the rms vector error where the attitude is known, else the rms error of the magnitude."""
+    squares = []
+    for each in samples:
+        vector, magnitude, true = with_known_effects(calibration, each, None)
+        error = np.linalg.norm(vector, axis=1) - magnitude if true is None else np.linalg.norm(vector - true, axis=1)
+        squares.append(error[each.known] ** 2)
+    together = np.concatenate(squares)
+    return float(np.sqrt(np.mean(together[np.isfinite(together)])))
 
 
-def _verdict(selection: Selection, unknown: Sequence[Any], noise: Noise | None) -> str:
-    """Return the verdict: what is selected must explain most of the excess, unless nothing else is left.
-
-    A residual that still depends on something beyond the catalogue is unexplained where that is worth naming beside
-    what was selected; next to a much larger effect it may be the small error of its linear equation.
-    """
-    left = False
-    if noise is not None:
-        floor = float(np.mean(noise.white**2 + noise.wander**2))
-        left = selection.fit.residual_rms**2 > FAR_ABOVE**2 * floor
-    share = _share(selection.base.residual_rms**2 - selection.fit.residual_rms**2, selection, noise)
-    if (unknown or left) and (not selection.names or share < MOSTLY):
-        return "unexplained"
-    if len(selection.names) > BELIEVED:
-        return "unexplained"
-    gain = 2.0 * (selection.fit.log_likelihood - selection.base.log_likelihood)
-    if unknown and max(float(found["delta_bic"]) for found in unknown) > UNKNOWN_SHARE * gain:
-        return "unexplained"
-    return "missing_effect" if selection.names else "nothing_missing"
+def _fitted_wander(selection: Selection, noise: Noise | None) -> dict[str, Any]:
+    """Return the wander under which base, configured and selected effects explain the readings best."""
+    settings = selection.ranking.settings
+    found = selection.ranking.log_likelihoods(selection.chosen())
+    best = int(np.argmax(found[1:])) + 1
+    white = float(np.sqrt(np.mean(selection.start.scale**2)))
+    expected = None if noise is None else float(np.sqrt(np.mean(noise.wander**2)))
+    ratio, inflated = settings[best].ratio, False
+    if expected is not None:
+        most = INFLATED * max(expected / white, LEAST_RATIO)
+        believed = [found[k] for k in range(1, len(settings)) if settings[k].ratio <= most]
+        inflated = ratio > most and (not believed or bool(found[best] - max(believed) > EVIDENCE))
+    return {
+        "ratio": ratio,
+        "time_s": settings[best].time if ratio else None,
+        "standard_deviation": ratio * white,
+        "expected": expected,
+        "inflated": bool(inflated),
+    }
 
 
 def _order(selection: Selection, hidden: Mapping[str, str]) -> list[str]:
@@ -225,28 +254,21 @@ def _order(selection: Selection, hidden: Mapping[str, str]) -> list[str]:
     return [*selection.names, *(s.name for s in others if s.name not in selection.names and s.name not in hidden)]
 
 
-def _ladder(
-    selection: Selection, recordings: Sequence[Recording], table: Mapping[str, Any]
-) -> list[tuple[Fit, float | None]]:
-    """Return the fits and held-out errors of the base and with each further selected effect."""
+def _fits(selection: Selection) -> list[Fit]:
+    """Return the fits of the base and with each further selected effect."""
     fits = [selection.base]
-    held = {term.effect.name: term for term in selection.fit.terms}
+    fitted = {term.effect.name: term for term in selection.fit.terms}
     for count in range(1, len(selection.names)):
-        terms = [*selection.base.terms, *(held[name] for name in selection.names[:count])]
+        terms = [*selection.base.terms, *(fitted[name] for name in selection.names[:count])]
         start = Start(selection.fit.bias, selection.fit.K, selection.start.scale)
         fits.append(fit_terms(selection.observations, terms, start, selection.settings))
-    if selection.names:
-        fits.append(selection.fit)
-    return [
-        (fit, held_out_error(fit, selection.observations, recordings, table) if selection.names else None)
-        for fit in fits
-    ]
+    return [*fits, selection.fit] if selection.names else fits
 
 
 def _entry(
     selection: Selection,
     name: str,
-    ladder: Sequence[tuple[Fit, float | None]],
+    steps: Sequence[tuple[Fit, float | None]],
     explained: NDArray[np.float64],
     noise: Noise | None,
 ) -> dict[str, Any]:
@@ -255,7 +277,7 @@ def _entry(
     before = after = None
     if name in selection.names:
         step = selection.names.index(name)
-        (without, before), (within, after) = ladder[step], ladder[step + 1]
+        (without, before), (within, after) = steps[step], steps[step + 1]
         drop = without.residual_rms**2 - within.residual_rms**2
     else:
         drop = _drop(selection, name, explained)

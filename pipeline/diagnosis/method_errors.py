@@ -1,21 +1,22 @@
-"""What a method's own approximations leave, beside a free fit of the same recordings: no fault of the sensor's.
+"""Errors that a method's own approximations leave, compared with a free fit of the same recordings.
 
-A method says ``truth = M (reading - b_m - z_m)``; bias b, K and effects z of the free fit say what is read. In a motion
-u that the recording's filter turns into u_f, the method's calibrated reading is off by
+A method says ``truth = M (reading - b_m - z_m)``; bias b, matrix K and effects z of the free fit predict the reading.
+In a motion u that the recording's filter turns into u_f, the method's calibrated reading is off by
 
     e = M (b - b_m) + (M K - 1) u_f + M (z - z_m) + (u_f - u)
 
     bias                 M (b - b_m)
-    scale_factor         diagonal of M K - 1
-    non_orthogonality    symmetric part off the diagonal, half of the angle by which two axes are not at a right angle
-    rotation             antisymmetric part: the mounting
-    two_sided            M (z - z_m), of effects that the method fits of its own accord
-    filter_delay         u_f - u: the reading is late, and smoothed
+    scale_factor         diagonal of E = M K - 1
+    non_orthogonality    symmetric part of E off the diagonal: half of the angle by which two axes depart from 90 deg
+    rotation             antisymmetric part of E: the mounting
+    two_sided            M (z - z_m), of effects that the method always fits
+    filter_delay         u_f - u: the reading is late and smoothed
 
-and each has the share ``mean(e_k^2) / sum_j mean(e_j^2)``. A turn or a delay does not change a magnitude; so the share
-of the error of the magnitude, ``d_k = |u_f + e_k| - |u_f|`` and for the filter ``|u_f| - |u(t - delay)|``, is told
-beside it. A part is named where it is more than noise leaves in the two fits, and more than a fiftieth of either. Where
-an effect is missing, bias and sides are not compared: the effect shifts both in the method's fit.
+and each has the share ``mean(e_k^2) / sum_j mean(e_j^2)``. A rotation or a delay does not change a magnitude, so the
+share of the error of the magnitude, ``d_k = |u_f + e_k| - |u_f|`` and for the filter ``|u_f| - |u(t - delay)|``, is
+published too. An error is named where it exceeds ``SURE`` standard uncertainties of both fits together, as if these
+were independent (which is never too small), and a fiftieth of either error. Where an effect is missing, bias and sides
+are not compared: the effect shifts both in the method's fit.
 """
 
 from __future__ import annotations
@@ -25,9 +26,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.diagnosis.method_difference import difference_of
-from pipeline.diagnosis.method_words import meaning
+from pipeline.estimation.design import Start
+from pipeline.estimation.joint import fit_terms
 from pipeline.estimation.observations import through_filter
+from pipeline.model.effects import effect_of
 from pipeline.model.effects.base import truth, unit_of
 from pipeline.model.kinematics import earth_rate, reference_motion
 
@@ -36,22 +38,56 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.diagnosis.method_difference import Difference
+    from pipeline.estimation.joint import Fit
     from pipeline.estimation.selection import Selection
-    from pipeline.records import Recording, SensorCalibration
+    from pipeline.records import Motion, Recording, SensorCalibration
 
     Values = NDArray[np.float64]
+    Errors = dict[str, tuple[Values, Values]]  # by cause: of the vector (n, 3), and of its magnitude (n,)
 
 FREE = ("reference_least_squares", "effects")  # stages that leave bias and matrix free
 LEAST_SHARE = 0.02
-
-
-@dataclass(frozen=True)
-class Error:
-    """An error of calibrated readings: (n, 3) and of the magnitude (n,), g or deg/s."""
-
-    vector: Values
-    magnitude: Values
+SURE = 5.0  # standard uncertainties: 9 elements of 10^4 units exceed them by chance less than once in 10
+COSINES = (
+    "the stages orthogonality and misalignment multiply readings by cosines, which changes a scale factor a little and "
+    "turns nothing (Sudsanguan 2019, eqs 3.15-3.37): the matrix stays diagonal"
+)
+MEANINGS = {
+    ("accelerometer", "orthogonality", "non_orthogonality"): (
+        f"the sensor's axes are not at right angles, and {COSINES}"
+    ),
+    ("accelerometer", "orthogonality", "rotation"): f"the sensor is turned against the table's axes, and {COSINES}",
+    ("accelerometer", "orthogonality", "scale_factor"): (
+        "the scale factors come from the extremes of each axis alone (eqs 3.40-3.43), with the cosines of the stages "
+        "orthogonality and misalignment in them"
+    ),
+    ("accelerometer", "orthogonality", "bias"): (
+        "the bias is the mean reading of an axis where it is level (eqs 3.38-3.39), which a table that is off level or "
+        "another axis' reading shifts"
+    ),
+    ("accelerometer", "orthogonality", "two_sided"): (
+        "the positive and the negative side get scale factors of their own (eqs 3.40-3.43)"
+    ),
+    ("accelerometer", "nonlinear_least_squares", "rotation"): (
+        "nine parameters from the length of gravity say nothing of how the sensor is mounted: its x axis is taken for "
+        "the body's"
+    ),
+    ("gyroscope", "orthogonality_and_misalignment", "bias"): (
+        "the bias is the mean of the rests beside the turns (eqs 3.47-3.48), wherever it has wandered since"
+    ),
+    ("gyroscope", "cholesky_lu", "bias"): "the bias is the mean of the rests beside the turns",
+}
+PLAIN = {
+    "bias": "the method's bias is not that of a free fit of the same recordings",
+    "scale_factor": "the method's scale factors are not those of a free fit of the same recordings",
+    "non_orthogonality": "the method leaves a part of the angles between the sensor's axes",
+    "rotation": "the method leaves the sensor turned against the body",
+    "two_sided": "the method fits a scale factor for each side, which these recordings do not ask for",
+}
+PRINTED = "; the equations are taken as printed (as_printed), errata included"
+FORWARD = (
+    "as printed, the forward matrix is applied as if it were the correction (Sudsanguan 2019, tables 5.25 and 5.26)"
+)
 
 
 def method_errors(
@@ -71,33 +107,31 @@ def method_errors(
     recordings : sequence of Recording
         All of the unit, filtered.
     settings : mapping
-        Sections ``table`` and, for the words, ``method``.
+        Sections ``table`` and ``method``.
 
     Returns
     -------
     list of dict
         ``name, meaning, size, unit, share`` of the error on the method's own recordings; beside these ``rms`` (there,
-        unit of the sensor) and ``held_out_share`` (of the vector error on held-out motion, or None).
+        unit of the sensor), ``held_out_share`` and ``held_out_magnitude_share`` (on held-out motion, or None).
     """
     stages = [stage.name for stage in calibration.stages]
     if not stages or stages[-1] in FREE:
         return []
-    difference = difference_of(calibration, selection)
+    difference = _difference_of(calibration, selection)
     own = _together([_errors(difference, r, settings["table"]) for r in recordings if r.role == calibration.sensor])
     held_out = _together([_errors(difference, r, settings["table"]) for r in recordings if r.role == "validation"])
-    if not own:
-        return []
-    share, held = (_shares({name: e.vector for name, e in found.items()}) for found in (own, held_out))
-    magnitude = _shares({name: e.magnitude[:, None] for name, e in held_out.items()})
+    share, held = (_shares({name: e[0] for name, e in found.items()}) for found in (own, held_out))
+    magnitude = _shares({name: e[1] for name, e in held_out.items()})
     sure = difference.certain(selection.names)
     printed = bool((settings.get("method") or {}).get("as_printed"))
     found = [
         {
             "name": name,
-            "meaning": meaning(name, calibration.sensor, stages, recordings, printed=printed),
-            **_size(name, difference, own[name].vector, recordings),
+            "meaning": _meaning(name, calibration.sensor, stages, recordings, printed=printed),
+            **_size(name, difference, own[name][0], recordings),
             "share": share[name],
-            "rms": _rms(own[name].vector),
+            "rms": _rms(own[name][0]),
             "held_out_share": held.get(name),
             "held_out_magnitude_share": magnitude.get(name),
         }
@@ -107,7 +141,84 @@ def method_errors(
     return sorted(found, key=lambda entry: -float(entry["share"]))
 
 
-def _errors(difference: Difference, recording: Recording, table: Mapping[str, Any]) -> dict[str, Error]:
+@dataclass(frozen=True)
+class _Difference:
+    """A method compared with the free fit: ``bias`` M (b - b_m), ``matrix`` E, and the uncertainty of both, (12,)."""
+
+    method: SensorCalibration
+    bias: Values
+    matrix: Values
+    uncertainty: Values
+    free: Fit
+
+    @property
+    def symmetric(self) -> Values:
+        """Symmetric part of E off the diagonal."""
+        return 0.5 * (self.matrix + self.matrix.T) - np.diag(np.diag(self.matrix))
+
+    @property
+    def antisymmetric(self) -> Values:
+        """Antisymmetric part of E."""
+        return 0.5 * (self.matrix - self.matrix.T)
+
+    def parts(self, motion: Motion) -> dict[str, Values]:
+        """Return the error of the calibrated reading by its cause, without the filter's: (n, 3) arrays."""
+        u = truth(self.method.sensor, motion)
+        return {
+            "bias": np.broadcast_to(self.bias, u.shape),
+            "scale_factor": u * np.diag(self.matrix),
+            "non_orthogonality": u @ self.symmetric.T,
+            "rotation": u @ self.antisymmetric.T,
+            "two_sided": self._of_effects(motion) @ self.method.matrix.T,
+        }
+
+    def _of_effects(self, motion: Motion) -> Values:
+        """Return what the method's effects add at the free fit's values, less what they add at the method's."""
+        added = np.zeros((len(motion.time), 3))
+        fitted = {term.effect.name: term for term in self.free.terms}
+        for effect in self.method.effects:
+            this = effect_of(effect)
+            if this.moves or not this.available(motion):
+                continue
+            added -= this.reading(self.method.sensor, motion, self.free.K, effect.values)
+            if effect.name in fitted:
+                added += this.reading(self.method.sensor, motion, self.free.K, fitted[effect.name].values)
+        return added
+
+    def certain(self, selected: Sequence[str]) -> dict[str, bool]:
+        """Return which parts exceed the noise of the two fits."""
+        u = self.uncertainty[3:].reshape(3, 3)
+        both = np.hypot(u, u.T) / 2.0 + np.diag(np.full(3, np.inf))
+        has = {effect.name for effect in self.method.effects}
+        whole = all(name in has for name in selected)
+        return {
+            "two_sided": whole,
+            "bias": whole and bool(np.any(np.abs(self.bias) > SURE * self.uncertainty[:3])),
+            "scale_factor": bool(np.any(np.abs(np.diag(self.matrix)) > SURE * np.diag(u))),
+            "non_orthogonality": bool(np.any(np.abs(self.symmetric) > SURE * both)),
+            "rotation": bool(np.any(np.abs(self.antisymmetric) > SURE * both)),
+        }
+
+
+def _difference_of(calibration: SensorCalibration, selection: Selection) -> _Difference:
+    """Compare with the free fit of base, configured effects and those selected that the method has too."""
+    free, names = selection.base, [effect.name for effect in calibration.effects]
+    known = {term.effect.name for term in free.terms}
+    more = [t for t in selection.fit.terms if t.effect.name in names and t.effect.name not in known]
+    if more:
+        start = Start(free.bias, free.K, selection.start.scale)
+        free = fit_terms(selection.observations, [*free.terms, *more], start, selection.settings)
+    M = calibration.matrix
+    own = np.zeros((12, 12)) if calibration.covariance is None else calibration.covariance[:12, :12]
+    of_free, of_method = np.zeros((12, 12)), np.zeros((12, 12))
+    of_free[:3, :3] = of_method[:3, :3] = M
+    of_free[3:, 3:], of_method[3:, 3:] = np.kron(M, np.eye(3)), np.kron(np.eye(3), free.K.T)
+    covariance = of_free @ free.covariance[:12, :12] @ of_free.T + of_method @ own @ of_method.T
+    uncertainty = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
+    return _Difference(calibration, M @ (free.bias - calibration.bias), M @ free.K - np.eye(3), uncertainty, free)
+
+
+def _errors(difference: _Difference, recording: Recording, table: Mapping[str, Any]) -> Errors:
     """Return the errors in one recording by their cause; none where no motion is known."""
     sensor = difference.method.sensor
     if recording.samples < 6 or recording.reading(sensor) is None:
@@ -121,22 +232,20 @@ def _errors(difference: Difference, recording: Recording, table: Mapping[str, An
     motion = through_filter(replace(before, at_offset=None, at_lag=None), recording) if filtered else before
     u = truth(sensor, motion)
     size = np.linalg.norm(u, axis=1)
-    found = {name: Error(e, np.linalg.norm(u + e, axis=1) - size) for name, e in difference.parts(motion).items()}
+    found: Errors = {name: (e, np.linalg.norm(u + e, axis=1) - size) for name, e in difference.parts(motion).items()}
     if filtered:
         plain = truth(sensor, before)
         late = recording.time - float(recording.filter.get("delay_s", 0.0))
-        found["filter_delay"] = Error(u - plain, size - np.interp(late, recording.time, np.linalg.norm(plain, axis=1)))
+        found["filter_delay"] = (u - plain, size - np.interp(late, recording.time, np.linalg.norm(plain, axis=1)))
     return found
 
 
-def _together(found: Sequence[dict[str, Error]]) -> dict[str, Error]:
-    names = dict.fromkeys(name for errors in found for name in errors)
+def _together(found: Sequence[Errors]) -> Errors:
+    """Return the errors of several recordings one after the other."""
+    every = {name: [errors[name] for errors in found if name in errors] for errors in found for name in errors}
     return {
-        name: Error(
-            np.concatenate([errors[name].vector for errors in found if name in errors]),
-            np.concatenate([errors[name].magnitude for errors in found if name in errors]),
-        )
-        for name in names
+        name: (np.concatenate([e[0] for e in errors]), np.concatenate([e[1] for e in errors]))
+        for name, errors in every.items()
     }
 
 
@@ -150,15 +259,15 @@ def _rms(values: Values) -> float:
     return float(np.sqrt(np.mean(np.sum(values**2, axis=1))))
 
 
-def _size(name: str, difference: Difference, own: Values, recordings: Sequence[Recording]) -> dict[str, Any]:
-    """Return the size of a part as the field says it."""
-    E, sensor = difference.matrix, difference.method.sensor
+def _size(name: str, difference: _Difference, own: Values, recordings: Sequence[Recording]) -> dict[str, Any]:
+    """Return the size of an error in its usual unit."""
+    sensor = difference.method.sensor
     if name == "bias":
         return {"size": float(np.abs(difference.bias).max()), "unit": unit_of(sensor)}
     if name == "scale_factor":
-        return {"size": float(np.abs(np.diag(E)).max()), "unit": "1"}
+        return {"size": float(np.abs(np.diag(difference.matrix)).max()), "unit": "1"}
     if name in ("non_orthogonality", "rotation"):
-        part = 0.5 * (E + E.T) - np.diag(np.diag(E)) if name == "non_orthogonality" else 0.5 * (E - E.T)
+        part = difference.symmetric if name == "non_orthogonality" else difference.antisymmetric
         return {"size": float(np.degrees(np.abs(part).max())), "unit": "deg"}
     if name == "filter_delay":
         turns = [r for r in recordings if r.role == sensor]
@@ -168,10 +277,22 @@ def _size(name: str, difference: Difference, own: Values, recordings: Sequence[R
 
 def _fastest(recording: Recording) -> float:
     """Return the largest rate of a turn, deg/s."""
-    if recording.table_rate is not None:
-        return float(np.abs(recording.table_rate).max())
-    return (
-        0.0
-        if recording.table_angle is None
-        else float(np.abs(np.gradient(recording.table_angle, recording.time)).max())
-    )
+    rate = recording.table_rate
+    if rate is None and recording.table_angle is not None:
+        rate = np.gradient(recording.table_angle, recording.time)
+    return 0.0 if rate is None else float(np.abs(rate).max())
+
+
+def _meaning(name: str, sensor: str, stages: Sequence[str], recordings: Sequence[Recording], *, printed: bool) -> str:
+    """Return what an error is, as the end of a sentence."""
+    if name == "filter_delay":
+        delay = max(float(r.filter.get("delay_s", 0.0)) for r in recordings)
+        used = next(r.filter["name"] for r in recordings if r.filter["name"] != "none")
+        return (
+            f"the filter {used} delays readings by {delay:.2g} s and smooths them, so that in a continuous turn the "
+            "angle is late by rate times delay (Sudsanguan 2019, eqs 3.3-3.14)"
+        )
+    if printed and "cholesky_lu" in stages:
+        return FORWARD
+    text = next((MEANINGS[sensor, s, name] for s in stages if (sensor, s, name) in MEANINGS), PLAIN[name])
+    return text + (PRINTED if printed else "")

@@ -5,8 +5,9 @@ that applies:
 
     reference_in_doubt  a check of the recordings says so (note ``N-REFERENCE``), or the fit is explained to its noise
                         and the held-out motion is not: the recordings contradict each other
-    missing_effect      effects were selected, and with them the held-out error lies in its interval
-    unexplained         the residual of the fit, or the held-out error, is above what noise leaves, for no known reason
+    missing_effect      plausible effects were selected, and with them the held-out error lies in its interval
+    unexplained         the residual of the fit, or the held-out error, is above what noise leaves, and no effect within
+                        the sensor's limits explains it
     floor_in_doubt      the held-out error is below its interval, or the residual far below the noise
     left_by_method      the error is above, but that of a free fit of the same recordings is not; or the method's matrix
                         or bias differs from that of a free fit by more than both fits' noise, which the error of the
@@ -18,10 +19,10 @@ that applies:
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from pipeline.diagnosis.advice import of_unknown
+from pipeline.diagnosis.words import listed, of_unknown, plain
 from pipeline.model.effects.base import unit_of
 from pipeline.validation.heldout import last_error
 
@@ -32,6 +33,10 @@ if TYPE_CHECKING:
 
 IN_DOUBT = "N-REFERENCE"
 EXPLAINED = 1.5  # times the noise: a residual of a fit up to it is noise; 0.92 to 1.14 in 140 sensors of null families
+MOSTLY = 0.5  # share of the residual's excess that selected effects must explain where something else is left
+BELIEVED = 3  # effects at once; more are what the catalogue makes of physics that it does not hold
+UNKNOWN_SHARE = 0.03  # of the gain in 2 log L by what was selected, above which what is left is worth naming
+WORSE = 0.3  # of the noise's mean square, by which what was selected may raise the held-out error's at most
 QUIET = 0.6  # times the noise: a residual below it contradicts the noise of the rests
 COMPARED = ("bias", "scale_factor", "non_orthogonality", "rotation")  # parts compared with the uncertainty of both fits
 FREE = ("reference_least_squares", "nonlinear_least_squares", "cholesky_lu")  # methods that leave bias and matrix free
@@ -78,6 +83,13 @@ class Evidence:
         What the recordings' checks say of the reference.
     approximations : sequence of str
         In what the method's matrix and bias differ from those of a free fit (``pipeline.diagnosis.method_errors``).
+    unknown : sequence of str
+        Covariates on which the residual depends beside what was selected.
+    implausible : sequence of str
+        Selected effects with parameters beyond the sensor's limits, where these are not accepted
+        (``sensor.<sensor>.accept_implausible``).
+    held_out : mapping or None
+        ``error_before, error_after, floor`` on held-out motion of the selection's own fits.
     method : str
     as_printed : bool
         Whether the method takes the equations of the founding document as printed.
@@ -94,12 +106,60 @@ class Evidence:
     published: HeldOut | None = None
     free: HeldOut | None = None
     full: HeldOut | None = None
-    doubts: Sequence[str] = field(default_factory=tuple)
-    approximations: Sequence[str] = field(default_factory=tuple)
+    doubts: Sequence[str] = ()
+    approximations: Sequence[str] = ()
+    unknown: Sequence[str] = ()
+    implausible: Sequence[str] = ()
+    held_out: Mapping[str, float] | None = None
     method: str = ""
     as_printed: bool = False
     filtered: bool = False
     on_table: bool = True
+
+
+def verdict_of_selection(
+    names: Sequence[str],
+    unknown: Sequence[Mapping[str, Any]],
+    share: float,
+    gain: float,
+    *,
+    above_noise: bool,
+    held_out: Mapping[str, float] | None,
+) -> str:
+    """Return the verdict of a selection alone.
+
+    What is selected must explain most of the excess, unless nothing else is left. A residual that still depends on
+    something beyond the catalogue is unexplained where that is worth naming beside what was selected; next to a much
+    larger effect it may be the small error of its linear equation.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Selected effects.
+    unknown : sequence of mapping
+        Entries ``unexplained`` of the diagnosis.
+    share, gain : float
+        Share of the residual's excess that the selected effects explain, and what they gain in 2 log L.
+    above_noise : bool
+        Whether the residual stays far above the noise with them.
+    held_out : mapping or None
+        ``error_before, error_after, floor`` on held-out motion.
+    """
+    if _made_worse(held_out) or len(names) > BELIEVED:
+        return "unexplained"
+    if (unknown or above_noise) and (not names or share < MOSTLY):
+        return "unexplained"
+    if unknown and max(float(found["delta_bic"]) for found in unknown) > UNKNOWN_SHARE * gain:
+        return "unexplained"
+    return "missing_effect" if names else "nothing_missing"
+
+
+def _made_worse(held_out: Mapping[str, float] | None) -> bool:
+    """Return whether what was selected raises the held-out error: then it is not what is missing."""
+    if held_out is None:
+        return False
+    more = held_out["error_after"] ** 2 - held_out["error_before"] ** 2
+    return more > WORSE * held_out["floor"] ** 2
 
 
 def held_out_of(part: Mapping[str, Any] | None) -> HeldOut | None:
@@ -163,6 +223,10 @@ def evidence_of(  # noqa: PLR0917  (what a diagnosis is made of)
         found = last_error(fit(), recordings, noise, settings, other=other, smoothed=smoothed)
         return None if found is None else HeldOut(found[0], *found[1])
 
+    accepted = ((settings.get("sensor") or {}).get(sensor) or {}).get("accept_implausible")
+    implausible = [
+        e["effect"] for e in document["ranking"] if e["effect"] in document["selected"] and not e["plausible"]
+    ]
     published = held_out_of(validation) if validation else error_of(free, smoothed=False)
     contradicted = published is not None and published.above
     return Evidence(
@@ -175,6 +239,9 @@ def evidence_of(  # noqa: PLR0917  (what a diagnosis is made of)
         full=error_of(full, smoothed=True) if contradicted else None,
         doubts=doubts_of(sensor, recordings),
         approximations=[error["name"] for error in document.get("method_errors") or () if error["name"] in COMPARED],
+        unknown=[entry["covariate"] for entry in document["unexplained"] if not entry.get("explained_by")],
+        implausible=() if accepted else implausible,
+        held_out=document.get("held_out"),
         method=str(method.get(sensor) or ""),
         as_printed=bool(method.get("as_printed")),
         filtered=filtered,
@@ -192,9 +259,42 @@ def decide(e: Evidence) -> tuple[str, str]:
         return "reference_in_doubt", f"A check of the recordings contradicts the reference: {'; '.join(e.doubts)}."
     if e.published and e.published.above:
         return _above(e, e.published)
-    if e.found in {"missing_effect", "unexplained"}:
-        return e.found, ""
-    return _within(e)
+    if e.found == "unexplained" or (e.found == "missing_effect" and e.implausible):
+        return "unexplained", why_unexplained(e)
+    return (e.found, "") if e.found == "missing_effect" else _within(e)
+
+
+def why_unexplained(e: Evidence) -> str:
+    """Return why no effect of the catalogue explains the residual, as sentences.
+
+    Parameters
+    ----------
+    e : Evidence
+    """
+    names, unit = listed([plain(name) for name in e.selected]), unit_of(e.sensor)
+    found = []
+    if e.implausible:
+        beyond = listed([plain(name) for name in e.implausible])
+        found.append(
+            f"To explain the residual, {beyond} would have to exceed the limits of the sensor's data sheet: a "
+            "recording of another unit, a wrong range or physics beyond the catalogue looks like that. If the sensor "
+            f"is known to exceed its data sheet, set sensor.{e.sensor}.accept_implausible=true."
+        )
+    if _made_worse(e.held_out) and e.held_out:
+        before, after = e.held_out["error_before"], e.held_out["error_after"]
+        found.append(f"With {names} the error on held-out motion rises from {before:.3g} to {after:.3g} {unit}.")
+    if len(e.selected) > BELIEVED:
+        found.append(
+            f"It takes {len(e.selected)} effects together to explain the residual, more than a unit usually has: the "
+            "true one may not be in the catalogue."
+        )
+    beside = f" beside {names}" if e.selected else ""
+    if e.unknown:
+        found.append(f"The residual depends on {listed([plain(n) for n in e.unknown])}{beside} as no effect does.")
+    left = e.left_over_noise if e.selected else e.over_noise
+    if left is not None and (left > EXPLAINED or not found):
+        found.append(f"The residual of the fit{beside} is {left:.3g} times the noise.")
+    return " ".join(found)
 
 
 def _within(e: Evidence) -> tuple[str, str]:
@@ -220,10 +320,10 @@ def _above(e: Evidence, published: HeldOut) -> tuple[str, str]:
         f"On held-out motion the error is {published.error:.3g} {unit}; noise and stated uncertainties leave at most "
         f"{published.high:.3g} {unit}"
     )
-    if e.found == "missing_effect" and not (e.full and e.full.above):
+    if e.found == "missing_effect" and not (e.implausible or (e.full and e.full.above)):
         return "missing_effect", ""
-    if e.found == "unexplained":
-        return "unexplained", f"{told}."
+    if e.found == "unexplained" or e.implausible:
+        return "unexplained", f"{told}. {why_unexplained(e)}"
     free = e.free or published
     same = e.method == "reference_least_squares" and not e.filtered  # the calibration is the free fit
     if e.as_printed or not (free.above or same):
@@ -258,7 +358,7 @@ def _too_low(e: Evidence, published: HeldOut) -> str:
     unit = unit_of(e.sensor)
     return (
         f"On held-out motion the error is {published.error:.3g} {unit}, less than the noise that was found would leave "
-        f"({published.low:.3g} to {published.high:.3g} {unit}): the noise is taken for too large, and may hide an "
+        f"({published.low:.3g} to {published.high:.3g} {unit}): the noise estimate is too large, and may hide an "
         "effect. Check that the unit did not move in the recording that the noise is taken from."
     )
 
@@ -274,9 +374,13 @@ def judged(document: dict[str, Any], e: Evidence) -> dict[str, Any]:
     """
     verdict, reason = decide(e)
     step = _next_step(verdict, e)
-    if verdict == "unexplained" != e.found:
+    if verdict == "unexplained" and e.implausible:
+        step = "check that every recording is of this unit in one mounting, and its range and units"
+        step += f"; then {of_unknown(document['unexplained'])}" if document["unexplained"] else ""
+    elif verdict == "unexplained" != e.found:
         step = of_unknown(document["unexplained"])
-    return document | {"verdict": verdict, "reason": reason} | ({"next_experiment": step} if step else {})
+    offered = {} if verdict == "missing_effect" else {"override": ""}
+    return document | {"verdict": verdict, "reason": reason} | ({"next_experiment": step} if step else {}) | offered
 
 
 def _next_step(verdict: str, e: Evidence) -> str:

@@ -1,17 +1,36 @@
-"""A diagnosis in plain words."""
+"""A diagnosis in plain words, and what to record next."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from pipeline.diagnosis import method_words
 from pipeline.model.effects import catalogue
+from pipeline.model.effects.base import unit_of
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
-STAYS = 1.15  # times the noise of held-out motion, above which more than noise is left
-UNITS = {"accelerometer": "g", "gyroscope": "deg/s"}
+STAYS = 1.15  # times the noise floor: two standard deviations of the rms of 100 samples, 1 / sqrt(200) each
+UNKNOWN = {
+    "temperature": "repeat the sequence at two steady temperatures, and while it heats and cools",
+    "time": "return to the first pose at the end, and repeat the sequence once the unit is warm",
+    "rate": "turn at several rates in both directions",
+    "angle": "turn a second time with the unit remounted at another angle: an error of the table stays with the table",
+    "specific_force": "record rests in which all three axes are inclined, and more than 1 g if you can",
+}
+FAR_OFF = (
+    "check the table against its log first (steps, play, rate, vibration) and the mounting: the residual is far above "
+    "the noise and depends on nothing that is recorded"
+)
+VERDICTS = {
+    "nothing_missing": "Nothing that these recordings can show is missing in the model of the {sensor}.",
+    "missing_effect": "The model of the {sensor} misses {effects}.",
+    "unexplained": "The {sensor} shows something that no plausible effect of the catalogue explains.",
+    "not_enough_data": "The recordings cannot show whether an effect of the {sensor} is missing.",
+    "reference_in_doubt": "The reference of the {sensor} is in doubt: recordings contradict each other.",
+    "floor_in_doubt": "The noise estimate of the {sensor} is in doubt: it may be too large and hide an effect.",
+    "left_by_method": "The {sensor} is explained; approximations of its method or filter leave more than noise.",
+}
 
 
 def in_words(part: Mapping[str, Any] | None, sensor: str) -> list[str]:
@@ -22,31 +41,22 @@ def in_words(part: Mapping[str, Any] | None, sensor: str) -> list[str]:
     part : mapping or None
         The sensor's part of ``diagnoses/<unit>.json``; None where the sensor was not calibrated.
     sensor : str
-
-    Returns
-    -------
-    list of str
     """
     if part is None:
         return [f"The {sensor} was not calibrated, so there is nothing to diagnose."]
     lines = [_verdict(part, sensor), *([part["reason"]] if part.get("reason") else [])]
     entries = {entry["effect"]: entry for entry in part["ranking"]}
     for name in part["selected"]:
-        lines += _selected(entries[name], sensor, with_shape=bool(part.get("suggested_effect")))
+        lines += _selected(entries[name], sensor, with_form=bool(part.get("suggested_effect")))
     lines += _unknown(part, sensor)
-    if len(part["selected"]) > 3 and part["verdict"] == "unexplained":
-        lines.append(
-            f"It takes {len(part['selected'])} effects together to explain this, more than a unit usually has: "
-            "the true one may not be in the catalogue."
-        )
     lines += _held_out(part, sensor)
     wander = part.get("wander") or {}
     if wander.get("inflated"):
         lines.append(
-            f"The bias seems to wander by {wander['standard_deviation']:.2g} {UNITS[sensor]}, against "
-            f"{wander['expected']:.2g} expected: something slow may be missing that the noise model has swallowed."
+            f"The fitted bias wander is {wander['standard_deviation']:.2g} {unit_of(sensor)}, against "
+            f"{wander['expected']:.2g} expected: the noise model may have taken up a slow effect that is missing."
         )
-    lines += method_words.in_words(part.get("method_errors") or [], sensor)
+    lines += [_method_error(error, sensor) for error in part.get("method_errors") or []]
     if part["not_observable"]:
         lines.append(_hidden(part))
     if part["next_experiment"]:
@@ -54,53 +64,8 @@ def in_words(part: Mapping[str, Any] | None, sensor: str) -> list[str]:
     return lines
 
 
-def _held_out(part: Mapping[str, Any], sensor: str) -> list[str]:
-    """Say where held-out motion speaks against what was selected."""
-    held = part.get("held_out")
-    if not held or held["error_after"] < STAYS * held["floor"]:
-        return []
-    ratio = held["error_after"] / held["floor"]
-    lines = [f"On held-out motion {held['error_after']:.3g} {UNITS[sensor]} stay, {ratio:.3g} times the noise."]
-    if held["error_after"] > held["error_before"]:
-        return [*lines, "That is more than without it: what was selected is not what is missing."]
-    return [*lines, "So it is not the whole of it, or one that looks like it is meant."]
-
-
-def _unknown(part: Mapping[str, Any], sensor: str) -> list[str]:
-    """Say what the residual depends on, in which shape, and how to try that as an effect."""
-    lines = []
-    for found in part["unexplained"]:
-        if found.get("explained_by"):
-            continue
-        shape = f": {found['shape']} (delta BIC {found['delta_bic']:.0f})" if found.get("shape") else ""
-        p = f"p = {found['p_value']:.1g}" if found["p_value"] > 0 else "p < 1e-300"
-        beyond = " beyond that" if part["selected"] else ""
-        lines.append(f"The residual depends on {plain(found['covariate'])} ({p}){beyond}{shape}.")
-    effect = part.get("suggested_effect")
-    if effect:
-        file = part.get("suggested_file", f"<unit>_{sensor}_unknown.yaml")
-        lines.append(
-            f"To try that shape, copy diagnoses/{file} from the results to effects/{effect['name']}.yaml in the "
-            f"campaign's directory, and add {sensor}.{effect['name']}."
-        )
-    return lines
-
-
-def plain(name: str) -> str:
-    """Return the name of an effect or covariate in words: ``bias temperature`` for ``bias_temperature``."""
-    return name.replace("_", " ")
-
-
 def _verdict(part: Mapping[str, Any], sensor: str) -> str:
-    text = {
-        "nothing_missing": f"Nothing that these recordings can show is missing in the model of the {sensor}.",
-        "missing_effect": f"The model of the {sensor} misses {_names(part['selected'])}.",
-        "unexplained": f"The {sensor} does something that no effect of the catalogue explains.",
-        "not_enough_data": f"The recordings cannot tell whether an effect of the {sensor} is missing.",
-        "reference_in_doubt": f"The reference of the {sensor} is in doubt: recordings contradict each other.",
-        "floor_in_doubt": f"The noise of the {sensor} is in doubt: it may be taken for too large and hide an effect.",
-        "left_by_method": f"The {sensor} is explained; approximations of its method or filter leave more than noise.",
-    }[part["verdict"]]
+    text = VERDICTS[part["verdict"]].format(sensor=sensor, effects=listed([plain(n) for n in part["selected"]]))
     ratio = part["residual_over_noise"]
     if ratio is None:
         return text
@@ -108,12 +73,17 @@ def _verdict(part: Mapping[str, Any], sensor: str) -> str:
     return f"{text} {subject} is {ratio:.3g} times the noise."
 
 
-def _names(names: list[str]) -> str:
-    words = [plain(name) for name in names]
-    return " and ".join(filter(None, [", ".join(words[:-1]), *words[-1:]]))
+def plain(name: str) -> str:
+    """Return the name of an effect or covariate in words: ``bias temperature`` for ``bias_temperature``."""
+    return name.replace("_", " ")
 
 
-def _selected(entry: Mapping[str, Any], sensor: str, *, with_shape: bool) -> list[str]:
+def listed(words: Sequence[str], conjunction: str = "and") -> str:
+    """Return words as a list in a sentence: ``a, b and c``."""
+    return f" {conjunction} ".join(filter(None, [", ".join(words[:-1]), *words[-1:]]))
+
+
+def _selected(entry: Mapping[str, Any], sensor: str, *, with_form: bool) -> list[str]:
     known = catalogue().get(entry["effect"])
     meaning = entry.get("meaning") or (known.meaning if known else "")
     values = ", ".join(_value(name, p) for name, p in entry["parameters"].items())
@@ -122,14 +92,16 @@ def _selected(entry: Mapping[str, Any], sensor: str, *, with_shape: bool) -> lis
     bic = f"(delta BIC {entry['delta_bic']:.0f})"
     lines = [f"{head} It explains {share:.0f} % of the excess over the noise {bic}."]
     if not entry["plausible"]:
-        lines.append("That is beyond the sensor's data sheet: take it as a sign of something else.")
+        lines.append("That is beyond the sensor's data sheet: something else probably looks like it.")
     if entry["look_alikes"]:
         alike = ", ".join(f"{plain(a['effect'])} ({100 * a['share']:.0f} %)" for a in entry["look_alikes"])
-        lines.append(f"It looks much like {alike} of the same signal.")
+        lines.append(f"Its signal looks much like that of {alike}.")
     before, after = entry["held_out_error_before"], entry["held_out_error_after"]
     if before is not None and after is not None:
-        beside = ", the shape below fitted with it" if with_shape else ""
-        lines.append(f"On held-out motion the rms error goes from {before:.4g} to {after:.4g} {UNITS[sensor]}{beside}.")
+        beside = ", the form below fitted with it" if with_form else ""
+        lines.append(
+            f"On held-out motion the rms error goes from {before:.4g} to {after:.4g} {unit_of(sensor)}{beside}."
+        )
     return lines
 
 
@@ -140,10 +112,112 @@ def _value(name: str, parameter: Mapping[str, Any]) -> str:
     return f"{name} = {parameter['value']:.4g}{spread}{unit}"
 
 
+def _unknown(part: Mapping[str, Any], sensor: str) -> list[str]:
+    """Return on what the residual depends, in which functional form, and how to try that as an effect."""
+    lines = []
+    for found in part["unexplained"]:
+        if found.get("explained_by"):
+            continue
+        form = f": {found['shape']} (delta BIC {found['delta_bic']:.0f})" if found.get("shape") else ""
+        p = f"p = {found['p_value']:.1g}" if found["p_value"] > 0 else "p < 1e-300"
+        beyond = " beyond that" if part["selected"] else ""
+        lines.append(f"The residual depends on {plain(found['covariate'])} ({p}){beyond}{form}.")
+    effect = part.get("suggested_effect")
+    if effect:
+        file = part.get("suggested_file", f"<unit>_{sensor}_unknown.yaml")
+        lines.append(
+            f"To try that form, copy diagnoses/{file} from the results to effects/{effect['name']}.yaml in the "
+            f"campaign's directory, and add {sensor}.{effect['name']}."
+        )
+    return lines
+
+
+def _held_out(part: Mapping[str, Any], sensor: str) -> list[str]:
+    """Return what held-out motion says against what was selected."""
+    held = part.get("held_out")
+    if not held or held["error_after"] < STAYS * held["floor"]:
+        return []
+    ratio = held["error_after"] / held["floor"]
+    error = f"{held['error_after']:.3g} {unit_of(sensor)}"
+    line = f"On held-out motion an error of {error} is left, {ratio:.3g} times the noise."
+    if held["error_after"] > held["error_before"]:
+        return [line, "That is more than without it: what was selected is not what is missing."]
+    return [line, "Either something else is missing too, or an effect with a similar signal is the right one."]
+
+
+def _method_error(error: Mapping[str, Any], sensor: str) -> str:
+    """Return one of ``pipeline.diagnosis.method_errors`` as a sentence."""
+    size = f"{error['size']:.2g} {error['unit']}" if error["unit"] != "1" else f"{100 * error['size']:.2g} %"
+    share = f"{100 * error['share']:.0f} % of what the method leaves"
+    magnitude = error.get("held_out_magnitude_share")
+    if magnitude is not None:
+        share += f", {100 * magnitude:.0f} % of its error of the magnitude on held-out motion"
+    rms = f"{error['rms']:.2g} {unit_of(sensor)} rms"
+    name = plain(error["name"].replace("non_", "non-"))
+    return f"An error of the method, not of the sensor: {name} ({size}; {rms}; {share}): {error['meaning']}."
+
+
 def _hidden(part: Mapping[str, Any]) -> str:
     hidden = part["not_observable"]
     reasons = {entry["reason"] for entry in hidden}
     if not part["ranking"] and len(reasons) == 1:
         return f"No effect can be seen: {hidden[0]['reason']}."
-    listed = "; ".join(f"{plain(e['effect'])} ({e['reason'].split('; it needs ')[0]})" for e in hidden)
-    return f"Not observable: {listed}."
+    each = "; ".join(f"{plain(e['effect'])} ({e['reason'].split('; it needs ')[0]})" for e in hidden)
+    return f"Not observable: {each}."
+
+
+def next_experiment(
+    verdict: str,
+    ranking: Sequence[Mapping[str, Any]],
+    selected: Sequence[str],
+    hidden: Mapping[str, str],
+    unknown: Sequence[Mapping[str, Any]],
+    *,
+    one_way: bool,
+) -> str:
+    """Return the experiment that would show most, as one sentence.
+
+    Parameters
+    ----------
+    verdict : str
+    ranking, unknown : sequence of mapping
+        Entries ``ranking`` and ``unexplained`` of the diagnosis.
+    selected : sequence of str
+    hidden : mapping
+        Effect that is not observable to the reason.
+    one_way : bool
+        Whether the turns about no axis go in both directions.
+    """
+    if verdict == "unexplained":
+        return of_unknown(unknown)
+    if selected:
+        return _of_selected({entry["effect"]: entry for entry in ranking}, selected)
+    if one_way:
+        return "make every turn in the other direction too: it shows five effects that one direction hides"
+    shown = next((name for name in ("bias_temperature", "lever_arm", "time_offset") if name in hidden), None)
+    if shown:
+        return f"to see {plain(shown)}: record {catalogue()[shown].excitation}"
+    return "none is needed: nothing that these recordings can show is missing"
+
+
+def of_unknown(unknown: Sequence[Mapping[str, Any]]) -> str:
+    """Return what would show on what the residual depends.
+
+    Parameters
+    ----------
+    unknown : sequence of mapping
+        Entries of ``unexplained``.
+    """
+    if not unknown:
+        return FAR_OFF
+    covariate = str(unknown[0]["covariate"])
+    return f"to find out on what the residual depends beside {plain(covariate)}: {UNKNOWN[covariate]}"
+
+
+def _of_selected(entries: Mapping[str, Mapping[str, Any]], selected: Sequence[str]) -> str:
+    for name in selected:
+        alike = entries[name]["look_alikes"]
+        if alike:
+            others = listed([plain(a["effect"]) for a in alike[:2]], "or")
+            return f"to distinguish {plain(name)} from {others}: {catalogue()[name].experiment}"
+    return f"to confirm {plain(selected[0])}: {catalogue()[selected[0]].experiment}"

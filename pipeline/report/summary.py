@@ -65,7 +65,7 @@ def summary_row(
     for sensor in SENSORS:
         held_out, found = (validation or {}).get(sensor) or {}, (diagnosis or {}).get(sensor) or {}
         raw, final = (held_out.get("steps") or [{}])[0], final_step(held_out)
-        selected = found.get("selected")
+        selected = found.get("selected") if found.get("verdict") == "missing_effect" else None
         values = (
             raw.get("rms_error"),
             final.get("rms_error"),

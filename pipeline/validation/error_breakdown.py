@@ -88,6 +88,12 @@ def last_step(calibration: SensorCalibration, samples: Samples, other: SensorCal
     return _with_effects(calibration, calibration.effects, other, samples)
 
 
+def with_known_effects(calibration: SensorCalibration, samples: Samples, other: SensorCalibration | None) -> Corrected:
+    """Return the same as ``last_step``, with those effects that the samples can show."""
+    shown = [fitted for fitted in calibration.effects if not _lack(calibration, fitted, samples)]
+    return _with_effects(calibration, shown, other, samples)
+
+
 def _uncorrected(samples: Samples, readings: NDArray[np.float64]) -> Corrected:
     """Return readings beside the reference as it was logged."""
     return readings, samples.magnitude, None if samples.motion is None else truth(samples.sensor, samples.motion)

@@ -137,5 +137,5 @@ def test_words_put_the_errors_on_the_method_and_not_on_the_sensor() -> None:
     _, part = diagnosed("staged", "accelerometer", recordings_of())
     text = "\n".join(in_words(part, "accelerometer"))
     assert "The accelerometer is explained; approximations of its method" in text
-    assert "Of the method, not of the sensor: rotation (" in text
+    assert "of the method, not of the sensor: rotation (" in text
     assert "eqs 3.15-3.37" in text

@@ -7,9 +7,16 @@ from typing import Any
 
 import pytest
 from bench_session import Session, record
+from pipeline.study.judge import calibrated, settings_of
 
+from pipeline.diagnosis.diagnose import diagnose
 from pipeline.diagnosis.verdict import Evidence, HeldOut, decide, doubts_of, held_out_of, judged
+from pipeline.estimation.noise import estimate_noise
+from pipeline.outcome import commands_of
 from pipeline.records import Note, Recording
+from pipeline.report.summary import summary_row
+from pipeline.study.bench import recordings_of
+from pipeline.study.cases import draw
 
 INSIDE, ABOVE, BELOW = HeldOut(1.0, 0.9, 1.2), HeldOut(9.0, 0.9, 1.2), HeldOut(0.5, 0.9, 1.2)
 NOTHING = Evidence("gyroscope", "nothing_missing", over_noise=1.0, published=INSIDE, method="reference_least_squares")
@@ -25,7 +32,7 @@ STAGED = replace(NOTHING, published=ABOVE, free=INSIDE, method="staged")
         (replace(NOTHING, published=ABOVE), "reference_in_doubt", "contradict each other"),
         (replace(NOTHING, published=ABOVE, free=INSIDE), "reference_in_doubt", "contradict each other"),
         (replace(NOTHING, published=ABOVE, over_noise=4.0), "unexplained", "4 times the noise"),
-        (replace(NOTHING, published=BELOW), "floor_in_doubt", "taken for too large"),
+        (replace(NOTHING, published=BELOW), "floor_in_doubt", "noise estimate is too large"),
         (replace(NOTHING, over_noise=0.1), "floor_in_doubt", "0.1 times the noise"),
         (replace(MISSING, published=ABOVE, free=ABOVE, full=INSIDE), "missing_effect", ""),
         (replace(MISSING, published=ABOVE, free=ABOVE, full=ABOVE), "reference_in_doubt", "9 deg/s stay"),
@@ -33,6 +40,10 @@ STAGED = replace(NOTHING, published=ABOVE, free=INSIDE, method="staged")
         (replace(MISSING, published=BELOW), "missing_effect", ""),
         (replace(MISSING, doubts=("validation: off",)), "reference_in_doubt", "validation: off"),
         (replace(NOTHING, found="unexplained", published=ABOVE), "unexplained", "at most 1.2 deg/s"),
+        (replace(NOTHING, found="unexplained"), "unexplained", "1 times the noise"),
+        (replace(NOTHING, found="unexplained", unknown=("time",)), "unexplained", "depends on time"),
+        (replace(MISSING, implausible=("g_sensitivity",)), "unexplained", "data sheet"),
+        (replace(MISSING, implausible=("g_sensitivity",), published=ABOVE, full=INSIDE), "unexplained", "data sheet"),
         (STAGED, "left_by_method", "the method staged leaves the rest"),
         (replace(STAGED, filtered=True), "left_by_method", "the method staged and the filter leave the rest"),
         (replace(STAGED, filtered=True, method="reference_least_squares"), "left_by_method", "the filter, which"),
@@ -49,10 +60,26 @@ def test_the_first_that_applies_is_said_with_its_numbers(evidence: Evidence, ver
     assert words in reason
     assert bool(words) == bool(reason)
     document: dict[str, Any] = {"verdict": evidence.found, "next_experiment": "none is needed", "unexplained": []}
-    step = judged(document, evidence)["next_experiment"]
+    said = judged(document | {"override": "effects.gyroscope=[g_sensitivity]"}, evidence)
+    step = said["next_experiment"]
     assert (step == "none is needed") == (verdict in {"nothing_missing", "missing_effect"} or verdict == evidence.found)
+    assert bool(said["override"]) == (verdict == "missing_effect")
     if evidence.method == "reference_least_squares":
         assert "reference_least_squares" not in step + reason
+
+
+def test_a_recording_of_another_unit_is_unexplained_with_a_reason_and_nothing_is_offered() -> None:
+    own, other = (recordings_of(draw("null_normal", number, 31)) for number in (1, 3))
+    recordings = [next(o for o in other if o.name == "gyro_y") if r.name == "gyro_y" else r for r in own]
+    settings = settings_of("mpu6050")
+    noise = estimate_noise("accelerometer", recordings, settings["sensor"]["accelerometer"])
+    found = diagnose(calibrated(recordings, "accelerometer", settings), recordings, noise, settings)
+    assert found["verdict"] == "unexplained"
+    assert "data sheet" in found["reason"]
+    assert (found["override"], commands_of(found, "accelerometer", "U1", {"campaign": "c"})) == ("", {})
+    assert any(not entry["plausible"] for entry in found["ranking"] if entry["effect"] in found["selected"])
+    row = summary_row("U1", {}, None, {"accelerometer": found}, {})
+    assert (row["accelerometer_verdict"], row["accelerometer_selected"]) == ("unexplained", None)
 
 
 def test_only_held_out_errors_with_an_interval_decide() -> None:

@@ -11,7 +11,7 @@ import pytest
 import yaml
 from bench_session import CONTINUOUS, STOP_AND_GO, WHITE, Session, record
 
-from pipeline.diagnosis.unknown import dependences
+from pipeline.diagnosis.residual_dependence import dependences
 from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import select

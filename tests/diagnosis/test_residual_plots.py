@@ -13,8 +13,8 @@ import pytest
 import yaml
 from bench_session import STOP_AND_GO, Session, record, values_of
 
-from pipeline.diagnosis.bins import Bins
 from pipeline.diagnosis.diagnose import diagnose
+from pipeline.diagnosis.residual_plots import Bins
 from pipeline.estimation.gauss_markov import Blocks
 from pipeline.estimation.noise import estimate_noise
 from pipeline.records import Recording, SensorCalibration

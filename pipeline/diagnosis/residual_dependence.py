@@ -1,6 +1,6 @@
-"""What the residual depends on beside the catalogue.
+"""On which covariates the residual still depends beside base, configured and selected effects.
 
-Generic curves in one covariate at a time are tried beside base, configured and selected effects:
+Generic curves in one covariate at a time are tried:
 
     temperature, time : Chebyshev polynomials of degree 1 to d over their span, d = 2 to 5
     rate              : those of |omega|
@@ -13,9 +13,8 @@ and, where effects were selected or the residual is above white noise,
     angle                      : for a gyroscope, n periods a turn in proportion to the rate, n = 2 to 8
 
 A covariate is named where one of its tests has delta BIC > 10 and m p < 1e-3, m the number of all tests, and has it too
-where the noise is not held to what a static recording says of it. The curves never take part in the selection: a
-flexible curve would win against physics in the first round. Which shape the dependence has is looked for only then
-(``pipeline.diagnosis.first_guess``).
+where the noise is not constrained by a static recording. The curves never take part in the selection, as a flexible
+curve would win against physics in the first round.
 """
 
 from __future__ import annotations
@@ -24,25 +23,26 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.polynomial.chebyshev import chebvander
 
-from pipeline.diagnosis.leftover import Leftover
-from pipeline.diagnosis.shapes import Span
+from pipeline.diagnosis.functional_forms import Span, signals_of
+from pipeline.diagnosis.residual_regression import ProjectedCurves
 from pipeline.estimation.gauss_markov import selection_grid
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
+    from pipeline.diagnosis.residual_regression import Curves
     from pipeline.estimation.selection import Selection
     from pipeline.records import Motion
 
     Values = NDArray[np.float64]
-    Curves = Callable[[Motion], Values]
     Block = tuple[Sequence[int], int]
     Tests = tuple[list[str], Values, NDArray[np.intp], float]
 
-GATE_BIC = 10.0
+GATE_BIC = 10.0  # "very strong" of R. E. Kass and A. E. Raftery, JASA 90 (1995), 773-795
 GATE_P = 1e-3
 DEGREE = 5
 FEWEST, MOST = 3, 8  # periods a turn: one and two look like base and catalogue
@@ -51,36 +51,37 @@ PLACES = 16
 SLOW = ("bias_drift", "bias_temperature", "bias_temperature_quadratic", "scale_factor_temperature", "warm_up")
 EQUATION = 0.05  # of what slow effects gain: less may be the error of a smoothed temperature where it turns
 ABOVE = 1.1  # times the white noise: a residual that may hold something sudden
+SIGNALS = {"temperature": "temperature", "time": "time", "rate": "speed"}  # of covariates in which steps are tried
 
 
-def dependences(selection: Selection, beside: Curves | None = None) -> list[tuple[str, float]]:
+def dependences(selection: Selection, explained: Curves | None = None) -> list[tuple[str, float]]:
     """Return the covariates on which the residual still depends, each with its p-value, the likeliest first.
 
     Parameters
     ----------
     selection : Selection
-    beside : callable, optional
+    explained : callable, optional
         Motion to (n, m) further curves that count as explained.
     """
-    found = _significant(selection, beside)
+    found = _significant(selection, explained)
     if any(name in SLOW for name in selection.names):
         least = EQUATION * 2.0 * (selection.fit.log_likelihood - selection.base.log_likelihood)
         found = {k: v for k, v in found.items() if v[0] > least or k not in ("temperature", "time")}
     if found and any(setting.prior for setting in selection.settings):
         least = min(setting.prior for setting in selection.settings)
         free = [replace(setting, prior=least) for setting in selection_grid(None)]
-        freely = _significant(replace(selection, settings=[*selection.settings, *free]), beside)
+        freely = _significant(replace(selection, settings=[*selection.settings, *free]), explained)
         found = {name: values for name, values in freely.items() if name in found}
     return [(name, p) for name, (_, p) in sorted(found.items(), key=lambda item: -item[1][0])]
 
 
-def _significant(selection: Selection, beside: Curves | None) -> dict[str, tuple[float, float]]:
+def _significant(selection: Selection, explained: Curves | None) -> dict[str, tuple[float, float]]:
     """Return delta BIC and p-value of the best test in each covariate that passes the gate."""
     from scipy.special import chdtrc  # noqa: PLC0415  (0.1 s that only a diagnosis pays)
 
-    tests = [_smooth(selection, beside)]
+    tests = [_smooth_tests(selection, explained)]
     if selection.names or selection.fit.residual_rms > ABOVE * float(np.sqrt(np.mean(selection.start.scale**2))):
-        tests.append(_further(selection, beside))
+        tests.append(_step_tests(selection, explained))
     count = sum(len(names) for names, _, _, _ in tests)
     found: dict[str, tuple[float, float]] = {}
     for names, delta, parameters, samples in tests:
@@ -91,57 +92,60 @@ def _significant(selection: Selection, beside: Curves | None) -> dict[str, tuple
     return found
 
 
-def _smooth(selection: Selection, beside: Curves | None) -> Tests:
+def _smooth_tests(selection: Selection, explained: Curves | None) -> Tests:
     """Return covariate, delta BIC and number of parameters of each test with smooth curves, and the samples."""
-    bases = bases_of(selection)
-    leftover = Leftover(selection, lambda motion: np.concatenate([b(motion) for _, b, _ in bases], axis=1), beside)
+    bases = _bases_of(selection)
+    projected = ProjectedCurves(selection, lambda m: np.concatenate([b(m) for _, b, _ in bases], axis=1), explained)
     names: list[str] = []
     counts: list[int] = []
-    drops, at = [np.zeros((*leftover.left.shape, 0))], 0
+    drops, at = [np.zeros((*projected.left.shape, 0))], 0
     for covariate, _, blocks in bases:
         for block, least in blocks:
-            kept = leftover.independent(at + np.asarray(block))
+            kept = projected.independent(at + np.asarray(block))
             if len(kept) >= least:
-                drops.append(leftover.drop(kept)[:, :, least - 1 :])
+                drops.append(projected.drop(kept)[:, :, least - 1 :])
                 counts += range(least, len(kept) + 1)
                 names += [covariate] * (len(kept) + 1 - least)
         at += 1 + max(max(block) for block, _ in blocks)
     parameters = 3 * np.array(counts, int)
-    return names, leftover.gains(np.concatenate(drops, axis=2), parameters), parameters, leftover.samples
+    return names, projected.gains(np.concatenate(drops, axis=2), parameters), parameters, projected.samples
 
 
-def _further(selection: Selection, beside: Curves | None) -> Tests:
+def _step_tests(selection: Selection, explained: Curves | None) -> Tests:
     """Return the same of the tests with steps and ripples."""
     observations = selection.observations
-    held = [name for name, _, _ in bases_of(selection)]
+    held = [name for name, _, _ in _bases_of(selection)]
     names: list[str] = []
-    values: list[tuple[Callable[[Motion], Values | None], Values]] = []
-    for covariate, (signal, of) in SIGNALS.items():
+    scanned: list[tuple[str, Values]] = []
+    for covariate, signal in SIGNALS.items():
         if covariate in held:
             places = Span.of(observations, signal).places()
-            values.append((of, places[max(1, len(places) // PLACES) // 2 :: max(1, len(places) // PLACES)]))
-            names += [covariate] * 2 * len(values[-1][1])
+            every = max(1, len(places) // PLACES)
+            scanned.append((signal, places[every // 2 :: every]))
+            names += [covariate] * 2 * len(scanned[-1][1])
     steps = len(names)
     ripples = (MOST - LEAST_RIPPLE + 1) if observations.sensor == "gyroscope" and "angle" in held else 0
 
     def curves(motion: Motion) -> Values:
-        known = [(np.asarray(of(motion))[:, None] - places, np.ptp(places) / PLACES) for of, places in values]
-        columns = [k for d, width in known for k in ((d >= 0).astype(float), np.tanh(d / (width + 1e-12)))]
+        signals, columns = signals_of(motion), []
+        for signal, places in scanned:
+            above = np.asarray(signals[signal])[:, None] - places
+            columns += [(above >= 0).astype(float), np.tanh(above / (np.ptp(places) / PLACES + 1e-12))]
         if ripples:
             rate = np.zeros(len(motion.time)) if motion.rate is None else motion.rate
             columns.append(rate[:, None] * _harmonics(motion, LEAST_RIPPLE))
         return np.concatenate(columns, axis=1)
 
-    leftover = Leftover(selection, curves, beside)
+    projected = ProjectedCurves(selection, curves, explained)
     weights = np.eye(steps + 2 * ripples)[:, :steps]
-    pairs = [leftover.independent((steps + j, steps + ripples + j)) for j in range(ripples)]
-    drops = [leftover.drops(weights), *(leftover.drop(pair)[:, :, -1:] for pair in pairs if pair)]
+    pairs = [projected.independent((steps + j, steps + ripples + j)) for j in range(ripples)]
+    drops = [projected.drops(weights), *(projected.drop(pair)[:, :, -1:] for pair in pairs if pair)]
     names += ["angle"] * (len(drops) - 1)
     parameters = np.append(np.full(steps, 4), [3 * len(pair) for pair in pairs if pair]).astype(int)
-    return names, leftover.gains(np.concatenate(drops, axis=2), parameters), parameters, leftover.samples
+    return names, projected.gains(np.concatenate(drops, axis=2), parameters), parameters, projected.samples
 
 
-def bases_of(selection: Selection) -> list[tuple[str, Curves, list[Block]]]:
+def _bases_of(selection: Selection) -> list[tuple[str, Curves, list[Block]]]:
     """Return covariates that the recordings hold, the curves of each, and which of these are tried together.
 
     A block is tried with its first ``least`` curves, and with each further one.
@@ -152,11 +156,11 @@ def bases_of(selection: Selection) -> list[tuple[str, Curves, list[Block]]]:
     components: list[Block] = [(range(3 * i, 3 * i + 3), 3) for i in range(3)]
     bases: list[tuple[str, Curves, list[Block]]] = [("specific_force", _force, [*components, (range(9), 9)])]
     if observations.clock_shared:
-        bases.append(("time", _chebyshev(SIGNALS["time"][1], motions), degrees))
+        bases.append(("time", _chebyshev("time", motions), degrees))
     if all(m.temperature is not None for m in motions):
-        bases.append(("temperature", _chebyshev(SIGNALS["temperature"][1], motions), degrees))
+        bases.append(("temperature", _chebyshev("temperature", motions), degrees))
     if any(np.any(~m.still) for m in motions):
-        bases.append(("rate", _chebyshev(speed, motions), degrees))
+        bases.append(("rate", _chebyshev("speed", motions), degrees))
     if any(m.axis is not None for m in motions):
         count = MOST - FEWEST + 1
         single: list[Block] = [((j, count + j), 2) for j in range(count)]
@@ -164,53 +168,28 @@ def bases_of(selection: Selection) -> list[tuple[str, Curves, list[Block]]]:
     return bases
 
 
-def speed(motion: Motion) -> Values:
-    """Return the magnitude of the angular rate: (n,) array, deg/s."""
-    size: Values = np.sqrt(np.einsum("ij,ij->i", motion.angular_rate, motion.angular_rate))
-    return size
-
-
-SIGNALS: dict[str, tuple[str, Callable[[Motion], Values | None]]] = {
-    "temperature": ("temperature", lambda motion: motion.temperature),
-    "time": ("time", lambda motion: motion.time),
-    "rate": ("speed", speed),
-}
-
-
-def _chebyshev(of: Callable[[Motion], Values | None], motions: list[Motion]) -> Curves:
-    values = [v for m in motions if (v := of(m)) is not None]
+def _chebyshev(signal: str, motions: Sequence[Motion]) -> Curves:
+    """Return what evaluates Chebyshev polynomials of degree 1 to 5 of a signal over its span."""
+    values = [np.asarray(signals_of(motion)[signal]) for motion in motions]
     low, high = min(float(v.min()) for v in values), max(float(v.max()) for v in values)
     width = max(high - low, 1e-12)
 
     def curves(motion: Motion) -> Values:
-        value = of(motion)
-        assert value is not None  # noqa: S101
-        return chebyshev(2.0 * (value - low) / width - 1.0)
+        x = 2.0 * (np.asarray(signals_of(motion)[signal]) - low) / width - 1.0
+        return np.asarray(chebvander(x, DEGREE)[:, 1:], np.float64)
 
     return curves
 
 
-def chebyshev(x: Values) -> Values:
-    """Return the Chebyshev polynomials of degree 1 to 5 of values from -1 to 1: (n, 5) array."""
-    out = np.empty((len(x), DEGREE))
-    out[:, 0], out[:, 1] = x, 2.0 * x * x - 1.0
-    for degree in range(2, DEGREE):
-        out[:, degree] = 2.0 * x * out[:, degree - 1] - out[:, degree - 2]
-    return out
-
-
 def _harmonics(motion: Motion, fewest: int = FEWEST) -> Values:
-    count = MOST - fewest + 1
+    """Return cos and sin of the table's angle times ``fewest`` to 8: (n, 2 m) array."""
     if motion.angle is None:
-        return np.zeros((len(motion.time), 2 * count))
-    turn = np.exp(1j * np.radians(motion.angle))
-    powers = np.empty((len(turn), count), complex)
-    powers[:, 0] = turn**fewest
-    for j in range(1, count):
-        powers[:, j] = powers[:, j - 1] * turn
-    return np.concatenate([powers.real, powers.imag], axis=1)
+        return np.zeros((len(motion.time), 2 * (MOST - fewest + 1)))
+    turns = np.radians(motion.angle)[:, None] * np.arange(fewest, MOST + 1)
+    return np.concatenate([np.cos(turns), np.sin(turns)], axis=1)
 
 
 def _force(motion: Motion) -> Values:
+    """Return Chebyshev polynomials of degree 3 to 5 of each component of the specific force: (n, 9) array."""
     scaled = motion.specific_force / max(float(np.abs(motion.specific_force).max()), 1.0)
-    return np.concatenate([chebyshev(scaled[:, i])[:, 2:] for i in range(3)], axis=1)
+    return np.concatenate([chebvander(scaled[:, i], DEGREE)[:, 3:] for i in range(3)], axis=1)
