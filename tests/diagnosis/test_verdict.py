@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 from bench_session import Session, record
-from pipeline.study.judge import calibrated, settings_of
 
 from pipeline.diagnosis.diagnose import diagnose
 from pipeline.diagnosis.verdict import Evidence, HeldOut, decide, doubts_of, held_out_of, judged
@@ -17,6 +16,7 @@ from pipeline.records import Note, Recording
 from pipeline.report.summary import summary_row
 from pipeline.study.bench import recordings_of
 from pipeline.study.cases import draw
+from pipeline.study.run import calibrated, settings_of
 
 INSIDE, ABOVE, BELOW = HeldOut(1.0, 0.9, 1.2), HeldOut(9.0, 0.9, 1.2), HeldOut(0.5, 0.9, 1.2)
 NOTHING = Evidence("gyroscope", "nothing_missing", over_noise=1.0, published=INSIDE, method="reference_least_squares")
