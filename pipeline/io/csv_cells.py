@@ -16,7 +16,7 @@ from pyarrow import compute as pc
 from pyarrow import csv as arrow_csv
 
 from pipeline.errors import InputError
-from pipeline.io.csv_layout import DELIMITERS, fields, single_blanks
+from pipeline.io.csv_header import DELIMITERS, fields, single_blanks
 from pipeline.io.ingest_settings import AUTO, COMMENTED, WHITESPACE
 
 if TYPE_CHECKING:

@@ -1,63 +1,201 @@
-"""Typed parsing of rows: every column's type is given, none is inferred, and no text stands for a missing value."""
+"""Rows of a text log to numbers, and what is wrong with the rows that are none.
+
+The type of every column is given, none is inferred, and no text stands for a missing value. The fast parser says that a
+block of rows holds a bad cell, but not where: only the lines of such a block are checked one by one.
+"""
 
 from __future__ import annotations
 
+import csv
+import math
+import re
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
-from pyarrow import csv
+from pyarrow import csv as arrow_csv
+
+from pipeline.errors import IngestError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping, Sequence
 
-PARSER_BLOCK_BYTES = 1 << 24
+    from numpy.typing import NDArray
+
+    from pipeline.io.ingest_settings import Column
+
+LISTED = 5
+LEAVE_A_GAP = "ingest.csv.bad_rows=drop leaves a gap in place of such rows"
+HINTS = {
+    "bad_row": LEAVE_A_GAP,
+    "nul": LEAVE_A_GAP,
+    "not_a_number": LEAVE_A_GAP,
+    "not_finite": "ingest.csv.nan=gap leaves a gap in place of such rows",
+    "decimal_comma": "set ingest.csv.decimal=',' and a delimiter that is none",
+    "restarted": "the log was restarted: set ingest.csv.session=1, 2 .. to read one part of it",
+}
+END_OF_NUMBER = re.compile(r"[\d.,eE+-]+")
 
 
-def parse(data: bytes | memoryview, delimiter: str, decimal: str, width: int, types: Mapping[int, Any]) -> Any:  # noqa: ANN401
-    """Parse some columns of rows.
+@dataclass(frozen=True)
+class Layout:
+    """The columns of a text log and the channels that they hold, each with the index of its column."""
+
+    path: str
+    names: list[str]
+    columns: list[tuple[Column, int]]
+    delimiter: str
+    decimal: str
+
+    def parse(self, body: bytes, types: Mapping[int, Any]) -> Any:  # noqa: ANN401  (pyarrow has no types)
+        """Return columns of rows as a pyarrow table, named by their index.
+
+        Raises
+        ------
+        pyarrow.ArrowInvalid
+            If a row has another number of fields, or a cell is not of its type.
+        """
+        names = [str(i) for i in range(len(self.names))]
+        return arrow_csv.read_csv(
+            pa.py_buffer(body),
+            arrow_csv.ReadOptions(use_threads=False, block_size=len(body) + 1, column_names=names),
+            arrow_csv.ParseOptions(delimiter=self.delimiter, quote_char='"' if b'"' in body else False),
+            arrow_csv.ConvertOptions(
+                column_types={str(i): t for i, t in types.items()},
+                include_columns=[str(i) for i in types],
+                null_values=[],
+                check_utf8=False,
+                decimal_point=self.decimal,
+            ),
+        )
+
+    def numbers(self, body: bytes, rows: int) -> dict[int, NDArray[np.float64]] | None:
+        """Return the columns in use as numbers, by index; None where a cell is not a finite number."""
+        wanted = sorted({index for _, index in self.columns})
+        if b"\0" in body or (b'"' in body and self._quoted_numbers(body)):
+            return None
+        try:
+            table = self.parse(body, dict.fromkeys(wanted, pa.float64()))
+        except pa.ArrowInvalid:
+            return None
+        found: dict[int, NDArray[np.float64]] = {i: table.column(str(i)).to_numpy() for i in wanted}
+        valid = table.num_rows == rows and all(bool(np.isfinite(values).all()) for values in found.values())
+        return found if valid else None
+
+    def _quoted_numbers(self, body: bytes) -> bool:
+        """Return whether a number stands in quotes, where a comma in it may separate thousands."""
+        wanted = {index for _, index in self.columns}
+        lines = (line.decode("utf-8", "replace") for line in body.split(b"\n") if b'"' in line)
+        return any(wanted & set(_quoted(line, self.delimiter)) for line in lines)
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A line that is no row of numbers.
+
+    ``line`` counts from 1. ``kind`` is a code of ``HINTS``. ``short``: it has too few fields. ``parted_before``: the
+    line is a row, but the next line may hold the end of its last number; that line's number.
+    """
+
+    line: int
+    kind: str
+    message: str
+    text: str
+    short: bool = False
+    parted_before: int = 0
+
+
+def refusal(layout: Layout, faults: Sequence[Fault], *, more: bool = False) -> IngestError:
+    """Return the error that names the first bad line of a log and how many there are (``more``: at least)."""
+    worst = next((f for f in faults if f.kind == "restarted"), faults[0])
+    others = [str(f.line) for f in faults if f is not worst]
+    said = ""
+    if others:
+        count = f"at least {len(others)}" if more else str(len(others))
+        said = f" ({count} more such lines, up to line {faults[-1].line}"
+        if len(others) > 1:
+            said += f": {', '.join(others[: LISTED - 1])}{' ..' if len(others) >= LISTED else ''}"
+        said += ")"
+    return IngestError(worst.message + said, f"{layout.path}:{worst.line}", fault=worst.kind, hint=HINTS[worst.kind])
+
+
+def find_faults(
+    layout: Layout, body: bytes, lines: NDArray[np.int64], before: tuple[int, str] | None
+) -> Iterator[Fault]:
+    """Yield the faults of a block of rows in the order of their lines.
 
     Parameters
     ----------
-    data : bytes
-        Lines without a header, each ending in a newline.
-    delimiter, decimal : str
-    width : int
-        Number of columns.
-    types : mapping of int to pyarrow type
-        Index of each column that is wanted, to its type.
-
-    Returns
-    -------
-    pyarrow.Table
-        Columns named by their index.
-
-    Raises
-    ------
-    pyarrow.ArrowInvalid
-        If a row has another number of fields, or a cell is not of its type.
+    layout : Layout
+    body : bytes
+    lines : (n,) array
+        The number of each line of ``body``.
+    before : (int, str), optional
+        Number and text of the valid row before the block.
     """
-    quoted = b'"' in data if isinstance(data, bytes) else False
-    return csv.read_csv(
-        pa.py_buffer(data),
-        read_options=csv.ReadOptions(
-            use_threads=False,
-            block_size=min(len(data) + 1, PARSER_BLOCK_BYTES),
-            column_names=[str(i) for i in range(width)],
-        ),
-        parse_options=csv.ParseOptions(
-            delimiter=delimiter, quote_char='"' if quoted else False, newlines_in_values=False
-        ),
-        convert_options=csv.ConvertOptions(
-            column_types={str(i): t for i, t in types.items()},
-            include_columns=[str(i) for i in types],
-            null_values=[],
-            check_utf8=False,
-            decimal_point=decimal,
-        ),
-    )
+    for number, raw in zip(lines.tolist(), body.split(b"\n"), strict=False):
+        text = raw.decode("utf-8", "replace")
+        fault = _fault(layout, number, text)
+        if fault is None:
+            before = (number, text)
+            continue
+        single = fault.short and layout.delimiter not in text and END_OF_NUMBER.fullmatch(text)
+        if single and before is not None:  # a line break in -0.0394 leaves -0.03 and 94
+            message = f"the line may end inside a number: the next has a single field, {text[:40]!r}"
+            yield Fault(before[0], "bad_row", message, before[1], parted_before=number)
+        before = None
+        yield fault
 
 
-def all_finite(table: Any) -> bool:  # noqa: ANN401  (pyarrow has no types)
-    """Return whether a table of doubles holds finite numbers only."""
-    return all(bool(np.isfinite(chunk.to_numpy()).all()) for column in table.columns for chunk in column.chunks)
+def _fault(layout: Layout, line: int, text: str) -> Fault | None:
+    """Return what is wrong with a line, None where it is a row of numbers."""
+    if "\0" in text:
+        nul = text.count("\0")
+        return Fault(line, "nul", f"{nul} NUL bytes within the line: {text[:60]!r}", text)
+    try:
+        cells = next(csv.reader([text], delimiter=layout.delimiter, strict=True), [])
+    except csv.Error as error:
+        return Fault(line, "bad_row", f"the line cannot be split into fields ({error}): {text[:120]!r}", text)
+    if [cell.strip() for cell in cells] == layout.names:
+        said = _fault_of_cell(layout, layout.columns[0], cells, [])[1]
+        return Fault(line, "restarted", f"{said}: a header again", text)
+    width = len(layout.names)
+    if len(cells) != width:
+        message = f"the line has {len(cells)} fields where {width} are expected: {text[:120]!r}"
+        return Fault(line, "bad_row", message, text, short=len(cells) < width)
+    quoted = _quoted(text, layout.delimiter) if '"' in text else []
+    for column in layout.columns:
+        kind, message = _fault_of_cell(layout, column, cells, quoted)
+        if kind:
+            return Fault(line, kind, message, text)
+    return None
+
+
+def _quoted(line: str, delimiter: str) -> list[int]:
+    """Return which cells of a line stand in quotes."""
+    cells = re.findall(rf'\s*("(?:[^"]|"")*"|[^{re.escape(delimiter)}]*)\s*(?:{re.escape(delimiter)}|$)', line)
+    return [index for index, cell in enumerate(cells) if cell.startswith('"')]
+
+
+def _fault_of_cell(
+    layout: Layout, where: tuple[Column, int], cells: list[str], quoted: Sequence[int]
+) -> tuple[str, str]:
+    """Return the kind of fault of a cell, empty where it is a finite number, and what is wrong with it."""
+    column, index = where
+    name, channel = layout.names[index], column.channel
+    label = f"column {name}" if not name.startswith("column ") else name
+    text = cells[index].strip()
+    point = re.escape(layout.decimal)
+    if not text:
+        return "not_finite", f"{label} ({channel}) is empty; a number is expected"
+    if re.fullmatch(rf"[+-]?(\d+{point}?\d*|{point}\d+)([eE][+-]?\d+)?", text):
+        if index in quoted:
+            return "not_a_number", f"{label} ({channel}) is '\"{text[:40]}\"', in quotes; a number stands without them"
+        if math.isfinite(float(text.replace(",", "."))):
+            return "", ""
+        return "not_finite", f"{label} ({channel}) is {text!r}, more than a number can hold"
+    if re.fullmatch(r"[+-]?\d+,\d+", text):
+        return "decimal_comma", f"{label} ({channel}) is {text!r}, a decimal comma; write numbers with a point"
+    kind = "not_finite" if re.fullmatch(r"[+-]?(nan|inf(inity)?)", text, re.IGNORECASE) else "not_a_number"
+    return kind, f"{label} ({channel}) is {text[:40]!r}; a finite number is expected"

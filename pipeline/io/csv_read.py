@@ -1,9 +1,9 @@
-"""Text logs to channels: typed parsing without inference, units, and counts that stay integers.
+"""Text logs to channels in the units of the package; counts stay integers.
 
     value = (count - offset) / counts_per_unit
 
-Files of one recording that were logged at the same times are joined row by row; a table's log with a clock of its own
-is brought to the sensor's (``pipeline.io.clock_alignment``).
+Files of one recording that were logged at the same times are joined row by row; the log of
+a table with a clock of its own is aligned with the sensor's (``pipeline.io.encoder_log``).
 """
 
 from __future__ import annotations
@@ -14,12 +14,10 @@ import numpy as np
 
 from pipeline.errors import IngestError
 from pipeline.io.channel_table import ChannelTable
-from pipeline.io.csv_careful import read_carefully
-from pipeline.io.csv_order import in_order
-from pipeline.io.csv_quick import read_quickly
-from pipeline.io.csv_time import LONGEST_S, refuse_coarse, seconds_per_unit, whole_times
+from pipeline.io.csv_rows import read_rows
+from pipeline.io.csv_times import in_order, times_of
 from pipeline.io.ingest_settings import Checks
-from pipeline.io.units import COUNTS, UNITS, decode, to_house_unit
+from pipeline.io.units import COUNTS, decode, to_house_unit
 from pipeline.records import Encoding, Note
 
 if TYPE_CHECKING:
@@ -28,30 +26,18 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.io.csv_rows import Rows
     from pipeline.io.ingest_settings import Column, CsvFormat
 
 TABLE_TIME = "table_time"
 
 
 def read_csv(paths: Sequence[Path], formats: Sequence[CsvFormat], checks: Checks | None = None) -> ChannelTable:
-    """Read a text log, or the parts of one.
-
-    Parameters
-    ----------
-    paths : sequence of Path
-    formats : sequence of CsvFormat
-        The layout of each file.
-    checks : Checks, optional
-
-    Returns
-    -------
-    ChannelTable
+    """Return the channels of a text log, or of the files of one recording.
 
     Raises
     ------
-    InputError
-        With ``path:line`` where a line is to blame.
+    IngestError
+        With ``path:line`` where a line is at fault.
     """
     tables = [read_one(path, layout, checks or Checks()) for path, layout in zip(paths, formats, strict=True)]
     same = [t for t, layout in zip(tables, formats, strict=True) if not layout.own_clock]
@@ -66,25 +52,39 @@ def read_csv(paths: Sequence[Path], formats: Sequence[CsvFormat], checks: Checks
 
 
 def read_one(path: Path, settings: CsvFormat, checks: Checks) -> ChannelTable:
-    """Read one file."""
-    rows = read_quickly(path, settings) or read_carefully(path, settings, checks)
-    tick_ns = float(settings.tick_ns or UNITS["time"][_unit_of_time(rows)][0])
-    ordered = in_order(rows, _times(rows, settings), settings.session, checks, tick_ns)
-    rows = ordered.rows
-    source = {"file": rows.path, "sha256": rows.sha256, "rows": rows.count}
-    values, encodings, notes = {}, {}, list(rows.notes)
+    """Return the channels of one file."""
+    rows = read_rows(path, settings, checks)
+    rows, time_ns = in_order(rows, times_of(rows, settings), settings, checks)
+    notes = rows.notes
     if settings.rate_hz is not None:
-        notes.append(Note("N-SYNTHTIME", rows.count, 0, 0, f"no time column: rows counted at {settings.rate_hz:g} Hz"))
-    for column, index in rows.columns:
+        detail = f"no time column: rows counted at {settings.rate_hz:g} Hz"
+        notes = (*notes, Note("N-SYNTHTIME", len(time_ns), 0, 0, detail))
+    values, encodings = {}, {}
+    for column, index in rows.layout.columns:
         if column.channel != "time":
-            uses = sum(i == index for _, i in rows.columns)
-            numbers = rows.numbers[index] if uses > 1 else rows.numbers.pop(index)
-            values[column.channel], encoding = _channel(column, numbers)
+            values[column.channel], encoding = _channel(column, rows.numbers[index])
             if encoding is not None:
                 encodings[column.channel] = encoding
+    lines = rows.lines
     return ChannelTable(
-        rows.path, ordered.time_ns, values, source, rows.line_of, encodings, tuple(notes), ordered.flags
+        path=rows.layout.path,
+        time_ns=time_ns,
+        values=values,
+        source={"file": rows.layout.path, "sha256": rows.sha256, "rows": len(lines)},
+        line_of=lambda row: int(lines[row]) if row < len(lines) else 0,
+        encodings=encodings,
+        notes=notes,
+        flags=rows.flags,
     )
+
+
+def _channel(column: Column, numbers: NDArray[np.float64]) -> tuple[NDArray[np.float64], Encoding | None]:
+    """Return a channel's values in its unit of the package and, for whole counts, how they are encoded."""
+    if column.unit != COUNTS:
+        return to_house_unit(column.channel, numbers, column.unit), None
+    encoding = Encoding(scale=1.0 / column.counts_per_unit, offset=column.offset)
+    whole = bool(np.all(numbers == np.rint(numbers)))
+    return decode(numbers, encoding), encoding if whole else None
 
 
 def _joined(tables: Sequence[ChannelTable]) -> ChannelTable:
@@ -106,43 +106,8 @@ def _joined(tables: Sequence[ChannelTable]) -> ChannelTable:
     )
 
 
-def _channel(column: Column, numbers: NDArray[np.float64]) -> tuple[NDArray[np.float64], Encoding | None]:
-    """Return a channel's values in its house unit and, for whole counts, the way back to them."""
-    if column.unit != COUNTS:
-        return to_house_unit(column.channel, numbers, column.unit), None
-    encoding = Encoding(scale=1.0 / column.counts_per_unit, offset=column.offset)
-    whole = bool(np.all(numbers == np.rint(numbers)))
-    return decode(numbers, encoding), encoding if whole else None
-
-
-def _unit_of_time(rows: Rows) -> str:
-    return next((c.unit for c, _ in rows.columns if c.channel == "time"), "s")
-
-
-def _times(rows: Rows, settings: CsvFormat) -> NDArray[np.int64]:
-    """Return the time of each row, ns."""
-    if settings.rate_hz is not None:
-        counted: NDArray[np.int64] = np.rint(np.arange(rows.count) * (1e9 / settings.rate_hz)).astype(np.int64)
-        return counted
-    column, index = next((c, i) for c, i in rows.columns if c.channel == "time")
-    values, name = rows.numbers[index], rows.names[index]
-    unit_s = float(settings.tick_ns) / 1e9 if settings.tick_ns is not None else seconds_per_unit(column.unit)
-    largest = float(np.max(np.abs(values[[np.argmin(values), np.argmax(values)]]))) * unit_s
-    if largest >= LONGEST_S:
-        row = int(np.argmax(np.abs(values)))
-        raise IngestError(
-            f"time {values[row] * unit_s:g} s is out of range; is {column.unit} the unit of column {name}?",
-            f"{rows.path}:{rows.line_of(row)}",
-            fault="wrong_rate",
-        )
-    if rows.exact_ns is not None:
-        refuse_coarse(values, rows.exact_ns, column.unit, name, rows.path)
-        return rows.exact_ns
-    return whole_times(values, column.unit, settings.tick_ns)
-
-
 def _check_same_times(first: ChannelTable, other: ChannelTable) -> None:
-    """Refuse parts that were not logged at the same times: their rows do not belong together."""
+    """Refuse files that were not logged at the same times: their rows do not belong together."""
     if np.array_equal(first.time_ns, other.time_ns):
         return
     rows = min(len(first.time_ns), len(other.time_ns))

@@ -1,14 +1,19 @@
-"""Which paths are regular files: to open a FIFO waits for ever, a device may never end."""
+"""Access to files of users: regular files only, unchanged while they are read, of the kind that is expected.
+
+Opening a FIFO would wait forever, and a device may never end.
+"""
 
 from __future__ import annotations
 
 import os
 import stat
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from pipeline.errors import ConfigurationError
+from pipeline.errors import ConfigurationError, IngestError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
 KINDS = {
@@ -18,10 +23,29 @@ KINDS = {
     stat.S_IFCHR: "a device",
     stat.S_IFBLK: "a device",
 }
+UTF_16 = "UTF-16 text: save it as UTF-8"
+# First bytes of files that are no text logs, and what to do.
+FOREIGN = {
+    b"\x89MCAP": "an MCAP file: give it the suffix .mcap",
+    b"\x1f\x8b": "a gzip file: decompress it first",
+    b"\x28\xb5\x2f\xfd": "a zstd file: decompress it first",
+    b"BZh": "a bzip2 file: decompress it first",
+    b"\xfd7zXZ": "an xz file: decompress it first",
+    b"PK\x03\x04": "a zip or Excel file: export it as text",
+    b"\xd0\xcf\x11\xe0": "an Excel file of the old kind: export it as text",
+    b"SQLite format 3": "an SQLite database (a ROS 2 bag of the old kind): convert it to MCAP",
+    b"#ROSBAG": "a ROS 1 bag: convert it to MCAP",
+    b"\x89HDF": "an HDF5 or MATLAB file: export it as text",
+    b"MATLAB 7.3": "an HDF5 file (MATLAB 7.3): export it as text",
+    b"MATLAB 5.0": "a MATLAB file: export it as text",
+    b"PAR1": "a Parquet file: export it as text",
+    b"\xff\xfe": UTF_16,
+    b"\xfe\xff": UTF_16,
+}
 
 
 def not_regular(path: Path) -> str:
-    """Return why a path cannot be read as a file; nothing for a regular file, or a link to one.
+    """Return why a path cannot be read as a file, empty for a regular file or a link to one.
 
     Raises
     ------
@@ -40,15 +64,7 @@ def not_regular(path: Path) -> str:
 
 
 def read_text(path: Path, largest: int, what: str) -> str:
-    """Return the text of a UTF-8 file, of which at most ``largest`` bytes are read.
-
-    Parameters
-    ----------
-    path : Path
-    largest : int
-        Bytes.
-    what : str
-        What the file holds, for the message: ``settings``.
+    """Return the text of a UTF-8 file of at most ``largest`` bytes; ``what`` it holds is named in refusals.
 
     Raises
     ------
@@ -67,3 +83,34 @@ def read_text(path: Path, largest: int, what: str) -> str:
     if len(content) > largest:
         raise ConfigurationError(f"has more than {largest} bytes, the limit for {what}", str(path))
     return text
+
+
+@contextmanager
+def unchanged(path: Path) -> Iterator[None]:
+    """Refuse a log that is no regular file, cannot be opened, is empty, or changes while it is read."""
+    try:
+        other = not_regular(path)
+        if other:
+            raise IngestError(other, str(path), fault="unreadable")
+        before = path.stat()
+        if before.st_size == 0:
+            raise IngestError("the file is empty (0 bytes)", str(path), fault="empty")
+        yield
+        after = path.stat()
+    except OSError as error:
+        raise IngestError(f"cannot be read: {error.strerror or error}", str(path), fault="unreadable") from error
+    if (before.st_size, before.st_mtime_ns, before.st_ino) != (after.st_size, after.st_mtime_ns, after.st_ino):
+        raise IngestError(
+            f"the file changed while it was read ({before.st_size} bytes, then {after.st_size})",
+            str(path),
+            fault="changed",
+            hint="is it still being recorded or copied? Run again when that is done",
+        )
+
+
+def refuse_foreign(start: bytes, path: str) -> None:
+    """Refuse a file whose first bytes are those of another kind of file."""
+    for magic, what in FOREIGN.items():
+        if start.startswith(magic):
+            fault = "utf16" if what == UTF_16 else "foreign"
+            raise IngestError(f"not a text log but {what}", path, fault=fault)

@@ -23,8 +23,8 @@ from fractions import Fraction
 from typing import TYPE_CHECKING
 
 from pipeline.errors import IngestError
+from pipeline.io.file_access import refuse_foreign, unchanged
 from pipeline.io.ingest_settings import Column, CsvFormat
-from pipeline.io.text_file import refuse_foreign, unchanged
 from pipeline.io.units import ATTITUDE, COUNTS, DEGREES, TRIADS
 
 if TYPE_CHECKING:

@@ -26,7 +26,7 @@ from mcap.records import Attachment, Channel, Chunk, ChunkIndex, DataEnd, Footer
 from pipeline.errors import IngestError
 from pipeline.io.mcap_chunk import Run, split, unpack
 from pipeline.io.mcap_records import MAGIC, RECORD_HEAD, attachment, message_index, parsed
-from pipeline.io.text_file import FOREIGN
+from pipeline.io.file_access import FOREIGN
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

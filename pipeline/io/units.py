@@ -8,6 +8,7 @@ House units are g, deg/s, deg, degC and integer ns. Nothing is guessed: a column
 from __future__ import annotations
 
 import math
+import re
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -47,6 +48,22 @@ UNITS: dict[str, dict[str, tuple[float, float]]] = {
     "table_rate": _RATE,
     **dict.fromkeys(ATTITUDE, _RATIO),
 }
+
+# Spellings of units in the names of columns, lower case and without blanks, to the names used here.
+SPELLINGS = {
+    "g": "g", "mg": "mg", "m/s^2": "m/s^2", "m/s2": "m/s^2", "m/s²": "m/s^2", "ms^-2": "m/s^2", "m/s/s": "m/s^2",
+    "mps2": "m/s^2", "deg/s": "deg/s", "°/s": "deg/s", "dps": "deg/s", "degs/s": "deg/s", "rad/s": "rad/s",
+    "rads/s": "rad/s", "s": "s", "sec": "s", "seconds": "s", "ms": "ms", "us": "us", "µs": "us", "μs": "us", "ns": "ns",
+    "deg": "deg", "°": "deg", "rad": "rad", "degc": "degC", "°c": "degC", "c": "degC", "celsius": "degC",
+    "counts": "counts", "lsb": "counts", "raw": "counts",
+}  # fmt: skip
+BRACKETS = re.compile(r"[\[(]([^\])]*)[\])]\s*$")
+
+
+def unit_in_brackets(name: str) -> str | None:
+    """Return the unit that a column's name states in brackets at its end, None where it states none."""
+    found = BRACKETS.search(name)
+    return SPELLINGS.get(found.group(1).strip().lower().replace(" ", "")) if found else None
 
 
 def to_house_unit(channel: str, values: NDArray[np.float64], unit: str) -> NDArray[np.float64]:

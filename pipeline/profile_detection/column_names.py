@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import re
 
-from pipeline.io.csv_columns import BRACKETS, SPELLINGS, unit_in_brackets
-from pipeline.io.units import CHANNELS, UNITS
+from pipeline.io.units import BRACKETS, CHANNELS, SPELLINGS, UNITS, unit_in_brackets
 
 WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d")
 MERGED = re.compile(r"(a|ac|acc|accl|accel|f|g|gy|gyr|gyro|w|omega|rot)([xyz])")

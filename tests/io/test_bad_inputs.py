@@ -12,6 +12,7 @@ from bad_logs import FILE, TABLE_ANGLE, VALUES, Case, cases
 from sample_logs import SENSOR, procedure
 
 from pipeline.errors import ConfigurationError, InputError, MissingInputError
+from pipeline.io.csv_parse import Layout
 from pipeline.io.ingest_settings import check_ingest
 from pipeline.io.parquet import load_recordings, save_recordings
 from pipeline.io.read import read_recordings
@@ -68,16 +69,14 @@ def test_bad_input_is_refused_by_its_code_with_its_facts(
 
 
 def _write_while_it_is_read(monkeypatch: pytest.MonkeyPatch, file: Path) -> None:
-    import pipeline.io.csv_quick as module  # noqa: PLC0415
-
-    parse = module.parse
+    parse = Layout.parse
 
     def parse_and_write(*arguments: Any) -> Any:
         with file.open("ab") as stream:
             stream.write(b"30.0,0,0,1,0,0,0\n")
         return parse(*arguments)
 
-    monkeypatch.setattr(module, "parse", parse_and_write)
+    monkeypatch.setattr(Layout, "parse", parse_and_write)
 
 
 @pytest.mark.parametrize("number", [n for n, c in CASES.items() if not c.fault])

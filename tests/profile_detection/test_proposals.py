@@ -14,7 +14,6 @@ from pipeline.config.compose import Composer
 from pipeline.errors import IngestError
 from pipeline.io.csv_read import read_csv
 from pipeline.io.ingest_settings import Checks, csv_formats
-from pipeline.io.text_file import load_text
 from pipeline.profile_detection.profile_text import as_yaml
 from pipeline.profile_detection.proposal import Proposal, propose
 from pipeline.profile_detection.text_layout import find_shape
@@ -176,7 +175,17 @@ def test_a_matlab_file_of_hdf5_is_named(tmp_path: Path) -> None:
     file = tmp_path / "log.csv"
     file.write_bytes(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(512, b"\0") + b"\x89HDF\r\n\x1a\n")
     with pytest.raises(IngestError, match=r"an HDF5 file \(MATLAB 7.3\): export it as text"):
-        load_text(file)
+        read_csv(
+            [file],
+            csv_formats(
+                {
+                    "csv": {
+                        "rate_hz": 1.0,
+                        "columns": {c: {"column": c, "unit": "g"} for c in ("accel_x", "accel_y", "accel_z")},
+                    }
+                }
+            ),
+        )
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,254 @@
+"""The times of a text log's rows: integer nanoseconds, increasing.
+
+    time = round(t * 10^9), from the decimal digits themselves where doubles are too coarse
+
+A double of t seconds is finer than half a nanosecond up to t = 10^6 s; Unix time, 1.7*10^9 s, is larger.
+
+A counter that overflows starts again at 0: a time that falls from within 2.5 intervals of M to within 2.5 intervals of
+0 continues at M, where M is 2^32 us or ms, or 2^16, 2^24 or 2^32 of the column's unit. Rows displaced by at most five
+are sorted and rows that repeat the one before them are dropped, within the limit of ``ingest.checks.repaired_rows``.
+Any other time that goes back belongs to another session of the logger.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from decimal import Decimal
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pyarrow as pa
+
+from pipeline.errors import IngestError
+from pipeline.io.timestamps import time_error
+from pipeline.io.units import UNITS
+from pipeline.records import Note
+
+if TYPE_CHECKING:
+    from fractions import Fraction
+
+    from numpy.typing import NDArray
+
+    from pipeline.io.csv_parse import Layout
+    from pipeline.io.csv_rows import Rows
+    from pipeline.io.ingest_settings import Checks, Column, CsvFormat
+
+EXACT_BELOW_S = 1e6
+LONGEST_S = 9.2e9  # int64 nanoseconds end at 292 years
+DECIMAL_DIGITS = {"s": 9, "ms": 6, "us": 3, "ns": 0}
+COARSEST = 0.01  # of the median interval
+NEAR = 2.5  # intervals
+LARGEST_DISPLACEMENT = 5  # rows
+RESET_INTERVALS = 5  # a time that falls back by more begins another session
+REPAIRED = np.uint16(8)
+
+
+def time_column(layout: Layout) -> tuple[Column, int] | None:
+    """Return the column of the time and its index, None where there is none."""
+    return next(((c, i) for c, i in layout.columns if c.channel == "time"), None)
+
+
+def seconds_per_unit(unit: str) -> float:
+    """Return the length of a unit of time, s."""
+    return UNITS["time"][unit][0] / 1e9
+
+
+def exact_times(layout: Layout, body: bytes) -> NDArray[np.int64]:
+    """Return the times of rows in ns from their decimal digits."""
+    column, index = next((c, i) for c, i in layout.columns if c.channel == "time")
+    digits = DECIMAL_DIGITS[column.unit]
+    try:
+        table = layout.parse(body, {index: pa.decimal128(38, digits)})
+    except pa.ArrowInvalid:  # more digits than whole ns have
+        strings = layout.parse(body, {index: pa.string()}).column(0).to_pylist()
+        texts = (s.strip().replace(",", ".") for s in strings)
+        return np.array([int(Decimal(s).scaleb(digits).to_integral_value()) for s in texts], np.int64)
+    decimals = table.column(0).combine_chunks()
+    words = np.frombuffer(decimals.buffers()[1], np.int64)
+    return words[2 * decimals.offset : 2 * (decimals.offset + len(decimals)) : 2].copy()  # low words of 128 bits
+
+
+def whole_times(values: NDArray[np.float64], unit: str, tick_ns: Fraction | None = None) -> NDArray[np.int64]:
+    """Return times in ns of numbers in a unit, or of counts of a tick."""
+    if tick_ns is not None and tick_ns.denominator == 1 and bool(np.all(values == np.rint(values))):
+        return np.asarray(values.astype(np.int64) * int(tick_ns))
+    scale = UNITS["time"][unit][0] if tick_ns is None else float(tick_ns)
+    return np.asarray(np.rint(values * scale).astype(np.int64))
+
+
+def times_of(rows: Rows, settings: CsvFormat) -> NDArray[np.int64]:
+    """Return the time of each row, ns.
+
+    Raises
+    ------
+    IngestError
+        If a time is out of range, or the times have lost their digits.
+    """
+    if settings.rate_hz is not None:
+        return np.asarray(np.rint(np.arange(len(rows.lines)) * (1e9 / settings.rate_hz)).astype(np.int64))
+    column, index = next((c, i) for c, i in rows.layout.columns if c.channel == "time")
+    values, name, tick_ns = rows.numbers[index], rows.layout.names[index], settings.tick_ns
+    unit_s = float(tick_ns) / 1e9 if tick_ns is not None else seconds_per_unit(column.unit)
+    row = int(np.argmax(np.abs(values)))
+    if abs(values[row]) * unit_s >= LONGEST_S:
+        raise IngestError(
+            f"time {values[row] * unit_s:g} s is out of range; is {column.unit} the unit of column {name}?",
+            rows.place(row),
+            fault="wrong_rate",
+        )
+    if rows.exact_ns is None:
+        return whole_times(values, column.unit, tick_ns)
+    _refuse_coarse(values, rows.exact_ns, column.unit, name, rows.layout.path)
+    return rows.exact_ns
+
+
+def _refuse_coarse(values: NDArray[np.float64], exact_ns: NDArray[np.int64], unit: str, name: str, path: str) -> None:
+    """Refuse times that were stored as doubles too coarse for them, as nanoseconds since 1970 are.
+
+    Such times are the doubles themselves, or end in zeros where the digits of a double end.
+    """
+    scale = int(UNITS["time"][unit][0])
+    spacing = float(np.spacing(np.abs(values).max())) * scale
+    step = float(np.median(np.abs(np.diff(exact_ns)))) if len(exact_ns) > 1 else 0.0
+    if spacing < 2 * scale or step == 0:
+        return
+    zeros = next(z for z in range(18, -1, -1) if not np.any(exact_ns % 10**z))
+    resolution = spacing if np.array_equal(exact_ns, values.astype(np.int64) * scale) else 10.0**zeros
+    if resolution >= spacing / 10 and resolution > COARSEST * step:
+        raise IngestError(
+            f"the times in column {name} have passed through floating-point numbers, which are {spacing:g} ns apart "
+            f"at {values[0]:.3g} {unit}: more than {COARSEST:.0%} of the median interval of {step:g} ns",
+            path,
+            fault="coarse_time",
+            hint="log them as integers",
+        )
+
+
+def in_order(
+    rows: Rows, time_ns: NDArray[np.int64], settings: CsvFormat, checks: Checks
+) -> tuple[Rows, NDArray[np.int64]]:
+    """Return rows in the order of their times, each time once, and these times.
+
+    Raises
+    ------
+    IngestError
+        If a time goes back otherwise than by an overflow or by displaced rows, if two rows of one time differ, or if
+        more would have to be repaired than ``checks`` allows.
+    """
+    clock = time_column(rows.layout)
+    tick_ns = float(settings.tick_ns or UNITS["time"][clock[0].unit if clock else "s"][0])
+    if settings.session is not None:
+        rows, time_ns = _one_session(rows, time_ns, settings.session, tick_ns)
+    if bool(np.all(np.diff(time_ns) > 0)):
+        return rows, time_ns
+    time_ns, wraps = _unwrap(time_ns, tick_ns)
+    if wraps:
+        rows = replace(rows, notes=(*rows.notes, _wrap_note(wraps, rows.lines, tick_ns)))
+    back = np.flatnonzero(np.diff(time_ns) <= 0)
+    if back.size == 0:
+        return rows, time_ns
+    first = int(back[0]) + 1
+    error = time_error(time_ns, rows.place(first), first)
+    order = np.argsort(time_ns, kind="stable")
+    displacement = int(np.abs(order - np.arange(len(order))).max())
+    if displacement > LARGEST_DISPLACEMENT:
+        raise error
+    moved = np.flatnonzero(order != np.arange(len(order)))
+    twice = _repeated(rows, time_ns, order, error)
+    touched = rows.repaired + moved.size + twice.size
+    if touched > checks.repaired_rows * len(rows.lines):
+        raise over_budget(error, touched, len(rows.lines), checks)
+    notes = []
+    for code, places, detail in (
+        ("N-SORT", moved, f"rows out of order were sorted by their times, displaced by {displacement} rows at most"),
+        ("N-DUP", twice, "rows that repeat the one before them, time and all, were dropped"),
+    ):
+        if places.size:
+            ends = order[places[[0, -1]]]
+            first, last = sorted(rows.lines[ends].tolist())
+            start, end = (time_ns[ends] / 1e9).tolist()
+            notes.append(Note(code, int(places.size), first, last, detail, start, end))
+    keep = np.delete(np.arange(len(order)), twice)
+    flags = np.zeros(len(order), np.uint16)
+    flags[moved] = REPAIRED
+    rows = replace(rows.select(order[keep], *notes), flags=flags[keep] if moved.size else None)
+    return rows, time_ns[order[keep]]
+
+
+def over_budget(error: IngestError, touched: int, rows: int, checks: Checks) -> IngestError:
+    """Return a refusal for more repairs than the profile allows."""
+    hint = (
+        f"{touched} of {rows} rows would have to be repaired, more than the share of {checks.repaired_rows:g} that "
+        "ingest.checks.repaired_rows allows"
+    )
+    return IngestError(error.fact, error.file, fault=error.code, hint=hint)
+
+
+def _repeated(rows: Rows, time_ns: NDArray[np.int64], order: NDArray[np.intp], error: IngestError) -> NDArray[np.intp]:
+    """Return the places, in order, of rows that repeat the one before them; differing rows of one time are refused."""
+    twice = np.flatnonzero(np.diff(time_ns[order]) == 0) + 1
+    here, before = order[twice], order[twice - 1]
+    for values in rows.numbers.values():
+        differ = np.flatnonzero(values[here] != values[before])
+        if differ.size:
+            if error.code != "duplicate_time":
+                raise error
+            row = int(max(here[differ[0]], before[differ[0]]))
+            raise IngestError(
+                f"time repeats {time_ns[row] / 1e9:.9g} s in rows that differ ({twice.size} such times)",
+                rows.place(row),
+                fault="duplicate_time",
+                hint="time has to increase; has the time enough digits, or were two logs merged?",
+            ) from error
+    return np.asarray(twice, np.intp)
+
+
+def _unwrap(time_ns: NDArray[np.int64], tick_ns: float) -> tuple[NDArray[np.int64], list[tuple[int, int]]]:
+    """Return times with the overflows of their counter undone, and the row after each overflow with its modulus, ns."""
+    steps = np.diff(time_ns)
+    back = np.flatnonzero(steps < 0)
+    forward = steps[steps > 0]
+    if back.size == 0 or forward.size == 0 or time_ns.min() < 0:
+        return time_ns, []
+    near = NEAR * float(np.median(forward))
+    moduli = sorted({2**32 * 1000, 2**32 * 1_000_000} | {round(2**bits * tick_ns) for bits in (16, 24, 32)})
+    largest = int(time_ns.max())
+    for modulus in (m for m in moduli if m > largest >= m - near):
+        rows = back[(time_ns[back] >= modulus - near) & (time_ns[back + 1] < near)]
+        if rows.size:
+            added = np.zeros(len(time_ns), np.int64)
+            added[rows + 1] = modulus
+            return time_ns + np.cumsum(added), [(int(r) + 1, modulus) for r in rows]
+    return time_ns, []
+
+
+def _wrap_note(wraps: list[tuple[int, int]], lines: NDArray[np.int64], tick_ns: float) -> Note:
+    modulus = wraps[0][1]
+    bits = next((b for b in (16, 24, 32) if round(2**b * tick_ns) == modulus), 32)
+    detail = f"the time counter of {bits} bits started again at 0 (every {modulus / 1e9:.9g} s) and was counted on"
+    return Note("N-WRAP", len(wraps), int(lines[wraps[0][0]]), int(lines[wraps[-1][0]]), detail)
+
+
+def _one_session(
+    rows: Rows, time_ns: NDArray[np.int64], session: int, tick_ns: float
+) -> tuple[Rows, NDArray[np.int64]]:
+    """Return one part of a log that was restarted: at a repeated header, or where time falls back for good."""
+    steps = np.diff(time_ns)
+    forward = steps[steps > 0]
+    longest = RESET_INTERVALS * float(np.median(forward)) if forward.size else 0.0
+    wrapped = {row for row, _ in _unwrap(time_ns, tick_ns)[1]} if not rows.restarts else set()
+    resets = {int(r) + 1 for r in np.flatnonzero(steps < -longest)} - wrapped
+    starts = sorted({0, *resets, *rows.restarts} - {len(time_ns)})
+    if session > len(starts):
+        raise IngestError(
+            f"ingest.csv.session is {session}, and the log was started {len(starts)} times",
+            rows.layout.path,
+            fault="session",
+        )
+    start, stop = [*starts, len(time_ns)][session - 1 : session + 1]
+    index = np.arange(start, stop)
+    first, last = int(rows.lines[start]), int(rows.lines[stop - 1])
+    detail = f"session {session} of {len(starts)}: lines {first} to {last} were read"
+    times = float(time_ns[start]) / 1e9, float(time_ns[stop - 1]) / 1e9
+    note = Note("N-SESSION", len(rows.lines) - index.size, first, last, detail, *times)
+    return rows.select(index, note), time_ns[start:stop]
