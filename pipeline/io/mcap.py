@@ -14,11 +14,11 @@ import numpy as np
 
 from pipeline.errors import IngestError
 from pipeline.io.channel_table import ChannelTable
+from pipeline.io.file_access import unchanged
 from pipeline.io.mcap_channels import MAPPED, TopicDecoder, kind_of, topic_of
 from pipeline.io.mcap_reader import McapReader
 from pipeline.io.mcap_settings import HEADER, OWN
 from pipeline.io.ros2_messages import IMU, JOINT_STATE, QUATERNION_STAMPED, TEMPERATURE
-from pipeline.io.file_access import unchanged
 from pipeline.io.timestamps import check_fine, check_plausible, in_order
 from pipeline.io.units import ACCELEROMETER, GYROSCOPE, TABLE_CHANNELS
 from pipeline.records import Encoding, Note
