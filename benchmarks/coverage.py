@@ -2,8 +2,8 @@
 
     nice python benchmarks/coverage.py [--n 1000] [--seed 1] [--conditions white,wander,table] [--methods ...]
 
-A unit is drawn by the product's own simulator (MPU-6050, quantised), recorded, and calibrated by each method; then the
-truth of each parameter lies within its expanded uncertainty or not. Conditions:
+A unit is drawn by the product's own simulator (MPU-6050, quantised), recorded, and calibrated by each method and by the
+stage ``effects``; then the truth of each parameter lies within its expanded uncertainty or not. Conditions:
 
     white   white noise alone, and a data sheet that states no bias wander
     wander  with the data sheet's bias wander; in both, a table without errors, which states none
@@ -53,9 +53,12 @@ METHODS: dict[str, tuple[str, str, tuple[str, ...]]] = {  # procedure, sensor, s
     "staged gyroscope": (BENCH, "gyroscope", ("bias", "orthogonality_and_misalignment", "scale_factor")),
     "nonlinear accelerometer": (BENCH, "accelerometer", ("nonlinear_least_squares",)),
     "cholesky gyroscope": (BENCH, "gyroscope", ("bias", "cholesky_lu")),
+    "effects accelerometer": (BENCH, "accelerometer", ("effects",)),
+    "effects gyroscope": (BENCH, "gyroscope", ("effects",)),
     "nonlinear accelerometer by hand": (HAND, "accelerometer", ("nonlinear_least_squares",)),
     "rests and moves gyroscope by hand": (HAND, "gyroscope", ("rests_and_moves",)),
 }
+EFFECTS = {"accelerometer": ["scale_factor_asymmetry"], "gyroscope": ["g_sensitivity"]}  # fitted; no unit has them
 ACCURACIES = ("angle_accuracy_deg", "rate_accuracy", "orthogonality_deg", "levelling_deg")
 CONDITIONS = ("white", "wander", "table")
 APPROXIMATIONS: dict[tuple[Any, ...], np.ndarray] = {}
@@ -74,6 +77,7 @@ def settings_of(condition: str, table: str, procedure: str) -> dict[str, Any]:
         "table": stated,
         "procedure": {"holdout_every": 0},
         "method": {"as_printed": False},
+        "effects": EFFECTS,
     }
 
 
@@ -142,6 +146,10 @@ def judged(method: str, recordings: list[Recording], settings: JSON, hidden: JSO
     expanded = part["expanded_uncertainty"]
     U = np.concatenate([expanded["bias"], np.ravel(expanded["matrix"])])
     error = value - true_values(method, recordings, settings, hidden)
+    if "effects" in method:
+        added = [p for effect in part["effects"] for p in effect["parameters"].values()]
+        error = np.append(error, [p["value"] for p in added])
+        U = np.append(U, [p["expanded_uncertainty"] for p in added])
     return np.where(U > 0.0, error / np.where(U > 0.0, U, 1.0), np.nan)
 
 

@@ -28,7 +28,7 @@ from pipeline.diagnosis.words import next_experiment
 from pipeline.errors import NotObservableError
 from pipeline.estimation.design import Start, Term
 from pipeline.estimation.effects_stage import AUTO
-from pipeline.estimation.joint import calibration_of, fit_terms
+from pipeline.estimation.generalized_least_squares import calibration_of, fit_terms
 from pipeline.estimation.multi_position.rests import by_hand
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import FAR_ABOVE, GATE_BIC, INFLATED, select
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.estimation.joint import Fit
+    from pipeline.estimation.generalized_least_squares import Fit
     from pipeline.estimation.ranking import Score
     from pipeline.estimation.selection import Selection
     from pipeline.records import Recording, SensorCalibration

@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.estimation.design import Start
-from pipeline.estimation.joint import fit_terms
+from pipeline.estimation.generalized_least_squares import fit_terms
 from pipeline.estimation.observations import through_filter
 from pipeline.model.effects import effect_of
 from pipeline.model.effects.base import truth, unit_of
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.estimation.joint import Fit
+    from pipeline.estimation.generalized_least_squares import Fit
     from pipeline.estimation.selection import Selection
     from pipeline.records import Motion, Recording, SensorCalibration
 

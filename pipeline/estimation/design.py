@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.errors import NotObservableError
+from pipeline.estimation.engine import LinearMap
 from pipeline.estimation.gauss_markov import Products
-from pipeline.estimation.linear_map import LinearMap
 from pipeline.model.effects.base import Layout, truth
 
 if TYPE_CHECKING:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from pipeline.estimation.joint import fit_joint
+from pipeline.estimation.generalized_least_squares import fit_joint
 from pipeline.estimation.multi_position.rests import by_hand
 from pipeline.estimation.noise import noise_of
 from pipeline.estimation.observations import observe

@@ -1,54 +1,66 @@
 """Propagation of distributions by a Monte Carlo method, beside the law of propagation (JCGM 101:2008).
 
-    y_r = f(x_r),    x_r drawn from the joint distribution of the inputs,  r = 1 .. M
+    parameters_r = f(z + e_r),    e_r = e_noise + sum over sources of type B e_s,    r = 1 .. M
 
-where the estimate is the mean of the y_r, u their standard deviation, and an interval that holds the share p of them
-the coverage interval: between the quantiles (1 - p)/2 and (1 + p)/2, or the shortest one (7.7, 5.3.4).
+where
 
-The law of propagation is borne out where both ends of its interval ``y +- U`` lie within
+    z       : what a fit first makes of the readings by a linear map (a sinusoid's coefficients, a response to the rate,
+              the lengths of gravity at the rests, the directions of moves), so that nothing is lost by drawing it
+    f       : all that follows, without linearising
+    e_noise : normal under each hypothesis of the noise, which are drawn by their weight
+    e_s     : normal; rounding errors are many, so that their sum is
 
-    delta = 10^l / 2,    u = c 10^l with c an integer of two digits
-
-of those of the Monte Carlo interval (8.1): where it holds to half of the last digit that is stated.
+The law of propagation holds where both ends of its interval ``y +- U`` lie within ``delta = 10^l / 2`` of those of the
+Monte Carlo interval, with ``u = c 10^l`` and c an integer of the digits stated (8.1): one digit below a million trials,
+two from there on, as the ends of a Monte Carlo interval scatter by 2.7 u / sqrt(M).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.estimation.engine import Posterior, draw_normal
+
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping, Sequence
 
     from numpy.typing import ArrayLike, NDArray
 
+    from pipeline.records import Contribution, SensorCalibration
+
     Values = NDArray[np.float64]
+    Draw = Callable[[np.random.Generator, int], Values]
+
+SEED = 101
+BATCH = 500  # trials drawn at a time, which bounds the memory
+TWO_DIGITS = 1_000_000  # trials
+KEY = "monte_carlo"
+NEWTONS = 4  # each squares the relative error of a step that starts at 1e-2 or less
 
 
 @dataclass(frozen=True)
 class Distribution:
-    """What a Monte Carlo run says of n results.
+    """The results of a Monte Carlo run.
 
     Attributes
     ----------
     estimate, standard_uncertainty : (n,) array
     symmetric, shortest : (n, 2) array
-        Coverage intervals: with as much outside on either side, and the shortest.
-    trials : int
+        Coverage intervals: with as much outside on either side, and the shortest (7.7, 5.3.4).
     """
 
     estimate: Values
     standard_uncertainty: Values
     symmetric: Values
     shortest: Values
-    trials: int
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Beside each other: the interval by the law of propagation and the one by Monte Carlo.
+    """The interval by the law of propagation against the one by Monte Carlo.
 
     Attributes
     ----------
@@ -69,58 +81,23 @@ class Comparison:
 
 
 def distribution_of(results: ArrayLike, probability: float = 0.95) -> Distribution:
-    """Return estimate, standard uncertainty and coverage intervals of drawn results.
-
-    Parameters
-    ----------
-    results : (M, n) array
-        A row for each trial.
-    probability : float
-        p.
-    """
+    """Return estimate, standard uncertainty and coverage intervals of (M, n) drawn results."""
     values = np.sort(np.asarray(results, float), axis=0)
     M = len(values)
     inside = round(probability * M)
     low = (M - inside) // 2
     last = np.minimum(np.arange(M - inside) + inside, M - 1)
-    widths = values[last] - values[: M - inside]
-    at, column = np.argmin(widths, axis=0), np.arange(values.shape[1])
+    at, column = np.argmin(values[last] - values[: M - inside], axis=0), np.arange(values.shape[1])
     shortest = np.stack([values[at, column], values[np.minimum(at + inside, M - 1), column]], axis=1)
     symmetric = np.stack([values[low], values[min(low + inside, M - 1)]], axis=1)
-    return Distribution(values.mean(axis=0), values.std(axis=0, ddof=1), symmetric, shortest, M)
-
-
-def propagate_distributions(
-    function: Callable[[Values], Values],
-    draw: Callable[[np.random.Generator, int], Values],
-    *,
-    seed: int,
-    trials: int = 1_000_000,
-    probability: float = 0.95,
-) -> Distribution:
-    """Propagate the distribution of inputs through a function.
-
-    Parameters
-    ----------
-    function : callable
-        (M, m) drawn inputs to (M, n) results.
-    draw : callable
-        ``draw(generator, M)`` returns (M, m) inputs.
-    seed : int
-    trials : int
-        M; at least ``1e4 / (1 - p)`` (7.2.1).
-    probability : float
-        p.
-    """
-    return distribution_of(function(draw(np.random.default_rng(seed), trials)), probability)
+    return Distribution(values.mean(axis=0), values.std(axis=0, ddof=1), symmetric, shortest)
 
 
 def numerical_tolerance(standard_uncertainty: ArrayLike, digits: int = 2) -> Values:
-    """Return delta for a standard uncertainty that is stated to some significant digits: (n,) array (7.9.2)."""
+    """Return delta for standard uncertainties that are stated to some significant digits: (n,) array (7.9.2)."""
     u = np.atleast_1d(np.asarray(standard_uncertainty, float))
     exponent = np.floor(np.log10(np.maximum(u, np.finfo(float).tiny))) - digits + 1.0
-    c = np.round(u / 10.0**exponent)
-    exponent += c >= 10.0**digits  # 0.0996 is 10 x 10^-2 to two digits
+    exponent += np.round(u / 10.0**exponent) >= 10.0**digits  # 0.0996 is 10 x 10^-2 to two digits
     delta: Values = 0.5 * 10.0**exponent
     return delta
 
@@ -133,19 +110,7 @@ def compare(
     digits: int = 2,
     shortest: bool = False,
 ) -> Comparison:
-    """Compare ``y +- U`` by the law of propagation with the interval of a Monte Carlo run (8.1).
-
-    Parameters
-    ----------
-    estimate, expanded_uncertainty : (n,) array
-        y and U.
-    found : Distribution
-        For the same probability.
-    digits : int
-        Significant digits of the standard uncertainty that are stated.
-    shortest : bool
-        Take the shortest interval in place of the symmetric one.
-    """
+    """Compare ``y +- U`` by the law of propagation with the interval of a Monte Carlo run of the same probability."""
     y, U = np.atleast_1d(np.asarray(estimate, float)), np.atleast_1d(np.asarray(expanded_uncertainty, float))
     interval = found.shortest if shortest else found.symmetric
     return Comparison(
@@ -153,3 +118,119 @@ def compare(
         np.abs(y - U - interval[:, 0]),
         np.abs(y + U - interval[:, 1]),
     )
+
+
+def trials_of(settings: Mapping[str, Any]) -> int:
+    """Return how many trials ``uncertainty.monte_carlo`` asks for; 0: none."""
+    return int((settings.get("uncertainty") or {}).get(KEY) or 0)
+
+
+def through(posterior: Posterior, stated: Sequence[Values], results: Callable[[Values], Values]) -> Draw:
+    """Return how parameters are drawn: errors of noise and of (q, q) stated covariances, through (t, q) to (t, p)."""
+
+    def draw(rng: np.random.Generator, count: int) -> Values:
+        errors = posterior.draw(rng, count)
+        for covariance in stated:
+            errors += draw_normal(rng, covariance, count)
+        return results(errors)
+
+    return draw
+
+
+def beside_trials(
+    calibration: SensorCalibration, draw: Draw, trials: int, direct: Sequence[Contribution] = ()
+) -> SensorCalibration:
+    """Return a calibration whose budget also holds the Monte Carlo run, and how it compares.
+
+    Parameters
+    ----------
+    calibration : SensorCalibration
+        With its budget.
+    draw : callable
+        Generator and t to (t, p) parameters.
+    trials : int
+        M.
+    direct : sequence of Contribution
+        Sources of type B that act on the parameters themselves.
+    """
+    rng, drawn = np.random.default_rng(SEED), []
+    for start in range(0, trials, BATCH):
+        values = draw(rng, min(BATCH, trials - start))
+        for source in direct:
+            values = values + draw_normal(rng, source.covariance, len(values))
+        drawn.append(values)
+    budget = dict(calibration.budget or {})
+    budget[KEY] = _compared(calibration, np.concatenate(drawn))
+    return replace(calibration, budget=budget)
+
+
+def without_trials(calibration: SensorCalibration, reason: str) -> SensorCalibration:
+    """Return a calibration whose budget says why it holds no Monte Carlo run."""
+    return replace(calibration, budget={**(calibration.budget or {}), KEY: {"trials": 0, "reason": reason}})
+
+
+def _compared(calibration: SensorCalibration, drawn: Values) -> dict[str, Any]:
+    effects = [value for effect in calibration.effects for value in effect.values]
+    estimate = np.concatenate([calibration.bias, calibration.matrix.ravel(), effects])
+    expanded = np.array((calibration.budget or {})["expanded_uncertainty"])
+    digits = 2 if len(drawn) >= TWO_DIGITS else 1
+    found = distribution_of(drawn)
+    against = compare(estimate, expanded, found, digits=digits)
+    known = expanded > 0.0
+    validated = against.borne_out | ~known
+    return {
+        "trials": len(drawn),
+        "reason": None,
+        "seed": SEED,
+        "digits": digits,
+        "estimate": estimate.tolist(),
+        "expanded_uncertainty": expanded.tolist(),
+        "mean": found.estimate.tolist(),
+        "standard_uncertainty": found.standard_uncertainty.tolist(),
+        "low": found.symmetric[:, 0].tolist(),
+        "high": found.symmetric[:, 1].tolist(),
+        "tolerance": np.where(known, against.tolerance, 0.0).tolist(),
+        "d_low": against.low.tolist(),
+        "d_high": against.high.tolist(),
+        "validated": validated.tolist(),
+        "all_validated": bool(validated.all()),
+    }
+
+
+def quadratic_results(columns: Values, curvature: Values, inverse: Values) -> Callable[[Values], Values]:
+    """Return the step of a least-squares fit by errors of its equations, to second order of the model.
+
+        g(d) = (X + H d)^T W (X d + d^T H d / 2 - e) = 0
+
+    Parameters
+    ----------
+    columns : (n, p) array
+        X.
+    curvature : (n, p, p) array
+        H, symmetric in its last two.
+    inverse : (n, n) array
+        W, the weights of the fit.
+
+    Returns
+    -------
+    callable
+        (t, n) errors e to (t, p) steps d, by Gauss-Newton.
+    """
+    size = np.sqrt(np.einsum("np,nm,mp->p", columns, inverse, columns))
+    size = np.where(size > 0.0, size, 1.0)
+    back = np.linalg.pinv(columns.T @ inverse @ columns / np.outer(size, size), rcond=1e-13, hermitian=True)
+    back = back / np.outer(size, size)
+    gain = back @ columns.T @ inverse
+    n, p = columns.shape
+    flat = curvature.reshape(n * p, p)
+
+    def step(e: Values) -> Values:
+        d = e @ gain.T
+        for _ in range(NEWTONS):
+            bent = (d @ flat.T).reshape(len(d), n, p)
+            left = (d @ columns.T + 0.5 * np.einsum("tnp,tp->tn", bent, d) - e) @ inverse
+            gradient = left @ columns + np.einsum("tnp,tn->tp", bent, left)
+            d = d - gradient @ back
+        return np.asarray(d)
+
+    return step

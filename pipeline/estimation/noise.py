@@ -122,11 +122,15 @@ def prior_of(sensor: str, recordings: Sequence[Recording], settings: Mapping[str
         Section ``sensor``.
     """
     sheet = settings.get("sensor", {}).get(sensor) or {}
-    static = [r for r in recordings if r.role == "static" and r.reading(sensor) is not None and r.samples > 1]
-    found = noise_of(sensor, recordings, settings) if static and sheet else None
-    if found and found.source == "static":
-        width = float(np.clip(np.sqrt(found.correlation_time / found.length), SHARPEST_WIDTH, SHEET_WIDTH))
-        return Prior(float(np.sqrt(np.mean(found.wander**2))), found.correlation_time, width)
+    static = any(r.role == "static" and r.reading(sensor) is not None and r.samples > 1 for r in recordings)
+    return static_or_sheet(noise_of(sensor, recordings, settings) if static and sheet else None, sheet)
+
+
+def static_or_sheet(noise: Noise | None, sheet: Mapping[str, Any]) -> Prior:
+    """Return the prior by a noise that a static recording tells, or else by the data sheet."""
+    if noise and noise.source == "static":
+        width = float(np.clip(np.sqrt(noise.correlation_time / noise.length), SHARPEST_WIDTH, SHEET_WIDTH))
+        return Prior(float(np.sqrt(np.mean(noise.wander**2))), noise.correlation_time, width)
     return Prior(float(sheet.get("bias_wander") or 0.0), _wander_time(sheet))
 
 
@@ -240,7 +244,7 @@ def _unseen(found: Likelihood, row: int, sheet: dict[str, Any], source: str) -> 
     return noise if loss < AGREES else Noise(white, np.zeros(3), noise.correlation_time, source)
 
 
-def _wander_time(sheet: dict[str, Any]) -> float:
+def _wander_time(sheet: Mapping[str, Any]) -> float:
     return float(sheet.get("wander_time_s") or DEFAULT_TIME_S)
 
 

@@ -18,8 +18,8 @@ its attenuation and in every ramp. A filter that this cannot rebuild leaves the 
 The accelerometer of a table that stops and goes is fitted to its settled rests, otherwise to all samples; the gyroscope
 to all samples, but where the table's rate is only the derivative of its logged angle the ramps are left out.
 
-The covariance allows for a bias wander (``pipeline.estimation.residual_noise``) and for the table's stated accuracies
-(``pipeline.estimation.table_inputs``); that of the matrix follows from ``dM = -M dK M``.
+The covariance allows for a bias wander (``pipeline.estimation.engine``) and for the table's stated accuracies
+(``pipeline.estimation.table_errors``); that of the matrix follows from ``dM = -M dK M``.
 """
 
 from __future__ import annotations
@@ -30,15 +30,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import ConfigurationError, NotObservableError
-from pipeline.estimation.bench_budget import budgeted
-from pipeline.estimation.budget import noise_contribution
+from pipeline.estimation.engine import LinearMap, assess_noise
 from pipeline.estimation.gauss_markov import blocks_of_samples
 from pipeline.estimation.least_squares import ScaledColumns, certificate
-from pipeline.estimation.linear_map import LinearMap
 from pipeline.estimation.noise import prior_of
-from pipeline.estimation.residual_noise import assess_noise
-from pipeline.estimation.table_inputs import Reference, disturbance
+from pipeline.estimation.table_errors import Reference, disturbance
 from pipeline.estimation.turns import parts_of, settled
+from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution
 from pipeline.model.effects.base import truth
 from pipeline.records import AXES, SensorCalibration, StageResult
 

@@ -26,7 +26,7 @@ import numpy as np
 
 from pipeline.estimation.design import BASE, Start, Term, ordinary_base
 from pipeline.estimation.gauss_markov import selection_grid
-from pipeline.estimation.joint import Fit, fit_best, fit_terms, starts_of
+from pipeline.estimation.generalized_least_squares import Fit, fit_best, fit_terms, starts_of
 from pipeline.estimation.observations import weighted
 from pipeline.estimation.ranking import Ranking, Score
 from pipeline.model.effect_limits import parameter_limits

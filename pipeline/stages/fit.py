@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import CannotCalibrateError
-from pipeline.estimation.stated import with_stated
+from pipeline.estimation.uncertainty_budget import with_stated
 from pipeline.files import read_json, write_json
 from pipeline.io.parquet import load_recordings
 from pipeline.records import SensorCalibration

@@ -20,7 +20,7 @@ from pipeline.diagnosis.residual_regression import ProjectedCurves
 from pipeline.diagnosis.words import in_words
 from pipeline.estimation.design import Term
 from pipeline.estimation.gauss_markov import Setting
-from pipeline.estimation.joint import fit_terms
+from pipeline.estimation.generalized_least_squares import fit_terms
 from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import Selection, select

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from pipeline.estimation.least_squares import solve_linear
-from pipeline.estimation.monte_carlo import compare, numerical_tolerance, propagate_distributions
-from pipeline.estimation.propagation import correlation, effective_degrees_of_freedom, means, propagate
+from pipeline.estimation.monte_carlo import compare, distribution_of, numerical_tolerance
+from pipeline.estimation.uncertainty_budget import effective_degrees_of_freedom, propagate
 from pipeline.records import coverage_factor
 
 # H.2: five simultaneous observations of V (V), I (mA) and phase angle (rad).
@@ -19,14 +19,19 @@ TEMPERATURE = [21.521, 22.012, 22.512, 23.003, 23.507, 23.999, 24.513, 25.002, 2
 CORRECTION = [-0.171, -0.169, -0.166, -0.159, -0.164, -0.165, -0.156, -0.157, -0.159, -0.161, -0.160]
 
 
+def correlation(covariance: np.ndarray) -> np.ndarray:
+    u = np.sqrt(np.diag(covariance))
+    return covariance / np.outer(u, u)
+
+
 def impedance(x: np.ndarray) -> np.ndarray:
     z = x[0] / x[1]
     return np.array([z * np.cos(x[2]), z * np.sin(x[2]), z])
 
 
 def test_h2_resistance_reactance_and_impedance_with_their_correlations() -> None:
-    mean, covariance, freedom = means(np.column_stack([VOLTAGE, np.array(CURRENT) * 1e-3, PHASE]))
-    assert freedom == 4
+    observed = np.column_stack([VOLTAGE, np.array(CURRENT) * 1e-3, PHASE])
+    mean, covariance = observed.mean(axis=0), np.cov(observed.T) / len(observed)
     assert [round(m, d) for m, d in zip(mean, (4, 7, 5), strict=True)] == [4.9990, 0.0196610, 1.04446]
     u = np.sqrt(np.diag(covariance))
     assert [round(s, d) for s, d in zip(u, (4, 7, 5), strict=True)] == [0.0032, 0.0000095, 0.00075]
@@ -77,9 +82,7 @@ def four_rectangular(generator: np.random.Generator, trials: int) -> np.ndarray:
 
 
 def test_jcgm_101_9_2_3_sum_of_four_rectangular_quantities() -> None:
-    found = propagate_distributions(
-        lambda x: x.sum(axis=1, keepdims=True), four_rectangular, seed=101, trials=4_000_000
-    )
+    found = distribution_of(four_rectangular(np.random.default_rng(101), 4_000_000).sum(axis=1, keepdims=True))
     assert round(float(found.standard_uncertainty[0]), 2) == 2.00
     assert np.round(found.symmetric[0], 2).tolist() == [-3.88, 3.88]
     assert np.diff(found.shortest[0])[0] == pytest.approx(2 * 3.88, abs=0.01)
@@ -101,6 +104,6 @@ def test_jcgm_101_7_9_2_numerical_tolerance() -> None:
 
 
 def test_the_shortest_interval_of_a_skew_distribution_is_shorter_than_the_symmetric_one() -> None:
-    found = propagate_distributions(lambda x: x**2, lambda rng, m: rng.standard_normal((m, 1)), seed=1, trials=200_000)
+    found = distribution_of(np.random.default_rng(1).standard_normal((200_000, 1)) ** 2)
     assert found.shortest[0] == pytest.approx([0.0, 1.96**2], abs=0.03)
     assert found.symmetric[0] == pytest.approx([0.00098, 5.02], abs=0.06)

@@ -11,7 +11,7 @@ from bench_session import BIAS, CONTINUOUS, STOP_AND_GO, K, Session, record
 from scipy.spatial.transform import Rotation
 
 from pipeline.errors import ConfigurationError, NotObservableError
-from pipeline.estimation.joint import fit_joint
+from pipeline.estimation.generalized_least_squares import fit_joint
 from pipeline.io.parquet import load_recordings, save_recordings
 from pipeline.model.effects import effect
 from pipeline.model.effects.base import truth

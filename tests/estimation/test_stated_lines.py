@@ -11,7 +11,7 @@ import pytest
 from table_turns import Bench, settings
 
 from pipeline.estimation.gyroscope import reference_least_squares
-from pipeline.estimation.stated import with_stated
+from pipeline.estimation.uncertainty_budget import with_stated
 from pipeline.io.parquet import save_recordings
 from pipeline.records import FittedEffect
 from pipeline.stages import batch

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from table_turns import Bench, run_stages, settings, specific_force
 
-from pipeline.estimation.propagation import effective_degrees_of_freedom
+from pipeline.estimation.uncertainty_budget import effective_degrees_of_freedom
 from pipeline.records import coverage_factor
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from bench_session import CONTINUOUS, STOP_AND_GO, K, Session, record
 
 from pipeline import load_calibration
 from pipeline.errors import ConfigurationError, InputError, MissingInputError
-from pipeline.estimation.joint import fit_joint
+from pipeline.estimation.generalized_least_squares import fit_joint
 from pipeline.model.effect_limits import parameter_limits
 from pipeline.model.effects import (
     built_in,

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from pipeline.estimation.budget import combined, scatter_contribution, type_b
 from pipeline.estimation.least_squares import certified
+from pipeline.estimation.uncertainty_budget import combined, scatter_contribution, type_b
 from pipeline.records import SensorCalibration
 from pipeline.report.budget_table import budget_of, convergence_of
 from pipeline.report.unit_page import render

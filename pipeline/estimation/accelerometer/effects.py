@@ -1,4 +1,4 @@
-"""Stage effects of the accelerometer: bias, matrix and effects fitted together (``pipeline.estimation.joint``)."""
+"""Stage effects of the accelerometer: bias, matrix and effects by generalized least squares."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ orientations need not be known. See ``pipeline.estimation.accelerometer.magnitud
 
 A misalignment that the orientations do not determine, as in six positions, is left at zero, and the result says so. On
 a table the errors of the rows are correlated by the bias wander, whose covariance is that of
-``pipeline.estimation.residual_noise``; by hand that of ``pipeline.estimation.accelerometer.rest_scatter``.
+``pipeline.estimation.engine``; by hand that of ``pipeline.estimation.accelerometer.rest_scatter``.
 """
 
 from __future__ import annotations
@@ -28,22 +28,20 @@ from pipeline.estimation.accelerometer.magnitude import (
 )
 from pipeline.estimation.accelerometer.orientations import orientations_of, without
 from pipeline.estimation.accelerometer.rest_scatter import RestErrors, rest_candidates, rest_scatter
-from pipeline.estimation.budget import (
-    candidate_covariances,
+from pipeline.estimation.engine import LinearMap, Posterior, assess_noise
+from pipeline.estimation.gauss_markov import blocks_of_samples
+from pipeline.estimation.least_squares import ScaledColumns, certified
+from pipeline.estimation.monte_carlo import beside_trials, quadratic_results, through, trials_of, without_trials
+from pipeline.estimation.noise import prior_of
+from pipeline.estimation.rest_means import describe_rests
+from pipeline.estimation.table_errors import Reference, disturbance
+from pipeline.estimation.turns import table_motion
+from pipeline.estimation.uncertainty_budget import (
     combined,
     gravity_contribution,
     noise_contribution,
     scatter_contribution,
 )
-from pipeline.estimation.gauss_markov import blocks_of_samples
-from pipeline.estimation.least_squares import ScaledColumns, certified
-from pipeline.estimation.linear_map import LinearMap
-from pipeline.estimation.noise import prior_of
-from pipeline.estimation.residual_noise import assess_noise
-from pipeline.estimation.rest_means import describe_rests
-from pipeline.estimation.table_inputs import Reference, disturbance
-from pipeline.estimation.trials import Errors, beside_trials, quadratic_results, trials_of, without_trials
-from pipeline.estimation.turns import table_motion
 from pipeline.records import SensorCalibration, StageResult, coverage_factor
 
 if TYPE_CHECKING:
@@ -53,8 +51,8 @@ if TYPE_CHECKING:
 
     from pipeline.estimation.accelerometer.magnitude import Ellipsoid
     from pipeline.estimation.accelerometer.orientations import Orientations
+    from pipeline.estimation.engine import ResidualNoise
     from pipeline.estimation.gauss_markov import Prior
-    from pipeline.estimation.residual_noise import ResidualNoise
     from pipeline.records import Contribution, Motion, Recording
 
     Values = NDArray[np.float64]
@@ -134,10 +132,12 @@ def fit(
 
     if isinstance(errors, str):
         return without_trials(complete, errors)
-    return beside_trials(complete, errors.through(results), trials, lines[1:])
+    return beside_trials(complete, through(errors, [], results), trials, lines[1:])
 
 
-def _row_errors(orientations: Orientations, found: Ellipsoid, prior: Prior, table: Mapping[str, Any]) -> Errors | str:
+def _row_errors(
+    orientations: Orientations, found: Ellipsoid, prior: Prior, table: Mapping[str, Any]
+) -> Posterior | str:
     """Return the distribution of the rows' errors, or why there is none."""
     rows, every = len(orientations.mean), np.eye(len(orientations.mean))
     spare = found.fit.degrees_of_freedom
@@ -145,15 +145,15 @@ def _row_errors(orientations: Orientations, found: Ellipsoid, prior: Prior, tabl
         return f"{rows} readings of a continuous turn are too many equations to draw; it is made for rests"
     if spare <= 1:
         variance = orientations.variance + prior.wander**2
-        return Errors(np.ones(1), np.diag(variance)[None], float(3 * np.sum(orientations.count - 1)))
+        return Posterior(np.ones(1), np.diag(variance)[None], float(3 * np.sum(orientations.count - 1)))
     if orientations.by_hand and orientations.rests:
         J = derivative_of(orientations.mean, found.values)[:, found.free]
         weight, candidates = rest_candidates(_errors(orientations, found, J), every, prior)
-        return Errors(weight, candidates, np.inf)
+        return Posterior(weight, candidates, np.inf)
     noise, along = _table_noise(orientations, found, prior, table)
     per_sample = np.where(np.arange(rows)[:, None] == orientations.row, 1.0 / orientations.count[orientations.row], 0.0)
     x, y, z = (per_sample * along[orientations.row, c] for c in range(3))
-    return Errors(noise.weight, candidate_covariances(noise, LinearMap((x, y, z), (every, every, every))), noise.spare)
+    return noise.posterior(LinearMap((x, y, z), (every, every, every)))
 
 
 def _second_order(orientations: Orientations, found: Ellipsoid) -> Callable[[Values], Values]:

@@ -12,7 +12,7 @@ where
 
 Rests that follow each other share the wander: taken for independent, they would claim too small an uncertainty of the
 bias. Nobody knows s, w and tau, so each point of a grid is weighted by its restricted likelihood (Patterson & Thompson,
-Biometrika 58, 1971) times what is believed of the wander, as in ``pipeline.estimation.residual_noise``. For one s and
+Biometrika 58, 1971) times what is believed of the wander, as in ``pipeline.estimation.engine``. For one s and
 tau one eigendecomposition gives every w.
 """
 
@@ -23,9 +23,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.estimation.averaged_covariance import averaged
-from pipeline.estimation.budget import scatter_contribution
+from pipeline.estimation.engine import Posterior
 from pipeline.estimation.gauss_markov import SURE, block_covariance
+from pipeline.estimation.uncertainty_budget import scatter_contribution
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -82,7 +82,7 @@ def rest_scatter(rests: RestErrors, gain: Values, prior: Prior) -> Contribution:
     """
     spare = len(rests.error) - rests.derivative.shape[1]
     weight, covariances = rest_candidates(rests, gain, prior)
-    covariance, freedom = averaged(weight, covariances, float("inf"))
+    covariance, freedom = Posterior(weight, covariances, float("inf")).averaged()
     parts = {
         "white noise": np.sqrt(np.minimum(np.diag(gain * rests.variance @ gain.T), np.diag(covariance))),
     }

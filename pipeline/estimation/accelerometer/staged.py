@@ -23,16 +23,14 @@ from pipeline.estimation.accelerometer.extremes import (
     sinusoids_of,
     turns_of,
 )
-from pipeline.estimation.bench_budget import budgeted
-from pipeline.estimation.budget import combined, noise_contribution, scatter_contribution
 from pipeline.estimation.correction import apply_correction
+from pipeline.estimation.engine import LinearMap, assess_noise
 from pipeline.estimation.gauss_markov import blocks_of_samples
 from pipeline.estimation.least_squares import ScaledColumns, certificate, certified
-from pipeline.estimation.linear_map import LinearMap
 from pipeline.estimation.noise import prior_of
-from pipeline.estimation.residual_noise import assess_noise
-from pipeline.estimation.table_inputs import Reference, disturbance
+from pipeline.estimation.table_errors import Reference, disturbance
 from pipeline.estimation.turns import parts_of
+from pipeline.estimation.uncertainty_budget import budgeted, combined, noise_contribution, scatter_contribution
 from pipeline.model.effects import effect
 from pipeline.records import FittedEffect, SensorCalibration, StageResult
 
@@ -43,8 +41,8 @@ if TYPE_CHECKING:
 
     from pipeline.estimation.accelerometer.chain import Chain
     from pipeline.estimation.accelerometer.extremes import Turn
+    from pipeline.estimation.engine import ResidualNoise
     from pipeline.estimation.gauss_markov import Prior
-    from pipeline.estimation.residual_noise import ResidualNoise
     from pipeline.estimation.turns import Sinusoid
     from pipeline.records import Contribution, Recording
 

@@ -20,7 +20,7 @@ matrix is ``A^-1``. As printed it is A: in Sudsanguan 2019, tables 5.25 and 5.26
 were the correction.
 
 Y is linear in the readings, so the covariance of A under white noise and bias wander follows from that of
-``pipeline.estimation.residual_noise``, and that of S, T, M and ``A^-1`` from their derivatives with respect to A.
+``pipeline.estimation.engine``, and that of S, T, M and ``A^-1`` from their derivatives with respect to A.
 """
 
 from __future__ import annotations
@@ -31,17 +31,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import ConfigurationError
-from pipeline.estimation.bench_budget import budgeted
-from pipeline.estimation.budget import noise_contribution, scatter_contribution
+from pipeline.estimation.engine import LinearMap, assess_noise
 from pipeline.estimation.gauss_markov import blocks_of_samples
 from pipeline.estimation.gyroscope.integrated_turns import require_turns, turns_of
 from pipeline.estimation.least_squares import certified, solve_linear
-from pipeline.estimation.linear_map import LinearMap
 from pipeline.estimation.noise import prior_of
 from pipeline.estimation.reference import inverted
-from pipeline.estimation.residual_noise import assess_noise
-from pipeline.estimation.table_inputs import Reference, disturbance
+from pipeline.estimation.table_errors import Reference, disturbance
 from pipeline.estimation.turns import parts_of
+from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, scatter_contribution
 from pipeline.records import AXES, SensorCalibration, StageResult
 
 if TYPE_CHECKING:

@@ -16,16 +16,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import ConfigurationError
-from pipeline.estimation.bench_budget import budgeted
-from pipeline.estimation.budget import noise_contribution
 from pipeline.estimation.correction import apply_correction
+from pipeline.estimation.engine import LinearMap, assess_noise
 from pipeline.estimation.gyroscope.response import Response, samples_of, weights_of
 from pipeline.estimation.least_squares import certified
-from pipeline.estimation.linear_map import LinearMap
 from pipeline.estimation.noise import prior_of
-from pipeline.estimation.residual_noise import assess_noise
-from pipeline.estimation.table_inputs import Reference, disturbance
+from pipeline.estimation.table_errors import Reference, disturbance
 from pipeline.estimation.turns import parts_of
+from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution
 from pipeline.records import SensorCalibration, StageResult
 
 if TYPE_CHECKING:

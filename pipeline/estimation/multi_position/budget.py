@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.estimation.budget import combined, gravity_contribution, scatter_contribution, type_b
+from pipeline.estimation.monte_carlo import trials_of
 from pipeline.estimation.multi_position.trials import tried_by_hand
-from pipeline.estimation.trials import trials_of
+from pipeline.estimation.uncertainty_budget import combined, gravity_contribution, scatter_contribution, type_b
 from pipeline.records import NORMAL
 
 if TYPE_CHECKING:

@@ -3,7 +3,7 @@
     step = (N + k P)^-1 (X^T C^-1 r - k P p),    covariance = k (N + k P)^-1,   N = X^T C^-1 X
 
 The step is taken at the most likely noise; the covariance is averaged over the noises by their restricted likelihood
-(``pipeline.estimation.averaged_covariance``),
+(``pipeline.estimation.engine``),
 
     -2 log L_R = rss / k + nu log k + log det C + log det(N + k P),    k = max(1, rss / nu),   nu = n - p
 
@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.averaged_covariance import averaged
-from pipeline.estimation.joint import parameter_names
+from pipeline.estimation.engine import Posterior
+from pipeline.estimation.generalized_least_squares import parameter_names
 from pipeline.estimation.multi_position.likelihood import NEW, beside
 from pipeline.estimation.multi_position.model import stepped
 
@@ -200,7 +200,7 @@ def _assessed(
     weight = np.exp(restricted - restricted.max())
     weight /= weight.sum()
     spare = max(len(equations.residual) - every[best].rank, 1)
-    covariance, freedom = averaged(weight, np.array([s.covariance for s in every]), spare)
+    covariance, freedom = Posterior(weight, np.array([s.covariance for s in every]), spare).averaged()
     return HandFit(
         state,
         covariance,

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.estimation.design import Term
-from pipeline.estimation.joint import starts_of
+from pipeline.estimation.generalized_least_squares import starts_of
 from pipeline.estimation.multi_position.equations import noises_for
 from pipeline.estimation.multi_position.fit import HandFit, fit
 from pipeline.estimation.multi_position.likelihood import NEW, beside

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.estimation.engine import draw_normal
+from pipeline.estimation.monte_carlo import beside_trials, quadratic_results
 from pipeline.estimation.multi_position.model import stepped
-from pipeline.estimation.trials import beside_trials, normal, quadratic_results
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -65,7 +66,7 @@ def tried_by_hand(
         chosen, steps = rng.choice(len(weight), count, p=weight), np.empty((count, p))
         for k in np.unique(chosen):
             own = chosen == k
-            steps[own] = solvers[k](normal(rng, candidates[k], int(np.count_nonzero(own))))
+            steps[own] = solvers[k](draw_normal(rng, candidates[k], int(np.count_nonzero(own))))
         return np.asarray(estimate + steps @ place.T)
 
     return beside_trials(calibration, draw, trials, direct)

@@ -9,8 +9,9 @@ import pytest
 from scipy.optimize import least_squares
 
 from pipeline.estimation.accelerometer import nonlinear_least_squares, reference_least_squares
+from pipeline.estimation.engine import Posterior
 from pipeline.estimation.gyroscope import rests_and_moves
-from pipeline.estimation.trials import Errors, beside_trials, quadratic_results
+from pipeline.estimation.monte_carlo import beside_trials, quadratic_results, through
 from pipeline.records import SensorCalibration
 from pipeline.report.budget_table import budget_of
 from pipeline.simulation.campaign import simulate_unit
@@ -29,14 +30,14 @@ def stated(u: float, value: float = 0.0) -> SensorCalibration:
 
 
 def drawn(function: Any, u: float) -> Any:
-    errors = Errors(np.ones(1), np.array([[[u**2]]]), np.inf)
+    errors = Posterior(np.ones(1), np.array([[[u**2]]]), np.inf)
 
     def results(e: np.ndarray) -> np.ndarray:
         out = np.tile(np.concatenate([np.zeros(3), np.eye(3).ravel()]), (len(e), 1))
         out[:, 0] = function(e[:, 0])
         return out
 
-    return errors.through(results)
+    return through(errors, [], results)
 
 
 def test_a_linear_model_is_validated() -> None:
@@ -60,7 +61,7 @@ def test_the_same_run_gives_the_same_numbers() -> None:
 
 
 def test_noise_that_is_a_mixture_keeps_its_long_tails() -> None:
-    errors = Errors(np.array([0.9, 0.1]), np.array([[[1.0]], [[100.0]]]), np.inf)
+    errors = Posterior(np.array([0.9, 0.1]), np.array([[[1.0]], [[100.0]]]), np.inf)
     values = errors.draw(np.random.default_rng(1), 40_000)[:, 0]
     assert values.var() == pytest.approx(0.9 + 10.0, rel=0.05)
     assert np.mean(np.abs(values) > 5.0) == pytest.approx(0.1 * 0.6171, rel=0.1)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.special import ndtr, stdtrit
 
-from pipeline.estimation.averaged_covariance import averaged
+from pipeline.estimation.engine import Posterior
 
 
 def test_one_candidate_keeps_its_covariance_and_its_degrees_of_freedom() -> None:
     covariance = np.array([[4.0, 1.0], [1.0, 9.0]])
-    found, freedom = averaged(np.ones(1), covariance[None], 30.0)
+    found, freedom = Posterior(np.ones(1), covariance[None], 30.0).averaged()
     np.testing.assert_allclose(found, covariance, rtol=1e-4)
     np.testing.assert_allclose(freedom, 30.0, rtol=1e-2)
 
@@ -22,7 +22,7 @@ def test_variances_by_inverse_chi_squared_make_the_student_distribution_that_the
 
     share = (np.arange(4000) + 0.5) / 4000
     variance = nu / (2.0 * gammaincinv(nu / 2.0, share))
-    found, freedom = averaged(np.full(4000, 1.0 / 4000), 7.0 * variance[:, None, None], np.inf)
+    found, freedom = Posterior(np.full(4000, 1.0 / 4000), 7.0 * variance[:, None, None], np.inf).averaged()
     assert found[0, 0] == pytest.approx(7.0, rel=0.01)
     assert freedom[0] == pytest.approx(nu, rel=0.03)
 
@@ -30,13 +30,15 @@ def test_variances_by_inverse_chi_squared_make_the_student_distribution_that_the
 @pytest.mark.parametrize("rare", [0.02, 0.1, 0.3])
 def test_the_interval_holds_95_percent_where_a_large_wander_is_believed_a_little(rare: float) -> None:
     weight, sigma = np.array([1.0 - rare, rare]), np.array([1.0, 5.0])
-    found, freedom = averaged(weight, (sigma**2)[:, None, None], np.inf)
+    found, freedom = Posterior(weight, (sigma**2)[:, None, None], np.inf).averaged()
     inside = np.sqrt(found[0, 0]) * stdtrit(min(freedom[0], 1e9), 0.975)
     assert weight @ (2.0 * ndtr(inside / sigma) - 1.0) == pytest.approx(0.95, abs=1e-3)
 
 
 def test_a_parameter_without_uncertainty_stays_without() -> None:
-    found, freedom = averaged(np.array([0.5, 0.5]), np.array([np.diag([0.0, 1.0]), np.diag([0.0, 2.0])]), 10.0)
+    found, freedom = Posterior(
+        np.array([0.5, 0.5]), np.array([np.diag([0.0, 1.0]), np.diag([0.0, 2.0])]), 10.0
+    ).averaged()
     assert found[0, 0] == 0.0
     assert np.isinf(freedom[0])
     assert freedom[1] < 10.0

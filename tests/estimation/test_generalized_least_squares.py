@@ -13,7 +13,7 @@ from scipy.special import stdtrit
 from pipeline.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.accelerometer import effects as accelerometer_stage
 from pipeline.estimation.gauss_markov import Products, Setting
-from pipeline.estimation.joint import fit_joint
+from pipeline.estimation.generalized_least_squares import fit_joint
 from pipeline.estimation.observations import observe
 from pipeline.model.effects import effect
 from pipeline.records import SensorCalibration

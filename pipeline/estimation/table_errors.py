@@ -21,13 +21,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.estimation.budget import type_b
-from pipeline.estimation.linear_map import LinearMap
+from pipeline.estimation.engine import LinearMap
 from pipeline.model.effects import effect
 from pipeline.model.effects.base import truth
 from pipeline.model.kinematics import earth_rate
 from pipeline.model.rotation import ABOUT
-from pipeline.records import NORMAL, noise_of_steps
+from pipeline.records import noise_of_steps
 from pipeline.signal.rests import RATE_AT_REST_DPS
 
 if TYPE_CHECKING:
@@ -36,7 +35,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.estimation.gauss_markov import Blocks
-    from pipeline.records import Contribution, Motion
+    from pipeline.records import Motion
 
     Values = NDArray[np.float64]
 
@@ -107,10 +106,18 @@ class Reference:
         return total
 
 
-def table_contributions(
-    reference: Reference, estimated: Sequence[str] = ()
-) -> tuple[list[Contribution], dict[str, str]]:
-    """Return the contribution of each stated accuracy, and why the others are not included.
+@dataclass(frozen=True)
+class StatedError:
+    """A stated accuracy: ``uncertainty`` of each independent error, and its ``effect``, (p, m), on the parameters."""
+
+    source: str
+    uncertainty: float
+    unit: str
+    effect: Values
+
+
+def table_errors(reference: Reference, estimated: Sequence[str] = ()) -> tuple[list[StatedError], dict[str, str]]:
+    """Return each stated accuracy with its effect, and why the others are not included.
 
     Parameters
     ----------
@@ -120,7 +127,7 @@ def table_contributions(
 
     Returns
     -------
-    contributions : list of Contribution
+    errors : list of StatedError
     not_included : dict of str to str
     """
     effects = {
@@ -142,7 +149,7 @@ def table_contributions(
         if reason:
             missing[source] = reason
         elif u:
-            found.append(type_b(source, NORMAL, float(u), unit, effects[source](reference)))
+            found.append(StatedError(source, float(u), unit, effects[source](reference)))
     return found, missing
 
 
@@ -152,7 +159,7 @@ def disturbance(reference: Reference, residuals: Values, blocks: Blocks) -> Valu
     Parameters
     ----------
     reference : Reference
-        Its linear map is not looked at.
+        Its linear map is not used.
     residuals : (n, 3) array
     blocks : Blocks
 
@@ -166,9 +173,14 @@ def disturbance(reference: Reference, residuals: Values, blocks: Blocks) -> Valu
         return None
     sums = np.zeros((len(blocks.weight), len(residuals)))
     sums[blocks.label(len(residuals)), np.arange(len(residuals))] = 1.0
-    x, y, z = np.eye(3 * len(sums)).reshape(3, len(sums), -1).transpose(0, 2, 1)
-    contributions, _ = table_contributions(replace(reference, fit=LinearMap((sums, sums, sums), (x, y, z))))
-    return np.sum([c.covariance for c in contributions], axis=0) if contributions else None
+    errors, _ = table_errors(replace(reference, fit=LinearMap((sums, sums, sums), _places(len(sums)))))
+    return np.sum([e.uncertainty**2 * e.effect @ e.effect.T for e in errors], axis=0) if errors else None
+
+
+def _places(count: int) -> tuple[Values, Values, Values]:
+    """Return what places ``count`` values of each channel one after the other."""
+    x, y, z = np.split(np.eye(3 * count), 3, axis=1)
+    return x, y, z
 
 
 def _largest(reference: Reference) -> float:

@@ -1,17 +1,17 @@
-"""Base and effects fitted together, by generalised least squares in the measurement direction.
+"""Bias, matrix and effects together, by generalized least squares in the measurement direction.
 
     y = b + K u(t') + sum over effects z(t'; p) + noise,    beta = (b, K, p)
-    step = (J^T C^-1 J)^-1 J^T C^-1 r,    covariance = s^2 (J^T C^-1 J)^-1
+    step = (J^T C^-1 J)^-1 J^T C^-1 r
 
 where
 
     u  : truth by the table, at the time t' that effects of timing lead to
     J  : derivative of the model with respect to beta; r: readings less the model
-    C  : white noise plus a bias wander, ``pipeline.estimation.gauss_markov``
-    s  : standard deviation of one sample, from the residual
+    C  : white noise plus a Gauss-Markov bias, ``pipeline.estimation.gauss_markov``
 
-Nearly everything is linear; time offsets, lags and time constants take a few Gauss-Newton rounds. The noise is the one
-under which the readings are most likely, and the covariance is averaged over the noises by their likelihood.
+Nearly everything is linear; time offsets, lags and time constants take a few Gauss-Newton rounds. The weights of the
+estimate are those of the noise under which the readings are most likely. Its uncertainty is that of
+``pipeline.estimation.engine``: all hypotheses about the noise, by their restricted likelihood.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import ConfigurationError, NotObservableError
-from pipeline.estimation.bench_budget import TEMPERATURE, TIME_BASE
-from pipeline.estimation.budget import combined, scatter_contribution
 from pipeline.estimation.design import BASE, BASE_NAMES, Design, Start, Term, motions_of, ordinary_base
+from pipeline.estimation.engine import Posterior, ResidualNoise
 from pipeline.estimation.gauss_markov import WHITE, Setting, selection_grid
 from pipeline.estimation.least_squares import certified
+from pipeline.estimation.noise import static_or_sheet
 from pipeline.estimation.observations import observe, weighted
-from pipeline.estimation.table_inputs import Reference, table_contributions
-from pipeline.estimation.trials import Errors, beside_trials, trials_of
+from pipeline.estimation.table_errors import Reference
+from pipeline.estimation.uncertainty_budget import budgeted, combined, noise_contribution, scatter_contribution
 from pipeline.model.effects import effect
 from pipeline.model.effects.base import Layout, truth
 from pipeline.model.sessions import OWN
@@ -48,12 +48,7 @@ ROUNDS = 25
 SMALL_STEP = 1e-3  # of a standard uncertainty
 RATIOS = (0.01, 0.03, 0.1, 0.2, 0.3, 0.5, 1.0, 3.0)
 TIMES = (30.0, 100.0, 300.0, 1000.0)
-SCATTER = "white noise and bias wander, averaged over the wanders by their likelihood; lack of fit included"
-NOT_INCLUDED = {
-    "quantisation": "contained in the noise of the readings",
-    "temperature": TEMPERATURE,
-    "time base": TIME_BASE,
-}
+RANK = 1e-12  # of the products' eigenvalues: the rounding of a double, with a margin
 LEAST_EIGENVALUE = 1e-7  # of the products of columns of unit norm: a column is 3e-4 new
 
 
@@ -68,7 +63,7 @@ class Fit:
     terms : tuple of Term
         The effects at their values.
     covariance : (12 + p, 12 + p) array
-        Of bias, K (row by row) and the effects' parameters.
+        Of bias, K (row by row) and the effects' parameters, as the noise settings of the fit weight it.
     log_likelihood : float
         Under the best noise setting, up to a constant of the readings.
     setting : Setting
@@ -128,19 +123,20 @@ def fit_terms(observations: Observations, terms: Sequence[Term], start: Start, s
     while rounds < ROUNDS and not converged:
         rounds += 1
         bias, K, terms, taken = _stepped(bias, K, terms, solved.step)
-        converged = linear or bool(np.all(np.abs(taken) <= _small(solved.covariance)))
+        converged = linear or bool(np.all(np.abs(taken) <= _small(solved.best_covariance)))
         if not linear:
             solved = _solve(_at(observations, terms, bias, K, start.scale), observations, settings)
     residual, _ = _residual(observations, terms, bias, K)
     squares = np.sum(observations.weight[:, None] * residual**2) + np.sum(observations.scatter)
+    covariance, freedom = solved.posterior.averaged()
     return Fit(
         bias,
         K,
         tuple(terms),
-        solved.covariance,
+        covariance,
         solved.log_likelihood,
         solved.setting,
-        solved.degrees_of_freedom,
+        float(freedom.min()),
         float(np.sqrt(squares / (3.0 * observations.samples))),
         rounds,
         converged,
@@ -208,11 +204,13 @@ def _residual(
 
 @dataclass(frozen=True)
 class _Solved:
+    """A Gauss-Newton step under the likeliest setting, and the covariance under each."""
+
     step: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    posterior: Posterior
+    best_covariance: NDArray[np.float64]
     log_likelihood: float
     setting: Setting
-    degrees_of_freedom: float
     condition: float
     cosine: float
     left: float
@@ -220,59 +218,52 @@ class _Solved:
 
 
 def _solve(design: Design, observations: Observations, settings: Sequence[Setting]) -> _Solved:
-    """Solve for the step under each noise setting; take the most likely one, and average the covariance."""
+    """Solve for the step under each noise setting and take the most likely one."""
     n = 3.0 * observations.samples
     within = float(np.sum(observations.scatter / design.scale**2))
     size = design.sizes()[:-1]
     size = np.where(size > 0, size, 1.0)
     spare = max(n - design.count, 1.0)
-    scores, steps, covariances, conditions, cosines = [], [], [], [], []
-    for setting, products, logarithm in zip(settings, *design.products(settings), strict=True):
-        gram, rhs = products[:-1, :-1] / np.outer(size, size), products[:-1, -1] / size
-        unit = np.sqrt(np.maximum(np.diag(gram), 1e-30))
-        values, vectors = np.linalg.eigh(gram / np.outer(unit, unit))
-        kept = values > 1e-12 * values[-1]
-        half = vectors[:, kept] / np.sqrt(values[kept]) / unit[:, None]
-        step = half @ (half.T @ rhs)
-        norm = unit * np.sqrt(max(float(products[-1, -1]), 1e-300))
-        cosines.append([float(np.max(np.abs(v) / norm)) for v in (rhs, rhs - gram @ step)] + [int(kept.sum())])
-        rss = max(products[-1, -1] - float(step @ rhs), 0.0) + within
-        rss = max(rss, 1e-300)
-        scores.append(-0.5 * n * np.log(rss / n) - 0.5 * logarithm + setting.prior)
-        steps.append(step / size)
-        covariances.append(half @ half.T / np.outer(size, size) * rss / spare)
-        conditions.append(float(np.sqrt(values[-1] / max(values[0], 1e-300))))
+    products, logarithms = design.products(settings)
+    gram, rhs = products[:, :-1, :-1] / np.outer(size, size), products[:, :-1, -1] / size
+    unit = np.sqrt(np.maximum(np.einsum("gpp->gp", gram), 1e-30))
+    values, vectors = np.linalg.eigh(gram / (unit[:, :, None] * unit[:, None, :]))
+    kept = values > RANK * values[:, -1:]
+    half = vectors * np.where(kept, 1.0 / np.sqrt(np.where(kept, values, 1.0)), 0.0)[:, None, :] / unit[:, :, None]
+    steps = np.einsum("gpi,gqi,gq->gp", half, half, rhs, optimize=True)
+    rss = np.maximum(np.maximum(products[:, -1, -1] - np.sum(steps * rhs, axis=1), 0.0) + within, 1e-300)
+    scores = -0.5 * n * np.log(rss / n) - 0.5 * logarithms + np.array([s.prior for s in settings])
+    covariances = half @ half.transpose(0, 2, 1) / np.outer(size, size) * (rss / spare)[:, None, None]
     best = int(np.argmax(scores))
-    weight = np.exp(np.array(scores) - scores[best])
-    covariance, freedom = _averaged(np.array(covariances), weight / weight.sum(), spare)
-    cosine, left, rank = cosines[best]
+    weight = np.exp(scores - scores[best])
+    norm = unit[best] * np.sqrt(max(float(products[best, -1, -1]), 1e-300))
+    left = rhs[best] - gram[best] @ steps[best]
     return _Solved(
-        steps[best],
-        covariance,
+        steps[best] / size,
+        Posterior(weight / weight.sum(), covariances, spare),
+        covariances[best],
         float(scores[best]),
         settings[best],
-        freedom,
-        conditions[best],
-        cosine,
-        left,
-        int(rank),
+        float(np.sqrt(values[best, -1] / max(values[best, 0], 1e-300))),
+        float(np.max(np.abs(rhs[best]) / norm)),
+        float(np.max(np.abs(left) / norm)),
+        int(kept[best].sum()),
     )
 
 
-def _averaged(
-    covariances: NDArray[np.float64], weight: NDArray[np.float64], spare: float
-) -> tuple[NDArray[np.float64], float]:
-    """Average covariances over the noises; their spread says how many degrees of freedom the average has.
-
-    A variance with a scaled inverse chi-square distribution of nu degrees has ``var / mean^2 = 2 / (nu - 4)``.
-    """
-    mean: NDArray[np.float64] = np.tensordot(weight, covariances, 1)
-    diagonal = np.diagonal(covariances, axis1=1, axis2=2)
-    average = np.maximum(np.diag(mean), 1e-300)
-    spread = float(np.max(weight @ (diagonal / average - 1.0) ** 2))
-    freedom = 4.0 + 2.0 / spread if spread > 1e-12 else np.inf
-    shrink = (freedom - 2.0) / freedom if np.isfinite(freedom) else 1.0
-    return mean * shrink, float(1.0 / (1.0 / spare + 1.0 / freedom))
+def residual_noise(design: Design, observations: Observations, settings: Sequence[Setting]) -> ResidualNoise:
+    """Weight hypotheses about the noise by their restricted likelihood, given a design of full rank at its solution."""
+    size = np.where(design.sizes()[:-1] > 0, design.sizes()[:-1], 1.0)
+    products, logarithms = design.products(settings)
+    gram, rhs = products[:, :-1, :-1] / np.outer(size, size), products[:, :-1, -1] / size
+    steps = np.linalg.solve(gram, rhs[:, :, None])[:, :, 0]
+    within = float(np.sum(observations.scatter / design.scale**2))
+    rss = np.maximum(products[:, -1, -1] - np.sum(steps * rhs, axis=1), 0.0) + within
+    free = max(3.0 * observations.samples - design.count, 1.0)
+    variance = np.maximum(rss / free, np.finfo(float).tiny)[:, None]
+    logarithms = logarithms + np.linalg.slogdet(gram)[1]
+    found = ResidualNoise.of(observations.blocks, settings, logarithms, variance, free, observations.weight)
+    return replace(found, white_variance=found.white_variance * design.scale**2)
 
 
 def starts_of(names: Sequence[str], sensor: str, known: SensorCalibration | None = None) -> list[list[Term]]:
@@ -430,15 +421,16 @@ def fit_joint(  # noqa: PLR0917  (the interface that the stages and the diagnosi
     grid = selection_grid(noise, RATIOS, TIMES)
     fit = fit_best(observations, combinations, base, grid)
     require_observable(observations, fit, base.scale)
-    return calibration_of(sensor, fit, observations, start, settings)
+    return calibration_of(sensor, fit, observations, start, settings, noise)
 
 
-def calibration_of(
+def calibration_of(  # noqa: PLR0917  (what a fit with effects is)
     sensor: str,
     fit: Fit,
     observations: Observations,
     before: SensorCalibration | None,
     settings: Mapping[str, Any] | None = None,
+    noise: Noise | None = None,
 ) -> SensorCalibration:
     """Return a fit as a calibration: ``matrix = K^-1``, with ``d matrix = -matrix dK matrix``.
 
@@ -462,13 +454,15 @@ def calibration_of(
             }
             at += 1
         effects.append(FittedEffect(term.effect.name, described, term.effect.definition))
-    details = {
+    details: dict[str, Any] = {
         "samples": round(observations.samples),
         "rounds": fit.rounds,
         "condition": fit.condition,
         "wander_ratio": fit.setting.ratio,
         "wander_time_s": fit.setting.time,
     }
+    if before is not None and before.stages:  # bias and matrix are fitted again, from ordinary least squares
+        details["replaces"] = before.stages[-1].name
     stage = StageResult("effects", parameters, fit.residual_rms, None, details)
     found = replace(
         before or SensorCalibration(sensor),
@@ -479,22 +473,22 @@ def calibration_of(
         converged=fit.converged,
         convergence=certified(fit.cosine, fit.condition, fit.rank, len(covariance)),
     )
-    lines, missing = [scatter_contribution(covariance, fit.degrees_of_freedom, remark=SCATTER)], dict(NOT_INCLUDED)
     if settings is None:
-        return combined(found, lines, missing)
+        return combined(found, [scatter_contribution(covariance, fit.degrees_of_freedom)], {})
+    names = [term.effect.name for term in fit.terms]
     design = _at(observations, fit.terms, fit.bias, fit.K, np.maximum(fit.scale, 1e-300))
-    motions, estimated = [part.motion for part in observations.parts], [term.effect.name for term in fit.terms]
     first = design.linear_map(fit.setting)
-    reference = Reference(sensor, motions, first.then(change), fit.K, settings["table"])
-    stated, absent = table_contributions(reference, estimated)
-    complete = combined(found, [*lines, *stated], {**absent, **missing})
-    trials = trials_of(settings)
-    if not trials:
-        return complete
+    prior = static_or_sheet(noise, (settings.get("sensor") or {}).get(sensor) or {})
+    errors = residual_noise(design, observations, prior.grid(float(np.sqrt(np.mean(design.scale**2)))))
+    whole = first.then(change)
+    reference = Reference(sensor, [part.motion for part in observations.parts], whole, fit.K, settings["table"])
     values = np.concatenate([fit.bias, fit.K.ravel(), *(term.values for term in fit.terms)])
-    stated, _ = table_contributions(replace(reference, fit=first), estimated)
-    errors = Errors(np.ones(1), fit.covariance[None], fit.degrees_of_freedom, stated)
-    return beside_trials(complete, errors.through(lambda e: _with_matrix(values + e)), trials)
+    of_channels = np.concatenate(first.derivative, axis=1)
+
+    def results(drawn: NDArray[np.float64]) -> NDArray[np.float64]:
+        return _with_matrix(values + drawn @ of_channels.T)
+
+    return budgeted(found, reference, errors, [noise_contribution(errors, whole, prior)], settings, results, names)
 
 
 def _with_matrix(values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,0 +1,396 @@
+"""From the residuals of a fit to the uncertainty of its estimate: one rule for every fit.
+
+Every fit is linear in the readings near its solution, ``d beta = sum over channels c of J_c A_c dy_c`` (``LinearMap``).
+Under one hypothesis about the noise (``pipeline.estimation.gauss_markov``) the estimate has the covariance
+
+    V = sum_c s_c^2 J_c (A_c diag(1/n) A_c^T + q a_c B(tau) a_c^T) J_c^T
+
+where ``a`` holds the columns of A summed over each block, and n the samples of each row. One calibration does not
+determine q and tau well. So each hypothesis of the prior's grid has the weight of its restricted likelihood times its
+prior (Patterson & Thompson, Biometrika 58, 1971), and the error of a parameter is distributed as a mixture over all of
+them (``Posterior``). The mixture is stated as a scaled Student's t that holds as much of it within one and within two
+standard uncertainties:
+
+    P(|e| < x) = sum_i p_i (2 Phi(x / sigma_i) - 1),    x_P: P(|e| < x_P) = P
+    t_95(nu) / t_68(nu) = x_95 / x_68,    u = x_95 / t_95(nu)
+
+A match of variance and kurtosis fails where "no bias instability" has nine tenths of the weight: a large one of little
+weight then decides both, and neither end of the interval.
+
+Stated accuracies of the bench (type B) act through the same map. They are nuisance parameters with a normal prior that
+the estimator does not fit (consider parameters; Schmidt 1966), and so add ``J A Z diag(u^2) Z^T A^T J^T`` once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.errors import NotObservableError
+from pipeline.estimation.gauss_markov import GaussMarkov, Setting
+from pipeline.records import noise_of_steps
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.estimation.gauss_markov import Blocks, Prior
+
+    Values = NDArray[np.float64]
+
+ONE_SIGMA, COVERED = 0.6827, 0.95  # probabilities at which the mixture and Student's t agree
+FEWEST = 2.0  # degrees of freedom: Student's t has no variance below
+STEPS, SMALL_STEP = 60, 1e-5  # of Newton's method for a quantile; relative
+NEGLIGIBLE = 1e-6  # weight of a hypothesis, relative to the largest, below which it does not change two digits of u
+AVERAGED_OUT = 1e-3  # share of a column's size in block means, below which it does not take up their noise
+
+
+@dataclass(frozen=True)
+class LinearMap:
+    """What small changes of the readings do to the parameters of a solved fit.
+
+    Attributes
+    ----------
+    weights : tuple of three (q, n) arrays
+        A: weights of the readings of each channel in what is fitted of it; may be one array for all.
+    derivative : tuple of three (p, q) arrays
+        J: derivative of the parameters with respect to that.
+    """
+
+    weights: tuple[Values, Values, Values]
+    derivative: tuple[Values, Values, Values]
+
+    @property
+    def parameters(self) -> int:
+        """Number of parameters."""
+        return int(self.derivative[0].shape[0])
+
+    def then(self, change: Values) -> LinearMap:
+        """Return the map to what (r, p) ``change`` makes of the parameters."""
+        x, y, z = (change @ J for J in self.derivative)
+        return LinearMap(self.weights, (x, y, z))
+
+    def first(self) -> LinearMap:
+        """Return the map to what is fitted of the channels, one after the other."""
+        sizes = [len(A) for A in self.weights]
+        x, y, z = np.split(np.eye(sum(sizes)), np.cumsum(sizes)[:-1], axis=1)
+        return LinearMap(self.weights, (x, y, z))
+
+    def results(self, kept: slice) -> LinearMap:
+        """Return the map to some of the parameters."""
+        x, y, z = (J[kept] for J in self.derivative)
+        return LinearMap(self.weights, (x, y, z))
+
+    def rows(self, rows: slice) -> LinearMap:
+        """Return the map of some consecutive readings."""
+        x, y, z = (A[:, rows] for A in self.weights)
+        return LinearMap((x, y, z), self.derivative)
+
+    def of(self, change: Values) -> Values:
+        """Return the change of the parameters by a change of the readings, (n, 3): (p,) array."""
+        channels = zip(self.derivative, self.weights, change.T, strict=True)
+        total: Values = np.sum([J @ (A @ dy) for J, A, dy in channels], axis=0)
+        return total
+
+    def of_groups(self, change: Values, group: NDArray[np.intp], count: int) -> Values:
+        """Return the change of the parameters by the change of each of ``count`` groups of readings: (p, count) array.
+
+        Parameters
+        ----------
+        change : (n, 3) array
+        group : (n,) array of int
+            0 .. count - 1.
+        count : int
+        """
+        total = np.zeros((self.parameters, count))
+        for J, A, dy in zip(self.derivative, self.weights, change.T, strict=True):
+            total += J @ np.array([np.bincount(group, row * dy, count) for row in A]).reshape(len(A), count)
+        return total
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """The error of an estimate: a mixture of normal distributions, one for each hypothesis about the noise.
+
+    Attributes
+    ----------
+    weight : (k,) array
+        They sum to 1.
+    covariances : (k, p, p) array
+        Under each hypothesis.
+    spare : float
+        Degrees of freedom of the scale of the noise.
+    """
+
+    weight: Values
+    covariances: Values
+    spare: float
+
+    def averaged(self) -> tuple[Values, Values]:
+        """Return the covariance under all hypotheses together, (p, p), and the degrees of freedom, (p,).
+
+        Degrees of freedom are infinite where nothing is uncertain.
+        """
+        mean = np.tensordot(self.weight, self.covariances, 1)
+        average = np.diag(mean)
+        known = average > 0.0
+        size, inverse = np.ones(len(average)), np.zeros(len(average))
+        sigma = np.sqrt(np.diagonal(self.covariances, axis1=1, axis2=2)[:, known] / average[known])
+        inner, outer = (_within(self.weight, sigma, level) for level in (ONE_SIGMA, COVERED))
+        size[known], inverse[known] = _student(inner, outer)
+        freedom = np.where(known, 1.0 / np.maximum(1.0 / self.spare + inverse, 1e-300), np.inf)
+        return mean * np.outer(size, size), freedom
+
+    def draw(self, rng: np.random.Generator, count: int) -> Values:
+        """Return (count, p) errors."""
+        chosen = rng.choice(len(self.weight), count, p=self.weight)
+        out = np.empty((count, self.covariances.shape[1]))
+        for k in np.unique(chosen):
+            out[chosen == k] = draw_normal(rng, self.covariances[k], int(np.count_nonzero(chosen == k)))
+        if np.isfinite(self.spare):
+            out *= np.sqrt(self.spare / rng.chisquare(self.spare, count))[:, None]
+        return out
+
+
+def draw_normal(rng: np.random.Generator, covariance: Values, count: int) -> Values:
+    """Return (count, p) normal errors, also of a singular covariance."""
+    values, vectors = np.linalg.eigh(covariance)
+    root: Values = vectors * np.sqrt(np.clip(values, 0.0, None))
+    drawn: Values = rng.standard_normal((count, len(values))) @ root.T
+    return drawn
+
+
+def _within(weight: Values, sigma: Values, probability: float) -> Values:
+    """Return what so much of each mixture lies within, both signs: (p,) array.
+
+    The probability is concave in x, so that Newton's method from below stays below.
+    """
+    from scipy.special import ndtr, ndtri  # noqa: PLC0415  (0.1 s that only fits pay)
+
+    quantile = float(ndtri(0.5 + probability / 2.0))
+    sigma = np.maximum(sigma, 1e-9)
+    x: Values = quantile * sigma.min(axis=0)
+    for _ in range(STEPS):
+        ratio = x / sigma
+        density = weight @ (np.exp(-0.5 * ratio**2) / sigma) * np.sqrt(2.0 / np.pi)
+        step = (probability - weight @ (2.0 * ndtr(ratio) - 1.0)) / np.maximum(density, 1e-300)
+        x = np.minimum(x + step, quantile * sigma.max(axis=0))
+        if np.all(np.abs(step) <= SMALL_STEP * x):
+            break
+    return x
+
+
+def _student(inner: Values, outer: Values) -> tuple[Values, Values]:
+    """Return scale and inverse degrees of freedom of Student's t of the same ``inner`` and ``outer``: (p,) arrays."""
+    inverse, ratio, quantile = _quantiles()
+    found = np.interp(outer / inner, ratio, inverse)
+    return outer / np.interp(found, inverse, quantile), found
+
+
+@cache
+def _quantiles() -> tuple[Values, Values, Values]:
+    """Return 1 / nu, the ratio of both quantiles of Student's t, and the outer one: (k,) arrays."""
+    from scipy.special import ndtri, stdtrit  # noqa: PLC0415  (as above)
+
+    inverse = np.linspace(0.0, 1.0 / FEWEST, 101)
+    inner, outer = (
+        np.append(ndtri(upper), stdtrit(1.0 / inverse[1:], upper))
+        for upper in (0.5 + ONE_SIGMA / 2.0, 0.5 + COVERED / 2.0)
+    )
+    return inverse, np.asarray(outer / inner, np.float64), np.asarray(outer, np.float64)
+
+
+@dataclass(frozen=True)
+class ResidualNoise:
+    """Weighted hypotheses about the noise of the readings.
+
+    Attributes
+    ----------
+    blocks : Blocks
+    settings : list of Setting
+        Of k hypotheses.
+    weight : (k,) array
+        They sum to 1.
+    white_variance : (k, 3) array, square of the unit of the readings
+        s^2 of each hypothesis and channel.
+    spare : int
+        Degrees of freedom of s^2.
+    row_weight : (n,) array or None
+        Samples of each row; None: rows are samples.
+    """
+
+    blocks: Blocks
+    settings: list[Setting]
+    weight: Values
+    white_variance: Values
+    spare: float
+    row_weight: Values | None = None
+
+    @classmethod
+    def of(  # noqa: PLR0917  (what a restricted likelihood is)
+        cls,
+        blocks: Blocks,
+        settings: Sequence[Setting],
+        logarithm: Values,
+        variance: Values,
+        free: float,
+        row_weight: Values | None = None,
+    ) -> ResidualNoise:
+        """Weight hypotheses by the restricted likelihood, maximised over s^2, times their prior.
+
+        Parameters
+        ----------
+        blocks : Blocks
+        settings : sequence of Setting
+        logarithm : (g,) array
+            ``log det C + log det(X^T C^-1 X)`` of all channels.
+        variance : (g, c) array
+            s^2 of each of c scales.
+        free : float
+            Values of each scale less its parameters.
+        row_weight : (n,) array, optional
+        """
+        score = -0.5 * (logarithm + free * np.log(variance).sum(axis=1)) + np.array([s.prior for s in settings])
+        weight = np.exp(score - score.max())
+        kept = np.flatnonzero(weight > NEGLIGIBLE)
+        chosen = [settings[k] for k in kept.tolist()]
+        return cls(blocks, chosen, weight[kept] / weight[kept].sum(), variance[kept], free, row_weight)
+
+    @property
+    def white(self) -> Values:
+        """Standard deviation of a white sample: (3,) array."""
+        return np.asarray(np.sqrt(self.weight @ self.white_variance))
+
+    @property
+    def wander(self) -> Values:
+        """Standard deviation of the bias instability: (3,) array."""
+        q = np.array([s.ratio**2 for s in self.settings])
+        return np.asarray(np.sqrt((self.weight * q) @ self.white_variance))
+
+    def draws(self, rng: np.random.Generator, number: int) -> Iterator[Values]:
+        """Yield noise of the likeliest hypothesis at each sample, (n, 3) arrays; the bias is even over a block."""
+        best = int(np.argmax(self.weight))
+        setting, rows = self.settings[best], int(self.blocks.weight.sum())
+        bias = GaussMarkov(self.blocks, [Setting(1.0, setting.time)], np.zeros(len(self.blocks.weight)))
+        label = self.blocks.label(rows)
+        for _ in range(number):
+            drawn = rng.standard_normal((rows, 3)) + setting.ratio * bias.draw(rng, 3)[label]
+            yield np.sqrt(self.white_variance[best]) * drawn
+
+    def posterior(self, fit: LinearMap) -> Posterior:
+        """Return the error of a fit's parameters."""
+        total = np.zeros((len(self.weight), fit.parameters, fit.parameters))
+        ratios = np.array([s.ratio**2 for s in self.settings])[:, None, None]
+        times = [s.time for s in self.settings]
+        for J, own, (white, slow) in zip(
+            fit.derivative, self.white_variance.T, self._products(fit, times), strict=True
+        ):
+            total += own[:, None, None] * (J @ (white + ratios * np.stack([slow[t] for t in times])) @ J.T)
+        return Posterior(self.weight, total, self.spare)
+
+    def variances(self, fit: LinearMap, prior: Prior) -> tuple[Values, Values]:
+        """Return the variances by the white noise that is seen, and by the bias instability of a prior: (p,) arrays."""
+        white, wander = np.zeros(fit.parameters), np.zeros(fit.parameters)
+        for J, s, (alone, slow) in zip(fit.derivative, self.white, self._products(fit, [prior.time]), strict=True):
+            white += s**2 * np.einsum("pi,ij,pj->p", J, alone, J)
+            wander += prior.wander**2 * np.einsum("pi,ij,pj->p", J, slow[prior.time], J)
+        return white, wander
+
+    def _products(self, fit: LinearMap, times: Sequence[float]) -> list[tuple[Values, dict[float, Values]]]:
+        """Return ``A diag(1/n) A^T`` and ``a B(tau) a^T`` of each channel."""
+        found: dict[int, tuple[Values, dict[float, Values]]] = {}
+        for A in fit.weights:
+            if id(A) not in found:
+                a = self.blocks.sums(A.T)
+                slow = {tau: a.T @ self.blocks.covariance(tau) @ a for tau in set(times)}
+                found[id(A)] = (A if self.row_weight is None else A / self.row_weight) @ A.T, slow
+        return [found[id(A)] for A in fit.weights]
+
+
+def assess_noise(
+    residuals: Values, design: Values, blocks: Blocks, prior: Prior, disturbance: Values | None = None
+) -> ResidualNoise:
+    """Weight the hypotheses of a prior by the residuals of a fit, one sample a row.
+
+    Where the table's stated accuracies are worse than the noise, the residuals show its errors, which have lines of
+    their own in the budget. Then the directions in which these exceed white noise are projected out of all channels.
+
+    Parameters
+    ----------
+    residuals : (n, 3) array
+    design : (n, p) array
+        Columns that were fitted; those of one channel may be more than its own.
+    blocks : Blocks
+    prior : Prior
+    disturbance : (3 m, 3 m) array, optional
+        Covariance that the table's stated errors give the sums over the blocks, channel by channel.
+
+    Raises
+    ------
+    NotObservableError
+        If there are no more samples than parameters.
+    """
+    count = blocks.weight[:, None]
+    spare = len(count) - design.shape[1]
+    if spare < 1:
+        raise NotObservableError(
+            f"{len(count)} samples determine {design.shape[1]} parameters and leave none to tell the noise by: "
+            "record more samples"
+        )
+    size = np.sqrt(np.mean(design**2, axis=0))
+    scaled = np.sqrt(count) * (blocks.sums(design) / count / np.where(size > 0, size, 1.0))
+    U, s, _ = np.linalg.svd(scaled, full_matrices=disturbance is not None)
+    rank = int(np.sum(s > AVERAGED_OUT * s[0]))
+    means = blocks.sums(residuals) / count
+    if disturbance is None:
+        settings = prior.grid(float(np.sqrt(np.mean(residuals**2))))
+        logarithm, squares = GaussMarkov(blocks, settings).restricted(U[:, :rank] / np.sqrt(count), means)
+        free = len(count) - rank
+        variance = np.maximum(squares / free, np.finfo(float).tiny)
+        found = ResidualNoise.of(blocks, settings, 3.0 * logarithm, variance, free)
+        return ResidualNoise(blocks, found.settings, found.weight, found.white_variance, spare)
+    white = noise_of_steps(np.abs(np.diff(residuals, axis=0)))
+    settings = prior.grid(float(np.sqrt(np.mean(white**2))))
+    every, scale = np.asarray(np.kron(np.eye(3), U[:, rank:]), np.float64), np.outer(white, np.sqrt(count)).ravel()
+    variances, directions = np.linalg.eigh(every.T @ (disturbance / np.outer(scale, scale)) @ every)
+    basis = every @ directions[:, : max(int(np.sum(variances <= 1.0)), 1)]
+    z = basis.T @ (np.sqrt(count) * means / white).T.ravel()
+    logarithm, squares = _in_subspace(basis, z, blocks, settings)
+    variance = np.maximum(squares / len(z), np.finfo(float).tiny)[:, None]
+    found = ResidualNoise.of(blocks, settings, logarithm, variance, len(z))
+    return ResidualNoise(blocks, found.settings, found.weight, found.white_variance * white**2, len(z))
+
+
+def _in_subspace(basis: Values, z: Values, blocks: Blocks, settings: Sequence[Setting]) -> tuple[Values, Values]:
+    """Return log det and weighted squares of ``z ~ N(0, I + q E)`` in a subspace that mixes the channels, dense.
+
+    Parameters
+    ----------
+    basis : (3 m, r) array
+    z : (r,) array
+    blocks : Blocks
+    settings : sequence of Setting
+    """
+    root = np.sqrt(blocks.weight)
+    logarithm, squares = np.empty(len(settings)), np.empty(len(settings))
+    channels = basis.reshape(3, len(root), -1)
+    for tau in {s.time for s in settings}:
+        R = root[:, None] * blocks.covariance(tau) * root
+        e, U = np.linalg.eigh(np.einsum("cbi,cbj->ij", channels, R @ channels, optimize=True))
+        own = np.array([k for k, s in enumerate(settings) if s.time == tau])
+        spectrum = 1.0 + np.outer([settings[k].ratio ** 2 for k in own], np.clip(e, 0.0, None))
+        logarithm[own] = np.log(spectrum).sum(axis=1)
+        squares[own] = (1.0 / spectrum) @ (U.T @ z) ** 2
+    return logarithm, squares
+
+
+def derivative(function: Callable[[Values], Values], x: Values, step: Values) -> Values:
+    """Return the (n, m) derivative of a function of (m,) by central differences with a step for each input."""
+    columns = [
+        (function(x + h * e) - function(x - h * e)) / (2.0 * h) for h, e in zip(step, np.eye(len(x)), strict=True)
+    ]
+    return np.stack(columns, axis=-1)

@@ -1,0 +1,357 @@
+"""The uncertainty budget of a fit (JCGM 100:2008, GUM, 5, 8 and annex G).
+
+    U = sum over sources of U_s,    nu_eff = u^4 / sum_s (u_s^4 / nu_s),    expanded uncertainty = k(nu_eff) u
+
+The noise of the readings is of type A, as the residuals show it (``pipeline.estimation.engine``); slow errors and lack
+of fit are part of it. Its parts are told apart: white noise, the bias instability that the static recording or the data
+sheet lets expect, and lack of fit beyond both. Everything else is of type B, with infinite degrees of freedom:
+
+    bench         : the table's stated accuracies (``pipeline.estimation.table_errors``), local gravity
+    quantisation  : where white noise does not make the rounding errors of the samples independent
+    temperature   : u_T = sqrt(a^2 + R^2 / 12);  db = c_b u_T / sqrt(3),  dM = M c_k u_T / sqrt(3) by columns
+    repeatability : db = r_b,  dM = M r_k by columns, each axis by itself
+
+where a is the standard uncertainty of the thermometer, R the range of temperatures recorded, c the data sheet's limits
+of the change per degC (or the fitted effect: then without the root, and R is 0), and r standard deviations from one
+switching-on to the next. The last two depend on no method and are added after the last stage of a fit. Sources without
+a stated accuracy are named and left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.estimation.engine import derivative
+from pipeline.estimation.monte_carlo import beside_trials, through, trials_of
+from pipeline.estimation.table_errors import table_errors
+from pipeline.records import NORMAL, RECTANGULAR, SENSOR_UNITS, Contribution, coverage_factor, finite
+from pipeline.signal.temperature import temperature_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from numpy.typing import ArrayLike, NDArray
+
+    from pipeline.estimation.engine import LinearMap, ResidualNoise
+    from pipeline.estimation.gauss_markov import Prior
+    from pipeline.estimation.table_errors import Reference
+    from pipeline.records import Recording, SensorCalibration
+
+    Values = NDArray[np.float64]
+
+ROUNDING = 1e-10  # of the largest effect of an input: a hundred thousand times the rounding of a double
+DITHERED = 0.5  # counts of white noise above which rounding errors are independent (Widrow & Kollar 2008)
+NOISE, QUANTISATION = "noise of the readings", "quantisation"
+NOT_STATED = "one calibration does not tell it: calibrate the unit again after switching it off"
+TEMPERATURE = "the parameters hold at the temperature of these recordings; no accuracy of the thermometer is stated"
+TIME_BASE = "the table logs angle and rate itself, so that a wrong clock changes neither"
+FITTED = {"bias": ("bias_temperature", "bias_temperature_quadratic"), "scale_factor": ("scale_factor_temperature",)}
+ACCURACY = "temperature_accuracy_degc"
+
+
+def propagate(
+    function: Callable[[Values], Values], inputs: ArrayLike, covariance: ArrayLike
+) -> tuple[Values, Values, Values]:
+    """Return value, covariance ``C U C^T`` and sensitivity C of a function of (m,) inputs (JCGM 100:2008, 5.2.2)."""
+    x, U = np.asarray(inputs, float), np.asarray(covariance, float)
+    # a ten-thousandth of each uncertainty, or the cube root of rounding, where central differences are best
+    step = np.maximum(1e-4 * np.sqrt(np.diag(U)), 6e-6 * np.maximum(np.abs(x), 1e-300))
+    C = derivative(lambda at: np.asarray(function(at), float), x, step)
+    return np.asarray(function(x), float), C @ U @ C.T, C
+
+
+def effective_degrees_of_freedom(contributions: ArrayLike, degrees_of_freedom: ArrayLike) -> Values:
+    """Return ``nu_eff`` by Welch and Satterthwaite: (n,) array, infinite where no finite one contributes.
+
+    Parameters
+    ----------
+    contributions : (m, n) array
+        Standard uncertainty that each of m inputs contributes to each of n results; the inputs are independent.
+    degrees_of_freedom : (m,) or (m, n) array
+        Of each; may be infinite.
+    """
+    u = np.atleast_2d(np.asarray(contributions, float))
+    nu = np.asarray(degrees_of_freedom, float)
+    share = np.sum(u**4 / np.broadcast_to(nu[:, None] if nu.ndim == 1 else nu, u.shape), axis=0)
+    total = np.sum(u**2, axis=0) ** 2
+    nu_eff: Values = np.divide(total, share, out=np.full(u.shape[1], np.inf), where=share > 0.0)
+    return nu_eff
+
+
+def type_b(  # noqa: PLR0917  (the columns of a budget's line)
+    source: str, distribution: str, u: float, unit: str, effect: Values, remark: str = ""
+) -> Contribution:
+    """Return the contribution of m independent inputs of standard uncertainty u; ``effect``: (p, m) array."""
+    effect = np.where(np.abs(effect) > ROUNDING * np.abs(effect).max(initial=0.0), effect, 0.0)
+    covariance = u**2 * effect @ effect.T
+    freedom = np.full(len(effect), np.inf)
+    return Contribution(source, "B", distribution, covariance, freedom, u, unit, effect.shape[1], remark=remark)
+
+
+def noise_contribution(noise: ResidualNoise, fit: LinearMap, prior: Prior) -> Contribution:
+    """Return what white noise, bias instability and lack of fit contribute.
+
+    Parameters
+    ----------
+    noise : ResidualNoise
+    fit : LinearMap
+    prior : Prior
+        The bias instability that was expected.
+    """
+    covariance, freedom = noise.posterior(fit).averaged()
+    total = np.diag(covariance)
+    white, wander = noise.variances(fit, prior)
+    white = np.minimum(white, total)
+    wander = np.minimum(wander, total - white)
+    parts = {
+        "white noise": np.sqrt(white),
+        "bias wander": np.sqrt(wander),
+        "lack of fit": np.sqrt(np.clip(total - white - wander, 0.0, None)),
+    }
+    return Contribution(NOISE, "A", "Student's t", covariance, freedom, parts=parts)
+
+
+def scatter_contribution(
+    covariance: Values, degrees_of_freedom: float, parts: Mapping[str, Values] | None = None, remark: str = ""
+) -> Contribution:
+    """Return the contribution of the readings' scatter where a fit gives its covariance at once."""
+    freedom = np.full(len(covariance), float(degrees_of_freedom))
+    return Contribution(NOISE, "A", "Student's t", covariance, freedom, parts=dict(parts or {}), remark=remark)
+
+
+def quantisation(noise: ResidualNoise, fit: LinearMap, counts_per_unit: float | None, unit: str) -> Contribution | str:
+    """Return what rounding to whole counts contributes, or why it has no line of its own.
+
+    With white noise of half a count and more, the rounding errors of the samples are independent, of variance 1/12
+    count^2, and part of the noise that the residuals show. With less, each block of samples has one error.
+    """
+    if not counts_per_unit:
+        return "the sensor's counts_per_unit is not configured"
+    step = 1.0 / float(counts_per_unit)
+    if np.all(noise.white >= DITHERED * step):
+        return f"contained in the {NOISE}, which reach {float(noise.white.min()) / step:.1f} counts or more"
+    label = noise.blocks.label(int(noise.blocks.weight.sum()))
+    rough = np.where(noise.white < DITHERED * step, 1.0, 0.0) * np.ones((len(label), 3))
+    effects = [fit.of_groups(rough * axis, label, len(noise.blocks.weight)) for axis in np.eye(3)]
+    return type_b(QUANTISATION, RECTANGULAR, step / np.sqrt(12.0), unit, np.concatenate(effects, axis=1))
+
+
+def gravity_contribution(sensor: str, matrix: Values, table: Mapping[str, Any], parameters: int) -> Contribution | None:
+    """Return what an error of local gravity does to a matrix that is scaled by it, ``dM = M dG / G``, if stated."""
+    u = table.get("gravity_accuracy_g")
+    if sensor != "accelerometer" or not u:
+        return None
+    effect = np.zeros((parameters, 1))
+    effect[3:12, 0] = matrix.ravel() / float(table.get("gravity_g") or 1.0)
+    return type_b("local gravity", NORMAL, float(u), "g", effect)
+
+
+def table_contributions(
+    reference: Reference, estimated: Sequence[str] = ()
+) -> tuple[list[Contribution], dict[str, str]]:
+    """Return the contribution of each stated accuracy of the table, and why the others are not included."""
+    errors, missing = table_errors(reference, estimated)
+    return [type_b(e.source, NORMAL, e.uncertainty, e.unit, e.effect) for e in errors], missing
+
+
+def combined(
+    calibration: SensorCalibration, contributions: Sequence[Contribution], not_included: Mapping[str, str]
+) -> SensorCalibration:
+    """Return a calibration with the covariance and the degrees of freedom of all contributions together.
+
+    Parameters
+    ----------
+    calibration : SensorCalibration
+    contributions : sequence of Contribution
+        Of all of its parameters.
+    not_included : mapping of str to str
+        Source to the reason why it is not among them.
+    """
+    covariance = np.sum([c.covariance for c in contributions], axis=0)
+    freedom = effective_degrees_of_freedom(
+        np.array([c.standard_uncertainty for c in contributions]),
+        np.array([c.degrees_of_freedom for c in contributions]),
+    )
+    unit = SENSOR_UNITS[calibration.sensor]
+    own = [str(p.get("unit", "")) for effect in calibration.effects for p in effect.parameters.values()]
+    head = {
+        "parameters": calibration.parameter_names(),
+        "units": [unit] * 3 + ["1"] * 9 + own,
+        "contributions": [c.to_json() for c in contributions],
+    }
+    reasons = {**not_included, "repeatability": f"{NOT_STATED}, and compare"}
+    left = [{"source": source, "reason": reason} for source, reason in reasons.items()]
+    return _with_uncertainty(calibration, covariance, freedom, head, left)
+
+
+def budgeted(  # noqa: PLR0917  (what a fit on a table is)
+    calibration: SensorCalibration,
+    reference: Reference,
+    noise: ResidualNoise,
+    contributions: Sequence[Contribution],
+    settings: Mapping[str, Any],
+    results: Callable[[Values], Values],
+    estimated: Sequence[str] = (),
+) -> SensorCalibration:
+    """Return a calibration on a table with its budget, and a Monte Carlo run beside it where that is asked for.
+
+    Parameters
+    ----------
+    calibration : SensorCalibration
+    reference : Reference
+    noise : ResidualNoise
+    contributions : sequence of Contribution
+        The first that of the noise; the others act on the parameters themselves.
+    settings : mapping
+        Sections ``sensor``, for the size of a count, and ``uncertainty``.
+    results : callable
+        (t, q) errors of what the fit's map makes of the channels, one after the other, to (t, p) parameters.
+    estimated : sequence of str
+        Effects of the fit: what one of them estimates is no input any more.
+    """
+    sensor = calibration.sensor
+    counts = ((settings.get("sensor") or {}).get(sensor) or {}).get("counts_per_unit")
+    found, absent = table_contributions(reference, estimated)
+    lines, missing = list(contributions), {"temperature": TEMPERATURE, "time base": TIME_BASE}
+    if noise.row_weight is None:
+        rounded = quantisation(noise, reference.fit, counts, SENSOR_UNITS[sensor])
+    else:
+        rounded = f"contained in the {NOISE}"
+    if isinstance(rounded, str):
+        missing[QUANTISATION] = rounded
+    else:
+        lines.append(rounded)
+    complete = combined(calibration, [*lines, *found], {**absent, **missing})
+    trials = trials_of(settings)
+    if not trials:
+        return complete
+    first = reference.fit.first()
+    stated, _ = table_contributions(replace(reference, fit=first), estimated)
+    again = None if isinstance(rounded, str) else quantisation(noise, first, counts, SENSOR_UNITS[sensor])
+    covariances = [c.covariance for c in (*stated, again) if isinstance(c, Contribution)]
+    draw = through(noise.posterior(first), covariances, results)
+    return beside_trials(complete, draw, trials, contributions[1:])
+
+
+def with_stated(
+    calibration: SensorCalibration, recordings: Sequence[Recording], settings: Mapping[str, Any]
+) -> SensorCalibration:
+    """Return a calibration whose budget holds temperature and repeatability, as far as they are stated.
+
+    Parameters
+    ----------
+    calibration : SensorCalibration
+    recordings : sequence of Recording
+        Of the fit; only their temperature is used.
+    settings : mapping
+        Section ``sensor``.
+    """
+    before, budget = calibration.covariance, calibration.budget
+    if before is None or budget is None:
+        return calibration
+    sheet = settings["sensor"].get(calibration.sensor) or {}
+    lines, missing = _repeatability(calibration, sheet)
+    accuracy = settings["sensor"].get(ACCURACY)
+    if accuracy is not None:
+        warm = _temperature(calibration, float(accuracy), recordings, sheet.get("effects") or {})
+        if isinstance(warm, str):
+            missing["temperature"] = warm
+        else:
+            lines += warm
+    known = {line.source.partition(" (")[0] for line in lines} | set(missing)
+    kept = [entry for entry in budget["not_included"] if entry["source"] not in known]
+    left = [*kept, *({"source": source, "reason": reason} for source, reason in missing.items())]
+    covariance = before + np.sum([line.covariance for line in lines], axis=0) if lines else before
+    old = np.array([np.inf if v is None else v for v in budget["effective_degrees_of_freedom"]])
+    share = np.divide(np.diag(covariance), np.diag(before), out=np.ones(len(before)), where=np.diag(before) > 0.0)
+    freedom = np.where(np.diag(before) > 0.0, old * share**2, np.inf)
+    contributions = [*budget["contributions"], *(line.to_json() for line in lines)]
+    return _with_uncertainty(calibration, covariance, freedom, {**budget, "contributions": contributions}, left)
+
+
+def _effects_on(calibration: SensorCalibration) -> list[tuple[str, str, Values]]:
+    """Return name, unit and effect, (p, 3), of errors of bias and of scale factor of each reading axis."""
+    size = len(calibration.parameter_names())
+    of_scale = np.zeros((size, 3))
+    for axis in range(3):
+        change = np.zeros((3, 3))
+        change[:, axis] = -calibration.matrix[:, axis]
+        of_scale[3:12, axis] = change.ravel()
+    return [("bias", SENSOR_UNITS[calibration.sensor], np.eye(size)[:, :3]), ("scale_factor", "1", of_scale)]
+
+
+def _repeatability(
+    calibration: SensorCalibration, sheet: Mapping[str, Any]
+) -> tuple[list[Contribution], dict[str, str]]:
+    lines, lacking = [], []
+    for name, unit, effect in _effects_on(calibration):
+        u = sheet.get(f"repeatability_{name}")
+        if u is None:
+            lacking.append(f"sensor.{calibration.sensor}.repeatability_{name}")
+        elif u:
+            lines.append(type_b(f"repeatability ({name.replace('_', ' ')})", NORMAL, float(u), unit, effect))
+    reason = f"{NOT_STATED}, compare, and state it as {' and '.join(lacking)}"
+    return lines, {"repeatability": reason} if lacking else {}
+
+
+def _temperature(
+    calibration: SensorCalibration, accuracy: float, recordings: Sequence[Recording], limits: Mapping[str, float]
+) -> list[Contribution] | str:
+    """Return what the temperature contributes to bias and scale factor, or why that is not known."""
+    own = [r for r in recordings if r.role in (calibration.sensor, "rests") and r.temperature is not None]
+    if not own:
+        return "the recordings hold no temperature"
+    spread = float(np.ptp(np.concatenate([temperature_of(r) for r in own]))) / np.sqrt(12.0)
+    lines = []
+    for name, unit, effect in _effects_on(calibration):
+        fitted = next((e for e in calibration.effects if e.name in FITTED[name]), None)
+        limit = limits.get(f"{name}_temperature")
+        if fitted is not None:
+            slope, u, how = fitted.values.reshape(3, -1)[:, 0], accuracy, f"by the fitted {fitted.name}"
+        elif limit is None:
+            return f"the sensor's data sheet states no effects.{name}_temperature"
+        else:
+            slope, u = np.full(3, limit / np.sqrt(3.0)), float(np.hypot(accuracy, spread))
+            how = f"by the data sheet's limit of {limit:g} {unit}/degC"
+        kind = NORMAL if fitted is not None else RECTANGULAR
+        lines.append(type_b(f"temperature ({name.replace('_', ' ')})", kind, u, "degC", effect * slope, how))
+    return lines
+
+
+def _with_uncertainty(
+    calibration: SensorCalibration,
+    covariance: Values,
+    freedom: Values,
+    budget: Mapping[str, Any],
+    not_included: Sequence[Mapping[str, str]],
+) -> SensorCalibration:
+    """Return a calibration with a covariance and all that follows from it: of its effects and its budget, too."""
+    u = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
+    factors = coverage_factor(freedom)
+    known = freedom[u > 0.0]
+    document = {
+        **budget,
+        "standard_uncertainty": u.tolist(),
+        "effective_degrees_of_freedom": finite(freedom),
+        "coverage_factor": factors.tolist(),
+        "expanded_uncertainty": (factors * u).tolist(),
+        "not_included": list(not_included),
+    }
+    effects, at = [], 12
+    for effect in calibration.effects:
+        renewed = {}
+        for name, parameter in effect.parameters.items():
+            renewed[name] = {**parameter, "expanded_uncertainty": float(factors[at] * u[at])}
+            at += 1
+        effects.append(replace(effect, parameters=renewed))
+    return replace(
+        calibration,
+        effects=tuple(effects),
+        covariance=covariance,
+        degrees_of_freedom=float(known.min()) if len(known) else float("inf"),
+        freedom=freedom,
+        budget=document,
+    )
