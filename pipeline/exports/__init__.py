@@ -1,28 +1,100 @@
-"""One module per format that consumes a calibration; every module of this package that has one is used.
+"""Exports: a calibration in the formats of the programs that use it. One template in ``templates/`` is one format.
 
-Each has ``FILE_NAME`` and ``export(calibration, settings, validation)``, which returns the file's text, or None where
-the format can hold nothing of this unit. There is no list to extend.
+A template has two parts, separated by a line ``---``: a declaration (``Format``: what the format can hold, in which
+units), and the text of the file in Jinja2. The text sees
+
+    accelerometer, gyroscope   ``sensors.ExportedSensor`` in the units of the format, None where it is not calibrated
+    sensors                    those of the two that are calibrated, by name
+    remarks                    convention, what is left out, the error that remains, the held-out errors
+    unit, document, settings   name of the unit, its calibration, the sections ``sensor`` and ``table``
+
+and the functions of ``sensors.FUNCTIONS``. The file has the name of its template without ``.j2``. There is no list to
+extend.
 """
 
 from __future__ import annotations
 
+import json
 from functools import cache
-from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Literal
 
+import yaml
+from jinja2 import Environment, StrictUndefined, Template
+from pydantic import BaseModel, ConfigDict
+
+from pipeline.exports.c_effects import plan_of
+from pipeline.exports.sensors import FUNCTIONS, ExportedSensor, before_use, final_errors, missing, plain
 from pipeline.files import write_atomically
+from pipeline.records import SENSORS, SensorCalibration
 
-if TYPE_CHECKING:
-    from types import ModuleType
+TEMPLATES = Path(__file__).parent / "templates"
+Matrix = Literal["full", "diagonal", "none"]
+
+
+class Format(BaseModel):
+    """What a format can hold.
+
+    Attributes
+    ----------
+    consumer, equation, source : str
+        Who reads the file, how it corrects a reading, and where that is documented.
+    units : dict
+        Sensor to the unit of readings: g or m/s^2, deg/s or rad/s. A sensor without a unit is not in the format.
+    needs : list of str
+        Sensors that must be calibrated; without them no file is written.
+    needs_counts : list of str
+        Sensors whose counts per unit must be known.
+    matrix : dict
+        Sensor to what the format holds of its matrix; ``full`` by default.
+    holds : list of str
+        Effects that the format carries, beside bias and matrix; ``any``: the template deals with all of them.
+    approximates : dict of str to str
+        Effect that the format carries in part, to how well.
+    says, adds, adds_with_temperature : list of str
+        Remarks: before the others, after what is left out, and there where a bias follows the temperature.
+    errors : str
+        How the held-out errors are introduced; by default as those of the export, or of the full calibration.
+    files : dict
+        Sensor to file name, where each sensor has a file of its own.
+    """
+
+    model_config = ConfigDict(extra="forbid")
+
+    consumer: str
+    equation: str
+    source: str
+    units: dict[str, Literal["g", "m/s^2", "deg/s", "rad/s"]]
+    needs: list[str] = []
+    needs_counts: list[str] = []
+    matrix: dict[str, Matrix] = {}
+    holds: list[str] = []
+    approximates: dict[str, str] = {}
+    says: list[str]
+    adds: list[str] = []
+    adds_with_temperature: list[str] = []
+    errors: str | None = None
+    files: dict[str, str] = {}
 
 
 @cache
-def exporters() -> tuple[ModuleType, ...]:
-    """Return the modules of all formats, in alphabetical order."""
-    names = sorted(f.stem for f in Path(__file__).parent.glob("*.py") if f.stem != "__init__")
-    modules = (import_module(f"{__name__}.{name}") for name in names)
-    return tuple(module for module in modules if hasattr(module, "FILE_NAME"))
+def formats() -> dict[str, tuple[Format, Template]]:
+    """Return declaration and text of every format, by the name of the template, in alphabetical order."""
+    environment = Environment(
+        autoescape=False,  # noqa: S701  (no HTML; each comment filter closes its own comments)
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        undefined=StrictUndefined,
+        extensions=["jinja2.ext.do"],
+    )
+    environment.filters |= {"comment": _comment, "json": _json, "yaml": _yaml, "numbers": _numbers}
+    environment.globals |= {**FUNCTIONS, "plan_of": plan_of}
+    found = {}
+    for file in sorted(TEMPLATES.glob("*.j2")):
+        declared, _, text = file.read_text(encoding="utf-8").partition("\n---\n")
+        found[file.stem] = Format(**yaml.safe_load(declared)), environment.from_string(text)
+    return found
 
 
 def export_all(
@@ -48,11 +120,112 @@ def export_all(
     """
     folder.mkdir(parents=True, exist_ok=True)
     written = []
-    for module in exporters():
-        text = module.export(calibration, settings, validation)
-        if text is None:
-            continue
-        path = folder / module.FILE_NAME
-        write_atomically(path, text)
-        written.append(path)
+    for name in formats():
+        for file, text in export(name, calibration, settings, validation).items():
+            write_atomically(folder / file, text)
+            written.append(folder / file)
     return written
+
+
+def export(
+    name: str, calibration: dict[str, Any], settings: dict[str, Any], validation: dict[str, Any] | None = None
+) -> dict[str, str]:
+    """Return the files of one format, by name: none where it can hold nothing of this unit."""
+    declared, template = formats()[name]
+    if declared.files:
+        parts = {file: declared.model_copy(update=_alone(declared, s)) for s, file in declared.files.items()}
+    else:
+        parts = {name: declared}
+    texts = {file: _rendered(part, template, calibration, settings, validation) for file, part in parts.items()}
+    return {file: text for file, text in texts.items() if text is not None}
+
+
+def _alone(declared: Format, sensor: str) -> dict[str, Any]:
+    """Return what changes in the declaration of a format with a file for each sensor."""
+    return {"units": {sensor: declared.units[sensor]}, "needs": [sensor]}
+
+
+def _rendered(
+    declared: Format,
+    template: Template,
+    document: dict[str, Any],
+    settings: dict[str, Any],
+    validation: dict[str, Any] | None,
+) -> str | None:
+    """Return the text of a file, None where a sensor or its counts are missing."""
+    sheets = settings.get("sensor") or {}
+    sensors: dict[str, ExportedSensor] = {
+        s: ExportedSensor(SensorCalibration.from_json(s, document[s]), declared.units[s], sheets.get(s) or {})
+        for s in SENSORS
+        if s in declared.units and document.get(s)
+    }
+    if not set(declared.needs) <= set(sensors):
+        return None
+    if any(not sensors[s].counts for s in declared.needs_counts if s in sensors):
+        return None
+    return template.render(
+        **{s: sensors.get(s) for s in SENSORS},
+        sensors=sensors,
+        unit=document["unit"],
+        document=document,
+        settings=settings,
+        remarks=_remarks(declared, sensors, document, validation),
+    )
+
+
+def _remarks(
+    declared: Format,
+    sensors: dict[str, ExportedSensor],
+    document: dict[str, Any],
+    validation: dict[str, Any] | None,
+) -> list[str]:
+    """Return what a reader of the file must know, a sentence or a line each."""
+    counts = {s: sensor.counts for s, sensor in sensors.items()}
+    known = {
+        "unit": document["unit"],
+        "sensor": document["sensor"],
+        "counts": counts,
+        "sensors": list(sensors.values()),
+    }
+    says = [line.format(**known) for line in declared.says]
+    lines = says + (before_use(document) if declared.units else [])
+    both = len(declared.units) == len(SENSORS)
+    lines += [f"Left out: {line}." for line in missing(document) if both]
+    carried = [*declared.holds, *declared.approximates]
+    for s, sensor in sensors.items():
+        lost = [] if "any" in declared.holds else [name for name in sensor.effects if name not in carried]
+        lines += [f"Left out of this format, {s}: {', '.join(lost)}."] if lost else []
+        lines += [f"Of the bench, not of the {s}: {', '.join(sensor.bench_effects)}."] if sensor.bench_effects else []
+    for s, sensor in sensors.items():
+        partial = [name for name in sensor.effects if name in declared.approximates]
+        lines += [f"{declared.approximates[name]}, {s}: {name}." for name in partial]
+        lines += sensor.left_by_matrix(declared.matrix.get(s, "full"))
+    lines += declared.adds + (
+        declared.adds_with_temperature if any(x.follows_temperature for x in sensors.values()) else []
+    )
+    partly = any(kind != "full" for kind in declared.matrix.values())
+    errors = declared.errors or ("With all of the calibration: {}." if partly else "The {}.")
+    of_these = [line for s in SENSORS for line in final_errors(validation, s) if s in declared.units]
+    return lines + [errors.format(line) for line in of_these]
+
+
+def _comment(lines: list[str], mark: str = "# ", end: str = "\n", *, escape: tuple[str, str] = ("", "")) -> str:
+    """Return lines as comments; line ends that users wrote stay inside, and what would end the comment is split."""
+    texts = (" ".join(line.splitlines()) for line in lines)
+    return "".join(f"{mark}{text.replace(*escape) if escape[0] else text}{end}" for text in texts)
+
+
+def _json(content: Any, indent: int = 2) -> str:  # noqa: ANN401
+    return json.dumps(plain(content), indent=indent, allow_nan=False)
+
+
+def _yaml(content: Any) -> str:  # noqa: ANN401
+    """Return YAML, keys in their order and short lists on one line; by libyaml, which is faster, where there is one."""
+    dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+    text: str = yaml.dump(plain(content), Dumper=dumper, sort_keys=False, default_flow_style=None, width=120)
+    return text
+
+
+def _numbers(values: Any, form: str = "%.17g", separator: str = " ") -> str:  # noqa: ANN401
+    """Return numbers in a row."""
+    return separator.join(form % value for value in values)

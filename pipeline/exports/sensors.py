@@ -1,29 +1,161 @@
-"""What every format needs of a calibration document."""
+"""What the templates of exports see of a calibrated sensor, and the mathematics that several formats need.
+
+truth = matrix @ (reading - bias - effects),    reading = bias + K @ truth + effects,    K = matrix^-1
+"""
 
 from __future__ import annotations
 
+from math import comb
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import yaml
 
 from pipeline.io.axes import STRAIGHT, maps_of_log
 from pipeline.model.effects import owner_of
-from pipeline.model.effects.base import Owner
+from pipeline.model.effects.base import REFERENCE_TEMPERATURE, STANDARD_GRAVITY, Owner
 from pipeline.model.plausible import sentences
-from pipeline.records import SENSORS, SensorCalibration
+from pipeline.records import SENSORS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-STANDARD_GRAVITY = 9.80665  # m/s^2
+    from pipeline.records import SensorCalibration
+
+    Values = NDArray[np.float64]
+
+FACTORS = {"g": 1.0, "m/s^2": STANDARD_GRAVITY, "deg/s": 1.0, "rad/s": float(np.pi / 180.0)}
 OF_THE_BIAS = ("bias_temperature", "bias_temperature_quadratic")
 TEMPERATURES = (-40.0, 85.0)  # degC, the widest that parts of this kind are made for
+ORDER = 4  # coefficients of a polynomial of third order in the temperature
 
 
-def calibrations(document: dict[str, Any]) -> dict[str, SensorCalibration]:
-    """Return the sensors that were calibrated."""
-    return {s: SensorCalibration.from_json(s, document[s]) for s in SENSORS if document.get(s)}
+class ExportedSensor:
+    """A calibrated sensor in the unit of a format.
+
+    Parameters
+    ----------
+    calibration : SensorCalibration
+    unit : str
+        g, m/s^2, deg/s or rad/s.
+    sheet : dict
+        The sensor's configuration.
+
+    Attributes
+    ----------
+    bias : (3,) array
+    matrix, K : (3, 3) array
+    effects : dict of str to array
+        Values of the effects that belong to the sensor itself.
+    bench_effects : list of str
+        Effects of mounting, place, recording, table and timing, which no export carries.
+    counts : float or None
+        Counts per g or deg/s.
+    """
+
+    def __init__(self, calibration: SensorCalibration, unit: str, sheet: dict[str, Any]) -> None:
+        self.calibration, self.name, self.unit, self.sheet = calibration, calibration.sensor, unit, sheet
+        self.factor = FACTORS[unit]
+        self.bias, self.matrix = calibration.bias * self.factor, calibration.matrix
+        self.K: Values = np.asarray(np.linalg.solve(calibration.matrix, np.eye(3)))
+        own = [e for e in calibration.effects if owner_of(e) == Owner.SENSOR]
+        self.effects = {e.name: e.values for e in own}
+        self.bench_effects = [e.name for e in calibration.effects if e not in own]
+        self.counts = sheet.get("counts_per_unit")
+
+    @property
+    def bias_after_matrix(self) -> Values:
+        """What is subtracted after the matrix: ``matrix @ bias``."""
+        return np.asarray(self.matrix @ self.calibration.bias * self.factor)
+
+    @property
+    def bias_deviation(self) -> Values:
+        """Standard uncertainty of the bias; zeros where it is not known."""
+        covariance = self.calibration.covariance
+        return np.zeros(3) if covariance is None else np.sqrt(np.diag(covariance)[:3]) * self.factor
+
+    @property
+    def scale(self) -> Values:
+        """Scale factors that stand best for the whole matrix.
+
+        ``s_i = K_ii / |K_i|^2`` minimises ``E (t_i - s_i K_i t)^2`` over truths t of any direction, K_i the rows of K.
+        """
+        return np.asarray(np.diag(self.K) / np.sum(self.K**2, axis=1))
+
+    @property
+    def scale_error(self) -> float:
+        """Root mean square of the error that ``scale`` leaves, relative to the truth.
+
+        ``sqrt(sum_i (1 - K_ii^2 / |K_i|^2) / 3)`` over directions of the truth.
+        """
+        return float(np.sqrt(np.sum(1.0 - np.diag(self.K) ** 2 / np.sum(self.K**2, axis=1)) / 3.0))
+
+    @property
+    def bias_error(self) -> float:
+        """Likewise of the error that taking off the bias alone leaves: ``|1 - K| / sqrt(3)``."""
+        return float(np.linalg.norm(np.eye(3) - self.K) / np.sqrt(3.0))
+
+    @property
+    def follows_temperature(self) -> bool:
+        """Whether the bias follows the temperature."""
+        return bool(set(OF_THE_BIAS) & set(self.effects))
+
+    @property
+    def bias_polynomial(self) -> Values:
+        """The bias, and how it changes per degC and per degC^2 from 25 degC: (3, 3) array, a row an axis."""
+        return np.asarray(self._bias_polynomial * self.factor)
+
+    @property
+    def _bias_polynomial(self) -> Values:
+        found = np.zeros((3, 3))
+        found[:, 0] = self.calibration.bias
+        found[:, 1] += self.effects.get("bias_temperature", np.zeros(3))
+        found[:, 1:] += self.effects.get("bias_temperature_quadratic", np.zeros(6)).reshape(3, 2)
+        return found
+
+    @property
+    def g_sensitivity(self) -> Values:
+        """Rate read per specific force, in the sensor's unit per g: (3, 3) array."""
+        return self.effects.get("g_sensitivity", np.zeros(9)).reshape(3, 3) * self.factor
+
+    @property
+    def noise_density(self) -> float:
+        """White noise by the sensor's configuration, unit/sqrt(Hz)."""
+        return float(self.sheet["noise_density"] * self.factor)
+
+    @property
+    def temperature_polynomials(self) -> tuple[Values, Values]:
+        """Coefficients in T, degC, of ``M(T)`` and ``b(T)`` in ``M raw + b``: (3, 3, 4) and (3, 4) arrays.
+
+        A scale factor that follows the temperature, K + D dT, is inverted to third order: ``M - M D M dT + ...``.
+        """
+        M, D = self.matrix, np.diag(self.effects.get("scale_factor_temperature", np.zeros(3)))
+        powers = [M]
+        while len(powers) < ORDER:
+            powers.append(-powers[-1] @ D @ M)
+        offset = self._bias_polynomial
+        added = np.zeros((3, ORDER))
+        for i, power in enumerate(powers):
+            for j in range(min(3, ORDER - i)):
+                added[:, i + j] -= power @ offset[:, j]
+        return _of_temperature(np.stack(powers, axis=2)), _of_temperature(added) * self.factor
+
+    def left_by_matrix(self, held: str) -> list[str]:
+        """Return a sentence on the error that a format leaves which holds the diagonal of the matrix, or none of it."""
+        if held == "full":
+            return []
+        error = self.scale_error if held == "diagonal" else self.bias_error
+        what = "Cross-axis terms" if held == "diagonal" else "The matrix"
+        left = f"{error:.2g} g at 1 g" if self.name == "accelerometer" else f"{100 * error:.2g} % of the rate"
+        return [
+            f"{what} of the {self.name} {'are' if held == 'diagonal' else 'is'} left out: that leaves about {left}."
+        ]
+
+
+def _of_temperature(coefficients: Values) -> Values:
+    """Turn coefficients in T - 25 degC into those in T, along the last axis: ``(T - 25)^k`` is binomial in T."""
+    orders = range(ORDER)
+    change = [[comb(k, j) * (-REFERENCE_TEMPERATURE) ** (k - j) if j <= k else 0.0 for j in orders] for k in orders]
+    return np.asarray(coefficients @ np.array(change), np.float64)
 
 
 def missing(document: dict[str, Any]) -> list[str]:
@@ -32,18 +164,8 @@ def missing(document: dict[str, Any]) -> list[str]:
     return [f"the {s} is not calibrated: {reasons.get(s, 'no reason given')}" for s in SENSORS if not document.get(s)]
 
 
-def sensor_effects(calibration: SensorCalibration) -> dict[str, NDArray[np.float64]]:
-    """Return the values of the effects that belong to the sensor itself, by name."""
-    return {e.name: e.values for e in calibration.effects if owner_of(e) == Owner.SENSOR}
-
-
-def bench_effects(calibration: SensorCalibration) -> list[str]:
-    """Return the effects of mounting, place, recording, table and timing, which no export carries."""
-    return [e.name for e in calibration.effects if owner_of(e) != Owner.SENSOR]
-
-
-def axes_of_readings(document: dict[str, Any]) -> list[str]:
-    """Return a sentence a sensor on how its axes become the body's, where they differ; one where both are alike."""
+def before_use(document: dict[str, Any]) -> list[str]:
+    """Return what to know before using an export: how readings become body axes, and what is implausible."""
     maps = maps_of_log(document.get("log") or {})
     whose = dict.fromkeys(maps.values(), "sensor") if len(set(maps.values())) == 1 else {m: s for s, m in maps.items()}
     lines = []
@@ -51,112 +173,95 @@ def axes_of_readings(document: dict[str, Any]) -> list[str]:
         if axis_map != STRAIGHT:
             pairs = ", ".join(f"{a} along body {b}" for a, b in zip("xyz", axis_map, strict=True))
             lines.append(f"Turn the readings to body axes first: the {sensor}'s {pairs}.")
-    return lines
+    return lines + [line for s in SENSORS for line in sentences(s, document.get(s))]
 
 
-def before_use(document: dict[str, Any]) -> list[str]:
-    """Return what to know before using an export: the sensor's axes, and what is implausible in the calibration."""
-    return axes_of_readings(document) + [line for s in SENSORS for line in sentences(s, document.get(s))]
+def final_errors(validation: dict[str, Any] | None, sensor: str) -> list[str]:
+    """Return a sentence on the held-out error of a sensor with and without each effect."""
+    found = (validation or {}).get(sensor) or {}
+    steps = [s for s in found.get("steps") or [] if s["name"] == "calibrated" or s["name"].startswith("+ ")]
+    errors = ["unknown" if s["rms_error"] is None else f"{s['rms_error']:.4g} {found['unit']}" for s in steps]
+    return [
+        f"held-out rms error of the {sensor}, {step['name']}: {error}"
+        for step, error in zip(steps, errors, strict=True)
+    ]
 
 
-def forward(calibration: SensorCalibration) -> NDArray[np.float64]:
-    """Return K, the inverse of the calibration matrix, with ``reading = bias + K @ truth``."""
-    return np.asarray(np.linalg.solve(calibration.matrix, np.eye(3)))
+def lower_times_rotation(K: Values) -> tuple[Values, Values]:
+    """Return L (lower triangular, positive diagonal) and Q (orthonormal) with ``K = L Q``."""
+    q, r = np.linalg.qr(K.T)
+    sign = np.sign(np.diag(r))
+    return (r * sign[:, None]).T, (q * sign).T
 
 
-def left_out(found: dict[str, SensorCalibration], carried: tuple[str, ...] = ()) -> list[str]:
-    """Return a sentence a sensor on the effects that a format does not carry, and on those of the bench."""
-    lines = []
-    for sensor, c in found.items():
-        lost = [name for name in sensor_effects(c) if name not in carried]
-        lines += [f"Left out of this format, {sensor}: {', '.join(lost)}."] if lost else []
-        lines += [f"Of the bench, not of the {sensor}: {', '.join(bench_effects(c))}."] if bench_effects(c) else []
-    return lines
+def rotation_times_lower(matrix: Values) -> tuple[Values, Values]:
+    """Return Q (orthonormal) and L (lower triangular, positive diagonal) with ``matrix = Q L``."""
+    q, r = np.linalg.qr(matrix[:, ::-1])
+    sign = np.sign(np.diag(r))
+    return (q * sign)[:, ::-1], (r * sign[:, None])[::-1, ::-1]
 
 
-def bias_polynomial(calibration: SensorCalibration) -> NDArray[np.float64]:
-    """Return the bias and how it changes per degC and per degC^2 from 25 degC: (3, 3) array, a row an axis."""
-    effects = sensor_effects(calibration)
-    found = np.zeros((3, 3))
-    found[:, 0] = calibration.bias
-    found[:, 1] += effects.get("bias_temperature", np.zeros(3))
-    found[:, 1:] += effects.get("bias_temperature_quadratic", np.zeros(6)).reshape(3, 2)
+def row_lengths(F: Values) -> tuple[Values, Values]:
+    """Return the lengths of the rows as a diagonal matrix, and the rows of unit length."""
+    length = np.linalg.norm(F, axis=1)
+    return np.diag(length), F / length[:, None]
+
+
+def accelerometer_frame(accelerometer: ExportedSensor | None, gyroscope: ExportedSensor | None) -> dict[str, Any]:
+    """Return Kalibr's factors of both matrices, in the frame i in which the accelerometer's is lower triangular.
+
+    ``a_meas = M_a f_i + b_a``, ``w_meas = M_g C w_i + A C f_i + b_w`` with M_a, M_g lower triangular and C a rotation:
+    ``K_a = M_a Q``, ``f_i = Q f``, ``K_g Q^T = M_g C``, ``A = G Q^T C^T`` with G the g-sensitivity, so nothing is lost.
+    """
+    M_a, Q = (np.eye(3), np.eye(3)) if accelerometer is None else lower_times_rotation(accelerometer.K)
+    pose = np.block([[Q, np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]])
+    if gyroscope is None:
+        return {"M_a": M_a, "T_i_b": pose, "M_g": np.eye(3), "C": np.eye(3), "A": np.zeros((3, 3))}
+    M_g, C = lower_times_rotation(gyroscope.K @ Q.T)
+    A = gyroscope.g_sensitivity / STANDARD_GRAVITY @ Q.T @ C.T
+    return {"M_a": M_a, "T_i_b": pose, "M_g": M_g, "C": C, "A": A}
+
+
+def noise(settings: dict[str, Any]) -> dict[str, float]:
+    """Return Kalibr's four noise parameters by the sensor's configuration, in m/s^2 and rad/s.
+
+    The random walk that stands for a bias with the standard deviation s and the correlation time T has ``s sqrt(2/T)``.
+    """
+    found = {}
+    for sensor, unit in (("accelerometer", "m/s^2"), ("gyroscope", "rad/s")):
+        sheet, factor = settings["sensor"][sensor], FACTORS[unit]
+        found[f"{sensor}_noise_density"] = float(sheet["noise_density"] * factor)
+        found[f"{sensor}_random_walk"] = float(sheet["bias_wander"] * np.sqrt(2.0 / sheet["wander_time_s"]) * factor)
     return found
 
 
-def diagonal(calibration: SensorCalibration) -> tuple[NDArray[np.float64], float]:
-    """Return the scale factors that stand best for the whole matrix, and the relative error that they leave.
-
-    ``s_i = K_ii / |K_i|^2`` minimises ``E (t_i - s_i K_i t)^2`` over truths t of any direction, and leaves
-    ``sqrt(sum_i (1 - K_ii^2 / |K_i|^2) / 3)`` of |t|, K_i the rows of K.
-
-    Parameters
-    ----------
-    calibration : SensorCalibration
-
-    Returns
-    -------
-    scale : (3,) array
-    error : float
-        Root mean square of the vector's error over directions, relative to its length.
-    """
-    K = forward(calibration)
-    length = np.sum(K**2, axis=1)
-    return np.diag(K) / length, float(np.sqrt(np.sum(1.0 - np.diag(K) ** 2 / length) / 3.0))
+def sampling_rate(document: dict[str, Any]) -> float:
+    """Return the sampling rate of the unit's recordings, Hz; 0 where none is known."""
+    rates = [i["rate_hz"] for i in document.get("inputs", []) if i.get("rate_hz")]
+    return float(rates[0]) if rates else 0.0
 
 
-def axis_by_axis(
-    document: dict[str, Any], carried: tuple[str, ...] = ()
-) -> tuple[dict[str, NDArray[np.float64]], list[str]]:
-    """Return what ``(raw - offset) * scale`` on each axis can hold, and remarks on what it cannot.
-
-    Returns
-    -------
-    values : dict of str to (3,) array
-        ``accelerometer_offset``, m/s^2, ``accelerometer_scale``, ``gyroscope_offset``, rad/s; of calibrated sensors.
-    remarks : list of str
-    """
-    found = calibrations(document)
-    values: dict[str, NDArray[np.float64]] = {}
-    remarks = [*(f"Left out: {line}." for line in missing(document)), *left_out(found, carried)]
-    if "accelerometer" in found:
-        c = found["accelerometer"]
-        scale, error = diagonal(c)
-        values |= {"accelerometer_offset": c.bias * STANDARD_GRAVITY, "accelerometer_scale": scale}
-        remarks.append(f"Cross-axis terms of the accelerometer are left out: that leaves about {error:.2g} g at 1 g.")
-    if "gyroscope" in found:
-        c = found["gyroscope"]
-        values["gyroscope_offset"] = np.radians(c.bias)
-        remarks.append(no_gyroscope_matrix(c))
-    return values, remarks
+def plain(content: Any) -> Any:  # noqa: ANN401
+    """Return content with lists in place of arrays."""
+    if isinstance(content, dict):
+        return {key: plain(value) for key, value in content.items()}
+    if isinstance(content, (list, tuple)):
+        return [plain(value) for value in content]
+    return content.tolist() if isinstance(content, (np.ndarray, np.generic)) else content
 
 
-def no_gyroscope_matrix(calibration: SensorCalibration) -> str:
-    """Return a sentence on the error that taking off the bias alone leaves, over directions: ``|1 - K| / sqrt(3)``."""
-    share = float(np.linalg.norm(np.eye(3) - forward(calibration))) / np.sqrt(3.0)
-    return f"The matrix of the gyroscope is left out: that leaves about {100 * share:.2g} % of the rate."
-
-
-def comment(lines: list[str], mark: str = "# ") -> str:
-    """Return lines as comments; line ends that users wrote stay inside."""
-    return "".join(f"{mark}{' '.join(line.splitlines())}\n" for line in lines)
-
-
-def yaml_text(content: dict[str, Any]) -> str:
-    """Return YAML, keys in their order and short lists on one line; by libyaml, which is faster, where there is one."""
-    dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
-    text: str = yaml.dump(content, Dumper=dumper, sort_keys=False, default_flow_style=None, width=120)
-    return text
-
-
-def final_errors(validation: dict[str, Any] | None) -> list[str]:
-    """Return a sentence a sensor on the held-out error with and without effects."""
-    lines = []
-    for sensor in SENSORS:
-        steps = ((validation or {}).get(sensor) or {}).get("steps") or []
-        for step in steps:
-            if step["name"] == "calibrated" or step["name"].startswith("+ "):
-                unit = validation[sensor]["unit"] if validation else ""
-                error = "unknown" if step["rms_error"] is None else f"{step['rms_error']:.4g} {unit}"
-                lines.append(f"held-out rms error of the {sensor}, {step['name']}: {error}")
-    return lines
+FUNCTIONS: dict[str, Any] = {
+    "accelerometer_frame": accelerometer_frame,
+    "identity": np.eye(3),
+    "matmul": np.matmul,
+    "lower_half": np.triu_indices(3)[::-1],  # column by column
+    "noise": noise,
+    "rint": lambda values: np.rint(values).astype(int).tolist(),
+    "rotation_times_lower": rotation_times_lower,
+    "row_lengths": row_lengths,
+    "sampling_rate": sampling_rate,
+    "RADIAN": FACTORS["rad/s"],
+    "REFERENCE_TEMPERATURE": REFERENCE_TEMPERATURE,
+    "STANDARD_GRAVITY": STANDARD_GRAVITY,
+    "TEMPERATURES": TEMPERATURES,
+}

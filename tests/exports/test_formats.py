@@ -1,5 +1,6 @@
 """Every format, read back by its consumer's own formula, gives what the calibration gives."""
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -7,11 +8,30 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.exports import export_all, exporters
-from pipeline.exports.kalibr import lower_times_rotation
+from pipeline import exports
+from pipeline.exports import export_all, formats
+from pipeline.exports.sensors import lower_times_rotation
 from pipeline.model.effects import effect
 from pipeline.records import FittedEffect, SensorCalibration
 
+FILES = {
+    *("ardupilot.param", "azure_kinect.json", "basalt_imu.json", "betaflight.txt", "calibration.h", "dlio.yaml"),
+    *("fusion_calibration.h", "imu_calib.yaml", "imu_calib_toolkit.json", "imu_tk_acc.calib", "imu_tk_gyro.calib"),
+    *("imucal.json", "inav.txt", "kalibr.yaml", "kalibr_imu.yaml", "kalibr_imu_chain.yaml", "paparazzi_imu.xml"),
+    *("px4.params", "realsense_calibration.json"),
+}
+MINE = """\
+consumer: mine
+equation: a = s (raw - b)
+source: none
+units: {accelerometer: m/s^2}
+needs: [accelerometer]
+matrix: {accelerometer: diagonal}
+says: ["Unit {unit}: a = s (raw - b)."]
+---
+{{ remarks | comment -}}
+{{ accelerometer.bias | numbers }}
+"""
 ACCELEROMETER = np.array([[0.994, 0.004, -0.002], [0.021, 1.007, 0.003], [-0.005, 0.012, 0.951]])
 GYROSCOPE = np.array([[1.017, 0.016, -0.019], [-0.013, 1.001, -0.005], [0.014, 0.005, 0.998]])
 
@@ -52,9 +72,24 @@ def samples(n: int = 200) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return rng.uniform(-1.5, 1.5, (n, 3)), rng.uniform(-200, 200, (n, 3)), rng.uniform(10, 50, n)
 
 
+def test_one_template_adds_a_format(tmp_path: Path, settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copytree(exports.TEMPLATES, tmp_path / "templates")
+    (tmp_path / "templates" / "mine.txt.j2").write_text(MINE)
+    monkeypatch.setattr(exports, "TEMPLATES", tmp_path / "templates")
+    formats.cache_clear()
+    try:
+        export_all(document({"accelerometer": {"hysteresis": 1e-3}}), settings, tmp_path)
+    finally:
+        formats.cache_clear()
+    lines = (tmp_path / "mine.txt").read_text().splitlines()
+    assert lines[:2] == ["# Unit U1 */: a = s (raw - b).", "# Left out of this format, accelerometer: hysteresis."]
+    assert lines[2].startswith("# Cross-axis terms of the accelerometer are left out")
+    assert [float(x) for x in lines[3].split()] == pytest.approx([0.031 * 9.80665, -0.022 * 9.80665, 0.067 * 9.80665])
+
+
 def test_every_format_writes_its_file(tmp_path: Path, settings: dict[str, Any]) -> None:
     written = export_all(document({}), settings, tmp_path / "U1")
-    assert {p.name for p in written} == {m.FILE_NAME for m in exporters()} >= {"kalibr.yaml", "calibration.h"}
+    assert {p.name for p in written} == FILES
     assert all(p.stat().st_size > 300 for p in written)
 
 

@@ -10,7 +10,7 @@ import yaml
 
 from pipeline import load_calibration
 from pipeline.exports import export_all
-from pipeline.exports.sensors import diagonal
+from pipeline.exports.sensors import ExportedSensor
 from pipeline.records import FittedEffect, SensorCalibration
 
 G0 = 9.80665
@@ -137,7 +137,8 @@ def test_an_autopilots_axis_by_axis_correction_leaves_what_its_header_says(
 
 def test_the_diagonal_that_stands_for_a_matrix_is_the_best_one() -> None:
     c = SensorCalibration("accelerometer", BIAS["accelerometer"], MATRIX["accelerometer"])
-    scale, error = diagonal(c)
+    found = ExportedSensor(c, "g", {})
+    scale, error = found.scale, found.scale_error
     K = np.linalg.inv(MATRIX["accelerometer"])
     for change in (0.0, 1e-3, -1e-3):
         left = np.linalg.norm(np.eye(3) - np.diag(scale * (1.0 + change)) @ K) / np.sqrt(3.0)
