@@ -22,9 +22,9 @@ from pipeline.diagnosis.words import in_words
 from pipeline.files import read_json
 from pipeline.io.parquet import load_recordings
 from pipeline.records import SENSORS
-from pipeline.report import campaign_page, certificate_page
-from pipeline.report.certificate import certificate
-from pipeline.report.session import sensor_temperature
+from pipeline.report import campaign_page
+from pipeline.report.certificate import certificate, certificate_page
+from pipeline.report.recording_section import sensor_temperature
 from pipeline.report.unit_page import render
 from pipeline.stages.batch import merge_common
 from pipeline.stages.unit_files import load_fits
@@ -72,7 +72,7 @@ def unit_costs(results: Path, runs: int) -> dict[str, float]:
 
     def report() -> str:
         made = certificate(*documents[:2], part, sensor_temperature(recordings))
-        return json.dumps(made, indent=1) + certificate_page.render(UNIT, made)
+        return json.dumps(made, indent=1) + certificate_page(UNIT, made)
 
     return {
         "page of a unit": least(lambda: render(*documents, recordings, part, words=words), runs),

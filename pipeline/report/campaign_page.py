@@ -1,40 +1,39 @@
-"""The page of a campaign: failures first, then the fleet in figures, methods side by side, and every unit.
-
-Units with the same serial are the same device calibrated in several ways (or several times): they are put side by side.
-"""
+"""The page of a campaign: failures first, then every unit, the fleet in charts, comparisons and statistics."""
 
 from __future__ import annotations
 
-import json
 from collections import Counter
-from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from markupsafe import Markup
+import numpy as np
+import pandas as pd
 
 from pipeline.outcome import findings_of, next_commands, verdict_groups
 from pipeline.records import SENSORS
-from pipeline.report.fleet_figures import FAR, fleet_figures, fleet_values
-from pipeline.report.numbers import number
+from pipeline.records.calibration import UNITS
+from pipeline.report.chart import Dots, Figure, Layer, Panel, chart
+from pipeline.report.numbers import number, plain
+from pipeline.report.pages import script_data, template
 from pipeline.report.summary import COLUMNS
-from pipeline.report.templating import template
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Sequence
 
 JSON = dict[str, Any]
 FIRST = 100  # rows that a browser shows at once; it shows the others when asked
-FEWEST_UNITS, FAR_SHOWN = 3, 30  # units, below which a distribution says nothing; units far from their siblings
-UNITS = {"accelerometer": "g", "gyroscope": "deg/s"}
+FAR = 3.0  # error over noise floor from which a unit is marked
+NAMED = 3  # units that the finding of a chart names
+FEWEST_UNITS, FAR_SHOWN = 3, 30  # units, below which a distribution says nothing; units far from the others
+MOST_LOTS = 60  # of which medians are shown lot by lot
 VERDICTS = {
-    "nothing_missing": ("nothing missing", "good"),
-    "missing_effect": ("missing effect", "warn"),
-    "unexplained": ("unexplained", "warn"),
-    "not_enough_data": ("not enough data", ""),
-    "left_by_method": ("left by method", "warn"),
-    "reference_in_doubt": ("reference in doubt", "warn"),
-    "floor_in_doubt": ("floor in doubt", "warn"),
-}
+    "nothing_missing": "good",
+    "missing_effect": "warn",
+    "unexplained": "warn",
+    "not_enough_data": "",
+    "left_by_method": "warn",
+    "reference_in_doubt": "warn",
+    "floor_in_doubt": "warn",
+}  # with the class of their colour
 
 
 def render(
@@ -55,57 +54,62 @@ def render(
     ----------
     campaign : str
     rows : list of dict
-        One a unit, as of ``summary.summary_row``.
+        One a unit, as of ``summary.summary_row``, in the order of ``units.csv``.
     failures : list of dict
         ``unit``, ``stage``, ``code``, ``message``, ``file`` of each failed unit.
     comparisons : sequence, optional
-        As of ``comparison_page.section``.
+        As of ``comparison_section.section``.
     page : str, optional
-        Name of a page of its own that the campaign has beside this one.
+        Name of a further page of the campaign.
     twins : sequence of sequence of str, optional
-        Files of several units that are the same, byte for byte, under different names.
+        Files of several units with the same content under different names.
     statistics : dict, optional
-        As of ``fleet_statistics.fleet_statistics``.
+        As of ``fleet.fleet_statistics``.
     history : dict, optional
-        As of ``history_section.runs_data``.
+        As of ``run_section.runs_data``.
     settings : dict, optional
         Of the run, for the commands to continue with.
-
-    Returns
-    -------
-    str
     """
-    shown = [_cells(row) for row in rows]
     findings = findings_of(rows)
-    by_unit = {row["unit"]: cells for row, cells in zip(rows, shown, strict=True)}
+    table = pd.DataFrame(rows).reindex(columns=list(dict.fromkeys([*COLUMNS, *(k for row in rows for k in row)])))
+    judged = [row.get("pass") for row in rows]
     text: str = template("campaign.html").render(
         campaign=campaign,
-        rows=shown,
+        rows=rows,
         failures=failures,
         twins=twins,
-        implausible=_implausible(rows),
-        ok=sum(row["status"] == "ok" for row in rows),
-        passed=sum(row.get("pass") is True for row in rows),
-        not_passed=sum(row.get("pass") is False for row in rows),
-        judged=any(row.get("pass") is not None for row in rows if row["status"] == "ok"),
-        fleet=[f for s in SENSORS if (f := _fleet(s, "all units", rows))],
-        lots=_lots(rows),
-        groups=[
-            {"title": title, "rows": [by_unit[u] for u in units if u in by_unit]} for title, units in _same_serial(rows)
+        implausible=[
+            (row["unit"], s, names.replace(";", ", "))
+            for row in rows
+            for s in SENSORS
+            if (names := row.get(f"{s}_implausible"))
         ],
-        figures=fleet_figures(rows),
+        ok=sum(row["status"] == "ok" for row in rows),
+        passed=judged.count(True),
+        not_passed=judged.count(False),
+        judged=any(row.get("pass") is not None for row in rows if row["status"] == "ok"),
+        fleet=[m for s in SENSORS if (m := _medians(s, "all units", table))],
+        lots=_lots(table),
+        groups=[
+            (f"Serial {serial}", [rows[i] for i in same.index])
+            for serial, same in table[table["serial"].fillna("") != ""].groupby("serial", sort=False)
+            if len(same) > 1
+        ],
+        figures=[f for sensor in SENSORS if (f := _fleet_figure(sensor, table))],
         statistics=statistics if statistics and len(rows) >= FEWEST_UNITS else None,
         far_shown=FAR_SHOWN,
+        far=FAR,
         causes=_causes(failures),
         found=verdict_groups(findings),
         commands=next_commands(findings, settings or {"campaign": campaign}),
         history=history,
-        history_data=_script_data({"units": history["units"]}) if history else None,
-        names=_script_data([row["unit"] for row in rows]),
-        values=_script_data(fleet_values(rows)),
+        history_data=script_data({"units": history["units"]}) if history else None,
+        names=script_data([row["unit"] for row in rows]),
+        values=script_data(_fleet_values(rows)),
         first=FIRST,
         sections=comparisons,
         verdicts=VERDICTS,
+        sensors=SENSORS,
         kept=sorted({key for row in rows for key in row} - set(COLUMNS)),
         beside=page,
     )
@@ -121,85 +125,92 @@ def _causes(failures: list[JSON]) -> list[tuple[str, list[str]]]:
     return sorted(causes.items(), key=lambda c: -len(c[1]))
 
 
-def _implausible(rows: list[JSON]) -> list[tuple[str, str, str]]:
-    """Return unit, sensor and parameters of sensors with parameters far beyond the data sheet."""
-    found = ((r["unit"], s, str(r.get(f"{s}_implausible") or "")) for r in rows for s in SENSORS)
-    return [(unit, sensor, names.replace(";", ", ")) for unit, sensor, names in found if names]
-
-
-def _script_data(value: object) -> Markup:
-    """Return a value as JSON that may stand within a script element."""
-    return Markup(json.dumps(value, ensure_ascii=False).replace("<", "\\u003c"))  # noqa: S704  (no tag can begin)
-
-
-def _cells(row: JSON) -> JSON:
-    """Return a row with its figures as text, so that the template only places them."""
-    cells: JSON = {k: row.get(k) or "" for k in ("unit", "serial", "lot", "date", "status", "sensor", "method")}
-    cells["pass"] = row.get("pass")
-    cells["sensors"] = []
-    for sensor in SENSORS:
-        after, floor = row.get(f"{sensor}_error_after"), row.get(f"{sensor}_noise_floor")
-        ratio = after / floor if after is not None and floor else None
-        cells["sensors"].append(
-            (
-                _figure(row.get(f"{sensor}_error_before")),
-                _figure(after),
-                _figure(floor),
-                _figure(ratio),
-                "n" if ratio is None or ratio <= FAR else "n warn-text",
-                row.get(f"{sensor}_verdict") or "",
-                (row.get(f"{sensor}_selected") or "").replace("_", " ").replace(";", ", "),
-            )
-        )
-    return cells
-
-
-def _figure(value: float | None) -> str:
-    return "" if value is None else number(value)
-
-
-def _fleet(sensor: str, name: str, rows: list[JSON]) -> JSON | None:
-    """Return medians over units of what was reached."""
-    known = [r for r in rows if r.get(f"{sensor}_error_after") is not None]
-    if not known:
+def _medians(sensor: str, name: str, table: pd.DataFrame) -> JSON | None:
+    """Return the medians of the errors, the verdicts and the missing effects of some units."""
+    known = table[table[f"{sensor}_error_after"].notna()]
+    if known.empty:
         return None
-
-    def middle(column: str) -> float | None:
-        values = [v for r in known if (v := r.get(f"{sensor}_{column}")) is not None]
-        return median(values) if values else None
-
-    verdicts = [r.get(f"{sensor}_verdict") for r in known]
+    figures = ("error_before", "error_after", "noise_floor")
+    before, after, floor = (pd.to_numeric(known[f"{sensor}_{column}"]).median() for column in figures)
+    verdicts = Counter(known[f"{sensor}_verdict"])
     return {
         "sensor": sensor,
         "name": name,
         "unit": UNITS[sensor],
         "count": len(known),
-        "before": number(middle("error_before")),
-        "after": number(middle("error_after")),
-        "floor": number(middle("noise_floor")),
-        "verdicts": {VERDICTS[v][0]: verdicts.count(v) for v in VERDICTS if v in verdicts},
-        "missing": _missing(sensor, known),
+        "before": number(float(before)),
+        "after": number(float(after)),
+        "floor": number(float(floor)),
+        "verdicts": {plain(v): verdicts[v] for v in VERDICTS if verdicts[v]},
+        "missing": sorted(_selected(sensor, known).items(), key=lambda c: (-c[1], c[0])),
     }
 
 
-def _missing(sensor: str, rows: list[JSON]) -> list[tuple[str, int]]:
-    """Return in how many units each effect is missing, the most frequent first."""
-    counts = Counter(name for r in rows for name in str(r.get(f"{sensor}_selected") or "").split(";") if name)
-    return [(name.replace("_", " "), count) for name, count in sorted(counts.items(), key=lambda c: (-c[1], c[0]))]
+def _selected(sensor: str, table: pd.DataFrame) -> Counter[str]:
+    """Return in how many units each effect is missing."""
+    names = (name for names in table[f"{sensor}_selected"].dropna() for name in str(names).split(";"))
+    return Counter(plain(name) for name in names if name)
 
 
-def _lots(rows: list[JSON]) -> list[JSON]:
-    lots = list(dict.fromkeys(r["lot"] for r in rows if r.get("lot")))
-    if not 1 < len(lots) <= 60:
+def _lots(table: pd.DataFrame) -> list[JSON]:
+    """Return the medians lot by lot."""
+    lots = {lot: of for lot, of in table.groupby("lot", sort=False) if lot}
+    if not 1 < len(lots) <= MOST_LOTS:
         return []
-    return [
-        f for s in SENSORS for lot in lots if (f := _fleet(s, f"lot {lot}", [r for r in rows if r.get("lot") == lot]))
-    ]
+    return [m for s in SENSORS for lot, of in lots.items() if (m := _medians(s, f"lot {lot}", of))]
 
 
-def _same_serial(rows: list[JSON]) -> Iterable[tuple[str, list[str]]]:
-    groups: dict[str, list[str]] = {}
-    for row in rows:
-        if row.get("serial"):
-            groups.setdefault(row["serial"], []).append(row["unit"])
-    return [(f"Serial {serial}", units) for serial, units in groups.items() if len(units) > 1]
+def _fleet_values(rows: list[JSON]) -> JSON:
+    """Return the value of each dot of the charts, by chart and colour, in the order of the units."""
+    return {
+        f"fleet-{sensor}": {
+            colour: ["" if (v := r.get(f"{sensor}_{column}")) is None else f"{v:.6g}" for r in rows]
+            for colour, column in (("c3", "error_before"), ("c4", "noise_floor"), ("after", "error_after"))
+        }
+        for sensor in SENSORS
+    }
+
+
+def _fleet_figure(sensor: str, table: pd.DataFrame) -> Figure | None:
+    """Draw each unit's error before and after as a dot, in the order of ``units.csv``; None for few units."""
+    unit, order = UNITS[sensor], np.arange(1.0, len(table) + 1)
+    errors = (pd.to_numeric(table[f"{sensor}_{name}"]) for name in ("error_before", "error_after", "noise_floor"))
+    before, after, floor = (v.where(v > 0).to_numpy(float) for v in errors)
+    known = np.isfinite(after)
+    if known.sum() < FEWEST_UNITS:
+        return None
+    complete = known & (table[f"{sensor}_verdict"] == "nothing_missing").to_numpy(bool)
+    layers: list[Layer] = [Dots(order, before, 3), Dots(order, floor, 4)]
+    legend = [("c3", "before"), ("c4", "noise floor")]
+    for chosen, colour, name in (
+        (complete, 2, "after, nothing missing"),
+        (known & ~complete, 0, "after, any other verdict"),
+    ):
+        if chosen.any():
+            layers.append(Dots(order[chosen], after[chosen], colour))
+            legend.append((f"c{colour}", name))
+    missing = _selected(sensor, table).most_common()
+    effects = ", ".join(f"{name} ({count} unit{'s' if count != 1 else ''})" for name, count in missing)
+    words = f"Missing effects: {effects}." if effects else "No effect is named as missing."
+    middle = [number(float(np.nanmedian(v))) if np.isfinite(v).any() else "not known" for v in (before, after, floor)]
+    finding = f"{sensor.capitalize()}: {_farthest(table['unit'].tolist(), after / floor, int(known.sum()))}"
+    drawn = chart(
+        f"fleet-{sensor}",
+        finding,
+        f"Held-out error of {int(known.sum())} units. Median {middle[0]} {unit} before, {middle[1]} after, noise floor "
+        f"{middle[2]}. {words}",
+        [Panel(layers, f"rms error, {unit}", 200, logarithmic=True)],
+        "unit, in the order of units.csv",
+        margin=0.03,
+        names="units",
+    )
+    return Figure(drawn, f"Error on held-out motion, each unit a dot. {words}", tuple(legend), finding)
+
+
+def _farthest(units: list[str], ratio: np.ndarray, known: int) -> str:
+    """Return how many units have errors far above the noise, with the names of the worst."""
+    far = [int(i) for i in np.argsort(-np.nan_to_num(ratio)) if ratio[i] > FAR]
+    if not far:
+        return f"all {known} units are within {FAR:g} × the noise floor"
+    named = ", ".join(f"{units[i]} ({number(float(ratio[i]))} ×)" for i in far[:NAMED])
+    return f"{len(far)} of {known} units are beyond {FAR:g} × the noise floor; worst: {named}"

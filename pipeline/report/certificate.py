@@ -1,23 +1,29 @@
 """The calibration report of a laboratory: what ISO/IEC 17025:2017 asks for in 7.8.2.1, 7.8.4.1 and 7.8.6.
 
-Filled from what was measured and from what the laboratory states in its ``certificate`` config. What neither holds is
-not made up: the report lists it, and is stamped as no calibration certificate. Traceability is printed as stated, or
-as not stated. Names follow the Digital Calibration Certificate (PTB, DCC 3) where it has one; units are those of the
-house (g = 9.80665 m/s^2, deg/s).
+It holds the measured results and what the laboratory states in its ``certificate`` config. What is missing is listed,
+and the report is then stamped as no calibration certificate. Traceability is printed as stated, or as not stated. Names
+follow the Digital Calibration Certificate (PTB, DCC 3) where it has one; units are g (9.80665 m/s^2) and deg/s.
 """
 
 from __future__ import annotations
 
 import re
+from itertools import repeat
 from typing import TYPE_CHECKING, Any
+
+from markupsafe import Markup
 
 from pipeline.outcome import run_command
 from pipeline.records import SENSORS
-from pipeline.report.figure import AXES
+from pipeline.report.held_out_section import first_and_last_step
+from pipeline.report.pages import template
+from pipeline.report.parameter_section import budget_of
+from pipeline.report.parameters import fitted_parameters
 
 if TYPE_CHECKING:
-    from pipeline.report.figure import JSON
+    from collections.abc import Iterator
 
+JSON = dict[str, Any]
 STAMP = "NOT A CALIBRATION CERTIFICATE - incomplete: "
 ONLY_THIS_ITEM = "The results relate only to the item calibrated."
 COVERAGE = (
@@ -26,6 +32,24 @@ COVERAGE = (
 )
 SOFTWARE_SAYS = "Accreditation and traceability are the laboratory's statements; the software asserts neither."
 DAY = re.compile(r"\d{4}-\d{2}-\d{2}")
+ERRORS = ("rms_error", "mean_abs_error", "max_error", "min_error", "vector_rms_error")
+ASKED = (
+    ("name of the laboratory", "7.8.2.1 b", "certificate.laboratory.name"),
+    ("address of the laboratory", "7.8.2.1 b", "certificate.laboratory.address"),
+    ("place of performance", "7.8.2.1 c", "certificate.place"),
+    ("unique identification", "7.8.2.1 d", "certificate.number"),
+    ("customer", "7.8.2.1 e", "certificate.customer.name"),
+    ("contact of the customer", "7.8.2.1 e", "certificate.customer.contact"),
+    ("description of the item", "7.8.2.1 g", "certificate.item.description"),
+    ("serial number of the item", "7.8.2.1 g", "serial in units.csv"),
+    ("date of performance", "7.8.2.1 i", "certificate.performed.begin"),
+    ("date of issue", "7.8.2.1 j", "certificate.issued"),
+    ("deviations from the method", "7.8.2.1 n", "certificate.method.deviations"),
+    ("authorising person", "7.8.2.1 o", "certificate.authorised_by.name"),
+    ("conditions of influence", "7.8.4.1 b", "certificate.environment"),
+    ("reference equipment", "7.8.4.1 c", "certificate.equipment"),
+    ("traceability", "7.8.4.1 c", "certificate.traceability"),
+)  # what the standard asks for: what, its clause and the key to set
 
 
 def certificate(calibration: JSON, validation: JSON | None, settings: JSON, temperature: str | None) -> JSON:
@@ -61,7 +85,11 @@ def certificate(calibration: JSON, validation: JSON | None, settings: JSON, temp
             "command": run_command(settings["run"]) if settings.get("run") else None,
         },
     }
-    missing = _missing(document, stated, validation or {})
+    missing = [
+        {"what": what, "clause": clause, "key": key}
+        for what, clause, key, value in _wanted(document, stated)
+        if not value
+    ]
     stamp = STAMP + ", ".join(m["what"] for m in missing) if missing else None
     return {"complete": not missing, "stamp": stamp, "missing": missing, **document}
 
@@ -113,6 +141,7 @@ def _administrative(calibration: JSON, stated: JSON, row: JSON) -> JSON:
 
 def _result(sensor: str, calibration: JSON, held_out: JSON, settings: JSON, temperature: str | None) -> JSON:
     part, stated, table = calibration[sensor], settings["certificate"], settings["table"]
+    first, last = first_and_last_step(held_out)
     return {
         "name": sensor,
         "unit": part["unit"],
@@ -135,10 +164,10 @@ def _result(sensor: str, calibration: JSON, held_out: JSON, settings: JSON, temp
             "accuracy of local gravity, g": table.get("gravity_accuracy_g"),
             "laboratory": stated["environment"],
         },
-        "results": quantities(part),
+        "results": _quantities(part),
         "uncertaintyBudget": part.get("uncertainty_budget"),
-        "beforeAdjustment": _errors(held_out, 0),
-        "afterAdjustment": _errors(held_out, -1),
+        "beforeAdjustment": {k: first.get(k) for k in ERRORS} if first else None,
+        "afterAdjustment": {k: last.get(k) for k in ERRORS} if last else None,
         "noiseFloor": held_out.get("noise_floor"),
         "conformity": {
             **stated["conformity"],
@@ -148,95 +177,66 @@ def _result(sensor: str, calibration: JSON, held_out: JSON, settings: JSON, temp
     }
 
 
-def quantities(part: JSON) -> list[JSON]:
-    """Return bias, matrix and the parameters of fitted effects, each with its expanded uncertainty.
-
-    Parameters
-    ----------
-    part : dict
-        The sensor's part of the calibration.
-
-    Returns
-    -------
-    list of dict
-        ``name, value, unit, expandedUnc``; the last None for what the method does not fit, or where no budget is known.
-    """
+def _quantities(part: JSON) -> list[JSON]:
+    """Return each parameter with its uncertainty: None where the method does not fit it, or states none."""
     budget = part.get("uncertainty_budget")
-    rows = [p for effect in part.get("effects") or [] for p in effect["parameters"].values()]
-    values = [*part["bias"], *(m for row in part["matrix"] for m in row), *(p["value"] for p in rows)]
-    if not budget:
-        names = [*(f"bias_{a}" for a in AXES), *(f"matrix_{a}{b}" for a in AXES for b in AXES)]
-        units = [part["unit"]] * 3 + ["1"] * 9
-        return [
-            {"name": n, "value": v, "unit": u, "expandedUnc": None}
-            for n, v, u in zip(names, values[:12], units, strict=True)
-        ]
-    return [
-        {"name": name, "value": value, "unit": budget["units"][j], "expandedUnc": _expanded(budget, j)}
-        for j, (name, value) in enumerate(zip(budget["parameters"], values, strict=True))
-    ]
+    keys = ("expanded_uncertainty", "standard_uncertainty", "coverage_factor", "effective_degrees_of_freedom")
+    known = zip(*(budget[key] for key in keys), strict=True) if budget else repeat((None, 0.0, None, None))
+    rows = []
+    for p, (U, u, k, freedom) in zip(fitted_parameters(part), known, strict=False):
+        expanded = {"uncertainty": U, "standardUncertainty": u, "coverageFactor": k}
+        expanded |= {"effectiveDegreesOfFreedom": freedom, "coverageProbability": 0.95, "distribution": "t"}
+        rows.append({"name": p.name, "value": p.value, "unit": p.unit, "expandedUnc": expanded if u > 0.0 else None})
+    return rows
 
 
-def _expanded(budget: JSON, j: int) -> JSON | None:
-    if not budget["standard_uncertainty"][j] > 0.0:
-        return None
-    return {
-        "uncertainty": budget["expanded_uncertainty"][j],
-        "standardUncertainty": budget["standard_uncertainty"][j],
-        "coverageFactor": budget["coverage_factor"][j],
-        "effectiveDegreesOfFreedom": budget["effective_degrees_of_freedom"][j],
-        "coverageProbability": 0.95,
-        "distribution": "t",
+def _wanted(document: JSON, stated: JSON) -> Iterator[tuple[str, str, str, Any]]:
+    """Yield what the standard asks for: what, its clause, the key to set, and what is known of it."""
+    core, results = document["administrativeData"]["coreData"], document["measurementResults"]
+    conditions = [r["influenceConditions"] for r in results]
+    warm = all(c["temperature of the sensor, degC"] is not None for c in conditions)
+    known = {
+        "certificate.number": core["uniqueIdentifier"],
+        "certificate.performed.begin": core["beginPerformanceDate"],
+        "certificate.customer.contact": stated["customer"]["contact"] or stated["customer"]["address"],
+        "certificate.environment": stated["environment"] or warm,
+        "serial in units.csv": document["administrativeData"]["items"][0]["identifications"][0]["value"],
     }
-
-
-def _errors(held_out: JSON, step: int) -> JSON | None:
-    """Return the held-out errors of the first (0) or last (-1) step."""
-    steps = held_out.get("steps") or []
-    keys = ("rms_error", "mean_abs_error", "max_error", "min_error", "vector_rms_error")
-    return {k: steps[step].get(k) for k in keys} if steps else None
-
-
-def _missing(document: JSON, stated: JSON, validation: JSON) -> list[JSON]:
-    """Return what the standard asks for and nobody has stated: ``what``, its ``clause`` and the ``key`` to set."""
-    core = document["administrativeData"]["coreData"]
-    results = document["measurementResults"]
-    judged = any(r["conformity"]["checks"] for r in results)
-    warm = all(r["influenceConditions"]["temperature of the sensor, degC"] is not None for r in results)
-    serial = document["administrativeData"]["items"][0]["identifications"][0]["value"]
-    wanted: list[tuple[str, str, str, Any]] = [
-        ("name of the laboratory", "7.8.2.1 b", "certificate.laboratory.name", stated["laboratory"]["name"]),
-        ("address of the laboratory", "7.8.2.1 b", "certificate.laboratory.address", stated["laboratory"]["address"]),
-        ("place of performance", "7.8.2.1 c", "certificate.place", stated["place"]),
-        ("unique identification", "7.8.2.1 d", "certificate.number", core["uniqueIdentifier"]),
-        ("customer", "7.8.2.1 e", "certificate.customer.name", stated["customer"]["name"]),
-        (
-            "contact of the customer",
-            "7.8.2.1 e",
-            "certificate.customer.contact",
-            stated["customer"]["contact"] or stated["customer"]["address"],
-        ),
-        ("description of the item", "7.8.2.1 g", "certificate.item.description", stated["item"]["description"]),
-        ("serial number of the item", "7.8.2.1 g", "serial in units.csv", serial),
-        ("date of performance", "7.8.2.1 i", "certificate.performed.begin", core["beginPerformanceDate"]),
-        ("date of issue", "7.8.2.1 j", "certificate.issued", stated["issued"]),
-        ("deviations from the method", "7.8.2.1 n", "certificate.method.deviations", stated["method"]["deviations"]),
-        ("authorising person", "7.8.2.1 o", "certificate.authorised_by.name", stated["authorised_by"]["name"]),
-        ("conditions of influence", "7.8.4.1 b", "certificate.environment", stated["environment"] or warm or None),
-        ("reference equipment", "7.8.4.1 c", "certificate.equipment", stated["equipment"]),
-        ("traceability", "7.8.4.1 c", "certificate.traceability", stated["traceability"]),
-    ]
+    for what, clause, key in ASKED:
+        yield what, clause, key, known[key] if key in known else _setting(stated, key)
     if any(r["name"] == "accelerometer" for r in results):
-        accuracy = results[0]["influenceConditions"]["accuracy of local gravity, g"]
-        key = "table.gravity_accuracy_g"
-        wanted.append(("accuracy of local gravity", "7.8.4.1 a", key, accuracy is not None))
-    for sensor in (r["name"] for r in results):
-        given = any(q["expandedUnc"] for q in next(r["results"] for r in results if r["name"] == sensor))
-        wanted.append((f"uncertainty of the {sensor}", "7.8.4.1 a", "method=reference_least_squares", given))
-        errors = (validation.get(sensor) or {}).get("steps")
-        wanted.append((f"results of the {sensor} before and after", "7.8.4.1 d", "a held-out recording", errors))
-    if judged:
-        rule = stated["conformity"]
-        wanted.append(("specification", "7.8.6.2", "certificate.conformity.specification", rule["specification"]))
-        wanted.append(("decision rule", "7.8.6.2", "certificate.conformity.decision_rule", rule["decision_rule"]))
-    return [{"what": what, "clause": clause, "key": key} for what, clause, key, value in wanted if not value]
+        accuracy = conditions[0]["accuracy of local gravity, g"]
+        yield "accuracy of local gravity", "7.8.4.1 a", "table.gravity_accuracy_g", accuracy is not None
+    for r in results:
+        sensor, uncertain = r["name"], any(q["expandedUnc"] for q in r["results"])
+        yield f"uncertainty of the {sensor}", "7.8.4.1 a", "method=reference_least_squares", uncertain
+        yield f"results of the {sensor} before and after", "7.8.4.1 d", "a held-out recording", r["beforeAdjustment"]
+    if any(r["conformity"]["checks"] for r in results):
+        for what, key in (("specification", "specification"), ("decision rule", "decision_rule")):
+            yield what, "7.8.6.2", f"certificate.conformity.{key}", stated["conformity"][key]
+
+
+def _setting(stated: JSON, key: str) -> Any:  # noqa: ANN401  (any setting)
+    """Return a setting by its key: ``certificate.laboratory.name``."""
+    value: Any = stated
+    for name in key.split(".")[1:]:
+        value = value[name]
+    return value
+
+
+def certificate_page(unit: str, report: JSON) -> str:
+    """Return the report of ``certificate`` as a page that prints well: its identification is on every sheet."""
+    core = report["administrativeData"]["coreData"]
+    sheet = f"{core['title']} {core['uniqueIdentifier'] or unit}"
+    if report["stamp"]:
+        sheet += " \N{MIDDLE DOT} NOT A CALIBRATION CERTIFICATE"
+    budgets = {
+        r["name"]: budget_of({"uncertainty_budget": r["uncertaintyBudget"]}) for r in report["measurementResults"]
+    }
+    page: str = template("certificate.html").render(unit=unit, report=report, sheet=_css_text(sheet), budgets=budgets)
+    return page
+
+
+def _css_text(text: str) -> Markup:
+    """Return text for a string of a style sheet: everything but letters and digits as its number."""
+    return Markup("".join(c if c.isascii() and c.isalnum() else f"\\{ord(c):x} " for c in text))  # noqa: S704  (no markup left)

@@ -54,3 +54,13 @@ def typeset(sentence: str) -> str:
     """Return a sentence as a terminal prints it with the signs of print: ``±``, the minus sign, ``ΔBIC``."""
     signs = sentence.replace("+-", "±").replace("delta BIC", "ΔBIC")
     return re.sub(r"(?<![\w.-])-(?=\d)|(?<=\de)-(?=\d)", MINUS, signs)
+
+
+def plain(name: str) -> str:
+    """Return the name of an effect, a verdict or a setting with spaces."""
+    return name.replace("_", " ")
+
+
+def unit_text(unit: object) -> str:
+    """Return a unit as it stands behind a number: nothing for 1."""
+    return "" if unit in (None, "1") else str(unit)

@@ -6,14 +6,14 @@ the user's whose name is taken gets ``sheet_`` before it.
 
 from __future__ import annotations
 
-import csv
-import io
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pipeline.files import write_atomically
 from pipeline.records import SENSORS
-from pipeline.report.limits import final_step, verdict
+from pipeline.report.held_out_section import first_and_last_step, passes
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 JSON = dict[str, Any]
 UNIT_COLUMNS = ("unit", "serial", "lot", "date", "status", "error", "sensor", "method")
@@ -29,15 +29,11 @@ SENSOR_COLUMNS = (
 )
 IMPLAUSIBLE = tuple(f"{s}_implausible" for s in SENSORS)
 COLUMNS = (*UNIT_COLUMNS, *(f"{s}_{c}" for s in SENSORS for c in SENSOR_COLUMNS), "pass", *IMPLAUSIBLE)
-SHEET_COLUMNS = ("table", "procedure", "ingest", "filter", "certificate", "overrides")  # of units.csv, said elsewhere
+SHEET_COLUMNS = ("table", "procedure", "ingest", "filter", "certificate", "overrides")  # of units.csv; not repeated
 
 
 def summary_row(
-    unit: str,
-    calibration: JSON,
-    validation: JSON | None,
-    diagnosis: JSON | None,
-    sheet_row: dict[str, str],
+    unit: str, calibration: JSON, validation: JSON | None, diagnosis: JSON | None, sheet_row: dict[str, str]
 ) -> JSON:
     """Return a unit's row: a dict from column to value, None where there is none.
 
@@ -49,22 +45,20 @@ def summary_row(
     sheet_row : dict of str to str
         The unit's row of ``units.csv``.
     """
-    error = calibration.get("error")
-    row: JSON = dict.fromkeys(COLUMNS)
-    row |= {
+    error = calibration.get("error") or {}
+    file = f"{error['file']}: " if error.get("file") else ""
+    row: JSON = dict.fromkeys(COLUMNS) | {
         "unit": unit,
         **{key: sheet_row.get(key) or None for key in ("serial", "lot", "date")},
         "status": calibration.get("status"),
-        "error": f"{error['file']}: {error['message']}"
-        if error and error.get("file")
-        else (error or {}).get("message"),
+        "error": f"{file}{error['message']}" if error.get("message") else None,
         "sensor": calibration.get("sensor"),
         "method": calibration.get("method"),
-        "pass": verdict(calibration, validation),
+        "pass": passes(calibration, validation),
     }
     for sensor in SENSORS:
         held_out, found = (validation or {}).get(sensor) or {}, (diagnosis or {}).get(sensor) or {}
-        raw, final = (held_out.get("steps") or [{}])[0], final_step(held_out)
+        raw, final = first_and_last_step(held_out)
         selected = found.get("selected") if found.get("verdict") == "missing_effect" else None
         values = (
             raw.get("rms_error"),
@@ -73,39 +67,36 @@ def summary_row(
             final.get("mean_abs_error"),
             held_out.get("noise_floor"),
             found.get("verdict"),
-            ";".join(selected) if selected else None,
+            ";".join(selected or []) or None,
             found.get("reason") or None,
         )
         row |= {f"{sensor}_{column}": value for column, value in zip(SENSOR_COLUMNS, values, strict=True)}
-        implausible = (calibration.get(sensor) or {}).get("implausible")
-        row[f"{sensor}_implausible"] = ";".join(e["parameter"] for e in implausible) if implausible else None
+        implausible = (calibration.get(sensor) or {}).get("implausible") or []
+        row[f"{sensor}_implausible"] = ";".join(e["parameter"] for e in implausible) or None
     for key, value in sheet_row.items():
         if key not in SHEET_COLUMNS and key not in UNIT_COLUMNS:
             row[f"sheet_{key}" if key in COLUMNS else key] = value
     return row
 
 
-def write_summary(path: Path | str, rows: list[JSON]) -> None:
-    """Write ``summary.csv`` under a temporary name, then rename it.
+def write_summary(path: Path, rows: list[JSON]) -> None:
+    """Write ``summary.csv``; own columns may differ from unit to unit.
 
     Parameters
     ----------
-    path : Path or str
+    path : Path
     rows : list of dict
-        As of ``summary_row``; own columns may differ from unit to unit.
+        As of ``summary_row``.
     """
-    path = Path(path)
+    import pandas as pd  # noqa: PLC0415  (0.4 s, and summary_row is used without it)
+
     columns = list(dict.fromkeys([*COLUMNS, *(key for row in rows for key in row)]))
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows([_cell(row.get(column)) for column in columns] for row in rows)
-    write_atomically(path, buffer.getvalue())
+    table = pd.DataFrame([{key: _cell(value) for key, value in row.items()} for row in rows], columns=columns)
+    write_atomically(path, table.to_csv(index=False, lineterminator="\n"))
 
 
-def _cell(value: object) -> str:
-    if value is None:
-        return ""
+def _cell(value: object) -> object:
+    """Return a number to nine digits, and a truth value in lower case."""
     if isinstance(value, bool):
         return str(value).lower()
-    return f"{value:.9g}" if isinstance(value, float) else str(value)
+    return f"{value:.9g}" if isinstance(value, float) else value

@@ -1,7 +1,7 @@
 """Stage gather: publish every unit's files under their stable paths, and write the summary and the campaign page.
 
-The whole set is made beside the published one, and takes its place when it is complete: whatever stops the stage, the
-published files are those of one run.
+The whole set is made in a folder of its own and replaces the published one when it is complete, so that the published
+files are always those of one run.
 """
 
 from __future__ import annotations
@@ -16,12 +16,11 @@ from pipeline.errors import PipelineError
 from pipeline.files import flushed_together, read_json, write_atomically, write_json
 from pipeline.history import of_units, record, unit_state
 from pipeline.report.campaign_page import render
-from pipeline.report.comparison_page import section
-from pipeline.report.comparison_units import unit_figures
-from pipeline.report.failure_page import failure_page
-from pipeline.report.fleet_statistics import fleet_statistics, parameters
-from pipeline.report.fleet_table import write_parameters
-from pipeline.report.history_section import runs_data, times_of, with_history
+from pipeline.report.comparison import unit_figures
+from pipeline.report.comparison_section import section
+from pipeline.report.fleet import fleet_statistics, unit_parameters, write_parameters
+from pipeline.report.pages import failure_page
+from pipeline.report.run_section import runs_data, times_of, with_history
 from pipeline.report.summary import summary_row, write_summary
 from pipeline.results_folder import PUBLISHED, finish_publishing, publish_all
 from pipeline.stages.batch import FAILED, failure_of, record_output
@@ -29,24 +28,26 @@ from pipeline.stages.batch import FAILED, failure_of, record_output
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from pipeline.report.parameters import Parameter
     from pipeline.stages.batch import Job
 
-NEW = ".new"  # the set in the making, below the results
-FOLDERS = {"validate": "validations", "diagnose": "diagnoses"}
+JSON = dict[str, Any]
+NEW = ".new"  # folder of the new set, below the results
+STAGES_BACKWARDS = ("report", "export", "diagnose", "validate", "calibration")
 
 
 @dataclass
 class Gathered:
     """What one unit adds to the campaign: its documents, and each file to publish with its stable path."""
 
-    calibration: dict[str, Any]
-    failure: dict[str, Any] | None = None
-    documents: dict[str, Any] = field(default_factory=lambda: dict.fromkeys(FOLDERS))
+    calibration: JSON
+    failure: JSON | None = None
+    validation: JSON | None = None
+    diagnosis: JSON | None = None
     files: list[tuple[Path, str]] = field(default_factory=list)
-    figures: Any = None
-    row: dict[str, Any] = field(default_factory=dict)
-    state: dict[str, Any] = field(default_factory=dict)
-    fitted: dict[str, tuple[float, float | None, str]] = field(default_factory=dict)
+    row: JSON = field(default_factory=dict)
+    fitted: dict[str, Parameter] = field(default_factory=dict)
+    figures: list[JSON] = field(default_factory=list)
 
 
 def process_batch(job: Job) -> None:
@@ -67,51 +68,12 @@ def process_batch(job: Job) -> None:
     write_json(job.output, [u.failure for u in units.values() if u.failure])
 
 
-def _write_campaign(job: Job, units: Mapping[str, Gathered], new: Path) -> None:
-    """Write what speaks of all units."""
-    rows, fitted = [u.row for u in units.values()], {name: u.fitted for name, u in units.items()}
-    failures = [u.failure for u in units.values() if u.failure]
-    write_summary(new / "summary.csv", rows)
-    write_json(new / "failures.json", failures)
-    write_parameters(new / "parameters.parquet", rows, fitted)
-    statistics = fleet_statistics(rows, fitted)
-    write_json(new / "fleet.json", statistics)
-    figures = {name: u.figures for name, u in units.items() if u.figures is not None}
-    sections = [section(c, figures, f"comparison-{i}") for i, c in enumerate(job.run["compare"], 1)]
-    inputs = {name: u.calibration.get("inputs") or [] for name, u in units.items()}
-    entries = record(job.results, {name: u.state for name, u in units.items()}, job.run["run"])
-    _publish_histories(new, entries)
-    page = render(
-        job.run["campaign"],
-        rows,
-        failures,
-        sections,
-        job.run["page"],
-        twins=same_files(inputs),
-        statistics=statistics,
-        history=runs_data(entries, job.run["run"]),
-        settings=job.run["run"],
-    )
-    write_atomically(new / "index.html", page)
-
-
-def _publish_histories(new: Path, entries: Sequence[dict[str, Any]]) -> None:
-    """Put into the page of each unit that several runs have changed what they changed."""
-    times = times_of(entries)
-    for unit, history in of_units(entries).items():
-        page = new / "reports" / f"{unit}.html"
-        if len(history) > 1 and page.is_file():
-            write_atomically(page, with_history(page.read_text(encoding="utf-8"), history, times))
-
-
 def _gather_unit(job: Job, batch: Path, sheet_row: dict[str, str], new: Path) -> Gathered:
     """Publish the files of one unit; one whose files cannot be gathered has failed."""
     try:
         found = _read_unit(job, batch, sheet_row)
     except Exception as error:  # noqa: BLE001  (one unit never stops the campaign)
         found = _failed_unit(batch, sheet_row, error, new)
-    overrides = job.run["overrides"].get(sheet_row["unit"], {})
-    found.state = unit_state(found.calibration, found.documents["validate"], found.documents["diagnose"], overrides)
     for source, target in found.files:
         publish(source, new / target)
     return found
@@ -120,35 +82,35 @@ def _gather_unit(job: Job, batch: Path, sheet_row: dict[str, str], new: Path) ->
 def _read_unit(job: Job, batch: Path, sheet_row: dict[str, str]) -> Gathered:
     """Return what a unit adds to the campaign; nothing is written."""
     unit = sheet_row["unit"]
-    failure = _failure(batch, unit)
-    page = batch / "report" / f"{unit}.html"
+    failed = (batch / stage / f"{unit}{FAILED}" for stage in STAGES_BACKWARDS)
+    failure = next((read_json(file) for file in failed if file.is_file()), None)
     document = batch / "report" / f"{unit}.calibration.json" if failure else batch / "calibration" / f"{unit}.json"
     found = Gathered(read_json(document), failure)
-    found.files = [(page, f"reports/{unit}.html"), (document, f"calibrations/{unit}.json")]
+    found.files = [
+        (batch / "report" / f"{unit}.html", f"reports/{unit}.html"),
+        (document, f"calibrations/{unit}.json"),
+    ]
     if not failure:
-        for stage, folder in FOLDERS.items():
-            found.documents[stage] = read_json(batch / stage / f"{unit}.json")
-            found.files.append((batch / stage / f"{unit}.json", f"{folder}/{unit}.json"))
-        for part in found.documents["diagnose"].values():
-            if isinstance(part, dict) and part.get("suggested_file"):
-                name = part["suggested_file"]
-                found.files.append((batch / "diagnose" / name, f"diagnoses/{name}"))
-        for kind in ("json", "html"):
-            name = f"{unit}.{kind}"
-            found.files.append((batch / "report" / "certificates" / name, f"certificates/{name}"))
-        exported = sorted((batch / "export" / unit).iterdir())
-        found.files += [(file, f"exports/{unit}/{file.name}") for file in exported]
-    validation, diagnosis = (found.documents[stage] for stage in FOLDERS)
+        files = (batch / "validate" / f"{unit}.json", batch / "diagnose" / f"{unit}.json")
+        found.validation, found.diagnosis = map(read_json, files)
+        found.files += zip(files, (f"validations/{unit}.json", f"diagnoses/{unit}.json"), strict=True)
+        parts = [part for part in (found.diagnosis or {}).values() if isinstance(part, dict)]
+        suggested = [name for part in parts if (name := part.get("suggested_file"))]
+        found.files += [(batch / "diagnose" / name, f"diagnoses/{name}") for name in suggested]
+        certificates = (f"certificates/{unit}.{kind}" for kind in ("json", "html"))
+        found.files += [(batch / "report" / name, name) for name in certificates]
+        found.files += [(file, f"exports/{unit}/{file.name}") for file in sorted((batch / "export" / unit).iterdir())]
     missing = [str(source) for source, _ in found.files if not source.is_file()]
     if missing:
         raise FileNotFoundError(
             f"{missing[0]} does not exist; delete the folder above it and run the same command again"
         )
+    documents = (found.calibration, found.validation, found.diagnosis)
     if any(unit in g["units"] for c in job.run["compare"] for g in c["groups"]):
-        truth = _truth(Path(job.run["truths"][unit]))
-        found.figures = unit_figures(found.calibration, validation, diagnosis, truth)
-    found.fitted = parameters(found.calibration)
-    found.row = summary_row(unit, found.calibration, validation, diagnosis, sheet_row)
+        truth = Path(job.run["truths"][unit])  # behind the recordings, where they were simulated
+        found.figures = unit_figures(*documents, read_json(truth) if truth.is_file() else None)
+    found.fitted = unit_parameters(found.calibration)
+    found.row = summary_row(unit, *documents, sheet_row)
     return found
 
 
@@ -168,13 +130,52 @@ def _failed_unit(batch: Path, sheet_row: dict[str, str], error: Exception, new: 
     return Gathered(calibration, failure, row=summary_row(unit, calibration, None, None, sheet_row))
 
 
+def _write_campaign(job: Job, units: Mapping[str, Gathered], new: Path) -> None:
+    """Write the files about all units."""
+    run, rows = job.run, [u.row for u in units.values()]
+    fitted = {name: u.fitted for name, u in units.items()}
+    failures, statistics = [u.failure for u in units.values() if u.failure], fleet_statistics(rows, fitted)
+    write_summary(new / "summary.csv", rows)
+    write_json(new / "failures.json", failures)
+    write_parameters(new / "parameters.parquet", rows, fitted)
+    write_json(new / "fleet.json", statistics)
+    figures = [figure for u in units.values() for figure in u.figures]
+    states = {
+        name: unit_state(u.calibration, u.validation, u.diagnosis, run["overrides"].get(name, {}))
+        for name, u in units.items()
+    }
+    entries = record(job.results, states, run["run"])
+    _publish_histories(new, entries)
+    page = render(
+        run["campaign"],
+        rows,
+        failures,
+        [section(c, figures, f"comparison-{i}") for i, c in enumerate(run["compare"], 1)],
+        run["page"],
+        twins=same_files({name: u.calibration.get("inputs") or [] for name, u in units.items()}),
+        statistics=statistics,
+        history=runs_data(entries, run["run"]),
+        settings=run["run"],
+    )
+    write_atomically(new / "index.html", page)
+
+
+def _publish_histories(new: Path, entries: Sequence[JSON]) -> None:
+    """Add to the page of each unit that several runs have changed what they changed."""
+    times = times_of(entries)
+    for unit, history in of_units(entries).items():
+        page = new / "reports" / f"{unit}.html"
+        if len(history) > 1 and page.is_file():
+            write_atomically(page, with_history(page.read_text(encoding="utf-8"), history, times))
+
+
 def same_files(inputs: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[list[str]]:
-    """Return the files of several units that are the same, byte for byte, under different names.
+    """Return the files of several units with the same content under different names.
 
     Parameters
     ----------
     inputs : mapping of str to sequence of mapping
-        Unit to its inputs: ``file``, ``sha256``. One file that several units are calibrated from is meant so.
+        Unit to its inputs: ``file``, ``sha256``. One file that several units are calibrated from is not reported.
     """
     known: dict[str, dict[str, str]] = {}
     for unit, files in inputs.items():
@@ -191,18 +192,3 @@ def publish(source: Path, target: Path) -> None:
         os.link(source, target)
     except OSError:
         shutil.copyfile(source, target)
-
-
-def _truth(path: Path) -> dict[str, Any] | None:
-    """Return the truth behind a unit's recordings, where they were simulated."""
-    document: dict[str, Any] | None = read_json(path) if path.is_file() else None
-    return document
-
-
-def _failure(batch: Path, unit: str) -> dict[str, Any] | None:
-    for stage in ("report", "export", "diagnose", "validate", "calibration"):
-        file = batch / stage / f"{unit}{FAILED}"
-        if file.is_file():
-            failure: dict[str, Any] = read_json(file)
-            return failure
-    return None

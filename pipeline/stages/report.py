@@ -10,10 +10,9 @@ from pipeline.estimation.rest_means import rests_by_use
 from pipeline.files import read_json, write_atomically, write_json
 from pipeline.io.parquet import load_recordings
 from pipeline.records import SENSORS
-from pipeline.report import certificate_page
-from pipeline.report.certificate import certificate
-from pipeline.report.failure_page import failure_page
-from pipeline.report.session import sensor_temperature
+from pipeline.report.certificate import certificate, certificate_page
+from pipeline.report.pages import failure_page
+from pipeline.report.recording_section import sensor_temperature
 from pipeline.report.unit_page import render
 from pipeline.stages.calibration import header, inputs
 
@@ -34,7 +33,7 @@ def process_unit(job: Job, unit: str, settings: dict[str, Any]) -> None:
     write_atomically(job.output / f"{unit}.html", page)
     report = certificate(calibration, validation, settings, sensor_temperature(recordings))
     write_json(job.output / "certificates" / f"{unit}.json", report)
-    write_atomically(job.output / "certificates" / f"{unit}.html", certificate_page.render(unit, report))
+    write_atomically(job.output / "certificates" / f"{unit}.html", certificate_page(unit, report))
 
 
 def process_failed(job: Job, unit: str, settings: dict[str, Any], failure: dict[str, Any]) -> None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.report.comparison_statistics import Quantity, mean_of
+from pipeline.report.comparison import mean_of
 from pipeline.report.numbers import number
 from pipeline.thesis.results import CONTINUOUS, DEVICES, RATES, STOPS, in_words
 from pipeline.thesis.seeds import INTERVAL_S, TIME_CONSTANT_S
@@ -20,7 +20,7 @@ from pipeline.thesis.seeds import INTERVAL_S, TIME_CONSTANT_S
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from pipeline.report.comparison_statistics import Estimate
+    from pipeline.report.comparison import Estimate
     from pipeline.thesis.seeds import Row
 
 LOST = 2  # index in recorded.CAUSES: what the campaign has
@@ -119,7 +119,7 @@ class Errors:
 
 
 def _mean(values: Iterable[float]) -> Estimate:
-    found = mean_of(Quantity(v) for v in values)
+    found = mean_of(list(values))
     assert found is not None  # noqa: S101  (every key holds a row)
     return found
 

@@ -11,13 +11,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.estimation.correction import apply_correction
-from pipeline.report.bars import columns
-from pipeline.report.comparison_chart import Point, curve
-from pipeline.report.figure import AXES_LEGEND, UNITS, Figure
-from pipeline.report.figures import held_out_over_time
+from pipeline.records.calibration import UNITS
+from pipeline.report.chart import AXES_LEGEND, Figure, Panel, Samples, chart
+from pipeline.report.group_charts import Point, columns, curves
+from pipeline.report.held_out_section import held_out_over_time
 from pipeline.report.numbers import number
-from pipeline.report.shapes import Samples
-from pipeline.report.svg import Panel, chart
 from pipeline.thesis.conclusions import Errors
 from pipeline.thesis.results import CONTINUOUS, DEVICES, RATES, STOPS, in_words, procedure_of
 from pipeline.thesis.seeds import CAUSES, device_of
@@ -29,7 +27,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from pipeline.records import Noise
-    from pipeline.report.shapes import Layer
     from pipeline.thesis.agreement import Scatter
     from pipeline.thesis.results import Results
     from pipeline.thesis.seeds import Row
@@ -91,12 +88,11 @@ def _motion(results: Results, device: str, sensor: str, procedure: str) -> Figur
     if recording is None:
         return None
     reading, x = np.asarray(recording.reading(sensor)), recording.time - recording.time[0]
-    layers: list[Layer] = [Samples(x, reading[:, i], i) for i in range(3)]
     svg = chart(
         f"motion-{device}-{sensor}",
         f"{DEVICES[device]}, {sensor}: held-out motion",
         f"{recording.samples} samples in {number(float(x[-1]))} s.",
-        [Panel(layers, f"reading, {UNITS[sensor]}", 150)],
+        [Panel([Samples(x, reading)], f"reading, {UNITS[sensor]}", 150)],
         "time, s",
     )
     caption = f"{recording.samples} samples that reached the logger, in {number(float(x[-1]))} s; no fit sees them."
@@ -217,10 +213,10 @@ def _speed(rows: Sequence[Row]) -> Figure:
         for procedure in CONTINUOUS:
             mean = errors.mean(f"mpu6050-2-{procedure}", method)
             rate = float(procedure.split("-")[1].removesuffix("dps"))
-            points.append(Point(_short(procedure), mean.value, mean.interval, x=rate, series=name))
-    svg = curve(
-        "speed", "Error of continuous rotation by rate", points, "mean |e| after, g", "rate, deg/s", labelled=False
-    )
+            points.append(Point(_short(procedure), mean.value, interval=mean.interval, x=rate, series=name))
+    title = "Error of continuous rotation by rate"
+    words = "; ".join(f"{p.series}, {p.x:g} deg/s: {number(p.value)}" for p in points)
+    svg = curves("speed", title, words, points, "mean |e| after, g", x_label="rate, deg/s", named=False)
     legend = tuple((f"c{i}", name) for i, name in enumerate(FILTERS.values()))
     caption = (
         "MPU6050 (2), errata corrected; means over seeds with their 95 % intervals. The filter is on the turns and on "

@@ -14,7 +14,7 @@ import numpy as np
 
 from pipeline.records import Noise
 from pipeline.report.numbers import MINUS, NOTHING, number, percent
-from pipeline.report.templating import template
+from pipeline.report.pages import template
 from pipeline.thesis.agreement import agreements, scatters
 from pipeline.thesis.conclusions import KINDS, conclusions
 from pipeline.thesis.errata import errata
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from pipeline.report.comparison_statistics import Estimate
+    from pipeline.report.comparison import Estimate
     from pipeline.thesis.conclusions import Conclusion
     from pipeline.thesis.tables import Cell, Table
 

@@ -13,7 +13,7 @@ from pipeline.estimation.engine import Posterior
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.monte_carlo import beside_trials, quadratic_results, through
 from pipeline.records import SensorCalibration
-from pipeline.report.budget_table import budget_of
+from pipeline.report.parameter_section import budget_of
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, read_config
 from tests.hand_session import hand_held

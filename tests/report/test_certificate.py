@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.config.schema import Certificate
 from pipeline.report.certificate import STAMP, certificate
-from pipeline.report.certificate_page import render
+from pipeline.report.certificate import certificate_page as render
 
 from .conftest import Unit, build_unit
 

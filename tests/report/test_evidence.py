@@ -10,13 +10,10 @@ import numpy as np
 import pytest
 
 from pipeline.records import Recording
-from pipeline.report.evidence_figures import added_variable, column_unit, unexplained
-from pipeline.report.figures import staircase
-from pipeline.report.harmonics import harmonic_noise, harmonics
-from pipeline.report.noise_figure import allan, deviations, expected, longest_rest
-from pipeline.report.ranking_chart import ranking, symlog
-from pipeline.report.residual_figures import residual_figures
-from pipeline.report.residuals import residuals
+from pipeline.report.diagnosis_section import added_variable, column_unit, ranking, symlog, unexplained
+from pipeline.report.held_out_section import error_steps
+from pipeline.report.noise_section import allan, deviations, expected, longest_rest
+from pipeline.report.residual_section import harmonic_noise, harmonics, residual_figures, residuals
 from pipeline.report.unit_page import render
 
 from .conftest import SIGMA, Unit, build_unit, diagnosis_of
@@ -80,7 +77,7 @@ def test_evidence_against_every_effect_is_drawn_to_the_left_of_zero() -> None:
     assert figure is not None
     (_, zero, _, near), (_, _, _, far) = BAR.findall(figure.svg)
     assert float(far) < float(near) < float(zero)
-    assert figure.finding == "No effect passes the gate: at best, hysteresis reaches −8.00"
+    assert figure.finding == "No effect passes the threshold: at best, hysteresis reaches −8.00"
     assert ranking("gyroscope", {"ranking": []}) is None
 
 
@@ -191,7 +188,10 @@ def test_the_words_beside_the_allan_deviation_say_what_was_found_and_whether_it_
     assert figure is not None
     assert figure.finding == "White noise 0.00300 g a sample, as the data sheet says"
     assert "static, 108 s at rest" in figure.caption
-    assert "needs a wander of 0.000900 g over 50.0 s, against 0.000100 expected: it is inflated" in figure.caption
+    assert (
+        "needs a wander of 0.000900 g, correlation time 50.0 s, against 0.000100 expected: it is inflated"
+        in figure.caption
+    )
     assert [text for _, text in figure.legend[3:]] == ["noise model", "its white noise alone", "data sheet"]
     calm = allan("accelerometer", recordings, noise, sheet | {"noise_density": 1e-3}, wander | {"inflated": False})
     assert calm is not None
@@ -254,17 +254,17 @@ def test_the_stairs_go_on_to_what_the_missing_effect_would_bring() -> None:
     held_out = {"steps": steps, "noise_floor": 0.01, "vector_noise_floor": 0.02}
     found = diagnosis_of("accelerometer")
     found["ranking"][0] |= {"held_out_error_before": 0.19, "held_out_error_after": 0.021}
-    figure = staircase("accelerometer", held_out, found, vector=True)
+    figure = error_steps("accelerometer", held_out, found, vector=True)
     assert figure is not None
     assert "+ quadratic nonlinearity, if added" in figure.svg
     assert figure.finding == (
-        "The error of the vector ends at 0.200 g, 10.0 × the noise floor; with what is missing, at 0.0210"
+        "The error of the vector ends at 0.200 g, 10.0 × the noise floor; with the missing effects, at 0.0210"
     )
-    magnitude = staircase("accelerometer", held_out, found, vector=False)
+    magnitude = error_steps("accelerometer", held_out, found, vector=False)
     assert magnitude is not None
     assert "if added" not in magnitude.svg  # the diagnosis tells the error of the vector
     found["ranking"][0]["held_out_error_before"] = 0.5
-    other = staircase("accelerometer", held_out, found, vector=True)
+    other = error_steps("accelerometer", held_out, found, vector=True)
     assert other is not None
     assert "if added" not in other.svg  # the method's calibration is not the diagnosis's base
 

@@ -5,7 +5,7 @@ from html import unescape
 from typing import Any
 
 from pipeline.report import unit_page
-from pipeline.report.history_section import LINK_MARK, MARK, runs_data, with_history
+from pipeline.report.run_section import LINK_MARK, MARK, runs_data, with_history
 
 from .conftest import Unit
 

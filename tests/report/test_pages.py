@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from pipeline.report import campaign_page
-from pipeline.report.shapes import Samples
+from pipeline.report.chart import Panel, Samples, chart
 from pipeline.report.summary import COLUMNS, summary_row, write_summary
-from pipeline.report.svg import Panel, chart
 from pipeline.report.unit_page import render
 
 from .conftest import Unit, build_unit

@@ -11,10 +11,9 @@ import pytest
 from playwright.sync_api import Browser, Page, sync_playwright
 
 from pipeline.report import campaign_page, unit_page
-from pipeline.report.history_section import runs_data
-from pipeline.report.shapes import Line
-from pipeline.report.svg import Panel, chart
-from pipeline.report.templating import asset
+from pipeline.report.chart import Line, Panel, chart
+from pipeline.report.pages import asset
+from pipeline.report.run_section import runs_data
 
 from .conftest import build_unit
 

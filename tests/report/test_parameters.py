@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.records import FittedEffect, SensorCalibration
-from pipeline.report.comparison_units import unit_figures
+from pipeline.report.comparison import unit_figures
 from pipeline.report.parameters import fitted_parameters, reading_errors
 
 
@@ -32,7 +32,8 @@ def test_each_parameter_has_its_own_coverage_factor_not_that_of_the_bias() -> No
     assert found["bias_x"].coverage_factor == pytest.approx(2.776445, rel=1e-6)
     assert found["scale_factor_asymmetry.c_x"].coverage_factor == pytest.approx(1.965912, rel=1e-6)
     held_out = {"steps": [{"rms_error": 1.0}]}
-    compared = unit_figures({"gyroscope": part}, {"gyroscope": held_out}, None)["gyroscope"].parameters
+    (figures,) = unit_figures({"unit": "U1", "gyroscope": part}, {"gyroscope": held_out}, None)
+    compared = figures["parameters"]
     assert compared["scale factor asymmetry: c_x"].standard_uncertainty == pytest.approx(1e-3, rel=1e-6)
     assert compared["bias x"].standard_uncertainty == pytest.approx(1e-3, rel=1e-6)
 

@@ -1,0 +1,222 @@
+"""Statistics over the units of a campaign: distributions, outliers, lots, drift, repeatability, missing effects.
+
+Units of one sensor model that were calibrated by one method are compared with each other. For each parameter
+
+    z = (value - median) / (1.4826 median(|value - median|))
+
+is a unit's distance in robust standard deviations. A unit is far where |z| > 6, with 20 units or more. A parameter
+drifts with the date where Spearman's rank correlation differs from zero, and differs between lots by the test of
+Kruskal and Wallis, both at 0.001 after Bonferroni's correction for the number of parameters. The drift is the slope of
+Theil and Sen. Repeatability is the pooled standard deviation of units that share a serial.
+
+References
+----------
+1. Rousseeuw & Croux, Alternatives to the median absolute deviation, J. Am. Stat. Assoc. 88 (1993) 1273.
+2. Sen, Estimates of the regression coefficient based on Kendall's tau, J. Am. Stat. Assoc. 63 (1968) 1379.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from pipeline.records import SENSORS
+from pipeline.report.parameters import Parameter, fitted_parameters
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+    from pathlib import Path
+
+JSON = dict[str, Any]
+FEWEST = 20  # units, below which a median absolute deviation says little: its own spread is 17 % of it there
+FAR = 6.0  # robust standard deviations: of 10,000 units with 24 parameters, noise alone puts none there
+LEVEL = 0.001  # of the tests of drift and lots, for a whole fleet
+MOST_PAIRED = 2000  # units that the slope is taken from: it needs all pairs of them
+DAYS_OF_A_YEAR = 365.25
+SIBLINGS = ["sensor", "method"]
+
+
+def unit_parameters(calibration: JSON) -> dict[str, Parameter]:
+    """Return every fitted parameter of a unit: ``<sensor>_bias_x``, ``<sensor>_<effect>_<symbol>``."""
+    return {
+        f"{sensor}_{p.name.replace('.', '_')}": p
+        for sensor in SENSORS
+        if calibration.get(sensor)
+        for p in fitted_parameters(calibration[sensor])
+    }
+
+
+def fleet_statistics(rows: Sequence[JSON], fitted: Mapping[str, Mapping[str, Parameter]]) -> JSON:
+    """Return the statistics of a fleet, ``fleet.json``.
+
+    Parameters
+    ----------
+    rows : sequence of dict
+        One a unit, as of ``summary.summary_row``.
+    fitted : mapping
+        Unit to its parameters, as of ``unit_parameters``; units that failed have none.
+
+    Returns
+    -------
+    dict
+        ``distributions``, ``far``, ``drift``, ``lots``, ``repeatability``: lists of dicts; ``missing``: sentences.
+    """
+    sheet = pd.DataFrame(rows, columns=["unit", "lot", "date", "serial", *SIBLINGS]).set_index("unit").replace("", None)
+    out: JSON = {key: [] for key in STATISTICS}
+    fitted_units = [unit for unit in sheet.index if fitted.get(unit)]
+    for (model, method), siblings in sheet.loc[fitted_units].groupby(SIBLINGS, sort=False):
+        units = {name: p.unit for unit in siblings.index for name, p in fitted[unit].items()}
+        values = pd.DataFrame(
+            [{name: p.value for name, p in fitted[unit].items()} for unit in siblings.index],
+            siblings.index,
+            list(units),
+        )
+        for key, statistic in STATISTICS.items():
+            for name, found in statistic(values, siblings):
+                about = {"sensor": model, "method": method, "parameter": name, "unit": units[name]}
+                out[key].append(about | found)
+    out["far"].sort(key=lambda f: -abs(f["z"]))
+    out["missing"] = missing_effects(rows)
+    return out
+
+
+def _spread(values: pd.DataFrame) -> pd.Series:
+    """Return 1.4826 times the median absolute deviation: the standard deviation where the values are normal."""
+    return 1.4826 * (values - values.median()).abs().median()
+
+
+def _distributions(values: pd.DataFrame, _: pd.DataFrame) -> Iterable[tuple[str, JSON]]:
+    low, middle, high = values.quantile([0.05, 0.5, 0.95]).to_numpy()
+    table = pd.DataFrame({
+        "median": middle,
+        "robust_standard_deviation": _spread(values),
+        "quantile_05": low,
+        "quantile_95": high,
+        "smallest": values.min(),
+        "largest": values.max(),
+    })  # fmt: skip
+    for name, count, row in zip(table.index, values.count(), table.to_dict("records"), strict=True):
+        yield name, {"units": int(count), **row}
+
+
+def _far(values: pd.DataFrame, siblings: pd.DataFrame) -> Iterable[tuple[str, JSON]]:
+    """Find the units that are far from the others."""
+    many = values.loc[:, values.count() >= FEWEST]
+    z = (many - many.median()) / _spread(many).replace(0.0, np.nan)
+    for name in many:
+        for unit in z.index[z[name].abs() > FAR]:
+            lot = siblings.loc[unit, "lot"]
+            found = {"name": unit, "lot": lot if isinstance(lot, str) else None, "value": float(values.loc[unit, name])}
+            yield name, found | {"z": float(z.loc[unit, name])}
+
+
+def _drift(values: pd.DataFrame, siblings: pd.DataFrame) -> Iterable[tuple[str, JSON]]:
+    """Find the parameters that change with the date."""
+    days = (pd.to_datetime(siblings["date"], format="%Y-%m-%d", errors="coerce") - pd.Timestamp(0)).dt.days
+    for name in values:
+        known = pd.DataFrame({"day": days, "value": values[name]}).dropna()
+        if len(known) < FEWEST or np.ptp(known["day"]) == 0:
+            continue
+        from scipy import stats  # noqa: PLC0415  (0.3 s that few fleets need)
+
+        rho, p = stats.spearmanr(known["day"], known["value"])
+        if p * len(values.columns) < LEVEL:
+            some = known.iloc[:: -(-len(known) // MOST_PAIRED)]
+            slope = float(stats.theilslopes(some["value"], some["day"]).slope)
+            found = {"rank_correlation": float(rho), "p_value": float(p), "per_year": slope * DAYS_OF_A_YEAR}
+            yield name, found | {"units": len(known)}
+
+
+def _lots(values: pd.DataFrame, siblings: pd.DataFrame) -> Iterable[tuple[str, JSON]]:
+    """Find the parameters that differ between lots."""
+    for name in values.columns[values.count() >= FEWEST]:
+        lots = {lot: v.dropna() for lot, v in values[name].groupby(siblings["lot"])}
+        lots = {lot: v for lot, v in lots.items() if len(v) >= 3}
+        if len(lots) < 2 or np.ptp(values[name].dropna()) == 0.0:
+            continue
+        from scipy import stats  # noqa: PLC0415  (as above)
+
+        p = float(stats.kruskal(*lots.values()).pvalue)
+        if p * len(values.columns) < LEVEL:
+            medians, middle = {lot: float(v.median()) for lot, v in lots.items()}, float(values[name].median())
+            lot = max(medians, key=lambda lot: abs(medians[lot] - middle))
+            yield name, {"p_value": p, "lot": lot, "lot_median": medians[lot], "median": middle}
+
+
+def _repeatability(values: pd.DataFrame, siblings: pd.DataFrame) -> Iterable[tuple[str, JSON]]:
+    """Return the pooled standard deviation of the devices that were calibrated more than once."""
+    devices = values.groupby(siblings["serial"])
+    counts = devices.count()
+    counts = counts.where(counts > 1)
+    squares = ((values - devices.transform("mean")) ** 2).sum()  # 0 for a device that was calibrated once
+    for name in values:
+        repeated, calibrations = int(counts[name].count()), int(counts[name].sum())
+        if repeated:
+            deviation = math.sqrt(squares[name] / (calibrations - repeated))
+            yield name, {"devices": repeated, "calibrations": calibrations, "standard_deviation": deviation}
+
+
+STATISTICS = {
+    "distributions": _distributions,
+    "far": _far,
+    "drift": _drift,
+    "lots": _lots,
+    "repeatability": _repeatability,
+}
+
+
+def missing_effects(rows: Sequence[JSON]) -> list[str]:
+    """Return a sentence for each missing effect: in how many units, and from which lots."""
+    table = pd.DataFrame(rows).reindex(columns=["lot", *(f"{s}_{c}" for s in SENSORS for c in ("verdict", "selected"))])
+    lots = table["lot"].replace("", None).value_counts()
+    sentences = []
+    for sensor in SENSORS:
+        judged = table[table[f"{sensor}_verdict"].notna()]
+        effects = judged[f"{sensor}_selected"].fillna("").astype(str).str.split(";").explode()
+        for name, count in effects[effects != ""].value_counts().items():
+            of = judged.loc[effects.index[effects == name], "lot"].replace("", None).value_counts()
+            said = f"missing effect: {name} ({count} of {len(judged)} units, {sensor})"
+            if len(lots) > 1 and len(of):
+                lot, most = of.index[0], int(of.iloc[0])
+                share = f"from lot {lot} ({most} of its {lots[lot]})"
+                if most == count:
+                    said += f", all {share}"
+                else:
+                    said += f", {most} of them {share}" if most > count / 2 else f", from {len(of)} lots"
+            sentences.append(said)
+    return sentences
+
+
+def write_parameters(path: Path, rows: Sequence[JSON], fitted: Mapping[str, Mapping[str, Parameter]]) -> None:
+    """Write ``parameters.parquet``: a row a unit with everything of ``summary.csv`` and every fitted parameter.
+
+    Columns of a parameter: ``<name>`` and ``<name>_expanded_uncertainty``, with the unit in the column's metadata.
+
+    Parameters
+    ----------
+    path : Path
+    rows, fitted
+        As of ``fleet_statistics``.
+    """
+    arrays, fields = [], []
+    for column in dict.fromkeys(key for row in rows for key in row):
+        values = [row.get(column) for row in rows]
+        kinds = {type(value) for value in values if value is not None}
+        kind = {frozenset([bool]): pa.bool_(), frozenset([float]): pa.float64()}.get(frozenset(kinds), pa.string())
+        arrays.append(pa.array(values, kind))
+        fields.append(pa.field(column, kind))
+    units = {name: p.unit for each in fitted.values() for name, p in each.items()}
+    for name, unit in units.items():
+        found = [fitted.get(row["unit"], {}).get(name) for row in rows]
+        for suffix, of in (("", "value"), ("_expanded_uncertainty", "expanded_uncertainty")):
+            arrays.append(pa.array([getattr(p, of) if p else None for p in found], pa.float64()))
+            fields.append(pa.field(name + suffix, pa.float64(), metadata={"unit": unit}))
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    pq.write_table(pa.Table.from_arrays(arrays, schema=pa.schema(fields)), temporary, compression="zstd")
+    temporary.replace(path)

@@ -1,0 +1,209 @@
+"""Errors on held-out motion: each step of the calibration, the error over time, the attitude, and the limits.
+
+A unit without limits neither passes nor fails; a unit that failed does not pass.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.model.effects import effect_of
+from pipeline.model.inversion import compensate, linear_truth, sensor_effects
+from pipeline.model.kinematics import reference_motion
+from pipeline.records import SENSORS, SensorCalibration
+from pipeline.records.calibration import UNITS
+from pipeline.report.chart import Band, Figure, Layer, Line, Panel, Samples, chart
+from pipeline.report.group_charts import Point, bars
+from pipeline.report.numbers import number, plain
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pipeline.records import Recording
+
+JSON = dict[str, Any]
+ALIKE = 1.2  # the diagnosis's held-out error may continue the validation's steps where both agree within this factor
+
+
+def checks(validation: JSON | None) -> list[JSON]:
+    """Return each limit of the configuration with its figure: ``sensor, name, value, limit, unit, pass``."""
+    return [
+        {**check, "sensor": sensor, "unit": "" if check["name"] == "scale_factor" else UNITS[sensor]}
+        for sensor in SENSORS
+        for check in ((validation or {}).get(sensor) or {}).get("limits") or []
+    ]
+
+
+def passes(calibration: JSON, validation: JSON | None) -> bool | None:
+    """Return whether a unit keeps its limits; None where it has none."""
+    if calibration.get("status") != "ok":
+        return False
+    results = [bool(check["pass"]) for check in checks(validation)]
+    return all(results) if results else None
+
+
+def first_and_last_step(held_out: JSON | None) -> tuple[JSON, JSON]:
+    """Return the errors of the raw readings and of the readings after everything that was fitted."""
+    steps = (held_out or {}).get("steps") or [{}]
+    return steps[0], steps[-1]
+
+
+def step_label(name: str) -> str:
+    """Return the name of a step for a page."""
+    return plain(name.replace("stage:", "after ", 1))
+
+
+def error_steps(sensor: str, held_out: JSON, found: JSON, *, vector: bool) -> Figure | None:
+    """Draw the held-out error after each step, with the noise floor.
+
+    Parameters
+    ----------
+    sensor : str
+    held_out, found : dict
+        The sensor's parts of validation and diagnosis; effects that the diagnosis selected are further steps.
+    vector : bool
+        The error of the vector instead of the magnitude; None is returned where it is not known.
+    """
+    key, floor_key = ("vector_rms_error", "vector_noise_floor") if vector else ("rms_error", "noise_floor")
+    steps, floor, unit = held_out.get("steps", []), held_out.get(floor_key), UNITS[sensor]
+    if not steps or all(s.get(key) is None for s in steps):
+        return None
+    rows = [Point(step_label(s["name"]), s.get(key), 3 if s["name"] == "raw" else 2) for s in steps]
+    reached, added = steps[-1].get(key), []
+    if vector or all(s.get("vector_rms_error") is None for s in steps):
+        added = _steps_if_added(found, reached)
+    kind = "vector" if vector else "magnitude"
+    finding = f"The error of the {kind} ends at {number(reached)} {unit}"
+    if reached and floor:
+        finding += f", {number(reached / floor)} × the noise floor"
+    if added:
+        finding += f"; with the missing effects, at {number(added[-1].value)}"
+    drawn = bars(
+        f"{sensor}-staircase-{kind}",
+        f"{sensor}: {finding}",
+        "; ".join(f"{r.label} {number(r.value)}" for r in rows + added) + f"; noise floor {number(floor)} {unit}",
+        rows + added,
+        f"root mean square error, {unit} (logarithmic)",
+        levels={"noise floor": floor} if floor else {},
+    )
+    words = "if it were added" + (" with the suggested shape" if found.get("suggested_effect") else "")
+    caption = f"Held-out error of the {kind} after each step; the line is the error that noise alone gives."
+    return Figure(drawn, caption, (("c4", words),) if added else (), finding)
+
+
+def _steps_if_added(found: JSON, reached: float | None) -> list[Point]:
+    """Return the errors with each selected effect added, where the diagnosis starts from the error reached so far."""
+    entries = {r["effect"]: r for r in found.get("ranking") or []}
+    chosen = [entries[name] for name in found.get("selected") or [] if name in entries]
+    if not chosen or not reached or any(r.get("held_out_error_after") is None for r in chosen):
+        return []
+    if not 1.0 / ALIKE < chosen[0]["held_out_error_before"] / reached < ALIKE:
+        return []
+    return [Point(f"+ {plain(r['effect'])}, if added", r["held_out_error_after"], 4) for r in chosen]
+
+
+def held_out_figures(sensor: str, part: JSON, held_out: JSON, recordings: list[Recording], table: JSON) -> list[Figure]:
+    """Draw the error of the magnitude over each held-out recording with a reference."""
+    out = []
+    calibration = SensorCalibration.from_json(sensor, part)
+    for recording in recordings:
+        reading, rate = recording.reading(sensor), recording.table_rate
+        if recording.role != "validation" or reading is None or (sensor == "gyroscope" and rate is None):
+            continue
+        reference: Any = table.get("gravity_g") or 1.0
+        if rate is not None and sensor == "gyroscope":
+            late = recording.time - float(recording.filter.get("delay_s", 0.0))
+            reference = np.interp(late, recording.time, np.abs(rate))
+        calibrated = _calibrated(calibration, reading, recording, table)
+        raw, after = (np.linalg.norm(v, axis=1) - reference for v in (reading, calibrated))
+        out.append(held_out_over_time(sensor, recording, raw, after, held_out.get("noise_floor")))
+    return out
+
+
+def _calibrated(
+    calibration: SensorCalibration, reading: NDArray[np.float64], recording: Recording, table: JSON
+) -> NDArray[np.float64]:
+    """Return calibrated readings, with the sensor's own effects where the motion is known."""
+    effects = sensor_effects(calibration)
+    motion = reference_motion(recording, table.get("gravity_g") or 1.0) if effects else None
+    own = [e for e in effects if motion is not None and effect_of(e).available(motion)]
+    return compensate(calibration, reading, motion, own) if motion and own else linear_truth(calibration, reading)
+
+
+def held_out_over_time(
+    sensor: str, recording: Recording, raw: NDArray[np.float64], calibrated: NDArray[np.float64], floor: float | None
+) -> Figure:
+    """Draw the error of the magnitude in held-out motion before and after calibration.
+
+    Parameters
+    ----------
+    sensor : str
+    recording : Recording
+    raw, calibrated : (n,) array, g or deg/s
+        Magnitude minus reference.
+    floor : float or None
+        Root mean square error that noise alone gives.
+    """
+    unit, x = UNITS[sensor], recording.time - recording.time[0]
+    after: list[Layer] = [Samples(x, calibrated, 2, mean=True)]
+    panels = [
+        Panel([Samples(x, raw, 3), Samples(x, calibrated, 2)], f"error, {unit}", 120, {"": 0.0}),
+        Panel([Band(-2 * floor, 2 * floor), *after] if floor else after, f"after, {unit}", 80),
+    ]
+    rms = [number(float(np.sqrt(np.mean(v**2)))) for v in (raw, calibrated)]
+    finding = f"In {recording.name} the error goes from {rms[0]} to {rms[1]} {unit}"
+    drawn = chart(
+        f"{sensor}-held-out",
+        f"{sensor}: {finding}",
+        f"Root mean square {rms[0]} {unit} before, {rms[1]} after.",
+        panels,
+        "time, s",
+    )
+    what = "specific force minus gravity" if sensor == "accelerometer" else "angular rate minus the table's rate"
+    caption = (
+        f"Magnitude of the {what}, before and after calibration, in a recording that no fit used. Below: after "
+        "calibration, with a band of ±2 noise floors."
+    )
+    return Figure(drawn, caption, (("c3", "before"), ("c2", "after")), finding)
+
+
+def attitude_over_time(found: JSON) -> Figure | None:
+    """Draw the attitude error of the integrated gyroscope, and the tilt error of the fused attitude.
+
+    Parameters
+    ----------
+    found : dict
+        Part ``attitude`` of a validation; None is returned where it holds no curve.
+    """
+    curve = found.get("curve")
+    if not curve:
+        return None
+    drift, tilt = found["drift_deg"], found.get("tilt_rms_deg")
+    after = "one minute" if found["seconds"] == 60.0 else f"{number(found['seconds'])} s"
+    finding = f"After {after} the attitude is {number(drift['after'])}° off, uncalibrated {number(drift['before'])}°"
+    panels = [_attitude_panel(curve, "drift", "gyroscope alone, deg")]
+    words = f"Gyroscope alone after {after}: {number(drift['before'])} deg before, {number(drift['after'])} deg after."
+    caption = (
+        f"Angle to the table's attitude in {found['recording']}, which no fit used, on a logarithmic axis. Above: the "
+        f"gyroscope integrated from the table's attitude at the start (the figure of {after} is the root mean square "
+        "over all starts)."
+    )
+    if tilt:
+        panels.append(_attitude_panel(curve, "tilt", "fused tilt, deg"))
+        before, now = number(tilt["before"]), number(tilt["after"])
+        words += f" Tilt of the fused attitude, rms: {before} deg before, {now} deg after."
+        caption += " Below: the vertical of a complementary filter that also uses the accelerometer."
+    drawn = chart("attitude-error", finding, words, panels, "time, s")
+    return Figure(drawn, caption, (("c3", "before"), ("c2", "after")), finding)
+
+
+def _attitude_panel(curve: JSON, name: str, label: str) -> Panel:
+    """Return the angles before and after; the axis leaves out the start, where both are nearly zero."""
+    time = np.array(curve["time_s"], float)
+    angles = {colour: np.array(curve[f"{name}_{when}"], float) for when, colour in (("before", 3), ("after", 2))}
+    seen = np.concatenate([v[len(v) // 50 + 1 :] for v in angles.values()])
+    seen = seen[seen > 0]
+    limits = (float(seen.min()) / 1.2, float(seen.max()) * 1.2) if seen.size else (1e-3, 1.0)
+    return Panel([Line(time, v, c) for c, v in angles.items()], label, 110, limits=limits, logarithmic=True)

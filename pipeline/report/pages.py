@@ -1,0 +1,66 @@
+"""The templates of the pages: HTML, CSS and JavaScript in ``templates``, every value escaped."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from jinja2 import Environment, FileSystemLoader, Template
+from markupsafe import Markup
+
+from pipeline.report.numbers import measured, number, percent, plain, probability, typeset
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+FOLDER = Path(__file__).parent / "templates"
+
+
+class _Pages(Environment):
+    """Templates whose values are mostly dicts: ``row.name`` looks for a key first, which is faster."""
+
+    def getattr(self, obj: Any, attribute: str) -> Any:  # noqa: ANN401  (as of the base class)
+        if type(obj) is dict and attribute in obj and not hasattr(dict, attribute):
+            return obj[attribute]
+        return super().getattr(obj, attribute)
+
+
+def _figure(value: object) -> str:
+    """Return a number for a cell, empty where there is none."""
+    return number(value) if isinstance(value, int | float) and value == value else ""  # noqa: PLR0124  (not NaN)
+
+
+@cache
+def template(name: str) -> Template:
+    """Return a template by its file name."""
+    environment = _Pages(loader=FileSystemLoader(FOLDER), autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    filters = {"number": number, "measured": measured, "percent": percent, "probability": probability}
+    environment.filters.update(filters, typeset=typeset, words=plain, figure=_figure)
+    environment.globals["asset"] = asset
+    return environment.get_template(name)
+
+
+@cache
+def asset(name: str) -> Markup:
+    """Return a style sheet or script of the templates' folder."""
+    return Markup((FOLDER / name).read_text(encoding="utf-8"))  # noqa: S704  (our own file)
+
+
+def script_data(value: object) -> Markup:
+    """Return a value as JSON that may stand within a script element."""
+    return Markup(json.dumps(value, ensure_ascii=False).replace("<", "\\u003c"))  # noqa: S704  (no tag can begin)
+
+
+def failure_page(unit: str, failure: Mapping[str, Any]) -> str:
+    """Return a page that needs no template and no results: for a unit whose page could not be made."""
+    where = f"{failure['file']}: " if failure["file"] else ""
+    cause = escape(f"{where}{failure['message']}")
+    return (
+        f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(unit)}</title></head>\n'
+        f"<body><h1>{escape(unit)}</h1><p>Not calibrated: the stage {escape(failure['stage'])} failed "
+        f"({escape(failure['code'])}).</p><pre>{cause}</pre>\n"
+        '<p><a href="../index.html">The campaign</a></p></body></html>\n'
+    )

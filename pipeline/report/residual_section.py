@@ -1,0 +1,345 @@
+"""Residuals of the fit: reading minus model, and what they depend on.
+
+    e[n] = reading[n] - predicted[n],    predicted = bias + matrix^-1 truth + effects
+
+The prediction passes the filter of the readings, so that the filter's lag is no residual.
+
+Covariates: e is averaged in bins of angle, rate, force, temperature and time, with the standard error of white noise.
+The mean of ``(mean / standard error)^2`` is about 1 where e does not depend on the covariate, and orders the charts.
+
+Harmonics of the turn: ``e = sum_k a_k cos kA + b_k sin kA`` over the table angle A, amplitude ``sqrt(a_k^2 + b_k^2)``.
+1 cycle a turn is misalignment, tilt or encoder, 2 and 4 are quadratic nonlinearity or scale factor asymmetry, 3 is
+cubic nonlinearity; more are gears and steps of the table.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.model.kinematics import earth_rate, reference_motion
+from pipeline.model.measurement import predicted_reading
+from pipeline.records import AXES, SensorCalibration
+from pipeline.records.calibration import UNITS
+from pipeline.report.chart import AXES_LEGEND, Band, Dots, Figure, Layer, Line, Panel, Samples, chart
+from pipeline.report.group_charts import columns
+from pipeline.report.numbers import number
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from pipeline.records import Motion, Recording
+
+JSON = dict[str, Any]
+BINS = 36  # of a covariate, and of a turn: 10 deg each
+FEWEST = 5  # samples of a bin, below which it counts as empty: its scatter is not known
+HARMONICS = 12  # cycles a turn; averaging over 36 bins takes 16 % of the amplitude of the last one
+ONE_IN_A_THOUSAND = float(np.sqrt(2.0 * np.log(1000.0)))  # quantile 0.999 of the Rayleigh distribution
+FLAT = 2.0  # mean square of the means over noise and wander, below which the page calls them flat
+NOISE = 1.1  # residual over noise up to which the page says that nothing is left
+MODEL_POINTS = 150  # of a model's line: as many as the ranges of a chart
+
+
+@dataclass(frozen=True)
+class Residual:
+    """Reading and prediction of one recording, (n, 3) in g or deg/s."""
+
+    recording: Recording
+    motion: Motion
+    reading: NDArray[np.float64]
+    predicted: NDArray[np.float64]
+
+    @cached_property
+    def error(self) -> NDArray[np.float64]:
+        """Reading minus prediction: (n, 3) array, g or deg/s."""
+        return self.reading - self.predicted
+
+
+def residuals(sensor: str, part: JSON, recordings: list[Recording], table: JSON) -> list[Residual]:
+    """Return the residuals of the recordings that were made for a sensor and whose motion is known.
+
+    Parameters
+    ----------
+    sensor : str
+    part : dict
+        The sensor's part of the calibration.
+    recordings : list of Recording
+    table : dict
+        The section ``table`` of the unit's configuration.
+    """
+    calibration = SensorCalibration.from_json(sensor, part)
+    latitude, azimuth = table.get("latitude_deg"), table.get("azimuth_deg")
+    earth = None if latitude is None or azimuth is None else earth_rate(latitude, azimuth)
+    out = []
+    for recording in recordings:
+        reading = recording.reading(sensor)
+        if recording.role != sensor or reading is None:
+            continue
+        motion = reference_motion(recording, table.get("gravity_g") or 1.0, earth)
+        if motion is not None:
+            out.append(
+                Residual(recording, motion, reading, _filtered(recording, predicted_reading(calibration, motion)))
+            )
+    return out
+
+
+def _filtered(recording: Recording, predicted: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a prediction behind the filter of its recording."""
+    settings = {k: v for k, v in recording.filter.items() if k not in ("delay_s", "noise_gain")}
+    if settings.get("name", "none") == "none":
+        return predicted
+    from pipeline.signal.filters import apply_filter  # noqa: PLC0415  (scipy.signal, for filtered recordings only)
+
+    ideal = replace(recording, accelerometer=predicted, gyroscope=None, filter={"name": "none"}, encodings={})
+    passed = apply_filter(ideal, settings).accelerometer
+    return predicted if passed is None else passed
+
+
+def white_noise(residual: Residual, noise: JSON | None) -> NDArray[np.float64]:
+    """Return the standard deviation of a sample's white noise after the filter: (3,) array, g or deg/s.
+
+    Without a noise model ``1.4826 median |e[n+1] - e[n]| / sqrt(2)``, which slow errors and outliers do not change.
+    """
+    if noise and noise.get("white"):
+        return float(residual.recording.filter.get("noise_gain", 1.0)) * np.array(noise["white"], float)
+    sigma: NDArray[np.float64] = 1.4826 * np.median(np.abs(np.diff(residual.error, axis=0)), axis=0) / np.sqrt(2.0)
+    return sigma
+
+
+@dataclass(frozen=True)
+class BinnedMean:
+    """Means of a residual in bins of a covariate: centres (m,), means and standard errors (m, 3); NaN in empty bins."""
+
+    centre: NDArray[np.float64]
+    mean: NDArray[np.float64]
+    error: NDArray[np.float64]
+
+    def excess(self, wander: NDArray[np.float64]) -> float:
+        """Return the mean square of the means over that of noise and wander (standard deviations), worst axis."""
+        filled = np.isfinite(self.mean[:, 0])
+        ratio = self.mean[filled] ** 2 / (self.error[filled] ** 2 + wander**2)
+        return float(ratio.mean(axis=0).max())
+
+
+def binned_mean(covariate: NDArray[np.float64], error: NDArray[np.float64]) -> BinnedMean | None:
+    """Return means of ``error`` (n, 3) in 36 equal bins of the covariate (n,); None where it does not vary."""
+    known = np.isfinite(covariate) & np.isfinite(error).all(axis=1)
+    if not known.all():
+        covariate, error = covariate[known], error[known]
+    low, high = (float(covariate.min()), float(covariate.max())) if len(covariate) else (0.0, 0.0)
+    if not high - low > 1e-9 * max(1.0, abs(low)):
+        return None
+    cell = np.minimum(((covariate - low) * (BINS / (high - low))).astype(np.int64), BINS - 1)
+    count = np.bincount(cell, minlength=BINS).astype(float)
+    count[count < FEWEST] = np.nan
+    filled = np.isfinite(count)
+    if filled.sum() < 2:
+        return None
+    mean = np.stack([np.bincount(cell, e, BINS) / count for e in error.T], 1)
+    between = np.sum(mean[filled] ** 2 * count[filled, None], axis=0) / count[filled].sum()
+    scatter = np.sqrt(np.maximum(np.mean(error**2, axis=0) - between, 0.0)) + 1e-300
+    centre = low + (np.arange(BINS) + 0.5) * (high - low) / BINS
+    return BinnedMean(centre, mean, scatter / np.sqrt(count)[:, None])
+
+
+COVARIATES: dict[str, Callable[[Residual], NDArray[np.float64] | None]] = {
+    "angle, deg": lambda r: None if r.motion.angle is None else np.mod(r.motion.angle, 360.0),
+    "rate, deg/s": lambda r: r.motion.rate,
+    "specific force x, g": lambda r: r.motion.specific_force[:, 0],
+    "specific force y, g": lambda r: r.motion.specific_force[:, 1],
+    "specific force z, g": lambda r: r.motion.specific_force[:, 2],
+    "temperature, degC": lambda r: r.motion.temperature,
+    "time, s": lambda r: r.motion.time if r.recording.clock_shared else r.motion.time - r.motion.time[0],
+}
+
+
+def covariates(found: list[Residual], wander: NDArray[np.float64]) -> dict[str, BinnedMean]:
+    """Return binned means over all recordings by covariate, the largest excess first.
+
+    Of the components of the specific force only the one with the largest excess is returned.
+    """
+    out: dict[str, BinnedMean] = {}
+    for label, value in COVARIATES.items():
+        pairs = [(v, r.error) for r in found if (v := value(r)) is not None]
+        if pairs:
+            binned = binned_mean(np.concatenate([v for v, _ in pairs]), np.concatenate([e for _, e in pairs]))
+            out |= {label: binned} if binned else {}
+    order = sorted(out, key=lambda label: -out[label].excess(wander))
+    forces = [label for label in order if label.startswith("specific force")]
+    return {label: out[label] for label in order if label not in forces[1:]}
+
+
+def angle_bins(angle: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return in which of 36 bins of a turn each of (n,) angles (deg) is, and how many are in each bin."""
+    cell = (np.mod(angle, 360.0) * (BINS / 360.0)).astype(np.int64) % BINS
+    return cell, np.bincount(cell, minlength=BINS)
+
+
+def harmonics(residual: Residual) -> NDArray[np.float64] | None:
+    """Return the amplitudes of 0 to 12 cycles a turn: (13, 3) array, None where a bin of the turn has no sample.
+
+    From means in 36 bins of the angle; the division by ``sinc`` restores what averaging over a bin takes away.
+    """
+    angle = residual.motion.angle
+    if angle is None:
+        return None
+    cell, count = angle_bins(angle)
+    if not count.all():
+        return None
+    mean = np.stack([np.bincount(cell, e, BINS) / count for e in residual.error.T], 1)
+    amplitude = np.abs(np.fft.rfft(mean, axis=0))[: HARMONICS + 1] * (2.0 / BINS)
+    amplitude[0] /= 2.0
+    restored: NDArray[np.float64] = amplitude / np.sinc(np.arange(HARMONICS + 1) / BINS)[:, None]
+    return restored
+
+
+def harmonic_noise(
+    residual: Residual, white: NDArray[np.float64], wander: NDArray[np.float64], time: float
+) -> NDArray[np.float64]:
+    """Return the amplitude that noise alone exceeds once in a thousand, by cycles a turn: (13,) array.
+
+    The mean of ``a^2 + b^2`` of a harmonic is ``2 (2 white^2 / n + 2 S(f) / D)`` with the two-sided spectrum of the
+    wander ``S = 2 s^2 T / (1 + (2 pi f T)^2)``, the recorded time D and the effective number of samples n, for which
+    ``1 / n`` is the mean of ``1 / (36 n_bin)``.
+
+    Parameters
+    ----------
+    residual : Residual
+    white, wander : (3,) array
+        Standard deviations; the largest axis counts.
+    time : float, s
+        Correlation time of the wander.
+    """
+    motion = residual.motion
+    assert motion.angle is not None  # noqa: S101
+    duration = max(float(np.ptp(motion.time)), 1e-9)
+    turns = max(float(np.abs(np.diff(motion.angle)).sum()) / 360.0, 1.0)
+    frequency = np.arange(HARMONICS + 1) * turns / duration
+    spectrum = 2.0 * float(wander.max()) ** 2 * time / (1.0 + (2.0 * np.pi * frequency * time) ** 2)
+    of_white = float(white.max()) ** 2 * float(np.mean(1.0 / np.maximum(angle_bins(motion.angle)[1], 1))) / BINS
+    spread = np.sqrt(2.0 * of_white + 2.0 * spectrum / duration)
+    spread[0] = np.hypot(np.sqrt(of_white), wander.max())  # a mean, not an amplitude
+    level: NDArray[np.float64] = ONE_IN_A_THOUSAND * spread
+    return level
+
+
+def residual_figures(sensor: str, found: list[Residual], noise: JSON | None) -> list[Figure]:
+    """Draw binned means of the residual against each covariate (worst first), and its harmonics of the turn.
+
+    Parameters
+    ----------
+    sensor : str
+    found : list of Residual
+    noise : dict or None
+        The noise model: ``white, wander, correlation_time_s``.
+    """
+    wander = np.array((noise or {}).get("wander") or [0.0] * 3, float)
+    time = float((noise or {}).get("correlation_time_s") or 100.0)
+    figures = [_covariate(sensor, label, mean, wander) for label, mean in covariates(found, wander).items()]
+    for residual in found:
+        amplitudes = harmonics(residual)
+        if amplitudes is not None:
+            level = harmonic_noise(residual, white_noise(residual, noise), wander, time)
+            figures.append(_harmonics(sensor, residual.recording.name, amplitudes, level))
+    return figures
+
+
+def _covariate(sensor: str, label: str, mean: BinnedMean, wander: NDArray[np.float64]) -> Figure:
+    """Draw the binned means of each axis with the band of the wander."""
+    unit, (name, covariate_unit) = UNITS[sensor], label.split(", ")
+    words, excess = name.replace("force ", "force along "), mean.excess(wander)
+    top = 1.05 * max(float(np.nanmax(np.abs(mean.mean) + 2 * mean.error)), 2.2 * float(wander.max()))
+    panels = []
+    for i, axis in enumerate(AXES):
+        m, U = mean.mean[:, i], 2 * mean.error[:, i]
+        layers: list[Layer] = [Band(-2 * wander[i], 2 * wander[i])] if wander[i] > 0 else []
+        layers.append(Dots(mean.centre, m, i, m - U, m + U))
+        panels.append(Panel(layers, f"{axis}, {unit}", height=64, levels={"": 0.0}, limits=(-top, top)))
+    finding = f"Flat against {words}, within the noise"
+    if excess >= FLAT:
+        spread = np.abs(mean.mean) / np.sqrt(mean.error**2 + wander**2)
+        row, worst = np.unravel_index(int(np.nanargmax(spread)), spread.shape)
+        at, size = (
+            f"{number(float(mean.centre[row]))} {covariate_unit}",
+            f"{number(float(mean.mean[row, worst]))} {unit}",
+        )
+        sigmas = number(float(spread[row, worst]), 2)
+        finding = f"Not flat against {words}: {size} on {AXES[worst]} at {at}, {sigmas} σ"
+    drawn = chart(
+        f"{sensor}-residual-{name.replace(' ', '-')}",
+        f"{sensor}: {finding}",
+        f"Means in bins; on the worst axis their mean square is {number(excess)} times that of noise and wander.",
+        panels,
+        label,
+        kind="angle" if name == "angle" else "",
+    )
+    return Figure(drawn, finding=finding, quiet=excess < FLAT)
+
+
+def _harmonics(sensor: str, name: str, amplitudes: NDArray[np.float64], level: NDArray[np.float64]) -> Figure:
+    """Draw the amplitudes by cycles a turn, with the level of noise."""
+    unit = UNITS[sensor]
+    ratio = amplitudes / np.maximum(level[:, None], 1e-300)
+    ratio[0] = 0.0  # a bias
+    cycles, axis = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
+    loud = ratio.max() > 1.0
+    finding = f"{name}: no harmonic of the turn above the noise"
+    if loud:
+        size, plural = number(float(amplitudes[cycles, axis]), 2), "s" if cycles != 1 else ""
+        finding = f"{name}: {cycles} cycle{plural} a turn on {AXES[axis]}, {size} {unit}, above the noise"
+    groups = {str(k): row for k, row in enumerate(amplitudes.tolist())}
+    drawn = columns(
+        f"{sensor}-harmonics-{name}",
+        f"{sensor}: {finding}",
+        "; ".join(f"{k} cycles: {', '.join(number(v, 2) for v in row)}" for k, row in groups.items()),
+        groups,
+        f"amplitude, {unit}",
+        x_label="cycles a turn",
+        levels=level.tolist(),
+    )
+    return Figure(drawn, legend=AXES_LEGEND, finding=finding, quiet=not loud)
+
+
+def measurement_and_model(sensor: str, residual: Residual, noise: JSON | None) -> Figure:
+    """Draw readings and model over a turn, and below them the residual of each axis with the band of +-2 sigma.
+
+    Parameters
+    ----------
+    sensor : str
+    residual : Residual
+    noise : dict or None
+        The noise model; sigma is from the residual's own scatter where it is None.
+    """
+    unit, motion, name = UNITS[sensor], residual.motion, residual.recording.name
+    turns = motion.angle is not None and np.ptp(motion.angle) > 1.0
+    x = motion.angle if turns and motion.angle is not None else motion.time
+    known = bool(noise and noise.get("white"))
+    sigma = np.hypot(white_noise(residual, noise), ((noise or {}).get("wander") or 0.0) if known else 0.0)
+    every = slice(None, None, -(-len(x) // MODEL_POINTS))  # the model has no noise whose extremes could be lost
+    layers: list[Layer] = [Samples(x, residual.reading)]
+    layers += [Line(x[every], residual.predicted[every, i], 5, "model") for i in range(3)]
+    top = max(float(np.abs(residual.error).max()), 2.2 * float(sigma.max()))
+    panels = [Panel(layers, f"reading, {unit}")]
+    for i, axis in enumerate(AXES):
+        layers = [Band(-2 * sigma[i], 2 * sigma[i]), Samples(x, residual.error[:, i], i, mean=True)]
+        panels.append(Panel(layers, f"{axis}, {unit}", height=56, limits=(-top, top)))
+    rms = np.sqrt(np.mean(residual.error**2, axis=0))
+    ratio, outside = float((rms / sigma).max()), float(np.mean(np.abs(residual.error) > 2 * sigma))
+    finding = f"{name}: reading minus model is {number(ratio)} × the noise"
+    finding += "" if ratio > NOISE else ", so nothing is left"
+    caption = f"{100 * outside:.1f} % of the residuals lie outside the band; white noise alone puts 4.6 % there."
+    caption += "" if known else " Its σ is taken from the sample-to-sample scatter."
+    drawn = chart(
+        f"{sensor}-{name}",
+        f"{sensor}: measurement and model. {finding}",
+        f"Root mean square of the residual: {', '.join(map(number, rms.tolist()))} {unit} on x, y, z.",
+        panels,
+        "table angle, deg" if turns else "time, s",
+        kind="angle" if turns else "",
+    )
+    return Figure(drawn, caption, (*AXES_LEGEND, ("c5", "model")), finding)

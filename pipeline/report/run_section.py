@@ -1,0 +1,150 @@
+"""What changed from run to run: a section of a unit's page, and the data with which the campaign's page compares runs.
+
+The page of a unit that only one run has changed has no such section.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from pipeline.history import difference, dropped, of_units
+from pipeline.outcome import add_command
+from pipeline.records import SENSORS
+from pipeline.records.calibration import UNITS
+from pipeline.report.chart import Figure
+from pipeline.report.group_charts import Point, bars
+from pipeline.report.numbers import number, plain
+from pipeline.report.pages import template
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+JSON = dict[str, Any]
+MARK, LINK_MARK = "<!-- history -->", "<!-- history link -->"  # in templates/unit.html
+SHOWN = 12  # runs that a chart has room for: the first, and the last ones
+LABEL = 50  # letters of a bar's text before the ratio; a bar is 66 letters long
+STATES = 10_000  # of units in runs after the first that a campaign's page holds: 2 MB at 0.2 kB each
+SAME = 0.02  # relative change of an error that is too small to tell
+NEAR_FLOOR = 1.5  # of the noise floor, up to which a bar is green
+
+
+def with_history(page: str, states: Sequence[tuple[int, JSON]], times: Mapping[int, str]) -> str:
+    """Return a unit's page with the section on its runs.
+
+    Parameters
+    ----------
+    page : str
+        As of ``unit_page.render``.
+    states : sequence of (int, dict)
+        Number of each run that changed the unit, and the unit's state after it.
+    times : mapping of int to str
+        When each run was.
+    """
+    entries: list[JSON] = []
+    before: JSON = {}
+    for run, state in states:
+        change = difference(before, state) if before else None
+        words = change.words() if change else []
+        entries.append({"run": run, "time": times[run], "state": state, "change": change, "words": words})
+        before = state
+    figures = [figure for sensor in SENSORS if (figure := _chart(sensor, entries))]
+    last = entries[-1]["change"]
+    lost = [plain(name) for sensor in SENSORS for name in last.removed[sensor]] if last else []
+    section = template("history.html").render(entries=entries, figures=figures, lost=lost, before=states[-2][0])
+    return page.replace(MARK, section, 1).replace(LINK_MARK, '<li><a href="#history">Runs</a></li>', 1)
+
+
+def _chart(sensor: str, entries: Sequence[JSON]) -> Figure | None:
+    """Draw the held-out error of a sensor run by run with its noise floor; None where it never changed."""
+    known: list[tuple[JSON, JSON]] = [(e, part) for e in entries if (part := e["state"].get(sensor)) and part["error"]]
+    if len({part["error"] for _, part in known}) < 2:
+        return None
+    shown = known if len(known) <= SHOWN else [known[0], *known[1 - SHOWN :]]
+    unit, rows = UNITS[sensor], [_row(entry, part, sensor) for entry, part in shown]
+    first, last = known[-2][1]["error"], known[-1][1]["error"]
+    floor = known[-1][1]["floor"]
+    if abs(last - first) <= SAME * first:
+        change = f"stays at {number(last)}"
+    else:
+        change = f"{'falls' if last < first else 'rises'} from {number(first)} to {number(last)}"
+    ratio = f", {number(last / floor)} × the noise floor" if floor else ""
+    finding = f"{sensor.capitalize()}: in the last run the held-out error {change} {unit}{ratio}"
+    description = "; ".join(f"{row.label}: {number(row.value)} {unit}" for row in rows)
+    levels = {"noise floor": floor} if floor else {}
+    drawn = bars(f"history-{sensor}", finding, description, rows, f"rms error, {unit} (logarithmic)", levels=levels)
+    caption = "Error on held-out motion after each run that changed the unit, and the effects that it added or removed."
+    return Figure(drawn, caption, (), finding)
+
+
+def _row(entry: JSON, part: JSON, sensor: str) -> Point:
+    change, floor = entry["change"], part["floor"]
+    words = change.words(sensor) if change else [f"+ {name}" for name in part["effects"]]
+    label = f"run {entry['run']}" + (f": {plain(', '.join(words))}" if words else "")
+    label = label if len(label) <= LABEL else f"{label[: LABEL - 1]}…"
+    label += f", {number(part['error'] / floor)} × floor" if floor else ""
+    return Point(label, part["error"], 1 if floor and part["error"] < NEAR_FLOOR * floor else 3)
+
+
+def times_of(entries: Sequence[JSON]) -> dict[int, str]:
+    """Return when each run was, to the minute (UTC)."""
+    return {entry["run"]: str(entry["time"])[:16].replace("T", " ") for entry in entries}
+
+
+def runs_data(entries: Sequence[JSON], settings: JSON) -> JSON | None:
+    """Return what the campaign's page needs to compare any two runs; None while there is one run.
+
+    Parameters
+    ----------
+    entries : sequence of dict
+        As of ``history.read_history``.
+    settings : dict
+        Of the run.
+    """
+    if len(entries) < 2:
+        return None
+    kept, times = _kept(entries), times_of(entries)
+    units = [
+        [unit, [[run, _short(state)] for run, state in shown]]
+        for unit, states in of_units(entries).items()
+        if len(shown := _states_after(states, [e["run"] for e in kept])) > 1
+    ]
+    runs = [[e["run"], f"run {e['run']}, {times[e['run']]}: {_count(e)}"] for e in kept]
+    lost: dict[tuple[str, int], list[str]] = {}
+    for unit, sensor, effect, run in dropped(entries):
+        lost.setdefault((unit, run), []).append(f"{sensor}.{effect}")
+    gone = [
+        {"unit": unit, "run": run, "effects": effects, "add": add_command(settings, unit, effects)}
+        for (unit, run), effects in lost.items()
+    ]
+    return {"runs": runs, "units": units, "dropped": gone, "number": entries[-1]["run"]}
+
+
+def _kept(entries: Sequence[JSON]) -> list[JSON]:
+    """Return the runs that can be compared: the first, and the last ones, as many as ``STATES`` allows."""
+    kept, count = [entries[-1]], len(entries[-1]["units"])
+    for entry in reversed(entries[1:-1]):
+        count += len(entry["units"])
+        if count > STATES:
+            break
+        kept.append(entry)
+    return [entries[0], *reversed(kept)]
+
+
+def _states_after(states: Sequence[tuple[int, JSON]], runs: Sequence[int]) -> list[tuple[int, JSON]]:
+    """Return the states that hold after some runs, each once."""
+    found = [next((s for s in reversed(states) if s[0] <= run), None) for run in runs]
+    return list({s[0]: s for s in found if s}.values())
+
+
+def _count(entry: JSON) -> str:
+    count = len(entry["units"]) + len(entry.get("gone") or [])
+    return f"{count} unit{'s' if count != 1 else ''} changed" if entry["run"] > 1 else f"{count} units"
+
+
+def _short(state: JSON) -> JSON:
+    """Return what a comparison shows of a state."""
+    if not state:
+        return {"status": "not in units.csv"}
+    parts = {s: state[s] for s in SENSORS if state.get(s)}
+    shown = {s: [part[key] for key in ("error", "floor", "verdict", "effects")] for s, part in parts.items()}
+    return {"status": state["status"], "overrides": state["overrides"], **shown}
