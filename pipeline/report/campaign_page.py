@@ -9,8 +9,7 @@ import numpy as np
 import pandas as pd
 
 from pipeline.outcome import findings_of, next_commands, verdict_groups
-from pipeline.records import SENSORS
-from pipeline.records.calibration import UNITS
+from pipeline.records import SENSOR_UNITS, SENSORS
 from pipeline.report.chart import Dots, Figure, Layer, Panel, chart
 from pipeline.report.numbers import number, plain
 from pipeline.report.pages import script_data, template
@@ -136,7 +135,7 @@ def _medians(sensor: str, name: str, table: pd.DataFrame) -> JSON | None:
     return {
         "sensor": sensor,
         "name": name,
-        "unit": UNITS[sensor],
+        "unit": SENSOR_UNITS[sensor],
         "count": len(known),
         "before": number(float(before)),
         "after": number(float(after)),
@@ -173,7 +172,7 @@ def _fleet_values(rows: list[JSON]) -> JSON:
 
 def _fleet_figure(sensor: str, table: pd.DataFrame) -> Figure | None:
     """Draw each unit's error before and after as a dot, in the order of ``units.csv``; None for few units."""
-    unit, order = UNITS[sensor], np.arange(1.0, len(table) + 1)
+    unit, order = SENSOR_UNITS[sensor], np.arange(1.0, len(table) + 1)
     errors = (pd.to_numeric(table[f"{sensor}_{name}"]) for name in ("error_before", "error_after", "noise_floor"))
     before, after, floor = (v.where(v > 0).to_numpy(float) for v in errors)
     known = np.isfinite(after)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from pipeline.records.calibration import UNITS
+from pipeline.records import SENSOR_UNITS
 from pipeline.report.chart import Figure
 from pipeline.report.comparison import LEVEL, Compared, Group, compare, difference, finding, mean_of
 from pipeline.report.group_charts import COLOURS, Point, bars, curves
@@ -59,12 +59,12 @@ def section(comparison: JSON, figures: Sequence[JSON], name: str) -> JSON:
         if compared:
             sensors.append({
                 "sensor": sensor,
-                "unit": UNITS[sensor],
+                "unit": SENSOR_UNITS[sensor],
                 "measures": [
                     {
                         "name": m,
                         "title": MEASURES[m],
-                        "figure": _figure(c, comparison, m, UNITS[sensor], f"{name}-{sensor}"),
+                        "figure": _figure(c, comparison, m, SENSOR_UNITS[sensor], f"{name}-{sensor}"),
                         "rows": [_row(one, m) for one in c],
                     }
                     for m, c in compared.items()

@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.records import AXES
-from pipeline.records.calibration import UNITS
+from pipeline.records import AXES, SENSOR_UNITS
 from pipeline.report.chart import WIDTH, Axis, Dots, Figure, Layer, Line, Panel, chart, svg, text
 from pipeline.report.numbers import MINUS, measured, number, percent, plain, unit_text
 from pipeline.report.parameter_section import parameter_texts
@@ -293,7 +292,7 @@ def _unexplained(sensor: str, shown: JSON, entry: JSON) -> Figure:
         f"{sensor}: {finding}",
         f"Binned means of the residual: {', '.join(reaches)}.",
         panels,
-        SIGNALS.get(shown["signal"], f"what the axis should read, {UNITS[sensor]}"),
+        SIGNALS.get(shown["signal"], f"what the axis should read, {SENSOR_UNITS[sensor]}"),
         kind="angle" if shown["signal"] == "angle" else "",
     )
     caption = "Residual in bins, with ±2 standard errors of white noise and the expected bias wander"

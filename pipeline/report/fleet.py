@@ -151,10 +151,14 @@ def _lots(values: pd.DataFrame, siblings: pd.DataFrame) -> Iterable[tuple[str, J
 
 def _repeatability(values: pd.DataFrame, siblings: pd.DataFrame) -> Iterable[tuple[str, JSON]]:
     """Return the pooled standard deviation of the devices that were calibrated more than once."""
-    devices = values.groupby(siblings["serial"])
+    serial = siblings["serial"].dropna()
+    serial = serial[serial.duplicated(keep=False)]
+    if serial.empty:
+        return
+    devices = values.loc[serial.index].groupby(serial)
     counts = devices.count()
     counts = counts.where(counts > 1)
-    squares = ((values - devices.transform("mean")) ** 2).sum()  # 0 for a device that was calibrated once
+    squares = ((values.loc[serial.index] - devices.transform("mean")) ** 2).sum()
     for name in values:
         repeated, calibrations = int(counts[name].count()), int(counts[name].sum())
         if repeated:

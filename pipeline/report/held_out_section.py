@@ -12,8 +12,7 @@ import numpy as np
 from pipeline.model.effects import effect_of
 from pipeline.model.inversion import compensate, linear_truth, sensor_effects
 from pipeline.model.kinematics import reference_motion
-from pipeline.records import SENSORS, SensorCalibration
-from pipeline.records.calibration import UNITS
+from pipeline.records import SENSOR_UNITS, SENSORS, SensorCalibration
 from pipeline.report.chart import Band, Figure, Layer, Line, Panel, Samples, chart
 from pipeline.report.group_charts import Point, bars
 from pipeline.report.numbers import number, plain
@@ -30,7 +29,7 @@ ALIKE = 1.2  # the diagnosis's held-out error may continue the validation's step
 def checks(validation: JSON | None) -> list[JSON]:
     """Return each limit of the configuration with its figure: ``sensor, name, value, limit, unit, pass``."""
     return [
-        {**check, "sensor": sensor, "unit": "" if check["name"] == "scale_factor" else UNITS[sensor]}
+        {**check, "sensor": sensor, "unit": "" if check["name"] == "scale_factor" else SENSOR_UNITS[sensor]}
         for sensor in SENSORS
         for check in ((validation or {}).get(sensor) or {}).get("limits") or []
     ]
@@ -67,7 +66,7 @@ def error_steps(sensor: str, held_out: JSON, found: JSON, *, vector: bool) -> Fi
         The error of the vector instead of the magnitude; None is returned where it is not known.
     """
     key, floor_key = ("vector_rms_error", "vector_noise_floor") if vector else ("rms_error", "noise_floor")
-    steps, floor, unit = held_out.get("steps", []), held_out.get(floor_key), UNITS[sensor]
+    steps, floor, unit = held_out.get("steps", []), held_out.get(floor_key), SENSOR_UNITS[sensor]
     if not steps or all(s.get(key) is None for s in steps):
         return None
     rows = [Point(step_label(s["name"]), s.get(key), 3 if s["name"] == "raw" else 2) for s in steps]
@@ -146,7 +145,7 @@ def held_out_over_time(
     floor : float or None
         Root mean square error that noise alone gives.
     """
-    unit, x = UNITS[sensor], recording.time - recording.time[0]
+    unit, x = SENSOR_UNITS[sensor], recording.time - recording.time[0]
     after: list[Layer] = [Samples(x, calibrated, 2, mean=True)]
     panels = [
         Panel([Samples(x, raw, 3), Samples(x, calibrated, 2)], f"error, {unit}", 120, {"": 0.0}),

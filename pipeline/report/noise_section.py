@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.records.calibration import UNITS
+from pipeline.records import SENSOR_UNITS
 from pipeline.report.chart import AXES_LEGEND, Figure, Layer, Line, Panel, chart
 from pipeline.report.numbers import number
 from pipeline.signal.allan import allan_deviation
@@ -66,7 +66,7 @@ def allan(
     found = longest_rest(sensor, recordings)
     if found is None:
         return None
-    (recording, values), unit = found, UNITS[sensor]
+    (recording, values), unit = found, SENSOR_UNITS[sensor]
     tau, deviation = deviations(values, recording.interval)
     sure = tau <= len(values) * recording.interval / SURE
     tau, deviation = tau[sure], deviation[sure]

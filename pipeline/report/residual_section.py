@@ -22,8 +22,7 @@ import numpy as np
 
 from pipeline.model.kinematics import earth_rate, reference_motion
 from pipeline.model.measurement import predicted_reading
-from pipeline.records import AXES, SensorCalibration
-from pipeline.records.calibration import UNITS
+from pipeline.records import AXES, SENSOR_UNITS, SensorCalibration
 from pipeline.report.chart import AXES_LEGEND, Band, Dots, Figure, Layer, Line, Panel, Samples, chart
 from pipeline.report.group_charts import columns
 from pipeline.report.numbers import number
@@ -251,7 +250,7 @@ def residual_figures(sensor: str, found: list[Residual], noise: JSON | None) -> 
 
 def _covariate(sensor: str, label: str, mean: BinnedMean, wander: NDArray[np.float64]) -> Figure:
     """Draw the binned means of each axis with the band of the wander."""
-    unit, (name, covariate_unit) = UNITS[sensor], label.split(", ")
+    unit, (name, covariate_unit) = SENSOR_UNITS[sensor], label.split(", ")
     words, excess = name.replace("force ", "force along "), mean.excess(wander)
     top = 1.05 * max(float(np.nanmax(np.abs(mean.mean) + 2 * mean.error)), 2.2 * float(wander.max()))
     panels = []
@@ -283,7 +282,7 @@ def _covariate(sensor: str, label: str, mean: BinnedMean, wander: NDArray[np.flo
 
 def _harmonics(sensor: str, name: str, amplitudes: NDArray[np.float64], level: NDArray[np.float64]) -> Figure:
     """Draw the amplitudes by cycles a turn, with the level of noise."""
-    unit = UNITS[sensor]
+    unit = SENSOR_UNITS[sensor]
     ratio = amplitudes / np.maximum(level[:, None], 1e-300)
     ratio[0] = 0.0  # a bias
     cycles, axis = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
@@ -315,7 +314,7 @@ def measurement_and_model(sensor: str, residual: Residual, noise: JSON | None) -
     noise : dict or None
         The noise model; sigma is from the residual's own scatter where it is None.
     """
-    unit, motion, name = UNITS[sensor], residual.motion, residual.recording.name
+    unit, motion, name = SENSOR_UNITS[sensor], residual.motion, residual.recording.name
     turns = motion.angle is not None and np.ptp(motion.angle) > 1.0
     x = motion.angle if turns and motion.angle is not None else motion.time
     known = bool(noise and noise.get("white"))

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.history import difference, dropped, of_units
 from pipeline.outcome import add_command
-from pipeline.records import SENSORS
-from pipeline.records.calibration import UNITS
+from pipeline.records import SENSOR_UNITS, SENSORS
 from pipeline.report.chart import Figure
 from pipeline.report.group_charts import Point, bars
 from pipeline.report.numbers import number, plain
@@ -60,7 +59,7 @@ def _chart(sensor: str, entries: Sequence[JSON]) -> Figure | None:
     if len({part["error"] for _, part in known}) < 2:
         return None
     shown = known if len(known) <= SHOWN else [known[0], *known[1 - SHOWN :]]
-    unit, rows = UNITS[sensor], [_row(entry, part, sensor) for entry, part in shown]
+    unit, rows = SENSOR_UNITS[sensor], [_row(entry, part, sensor) for entry, part in shown]
     first, last = known[-2][1]["error"], known[-1][1]["error"]
     floor = known[-1][1]["floor"]
     if abs(last - first) <= SAME * first:

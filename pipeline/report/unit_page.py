@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.files import json_text
 from pipeline.model.plausible import sentences
 from pipeline.outcome import commands_of, place, run_command
-from pipeline.records import SENSORS
-from pipeline.records.calibration import UNITS
+from pipeline.records import SENSOR_UNITS, SENSORS
 from pipeline.report.diagnosis_section import evidence_figures, ranking_rows
 from pipeline.report.held_out_section import (
     attitude_over_time,
@@ -104,7 +103,7 @@ def _sensor(
     sensor: str, calibration: JSON, held_out: JSON, found: JSON, *, recordings: list[Recording], settings: JSON
 ) -> JSON:
     """Return what the template shows of one sensor, from its parts of validation and diagnosis."""
-    part, unit = calibration.get(sensor), UNITS[sensor]
+    part, unit = calibration.get(sensor), SENSOR_UNITS[sensor]
     if part is None:
         reason = (calibration.get("not_calibrated") or {}).get(sensor) or "the procedure does not calibrate it"
         return {"name": sensor, "unit": unit, "part": None, "reason": reason}

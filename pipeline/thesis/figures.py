@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.estimation.correction import apply_correction
-from pipeline.records.calibration import UNITS
+from pipeline.records import SENSOR_UNITS
 from pipeline.report.chart import AXES_LEGEND, Figure, Panel, Samples, chart
 from pipeline.report.group_charts import Point, columns, curves
 from pipeline.report.held_out_section import held_out_over_time
@@ -92,7 +92,7 @@ def _motion(results: Results, device: str, sensor: str, procedure: str) -> Figur
         f"motion-{device}-{sensor}",
         f"{DEVICES[device]}, {sensor}: held-out motion",
         f"{recording.samples} samples in {number(float(x[-1]))} s.",
-        [Panel([Samples(x, reading)], f"reading, {UNITS[sensor]}", 150)],
+        [Panel([Samples(x, reading)], f"reading, {SENSOR_UNITS[sensor]}", 150)],
         "time, s",
     )
     caption = f"{recording.samples} samples that reached the logger, in {number(float(x[-1]))} s; no fit sees them."
@@ -112,7 +112,7 @@ def _before_and_after(results: Results, unit: str, sensor: str, noise: Noise) ->
     drawn = held_out_over_time(sensor, recording, before, after, None)
     means = [number(float(np.mean(np.abs(e)))) for e in (before, after)]
     name = unit.removesuffix("-printed")
-    finding = f"{_in_words(name)}: mean |e| goes from {means[0]} to {means[1]} {UNITS[sensor]}"
+    finding = f"{_in_words(name)}: mean |e| goes from {means[0]} to {means[1]} {SENSOR_UNITS[sensor]}"
     svg = str(drawn.svg).replace(f"{sensor}-held-out", f"held-out-{name}")
     return replace(drawn, svg=type(drawn.svg)(svg), finding=finding, caption="Staged, as printed; below, after alone.")
 
@@ -136,7 +136,7 @@ def _per_procedure(results: Results, told: dict[tuple[str, str, str], float], de
         f"{DEVICES[device]}, {sensor}: held-out error by procedure",
         _told(groups),
         groups,
-        f"mean |e| after, {UNITS[sensor]}",
+        f"mean |e| after, {SENSOR_UNITS[sensor]}",
         x_label=BELOW[sensor],
     )
     legend = tuple(zip(COLOURS, ("printed", "ours, as printed", "ours, errata corrected"), strict=False))
@@ -170,7 +170,7 @@ def _methods(results: Results, printed: Path, sensor: str) -> Figure:
         f"{sensor.capitalize()}: held-out error by method",
         _told(groups),
         groups,
-        f"mean |e| after, {UNITS[sensor]}",
+        f"mean |e| after, {SENSOR_UNITS[sensor]}",
         x_label="device",
     )
     legend = tuple((f"c{i}", text) for i, text in enumerate((*printed_names, *names)))

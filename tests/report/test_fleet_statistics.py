@@ -66,6 +66,14 @@ def test_few_fleets_in_which_nothing_is_wrong_are_said_to_have_something() -> No
     assert sum(bool(t["drift"] or t["lots"]) for t in told) <= 1
 
 
+def test_a_fleet_without_serials_lots_and_dates_has_distributions_only() -> None:
+    rows, found = fleet(np.random.default_rng(8).normal(0.0, 1.0, 25))
+    rows = [row | {"serial": None, "lot": None, "date": ""} for row in rows]
+    told = fleet_statistics([*rows, {"unit": "failed", "sensor": "mpu6050", "method": None}], found)
+    assert [key for key, value in told.items() if value] == ["distributions"]
+    assert fleet_statistics([], {})["distributions"] == []
+
+
 def test_a_drift_over_the_date_is_found_with_its_size() -> None:
     rng = np.random.default_rng(4)
     values = rng.normal(0.0, 0.1, 200) + 0.002 * np.arange(200)
