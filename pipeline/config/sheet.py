@@ -12,7 +12,7 @@ from pipeline.config.compose import GROUPS
 from pipeline.config.user_effects import ONLY_FROM_THE_COMMAND_LINE, PYTHON
 from pipeline.errors import ConfigurationError
 from pipeline.io.file_access import not_regular
-from pipeline.io.unit_name import wrong_name
+from pipeline.io.files import wrong_name
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -1,4 +1,4 @@
-"""A table's log with a clock of its own, brought to the sensor's by the motion that both saw.
+"""The clock of a table's log, aligned with the sensor's by the motion in both logs.
 
     tau = t + d + k (t - t_m)
 
@@ -7,23 +7,25 @@
 where
 
     t, tau     : the sensor's and the table's clock, s
-    t_m        : middle of what tells the offset, so that offset and drift are told apart
+    t_m        : middle of the samples that determine the offset, which makes offset and drift uncorrelated
     d, k       : offset and drift of the table's clock, s and 1
     w, f       : angular rate and specific force read by the sensor
-    r, u       : what the table's log says of them (``pipeline.io.table_log``)
+    r, u       : the corresponding signals of the table's log (``pipeline.io.encoder_log``)
     A, B, a, b : scales, axes and biases, not used further
 
-``d`` is found by correlation on a grid; of the places where the motions are alike that one counts where the whole
-model leaves least, for the steps of a table are alike and the directions of gravity at them are not. A table rests
-before and after its log; where this fits nowhere, what both logs cover is compared. Then all are fitted by Gauss-
-Newton, A, B, a, b eliminated by projection. What is left is no white noise: it is largest where the rate changes,
-which is where the clocks are seen. So the covariance is taken from what blocks of some seconds say against each other,
+``d`` is first found by correlation on a grid. Steps of a table repeat, the directions of gravity at them do not: of the
+offsets with similar correlation, the one with the smallest residual of the whole model is taken. The table is assumed
+at rest before and after its log; where no offset fits so, only what both logs cover is compared. Then d and k are
+refined by Gauss-Newton, with A, B, a, b eliminated by projection.
+
+The residuals are not white: they are largest where the rate changes, and there the offset is determined. So the
+covariance is estimated from the scatter between blocks of some seconds (a sandwich estimate),
 
     C = H^-1 (sum_b s_b s_b') H^-1,   H = J'J,   s_b = J_b' e_b
 
-where J are the projected derivatives and e the residuals, enlarged where few blocks say it all; of blocks of 1 s and
-of 4 s those count that say less, for slow errors are alike in neighbouring blocks. It is never below what white noise
-alone would leave, nor below 0.5 % of the table's interval, within which the motion is interpolated.
+with J the projected derivatives and e the residuals, enlarged for the effective number of blocks. The larger estimate
+of blocks of 1 s and of 4 s is used, as slow errors are correlated between neighbouring blocks. It is never below that
+of white noise, nor below 0.5 % of the table's interval, the error of the interpolation.
 """
 
 from __future__ import annotations
@@ -34,7 +36,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.errors import IngestError
-from pipeline.io.table_log import Signals, seconds_of, signals_of
+from pipeline.io.encoder_log import Signals, seconds_of, signals_of
 from pipeline.io.units import TRIADS
 
 if TYPE_CHECKING:
@@ -44,13 +46,13 @@ if TYPE_CHECKING:
 
     Values = NDArray[np.float64]
 
-ALIKE = 0.9
+SMALLEST_CORRELATION = 0.9
 BLOCKS_S = (1.0, 4.0)
-COARSE_S = 0.01  # of the grid for a first look
-MOST_PLACES, WORTH_A_LOOK = 40, 0.3
+COARSE_S = 0.01  # step of the grid of offsets
+MOST_PLACES, WORTH_A_LOOK = 40, 0.3  # offsets refined, and their least correlation relative to the best
 SAMPLES_OF_A_LOOK = 20_000
-AMBIGUOUS = 1.1
-SHARED = 0.5  # of what two logs could share at most
+AMBIGUOUS = 1.1  # ratio of the second-best mean squared residual to the best
+SHARED = 0.5  # share of the shorter log that both have to cover
 STEPS, ROUNDING_S = 20, 1e-9
 FEWEST_BLOCKS = 3.0
 RESOLVED = 0.005  # of the table's interval: between its samples the motion is interpolated
@@ -58,7 +60,7 @@ RESOLVED = 0.005  # of the table's interval: between its samples the motion is i
 
 @dataclass(frozen=True)
 class ClockFit:
-    """Offset (s) and drift (1) of the table's clock with standard uncertainties, and how alike the motions are.
+    """Offset (s) and drift (1) of the table's clock with standard uncertainties, and the correlation of the motions.
 
     ``middle`` is t_m; both times count from the first sample of each log.
     """
@@ -72,26 +74,21 @@ class ClockFit:
 
     def table_time(self, t: Values) -> Values:
         """Return the table's time of times of the sensor, s."""
-        tau: Values = t + self.offset + self.drift * (t - self.middle)
-        return tau
+        return np.asarray(t + self.offset + self.drift * (t - self.middle))
 
 
 @dataclass(frozen=True)
-class Felt:
-    """What the sensor felt: times (s), readings (n, 3 or 6), which of them are rates, and their noise."""
+class SensorSignals:
+    """Times (s), readings (n, 3 or 6), the number of rates among them, and the noise of each."""
 
     time: Values
     readings: Values
     rates: int
     noise: Values
 
-    def thinned(self) -> Felt:
-        """Return fewer samples, for a first look."""
-        return self.part(slice(None, None, max(1, len(self.time) // SAMPLES_OF_A_LOOK)))
-
-    def part(self, rows: slice | NDArray[np.bool_]) -> Felt:
+    def part(self, rows: slice | NDArray[np.bool_]) -> SensorSignals:
         """Return some of the samples."""
-        return Felt(self.time[rows], self.readings[rows], self.rates, self.noise)
+        return SensorSignals(self.time[rows], self.readings[rows], self.rates, self.noise)
 
 
 def fit_clocks(sensor: ChannelTable, log: ChannelTable) -> ClockFit:
@@ -105,19 +102,19 @@ def fit_clocks(sensor: ChannelTable, log: ChannelTable) -> ClockFit:
     if "gyro_x" not in sensor.values:
         raise IngestError("a table's log with its own clock needs a gyroscope to be aligned", log.path, fault="no_sync")
     signals = signals_of(log)
-    felt = _felt(sensor, signals)
-    look = felt.thinned()
+    sensed = _sensor_signals(sensor, signals)
+    look = sensed.part(slice(None, None, max(1, len(sensed.time) // SAMPLES_OF_A_LOOK)))
     places = _places(look, signals)
     for resting in (True, False):
         left = np.array([_left(look, signals, place, beyond=resting) for place in places])
         order = np.argsort(left)
         best = places[int(order[0])]
-        fit = _refine(felt if resting else felt.part(signals.covers(felt.time + best)), signals, best)
-        if fit.correlation > ALIKE:
+        fit = _refine(sensed if resting else sensed.part(signals.covers(sensed.time + best)), signals, best)
+        if fit.correlation > SMALLEST_CORRELATION:
             break
-    if not fit.correlation > ALIKE:
+    if not fit.correlation > SMALLEST_CORRELATION:
         raise IngestError(
-            "the table's log does not show the motion that the gyroscope saw "
+            "the table's log does not show the motion that the gyroscope read "
             f"(correlation {fit.correlation:.2f} at best)",
             log.path,
             fault="no_sync",
@@ -133,7 +130,7 @@ def fit_clocks(sensor: ChannelTable, log: ChannelTable) -> ClockFit:
     return fit
 
 
-def _felt(sensor: ChannelTable, signals: Signals) -> Felt:
+def _sensor_signals(sensor: ChannelTable, signals: Signals) -> SensorSignals:
     rates = np.column_stack([sensor.values[c] for c in TRIADS["gyroscope"]])
     if signals.magnitude:
         rates = np.linalg.norm(rates - np.median(rates, axis=0), axis=1)[:, None]
@@ -144,21 +141,21 @@ def _felt(sensor: ChannelTable, signals: Signals) -> Felt:
     noise = np.maximum(np.median(np.abs(np.diff(readings, axis=0)), axis=0), 1e-3 * np.std(readings, axis=0))
     m = rates.shape[1]
     noise[:m], noise[m:] = noise[:m].max(initial=0.0), noise[m:].max(initial=0.0)
-    return Felt(seconds_of(sensor), readings, m, np.maximum(noise, 1e-12))
+    return SensorSignals(seconds_of(sensor), readings, m, np.maximum(noise, 1e-12))
 
 
-def _places(felt: Felt, signals: Signals) -> list[float]:
-    """Return the offsets at which the rates are most alike, s."""
+def _places(sensed: SensorSignals, signals: Signals) -> list[float]:
+    """Return the offsets with the highest correlation of the rates, s."""
     stride = max(1, round(COARSE_S / signals.step))
     step, rates = stride * signals.step, signals.rates[::stride]
-    grid = step * np.arange(int(felt.time[-1] / step) + 1)
+    grid = step * np.arange(int(sensed.time[-1] / step) + 1)
     size = len(grid) + len(rates)
     size = 1 << (size - 1).bit_length()
     score = np.zeros(size)
     for r in rates.T:
         transformed = np.fft.rfft(r - r.mean(), size)
-        for w in felt.readings[:, : felt.rates].T:
-            one = np.interp(grid, felt.time, w)
+        for w in sensed.readings[:, : sensed.rates].T:
+            one = np.interp(grid, sensed.time, w)
             score += np.fft.irfft(transformed * np.conj(np.fft.rfft(one - one.mean(), size)), size) ** 2
     peaks = np.flatnonzero((score >= np.roll(score, 1)) & (score > np.roll(score, -1)))
     peaks = peaks[score[peaks] > WORTH_A_LOOK**2 * score.max()]
@@ -167,16 +164,16 @@ def _places(felt: Felt, signals: Signals) -> list[float]:
     return [float(lag) * step for lag in lags] or [0.0]
 
 
-def _left(felt: Felt, signals: Signals, offset: float, *, beyond: bool) -> float:
-    """Return what the whole model leaves of a sample at an offset, in squares of the noise.
+def _left(sensed: SensorSignals, signals: Signals, offset: float, *, beyond: bool) -> float:
+    """Return the mean squared residual of the whole model at an offset, relative to the noise.
 
     Infinite where the two logs share less than half of what they could.
     """
-    inside = signals.covers(felt.time + offset)
-    shared = float(np.mean(inside)) * felt.time[-1]
-    if shared < SHARED * min(felt.time[-1], signals.duration):
+    inside = signals.covers(sensed.time + offset)
+    shared = float(np.mean(inside)) * sensed.time[-1]
+    if shared < SHARED * min(sensed.time[-1], signals.duration):
         return np.inf
-    covered = felt if beyond else felt.part(inside)
+    covered = sensed if beyond else sensed.part(inside)
     rates, directions, *_ = signals.at(covered.time + offset)
     left = 0.0
     for columns, readings, noise in _groups(covered, rates, directions):
@@ -185,22 +182,22 @@ def _left(felt: Felt, signals: Signals, offset: float, *, beyond: bool) -> float
     return left / len(covered.time)
 
 
-def _groups(felt: Felt, rates: Values, directions: Values) -> list[tuple[Values, Values, Values]]:
+def _groups(sensed: SensorSignals, rates: Values, directions: Values) -> list[tuple[Values, Values, Values]]:
     """Return columns, readings and noise of the rates and, where there are some, of the forces."""
-    ones = np.ones((len(felt.time), 1))
-    m = felt.rates
-    out = [(np.hstack([rates, ones]), felt.readings[:, :m], felt.noise[:m])]
-    if felt.readings.shape[1] > m:
-        out.append((np.hstack([directions, ones]), felt.readings[:, m:], felt.noise[m:]))
+    ones = np.ones((len(sensed.time), 1))
+    m = sensed.rates
+    out = [(np.hstack([rates, ones]), sensed.readings[:, :m], sensed.noise[:m])]
+    if sensed.readings.shape[1] > m:
+        out.append((np.hstack([directions, ones]), sensed.readings[:, m:], sensed.noise[m:]))
     return out
 
 
-def _refine(felt: Felt, signals: Signals, offset: float) -> ClockFit:
-    d, k, middle = offset, 0.0, float(felt.time[-1]) / 2
+def _refine(sensed: SensorSignals, signals: Signals, offset: float) -> ClockFit:
+    d, k, middle = offset, 0.0, float(sensed.time[-1]) / 2
     for _ in range(STEPS):
-        J, e, weight, correlation = _linearised(felt, signals, d + k * (felt.time - middle), middle)
-        moved = float(np.average(felt.time, weights=weight)) if weight.sum() > 0 else middle
-        if abs(moved - middle) > 1e-3 * felt.time[-1]:
+        J, e, weight, correlation = _linearised(sensed, signals, d + k * (sensed.time - middle), middle)
+        moved = float(np.average(sensed.time, weights=weight)) if weight.sum() > 0 else middle
+        if abs(moved - middle) > 1e-3 * sensed.time[-1]:
             d, middle = d + k * (moved - middle), moved
             continue
         size = np.linalg.norm(J, axis=0)
@@ -208,23 +205,25 @@ def _refine(felt: Felt, signals: Signals, offset: float) -> ClockFit:
             return ClockFit(d, k, np.inf, np.inf, middle, 0.0)
         change = np.linalg.lstsq(J / size, e, rcond=None)[0] / size
         d, k = d + float(change[0]), k + float(change[1])
-        if abs(change[0]) + abs(change[1]) * felt.time[-1] < ROUNDING_S:
+        if abs(change[0]) + abs(change[1]) * sensed.time[-1] < ROUNDING_S:
             break
-    floor = RESOLVED * signals.interval * np.array([1.0, 1.0 / max(felt.time[-1], 1e-9)])
-    spread = np.hypot(_standard_uncertainties(J, e, felt), floor)
+    floor = RESOLVED * signals.interval * np.array([1.0, 1.0 / max(sensed.time[-1], 1e-9)])
+    spread = np.hypot(_standard_uncertainties(J, e, sensed), floor)
     return ClockFit(d, k, float(spread[0]), float(spread[1]), middle, correlation)
 
 
-def _linearised(felt: Felt, signals: Signals, shift: Values, middle: float) -> tuple[Values, Values, Values, float]:
+def _linearised(
+    sensed: SensorSignals, signals: Signals, shift: Values, middle: float
+) -> tuple[Values, Values, Values, float]:
     """Return projected derivatives to d and k, residuals (in noise), the weight of each time, and the correlation."""
-    rates, directions, rate_slopes, direction_slopes = signals.at(felt.time + shift)
-    lever = felt.time - middle
+    rates, directions, rate_slopes, direction_slopes = signals.at(sensed.time + shift)
+    lever = sensed.time - middle
     derivatives: list[Values] = []
     residuals: list[Values] = []
     weight = np.zeros(len(lever))
     correlation = 0.0
     slopes = (rate_slopes, direction_slopes)
-    for (columns, readings, noise), slope in zip(_groups(felt, rates, directions), slopes, strict=False):
+    for (columns, readings, noise), slope in zip(_groups(sensed, rates, directions), slopes, strict=False):
         Q, R = np.linalg.qr(columns)
         B = np.linalg.lstsq(R, Q.T @ readings, rcond=None)[0]
         residual = readings - columns @ B
@@ -241,23 +240,22 @@ def _linearised(felt: Felt, signals: Signals, shift: Values, middle: float) -> t
     return np.concatenate(derivatives), np.concatenate(residuals), weight, correlation
 
 
-def _standard_uncertainties(J: Values, e: Values, felt: Felt) -> Values:
+def _standard_uncertainties(J: Values, e: Values, sensed: SensorSignals) -> Values:
     """Return the standard uncertainties of offset and drift, by blocks of some seconds."""
     R = np.asarray(np.linalg.qr(J, mode="r"))
     inverse = np.linalg.lstsq(R, np.eye(2), rcond=None)[0]
     found: Values = np.linalg.norm(inverse, axis=1) * np.sqrt(np.mean(e**2))
     for length in BLOCKS_S:
-        found = np.maximum(found, _by_blocks(J, e, felt, inverse @ inverse.T, length))
+        found = np.maximum(found, _by_blocks(J, e, sensed, inverse @ inverse.T, length))
     return found
 
 
-def _by_blocks(J: Values, e: Values, felt: Felt, covariance: Values, length: float) -> Values:
-    """Return the standard uncertainties that blocks of a length (s) say against each other."""
-    channels = felt.readings.shape[1]
-    starts = np.flatnonzero(np.diff(np.floor(felt.time / length), prepend=-1.0))
-    scores = np.add.reduceat((J * e[:, None]).reshape(channels, len(felt.time), 2).sum(axis=0), starts)
-    told = np.add.reduceat((J**2).reshape(channels, len(felt.time), 2).sum(axis=0), starts)
+def _by_blocks(J: Values, e: Values, sensed: SensorSignals, covariance: Values, length: float) -> Values:
+    """Return the standard uncertainties from the scatter between blocks of a length (s)."""
+    channels = sensed.readings.shape[1]
+    starts = np.flatnonzero(np.diff(np.floor(sensed.time / length), prepend=-1.0))
+    scores = np.add.reduceat((J * e[:, None]).reshape(channels, len(sensed.time), 2).sum(axis=0), starts)
+    information = np.add.reduceat((J**2).reshape(channels, len(sensed.time), 2).sum(axis=0), starts)
     spread = np.linalg.norm(covariance @ scores.T, axis=1)
-    blocks = told.sum(axis=0) ** 2 / np.sum(told**2, axis=0)
-    enlarged: Values = spread * np.sqrt(blocks / np.maximum(blocks - 2.0, 1.0 / FEWEST_BLOCKS))
-    return enlarged
+    blocks = information.sum(axis=0) ** 2 / np.sum(information**2, axis=0)
+    return np.asarray(spread * np.sqrt(blocks / np.maximum(blocks - 2.0, 1.0 / FEWEST_BLOCKS)))

@@ -24,7 +24,7 @@ import numpy as np
 
 from pipeline.io.channel_table import ChannelTable
 from pipeline.io.clock_alignment import fit_clocks
-from pipeline.io.table_log import seconds_of
+from pipeline.io.encoder_log import seconds_of
 from pipeline.io.units import TRIADS
 from pipeline.records import Note
 

@@ -1,22 +1,32 @@
-"""Samples that neither noise nor the table's motion can have made: a bus that glitched, a knock at the bench.
+"""Samples that neither noise nor the table's motion explains: bus glitches, shocks, and disturbed rests.
 
-First what the log explains is taken off each channel, by least squares: of a specific force a constant and gravity in
-the body (by attitude, or cosine and sine of the angle), of an angular rate a constant and the table's rate. A sample is
-disturbed where what is left leaves the median m of the samples around it by
+**Disturbances.** First what the log explains is removed from each channel by least squares: from a specific force a
+constant and gravity in the body (by attitude, or cosine and sine of the angle), from an angular rate a constant and the
+table's rate. A sample is disturbed where the residual x departs from the median m of the samples around it by
 
     |x - m| > 10 s + 1.5 L
 
 where s is the larger of the noise of neighbours (``median |x[n+1] - x[n]| / 0.9539``) and of the scatter about m
-(``1.4826 median |x - m|``; at rest that of most rests), and L is what a delay, a clock or a lever arm can do within
-half a second: for a gyroscope the variation of the table's rate; for an accelerometer g times the angle turned in
-0.2 s, and what 0.1 m of lever arm adds. So effects that shift a reading in time disturb nothing. The samples around are
-those of the same rest, up to 2 s on either side, or half a second of motion.
+(``1.4826 median |x - m|``; at rest that of most rests), and L is the largest change by a delay, a clock error or a
+lever arm within half a second: for a gyroscope the variation of the table's rate; for an accelerometer g times the
+angle turned in 0.2 s, and the acceleration at a lever arm of 0.1 m. So effects that shift a reading in time are no
+disturbances. The samples around are those of the same rest, up to 2 s on either side, or half a second of motion.
+Without a table's log, the gyroscope gives the motion, and only rests are searched; of a static recording all of it.
 
-Without a log, motion is that of the gyroscope, and only rests are looked at; of a static recording all of it.
+**Disturbed rests.** Someone leant on the table, or shook it, during a part of a dwell. A rest by the table's log,
+without its first and last 0.3 s, in which a late or early sensor reads the move, is cut into pieces of at most 2 s. A
+piece is left out as a whole where
+
+    chi^2 = sum over its n samples and the 3 axes of (x - m)^2 / s^2 > 4 nu  and  > nu + 6 sqrt(2 nu) + 18
+
+with ``nu = 3 (n - 1)``, m the mean of the piece and s the median scatter of an axis over the pieces of the recording
+(half a count at least), without the sample that is farthest off, which may be a glitch. Rests by hand are tested in
+``pipeline.signal.rests``.
 """
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -33,6 +43,7 @@ if TYPE_CHECKING:
     from pipeline.records import Note, Recording
 
     Array = NDArray[np.float64]
+    Index = NDArray[np.intp]
 
 BEYOND, ALLOWED, JUMP = 10.0, 1.5, 7.0
 MEDIAN_SIZE = 1.4826
@@ -44,6 +55,14 @@ LEVER_M, STANDARD_GRAVITY = 0.1, 9.80665
 STILL_DEG = 0.05  # turned within a window that is at rest
 STILL_BY_HAND_DEG = 0.5  # as a gyroscope with noise and bias adds it up
 SAME_EVENT = 5  # samples between two that belong to one event; an event of several is widened by 2
+
+PIECE_S, SETTLING_S = 2.0, 0.3
+AT_REST_DPS = 0.02
+FEWEST = 4  # samples of a piece
+FEWEST_PIECES = 8  # by which the usual scatter is known
+RATIO = 4.0
+SIGNIFICANT, TAIL = 6.0, 18.0
+LARGEST_SHARE = 0.1  # of the pieces
 
 
 def leave_out_disturbances(
@@ -250,3 +269,83 @@ class _Motion:
         windows = [self.around(n) for n in np.linspace(0, len(values) - 1, WINDOWS).astype(int)]
         scatters = [_scatter(values[window]) for window, resting in windows if resting]
         return float(np.median(scatters)) if len(scatters) >= WINDOWS // 4 else None
+
+
+def leave_out_shaken_rests(recording: Recording, note: Callable[[str, Index, str], Note]) -> Recording:
+    """Return a recording without the pieces of its rests that were shaken, noted as ``N-SHAKEN``.
+
+    Parameters
+    ----------
+    recording : Recording
+        Others than those that log a table's rate or angle are returned as they are.
+    note : callable
+        ``ChannelTable.note`` of its file.
+    """
+    pieces = _pieces(recording)
+    if len(pieces) < FEWEST_PIECES:
+        return recording
+    found = {s: r for s in UNIT_NAMES if (r := recording.reading(s)) is not None and np.isfinite(r).all()}
+    worst: tuple[float, str] = (0.0, "")
+    shaken = np.zeros(len(pieces), bool)
+    for sensor, reading in found.items():
+        excess, scatter = _excess(reading, pieces[:, :2])
+        shaken |= excess > 0.0
+        first = int(np.argmax(excess))
+        if excess[first] > worst[0]:
+            times = recording.time[pieces[first, 0]]
+            worst = float(excess[first]), f"the {sensor} scatters {scatter[first]:.1f} times as usual at {times:.6g} s"
+    count = int(shaken.sum())
+    if count == 0 or count > max(1.0, LARGEST_SHARE * len(pieces)):
+        return recording
+    rows = np.concatenate([np.arange(a, b) for a, b in pieces[shaken, 2:]])
+    detail = f"{count} of {len(pieces)} pieces of rests left out, in which the unit was shaken or leant on; {worst[1]}"
+    return without_rows(recording, rows, note("N-SHAKEN", rows, detail))
+
+
+def _pieces(recording: Recording) -> Index:
+    """Return first sample and end of each piece of a rest, and of what goes with it: (p, 4) array."""
+    none = np.zeros((0, 4), np.intp)
+    if recording.samples < FEWEST * FEWEST_PIECES or recording.role in ("rests", "static"):
+        return none
+    if recording.table_rate is not None:
+        still = np.abs(recording.table_rate) < AT_REST_DPS
+    elif recording.table_angle is not None:
+        step = np.abs(np.diff(recording.table_angle, prepend=recording.table_angle[0]))
+        still = np.maximum(step, np.append(step[1:], 0.0)) < AT_REST_DPS * recording.interval
+    else:
+        return none
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(np.int8)))
+    size = max(FEWEST, round(PIECE_S / recording.interval))
+    out = []
+    settling = int(np.ceil(SETTLING_S / recording.interval))
+    for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        start, stop = begin + settling, end - settling
+        if stop - start < FEWEST:
+            continue
+        parts = -(-(stop - start) // size)
+        cuts = [start + (stop - start) * k // parts for k in range(parts + 1)]
+        whole = [begin, *cuts[1:-1], end]
+        spans = zip(itertools.pairwise(cuts), itertools.pairwise(whole), strict=True)
+        out += [(*inner, *outer) for inner, outer in spans if inner[1] - inner[0] >= FEWEST]
+    return np.array(out, np.intp).reshape(-1, 4)
+
+
+def _excess(reading: Array, pieces: Index) -> tuple[Array, Array]:
+    """Return by how much the chi^2 of each piece exceeds its limit, and its scatter over the usual one: (p,) arrays."""
+    count = np.diff(pieces, axis=1)[:, 0].astype(float)
+    bounds = pieces.ravel()
+    centred = np.append(reading - reading.mean(axis=0), np.zeros((1, 3)), axis=0)
+    sums, squares = (np.add.reduceat(v, bounds, axis=0)[::2] for v in (centred, centred**2))
+    left = np.maximum(squares - sums**2 / count[:, None], 0.0)
+    step = np.abs(np.diff(reading, axis=0))
+    rounding = np.where(step > 0.0, step, np.inf).min(axis=0) ** 2 / 4.0  # between two counts
+    usual = np.maximum(np.median(left / (count - 1.0)[:, None], axis=0), rounding)
+    chi = np.sum(left / usual, axis=1)
+    freedom = 3.0 * (count - 1.0)
+    most = np.maximum(RATIO * freedom, freedom + SIGNIFICANT * np.sqrt(2.0 * freedom) + TAIL)
+    for piece in np.flatnonzero(chi > most):
+        start, stop = pieces[piece]
+        own = reading[start:stop]
+        alone = np.sum((own - own.mean(axis=0)) ** 2 / usual, axis=1) * count[piece] / (count[piece] - 1.0)
+        chi[piece] -= float(alone.max())
+    return np.maximum(chi - most, 0.0), np.sqrt(chi / freedom)

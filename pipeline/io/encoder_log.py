@@ -1,24 +1,90 @@
-"""The channels of a table's log with a clock of its own, at the sensor's times."""
+"""The log of a table's encoders with a clock of its own: its signals at any time, and at the times of a sensor.
+
+    rate r and angle A of the turn     the gyroscope reads along r, the accelerometer along (cos A, sin A)
+    attitude q                         the gyroscope reads along omega, the accelerometer along R(q)^T e_z
+
+Between two samples the angle is the cubic through angle and rate at both ends, exact for constant acceleration. The
+rate is linear; it bends once where the slopes on both sides of the interval require it. The attitude is the quintic
+spline of its components.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.errors import IngestError
 from pipeline.io.channel_table import ChannelTable
-from pipeline.io.clock_alignment import fit_clocks
-from pipeline.io.table_log import interpolators, seconds_of, signals_of, unwrapped
-from pipeline.io.units import TABLE_CHANNELS
-from pipeline.records import Note
+from pipeline.io.units import ATTITUDE, TABLE_CHANNELS
+from pipeline.records import Note, conjugate_product, continuous, level_in_body
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     from pipeline.io.clock_alignment import ClockFit
 
+    Values = NDArray[np.float64]
+
 TABLE_TIME = "table_time"
+FEWEST_ROWS = 6  # the quintic spline needs them
+FINEST_S, FINEST_OF_ATTITUDE_S = 0.0025, 0.01  # steps of the grid; only the rate of one axis is known to bend
+MOST_POINTS = 1 << 18
+BENT = 8.0  # times the median change of slope
+RESTING_DPS = 0.5
+SAME_SIGN = 0.9  # correlation of the logged rate with the slope of the angle
+
+
+@dataclass(frozen=True)
+class Signals:
+    """Signals of a table's motion that sensors respond to, on a regular grid of the table's own time.
+
+    Attributes
+    ----------
+    step : float, s
+        Of the grid, which begins at the log's first sample.
+    rates : (n, m) array, deg/s
+        Signals that angular rates follow.
+    directions : (n, p) array
+        Signals that specific forces follow; p is 0 where the log does not determine them.
+    interval : float, s
+        Median of the log's own.
+    magnitude : bool
+        Whether only the magnitude of the rate is known.
+    """
+
+    step: float
+    rates: Values
+    directions: Values
+    interval: float
+    magnitude: bool = False
+
+    @property
+    def duration(self) -> float:
+        """Length of the log, s."""
+        return self.step * (len(self.rates) - 1)
+
+    @property
+    def resting(self) -> bool:
+        """Whether the table rests throughout."""
+        return bool(np.ptp(self.rates, axis=0).max() < RESTING_DPS)
+
+    def covers(self, tau: Values) -> NDArray[np.bool_]:
+        """Return which times lie within the log."""
+        return np.asarray((tau >= 0) & (tau <= self.duration))
+
+    def at(self, tau: Values) -> tuple[Values, Values, Values, Values]:
+        """Return rates, directions, and their derivatives, at any times; constant beyond the ends of the log."""
+        place = np.clip(tau / self.step, 0.0, len(self.rates) - 1.000001)
+        k = place.astype(np.intp)
+        x = (place - k)[:, None]
+        inside = self.covers(tau)[:, None]
+        r, r_next, u, u_next = self.rates[k], self.rates[k + 1], self.directions[k], self.directions[k + 1]
+        slope = inside / self.step
+        return r + (r_next - r) * x, u + (u_next - u) * x, (r_next - r) * slope, (u_next - u) * slope
 
 
 def own_rows(table: ChannelTable) -> ChannelTable:
@@ -29,47 +95,68 @@ def own_rows(table: ChannelTable) -> ChannelTable:
     return ChannelTable(table.path, time[new], values, table.source, table.line_of)
 
 
+def unwrapped(table: ChannelTable) -> ChannelTable:
+    """Return a log with a continuous table angle, where an encoder started again at 0 or 360 deg.
+
+    A table turns by less than half a turn between two samples, so a larger step is one of the counter.
+    """
+    angle = table.values.get("table_angle")
+    if angle is None or len(angle) < 2:
+        return table
+    rows = np.flatnonzero(np.abs(np.diff(angle)) > 180.0) + 1
+    if not rows.size:
+        return table
+    values = {**table.values, "table_angle": np.asarray(np.unwrap(angle, period=360.0))}
+    note = table.note("N-UNWRAP", rows, "the table's angle started again at a full turn and was counted on")
+    encodings = {c: e for c, e in table.encodings.items() if c != "table_angle"}
+    return replace(table, values=values, encodings=encodings, notes=(*table.notes, note))
+
+
 def align(sensor: ChannelTable, log: ChannelTable) -> ChannelTable:
     """Return a sensor's log with the channels of a table's log at its own times.
 
-    Rows that the table's log does not cover are left out. Where the table rests throughout, its log begins with the
-    sensor's: nothing depends on it.
-
-    Parameters
-    ----------
-    sensor : ChannelTable
-        With a gyroscope.
-    log : ChannelTable
-        With the table's angle, rate or attitude.
+    Rows that the table's log does not cover are left out. Where the table rests throughout, both logs are taken to
+    begin together, as nothing depends on it.
 
     Raises
     ------
     IngestError
-        If the two logs do not show the same motion.
+        If the two logs do not show the same motion, or the sensor's holds no gyroscope.
     """
+    from pipeline.io.clock_alignment import fit_clocks  # noqa: PLC0415  (it reads the signals of this module)
+
     log = unwrapped(log)
     t, own = seconds_of(sensor), seconds_of(log)
-    if len(own) < 6:
-        raise IngestError(f"the table's log has {len(own)} rows; at least 6 are needed", log.path, fault="no_sync")
+    if len(own) < FEWEST_ROWS:
+        raise IngestError(
+            f"the table's log has {len(own)} rows; at least {FEWEST_ROWS} are needed", log.path, fault="no_sync"
+        )
     if signals_of(log).resting:
         tau = np.clip(t, 0.0, own[-1])
         note = Note("N-SYNC", len(t), 0, 0, "the table rests throughout its log: there is no motion to align by")
-        return _merged(sensor, log, slice(0, len(t)), tau, None, [note])
+        return _merged(sensor, log, slice(0, len(t)), tau, {}, [note])
     fit = fit_clocks(sensor, log)
     tau = fit.table_time(t)
     inside = np.flatnonzero((tau >= 0) & (tau <= own[-1]))
     if inside.size < 2:
         raise IngestError("no time is covered by both logs", log.path, fault="no_sync")
     rows = slice(int(inside[0]), int(inside[-1]) + 1)
-    return _merged(sensor, log, rows, tau[rows], fit, _notes(sensor, log, rows, fit))
+    clock = {
+        "offset_s": float(log.time_ns[0] - sensor.time_ns[0]) / 1e9 + fit.offset,
+        "offset_uncertainty_s": fit.offset_uncertainty,
+        "drift_ppm": fit.drift * 1e6,
+        "drift_uncertainty_ppm": fit.drift_uncertainty * 1e6,
+        "at_s": fit.middle,
+        "correlation": fit.correlation,
+    }
+    return _merged(sensor, log, rows, tau[rows], clock, _notes(sensor, rows, fit, clock["offset_s"]))
 
 
-def _notes(sensor: ChannelTable, log: ChannelTable, rows: slice, fit: ClockFit) -> list[Note]:
-    offset_s = float(log.time_ns[0] - sensor.time_ns[0]) / 1e9 + fit.offset
+def _notes(sensor: ChannelTable, rows: slice, fit: ClockFit, offset_s: float) -> list[Note]:
     detail = (
-        f"the table's clock is {offset_s:.7g} s (+- {_short(fit.offset_uncertainty)} s, one standard deviation) ahead "
-        f"of the sensor's {fit.middle:.4g} s after its first sample and gains {fit.drift * 1e6:.3g} ppm "
-        f"(+- {_short(fit.drift_uncertainty * 1e6)}); brought together by the motion that both saw (correlation "
+        f"the table's clock is {offset_s:.7g} s (+- {_one_digit(fit.offset_uncertainty)} s, one standard deviation) "
+        f"ahead of the sensor's {fit.middle:.4g} s after its first sample and gains {fit.drift * 1e6:.3g} ppm "
+        f"(+- {_one_digit(fit.drift_uncertainty * 1e6)}); aligned by the motion in both logs (correlation "
         f"{fit.correlation:.5f})"
     )
     first, last = sensor.line_of(rows.start), sensor.line_of(rows.stop - 1)
@@ -81,27 +168,17 @@ def _notes(sensor: ChannelTable, log: ChannelTable, rows: slice, fit: ClockFit) 
     return notes
 
 
-def _short(value: float) -> str:
+def _one_digit(value: float) -> str:
     """Return a number to one digit, without a power of ten."""
     return np.format_float_positional(float(f"{value:.1g}"), trim="-")
 
 
 def _merged(  # noqa: PLR0917  (parts of one table)
-    sensor: ChannelTable, log: ChannelTable, rows: slice, tau: NDArray[np.float64], fit: ClockFit | None,
-    notes: list[Note],
-) -> ChannelTable:  # fmt: skip
+    sensor: ChannelTable, log: ChannelTable, rows: slice, tau: Values, clock: dict[str, float], notes: list[Note]
+) -> ChannelTable:
     values = {c: v[rows] for c, v in sensor.values.items() if c not in log.values and c != TABLE_TIME}
     values |= {channel: at(tau) for channel, at in interpolators(log).items()}
-    source = dict(sensor.source)
-    if fit is not None:
-        source["table_clock"] = {
-            "offset_s": float(log.time_ns[0] - sensor.time_ns[0]) / 1e9 + fit.offset,
-            "offset_uncertainty_s": fit.offset_uncertainty,
-            "drift_ppm": fit.drift * 1e6,
-            "drift_uncertainty_ppm": fit.drift_uncertainty * 1e6,
-            "at_s": fit.middle,
-            "correlation": fit.correlation,
-        }
+    source = {**sensor.source, "table_clock": clock} if clock else dict(sensor.source)
     same = log.source is sensor.source
     return ChannelTable(
         path=sensor.path,
@@ -113,3 +190,93 @@ def _merged(  # noqa: PLR0917  (parts of one table)
         notes=(*sensor.notes, *(() if same else log.notes), *notes),
         flags=None if sensor.flags is None else sensor.flags[rows],
     )
+
+
+def signals_of(log: ChannelTable) -> Signals:
+    """Return the signals of a table's motion that sensors respond to.
+
+    Raises
+    ------
+    IngestError
+        If the log holds neither rate, angle nor attitude.
+    """
+    own = seconds_of(log)
+    found = interpolators(log)
+    step = max(FINEST_OF_ATTITUDE_S if ATTITUDE[0] in found else FINEST_S, own[-1] / MOST_POINTS)
+    grid = step * np.arange(int(own[-1] / step) + 1)
+    interval = float(np.median(np.diff(own)))
+    if ATTITUDE[0] in found:
+        q = np.column_stack([found[c](grid) for c in ATTITUDE])
+        rates = np.degrees(2.0 * conjugate_product(q, np.gradient(q, step, axis=0)))  # 2 vec(conj(q) dq/dt)
+        return Signals(step, rates, level_in_body(q), interval)
+    if "table_angle" in found:
+        angle = found["table_angle"](grid)
+        rate = found["table_rate"](grid) if "table_rate" in found else np.gradient(angle, grid)
+        turn = np.radians(angle)
+        return Signals(step, rate[:, None], np.column_stack([np.cos(turn), np.sin(turn)]), interval)
+    if "table_rate" in found:
+        rate = found["table_rate"](grid)
+        return Signals(step, rate[:, None], np.zeros((len(grid), 0)), interval, magnitude=bool(rate.min() >= 0))
+    raise IngestError("the table's log holds neither rate, angle nor attitude", log.path, fault="no_sync")
+
+
+def seconds_of(table: ChannelTable) -> Values:
+    """Return the times of a log since its first sample, s."""
+    return np.asarray((table.time_ns - table.time_ns[0]) / 1e9)
+
+
+def interpolators(log: ChannelTable) -> dict[str, Callable[[Values], Values]]:
+    """Return functions of the table's own time, s, one for each channel."""
+    own, values = seconds_of(log), log.values
+    out: dict[str, Callable[[Values], Values]] = {}
+    rate = values.get("table_rate")
+    if rate is not None:
+        out["table_rate"] = lambda tau: _bent_line(own, rate, tau)
+    if "table_angle" in values:
+        angle = values["table_angle"]
+        slope = np.gradient(angle, own)
+        if rate is not None and np.ptp(rate) > 0 and np.ptp(slope) > 0 and np.corrcoef(slope, rate)[0, 1] > SAME_SIGN:
+            slope = rate  # it holds the sign as well
+        out["table_angle"] = lambda tau: _cubic(own, angle, slope, tau)
+    if ATTITUDE[0] in values:
+        from scipy.interpolate import make_interp_spline  # noqa: PLC0415  (0.3 s, needed by attitude logs alone)
+
+        spline = make_interp_spline(own, continuous(np.column_stack([values[c] for c in ATTITUDE])), k=5)
+        for index, channel in enumerate(ATTITUDE):
+            out[channel] = lambda tau, i=index: _unit(spline(np.clip(tau, 0.0, own[-1])))[:, i]  # type: ignore[misc]
+    return out
+
+
+def _unit(q: Values) -> Values:
+    return np.asarray(q / np.linalg.norm(q, axis=1, keepdims=True))
+
+
+def _bent_line(own: Values, value: Values, tau: Values) -> Values:
+    """Return linear interpolation that bends within an interval where the lines of its neighbours meet in it.
+
+    At a bend the slope changes by far more than elsewhere.
+    """
+    tau = np.clip(tau, own[0], own[-1])
+    plain: Values = np.interp(tau, own, value)
+    slope = np.diff(value) / np.diff(own)
+    if len(slope) < 3:
+        return plain
+    change = np.abs(slope[2:] - slope[:-2])
+    k = np.clip(np.searchsorted(own, tau, side="right") - 1, 1, len(own) - 3)
+    before, after = slope[k - 1], slope[k + 1]
+    left = value[k] + before * (tau - own[k])
+    right = value[k + 1] + after * (tau - own[k + 1])
+    ahead, h = value[k + 1] - value[k], own[k + 1] - own[k]
+    meet = (before * h - ahead) * (after * h - ahead) <= 0  # the slope between lies between those on either side
+    bent = meet & (change[k - 1] > BENT * np.median(change)) & (tau >= own[1]) & (tau <= own[-2])
+    return np.where(bent, np.where(before > after, np.minimum(left, right), np.maximum(left, right)), plain)
+
+
+def _cubic(own: Values, value: Values, slope: Values, tau: Values) -> Values:
+    """Return the cubic through value and slope at both ends of the interval of each time."""
+    k = np.clip(np.searchsorted(own, tau, side="right") - 1, 0, len(own) - 2)
+    h = own[k + 1] - own[k]
+    x = np.clip((tau - own[k]) / h, 0.0, 1.0)
+    rise = value[k + 1] - value[k] - slope[k] * h
+    bend = (slope[k + 1] - slope[k]) * h
+    return np.asarray(value[k] + x * slope[k] * h + x * x * (3 * rise - bend) + x**3 * (bend - 2 * rise))

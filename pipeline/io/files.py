@@ -10,6 +10,7 @@ Only the standard library is imported here: the Snakefile asks for the files of 
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +21,9 @@ if TYPE_CHECKING:
 
 SUFFIXES = (".csv", ".gcsv", ".mcap")
 FILE = "{file}"
+UNIT_NAME = re.compile(r"[A-Za-z0-9._-]+")
+LONGEST_NAME = 200  # a file name has at most 255 bytes; the longest of a unit's adds 41 (_accelerometer_unknown.yaml)
+OF_STAGES = (".failed", ".noise", ".calibration")  # <unit>.failed.json and others lie beside <unit>.json
 
 
 def recording_files(procedure: Mapping[str, Any], ingest: Mapping[str, Any], folder: Path) -> dict[str, list[Path]]:
@@ -90,3 +94,13 @@ def _owner_of_parts(recordings: Mapping[str, Mapping[str, Any]], parts: Sequence
             f"recording; this one requires {', '.join(required)}: write {FILE} where the recording's name belongs"
         )
     return required[0]
+
+
+def wrong_name(name: str) -> str:
+    """Return what is wrong with the name of a unit; nothing for a good one."""
+    if not UNIT_NAME.fullmatch(name) or name in (".", ".."):
+        return "use letters, digits, '.', '_', '-'"
+    if len(name) > LONGEST_NAME:
+        return f"has {len(name)} characters; {LONGEST_NAME} is the limit, as file names are made of it"
+    ending = next((e for e in OF_STAGES if name.endswith(e)), "")
+    return f"a name cannot end in {ending}, which marks files of another kind" if ending else ""

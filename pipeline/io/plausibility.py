@@ -1,11 +1,11 @@
-"""What cannot be true of a recording: refused, because it would calibrate without complaint.
+"""Recordings that cannot be valid are refused, as they would be calibrated without complaint.
 
-Time that does not increase or keeps another rate than is known, specific force far from gravity, readings that the
-sensor cannot give, rates that do not fit the table or the way in which gravity turns, an attitude that is no rotation.
-Each is nearly always a wrong unit or column.
+Times that do not increase or keep another rate than is known, specific force far from gravity, readings beyond the
+sensor's range, rates that contradict the table or the rotation of gravity, an attitude that is no rotation: the cause
+is nearly always a wrong unit or column.
 
-What is merely marked (gaps, clipped and stuck readings) is found in ``pipeline.io.quality_flags``; whether the unit is
-mounted as stated, in ``pipeline.preprocessing.mounting``.
+Gaps, clipped and stuck readings are flagged in ``pipeline.io.quality_flags``; the mounting of the unit is checked in
+``pipeline.preprocessing.mounting``.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 
 from pipeline.errors import IngestError
 from pipeline.io.ingest_settings import Checks
-from pipeline.io.quality_flags import mark_clipped, mark_gaps, mark_stuck
+from pipeline.io.quality_flags import flag_clipped, flag_gaps, flag_stuck
 from pipeline.io.timestamps import time_error
 from pipeline.io.units import ATTITUDE, DEGREES, TRIADS
 
@@ -38,7 +38,7 @@ TURNING_DPS = 5.0
 def examine(
     table: ChannelTable, sensor: Mapping[str, Any], checks: Checks | None = None
 ) -> tuple[NDArray[np.uint16] | None, list[Note]]:
-    """Refuse what cannot be true, mark gaps, clipped and stuck readings.
+    """Return quality flags (None where none is set) and notes; refuse what cannot be valid.
 
     Parameters
     ----------
@@ -47,15 +47,10 @@ def examine(
         Section of the unit's configuration; its full scales may be absent.
     checks : Checks, optional
 
-    Returns
-    -------
-    flags : (n,) array of uint16, or None
-        None where nothing is marked.
-    notes : list of Note
-
     Raises
     ------
     IngestError
+        With a code of ``docs/bad_inputs.md``.
     """
     checks = checks or Checks()
     _check_whole(table)
@@ -64,12 +59,12 @@ def examine(
     _check_force(table)
     _check_attitude(table)
     flags = np.zeros(len(table.time_ns), np.uint16) if table.flags is None else table.flags.copy()
-    notes = mark_gaps(table, flags, checks)
+    notes = flag_gaps(table, flags, checks)
     for name in TRIADS:
         full_scale = (sensor.get(name) or {}).get("full_scale")
         if full_scale is not None:
-            notes += mark_clipped(table, name, float(full_scale), flags)
-        notes += mark_stuck(table, name, flags)
+            notes += flag_clipped(table, name, float(full_scale), flags)
+        notes += flag_stuck(table, name, flags)
     _check_turn_rate(table)
     return (flags if flags.any() else None), notes
 
@@ -108,7 +103,7 @@ def _check_rate(table: ChannelTable, checks: Checks) -> None:
         f"{1e6 / checks.rate_hz:g} us{unit}",
         table.path,
         fault="wrong_rate",
-        hint="correct the unit of the time or the rate",
+        hint="correct ingest.csv.columns.time.unit or ingest.checks.rate_hz",
     )
 
 
@@ -138,7 +133,7 @@ def _check_force(table: ChannelTable) -> None:
         hint = "the numbers look like raw counts, which need counts_per_unit"
     raise IngestError(
         f"median specific force is {usual:.4g} g, and a log of rests and turns has about 1 g (allowed {low} to "
-        f"{high}): {hint}; correct the units in ingest.csv.columns",
+        f"{high}): {hint}; correct ingest.csv.columns.accel_x.unit (accel_y, accel_z)",
         table.path,
         fault="implausible_force",
     )
@@ -185,5 +180,5 @@ def _check_turn_rate(table: ChannelTable) -> None:
                 f"{seen}: the numbers look like {what}",
                 table.path,
                 fault="implausible_rate",
-                hint="correct the unit of gyro_x, gyro_y and gyro_z in ingest.csv.columns",
+                hint="correct ingest.csv.columns.gyro_x.unit (gyro_y, gyro_z)",
             )

@@ -1,12 +1,12 @@
-"""What has to be marked in a recording: gaps, irregular intervals, clipped and stuck readings. Nothing is filled in.
+"""Quality flags of a recording: gaps, clipped and stuck readings. Flagged samples stay, and no fit uses them.
 
-A reading is *stuck* where it stays the same for so long as noise does not allow: the share ``p`` of equal neighbours in
-windows of 64 samples says how noisy the channel is, and a run of ``L`` equal values among ``n`` is expected
+A reading is *stuck* where it stays the same for longer than noise allows. The share ``p`` of equal neighbours in
+windows of 64 samples measures how noisy the channel is; a run of ``L`` equal values among ``n`` is expected
 
     n p^(L-1)
 
-times by chance; below 10^-6 it is marked. Where the 95th percentile of ``p`` exceeds a half the channel's noise is
-below its resolution, and nothing can be said.
+times by chance, and flagged where that is below 10^-6. Where the 95th percentile of ``p`` exceeds one half, the noise
+is below the resolution and nothing can be decided.
 """
 
 from __future__ import annotations
@@ -39,14 +39,8 @@ QUIET = 0.5
 DEAD_ROWS = 1000
 
 
-def mark_gaps(table: ChannelTable, flags: NDArray[np.uint16], checks: Checks) -> list[Note]:
-    """Mark gaps, refuse a recording that lost too much time in them, note irregular intervals.
-
-    Raises
-    ------
-    IngestError
-        If more time is missing than ``checks.missing_time`` allows.
-    """
+def flag_gaps(table: ChannelTable, flags: NDArray[np.uint16], checks: Checks) -> list[Note]:
+    """Flag gaps and note irregular intervals; refuse more missing time than ``checks.missing_time`` allows."""
     steps = np.diff(table.time_ns)
     usual = float(np.median(steps))
     limit = GAP_INTERVALS * usual
@@ -82,14 +76,8 @@ def _irregular(table: ChannelTable, steps: NDArray[np.int64], usual: float) -> l
     return [table.note("N-JITTER", np.array([0, len(table.time_ns) - 1]), detail)]
 
 
-def mark_clipped(table: ChannelTable, sensor: str, full_scale: float, flags: NDArray[np.uint16]) -> list[Note]:
-    """Mark readings at full scale.
-
-    Raises
-    ------
-    IngestError
-        If one lies far beyond it.
-    """
+def flag_clipped(table: ChannelTable, sensor: str, full_scale: float, flags: NDArray[np.uint16]) -> list[Note]:
+    """Flag readings at full scale, g or deg/s; refuse those far beyond it."""
     notes = []
     for channel in TRIADS[sensor]:
         if channel not in table.values:
@@ -104,8 +92,8 @@ def mark_clipped(table: ChannelTable, sensor: str, full_scale: float, flags: NDA
             row = int(np.argmax(size > FULL_SCALE_MARGIN * full_scale))
             raise IngestError(
                 f"{channel} is {values[row]:.6g} {UNIT_NAMES[sensor]} at {table.time_ns[row] / 1e9:.9g} "
-                f"s, beyond {FULL_SCALE_MARGIN} times the full scale of {full_scale:g}; correct the column's unit or "
-                f"sensor.{sensor}.full_scale",
+                f"s, beyond {FULL_SCALE_MARGIN} times the full scale of {full_scale:g}; correct "
+                f"ingest.csv.columns.{channel}.unit or sensor.{sensor}.full_scale",
                 table.place(row),
                 fault="beyond_full_scale",
             )
@@ -131,13 +119,10 @@ def _at_rail(size: NDArray[np.float64], full_scale: float, count: float) -> NDAr
     return np.asarray(clipped)
 
 
-def mark_stuck(table: ChannelTable, sensor: str, flags: NDArray[np.uint16]) -> list[Note]:
-    """Mark readings that stay the same for longer than the channel's own noise allows.
+def flag_stuck(table: ChannelTable, sensor: str, flags: NDArray[np.uint16]) -> list[Note]:
+    """Flag readings that stay the same for longer than the channel's own noise allows.
 
-    Raises
-    ------
-    IngestError
-        If an axis never changes, or stays for half of the rows, while the others of its sensor do.
+    An axis that never changes, or stays for half of the rows while the others of its sensor change, is refused.
     """
     neighbours = {c: v[1:] == v[:-1] for c in TRIADS[sensor] if (v := table.values.get(c)) is not None}
     notes = []
@@ -154,7 +139,7 @@ def mark_stuck(table: ChannelTable, sensor: str, flags: NDArray[np.uint16]) -> l
                 fault="stuck",
                 hint="is the column right, and the sensor's axis alive?",
             )
-        rows = stuck_rows(same, share)
+        rows = _stuck_rows(same, share)
         rows = rows[(flags[rows] & CLIPPED) == 0]
         if rows.size >= len(same) / 2 and others and all(others):
             raise IngestError(
@@ -187,7 +172,7 @@ def equal_share(same: NDArray[np.bool_]) -> float:
     return float(np.interp(place, np.arange(partial.size), np.sort(partial)))
 
 
-def stuck_rows(same: NDArray[np.bool_], share: float) -> NDArray[np.intp]:
+def _stuck_rows(same: NDArray[np.bool_], share: float) -> NDArray[np.intp]:
     """Return the rows in runs of equal values that are longer than chance allows."""
     if share > QUIET:
         return np.zeros(0, np.intp)

@@ -16,12 +16,11 @@ import numpy as np
 
 from pipeline.errors import IngestError, MissingInputError
 from pipeline.io.axes import STRAIGHT, axis_maps, to_body_axes
-from pipeline.io.disturbances import leave_out_disturbances
+from pipeline.io.disturbances import leave_out_disturbances, leave_out_shaken_rests
+from pipeline.io.encoder_log import unwrapped
 from pipeline.io.files import candidate_files, recording_files
 from pipeline.io.ingest_settings import checks_of
 from pipeline.io.plausibility import examine
-from pipeline.io.shaken_rests import leave_out_shaken_rests
-from pipeline.io.table_log import unwrapped
 from pipeline.io.units import ATTITUDE, TABLE_CHANNELS, TRIADS
 from pipeline.records import Note, Recording, rate_of_attitude
 

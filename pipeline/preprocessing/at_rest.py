@@ -262,7 +262,7 @@ def _check_copies(recording: Recording) -> None:
                         recording,
                         "copied_axis",
                         f"{names[1]} is {what} of {names[0]} in {same.mean():.0%} of the rows in which it changes",
-                        "correct the columns in the ingest profile",
+                        f"correct ingest.csv.columns.{names[1]}.column",
                     )
 
 

@@ -220,7 +220,7 @@ def check_intervals(recordings: list[Recording], settings: Mapping[str, Any]) ->
                     "reference_time",
                     f"{column(recording, 'time', settings)} looks like {what}: the interval between samples is "
                     f"{usual[recording.name]:.6g} s, and {middle:.6g} s in the unit's other recordings",
-                    "correct the unit of the time in the ingest profile",
+                    "correct ingest.csv.columns.time.unit",
                 )
 
 
@@ -305,13 +305,15 @@ def _refuse_rate(
         _refuse_time(recording, settings, ratio, "the table's rate sums up to")
     name = column(recording, "table_rate", settings)
     what = next((w for f, w in UNITS if ratio.near(f)), f"is {ratio.value:.4g} times what it should be")
+    keys = "ingest.csv.columns.table_rate.unit"
     if gyro_agrees and what.startswith("looks"):
+        keys += " and those of gyro_x, gyro_y, gyro_z"
         name, what = f"{name} and {column(recording, 'gyroscope', settings)}", what.replace("looks", "look", 1)
     raise refusal(
         recording,
         "reference_scale",
         f"{name} {what}: over {_whole(recording)} the rate sums up to {ratio.value:.4g} times the angle by {against}",
-        "correct the unit in the ingest profile",
+        f"correct {keys}",
     )
 
 
@@ -324,7 +326,7 @@ def _refuse_angle(recording: Recording, settings: Mapping[str, Any], factor: flo
         recording,
         "reference_scale",
         f"{name} {what}: over {_whole(recording)} it turns {factor:.4g} times as far as {against} says",
-        "correct the unit in the ingest profile",
+        "correct ingest.csv.columns.table_angle.unit",
     )
 
 
@@ -335,5 +337,5 @@ def _refuse_time(recording: Recording, settings: Mapping[str, Any], ratio: Ratio
         "reference_time",
         f"{column(recording, 'time', settings)} looks like {what}: {seen} {ratio.value:.4g} times the angle that the "
         f"table turned over {_whole(recording)}",
-        "correct the unit of the time in the ingest profile",
+        "correct ingest.csv.columns.time.unit",
     )

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import ConfigurationError, MissingInputError
 from pipeline.files import CONFIGS
-from pipeline.io.unit_name import wrong_name
+from pipeline.io.files import wrong_name
 from pipeline.io.yaml_file import read_yaml
 from pipeline.simulation.procedures import ONE_RECORDING, TABLE_PROCEDURES, Course
 from pipeline.simulation.table_logs import table_log_of

@@ -449,7 +449,7 @@ def cases() -> dict[str, Case]:
         "41 unlike": Case(
             {FILE: whole, "table.csv": b"tau_s,angle_deg\n" + b"".join(b"%d,%d\n" % (i, i * i) for i in range(60))},
             "no_sync",
-            "does not show the motion that the gyroscope saw",
+            "does not show the motion that the gyroscope read",
         ),
         "43": one(whole, fault="changed", says="the file changed while it was read"),
         "44": Case(

@@ -9,8 +9,7 @@ import pytest
 from bench_session import CONTINUOUS, SIZE, STOP_AND_GO, Session, record, values_of
 
 from pipeline.estimation.accelerometer import nonlinear_least_squares, reference_least_squares
-from pipeline.io.disturbances import leave_out_disturbances
-from pipeline.io.shaken_rests import leave_out_shaken_rests
+from pipeline.io.disturbances import leave_out_disturbances, leave_out_shaken_rests
 from pipeline.records import Note, Recording
 
 SETTINGS = {

@@ -11,9 +11,9 @@ import pytest
 
 from pipeline.errors import InputError
 from pipeline.io.channel_table import ChannelTable
+from pipeline.io.encoder_log import unwrapped
 from pipeline.io.ingest_settings import Checks
 from pipeline.io.read import to_recording
-from pipeline.io.table_log import unwrapped
 from pipeline.records import rate_of_attitude
 from pipeline.signal.segments import cut
 from pipeline.simulation.campaign import course_of, simulate_unit
