@@ -62,7 +62,7 @@ def load_calibration(path: str | Path, python_effects: Sequence[str | Path] = ()
     InputError
         If the file does not exist, is no calibration, or is the record of a failed unit.
     ConfigurationError
-        If a sensor's effect is one in Python whose file is not given.
+        If an effect is not known, or is one in Python whose file is not given.
     """
     from pipeline.model.compensation import load  # noqa: PLC0415  (numpy is imported only where it is needed)
 

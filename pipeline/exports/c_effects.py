@@ -1,6 +1,6 @@
 """What becomes of each effect in ``calibration.h``: C expressions, sorted by what they depend on.
 
-The header does what ``pipeline.model.compensation_stream`` does with one sample, in the same order, so that double
+The header does what ``pipeline.model.compensation`` does with one sample, in the same order, so that double
 precision without fused operations gives the same last bit where no function of the C library is called. Effects of time
 and temperature alone (``steady``) are taken off once; those of the motion (``moving``) by fixed point where a sensor's
 effects depend, directly or through the other sensor, on what they change (``in_turn``).
@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from pipeline.model.compensation import SMOOTHING_S
-from pipeline.model.compensation_stream import OF_THE_PAST, OF_THE_ROOM
+from pipeline.model.compensation import OF_THE_PAST, OF_THE_ROOM
 from pipeline.model.effects import effect_of, owner_of
 from pipeline.model.effects.base import REFERENCE_TEMPERATURE, Owner
 from pipeline.model.formula import c_number

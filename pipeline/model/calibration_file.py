@@ -1,19 +1,19 @@
-"""``calibrations/<unit>.json`` read and checked, so that what is applied to a log is what was fitted.
+"""``calibrations/<unit>.json`` read and checked before it is applied to a log.
 
-A file may have been changed by hand, cut, or written by another version. Every fault is an ``InputError`` that names
-the file, the key and what was expected there.
+The file may have been edited, cut, or written by another version. Every fault is an ``InputError`` that names the file,
+the key, its value and what was expected.
 """
 
 from __future__ import annotations
 
 import json
-import math
-import stat
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from pipeline.errors import ConfigurationError, InputError, MissingInputError
+from pipeline.io.file_access import not_regular
 from pipeline.model.effects import effect_of
 from pipeline.records import SENSOR_UNITS, SENSORS, FittedEffect, SensorCalibration
 
@@ -27,13 +27,62 @@ LARGEST_FACTOR = 1000.0
 # Two axes 1 deg apart have a condition of 2 / sin(1 deg) = 115; a sensor's axes are 90 deg apart within some degrees.
 LARGEST_CONDITION = 100.0
 
+_Three = Field(min_length=3, max_length=3)
+_Vector = Annotated[list[float], _Three]
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(strict=True, allow_inf_nan=False)
+
+
+class _Parameter(_Model):
+    value: float
+    unit: str | None = None
+
+
+class _Effect(_Model):
+    model_config = ConfigDict(extra="forbid")
+
+    name: str
+    parameters: dict[str, _Parameter]
+    definition: dict[str, Any] | None = None
+
+
+class _Covariance(_Model):
+    parameters: list[str]
+    values: list[list[float]]
+
+
+class _Stage(_Model):
+    model_config = ConfigDict(extra="forbid")
+
+    name: str
+    parameters: dict[str, Any]
+    residual_rms: float | None = None
+    correction: dict[str, Any] | None = None
+    details: dict[str, Any] = {}
+
+
+class _Sensor(_Model):
+    unit: str
+    bias: _Vector
+    matrix: Annotated[list[_Vector], _Three]
+    covariance: _Covariance
+    effects: list[_Effect]
+    stages: list[_Stage]
+    converged: bool
+    degrees_of_freedom: float | None
+    effective_degrees_of_freedom: list[float | None] | None = None
+
+
+class _Document(_Model):
+    status: Literal["ok"]
+    accelerometer: _Sensor | None
+    gyroscope: _Sensor | None
+
 
 def read_calibration(file: Path) -> dict[str, Any]:
     """Return the document of a calibrated unit.
-
-    Parameters
-    ----------
-    file : Path
 
     Raises
     ------
@@ -41,13 +90,11 @@ def read_calibration(file: Path) -> dict[str, Any]:
         If the file does not exist.
     InputError
         If it is no file, no JSON, holds a key twice or a number that is not finite, is of another schema version, is
-        the record of a failed unit, or holds no calibrated sensor.
+        the record of a failed unit, holds no calibrated sensor, or a key has not the expected value.
     """
     try:
-        mode = file.stat().st_mode
-        if not stat.S_ISREG(mode):
-            kind = "a directory" if stat.S_ISDIR(mode) else "a pipe or a device"
-            _refuse(file, f"this is {kind}; expected a file calibrations/<unit>.json")
+        if other := not_regular(file):
+            _refuse(file, f"this {other}")
         document = json.loads(
             file.read_text(encoding="utf-8"), object_pairs_hook=_without_repeats, parse_constant=_not_finite
         )
@@ -65,11 +112,10 @@ def read_calibration(file: Path) -> dict[str, Any]:
         told = document.get("error")
         cause = told.get("message", "unknown") if isinstance(told, dict) else "unknown"
         _refuse(file, f"unit {document.get('unit')} failed and has no calibration; cause: {cause}")
-    if document["status"] != "ok":
-        _refuse(file, f'status is {document["status"]!r}; expected "ok" or "failed"')
-    missing = [sensor for sensor in SENSORS if sensor not in document]
-    if missing:
-        _refuse(file, f"{missing[0]} is missing; expected an object, or null where it is not calibrated")
+    try:
+        _Document.model_validate(document)
+    except ValidationError as error:
+        _refuse_first(file, dict(error.errors()[0]))
     if all(document[sensor] is None for sensor in SENSORS):
         reasons = document.get("not_calibrated")
         told = "; ".join(map(str, reasons.values())) if isinstance(reasons, dict) and reasons else "not stated"
@@ -77,46 +123,40 @@ def read_calibration(file: Path) -> dict[str, Any]:
     return document
 
 
-def sensor_of(document: dict[str, Any], sensor: str, file: Path) -> SensorCalibration | None:
-    """Return the calibration of one sensor; None where it is not calibrated.
+def _refuse_first(file: Path, error: dict[str, Any]) -> NoReturn:
+    """Refuse the first key that is not as declared above."""
+    key = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in error["loc"]).lstrip(".")
+    if error["type"] == "missing":
+        _refuse(file, f"{key} is missing")
+    text = json.dumps(error["input"], default=str)
+    _refuse(file, f"{key} is {text if len(text) <= 80 else f'{text[:77]}...'}; {error['msg']}")
 
-    Parameters
-    ----------
-    document : dict
-        Of ``read_calibration``.
-    sensor : str
-    file : Path
-        For messages.
+
+def sensor_of(document: dict[str, Any], sensor: str, file: Path) -> SensorCalibration | None:
+    """Return the calibration of one sensor of ``read_calibration``; None where it is not calibrated.
 
     Raises
     ------
     InputError
-        If unit, bias, matrix, covariance or an effect is not what it should be.
+        If unit, matrix, covariance or an effect is not what it should be.
     ConfigurationError
         If an effect is not known.
     """
     part = document[sensor]
     if part is None:
         return None
-    if not isinstance(part, dict):
-        _refuse(file, f"{sensor} is {_shown(part)}; expected an object or null")
-    if part.get("unit") != SENSOR_UNITS[sensor]:
-        _refuse(file, f"{sensor}.unit is {_shown(part.get('unit'))}; expected {SENSOR_UNITS[sensor]!r}")
-    _numbers(file, f"{sensor}.bias", part.get("bias"), (3,))
-    matrix = _numbers(file, f"{sensor}.matrix", part.get("matrix"), (3, 3))
-    _check_matrix(file, f"{sensor}.matrix", matrix)
-    covariance = part.get("covariance")
-    if not isinstance(covariance, dict) or not isinstance(covariance.get("parameters"), list):
-        _refuse(file, f"{sensor}.covariance is {_shown(covariance)}; expected an object with parameters and values")
-    size = len(covariance["parameters"])
-    _numbers(file, f"{sensor}.covariance.values", covariance.get("values"), (size, size) if size else (0,))
-    _check_effects(file, f"{sensor}.effects", sensor, part.get("effects"))
-    try:
-        return SensorCalibration.from_json(sensor, part)
-    except KeyError as error:
-        _refuse(file, f"{sensor}.{error.args[0]} is missing")
-    except (TypeError, ValueError, AttributeError) as error:
-        _refuse(file, f"{sensor}: this is no calibration of a unit: {error}")
+    if part["unit"] != SENSOR_UNITS[sensor]:
+        _refuse(file, f"{sensor}.unit is {part['unit']!r}; expected {SENSOR_UNITS[sensor]!r}")
+    _check_matrix(file, f"{sensor}.matrix", np.array(part["matrix"], float))
+    size, rows = len(part["covariance"]["parameters"]), part["covariance"]["values"]
+    if [len(row) for row in rows] != [size] * size:
+        _refuse(file, f"{sensor}.covariance.values is not {size} x {size}, as its parameters say")
+    names = [entry["name"] for entry in part["effects"]]
+    for i, entry in enumerate(part["effects"]):
+        if entry["name"] in names[:i]:
+            _refuse(file, f"{sensor}.effects[{i}] is {entry['name']} a second time; expected each effect once")
+        _check_effect(file, f"{sensor}.effects[{i}]", sensor, entry)
+    return SensorCalibration.from_json(sensor, part)
 
 
 def _check_matrix(file: Path, key: str, matrix: np.ndarray) -> None:
@@ -132,59 +172,20 @@ def _check_matrix(file: Path, key: str, matrix: np.ndarray) -> None:
         )
 
 
-def _check_effects(file: Path, key: str, sensor: str, effects: object) -> None:
-    if not isinstance(effects, list):
-        _refuse(file, f"{key} is {_shown(effects)}; expected a list")
-    for i, entry in enumerate(effects):
-        where = f"{key}[{i}]"
-        if not isinstance(entry, dict) or not isinstance(entry.get("name"), str):
-            _refuse(file, f"{where} is {_shown(entry)}; expected an object with name and parameters")
-        if entry["name"] in [before["name"] for before in effects[:i]]:
-            _refuse(file, f"{where} is {entry['name']} a second time; expected each effect once")
-        _check_effect(file, where, sensor, entry)
-
-
 def _check_effect(file: Path, where: str, sensor: str, entry: dict[str, Any]) -> None:
-    name, parameters, definition = entry["name"], entry.get("parameters"), entry.get("definition")
-    if set(entry) - {"name", "parameters", "definition"} or not isinstance(definition, dict | None):
-        _refuse(file, f"{where} ({name}) has the keys {', '.join(entry)}; expected name, parameters, definition")
-    if not isinstance(parameters, dict) or not all(isinstance(p, dict) for p in parameters.values()):
-        _refuse(file, f"{where}.parameters ({name}) is {_shown(parameters)}; expected an object of objects")
+    name, parameters = entry["name"], entry["parameters"]
     try:
-        effect = effect_of(FittedEffect(name, parameters, definition))
+        effect = effect_of(FittedEffect(name, parameters, entry.get("definition")))
     except ConfigurationError as error:
         raise ConfigurationError(f"{where}: {error.message}", str(file)) from None
     known = effect.parameters(sensor) if sensor in effect.sensors else ()
     if list(parameters) != [p.name for p in known]:
         listed = ", ".join(p.name for p in known) or f"none: it is no effect of the {sensor}"
         _refuse(file, f"{where}.parameters ({name}) are {', '.join(parameters) or 'none'}; expected {listed}")
-    for symbol, unit in ((p.name, p.unit) for p in known):
-        at = f"{where}.parameters.{symbol}"
-        _numbers(file, f"{at}.value ({name})", parameters[symbol].get("value"), ())
-        stated = parameters[symbol].get("unit")
-        if stated not in ("", unit):  # empty: not stated
-            _refuse(file, f"{at}.unit ({name}) is {_shown(stated)}; expected {unit!r}")
-
-
-def _numbers(file: Path, key: str, value: object, shape: tuple[int, ...]) -> np.ndarray:
-    """Return finite numbers of a shape; a bool or a text that reads as a number is none."""
-    expected = "a finite number" if not shape else f"{' x '.join(map(str, shape))} finite numbers"
-    if not _is_nested(value, shape):
-        _refuse(file, f"{key} is {_shown(value)}; expected {expected}")
-    return np.array(value, float)
-
-
-def _is_nested(value: object, shape: tuple[int, ...]) -> bool:
-    if not shape:
-        return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-    return isinstance(value, list) and len(value) == shape[0] and all(_is_nested(v, shape[1:]) for v in value)
-
-
-def _shown(value: object) -> str:
-    if value is None:
-        return "missing or null"
-    text = json.dumps(value, default=str)
-    return text if len(text) <= 80 else f"{text[:77]}..."
+    for p in known:
+        stated = parameters[p.name].get("unit")
+        if stated not in {"", p.unit}:  # empty: not stated
+            _refuse(file, f"{where}.parameters.{p.name}.unit ({name}) is {stated!r}; expected {p.unit!r}")
 
 
 def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -1,31 +1,231 @@
 """A unit's calibration as an object that compensates arrays, logs and streams.
 
-    truth = matrix @ (reading - bias - sum of effects(truth))        (solved in ``pipeline.model.inversion``)
+    truth = matrix @ (reading - bias - sum of effects(truth))
 
-Effects look at the other signals of the same log, calibrated too. Everything is causal, so that a log in one piece, the
-same log in blocks and the samples of a running sensor one by one give the same numbers.
+Everything is causal and each sample is computed by itself, so that a log in one piece, in blocks, or sample by sample
+gives the same numbers to the last bit. Effects of the time and the temperature alone are subtracted once, first.
+Sensors whose effects depend on what they change are solved by fixed point (``pipeline.model.inversion``). What a sample
+needs of the one before it, such as the rate for an angular acceleration, is that one's value of the same iteration. The
+effects of a sensor that depend on the other sensor's truth alone are subtracted once, last.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
-from pipeline.model.calibration_file import read_calibration, sensor_of
-from pipeline.model.compensation_stream import Compensated, CompensationStream
+import numpy as np
+
+from pipeline.errors import InputError
 from pipeline.model.effects import register
-from pipeline.model.inversion import compensate
+from pipeline.model.fading_line import FadingLine
+from pipeline.model.inversion import Part, sensor_effects, solve, without_effects
+from pipeline.model.log_motion import SIGNALS, LogEnd, fields_used, log_motion
 from pipeline.records import SENSORS
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
-    from pipeline.records import SensorCalibration
+    from numpy.typing import NDArray
 
-__all__ = ["Compensated", "Compensation", "CompensationStream", "compensate", "load"]
+    from pipeline.model.inversion import Truths
+    from pipeline.records import Motion, SensorCalibration
 
 SMOOTHING_S = 3.0
+BLOCK = 8192  # samples that are computed at once: their arrays stay in the processor's cache
+OF_THE_ROOM = {"time", "temperature"}  # fields of a motion that do not depend on the readings
+OF_THE_PAST = {"specific_force_rate", "angular_acceleration", "direction"}
+
+
+class Compensated(NamedTuple):
+    """Specific force, g, and angular rate, deg/s, of the body; None for a sensor that was not given."""
+
+    accelerometer: NDArray[np.float64] | None
+    gyroscope: NDArray[np.float64] | None
+
+
+@dataclass(frozen=True)
+class _Steps:
+    """What is subtracted from the readings of one sensor.
+
+    Attributes
+    ----------
+    steady : Part
+        The effects that depend on the time and the temperature alone.
+    moving : Part
+        Those that depend on the truth.
+    used : set of str
+        Fields of a motion that the effects use.
+    looks_at : set of str
+        Sensors on whose truths the moving ones depend.
+    signals : dict of str to set of str
+        Effect to the signals that it needs.
+    """
+
+    steady: Part
+    moving: Part
+    used: set[str]
+    looks_at: set[str]
+    signals: dict[str, set[str]]
+
+    @classmethod
+    def of(cls, calibration: SensorCalibration) -> Self:
+        """Return the steps of a calibration."""
+        effects = sensor_effects(calibration)
+        fields = {e.name: fields_used(calibration.sensor, [e]) for e in effects}
+        signals = {name: set().union(*(SIGNALS[f] for f in used)) for name, used in fields.items()}
+        moving = [e for e in effects if fields[e.name] - OF_THE_ROOM]
+        return cls(
+            steady=Part.of(calibration, [e for e in effects if e not in moving]),
+            moving=Part.of(calibration, moving),
+            used=set().union(*fields.values()),
+            looks_at=set().union(*(signals[e.name] for e in moving)) & set(SENSORS),
+            signals=signals,
+        )
+
+
+def _circular(steps: Mapping[str, _Steps]) -> set[str]:
+    """Return the sensors whose effects depend on what they change, directly or through the other sensor."""
+    looks_at = {s: step.looks_at & {o for o in steps if steps[o].moving.effects} for s, step in steps.items()}
+    return {s for s, seen in looks_at.items() if any(other == s or s in looks_at[other] for other in seen)}
+
+
+@dataclass
+class CompensationStream:
+    """Compensation of one log, block by block.
+
+    Attributes
+    ----------
+    unit : str
+    calibrations : dict of str to SensorCalibration
+        Those of the sensors that are calibrated.
+    smoothing : float, s
+        Memory of the line through the temperature's past (``pipeline.model.fading_line``); 0 takes it as it is.
+    """
+
+    unit: str
+    calibrations: dict[str, SensorCalibration]
+    smoothing: float
+    steps: dict[str, _Steps] = field(init=False)
+    _line: FadingLine = field(init=False)
+    _ends: list[LogEnd] = field(init=False)  # of the last block, one for each iteration
+
+    def __post_init__(self) -> None:
+        """Prepare the steps, and a memory of the past."""
+        self.steps = {s: _Steps.of(c) for s, c in self.calibrations.items()}
+        self._line = FadingLine(self.smoothing or 1.0)
+        self._ends = [LogEnd()]
+
+    @property
+    def needs(self) -> set[str]:
+        """Signals that the effects need: ``accelerometer``, ``gyroscope``, ``temperature``, ``time``."""
+        return set().union(*(need for step in self.steps.values() for need in step.signals.values()))
+
+    def apply(
+        self,
+        accelerometer: Any = None,  # noqa: ANN401
+        gyroscope: Any = None,  # noqa: ANN401
+        temperature: Any = None,  # noqa: ANN401
+        time: Any = None,  # noqa: ANN401
+    ) -> Compensated:
+        """Return the calibrated readings of the next sample or block; parameters as of ``Compensation.apply``."""
+        given = {"accelerometer": accelerometer, "gyroscope": gyroscope, "temperature": temperature, "time": time}
+        arrays, single = _checked(given)
+        self._require(arrays)
+        n = len(next(iter(arrays.values())))
+        if n <= BLOCK:
+            found = self._block(_by_axis(arrays)) if n else arrays
+        else:
+            found = {s: np.empty((n, 3)) if s in self.steps else arrays[s] for s in SENSORS if s in arrays}
+            for start in range(0, n, BLOCK):
+                cut = _by_axis({name: a[start : start + BLOCK] for name, a in arrays.items()})
+                for s, truth in self._block(cut).items():
+                    if s in self.steps:
+                        found[s][start : start + BLOCK] = truth
+        kept = {s: np.ascontiguousarray(found[s]) if s in self.steps else arrays[s] for s in SENSORS if s in arrays}
+        shaped = {s: value[0] if single else value for s, value in kept.items()}
+        return Compensated(shaped.get("accelerometer"), shaped.get("gyroscope"))
+
+    def _block(self, arrays: Mapping[str, NDArray[np.float64]]) -> Truths:
+        """Return the truths of some samples."""
+        readings = {s: arrays[s] for s in SENSORS if s in arrays}
+        steps = {s: self.steps[s] for s in readings if s in self.steps}
+        used = set().union(*(p.used for p in steps.values()))
+        nothing = np.zeros_like(next(iter(readings.values()))) if used else np.zeros((0, 3))
+        clock, warmth = arrays.get("time", nothing[:, 0]), arrays.get("temperature")
+        if warmth is not None and "time" in arrays and "temperature" in used and self.smoothing > 0:
+            warmth = self._line.follow(clock, warmth)
+
+        def true_motion(truths: Truths, number: int) -> Motion:
+            force, rate = truths.get("accelerometer", nothing), truths.get("gyroscope", nothing)
+            end = self._ends[min(number, len(self._ends) - 1)]
+            return log_motion(clock, specific_force=force, angular_rate=rate, temperature=warmth, used=used, end=end)
+
+        if any(step.steady.effects for step in steps.values()):
+            room = log_motion(
+                clock, specific_force=nothing, angular_rate=nothing, temperature=warmth, used=set(), end=LogEnd()
+            )
+            readings |= {s: step.steady.take_off(readings[s], room) for s, step in steps.items()}
+        return self._solved(steps, readings, true_motion, used & OF_THE_PAST)
+
+    def _solved(
+        self, steps: dict[str, _Steps], readings: Truths, true_motion: Callable[[Truths, int], Motion], past: set[str]
+    ) -> Truths:
+        """Subtract the effects that depend on the truth, and keep the end of the block in each iteration."""
+        parts = {s: step.moving for s, step in steps.items()}
+        circular = _circular(steps)
+        once = {s: part for s, part in parts.items() if part.effects and s not in circular}
+        ends: list[LogEnd] = []
+
+        def noted(truths: Truths, number: int) -> Motion:
+            motion = true_motion(truths, number)
+            if past:
+                ends.append(self._ends[min(number, len(self._ends) - 1)].after(motion, past))
+            return motion
+
+        truths = solve({s: p if s in circular else p.without() for s, p in parts.items()}, readings, noted)
+        settled = len(ends)
+        for number in range(settled, max(settled + 1, len(self._ends)) if circular and past else settled):
+            noted(truths, number)
+        if once:
+            motion = true_motion(truths, len(self._ends)) if circular else noted(truths, 0)
+            truths |= without_effects(once, readings, motion)
+        self._ends = ends or self._ends
+        return truths
+
+    def _require(self, arrays: Mapping[str, Any]) -> None:
+        """Refuse a log that lacks what an effect needs."""
+        for sensor in set(self.steps) & set(arrays):
+            for name, signals in self.steps[sensor].signals.items():
+                missing = sorted(signals - set(arrays))
+                if missing:
+                    raise InputError(
+                        f"the {sensor} of unit {self.unit} was calibrated with the effect {name}, "
+                        f"which needs {' and '.join(missing)}: give that too, or calibrate without the effect"
+                    )
+
+
+def _by_axis(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[np.float64]]:
+    """Return signals as doubles, axis by axis in memory, as they are processed."""
+    return {name: np.asarray(array, np.float64, order="F") for name, array in arrays.items()}
+
+
+def _checked(given: dict[str, Any]) -> tuple[dict[str, NDArray[Any]], bool]:
+    """Return the signals that are given as arrays of one length, and whether it was a single sample."""
+    if given["accelerometer"] is None and given["gyroscope"] is None:
+        raise InputError("give accelerometer, gyroscope or both: there is nothing to compensate")
+    arrays = {name: np.asarray(value) for name, value in given.items() if value is not None}
+    sensor = next(s for s in SENSORS if s in arrays)
+    single = arrays[sensor].ndim == 1
+    if single:
+        arrays = {s: a[None] if s in SENSORS else np.atleast_1d(a) for s, a in arrays.items()}
+    n = len(arrays[sensor])
+    for name, array in arrays.items():
+        expected = (n, 3) if name in SENSORS else (n,)
+        if array.shape != expected:
+            raise InputError(f"{name} has the shape {array.shape}; expected {expected}, as of the {sensor}")
+    return arrays, single
 
 
 @dataclass(frozen=True)
@@ -53,7 +253,7 @@ class Compensation:
         *,
         smoothing: float = SMOOTHING_S,
     ) -> Compensated:
-        """Return the calibrated readings of a log, or of a single sample.
+        """Return the calibrated readings of a log, or of a single sample, in the shapes that were given.
 
         Parameters
         ----------
@@ -65,11 +265,6 @@ class Compensation:
             Likewise; also with it the temperature is smoothed, causally.
         smoothing : float, s
             Memory of the line through the temperature's past (``pipeline.model.fading_line``); 0 takes it as it is.
-
-        Returns
-        -------
-        Compensated
-            ``accelerometer, gyroscope``, each of the shape that was given.
 
         Raises
         ------
@@ -89,22 +284,9 @@ class Compensation:
 
 
 def load(path: str | Path, python_effects: Sequence[str | Path] = ()) -> Compensation:
-    """Read ``calibrations/<unit>.json``.
+    """Read ``calibrations/<unit>.json``; parameters and errors as of ``pipeline.load_calibration``."""
+    from pipeline.model.calibration_file import read_calibration, sensor_of  # noqa: PLC0415  (stages need no pydantic)
 
-    Parameters
-    ----------
-    path : str or Path
-    python_effects : sequence of str or Path
-        Files of the effects in Python with which it was made; those from formulas come with the calibration.
-
-    Raises
-    ------
-    InputError
-        If the file does not exist, is no calibration, or is the record of a failed unit; it names file, key and what
-        was expected (``pipeline.model.calibration_file``).
-    ConfigurationError
-        If an effect is not known, or is one in Python whose file is not given.
-    """
     if python_effects:
         from pipeline.model.effects.files import load_python_effect  # noqa: PLC0415  (only where there are any)
 
