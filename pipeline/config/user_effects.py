@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import ConfigurationError, PipelineError
+from pipeline.files import CONFIGS
 from pipeline.io.file_access import not_regular
 
 if TYPE_CHECKING:
@@ -73,9 +74,13 @@ def load_user_effects(campaign: Path, configs: Iterable[Path], python: Sequence[
             found[name], places[name] = each, str(place)
 
     folders = [campaign / "effects", *(root / "effect" for root in configs)]
-    own = campaign.resolve()
+    own, shipped = campaign.resolve(), CONFIGS / "effect"
     files = {
-        folder: [f for f in sorted(folder.glob("*.yaml")) if not _ships(f) or f.resolve().is_relative_to(own)]
+        folder: [
+            f
+            for f in sorted(folder.glob("*.yaml"))
+            if not _ships(f) or (f.resolve().is_relative_to(own) and f.resolve().parent != shipped)
+        ]
         for folder in folders
     }
     if not any(files.values()) and not python:

@@ -11,8 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from pipeline.model.compensation import SMOOTHING_S
-from pipeline.model.compensation import OF_THE_PAST, OF_THE_ROOM
+from pipeline.model.compensation import OF_THE_PAST, OF_THE_ROOM, SMOOTHING_S
 from pipeline.model.effects import effect_of, owner_of
 from pipeline.model.effects.base import REFERENCE_TEMPERATURE, Owner
 from pipeline.model.formula import c_number
