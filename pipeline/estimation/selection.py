@@ -29,8 +29,8 @@ from pipeline.estimation.gauss_markov import selection_grid
 from pipeline.estimation.generalized_least_squares import Fit, fit_best, fit_terms, starts_of
 from pipeline.estimation.observations import weighted
 from pipeline.estimation.ranking import Ranking, Score
-from pipeline.model.effect_limits import parameter_limits
 from pipeline.model.effects import catalogue, effect
+from pipeline.model.effects.base import parameter_limits
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -1,7 +1,7 @@
 """The temperature at the readings of an MCAP log.
 
 A temperature on a topic of its own is taken as it comes: a message knows those that stand before it in the file
-(``pipeline.model.fading_line``), as in a running system. Messages before the first temperature get that one.
+(``pipeline.model.exponential_regression``), as in a running system. Messages before the first temperature get that one.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pipeline.errors import IngestError
 from pipeline.io.mcap_channels import TopicDecoder, kind_of, topic_of
 from pipeline.io.mcap_reader import McapReader
 from pipeline.io.ros2_messages import TEMPERATURE
-from pipeline.model.fading_line import FadingLine
+from pipeline.model.exponential_regression import ExponentialRegression
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -48,7 +48,7 @@ class Temperatures:
 
     def __init__(self, settings: McapFormat, path: Path, readings: str | None, smoothing: float) -> None:
         self.settings, self.path, self.smoothing = settings, path, smoothing
-        self.line = FadingLine(smoothing or 1.0)
+        self.line = ExponentialRegression(smoothing or 1.0)
         mapped = [t for t, f in settings.topics.items() if "temperature" in f]
         self.topic = mapped[0] if mapped else topic_of(TEMPERATURE, settings)
         self.decoder: TopicDecoder | None = None
@@ -112,7 +112,7 @@ class Temperatures:
         origin_ns : int
         """
         if beside is not None:
-            return self.line.follow(time, beside) if self.smoothing > 0 else beside
+            return self.line.apply(time, beside) if self.smoothing > 0 else beside
         own = (self.times - origin_ns) / 1e9
         self.count += len(own)
         if len(own):
@@ -122,7 +122,7 @@ class Temperatures:
         every_value = np.concatenate([self.values, np.full(len(time), np.nan)])[order]
         of_readings = order >= len(own)
         if self.smoothing > 0:
-            found = self.line.follow(every_time, every_value)
+            found = self.line.apply(every_time, every_value)
         else:
             known = np.maximum.accumulate(np.where(of_readings, 0, np.arange(1, len(order) + 1)))
             found = np.concatenate([[self.last], every_value])[known]

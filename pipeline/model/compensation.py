@@ -4,7 +4,7 @@
 
 Everything is causal and each sample is computed by itself, so that a log in one piece, in blocks, or sample by sample
 gives the same numbers to the last bit. Effects of the time and the temperature alone are subtracted once, first.
-Sensors whose effects depend on what they change are solved by fixed point (``pipeline.model.inversion``). What a sample
+Sensors whose effects depend on what they change are solved by fixed point (``pipeline.model.measurement``). What a sample
 needs of the one before it, such as the rate for an angular acceleration, is that one's value of the same iteration. The
 effects of a sensor that depend on the other sensor's truth alone are subtracted once, last.
 """
@@ -19,8 +19,8 @@ import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.model.effects import register
-from pipeline.model.fading_line import FadingLine
-from pipeline.model.inversion import Part, sensor_effects, solve, without_effects
+from pipeline.model.exponential_regression import ExponentialRegression
+from pipeline.model.measurement import Part, sensor_effects, solve, without_effects
 from pipeline.model.log_motion import SIGNALS, LogEnd, fields_used, log_motion
 from pipeline.records import SENSORS
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.model.inversion import Truths
+    from pipeline.model.measurement import Truths
     from pipeline.records import Motion, SensorCalibration
 
 SMOOTHING_S = 3.0
@@ -101,20 +101,20 @@ class CompensationStream:
     calibrations : dict of str to SensorCalibration
         Those of the sensors that are calibrated.
     smoothing : float, s
-        Memory of the line through the temperature's past (``pipeline.model.fading_line``); 0 takes it as it is.
+        Memory of the line through the temperature's past (``pipeline.model.exponential_regression``); 0 takes it as it is.
     """
 
     unit: str
     calibrations: dict[str, SensorCalibration]
     smoothing: float
     steps: dict[str, _Steps] = field(init=False)
-    _line: FadingLine = field(init=False)
+    _line: ExponentialRegression = field(init=False)
     _ends: list[LogEnd] = field(init=False)  # of the last block, one for each iteration
 
     def __post_init__(self) -> None:
         """Prepare the steps, and a memory of the past."""
         self.steps = {s: _Steps.of(c) for s, c in self.calibrations.items()}
-        self._line = FadingLine(self.smoothing or 1.0)
+        self._line = ExponentialRegression(self.smoothing or 1.0)
         self._ends = [LogEnd()]
 
     @property
@@ -155,7 +155,7 @@ class CompensationStream:
         nothing = np.zeros_like(next(iter(readings.values()))) if used else np.zeros((0, 3))
         clock, warmth = arrays.get("time", nothing[:, 0]), arrays.get("temperature")
         if warmth is not None and "time" in arrays and "temperature" in used and self.smoothing > 0:
-            warmth = self._line.follow(clock, warmth)
+            warmth = self._line.apply(clock, warmth)
 
         def true_motion(truths: Truths, number: int) -> Motion:
             force, rate = truths.get("accelerometer", nothing), truths.get("gyroscope", nothing)
@@ -264,7 +264,7 @@ class Compensation:
         time : (n,) array or float, s since power-on, optional
             Likewise; also with it the temperature is smoothed, causally.
         smoothing : float, s
-            Memory of the line through the temperature's past (``pipeline.model.fading_line``); 0 takes it as it is.
+            Memory of the temperature's smoothing (``pipeline.model.exponential_regression``); 0: none.
 
         Raises
         ------

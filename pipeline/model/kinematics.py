@@ -26,8 +26,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import InputError
+from pipeline.model.encoder_trajectory import EncoderTrajectory
 from pipeline.model.rotation import ABOUT, attitude_matrix, turn_about_axis
-from pipeline.model.turn_log import TurnLog
 from pipeline.records import AXES, Motion, conjugate_product, continuous
 from pipeline.signal.rests import RATE_AT_REST_DPS, still_samples
 from pipeline.signal.temperature import temperature_of
@@ -139,16 +139,16 @@ def _motion_of_turn(
     assert recording.table_angle is not None  # noqa: S101
     time, angle = recording.time, recording.table_angle
     rate, vague = _rate_of(time, angle) if recording.table_rate is None else (recording.table_rate, None)
-    log = TurnLog(time, angle, rate)
+    log = EncoderTrajectory(time, angle, rate)
     if vague is not None:
-        log.followed_samples &= ~vague
+        log.valid_samples &= ~vague
     still = still_samples(time, rate)
     axis = AXES.index(recording.axis)
     return _turn(log, axis, level_at_zero(axis, recording.up), gravity_g, earth, still, temperature, offset)
 
 
 def _turn(  # noqa: PLR0917  (bound one by one for the motion at an offset)
-    log: TurnLog,
+    log: EncoderTrajectory,
     axis: int,
     home: NDArray[np.float64],
     gravity_g: float,
@@ -186,7 +186,7 @@ def _turn(  # noqa: PLR0917  (bound one by one for the motion at an offset)
         at_offset=partial(_turn, log, axis, home, gravity_g, earth, still, temperature),
         at_lag=partial(_turn, log, axis, home, gravity_g, earth, still, temperature),
         level=level,
-        reference_valid=log.followed_samples,
+        reference_valid=log.valid_samples,
     )
 
 

@@ -1,9 +1,9 @@
-"""The motion that a log's own calibrated signals tell, causally: a sample knows nothing of those after it.
+"""The motion by a log's own calibrated signals, causally: no sample depends on later ones.
 
     domega/dt[n] = (omega[n] - omega[n-1]) / (t[n] - t[n-1]),    df/dt likewise; 0 at the first sample
 
-and the temperature is ``pipeline.model.fading_line``'s. What a block leaves to the next is a ``LogEnd``, so that a log
-cut into blocks of any size gives what it gives in one piece.
+The temperature is smoothed by ``pipeline.model.exponential_regression``. A ``LogEnd`` carries the state from one block
+to the next, so that blocks of any size give the same result as the whole log.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ SIGNALS = {
 
 @dataclass(frozen=True)
 class LogEnd:
-    """What a block of a log leaves to the next: its last samples that are not missing, and its last turn."""
+    """The state at the end of a block of a log: its last samples that are not missing, and its last turn."""
 
     force: Known | None = None
     rate: Known | None = None

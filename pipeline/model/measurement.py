@@ -1,18 +1,72 @@
-"""The measurement equation in the forward direction: what a sensor with given parameters reads in a given motion."""
+"""The measurement equation of a sensor, forward and inverse.
+
+    reading = bias + K @ truth + sum of effects,             K = matrix^-1
+    truth = matrix @ (reading - bias - sum of effects(truth))
+
+The inverse is solved by fixed point, starting without the effects; each round gains about two digits, as effects are
+small. A sample that has settled is left alone, so that its result does not depend on the other samples. Only effects
+that belong to the sensor are taken off; those of a mounting, a table or one recording do not exist in another log. The
+two sensors are solved together: a gyroscope's g-sensitivity needs the specific force, an accelerometer's inner lever
+arms the angular rate.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from pipeline.model.effects import effect_of
-from pipeline.model.effects.base import truth
+from pipeline.errors import ConvergenceError
+from pipeline.model.effects import effect_of, owner_of
+from pipeline.model.effects.base import Owner, truth
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping, Sequence
+
     from numpy.typing import NDArray
 
-    from pipeline.records import Motion, SensorCalibration
+    from pipeline.model.effects.base import Effect
+    from pipeline.records import FittedEffect, Motion, SensorCalibration
+
+    Truths = dict[str, NDArray[np.float64]]
+
+ROUNDS = 60  # two digits a round: far more than 1e-13 needs
+TOLERANCE = 1e-13  # relative: some hundred roundings of a double
+OUT_OF_REACH = 1e12  # g or deg/s: far beyond any reading, the fixed point runs away
+
+
+@dataclass(frozen=True)
+class Part:
+    """What is taken off the readings of one sensor.
+
+    Attributes
+    ----------
+    calibration : SensorCalibration
+    effects : tuple of (Effect, (p,) array)
+        With their parameters.
+    K : (3, 3) array
+        Inverse of the calibration matrix.
+    """
+
+    calibration: SensorCalibration
+    effects: tuple[tuple[Effect, NDArray[np.float64]], ...]
+    K: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, calibration: SensorCalibration, effects: Iterable[FittedEffect]) -> Self:
+        """Return the part that takes off the given effects of a calibration."""
+        return cls(calibration, tuple((effect_of(e), e.values) for e in effects), inverse_of(calibration))
+
+    def without(self) -> Part:
+        """Return the part that takes off no effect."""
+        return replace(self, effects=())
+
+    def take_off(self, reading: NDArray[np.float64], motion: Motion) -> NDArray[np.float64]:
+        """Return readings without what the effects add at a motion: (n, 3) array, g or deg/s."""
+        for effect, values in self.effects:
+            reading = reading - effect.reading(self.calibration.sensor, motion, self.K, values)
+        return reading
 
 
 def predicted_reading(calibration: SensorCalibration, motion: Motion) -> NDArray[np.float64]:
@@ -23,8 +77,8 @@ def predicted_reading(calibration: SensorCalibration, motion: Motion) -> NDArray
     calibration : SensorCalibration
     motion : Motion
     """
-    K = np.asarray(np.linalg.solve(calibration.matrix, np.eye(3)), np.float64)
-    motion = felt_motion(calibration, motion)
+    K = inverse_of(calibration)
+    motion = sensed_motion(calibration, motion)
     reading = calibration.bias + truth(calibration.sensor, motion) @ K.T
     for fitted in calibration.effects:
         if not effect_of(fitted).moves:
@@ -32,8 +86,8 @@ def predicted_reading(calibration: SensorCalibration, motion: Motion) -> NDArray
     return reading
 
 
-def felt_motion(calibration: SensorCalibration, motion: Motion) -> Motion:
-    """Return the motion that the sensor felt at its time stamps, after the fitted effects of timing.
+def sensed_motion(calibration: SensorCalibration, motion: Motion) -> Motion:
+    """Return the motion that the sensor shows at its time stamps: after the fitted effects of timing.
 
     Parameters
     ----------
@@ -44,3 +98,134 @@ def felt_motion(calibration: SensorCalibration, motion: Motion) -> Motion:
     for fitted in calibration.effects:
         motion = effect_of(fitted).moved(motion, fitted.values)
     return motion
+
+
+def compensate(
+    calibration: SensorCalibration,
+    reading: NDArray[np.float64],
+    motion: Motion,
+    effects: Sequence[FittedEffect] | None = None,
+) -> NDArray[np.float64]:
+    """Return the truth that a sensor's readings tell, beside a motion that is known otherwise.
+
+    Parameters
+    ----------
+    calibration : SensorCalibration
+    reading : (n, 3) array, g or deg/s
+    motion : Motion
+        Its truth of this very sensor is not looked at: that is solved for.
+    effects : sequence of FittedEffect, optional
+        Those to take off; by default all of the calibration that belong to the sensor.
+
+    Returns
+    -------
+    (n, 3) array, same unit
+
+    Raises
+    ------
+    ConvergenceError
+        If a reading is so far out of range that the equation has no solution.
+    """
+    chosen = sensor_effects(calibration) if effects is None else effects
+
+    def motion_at(truths: Truths, _number: int) -> Motion:
+        own = truths[calibration.sensor]
+        if calibration.sensor == "accelerometer":
+            return replace(motion, specific_force=own)
+        return replace(motion, angular_rate=own)
+
+    sensor = calibration.sensor
+    return solve({sensor: Part.of(calibration, chosen)}, {sensor: reading}, motion_at)[sensor]
+
+
+def sensor_effects(calibration: SensorCalibration) -> list[FittedEffect]:
+    """Return the fitted effects that belong to the sensor itself."""
+    return [fitted for fitted in calibration.effects if owner_of(fitted) == Owner.SENSOR]
+
+
+def solve(
+    parts: Mapping[str, Part],
+    readings: Truths,
+    motion_at: Callable[[Truths, int], Motion],
+) -> Truths:
+    """Solve the measurement equation of one or both sensors.
+
+    Parameters
+    ----------
+    parts : mapping
+        Sensor to what is to be taken off; the readings of a sensor without are taken for the truth.
+    readings : dict
+        Sensor to (n, 3) array, g or deg/s.
+    motion_at : callable
+        The motion that given truths make, in a round counted from 0.
+
+    Returns
+    -------
+    dict
+        Sensor to (n, 3) array of its truth.
+
+    Raises
+    ------
+    ConvergenceError
+        If a reading is so far out of range that the equation has no solution.
+    """
+    busy = {s: part for s, part in parts.items() if part.effects}
+    truths = {s: linear_truth(parts[s].calibration, r) if s in parts else r for s, r in readings.items()}
+    if not busy:
+        return truths
+    settled = np.zeros(len(next(iter(truths.values()))), bool)
+    for number in range(ROUNDS):
+        moved = without_effects(busy, readings, motion_at(truths, number))
+        if any(np.any(np.abs(moved[s]) > OUT_OF_REACH) for s in busy):
+            break
+        if settled.any():
+            moved = {s: np.where(settled[:, None], truths[s], new) for s, new in moved.items()}
+        settled |= np.logical_and.reduce([_near(moved[s], truths[s]) for s in busy])
+        truths |= moved
+        if settled.all():
+            return truths
+    _complain(truths, readings)
+    return truths
+
+
+def without_effects(parts: Mapping[str, Part], readings: Truths, motion: Motion) -> Truths:
+    """Return ``matrix @ (reading - bias - effects(motion))`` of each of the sensors in ``parts``."""
+    return {s: linear_truth(part.calibration, part.take_off(readings[s], motion)) for s, part in parts.items()}
+
+
+def linear_truth(calibration: SensorCalibration, reading: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return ``matrix @ (reading - bias)``: (n, 3) array.
+
+    Each row's terms are added in their order, so that no rounding depends on how many samples there are.
+    """
+    rest = reading - calibration.bias
+    if len(rest) == 1:  # without the cost of arrays
+        x, y, z = rest[0].tolist()
+        return np.array([[(a * x + b * y) + c * z for a, b, c in calibration.matrix.tolist()]])
+    x, y, z = rest.T
+    truth = np.empty_like(rest)
+    for c, (along_x, along_y, along_z) in enumerate(calibration.matrix.tolist()):
+        np.add(along_x * x + along_y * y, along_z * z, out=truth[:, c])
+    return truth
+
+
+def inverse_of(calibration: SensorCalibration) -> NDArray[np.float64]:
+    """Return K, the inverse of the calibration matrix: (3, 3) array."""
+    return np.asarray(np.linalg.solve(calibration.matrix, np.eye(3)), np.float64)
+
+
+def _near(new: NDArray[np.float64], old: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which samples have not moved, relative to their size; a missing one stays missing: (n,) array."""
+    far = np.abs(new - old) > TOLERANCE * np.maximum(np.abs(new), 1.0)
+    return np.logical_not(far[:, 0] | far[:, 1] | far[:, 2])
+
+
+def _complain(truths: Truths, readings: Truths) -> None:
+    """Name the reading for which the equation has no solution: the farthest out of range."""
+    sensor = max(truths, key=lambda s: float(np.max(np.nan_to_num(np.abs(truths[s]), posinf=1e300))))
+    size = np.nan_to_num(np.abs(readings[sensor]).max(axis=1))
+    row = int(np.argmax(size))
+    raise ConvergenceError(
+        f"the fitted effects of the {sensor} cannot be taken off a reading of {size[row]:g} (sample {row + 1} of the "
+        "block): it is far outside the range that was calibrated; remove such readings from the log"
+    )

@@ -25,8 +25,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import ConfigurationError
-from pipeline.model.effect_limits import parameter_limits
 from pipeline.model.effects import effect_of
+from pipeline.model.effects.base import parameter_limits
 from pipeline.records import AXES, SENSOR_UNITS, FittedEffect
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.model.effects import effect_of
-from pipeline.model.inversion import compensate, linear_truth, sensor_effects
+from pipeline.model.measurement import compensate, linear_truth, sensor_effects
 from pipeline.model.kinematics import reference_motion
 from pipeline.records import SENSOR_UNITS, SENSORS, SensorCalibration
 from pipeline.report.chart import Band, Figure, Layer, Line, Panel, Samples, chart

@@ -42,7 +42,7 @@ from pipeline.estimation.gyroscope import response
 from pipeline.estimation.gyroscope import staged as gyroscope
 from pipeline.estimation.gyroscope.integrated_turns import turns_of
 from pipeline.estimation.turns import parts_of
-from pipeline.model.inversion import linear_truth
+from pipeline.model.measurement import linear_truth
 from pipeline.records import SENSORS, Noise
 from pipeline.signal.filters import apply_filter
 from pipeline.simulation.campaign import simulate_unit

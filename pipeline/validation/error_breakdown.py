@@ -23,8 +23,8 @@ from pipeline.errors import ConfigurationError
 from pipeline.estimation.correction import apply_correction
 from pipeline.model.effects import effect_of
 from pipeline.model.effects.base import truth
-from pipeline.model.inversion import Part, inverse_of, linear_truth, solve
 from pipeline.model.log_motion import LogEnd, fields_used, log_motion
+from pipeline.model.measurement import Part, inverse_of, linear_truth, solve
 from pipeline.records import Motion
 from pipeline.validation.samples import OTHER
 

@@ -40,7 +40,7 @@ import numpy as np
 from pipeline.estimation.gauss_markov import DEFAULT_TIME_S, SHARPEST_WIDTH, SHEET_WIDTH, block_covariance
 from pipeline.estimation.selection import INFLATED
 from pipeline.estimation.uncertainty_budget import DITHERED
-from pipeline.model.inversion import inverse_of
+from pipeline.model.measurement import inverse_of
 from pipeline.validation.error_breakdown import last_step
 from pipeline.validation.norm_error import mean_squares
 

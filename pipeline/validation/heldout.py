@@ -25,8 +25,8 @@ import numpy as np
 from pipeline.errors import ConfigurationError
 from pipeline.estimation.rest_means import held_out_rests, split_rests
 from pipeline.model.effects.base import truth, unit_of
-from pipeline.model.inversion import linear_truth
 from pipeline.model.kinematics import EARTH_RATE_DPS
+from pipeline.model.measurement import linear_truth
 from pipeline.validation.error_breakdown import error_breakdown, last_step
 from pipeline.validation.expected_error import expected_rms_error, linearized
 from pipeline.validation.norm_error import squared_norm_errors

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from bench_session import CONTINUOUS, SIZE, K, Session, record, values_of
 
-from pipeline.model.effect_limits import parameter_limits
 from pipeline.model.effects import built_in, catalogue, files
-from pipeline.model.effects.base import Owner
+from pipeline.model.effects.base import Owner, parameter_limits
 from pipeline.model.effects.files import built_in_files
 from pipeline.model.kinematics import reference_motion
 from pipeline.records import SENSORS, Motion

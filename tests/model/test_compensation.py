@@ -14,8 +14,8 @@ from pipeline.model.compensation import BLOCK, Compensation, load
 from pipeline.model.effects import catalogue
 from pipeline.model.effects.base import Owner
 from pipeline.model.effects.files import effect_from
-from pipeline.model.fading_line import FadingLine
-from pipeline.model.inversion import compensate
+from pipeline.model.exponential_regression import ExponentialRegression
+from pipeline.model.measurement import compensate
 from pipeline.model.measurement import predicted_reading
 from pipeline.records import SENSORS, FittedEffect, Motion, SensorCalibration
 
@@ -242,7 +242,7 @@ def test_the_line_through_the_past_is_the_literal_weighted_fit() -> None:
     rng = np.random.default_rng(4)
     time = np.cumsum(rng.uniform(0.05, 0.4, 80))
     temperature = 20.0 + rng.standard_normal(80)
-    found = FadingLine(3.0).follow(time, temperature)
+    found = ExponentialRegression(3.0).apply(time, temperature)
     for n in (1, 2, 10, 79):
         root = np.exp(0.5 * (time[: n + 1] - time[n]) / 3.0)
         design = np.stack([root, root * (time[: n + 1] - time[n])], 1)
@@ -255,7 +255,7 @@ def test_a_ramp_of_temperature_passes_without_lag_and_a_gap_is_bridged() -> None
     ramp = 20.0 + 0.3 * time
     broken = ramp.copy()
     broken[100:110] = np.nan
-    assert FadingLine(3.0).follow(time, broken) == pytest.approx(ramp, abs=1e-7)
+    assert ExponentialRegression(3.0).apply(time, broken) == pytest.approx(ramp, abs=1e-7)
 
 
 @pytest.mark.parametrize(

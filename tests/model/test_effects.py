@@ -8,7 +8,7 @@ from bench_session import K, Session, record
 
 from pipeline.errors import ConfigurationError, InputError
 from pipeline.model.effects import effect
-from pipeline.model.effects.base import turning_direction
+from pipeline.model.effects.base import parameter_limits, turning_direction
 from pipeline.model.kinematics import reference_motion
 from pipeline.model.measurement import predicted_reading
 from pipeline.records import FittedEffect, Motion, Recording, SensorCalibration
@@ -147,3 +147,15 @@ def test_effects_of_single_turn_axes_leave_other_motion_alone() -> None:
     assert isinstance(motion, Motion)
     for name in ("table_encoder_error", "table_rate_ripple", "table_axis_nonorthogonality"):
         assert not np.any(effect(name).reading("accelerometer", motion, K["accelerometer"], np.ones(6)))
+
+
+def test_parameters_of_another_unit_have_a_limit_of_their_own() -> None:
+    limits = {"warm_up": 0.01, "warm_up_time_constant": 600.0}
+    assert parameter_limits(effect("warm_up"), "accelerometer", limits).tolist() == [0.01, 0.01, 0.01, 600.0]
+    limits = {"bias_temperature_quadratic": 1e-3, "bias_temperature_quadratic_b_T2": 1e-5}
+    found = parameter_limits(effect("bias_temperature_quadratic"), "gyroscope", limits)
+    assert found.tolist() == [1e-3, 1e-5] * 3
+
+
+def test_an_effect_without_a_limit_has_none() -> None:
+    assert np.all(np.isinf(parameter_limits(effect("g_sensitivity"), "gyroscope", {})))

@@ -17,7 +17,6 @@ from bench_session import CONTINUOUS, STOP_AND_GO, K, Session, record
 from pipeline import load_calibration
 from pipeline.errors import ConfigurationError, InputError, MissingInputError
 from pipeline.estimation.generalized_least_squares import fit_joint
-from pipeline.model.effect_limits import parameter_limits
 from pipeline.model.effects import (
     built_in,
     catalogue,
@@ -27,7 +26,7 @@ from pipeline.model.effects import (
     register,
     register_user_effects,
 )
-from pipeline.model.effects.base import Layout
+from pipeline.model.effects.base import Layout, parameter_limits
 from pipeline.model.effects.files import effect_from, load_python_effect, read_effect_file
 from pipeline.model.formula import FUNCTIONS, SIGNALS
 from pipeline.model.kinematics import reference_motion

@@ -12,7 +12,7 @@ from pipeline.estimation.accelerometer import bias as accelerometer_bias
 from pipeline.estimation.accelerometer import misalignment, orthogonality
 from pipeline.estimation.accelerometer import scale_factor as accelerometer_scale_factor
 from pipeline.estimation.gyroscope import bias, cholesky_lu, orthogonality_and_misalignment, scale_factor
-from pipeline.model.inversion import linear_truth
+from pipeline.model.measurement import linear_truth
 from pipeline.records import Noise, Recording, SensorCalibration, coverage_factor
 from pipeline.signal.filters import apply_filter
 from pipeline.simulation.campaign import simulate_unit

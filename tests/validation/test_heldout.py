@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 
 from pipeline.errors import ConfigurationError
 from pipeline.model.effects import catalogue
-from pipeline.model.inversion import compensate
+from pipeline.model.measurement import compensate
 from pipeline.model.kinematics import earth_rate, reference_motion
 from pipeline.model.measurement import predicted_reading
 from pipeline.records import FittedEffect, Noise, Recording, SensorCalibration, StageResult

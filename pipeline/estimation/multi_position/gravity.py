@@ -23,7 +23,7 @@ import numpy as np
 from pipeline.estimation.multi_position.model import motion_of
 from pipeline.estimation.rest_means import rest_means
 from pipeline.model.effects import effect
-from pipeline.model.inversion import compensate
+from pipeline.model.measurement import compensate
 from pipeline.signal.filter_noise import filter_autocovariance, variance_of_mean
 from pipeline.signal.rests import Rest
 

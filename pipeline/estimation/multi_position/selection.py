@@ -23,8 +23,8 @@ from pipeline.estimation.multi_position.likelihood import NEW, beside
 from pipeline.estimation.multi_position.model import State, candidates_for
 from pipeline.estimation.ranking import Score
 from pipeline.estimation.selection import GATE_BIC, GATE_P, MOST
-from pipeline.model.effect_limits import parameter_limits
 from pipeline.model.effects import catalogue, effect
+from pipeline.model.effects.base import parameter_limits
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -286,3 +286,27 @@ def axis_parameters(symbol: str, unit: str, meaning: str) -> tuple[Parameter, ..
 def unit_of(sensor: str) -> str:
     """Return the unit of a sensor's readings."""
     return "g" if sensor == "accelerometer" else "deg/s"
+
+
+def parameter_limits(effect: Effect, sensor: str, limits: Mapping[str, float]) -> NDArray[np.float64]:
+    """Return the limit of each parameter's absolute value: (p,) array, infinite where there is none.
+
+    The limit of an effect counts for each of its parameters. Where they differ in unit, ``<effect>_<parameter>`` (its
+    name, or the part before the axis) goes before it: ``warm_up_time_constant``. An effect in one session has the
+    limits of the effect. Limits in the file of the effect count where the configuration has none of it.
+
+    Parameters
+    ----------
+    effect : Effect
+    sensor : str
+    limits : mapping of str to float
+        ``effects`` of the sensor's configuration.
+    """
+    found, own = [], effect.name.partition("@")[0]
+    if own not in limits:
+        limits = {**effect.limits(sensor), **limits}
+    for parameter in effect.parameters(sensor):
+        symbol = parameter.name.rpartition("_")[0]
+        names = (f"{own}_{parameter.name}", f"{own}_{symbol}", own)
+        found.append(next((float(limits[name]) for name in names if name in limits), np.inf))
+    return np.array(found)

@@ -14,7 +14,7 @@ from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.rest_means import split_rests
 from pipeline.io.read import read_recordings
-from pipeline.model.inversion import compensate
+from pipeline.model.measurement import compensate
 from pipeline.simulation.description import read_config
 from pipeline.validation.attitude import gravity_direction
 

@@ -1,14 +1,14 @@
-"""The temperature of a log, smoothed by what is past: a straight line with exponentially fading weights.
+"""Exponential regression: the temperature of a log, smoothed by a line with exponentially decaying weights.
 
     T(t) = a,  (a, b) = argmin sum_i exp((t_i - t) / h) (T_i - a - b (t_i - t))^2,    t_i <= t
 
-where h is the memory, s. A ramp passes without lag, and the thermometer's noise does not reach the readings. The line
-needs five sums only, taken about the start ``o`` of the stretch of time in which the sample lies, a multiple of 4 h:
+where h is the memory, s. A ramp passes without lag; the thermometer's noise is averaged. The line follows from five
+sums, taken about the start ``o`` of the stretch of time in which the sample lies, a multiple of 4 h:
 
     S_k = sum_i exp((t_i - o) / h) (t_i - o)^k,   k = 0, 1, 2;    R_k likewise with T_i - 25 degC,   k = 0, 1
 
-Each sample adds its terms in its turn, and where a stretch begins the sums are carried over to its start; so samples
-one by one, blocks and a whole log give the same numbers to the last bit.
+Each sample adds its terms in its turn; where a stretch begins, the sums are moved to its start. So single samples,
+blocks and a whole log give the same numbers to the last bit.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from pipeline.model.effects.base import REFERENCE_TEMPERATURE
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-STRETCH = 4.0  # memories; longer ones cost digits, shorter ones time
-FARTHEST = 50.0  # memories that time may go back
-DEGENERATE = 1e-15
+STRETCH = 4.0  # memories: exp(4) costs two digits of the sums; shorter stretches cost time
+FARTHEST = 50.0  # memories that time may go back: exp(50) of the sums is still far from overflow
+DEGENERATE = 1e-15  # determinant over its scale, below which a double holds no slope
 
 
 @dataclass
-class FadingLine:
-    """The fading line of a temperature log.
+class ExponentialRegression:
+    """Exponential regression of a temperature log.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class FadingLine:
     _stretch: float = field(default=float("nan"), init=False)
     _sums: tuple[float, ...] = field(default=(0.0,) * 5, init=False)
 
-    def follow(self, time: NDArray[np.float64], temperature: NDArray[np.float64]) -> NDArray[np.float64]:
+    def apply(self, time: NDArray[np.float64], temperature: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the line at each sample: (n,) array, degC; a row without a temperature (NaN) is given the line's.
 
         Raises

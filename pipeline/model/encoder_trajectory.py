@@ -1,7 +1,7 @@
-"""The trajectory of a turn between the samples of its log.
+"""The trajectory of a turn between the samples of the table's log.
 
-A table's program is made of stretches of constant angular acceleration, and its log holds angle A and rate r at times
-that know nothing of where one stretch ends. Between two samples, dt apart,
+A table's program consists of stretches of constant angular acceleration; its log samples angle A and rate r at other
+times than where the stretches end. Between two samples, dt apart,
 
     no bend inside:   dA = (r_0 + r_1) dt / 2
     a bend at s:      dr = a s + b (dt - s),   dA = r_0 dt + a s (dt - s / 2) + b (dt - s)^2 / 2
@@ -24,16 +24,16 @@ if TYPE_CHECKING:
 
     Values = NDArray[np.float64]
 
-TIGHTEST_DEG, LOOSEST_DEG = 1e-5, 1e-3
+TIGHTEST_DEG, LOOSEST_DEG = 1e-5, 1e-3  # a good encoder's resolution; 17 ug of specific force
 GENTLE_DEG, EXACT_DEG = 1e-4, 1e-6  # smooth motion, where no bend is looked for; and an interval without any
-MOVING_DPS = 0.02
-SAME_SHARE, SAME_DPS2 = 0.01, 0.1
-LAG_ROUNDING_DPS = 1e-11
-MEMORY_S = 0.3
-CORNER_DPS2 = 3.0
+MOVING_DPS = 0.02  # above the rate noise of a resting table
+SAME_SHARE, SAME_DPS2 = 0.01, 0.1  # how nearly two neighbouring intervals must agree on an acceleration
+LAG_ROUNDING_DPS = 1e-11  # some hundred roundings of a rate of 400 deg/s
+MEMORY_S = 0.3  # fifteen time constants of the slowest filter of 20 ms
+CORNER_DPS2 = 3.0  # over a filter of 20 ms: 0.06 deg/s
 
 
-class TurnLog:
+class EncoderTrajectory:
     """Angle, rate and acceleration at any time, by a log.
 
     Parameters
@@ -47,12 +47,12 @@ class TurnLog:
     ----------
     explained : (n - 1,) array of bool
         Intervals that one or two stretches of constant acceleration reproduce.
-    followed : (n - 1,) array of bool
+    valid : (n - 1,) array of bool
         Those, and intervals of smooth motion: ``dA = (r_0 + r_1) dt / 2 - (r'_1 - r'_0) dt^2 / 12`` to 1e-3 deg, or to
         what the log's own noise allows. In the others the trajectory is a guess.
-    followed_samples : (n,) array of bool
-        Samples after which such an interval comes, and before which there were none but such for 0.3 s: a filter
-        inside the sensor remembers what came before. Left out are samples at which one stretch ends.
+    valid_samples : (n,) array of bool
+        Samples with a valid interval after them and valid intervals only in the 0.3 s before them, in which a filter
+        inside the sensor settles. Samples at which one stretch ends are left out.
     acceleration : (n,) array, deg/s^2
         At the samples.
     """
@@ -71,15 +71,15 @@ class TurnLog:
         gentle &= np.abs(excess) > EXACT_DEG
         self.explained: NDArray[np.bool_] = np.logical_and(even | bent, np.logical_not(gentle))
         self.acceleration = self._at_samples(slope)
-        self.followed: NDArray[np.bool_] = self.explained | self._smooth(miss)
-        self.followed_samples = self._remembered()
+        self.valid: NDArray[np.bool_] = self.explained | self._smooth(miss)
+        self.valid_samples = self._filter_settled()
 
-    def _remembered(self) -> NDArray[np.bool_]:
-        """Return the samples whose past, as far as a sensor's filter remembers it, and next interval are followed."""
-        lost = np.concatenate([[0], np.cumsum(~self.followed)])  # intervals not followed before each sample
+    def _filter_settled(self) -> NDArray[np.bool_]:
+        """Return the samples with valid intervals after them and while a filter of the sensor settles before them."""
+        lost = np.concatenate([[0], np.cumsum(~self.valid)])  # invalid intervals before each sample
         first = np.searchsorted(self.time, self.time - MEMORY_S, side="right") - 1
         past = lost - lost[np.maximum(first, 0)] == 0
-        known: NDArray[np.bool_] = np.logical_and(past, np.append(self.followed, True))
+        known: NDArray[np.bool_] = np.logical_and(past, np.append(self.valid, True))
         known[1:-1] &= ~self._corners()
         return known
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.model.turn_log import TurnLog, nearest_slope
+from pipeline.model.encoder_trajectory import EncoderTrajectory, nearest_slope
 from pipeline.simulation.rate_table import Program, ProgramBuilder
 
 
@@ -17,10 +17,10 @@ def program() -> Program:
     return builder.build()
 
 
-def log_of(program: Program, interval: float = 0.12) -> TurnLog:
+def log_of(program: Program, interval: float = 0.12) -> EncoderTrajectory:
     time = np.arange(0.0, program.duration, interval)
     angle, rate, _, _ = program.at(time)
-    return TurnLog(time, angle, rate)
+    return EncoderTrajectory(time, angle, rate)
 
 
 def test_ramps_of_a_few_samples_are_followed_exactly_between_them(program: Program) -> None:
@@ -37,19 +37,19 @@ def test_ramps_of_a_few_samples_are_followed_exactly_between_them(program: Progr
 def test_a_step_between_two_samples_is_not_claimed_to_be_followed() -> None:
     time = np.arange(0.0, 6.0, 0.12)
     angle = np.where(time < 3.0, 0.0, 1.0)
-    log = TurnLog(time, angle, np.zeros_like(time))
-    assert np.flatnonzero(~log.followed).tolist() == [int(np.searchsorted(time, 3.0)) - 1]
+    log = EncoderTrajectory(time, angle, np.zeros_like(time))
+    assert np.flatnonzero(~log.valid).tolist() == [int(np.searchsorted(time, 3.0)) - 1]
 
 
 def test_smooth_motion_is_interpolated_to_a_hundred_thousandth_of_its_amplitude() -> None:
     time = np.arange(0.0, 20.0, 0.12)
     w = 2 * np.pi * 0.3
-    log = TurnLog(time, 40 * np.sin(w * time), 40 * w * np.cos(w * time))
+    log = EncoderTrajectory(time, 40 * np.sin(w * time), 40 * w * np.cos(w * time))
     at = time[3:-4] + 0.05
     angle, rate, _ = log.at(at)
     np.testing.assert_allclose(angle, 40 * np.sin(w * at), atol=40 * 1e-5)
     np.testing.assert_allclose(rate, 40 * w * np.cos(w * at), atol=40 * w * 1e-4)
-    assert log.followed.all()
+    assert log.valid.all()
 
 
 def test_slope_of_a_quartic_is_exact_at_uneven_times() -> None:
