@@ -4,9 +4,9 @@
 
 Everything is causal and each sample is computed by itself, so that a log in one piece, in blocks, or sample by sample
 gives the same numbers to the last bit. Effects of the time and the temperature alone are subtracted once, first.
-Sensors whose effects depend on what they change are solved by fixed point (``pipeline.model.measurement``). What a sample
-needs of the one before it, such as the rate for an angular acceleration, is that one's value of the same iteration. The
-effects of a sensor that depend on the other sensor's truth alone are subtracted once, last.
+Sensors whose effects depend on what they change are solved by fixed point (``pipeline.model.measurement``). What a
+sample needs of the one before it, such as the rate for an angular acceleration, is that one's value of the same
+iteration. The effects of a sensor that depend on the other sensor's truth alone are subtracted once, last.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ import numpy as np
 from pipeline.errors import InputError
 from pipeline.model.effects import register
 from pipeline.model.exponential_regression import ExponentialRegression
-from pipeline.model.measurement import Part, sensor_effects, solve, without_effects
 from pipeline.model.log_motion import SIGNALS, LogEnd, fields_used, log_motion
+from pipeline.model.measurement import Part, sensor_effects, solve, without_effects
 from pipeline.records import SENSORS
 
 if TYPE_CHECKING:
@@ -101,7 +101,7 @@ class CompensationStream:
     calibrations : dict of str to SensorCalibration
         Those of the sensors that are calibrated.
     smoothing : float, s
-        Memory of the line through the temperature's past (``pipeline.model.exponential_regression``); 0 takes it as it is.
+        Memory of the temperature's smoothing (``pipeline.model.exponential_regression``); 0: none.
     """
 
     unit: str

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.model.effects import effect_of
-from pipeline.model.measurement import compensate, linear_truth, sensor_effects
 from pipeline.model.kinematics import reference_motion
+from pipeline.model.measurement import compensate, linear_truth, sensor_effects
 from pipeline.records import SENSOR_UNITS, SENSORS, SensorCalibration
 from pipeline.report.chart import Band, Figure, Layer, Line, Panel, Samples, chart
 from pipeline.report.group_charts import Point, bars

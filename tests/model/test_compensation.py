@@ -15,8 +15,7 @@ from pipeline.model.effects import catalogue
 from pipeline.model.effects.base import Owner
 from pipeline.model.effects.files import effect_from
 from pipeline.model.exponential_regression import ExponentialRegression
-from pipeline.model.measurement import compensate
-from pipeline.model.measurement import predicted_reading
+from pipeline.model.measurement import compensate, predicted_reading
 from pipeline.records import SENSORS, FittedEffect, Motion, SensorCalibration
 
 SIZE = {"accelerometer": 2e-3, "gyroscope": 1e-5}

@@ -10,9 +10,8 @@ from scipy.signal import lfilter
 
 from pipeline.errors import ConfigurationError
 from pipeline.model.effects import catalogue
-from pipeline.model.measurement import compensate
 from pipeline.model.kinematics import earth_rate, reference_motion
-from pipeline.model.measurement import predicted_reading
+from pipeline.model.measurement import compensate, predicted_reading
 from pipeline.records import FittedEffect, Noise, Recording, SensorCalibration, StageResult
 from pipeline.signal.filters import apply_filter
 from pipeline.validation.heldout import validate
