@@ -21,10 +21,9 @@ from pipeline.io.ingest_settings import checks_of
 from pipeline.io.read import read_table, to_recording
 from pipeline.preprocessing.checks import check_recordings
 from pipeline.profile_detection.mcap_topics import topic_lines
-from pipeline.profile_detection.profile_text import as_yaml
-from pipeline.profile_detection.proposal import propose
+from pipeline.profile_detection.proposal import as_yaml, propose
 from pipeline.profile_detection.recording_facts import as_text, facts
-from pipeline.profile_detection.text_layout import find_shape
+from pipeline.profile_detection.text_layout import find_layout
 from pipeline.profile_detection.unit_guesses import UNKNOWN
 from pipeline.signal.segments import cut
 
@@ -32,7 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.profile_detection.proposal import Proposal
-    from pipeline.profile_detection.text_layout import Shape
+    from pipeline.profile_detection.text_layout import TextLayout
     from pipeline.records import Recording
 
 DEFAULT_PROFILE = "canonical_csv"
@@ -85,7 +84,7 @@ def main(argv: Sequence[str]) -> int:
         error = _tell(reading)
         if error is not None:
             refused.append((reading, error))
-    unknown = [shape for reading, error in refused for shape in _shapes(reading, error)]
+    unknown = [shape for reading, error in refused for shape in _layouts(reading, error)]
     if unknown:
         _tell_proposals(propose(unknown), refused[0][0].sensor, arguments.save)
     elif arguments.save:
@@ -254,7 +253,7 @@ def _is_mcap(reading: Reading) -> bool:
     return reading.files[0].suffix == ".mcap"
 
 
-def _shapes(reading: Reading, error: PipelineError) -> list[Shape]:
+def _layouts(reading: Reading, error: PipelineError) -> list[TextLayout]:
     """Return the shape of each text log that the profile does not describe."""
     if not isinstance(error, IngestError) or error.code not in ANOTHER_LAYOUT:
         return []
@@ -263,7 +262,7 @@ def _shapes(reading: Reading, error: PipelineError) -> list[Shape]:
         with file.open("rb") as stream:
             data = stream.read(LOOKED_AT_BYTES)
         try:
-            found.append(find_shape(data, str(file)))
+            found.append(find_layout(data, str(file)))
         except IngestError as none:
             print(f"{file}: {none.message}\n")
     return found

@@ -78,7 +78,6 @@ def to_body_axes(table: ChannelTable, maps: Mapping[str, Sequence[str]]) -> Chan
 
     Parameters
     ----------
-    table : ChannelTable
     maps : mapping
         Axis map of ``accelerometer`` and ``gyroscope``.
     """

@@ -127,8 +127,6 @@ def find_faults(
 
     Parameters
     ----------
-    layout : Layout
-    body : bytes
     lines : (n,) array
         The number of each line of ``body``.
     before : (int, str), optional

@@ -43,7 +43,6 @@ def write_canonical_csv(path: Path, recording: Recording, decimals: Mapping[str,
     ----------
     path : Path
         Replaced at once, never half written.
-    recording : Recording
     decimals : mapping of str to int, optional
         Header name (``accel_x_g`` ...) to digits after the point; a column that is not named keeps every bit.
     """

@@ -72,7 +72,6 @@ def leave_out_disturbances(
 
     Parameters
     ----------
-    recording : Recording
     note : callable
         ``ChannelTable.note`` of its file.
     largest_share : float

@@ -136,13 +136,8 @@ def misfits_deg(moves: Sequence[Move], scales: Sequence[float]) -> NDArray[np.fl
 
     Parameters
     ----------
-    moves : sequence of Move
     scales : sequence of float
         Candidates of ``s``, deg/s in one unit of the gyroscope.
-
-    Returns
-    -------
-    (len(moves), len(scales)) array, deg
     """
     factors = np.radians(np.asarray(scales, float))[None, :, None]
     direction = np.repeat(np.stack([m.before for m in moves])[:, None, :], len(scales), axis=1)

@@ -42,10 +42,8 @@ def examine(
 
     Parameters
     ----------
-    table : ChannelTable
     sensor : mapping
         Section of the unit's configuration; its full scales may be absent.
-    checks : Checks, optional
 
     Raises
     ------

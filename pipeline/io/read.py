@@ -148,14 +148,12 @@ def to_recording(
 
     Parameters
     ----------
-    name : str
     entry : mapping
         What the procedure says of the recording: ``role``, ``axis``, and its ``program`` where the table logs nothing.
     table : ChannelTable
         Its channels are taken out of it.
     sensor : mapping
         Section of the unit's configuration.
-    checks : Checks
     """
     if entry.get("program") and not set(TABLE_CHANNELS) & table.values.keys():
         from pipeline.io.commanded_motion import follow_program  # noqa: PLC0415  (few tables need it)

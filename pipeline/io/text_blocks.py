@@ -39,7 +39,6 @@ class TextBlocks:
     ----------
     stream : binary stream
         At the beginning of the file.
-    path : str
     keep_nul : bool
         Whether lines with NUL bytes are kept; otherwise they are refused.
     """

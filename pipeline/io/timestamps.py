@@ -76,15 +76,10 @@ def check_plausible(
 
     Parameters
     ----------
-    topic : str
     time, log_time : (n,) array of int64, ns
         Of the headers, and of the recorder.
     difference_s : float or None
         How far both may be apart, beyond a constant where the stamps do not count from 1970; None: any.
-
-    Raises
-    ------
-    IngestError
     """
     absolute = bool((np.abs(time) > SINCE_1970).any())
     strange = np.flatnonzero((time < YEAR_2000) | (time > YEAR_2100)) if absolute else np.flatnonzero(time < 0)
@@ -121,7 +116,6 @@ def in_order(
 
     Parameters
     ----------
-    topic : str
     time : (n,) array of int64, ns
     columns : sequence of (n,) array
         All that is read of the messages, for comparison.

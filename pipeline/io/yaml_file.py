@@ -66,7 +66,6 @@ def read_yaml(path: Path, largest: int = LARGEST_SIZE) -> Any:  # noqa: ANN401  
 
     Parameters
     ----------
-    path : Path
     largest : int
         The largest size, as above.
 

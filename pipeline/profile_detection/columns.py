@@ -1,34 +1,56 @@
-"""Which columns of an unknown log may hold time, readings, temperature and the table's log."""
+"""The columns of an unknown log that may hold time, readings, temperature and the table's log, by name and content."""
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.io.units import TRIADS
-from pipeline.profile_detection.column_names import axis_of, is_time, other_channel, sensor_of, words_of
+from pipeline.io.units import BRACKETS, CHANNELS, SPELLINGS, TRIADS, UNITS, unit_in_brackets
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from pipeline.profile_detection.text_layout import Shape
+    from pipeline.profile_detection.text_layout import TextLayout
+
+    Triad = tuple[int, int, int]
 
 COUNTING = 0.98  # share of steps by exactly 1
 SCATTER = 0.2  # of intervals over their median: times of arrival, not of sampling
 TEMPERATURE_RANGE = (-60.0, 130.0)
 
+WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d")
+MERGED = re.compile(r"(a|ac|acc|accl|accel|f|g|gy|gyr|gyro|w|omega|rot)([xyz])")
+AXIS_WORDS = ("x", "y", "z", "0", "1", "2", "3")
+SENSOR_WORDS = {
+    "accelerometer": {"a", "ac", "acc", "accl", "accel", "accelerometer", "acceleration", "f", "force"},
+    "gyroscope": {"g", "gy", "gyr", "gyro", "gyroscope", "w", "omega", "rotation", "rot", "angular"},
+}
+NO_SENSOR = {"mag", "magnetometer", "magnetic", "gravity", "table", "encoder", "user", "variance", "covariance", "bias"}
+TIME_FIRST = {"t", "ts", "sec", "secs", "tow", "utc", "epoch", "elapsed", "date"}
+TIME_WORDS = {"time", "timestamp", "datetime", "millis", "micros", "seconds", "ticks", "zeit", "tiempo", "temps"}
+TABLE_WORDS = {"table", "turntable", "encoder", "enc"}
+TEMPERATURE_WORDS = {"temp", "temperature", "tmp"}
+TABLE_CHANNEL_WORDS = {
+    "table_rate": {"rate", "speed", "velocity", "vel", "dps"},
+    "table_angle": {"angle", "position", "pos", "deg", "encoder", "enc"},
+}
+UNIT_ENDINGS = (
+    ("m/s^2", ("m s 2", "mps 2", "ms 2")), ("deg/s", ("dps", "deg s", "degps")),
+    ("rad/s", ("rad s", "rads", "radps", "rad")), ("degC", ("degc", "deg c", "c")), ("mg", ("mg",)), ("g", ("g",)),
+    ("s", ("s", "sec")), ("ms", ("ms", "millis")), ("us", ("us", "micros")), ("ns", ("ns",)), ("deg", ("deg",)),
+)  # fmt: skip
+
 
 @dataclass
 class Columns:
-    """Where the channels of a log may be, by index of column.
+    """The index of the column that may hold each channel of a log.
 
     Attributes
     ----------
-    shape : Shape
-    time : int or None
     counter : int or None
         A column that counts samples.
     arrival : int or None
@@ -38,53 +60,112 @@ class Columns:
     others : dict of str to int
         ``temperature``, ``table_angle`` ...
     steady : bool
-        Whether time, or what counts samples, never falls back.
-    remarks : list of str
+        Whether time, or the counter of samples, never falls back.
     """
 
-    shape: Shape
+    layout: TextLayout
     time: int | None = None
     counter: int | None = None
     arrival: int | None = None
-    triads: dict[str, tuple[int, int, int]] = field(default_factory=dict)
+    triads: dict[str, Triad] = field(default_factory=dict)
     others: dict[str, int] = field(default_factory=dict)
     steady: bool = True
     remarks: list[str] = field(default_factory=list)
 
 
-def find_columns(shape: Shape) -> Columns:
-    """Return where the channels of a log may be."""
-    found = Columns(shape)
-    words = {i: words_of(shape.names[i]) if shape.header else [] for i in shape.numbers}
+def words_of(name: str) -> list[str]:
+    """Return the words of a name in lower case; brackets at its end count where they hold an axis."""
+    bracket = BRACKETS.search(name)
+    axis = bracket is not None and bracket.group(1).strip().lower() in AXIS_WORDS
+    words = [w.lower() for w in WORD.findall(name if axis or bracket is None else name[: bracket.start()])]
+    merged = [(w, MERGED.fullmatch(w)) for w in words]
+    return [part for w, found in merged for part in (found.groups() if found else (w,))]
+
+
+def stated_unit(name: str, channel: str) -> tuple[str | None, str]:
+    """Return the unit of a channel that a name states, in brackets or in its last words, and the evidence."""
+    unit = unit_in_brackets(name)
+    words = [w.lower() for w in WORD.findall(name)]
+    while words and words[-1] in ("x", "y", "z", "0", "1", "3"):
+        words = words[:-1]
+    ending = " ".join(words)
+    if unit not in UNITS[channel]:
+        found = [
+            candidate
+            for candidate, spellings in UNIT_ENDINGS
+            for s in spellings
+            if candidate in UNITS[channel] and (ending.endswith(f" {s}") or (ending == s and s in TIME_WORDS))
+        ]
+        unit = found[0] if found else SPELLINGS.get(words[-1]) if len(words) > 1 else None
+    return (unit, f"the name says {unit}") if unit in UNITS[channel] else (None, "")
+
+
+def find_columns(layout: TextLayout) -> Columns:
+    """Return the columns that may hold the channels of a log."""
+    found = Columns(layout)
+    words = {i: words_of(layout.names[i]) if layout.header else [] for i in layout.numbers}
     _find_time(found, words)
     for sensor in (*TRIADS, "?"):
-        named = {i: w for i, w in words.items() if sensor_of(w) == sensor}
+        named = {i: w for i, w in words.items() if _sensor_of(w) == sensor}
         triad = _triad(named)
         if triad is not None:
             found.triads[sensor] = triad
-            _tell_others(found, sensor, named)
+            _remark_on_other_triads(found, sensor, named)
     bare = found.triads.pop("?", None)
     if bare is not None and not found.triads:
-        found.triads[_sensor_of_file(shape, bare)] = bare
+        found.triads[_sensor_of_file(layout, bare)] = bare
         found.remarks.append(f"taken as the {next(iter(found.triads))} by the file's name and numbers; check it")
-    if not shape.header:
-        _triads_without_names(found)
+    if not layout.header:
+        _find_triads_without_names(found)
     for i, w in words.items():
-        channel = other_channel(shape.names[i], w)
-        if channel and channel not in found.others and _possible(channel, shape.numbers[i]):
+        channel = _other_channel(layout.names[i], w)
+        low, high = TEMPERATURE_RANGE
+        possible = channel != "temperature" or low < float(np.median(layout.numbers[i])) < high
+        if channel and channel not in found.others and possible:
             found.others[channel] = i
-    texts = [n for i, n in enumerate(shape.names) if i not in shape.numbers]
+    texts = [n for i, n in enumerate(layout.names) if i not in layout.numbers]
     if texts:
         found.remarks.append(f"left out, as not all of it is numbers: {', '.join(texts)}")
     return found
 
 
+def _axis_of(words: list[str]) -> str:
+    """Return the axis that a name ends in, or has before its unit; empty for none."""
+    return next((w for w in reversed(words) if w in AXIS_WORDS), "")
+
+
+def _sensor_of(words: list[str]) -> str:
+    """Return the sensor that a name states, empty for none, ``?`` where it is an axis alone."""
+    axis = _axis_of(words)
+    if not axis or set(words) & NO_SENSOR:
+        return ""
+    before = words[: len(words) - 1 - words[::-1].index(axis)]
+    return next((s for s, known in SENSOR_WORDS.items() if set(before) & known), "" if before else "?")
+
+
+def _is_time(words: list[str]) -> bool:
+    """Return whether a name states a time of the sensor's clock."""
+    return bool(words) and not set(words) & TABLE_WORDS and (words[0] in TIME_FIRST or bool(set(words) & TIME_WORDS))
+
+
+def _other_channel(name: str, words: list[str]) -> str:
+    """Return the channel beside time and readings that a name states, empty for none."""
+    canonical = [c for c in CHANNELS[6:] if name.lower().startswith(c)]
+    if canonical:
+        return canonical[0]
+    if set(words) & TEMPERATURE_WORDS:
+        return "temperature"
+    if set(words) & TABLE_WORDS:
+        return next((c for c, known in TABLE_CHANNEL_WORDS.items() if set(words) & known), "")
+    return ""
+
+
 def _find_time(found: Columns, words: dict[int, list[str]]) -> None:
-    numbers = found.shape.numbers
+    numbers = found.layout.numbers
     rising = [i for i, v in numbers.items() if len(v) > 2 and bool(np.all(np.diff(v) > 0))]
-    counters = [i for i, v in numbers.items() if _counts(v)]
-    named = [i for i in numbers if is_time(words[i])]
-    unnamed = [] if found.shape.header else [i for i in rising if i not in counters]
+    counters = [i for i, v in numbers.items() if len(v) > 2 and bool(np.mean(np.diff(v) == 1.0) > COUNTING)]
+    named = [i for i in numbers if _is_time(words[i])]
+    unnamed = [] if found.layout.header else [i for i in rising if i not in counters]
     candidates = [i for i in named if i in rising] or named or unnamed
     gap_free = [i for i in counters if i not in candidates and bool(np.all(np.diff(numbers[i]) == 1.0))]
     if candidates and gap_free and _scatters(numbers[candidates[0]]):
@@ -98,7 +179,7 @@ def _find_time(found: Columns, words: dict[int, list[str]]) -> None:
     if index is not None and index not in rising:
         back = int(np.count_nonzero(np.diff(numbers[index]) <= 0))
         found.remarks.append(
-            f"{found.shape.names[index]} does not increase at {back} rows: sessions one after the other (session: 1, "
+            f"{found.layout.names[index]} does not increase at {back} rows: sessions one after the other (session: 1, "
             "2 .. reads one of them), or a counter that overflows"
         )
 
@@ -108,20 +189,11 @@ def _scatters(time: NDArray[np.float64]) -> bool:
     return bool(np.std(steps) > SCATTER * abs(float(np.median(steps)))) and bool(time[-1] > time[0])
 
 
-def _counts(values: NDArray[np.float64]) -> bool:
-    return len(values) > 2 and bool(np.mean(np.diff(values) == 1.0) > COUNTING)
-
-
-def _possible(channel: str, values: NDArray[np.float64]) -> bool:
-    low, high = TEMPERATURE_RANGE
-    return channel != "temperature" or low < float(np.median(values)) < high
-
-
-def _triad(words: dict[int, list[str]]) -> tuple[int, int, int] | None:
-    """Return the columns of x, y and z among those of one sensor, the first that ends so where there are several."""
+def _triad(words: dict[int, list[str]]) -> Triad | None:
+    """Return the columns of x, y and z among those of one sensor, the first of each axis where there are several."""
     axes: dict[str, int] = {}
     for index, w in words.items():
-        axes.setdefault(axis_of(w), index)
+        axes.setdefault(_axis_of(w), index)
     for names in ("xyz", "012", "123"):
         if set(names) <= axes.keys():
             x, y, z = (axes[n] for n in names)
@@ -129,52 +201,49 @@ def _triad(words: dict[int, list[str]]) -> tuple[int, int, int] | None:
     return None
 
 
-def _tell_others(found: Columns, sensor: str, words: dict[int, list[str]]) -> None:
-    """Tell of further columns that may be the same sensor: another one of the board, or filtered readings."""
+def _remark_on_other_triads(found: Columns, sensor: str, words: dict[int, list[str]]) -> None:
+    """Remark on further columns that may be the same sensor: another one of the board, or filtered readings."""
     groups: dict[tuple[str, ...], dict[int, list[str]]] = {}
     for index, w in words.items():
-        at = len(w) - 1 - w[::-1].index(axis_of(w))
+        at = len(w) - 1 - w[::-1].index(_axis_of(w))
         groups.setdefault((*w[:at], *w[at + 1 :]), {})[index] = w
     triads = [t for group in groups.values() if (t := _triad(group)) is not None]
     if len(triads) > 1:
-        texts = [", ".join(found.shape.names[i] for i in t) for t in triads]
-        taken = ", ".join(found.shape.names[i] for i in found.triads[sensor])
+        texts = [", ".join(found.layout.names[i] for i in t) for t in triads]
+        taken = ", ".join(found.layout.names[i] for i in found.triads[sensor])
         others = "; ".join(text for text in texts if text != taken)
         what = sensor if sensor != "?" else "sensor"
         found.remarks.append(f"{len(triads)} triads may be the {what}: taken {taken}; the others are {others}; choose")
 
 
-def _sensor_of_file(shape: Shape, triad: tuple[int, int, int]) -> str:
-    stem = Path(shape.path).stem.lower()
+def _sensor_of_file(layout: TextLayout, triad: Triad) -> str:
+    stem = Path(layout.path).stem.lower()
     if "gyr" in stem or "angular" in stem or "rotation" in stem:
         return "gyroscope"
-    if "acc" in stem:
-        return "accelerometer"
-    return "accelerometer" if _spread(shape, triad) < 0.5 else "gyroscope"
+    return "accelerometer" if "acc" in stem or _spread(layout, triad) < 0.5 else "gyroscope"
 
 
-def _spread(shape: Shape, triad: tuple[int, int, int]) -> float:
-    """Return the relative spread of a vector's length: small for gravity."""
-    norm = np.linalg.norm(np.column_stack([shape.numbers[i] for i in triad]), axis=1)
+def _spread(layout: TextLayout, triad: Triad) -> float:
+    """Return the relative spread of a vector's length, which is small for gravity."""
+    norm = np.linalg.norm(np.column_stack([layout.numbers[i] for i in triad]), axis=1)
     low, middle, high = np.quantile(norm, [0.16, 0.5, 0.84])
     return float((high - low) / max(middle, 1e-30))
 
 
-def _triads_without_names(found: Columns) -> None:
-    """Find the sensors by what columns hold: gravity keeps its length."""
-    shape = found.shape
-    free = [i for i, v in shape.numbers.items() if i not in (found.time, found.counter) and np.ptp(v) > 0]
+def _find_triads_without_names(found: Columns) -> None:
+    """Find the sensors by content: gravity keeps its length."""
+    layout = found.layout
+    free = [i for i, v in layout.numbers.items() if i not in (found.time, found.counter) and np.ptp(v) > 0]
     groups = list(zip(free[::3], free[1::3], free[2::3], strict=False))
     if len(groups) == 1:
-        sensor = _sensor_of_file(shape, groups[0])
+        sensor = _sensor_of_file(layout, groups[0])
         found.triads[sensor] = groups[0]
         found.remarks.append(f"no names: columns {groups[0]} are taken as the {sensor}'s x, y, z; check it")
     elif groups:
-        first = min(range(len(groups)), key=lambda i: _spread(shape, groups[i]))
+        first = min(range(len(groups)), key=lambda i: _spread(layout, groups[i]))
         found.triads["accelerometer"] = groups[first]
         found.triads["gyroscope"] = next(g for i, g in enumerate(groups) if i != first)
-        text = (
+        found.remarks.append(
             f"no names: columns {groups[first]} are taken as the accelerometer's x, y, z, for their length varies by "
+            f"{_spread(layout, groups[first]):.1%} only, {found.triads['gyroscope']} as the gyroscope's; check it"
         )
-        text += f"{_spread(shape, groups[first]):.1%} only, {found.triads['gyroscope']} as the gyroscope's; check it"
-        found.remarks.append(text)

@@ -26,7 +26,6 @@ def topic_lines(path: Path, *, fields: bool) -> list[tuple[str, str]]:
 
     Parameters
     ----------
-    path : Path
     fields : bool
         Whether the fields of messages of types that ingest does not know are listed.
     """

@@ -1,12 +1,15 @@
-"""A profile proposed for unknown text logs, each guess with what speaks for it; to be confirmed, never applied unasked.
+"""A profile proposed for unknown text logs, each guess with its evidence; it is never applied unasked.
 
-Names tell which column may hold which channel. Units follow from what a name states, else from physics
+The names of columns tell which channel they may hold. Units follow from what a name states, else from physics
 (``unit_guesses``). Two files with the same times, one with the accelerometer and one with the gyroscope, are parts of
-one recording; what cannot be told of one file is taken from another of the same shape.
+one recording. What one file does not determine is taken from another of the same layout.
 """
 
 from __future__ import annotations
 
+import json
+import re
+import textwrap
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,8 +18,7 @@ import numpy as np
 
 from pipeline.io.gravity_rotation import moves_of
 from pipeline.io.units import COUNTS, GYROSCOPE, TRIADS, UNITS
-from pipeline.profile_detection.column_names import stated_unit, words_of
-from pipeline.profile_detection.columns import Columns, find_columns
+from pipeline.profile_detection.columns import Columns, find_columns, stated_unit, words_of
 from pipeline.profile_detection.unit_guesses import (
     ASSUMED_HZ,
     UNKNOWN,
@@ -33,10 +35,12 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.io.gravity_rotation import Move
-    from pipeline.profile_detection.text_layout import Shape
+    from pipeline.profile_detection.text_layout import TextLayout
 
 UNITS_OF = {"accelerometer": ("g", "mg", "m/s^2"), "gyroscope": ("deg/s", "rad/s")}
 Entries = dict[str, dict[str, Any]]
+WIDTH = 116  # of comments in a proposed profile
+WORD = re.compile(r"[A-Za-z_][\w.-]*(/[\w^]+)?")
 
 
 @dataclass
@@ -46,21 +50,21 @@ class Proposal:
     Attributes
     ----------
     files : list of str
-        For which it is made; of a recording in parts the file of each part.
-    shapes : list of Shape
+        Of a recording in parts, the file of each part.
+    layouts : list of TextLayout
         Of its parts, one where there are none.
     csv : dict
         The ``csv`` section without columns.
     columns : list of dict
         Of each part: channel to its entry; ``???`` stands for what has to be filled in.
     evidence : dict of str to str
-        Key of ``csv``, ``time``, sensor or channel to what speaks for it.
+        By key of ``csv``, ``time``, sensor or channel.
     remarks : list of str
         What has to be decided, or is odd.
     """
 
     files: list[str]
-    shapes: list[Shape]
+    layouts: list[TextLayout]
     csv: dict[str, Any]
     columns: list[Entries]
     evidence: dict[str, str] = field(default_factory=dict)
@@ -69,7 +73,7 @@ class Proposal:
     @property
     def parts(self) -> list[str]:
         """Names of the parts' files, empty where there is one file a recording."""
-        return [Path(s.path).name for s in self.shapes] if len(self.shapes) > 1 else []
+        return [Path(s.path).name for s in self.layouts] if len(self.layouts) > 1 else []
 
     @property
     def complete(self) -> bool:
@@ -90,9 +94,9 @@ class Proposal:
         return {"name": name, "csv": {**self.csv, "parts": parts, "columns": {}}, "mcap": {}}
 
 
-def propose(shapes: Sequence[Shape]) -> list[Proposal]:
-    """Return the profiles that text logs seem to ask for, those of the same shape together."""
-    found = [find_columns(shape) for shape in shapes]
+def propose(layouts: Sequence[TextLayout]) -> list[Proposal]:
+    """Return the profiles that text logs seem to ask for, those of the same layout together."""
+    found = [find_columns(layout) for layout in layouts]
     proposals: list[Proposal] = []
     for columns in _joined(found):
         new = _proposal(columns)
@@ -120,17 +124,17 @@ def _belong_together(one: Columns, two: Columns) -> bool:
     if len(one.triads) != 1 or len(two.triads) != 1 or set(one.triads) == set(two.triads):
         return False
     same = ("delimiter", "decimal", "skip_lines", "header", "comment")
-    if any(getattr(one.shape, k) != getattr(two.shape, k) for k in same) or one.time is None or two.time is None:
+    if any(getattr(one.layout, k) != getattr(two.layout, k) for k in same) or one.time is None or two.time is None:
         return False
-    return np.array_equal(one.shape.numbers[one.time], two.shape.numbers[two.time])
+    return np.array_equal(one.layout.numbers[one.time], two.layout.numbers[two.time])
 
 
 def _alike(one: Proposal, two: Proposal) -> bool:
-    return [s.names for s in one.shapes] == [s.names for s in two.shapes] and one.csv == two.csv and not one.parts
+    return [s.names for s in one.layouts] == [s.names for s in two.layouts] and one.csv == two.csv and not one.parts
 
 
 def _fill_in(proposal: Proposal, other: Proposal) -> None:
-    """Take from another file of the same shape what this one could not tell."""
+    """Take from another file of the same layout what this one could not tell."""
     proposal.files += other.files
     for channel, entry in proposal.columns[0].items():
         better = other.columns[0].get(channel, entry)
@@ -142,14 +146,14 @@ def _fill_in(proposal: Proposal, other: Proposal) -> None:
 
 
 def _proposal(parts: list[Columns]) -> Proposal:
-    shapes = [c.shape for c in parts]
-    proposal = Proposal([s.path for s in shapes], shapes, _csv_section(shapes[0]), [{} for _ in parts])
-    if shapes[0].rate_hz is not None:
-        proposal.evidence["rate_hz"] = f"the file says {shapes[0].rate_line!r}"
+    layouts = [c.layout for c in parts]
+    proposal = Proposal([s.path for s in layouts], layouts, _csv_section(layouts[0]), [{} for _ in parts])
+    if layouts[0].rate_hz is not None:
+        proposal.evidence["rate_hz"] = f"the file says {layouts[0].rate_line!r}"
     for columns in parts:
         proposal.remarks += columns.remarks
-        if columns.shape.odd_rows:
-            proposal.remarks.append(f"{columns.shape.odd_rows} rows have another number of fields than the others")
+        if columns.layout.odd_rows:
+            proposal.remarks.append(f"{columns.layout.odd_rows} rows have another number of fields than the others")
     time_s = _time(parts, proposal)
     force = _readings("accelerometer", parts)
     if force is not None:
@@ -169,21 +173,21 @@ def _proposal(parts: list[Columns]) -> Proposal:
     return proposal
 
 
-def _csv_section(shape: Shape) -> dict[str, Any]:
-    commented = shape.header and shape.comment is not None
+def _csv_section(layout: TextLayout) -> dict[str, Any]:
+    commented = layout.header and layout.comment is not None
     return {
-        "delimiter": "whitespace" if shape.delimiter == " " else shape.delimiter,
-        "decimal": shape.decimal,
-        "header": "commented" if commented else shape.header,
-        "skip_lines": 0 if shape.comment is not None else shape.skip_lines,
-        "comment": shape.comment,
-        "rate_hz": shape.rate_hz,
+        "delimiter": "whitespace" if layout.delimiter == " " else layout.delimiter,
+        "decimal": layout.decimal,
+        "header": "commented" if commented else layout.header,
+        "skip_lines": 0 if layout.comment is not None else layout.skip_lines,
+        "comment": layout.comment,
+        "rate_hz": layout.rate_hz,
     }
 
 
 def _time(parts: list[Columns], proposal: Proposal) -> NDArray[np.float64] | None:
     """Propose where the time comes from, and return it in s; None where it is not known."""
-    first = parts[0].shape
+    first = parts[0].layout
     count = len(next(iter(first.numbers.values())))
     if parts[0].arrival is not None:
         return _counted(parts[0], proposal)
@@ -198,7 +202,7 @@ def _time(parts: list[Columns], proposal: Proposal) -> NDArray[np.float64] | Non
         proposal.evidence["time"] = guess.evidence
         for columns, entries in zip(parts, proposal.columns, strict=True):
             assert columns.time is not None  # noqa: S101  (parts are joined by their times)
-            entries["time"] = {"column": columns.shape.key(columns.time), **guess.entry}
+            entries["time"] = {"column": columns.layout.key(columns.time), **guess.entry}
         return None if guess.second_s is None else values * guess.second_s
     if parts[0].counter is not None and first.rate_hz is None:
         key = first.key(parts[0].counter)
@@ -215,13 +219,17 @@ def _time(parts: list[Columns], proposal: Proposal) -> NDArray[np.float64] | Non
 
 def _counted(columns: Columns, proposal: Proposal) -> NDArray[np.float64] | None:
     """Propose a counter without a gap as time, at the mean rate of the times of arrival beside it."""
-    shape = columns.shape
+    layout = columns.layout
     assert columns.counter is not None  # noqa: S101
     assert columns.arrival is not None  # noqa: S101
-    arrival, count, name = shape.numbers[columns.arrival], shape.numbers[columns.counter], shape.names[columns.arrival]
+    arrival, count, name = (
+        layout.numbers[columns.arrival],
+        layout.numbers[columns.counter],
+        layout.names[columns.arrival],
+    )
     second = time_unit(arrival, *stated_unit(name, "time")).second_s
     rate = None if second is None else float(f"{(count[-1] - count[0]) / ((arrival[-1] - arrival[0]) * second):.6g}")
-    key = shape.key(columns.counter)
+    key = layout.key(columns.counter)
     proposal.csv["rate_hz"] = None
     proposal.columns[0]["time"] = {"column": key, "unit": COUNTS, "counts_per_unit": UNKNOWN if rate is None else rate}
     said = "the sampling rate in Hz" if rate is None else f"{rate:g} Hz on average by {name}"
@@ -246,43 +254,92 @@ def _by_table(parts: list[Columns], rate: NDArray[np.float64]) -> Guess | None:
     for columns in parts:
         if "gyroscope" in columns.triads and "table_rate" in columns.others:
             index = columns.others["table_rate"]
-            stated, _ = stated_unit(columns.shape.names[index], "table_rate")
+            stated, _ = stated_unit(columns.layout.names[index], "table_rate")
             multiplier, divisor = UNITS["table_rate"][stated or "deg/s"]
-            return rate_unit_by_table(rate, columns.shape.numbers[index] * multiplier / divisor)
+            return rate_unit_by_table(rate, columns.layout.numbers[index] * multiplier / divisor)
     return None
 
 
 def _readings(sensor: str, parts: list[Columns]) -> NDArray[np.float64] | None:
     for columns in parts:
         if sensor in columns.triads:
-            return np.column_stack([columns.shape.numbers[i] for i in columns.triads[sensor]])
+            return np.column_stack([columns.layout.numbers[i] for i in columns.triads[sensor]])
     return None
 
 
 def _add(sensor: str, parts: list[Columns], proposal: Proposal, guess: Guess) -> None:
     """Add a sensor's channels with the unit that their names state, else the one guessed."""
     place = next(i for i, c in enumerate(parts) if sensor in c.triads)
-    shape, triad = parts[place].shape, parts[place].triads[sensor]
+    layout, triad = parts[place].layout, parts[place].triads[sensor]
     proposal.evidence[sensor] = guess.evidence
     for channel, index in zip(TRIADS[sensor], triad, strict=True):
-        stated, why = stated_unit(shape.names[index], channel) if shape.header else (None, "")
+        stated, why = stated_unit(layout.names[index], channel) if layout.header else (None, "")
         entry = {"unit": stated} if stated in UNITS_OF[sensor] else guess.entry
-        proposal.columns[place][channel] = {"column": shape.key(index), **entry}
+        proposal.columns[place][channel] = {"column": layout.key(index), **entry}
         if entry is not guess.entry:
             proposal.evidence[sensor] = f"{why}; {guess.evidence}"
             if guess.entry["unit"] not in (stated, UNKNOWN):
-                proposal.remarks.append(f"{shape.names[index]}: {why}, and yet {guess.evidence}")
+                proposal.remarks.append(f"{layout.names[index]}: {why}, and yet {guess.evidence}")
 
 
 def _others(columns: Columns, entries: Entries, proposal: Proposal) -> None:
     """Add temperature and the table's log."""
-    shape = columns.shape
+    layout = columns.layout
     for channel, index in columns.others.items():
-        values = shape.numbers[index]
+        values = layout.numbers[index]
         usual = {"temperature": "degC", "table_angle": "deg", "table_rate": "deg/s"}.get(channel, "1")
-        stated, why = stated_unit(shape.names[index], channel)
-        entries[channel] = {"column": shape.key(index), "unit": stated or usual, "optional": True}
+        stated, why = stated_unit(layout.names[index], channel)
+        entries[channel] = {"column": layout.key(index), "unit": stated or usual, "optional": True}
         span = f"{values.min():.6g} to {values.max():.6g}"
         proposal.evidence[channel] = f"{why}: {span}" if stated else f"{span}, so {usual}"
     if GYROSCOPE[0] not in entries and "table_rate" in entries and not proposal.parts:
         proposal.remarks.append("a table's log, without the sensor's readings")
+
+
+def as_yaml(proposal: Proposal, name: str) -> str:
+    """Return a proposal as the text of a profile that Hydra reads."""
+    files = ", ".join(Path(f).name for f in proposal.files)
+    lines = _comment(f"Proposed by python -m pipeline check for {files}. Read each line: nothing of it is certain.")
+    for remark in proposal.remarks:
+        lines += _comment(f"To decide: {remark}.")
+    lines += [f"name: {_scalar(name)} # name of the profile, for the report", "", "csv:"]
+    for key, value in proposal.csv.items():
+        if key in proposal.evidence:
+            lines += _comment(proposal.evidence[key], "  ")
+        lines.append(f"  {key}: {_scalar(value)}")
+    if proposal.parts:
+        lines += ["  columns: {} # described by part", "  parts: # files of one recording, joined on equal time"]
+        for file, entries in zip(proposal.parts, proposal.columns, strict=True):
+            lines += [f"    - file: {_scalar(file)}", "      columns:"]
+            lines += _entries(entries, proposal.evidence, "        ")
+    else:
+        lines += ["  columns: # channel: the column's name (or index from 0) and its unit"]
+        lines += _entries(proposal.columns[0], proposal.evidence, "    ")
+    return "\n".join([*lines, "", "mcap: {}"]) + "\n"
+
+
+def _entries(entries: Entries, evidence: dict[str, str], indent: str) -> list[str]:
+    lines: list[str] = []
+    said: set[str] = set()
+    for channel, entry in entries.items():
+        key = next((s for s, triad in TRIADS.items() if channel in triad), channel)
+        if key in evidence and key not in said:
+            lines += _comment(evidence[key], indent)
+            said.add(key)
+        inner = ", ".join(f"{k}: {_scalar(v)}" for k, v in entry.items())
+        lines.append(f"{indent}{channel}: {{{inner}}}")
+    return lines
+
+
+def _comment(text: str, indent: str = "") -> list[str]:
+    return textwrap.wrap(text, WIDTH, initial_indent=f"{indent}# ", subsequent_indent=f"{indent}# ")
+
+
+def _scalar(value: Any) -> str:  # noqa: ANN401  (any scalar of YAML)
+    """Return a scalar as YAML: JSON is YAML; plain words need no quotes."""
+    if not isinstance(value, str):
+        return json.dumps(value)
+    keyword = value.lower() in ("true", "false", "yes", "no", "on", "off", "null", "y", "n")
+    if WORD.fullmatch(value) and not keyword:
+        return value
+    return json.dumps(value, ensure_ascii=False).replace("${", "\\\\${")

@@ -37,7 +37,6 @@ def facts(recording: Recording, sensor: Mapping[str, Any] | None = None) -> list
 
     Parameters
     ----------
-    recording : Recording
     sensor : mapping, optional
         Section of a configuration, for the full scales.
     """

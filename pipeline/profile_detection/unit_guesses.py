@@ -1,7 +1,7 @@
-"""Units that numbers seem to have, each with the evidence in words.
+"""Units that fit the numbers of an unknown log, each with its evidence.
 
-specific force : |f| at rest is 1 in g, 9.8 in m/s^2, 1000 in mg; of counts, it is the number of counts a g
-angular rate   : the unit in which the rates turn gravity from rest to rest (``pipeline.io.gravity_rotation``)
+specific force : |f| at rest is 1 in g, 9.8 in m/s^2, 1000 in mg; of counts, it is the number of counts per g
+angular rate   : the unit in which the integrated rates rotate gravity from rest to rest (``gravity_rotation``)
 time           : intervals of sensors are 0.05 to 200 ms long
 """
 
@@ -191,14 +191,19 @@ def rate_unit_by_table(rate: NDArray[np.float64], table_rate: NDArray[np.float64
     size = float(np.linalg.norm(slopes))
     seen = f"{size:.4g} a deg/s of the table's rate in the same rows"
     if whole(rate):
-        usual = min(USUAL_COUNTS_PER_DPS, key=lambda c: abs(np.log(size / c)))
-        near = abs(size / usual - 1) < CLOSE_BY_TABLE
-        taken = f"; {usual:g} is the usual number near it" if near else ""
-        entry = {"unit": COUNTS, "counts_per_unit": usual if near else float(f"{size:.3g}")}
+        entry, taken = _usual_counts(size, CLOSE_BY_TABLE)
         return Guess(entry, f"counts, {seen}{taken}")
     units = {"deg/s": 1.0, "rad/s": 1.0 / DEGREES}
     unit = next((u for u, one in units.items() if abs(size / one - 1) < CLOSE_BY_TABLE), UNKNOWN)
     return Guess({"unit": unit}, f"{seen}, " + ("neither deg/s nor rad/s" if unit == UNKNOWN else f"so {unit}"))
+
+
+def _usual_counts(measured: float, close: float) -> tuple[dict[str, Any], str]:
+    """Return the entry of a gyroscope in counts, with the usual counts per deg/s where they are near, and a remark."""
+    usual = min(USUAL_COUNTS_PER_DPS, key=lambda c: abs(np.log(measured / c)))
+    if abs(measured / usual - 1) < close:
+        return {"unit": COUNTS, "counts_per_unit": usual}, f"; {usual:g} is the usual number near it"
+    return {"unit": COUNTS, "counts_per_unit": float(f"{measured:.3g}")}, ""
 
 
 def _degrees_or_radians(moves: Sequence[Move]) -> Guess:
@@ -225,8 +230,5 @@ def _counts_per_dps(moves: Sequence[Move], otherwise: str, *, timed: bool) -> Gu
         product = measured * ASSUMED_HZ
         listed = " or ".join(f"{c:g} at {product / c:.3g} Hz" for c in USUAL_COUNTS_PER_DPS if 50 < product / c < 1100)
         return Guess(unknown, f"counts_per_unit times the sampling rate in Hz is near {product:.3g} ({listed}), {seen}")
-    usual = min(USUAL_COUNTS_PER_DPS, key=lambda c: abs(np.log(measured / c)))
-    near = abs(measured / usual - 1) < CLOSE_BY_TURNS
-    entry = {"unit": COUNTS, "counts_per_unit": usual if near else float(f"{measured:.3g}")}
-    taken = f"; {usual:g} is the usual number near it" if near else ""
+    entry, taken = _usual_counts(measured, CLOSE_BY_TURNS)
     return Guess(entry, f"counts, {measured:.3g} a deg/s, {seen}{taken}")

@@ -14,15 +14,14 @@ from pipeline.config.compose import Composer
 from pipeline.errors import IngestError
 from pipeline.io.csv_read import read_csv
 from pipeline.io.ingest_settings import Checks, csv_formats
-from pipeline.profile_detection.profile_text import as_yaml
-from pipeline.profile_detection.proposal import Proposal, propose
-from pipeline.profile_detection.text_layout import find_shape
+from pipeline.profile_detection.proposal import Proposal, as_yaml, propose
+from pipeline.profile_detection.text_layout import find_layout
 
 REFERENCE = Path(__file__).parents[3] / "shared" / "data"
 
 
 def proposed(*files: Path) -> Proposal:
-    (proposal,) = propose([find_shape(f.read_bytes(), str(f)) for f in files])
+    (proposal,) = propose([find_layout(f.read_bytes(), str(f)) for f in files])
     return proposal
 
 
@@ -119,12 +118,12 @@ def test_odd_names_of_columns_survive_yaml_and_hydra(tmp_path: Path, cell: str) 
 
 def test_text_without_a_table_is_refused_with_its_beginning(tmp_path: Path) -> None:
     with pytest.raises(IngestError, match="no table of numbers was found in it; it starts with 'Dear reader"):
-        find_shape(b"Dear reader,\nthere is nothing here.\n", str(tmp_path / "letter.txt"))
+        find_layout(b"Dear reader,\nthere is nothing here.\n", str(tmp_path / "letter.txt"))
 
 
 def test_a_counter_of_samples_is_no_time_until_its_rate_is_stated() -> None:
     text = "n,ax,ay,az\n" + "".join(f"{i},0,0,1.0\n" for i in range(100))
-    (proposal,) = propose([find_shape(text.encode(), "log.csv")])
+    (proposal,) = propose([find_layout(text.encode(), "log.csv")])
     entry: dict[str, Any] = yaml.safe_load(as_yaml(proposal, "mine"))["csv"]["columns"]["time"]
     assert entry == {"column": "n", "unit": "counts", "counts_per_unit": "???"}
 
@@ -140,7 +139,7 @@ def test_a_counter_of_samples_is_no_time_until_its_rate_is_stated() -> None:
 def test_common_names_are_known(header: str, expected: tuple[str, ...]) -> None:
     step = {"ms": 10.0, "s": 0.01}.get(expected[1], 160.0)
     text = header + "\n" + "".join(f"{step * i:g},0.01,0.02,0.99,{0.1 * (i % 3)},0.1,0.2\n" for i in range(200))
-    columns = propose([find_shape(text.encode(), "log.csv")])[0].columns[0]
+    columns = propose([find_layout(text.encode(), "log.csv")])[0].columns[0]
     found = [columns[c]["column"] for c in ("time", "accel_x", "gyro_z")]
     assert [found[0], columns["time"]["unit"], *found[1:]] == list(expected)
     assert (columns["time"].get("counts_per_unit") == "???") == (expected[1] == "counts")
@@ -152,12 +151,12 @@ def test_a_counter_without_a_gap_goes_before_times_of_arrival_that_scatter() -> 
     arrival = 10.0 * (n // 10) / 99.0 + 0.002 * (n % 10)
     head, rows = "seq,t_s,ax,ay,az\n", zip(n, arrival, strict=True)
     counted = head + "".join(f"{i},{t:.6f},0,0,1.0\n" for i, t in rows)
-    (proposal,) = propose([find_shape(counted.encode(), "log.csv")])
+    (proposal,) = propose([find_layout(counted.encode(), "log.csv")])
     entry = proposal.columns[0]["time"]
     assert (entry["column"], entry["unit"]) == ("seq", "counts")
     assert entry["counts_per_unit"] == pytest.approx(99.0, rel=0.02)
     gap = head + "".join(f"{i + (i > 250)},{t:.6f},0,0,1.0\n" for i, t in zip(n, arrival, strict=True))
-    (proposal,) = propose([find_shape(gap.encode(), "log.csv")])
+    (proposal,) = propose([find_layout(gap.encode(), "log.csv")])
     assert proposal.columns[0]["time"]["column"] == "t_s"
     assert "500 Hz by the median interval and 100.5 Hz on average" in proposal.evidence["time"]
 
@@ -165,7 +164,7 @@ def test_a_counter_without_a_gap_goes_before_times_of_arrival_that_scatter() -> 
 def test_several_triads_of_one_sensor_are_told() -> None:
     head = "t,acc_x,acc_y,acc_z,acc_lp_x,acc_lp_y,acc_lp_z\n"
     text = head + "".join(f"{0.01 * i:.2f},0,0,1.0,0.1,0,1.0\n" for i in range(100))
-    (proposal,) = propose([find_shape(text.encode(), "log.csv")])
+    (proposal,) = propose([find_layout(text.encode(), "log.csv")])
     assert proposal.columns[0]["accel_x"]["column"] == "acc_x"
     told = "2 triads may be the accelerometer: taken acc_x, acc_y, acc_z; the others are acc_lp_x, acc_lp_y, acc_lp_z"
     assert any(told in remark for remark in proposal.remarks)
@@ -207,6 +206,6 @@ def test_the_rate_of_the_table_in_the_same_rows_tells_the_unit_of_the_gyroscope(
     rows = "".join(f"{0.01 * i:.2f},{r:g},{x:.6g},{y:.6g},{z:.6g}\n" for i, (r, (x, y, z)) in enumerate(
         zip(rate, shown, strict=True)
     ))  # fmt: skip
-    (proposal,) = propose([find_shape(f"t,table_rate_dps,gx,gy,gz\n{rows}".encode(), "log.csv")])
+    (proposal,) = propose([find_layout(f"t,table_rate_dps,gx,gy,gz\n{rows}".encode(), "log.csv")])
     assert {k: proposal.columns[0]["gyro_y"].get(k) for k in entry} == entry, proposal.evidence
     assert "a deg/s of the table's rate in the same rows" in proposal.evidence["gyroscope"]
