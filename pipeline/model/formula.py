@@ -242,7 +242,7 @@ class _Reader:
         raise self._refused(node, f"{REFUSED.get(type(node), 'this')} has no place in a formula")
 
     def _number(self, value: float) -> tuple[Evaluate, str]:
-        return partial(_constant, value), c_number(value)
+        return partial(_constant, np.float64(value)), c_number(value)
 
     def _value(self, node: ast.Constant) -> float:
         if isinstance(node.value, bool) or not isinstance(node.value, (int, float)):
@@ -284,7 +284,7 @@ class _Reader:
         exponent = self._exponent(node.right)
         if exponent not in POWERS:
             c = f"(imu_real)pow({c_base}, {c_number(exponent)})"
-            return partial(_apply, np.power, (base, partial(_constant, exponent))), c
+            return partial(_apply, np.power, (base, partial(_constant, np.float64(exponent)))), c
         function, short, c = POWERS[exponent]
         return partial(_apply, function, (base,)), (short if SIMPLE_IN_C.fullmatch(c_base) else c).format(c_base)
 
@@ -305,9 +305,9 @@ def c_number(value: float) -> str:
     return f"(imu_real){float(value)!r}"
 
 
-def _constant(value: float, signals: Signals) -> np.float64:
+def _constant(value: np.float64, signals: Signals) -> np.float64:
     del signals
-    return np.float64(value)
+    return value
 
 
 def _signal(name: str, signals: Signals) -> NDArray[np.float64]:

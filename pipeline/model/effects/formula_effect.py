@@ -20,8 +20,6 @@ from pipeline.model.formula import OF_THE_MOTION, SIGNALS, c_number
 from pipeline.records import AXES
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from numpy.typing import NDArray
 
     from pipeline.model.effects.base import Parameter
@@ -73,8 +71,9 @@ class FormulaEffect(DeclaredEffect):
 
     def __init__(self, declared: Declaration, definition: dict[str, Any] | None = None) -> None:
         super().__init__(declared, definition)
-        terms = declared.terms.values()
+        self._terms = terms = list(declared.terms.values())
         signals = frozenset[str]().union(*(t.signals for t in terms))
+        self._names = sorted(signals)
         fields = {SIGNALS[s].field for s in signals}
         self.needs = tuple(field for field in NEEDED if field in fields)
         self.needs_clock = "time" in signals
@@ -89,15 +88,14 @@ class FormulaEffect(DeclaredEffect):
     def fields(self, sensor: str, values: NDArray[np.float64]) -> set[str]:
         """Return the fields of ``Motion`` that the formulas name."""
         del values
-        signals = frozenset[str]().union(*(t.signals for t in self.declared.terms.values()))
-        return {SIGNALS[signal].field or TRUTHS[sensor] for signal in signals}
+        return {SIGNALS[signal].field or TRUTHS[sensor] for signal in self._names}
 
     def in_c(self, values: NDArray[np.float64]) -> list[str] | None:
         """Return the sum on each axis as a C expression, its terms in the order of ``reading``."""
-        terms, rows = self.declared.terms, dict.fromkeys(AXES, "")
+        rows = dict.fromkeys(AXES, "")
         coefficients = iter(values.tolist())
         for axis in (*self.declared.axes, ""):
-            for term in terms.values():
+            for term in self._terms:
                 if term.formula.shared == bool(axis):
                     continue
                 factor = c_number(next(coefficients))
@@ -110,93 +108,95 @@ class FormulaEffect(DeclaredEffect):
     def regressors(
         self, sensor: str, motion: Motion, K: NDArray[np.float64], values: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the formulas' values in the shape of the layout."""
-        del values
-        terms = list(self.declared.terms.values())
-        signals = self._signals(sensor, motion)
-        if self.layout == Layout.EVERY_AXIS:
-            return np.stack([self._value(_formula_of(t, 0), signals, motion) for t in terms], axis=1)
-        if self.layout == Layout.PER_AXIS:
-            return np.stack([self._of_axes(t, signals, motion) for t in terms], axis=2)
-        scalar = [self._of_axes(t, signals, motion) for t in terms if not t.formula.shared]
-        columns = []
-        for axis in self.declared.axes:
-            c = AXES.index(axis)
-            for value in scalar:
-                columns.append(np.zeros_like(value))
-                columns[-1][:, c] = value[:, c]
-        columns += [self._of_axes(t, signals, motion) for t in terms if t.formula.shared]
-        stacked = np.stack(columns, axis=2)
-        return K @ stacked if self.declared.adds_to == "truth" else stacked
-
-    def _of_axes(self, term: Term, signals: list[dict[str, Any]], motion: Motion) -> NDArray[np.float64]:
-        """Return a term's value on each axis: (n, 3) array."""
-        if not term.by_axis:
-            value = self._value(_formula_of(term, 0), signals, motion)
-            return np.broadcast_to(value[:, None], (len(value), 3))
-        return np.stack([self._value(_formula_of(term, c), signals, motion, c) for c in range(3)], axis=1)
-
-    def _signals(self, sensor: str, motion: Motion) -> list[dict[str, Any]]:
-        """Return the signals that the formulas name, for each axis; what the motion lacks is left out."""
-        names = sorted(frozenset[str]().union(*(t.signals for t in self.declared.terms.values())))
-        common = {name: self._signal(name, motion) for name in names if name != "u"}
-        if "u" not in names:
-            return [common] * 3
-        u = truth(sensor, motion)
-        return [{**common, "u": u[:, c]} for c in range(3)]
-
-    def _signal(self, name: str, motion: Motion) -> NDArray[np.float64] | None:
-        """Return a signal: (n,) array, or None for the angle and the rate of a recording without a turn axis.
+        """Return the formulas' values in the shape of the layout.
 
         Raises
         ------
         InputError
-            If the recording does not hold it.
+            If a value is not finite where its signals are, or the recording does not hold a signal.
         """
+        del values
+        n, axes = len(motion.time), self.declared.axes
+        signals = {name: self._signal(name, sensor, motion) for name in self._names}
+        if self.layout == Layout.EVERY_AXIS:
+            out = np.empty((n, len(self._terms)))
+            for j, term in enumerate(self._terms):
+                _fill(out[:, j : j + 1], term.formula.of[""], signals)
+        elif self.layout == Layout.PER_AXIS:
+            out = np.empty((n, 3, len(self._terms)))
+            for j, term in enumerate(self._terms):
+                _fill_axes(out[:, :, j], term, signals)
+        else:
+            scalar = [t for t in self._terms if not t.formula.shared]
+            out = np.zeros((n, 3, len(axes) * len(scalar) + len(self._terms) - len(scalar)))
+            for j, term in enumerate(scalar):
+                value = np.empty((n, 3))
+                _fill_axes(value, term, signals)
+                for i, axis in enumerate(axes):
+                    out[:, AXES.index(axis), i * len(scalar) + j] = value[:, AXES.index(axis)]
+            shared = (t for t in self._terms if t.formula.shared)
+            for j, term in enumerate(shared, len(axes) * len(scalar)):
+                _fill_axes(out[:, :, j], term, signals)
+        if not np.isfinite(out).all():
+            self._check_finite(signals, motion)
+        return np.asarray(K @ out) if self.declared.adds_to == "truth" else out
+
+    def _signal(self, name: str, sensor: str, motion: Motion) -> NDArray[np.float64] | None:
+        """Return a signal: (n, 1) array, u of all axes: (n, 3); None: the angle or rate where there is no turn axis."""
+        if name == "u":
+            return truth(sensor, motion)
         if name == "speed":
-            return length(motion.angular_rate)
+            return length(motion.angular_rate)[:, None]
         field, place = SIGNALS[name].field, SIGNALS[name].place
         found: NDArray[np.float64] | None = (
             turning_direction(motion) if field == "direction" else getattr(motion, field)
         )
-        if found is None:
-            if name in OF_THE_TURN:
-                return None
-            raise InputError(
-                f"effect {self.name} looks at the {name}, but the recording{_of(motion, '')} holds none; "
-                "record one, or take the effect out of the configuration"
-            )
-        for i in place:
-            found = found[:, i]
-        return found
+        if found is not None:
+            for i in place:
+                found = found[:, i]
+            return found[:, None]
+        if name in OF_THE_TURN:
+            return None
+        raise InputError(
+            f"effect {self.name} looks at the {name}, but the recording{_of(motion, '')} holds none; "
+            "record one, or take the effect out of the configuration"
+        )
 
-    def _value(
-        self, formula: Formula, signals: list[dict[str, Any]], motion: Motion, axis: int = 0
-    ) -> NDArray[np.float64]:
-        """Return a formula's value: (n,) array.
+    def _check_finite(self, signals: dict[str, Any], motion: Motion) -> None:
+        """Refuse a formula that is not finite where its signals are."""
+        for term in self._terms:
+            for axis, formula in term.formula.of.items():
+                own = {name: signal for name, signal in _of_axis(signals, axis).items() if name in formula.signals}
+                if any(signal is None for signal in own.values()):
+                    continue
+                value, *given = np.broadcast_arrays(formula(own), *own.values())
+                rows, columns = np.nonzero(~np.isfinite(value) & np.logical_and.reduce(np.isfinite(given)))
+                if len(rows):
+                    i, c = int(rows[0]), int(columns[0])
+                    at = ", ".join(f"{name} = {signal[i, c]:.6g}" for name, signal in zip(own, given, strict=True))
+                    raise InputError(
+                        f"effect {self.name}: {formula.text} is not finite at {motion.time[i]:.6g} s{_of(motion)}, "
+                        f"where {at}; write the formula so that it has a value everywhere (band, maximum), or leave it "
+                        "out"
+                    )
 
-        Raises
-        ------
-        InputError
-            If it is not finite where its signals are.
-        """
-        n = len(motion.time)
-        given: Mapping[str, Any] = {name: signals[axis][name] for name in formula.signals}
-        if any(signal is None for signal in given.values()):
-            return np.zeros(n)
-        value = np.broadcast_to(formula(given), (n,))
-        wrong = ~np.isfinite(value)
-        if np.any(wrong):
-            known = np.all([np.isfinite(signal) for signal in given.values()], axis=0)
-            first = np.flatnonzero(wrong & known)
-            if len(first):
-                i = int(first[0])
-                at = ", ".join(f"{name} = {given[name][i]:.6g}" for name in sorted(given))
-                raise InputError(
-                    f"effect {self.name}: {formula.text} is not finite at {motion.time[i]:.6g} s{_of(motion)}, where "
-                    f"{at}; write the formula so that it has a value everywhere (band, maximum), or leave it out"
-                )
-        return value
+
+def _of_axis(signals: dict[str, Any], axis: str) -> dict[str, Any]:
+    """Return the signals of one axis, of all where none is named."""
+    c = AXES.index(axis) if axis else 0
+    return {**signals, "u": signals["u"][:, c : c + 1]} if axis and "u" in signals else signals
+
+
+def _fill_axes(out: NDArray[np.float64], term: Term, signals: dict[str, Any]) -> None:
+    """Write a term's value on each axis: (n, 3) array."""
+    for axis, formula in term.formula.of.items():
+        c = AXES.index(axis) if axis else 0
+        _fill(out[:, c : c + 1] if axis else out, formula, _of_axis(signals, axis))
+
+
+def _fill(out: NDArray[np.float64], formula: Formula, signals: dict[str, Any]) -> None:
+    """Write a formula's value: (n, 1) or (n, 3) array; zeros where the motion lacks a signal of the turn."""
+    out[:] = 0.0 if any(signals[name] is None for name in formula.signals) else formula(signals)
 
 
 def _formula_of(term: Term, axis: int) -> Formula:
