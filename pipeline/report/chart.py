@@ -34,7 +34,7 @@ UPRIGHT = 28  # px, of height for each tick of axis y
 SUBDIVISION = 10  # drawing units in a pixel
 MAXIMUM_DOTS = 240  # samples that are drawn as dots; about one in 1.4 px
 BUCKETS = 140  # ranges that are drawn of more samples; about one in 2.4 px
-LARGE_DOTS = 300  # dots that have room to be large
+LARGE_DOTS, LARGE_MEANS = 300, 20  # dots, and dots with intervals, that have room to be large
 ANGLE_STEPS = (10.0, 15.0, 30.0, 45.0, 90.0, 180.0, 360.0, 720.0, 1800.0, 3600.0)  # deg, parts and multiples of a turn
 
 Tick = tuple[float, str]
@@ -44,17 +44,8 @@ Tick = tuple[float, str]
 class Figure:
     """A chart with its texts.
 
-    Attributes
-    ----------
-    svg : Markup
-    caption : str
-        What is drawn, below the chart.
-    legend : tuple of (str, str)
-        CSS class and text of each colour.
-    finding : str
-        What the chart shows, in one sentence above it.
-    quiet : bool
-        Whether the chart shows nothing beyond noise; the page folds it.
+    ``caption``: what is drawn, below the chart; ``legend``: CSS class and text of each colour; ``finding``: what the
+    chart shows, in one sentence above it; ``quiet``: nothing is seen beyond noise, so that the page folds it.
     """
 
     svg: Markup
@@ -346,10 +337,11 @@ def _draw(layer: Layer, x: Axis, y: Axis) -> str:
         pieces = np.split(known, np.flatnonzero(np.diff(known) > 1) + 1)
         path = "".join([_line(x.units(layer.x[piece]), y.units(layer.y[piece])) for piece in pieces])
         return f'<path class="line c{layer.colour} {layer.style}" d="{path}"/>'
-    at, path, size = x.units(layer.x[known]), "", " large" * (len(layer.x) <= LARGE_DOTS)
+    at, path, room = x.units(layer.x[known]), "", LARGE_DOTS
     if layer.low is not None and layer.high is not None:
-        low, high, size = y.units(layer.low[known]), y.units(layer.high[known]), ""
+        low, high, room = y.units(layer.low[known]), y.units(layer.high[known]), LARGE_MEANS
         path = f'<path class="strokes faint-strokes c{layer.colour}" d="{_path("M%d %dV%d", at, low, high)}"/>'
+    size = " large" * (len(layer.x) <= room)
     return f'{path}<path class="dots{size} c{layer.colour}" d="{_dots(at, y.units(layer.y[known]))}"/>'
 
 

@@ -123,20 +123,15 @@ def _figure(compared: list[Compared], comparison: JSON, measure: str, unit: str,
     title = f"{MEASURES[measure]}, {unit}"
     words = ["Mean of each group with its 95 % interval; faint, its units."] * any(len(p.units) > 1 for p in points)
     words += ["Dashed: the error that noise alone gives."] * any(p.floor for p in points)
-    description = "; ".join(f"{c.group.label}: {number(c.mean)}, 95 % interval {_ends(c)}" for c in compared)
     legend: tuple[tuple[str, str], ...] = ()
     if x is None:
-        drawn = bars(f"{name}-{measure}", title, description, points, title)
+        drawn = bars(f"{name}-{measure}", title, points, title)
     else:
-        drawn = curves(f"{name}-{measure}", title, description, points, title, x_label=x["label"], named=x["named"])
+        drawn = curves(f"{name}-{measure}", title, points, title, x_label=x["label"], named=x["named"])
         series = list(dict.fromkeys(p.series for p in points))
         legend = tuple((f"c{i % COLOURS}", s) for i, s in enumerate(series)) if len(series) > 1 else ()
     told = finding([c.group for c in compared], measure, comparison["pairs"])
     return Figure(drawn, " ".join(words), legend, told)
-
-
-def _ends(c: Compared) -> str:
-    return " to ".join(map(number, c.interval))
 
 
 def _point(c: Compared, measure: str, x: JSON | None) -> Point | None:
@@ -150,8 +145,7 @@ def _point(c: Compared, measure: str, x: JSON | None) -> Point | None:
         return None
     units = tuple(v for v in c.group.figures[measure] if v and v > 0.0)
     floor = c.group.mean("noise_floor") if measure == "after" else None
-    label = c.group.label if x is not None else f"{c.group.label}: {number(c.mean)}"
-    return Point(label, c.mean, 0, c.interval, units, floor, at, c.group.series)
+    return Point(c.group.label, c.mean, 0, c.interval, units, floor, at, c.group.series)
 
 
 def _parameters(groups: Sequence[Group], against: str, pairs: Mapping[str, str] | None) -> JSON:

@@ -2,7 +2,7 @@
 
 The length of a bar on a logarithmic axis has no meaning, only its end has one: so each row shows its number, and levels
 (the noise floor) are lines across all rows. A row with an interval is the mean of several units: a dot with its 95 %
-interval and faint dots for the units.
+interval and faint dots for the units. The values are also the description of the chart for screen readers.
 """
 
 from __future__ import annotations
@@ -59,22 +59,14 @@ class Point:
     series: str = ""
 
 
-def bars(
-    name: str,
-    title: str,
-    description: str,
-    rows: Sequence[Point],
-    label: str,
-    *,
-    levels: dict[str, float] | None = None,
-) -> Markup:
+def bars(name: str, title: str, rows: Sequence[Point], label: str, *, levels: dict[str, float] | None = None) -> Markup:
     """Return a chart with a row for each value, on a logarithmic axis.
 
     Parameters
     ----------
-    name, title, description : str
-        Identifier that is unique on the page, and the text alternatives.
-    rows : sequence of Bar
+    name, title : str
+        Identifier that is unique on the page, and what the chart is.
+    rows : sequence of Point
     label : str
         Of the values, with unit.
     levels : dict of str to float, optional
@@ -98,12 +90,23 @@ def bars(
         out.append(text(min(max(at, LEFT + half), WIDTH - half), top - 4, said, "m"))
     out += [text(max(at, LEFT + 14), bottom + 13, tick, "m") for at, tick in ticks]
     out.append(text((axis.start + axis.stop) / 2, bottom + 27, label, "m"))
-    return svg(name, title, description, bottom + 34, "".join(out))
+    description = _description(rows) + "".join(f"; {words} {number(value)}" for words, value in levels.items())
+    return svg(name, title, f"{label}. {description}", bottom + 34, "".join(out))
+
+
+def _description(points: Sequence[Point]) -> str:
+    """Return the values of points with their intervals."""
+    said = []
+    for p in points:
+        interval = f", 95 % interval {number(p.interval[0])} to {number(p.interval[1])}" if p.interval else ""
+        said.append(f"{p.series}{', ' if p.series else ''}{p.label}: {number(p.value)}{interval}")
+    return "; ".join(said)
 
 
 def _row(row: Point, axis: Axis, top: float) -> str:
     """Return the text of a row, and its bar or its mean."""
-    out = text(LEFT, top + 11, row.label, "b")
+    said = f"{row.label}: {number(row.value)}" if row.interval else row.label
+    out = text(LEFT, top + 11, said, "b")
     if row.value is None:
         return out + text(LEFT, top + 23, "not known")
     end = axis.pixels(row.value)
@@ -111,7 +114,7 @@ def _row(row: Point, axis: Axis, top: float) -> str:
         out += f'<path class="bar c{row.colour}" d="M{LEFT} {top + 15}H{end:.1f}v10H{LEFT}z"/>'
         return out + text(end + 4, top + 24, number(row.value))
     middle, (low, high) = top + 21, row.interval
-    out += f"<g><title>{escape(f'{row.label} ({number(low)} to {number(high)})')}</title>"
+    out += f"<g><title>{escape(f'{said} ({number(low)} to {number(high)})')}</title>"
     if len(row.units) > 1:
         dots = "".join(f"M{axis.pixels(v):.1f} {middle}h0" for v in row.units)
         out += f'<path class="unit-dots c{row.colour}" d="{dots}"/>'
@@ -126,7 +129,6 @@ def _row(row: Point, axis: Axis, top: float) -> str:
 def columns(
     name: str,
     title: str,
-    description: str,
     groups: dict[str, list[float]],
     label: str,
     *,
@@ -137,7 +139,7 @@ def columns(
 
     Parameters
     ----------
-    name, title, description : str
+    name, title : str
     groups : dict of str to list of float
         Values by the text below their group.
     label, x_label : str
@@ -164,17 +166,16 @@ def columns(
         out.append(f'<path class="level" d="{dashes}"/>')
     out.append(upright_text((top + bottom) / 2, label))
     out.append(text((left + right) / 2, bottom + 27, x_label, "m"))
-    return svg(name, title, description, bottom + 34, "".join(out))
+    said = "; ".join(f"{below}: {', '.join(number(v, 2) for v in group)}" for below, group in groups.items())
+    return svg(name, title, f"{label}, by {x_label}. {said}", bottom + 34, "".join(out))
 
 
-def curves(
-    name: str, title: str, description: str, points: Sequence[Point], label: str, *, x_label: str, named: bool
-) -> Markup:
+def curves(name: str, title: str, points: Sequence[Point], label: str, *, x_label: str, named: bool) -> Markup:
     """Return a chart of means with intervals along an axis, a colour for each series.
 
     Parameters
     ----------
-    name, title, description : str
+    name, title : str
     points : sequence of Point
         Each with an interval.
     label, x_label : str
@@ -196,4 +197,6 @@ def curves(
     wide = min(places) > 0.0 and max(places) > DECADE * min(places)
     names = [(p.x, p.value or 0.0, p.label) for p in points] if named else None
     panel = Panel(layers, label, 230, logarithmic=True, names=names)
-    return chart(name, title, description, [panel], x_label, kind="log" if wide else "", margin=0.03)
+    return chart(
+        name, title, f"{label}. {_description(points)}", [panel], x_label, kind="log" if wide else "", margin=0.03
+    )

@@ -82,7 +82,6 @@ def error_steps(sensor: str, held_out: JSON, found: JSON, *, vector: bool) -> Fi
     drawn = bars(
         f"{sensor}-staircase-{kind}",
         f"{sensor}: {finding}",
-        "; ".join(f"{r.label} {number(r.value)}" for r in rows + added) + f"; noise floor {number(floor)} {unit}",
         rows + added,
         f"root mean square error, {unit} (logarithmic)",
         levels={"noise floor": floor} if floor else {},

@@ -295,7 +295,6 @@ def _harmonics(sensor: str, name: str, amplitudes: NDArray[np.float64], level: N
     drawn = columns(
         f"{sensor}-harmonics-{name}",
         f"{sensor}: {finding}",
-        "; ".join(f"{k} cycles: {', '.join(number(v, 2) for v in row)}" for k, row in groups.items()),
         groups,
         f"amplitude, {unit}",
         x_label="cycles a turn",

@@ -68,9 +68,8 @@ def _chart(sensor: str, entries: Sequence[JSON]) -> Figure | None:
         change = f"{'falls' if last < first else 'rises'} from {number(first)} to {number(last)}"
     ratio = f", {number(last / floor)} × the noise floor" if floor else ""
     finding = f"{sensor.capitalize()}: in the last run the held-out error {change} {unit}{ratio}"
-    description = "; ".join(f"{row.label}: {number(row.value)} {unit}" for row in rows)
     levels = {"noise floor": floor} if floor else {}
-    drawn = bars(f"history-{sensor}", finding, description, rows, f"rms error, {unit} (logarithmic)", levels=levels)
+    drawn = bars(f"history-{sensor}", finding, rows, f"rms error, {unit} (logarithmic)", levels=levels)
     caption = "Error on held-out motion after each run that changed the unit, and the effects that it added or removed."
     return Figure(drawn, caption, (), finding)
 

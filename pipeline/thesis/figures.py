@@ -134,7 +134,6 @@ def _per_procedure(results: Results, told: dict[tuple[str, str, str], float], de
     svg = columns(
         f"procedures-{device}-{sensor}",
         f"{DEVICES[device]}, {sensor}: held-out error by procedure",
-        _told(groups),
         groups,
         f"mean |e| after, {SENSOR_UNITS[sensor]}",
         x_label=BELOW[sensor],
@@ -168,7 +167,6 @@ def _methods(results: Results, printed: Path, sensor: str) -> Figure:
     svg = columns(
         f"methods-{sensor}",
         f"{sensor.capitalize()}: held-out error by method",
-        _told(groups),
         groups,
         f"mean |e| after, {SENSOR_UNITS[sensor]}",
         x_label="device",
@@ -196,7 +194,6 @@ def _tables(results: Results, told: dict[tuple[str, str, str], float]) -> Figure
     svg = columns(
         "tables",
         "What is left of the error on either table",
-        _told(groups, " %"),
         groups,
         "after, % of before",
         x_label="sensor; home: on the home-made table",
@@ -215,8 +212,7 @@ def _speed(rows: Sequence[Row]) -> Figure:
             rate = float(procedure.split("-")[1].removesuffix("dps"))
             points.append(Point(_short(procedure), mean.value, interval=mean.interval, x=rate, series=name))
     title = "Error of continuous rotation by rate"
-    words = "; ".join(f"{p.series}, {p.x:g} deg/s: {number(p.value)}" for p in points)
-    svg = curves("speed", title, words, points, "mean |e| after, g", x_label="rate, deg/s", named=False)
+    svg = curves("speed", title, points, "mean |e| after, g", x_label="rate, deg/s", named=False)
     legend = tuple((f"c{i}", name) for i, name in enumerate(FILTERS.values()))
     caption = (
         "MPU6050 (2), errata corrected; means over seeds with their 95 % intervals. The filter is on the turns and on "
@@ -239,15 +235,9 @@ def _scatter(scatter: Sequence[Scatter], quantity: str) -> Figure:
     svg = columns(
         f"scatter-{quantity}",
         f"Scatter of {quantity}",
-        _told(groups),
         groups,
         f"rms deviation of {quantity}",
         x_label="device",
     )
     legend = tuple((f"c{i}", text) for i, text in enumerate(("printed", *CAUSES)))
     return Figure(svg, "", legend, f"Scatter of {quantity}: printed, and by picking single samples")
-
-
-def _told(groups: dict[str, list[float]], unit: str = "") -> str:
-    """Return the values of a chart of groups in words, for those who do not see it."""
-    return "; ".join(f"{name}: {', '.join(number(v) for v in values)}{unit}" for name, values in groups.items())

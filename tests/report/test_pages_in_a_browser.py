@@ -186,7 +186,9 @@ def test_the_table_of_all_units_sorts_by_keyboard_with_empty_cells_last(browser:
 
 def test_the_table_of_all_units_needs_no_horizontal_scrolling_on_a_desktop(browser: Browser, pages: Path) -> None:
     page = opened(browser, pages / "campaign.html", viewport={"width": 1200, "height": 900})
-    page.evaluate("document.querySelectorAll('#all tbody a').forEach((a) => { a.textContent = 'mpu6050-1-mark2-thesis' })")
+    page.evaluate(
+        "document.querySelectorAll('#all tbody a').forEach((a) => { a.textContent = 'mpu6050-1-mark2-thesis' })"
+    )
     wide, shown = page.eval_on_selector(".tall", "e => [e.scrollWidth, e.clientWidth]")
     assert wide <= shown
     page.context.close()
