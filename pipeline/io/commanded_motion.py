@@ -1,4 +1,4 @@
-"""A table without encoders, followed from its commanded program and the moves in the data.
+"""Motion of a table without encoders, from its commanded program and the moves in the data.
 
     A(t) = P(tau),   r(t) = P'(tau),   tau = m_j + (1 + k) (t - t_j) + d_j       near move j
 
@@ -7,12 +7,12 @@ where
     P   : commanded angle by the program's own time, deg: rests, and turns with trapezoidal rate
     m_j : middle of move j by the program, s
     t_j : the sensor's time there by offset and drift of the whole program (``pipeline.io.clock_alignment``), s
-    d_j : how far the move is off that, s
-    k   : drift of the program's clock, 1: that of the moves, for pauses between them look like one
+    d_j : deviation of the move from that, s
+    k   : drift of the program's clock during moves, 1; pauses between moves would look like a drift
 
 ``d_j`` and ``k`` are fitted to the readings w = a P'(tau) + b of the gyroscope about the move, so a table that pauses
-now and then is followed from rest to rest. Angles and rates are those commanded: what the motors lost is not known
-here, and is a matter of the table's accuracy.
+between moves is followed from rest to rest. Angles and rates are the commanded ones: lost steps of the motors are not
+observable here and belong to the table's stated accuracy.
 """
 
 from __future__ import annotations
@@ -167,13 +167,13 @@ def _place(table: ChannelTable, knots: Values, t: Values, tau: Values) -> _Place
     for _ in range(ROUNDS):
         now = placed.tau(t)
         commanded = at(knots, now)[1]
-        felt = _about_the_moves(table, commanded)
+        sensed = _about_the_moves(table, commanded)
         slope = (at(knots, now + STEP_S)[1] - at(knots, now - STEP_S)[1]) / (2 * STEP_S)
-        off = slope * (felt - commanded)
-        told = np.bincount(near, slope**2, n)
-        change = np.divide(np.bincount(near, off, n), told, out=np.zeros(n), where=told > 0)
+        off = slope * (sensed - commanded)
+        info = np.bincount(near, slope**2, n)
+        change = np.divide(np.bincount(near, off, n), info, out=np.zeros(n), where=info > 0)
         since = t - placed.time[near]
-        lever = since - np.divide(np.bincount(near, slope**2 * since, n), told, out=np.zeros(n), where=told > 0)[near]
+        lever = since - np.divide(np.bincount(near, slope**2 * since, n), info, out=np.zeros(n), where=info > 0)[near]
         gain = float(np.sum(off * lever)) / max(float(np.sum((slope * lever) ** 2)), 1e-300)
         shifts = np.clip(placed.shifts + change, -reach, reach)
         placed = replace(placed, shifts=shifts, drift=placed.drift + gain)

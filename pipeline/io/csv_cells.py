@@ -1,13 +1,12 @@
-"""A text log as blocks of text cells: for programs that change some columns and keep the others as written.
+"""A text log as blocks of text cells, for programs that change some columns and write the others unchanged.
 
-Every cell is text until a column is asked for as numbers, so that nothing is lost in what is not changed. What stands
-before the data (lines that are skipped, comments, the header) is kept as it is, but for the names.
+A cell stays text until its column is asked for as numbers. The lines before the data (skipped lines, comments, the
+header) are kept, except for changed names.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import IO, TYPE_CHECKING
 
 import numpy as np
@@ -16,8 +15,8 @@ from pyarrow import compute as pc
 from pyarrow import csv as arrow_csv
 
 from pipeline.errors import InputError
-from pipeline.io.csv_header import DELIMITERS, fields, single_blanks
-from pipeline.io.ingest_settings import AUTO, COMMENTED, WHITESPACE
+from pipeline.io.csv_header import fields, find_delimiter, single_blanks
+from pipeline.io.ingest_settings import COMMENTED, WHITESPACE
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -33,19 +32,9 @@ DECIMALS = 12  # far below any sensor's resolution, above the rounding of a doub
 
 @dataclass(frozen=True)
 class Head:
-    """What stands before the data.
+    """The lines before the data, without the header; the header line (None: there is none) and its names.
 
-    Attributes
-    ----------
-    lines : list of str
-        As they are, without the header.
-    header : str or None
-        The line with the names, as it is; None where there is none.
-    names : list of str
-        Of the columns; ``column 0`` and so on where there is no header.
-    delimiter : str
-    start : int
-        Byte at which the data begin.
+    ``names`` are ``column 0`` ... where there is no header. The data begin at byte ``start``.
     """
 
     lines: list[str]
@@ -55,7 +44,7 @@ class Head:
     start: int
 
     def text(self, names: list[str]) -> str:
-        """Return what stands before the data, with other names where they differ."""
+        """Return the lines before the data, with other names where they differ."""
         header = self.header
         if header is not None and names != self.names:
             mark = header[: len(header) - len(header.lstrip("#%/;! "))]
@@ -70,56 +59,42 @@ def read_head(raw: IO[bytes], settings: CsvFormat, source: Path) -> Head:
     Raises
     ------
     InputError
-        If there is no header where there should be one, or what stands there is no text.
+        If there is no header where there should be one, or a line is not UTF-8.
     """
     lines: list[str] = []
     while True:
         start = raw.tell()
-        line = _decoded(raw.readline(LONGEST_LINE), f"{source}:{len(lines) + 1}")
+        try:
+            line = raw.readline(LONGEST_LINE).decode("utf-8" if lines else "utf-8-sig")
+        except UnicodeDecodeError as error:
+            raise InputError(f"this line is not UTF-8: {error.reason}", f"{source}:{len(lines) + 1}") from None
         comment = settings.comment is not None and line.lstrip().startswith(settings.comment)
         if not line or not (len(lines) < settings.skip_lines or comment):
             break
         lines.append(line.rstrip("\r\n"))
-    header: str | None = line.rstrip("\r\n") if settings.header is True else None
+    first = line.rstrip("\r\n")
+    header: str | None = None
     if settings.header is True:
-        start = raw.tell()
+        header, start = first, raw.tell()
     elif settings.header == COMMENTED and lines:
-        header = lines.pop()
-    first = header or line.rstrip("\r\n")
+        first = header = lines.pop()
     if not first.strip():
         raise InputError("the file is empty; expected a header with the names of the columns", f"{source}:1")
-    delimiter = settings.delimiter
-    if delimiter == AUTO:
-        delimiter = max(DELIMITERS, key=first.count)
-    if delimiter == WHITESPACE:
-        delimiter, first = " ", " ".join(first.split())
+    delimiter = find_delimiter(settings, first)
+    if settings.delimiter == WHITESPACE:
+        first = " ".join(first.split())
     names = fields(first.lstrip(settings.comment or ""), delimiter)
     if header is None:
         names = [f"column {i}" for i in range(len(names))]
     return Head(lines, header, names, delimiter, start)
 
 
-def _decoded(line: bytes, where: str) -> str:
-    try:
-        return line.decode("utf-8-sig" if where.endswith(":1") else "utf-8")
-    except UnicodeDecodeError as error:
-        raise InputError(f"this line is not UTF-8: {error.reason}", where) from None
-
-
 @dataclass(frozen=True)
 class TextBlock:
-    """Some rows of a text log.
+    """Rows of a text log as columns of text.
 
-    Attributes
-    ----------
-    columns : list of Array of text
-    quoted : bool
-        Whether cells may have to be quoted.
-    data : bytes
-        The lines, as they were read.
-    comment : str or None
-    line : int
-        Number of their first line, counted from 1.
+    ``quoted``: cells may have to be quoted. ``data``: the lines as they were read, the first of which has the number
+    ``line``, counted from 1; those that start with ``comment`` are no rows.
     """
 
     columns: list[pa.Array]
@@ -133,15 +108,12 @@ class TextBlock:
         """Number of rows."""
         return len(self.columns[0])
 
-    @cached_property
-    def _lines(self) -> list[int]:
-        parts = self.data.split(b"\n")
-        mark = (self.comment or "\0").encode()
-        return [i for i, part in enumerate(parts) if part.strip(b"\r") and not part.lstrip().startswith(mark)]
-
     def line_of(self, row: int) -> int:
         """Return the line of a row, counted from 1."""
-        return self.line + self._lines[row] if row < len(self._lines) else self.line
+        mark = (self.comment or "\0").encode()
+        parts = enumerate(self.data.split(b"\n"), self.line)
+        lines = [i for i, part in parts if part.strip(b"\r") and not part.lstrip().startswith(mark)]
+        return lines[row] if row < len(lines) else self.line
 
     def numbers(self, where: list[int], decimal: str, names: list[str], source: Path) -> NDArray[np.float64]:
         """Return columns as numbers, NaN where a cell is empty: (n, k) array.
@@ -153,28 +125,24 @@ class TextBlock:
         """
         out = np.empty((self.rows, len(where)))
         for k, i in enumerate(where):
-            text = self.columns[i]
-            if decimal != ".":
-                text = pc.replace_substring(text, decimal, ".")
+            text = self.columns[i] if decimal == "." else pc.replace_substring(self.columns[i], decimal, ".")
+            try:
+                out[:, k] = pc.cast(text, pa.float64()).to_numpy(zero_copy_only=False)
+                continue
+            except pa.ArrowInvalid:  # blanks, empty cells, or no number
+                trimmed = pc.utf8_trim_whitespace(text)
+                text = pc.if_else(pc.equal(trimmed, ""), pa.scalar(None, pa.string()), trimmed)
             try:
                 out[:, k] = pc.cast(text, pa.float64()).to_numpy(zero_copy_only=False)
             except pa.ArrowInvalid:
-                out[:, k] = self._carefully(text, names[i], source)
+                row, cell = next((r, c) for r, c in enumerate(text.to_pylist()) if c is not None and not _is_number(c))
+                place = f"{source}:{self.line_of(row)}"
+                raise InputError(f"{names[i]} is {cell!r}; expected a number", place) from None
         return out
-
-    def _carefully(self, text: pa.Array, name: str, source: Path) -> NDArray[np.float64]:
-        """Read a column with blanks, empty cells, or what is no number."""
-        trimmed = pc.utf8_trim_whitespace(text)
-        filled = pc.if_else(pc.equal(trimmed, ""), pa.scalar(None, pa.string()), trimmed)
-        try:
-            return np.asarray(pc.cast(filled, pa.float64()).to_numpy(zero_copy_only=False), np.float64)
-        except pa.ArrowInvalid:
-            row, cell = next((r, c) for r, c in enumerate(filled.to_pylist()) if c is not None and not _is_number(c))
-            raise InputError(f"{name} is {cell!r}; expected a number", f"{source}:{self.line_of(row)}") from None
 
 
 def text_blocks(raw: IO[bytes], head: Head, settings: CsvFormat, block_bytes: int, source: Path) -> Iterator[TextBlock]:
-    """Yield the rows as text, some at a time."""
+    """Yield the rows as text, block by block."""
     names = [str(i) for i in range(len(head.names))]
     convert = arrow_csv.ConvertOptions(
         column_types=dict.fromkeys(names, pa.string()), strings_can_be_null=False, check_utf8=True

@@ -1,4 +1,4 @@
-"""Gyroflow's self-describing log, ``.gcsv``: scales, orientation and column names stand in the file itself.
+"""Gyroflow's self-describing log, ``.gcsv``: the file states scales, orientation and column names.
 
     GYROFLOW IMU LOG            (or CAMERA IMU LOG)
     version,1.3
@@ -10,9 +10,9 @@
     0,39,86,183,-1137,-15689,-2986
 
 Source: docs.gyroflow.xyz/app/technical-details/gcsv-format (versions 1.0 to 1.3). The orientation names, for the
-body's x, y and z, the reading that points along it, in capitals, or against it, in small letters. A magnetometer
-(``mx`` ..) is not used. Columns with canonical names (``temperature_degc``, ``table_angle_deg`` ...) may follow, in the
-unit that the name says. A recording without an accelerometer holds ``t,gx,gy,gz``.
+body's x, y and z, the reading that points along it (capital) or against it (small letter). A magnetometer (``mx`` ..)
+is not used. Columns with canonical names (``temperature_degc``, ``table_angle_deg`` ...) may follow, in the unit that
+the name states. A recording without an accelerometer holds ``t,gx,gy,gz``.
 """
 
 from __future__ import annotations

@@ -1,17 +1,17 @@
-"""How gravity turns between rests tells the unit of the angular rates.
+"""The unit of the angular rates, from the rotation of gravity between rests.
 
-A vector at rest in the room turns in the sensor's axes against the sensor's own rate:
+In the sensor's axes the direction of gravity rotates against the angular rate:
 
     du/dt = -(s w) x u
 
 where
 
-    u : direction of the specific force at rest, before and after a move
+    u : direction of the specific force, measured at rest before and after a move
     w : reading of the gyroscope, minus its mean in the rests on both sides
-    s : deg/s in one of its units, which is looked for
+    s : deg/s per unit of the gyroscope, the unknown
 
-The unit whose s carries u over the moves, from rest to rest, with the smallest angle left is the right one; the next
-possible unit (57.3 times, or another range of the sensor) misses by tens of degrees.
+The right s rotates u from rest to rest with the smallest residual angle. The next possible unit (57.3 times, or another
+range of the sensor) misses by tens of degrees.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ FITS_DEG, FAILS_DEG = 15.0, 30.0
 
 @dataclass(frozen=True)
 class Move:
-    """What happened between two rests.
+    """A move between two rests.
 
     Attributes
     ----------
@@ -127,12 +127,11 @@ def moves_of(force: NDArray[np.float64], rate: NDArray[np.float64], time_s: NDAr
 
 def misfit_deg(moves: Sequence[Move], scales: Sequence[float]) -> NDArray[np.float64]:
     """Return the median over moves of ``misfits_deg``: (len(scales),) array, deg."""
-    median: NDArray[np.float64] = np.median(misfits_deg(moves, scales), axis=0)
-    return median
+    return np.asarray(np.median(misfits_deg(moves, scales), axis=0))
 
 
 def misfits_deg(moves: Sequence[Move], scales: Sequence[float]) -> NDArray[np.float64]:
-    """Return the angle that each scale leaves between the gravity it predicts after a move and the one that was read.
+    """Return the angle between the gravity that each scale predicts after a move and the one that was read.
 
     Parameters
     ----------
@@ -150,12 +149,11 @@ def misfits_deg(moves: Sequence[Move], scales: Sequence[float]) -> NDArray[np.fl
             direction * np.cos(angle) + np.cross(axis, direction) * np.sin(angle) + axis * along * (1 - np.cos(angle))
         )
     after = np.stack([m.after for m in moves])[:, None, :]
-    left: NDArray[np.float64] = np.degrees(np.arccos(np.clip(np.sum(direction * after, axis=2), -1.0, 1.0)))
-    return left
+    return np.asarray(np.degrees(np.arccos(np.clip(np.sum(direction * after, axis=2), -1.0, 1.0))))
 
 
 def declared_scale(table: ChannelTable) -> tuple[float, str] | None:
-    """Return by what factor the angular rates are off, and what shows it; None where they fit or nothing shows it."""
+    """Return the factor by which the angular rates are off, and the evidence; None where none is found."""
     if not {"accel_x", "gyro_x"} <= table.values.keys():
         return None
     part = slice(0, MOST_SAMPLES)

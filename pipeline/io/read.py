@@ -1,8 +1,8 @@
 """All recordings of one unit: files found, read, checked, turned into body axes, their clocks compared.
 
-Times of a unit count from power-on. Where the times of two files overlap they cannot be one clock (each file starts at
-0), and the time between the recordings is unknown. Times since 1970 are counted from the unit's first sample instead: a
-double holds 1.7*10^9 s to 2*10^-7 s only, too coarse to differentiate.
+Times of a unit count from power-on. Where the times of two files overlap they cannot be of one clock (each file starts
+at 0), and the time between the recordings is unknown. Times since 1970 are counted from the unit's first sample
+instead, as a double resolves 1.7*10^9 s to 2*10^-7 s only, too coarse to differentiate.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""Moments to integer nanoseconds, and what cannot be true of them.
+"""Timestamps of messages as integer nanoseconds, and the checks of their values and order.
 
     t [ns] = seconds * 10^9 + nanoseconds,   0 <= nanoseconds < 10^9
 
-A double holds a time since 1970 to 238 ns only, so that no moment passes through one, unless the log itself sends it as
-one; then its whole seconds and its fraction are converted apart, which loses nothing more.
+A double resolves a time since 1970 to 238 ns only. So no timestamp passes through one, unless the log itself stores it
+as one; then whole seconds and fraction are converted separately, which loses nothing more.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
-"""YAML files of users, read within limits: no file of a stranger costs more time or memory than its size explains.
+"""YAML files of users, read within limits of time and memory.
 
-An alias (``*name``) stands for everything that its anchor holds. A few lines of aliases of aliases can so stand for
-10^9 values. Before anything is built, the events of the parser are counted, an alias with all that it stands for:
+An alias (``*name``) stands for everything that its anchor holds, so a few lines of nested aliases can stand for 10^9
+values. Before anything is built, the events of the parser are counted:
 
     size = number of scalars, lists and mappings, each alias counted with the size of its anchor
 
-Numbers, dates and repeated keys are read as Hydra reads them: ``1e-3`` is a number, a date stays a text, a key that
-stands twice is refused.
+Numbers, dates and repeated keys are read as Hydra reads them: ``1e-3`` is a number, a date stays a text, a repeated key
+is refused.
 """
 
 from __future__ import annotations
