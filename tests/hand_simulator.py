@@ -99,6 +99,11 @@ def level_up(q: Array) -> Array:
 
 def draw(hand: Hand, seed: int) -> Drawn:
     """Draw a unit and its recording."""
+    return draw_together(hand, seed, 1)[0]
+
+
+def draw_together(hand: Hand, seed: int, units: int) -> list[Drawn]:
+    """Draw units that are moved together, and one recording of each: sensors and noise differ, the motion is one."""
     rng = np.random.default_rng(seed)
     step = 1.0 / hand.rate_hz
     fine = step / FINE
@@ -125,7 +130,11 @@ def draw(hand: Hand, seed: int) -> Drawn:
         felt.append(up + shake)
         still.append(np.full(len(up), resting))
     rate, felt, still = (np.concatenate(v)[::FINE] for v in (rate, felt, still))
-    return _read(hand, rng, rate, felt, still)
+    if hand.settle_deg:  # gravity that the accelerometers feel is off by an angle common to a rest and a move
+        edges = np.flatnonzero(np.diff(still.astype(int)) != 0)
+        off = hand.settle_deg / GRAVITY_DPS * rng.standard_normal((hand.rests + 1, 3))
+        felt = felt + np.cross(off[np.searchsorted(edges, np.arange(len(still))) // 2], felt)
+    return [_read(hand, rng, rate, felt, still) for _ in range(units)]
 
 
 def _move(hand: Hand, rng: np.random.Generator, fine: float, up: Array) -> Array:
@@ -162,13 +171,6 @@ def _read(hand: Hand, rng: np.random.Generator, rate: Array, felt: Array, still:
     sheets = read_config("sensor", "mpu6050")
     truths = {"accelerometer": felt, "gyroscope": rate}
     readings, biases, matrices = {}, {}, {}
-    if (
-        hand.settle_deg
-    ):  # each move ends a little off what the accelerometer feels: common to the move, as by a soft seat
-        edges = np.flatnonzero(np.diff(still.astype(int)) != 0)
-        number = np.searchsorted(edges, np.arange(n)) // 2
-        off = hand.settle_deg / GRAVITY_DPS * rng.standard_normal((hand.rests + 1, 3))
-        truths["accelerometer"] = felt + np.cross(off[number], felt)
     for sensor in ("accelerometer", "gyroscope"):
         sheet = sheets[sensor]
         bias = 0.5 * sheet["bias"] * rng.uniform(-1, 1, 3)
