@@ -19,8 +19,7 @@ from pipeline.diagnosis.by_hand_left import dependences
 from pipeline.diagnosis.by_hand_picture import added_variable
 from pipeline.diagnosis.verdict import evidence_of, judged
 from pipeline.errors import CannotCalibrateError
-from pipeline.estimation.multi_position.equations import HandNoise
-from pipeline.estimation.multi_position.likelihood import beside
+from pipeline.estimation.multi_position.likelihood import NoiseHypothesis, project_out
 from pipeline.estimation.multi_position.result import AUTO, calibration_of, model_of
 from pipeline.estimation.multi_position.selection import select
 from pipeline.estimation.selection import GATE_BIC, INFLATED
@@ -29,8 +28,8 @@ from pipeline.model.effects import effect
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.estimation.multi_position.fit import HandFit
-    from pipeline.estimation.multi_position.selection import HandSelection, Scored
+    from pipeline.estimation.multi_position.fit import Fit
+    from pipeline.estimation.multi_position.selection import Scored, Selection
     from pipeline.estimation.ranking import Score
     from pipeline.records import Noise, Recording, SensorCalibration
 
@@ -39,7 +38,7 @@ FAR_ABOVE = 10.0  # times the noise: no unit that somebody sets down or holds re
 EVIDENCE = 5.0
 
 
-def diagnose_by_hand(
+def diagnose_multi_position(
     calibration: SensorCalibration,
     recordings: Sequence[Recording],
     noise: Noise | None,
@@ -117,7 +116,7 @@ def _without_creep(noise: Noise | None, sheet: Mapping[str, Any]) -> Noise | Non
     return replace(noise, wander=wander, correlation_time=float(sheet.get("wander_time_s") or noise.correlation_time))
 
 
-def _document(selection: HandSelection, configured: list[str], noise: Noise | None) -> dict[str, Any]:
+def _document(selection: Selection, configured: list[str], noise: Noise | None) -> dict[str, Any]:
     sensor, selected = selection.model.sensor, selection.names
     hidden = hidden_effects(selection, configured)
     unknown = dependences(selection)
@@ -148,7 +147,7 @@ def _document(selection: HandSelection, configured: list[str], noise: Noise | No
     }
 
 
-def _entry(selection: HandSelection, name: str, held: Sequence[float | None], chi: Sequence[float]) -> dict[str, Any]:
+def _entry(selection: Selection, name: str, held: Sequence[float | None], chi: Sequence[float]) -> dict[str, Any]:
     """Return one line of the ranking."""
     score = selection.steps.get(name) or selection.first.scores[name]
     before = after = None
@@ -177,7 +176,7 @@ def _share(drop: float, chi: Sequence[float], spare: int) -> float:
     return float(np.clip(drop / excess, 0.0, 1.0)) if excess > 0 else 0.0
 
 
-def _parameters(selection: HandSelection, score: Score) -> dict[str, dict[str, Any]]:
+def _parameters(selection: Selection, score: Score) -> dict[str, dict[str, Any]]:
     """Return the estimates: of the fit of all selected effects, or of the effect alone."""
     values, uncertainty = score.values, score.uncertainty
     found = selection.fits[-1]
@@ -209,42 +208,42 @@ def _look_alikes(scored: Scored, score: Score) -> list[dict[str, Any]]:
     return [{"effect": name, "share": min(share, 1.0)} for share, name in alike]
 
 
-def _expected(selection: HandSelection, noise: Noise | None) -> HandNoise:
+def _expected(selection: Selection, noise: Noise | None) -> NoiseHypothesis:
     """Return the noise without scatter of the rests, with the wander that is expected."""
     nothing = (0.0,) * selection.model.kinds
     if noise is None:
-        return HandNoise(0.0, 1.0, nothing, 0.0)
+        return NoiseHypothesis(0.0, 1.0, nothing, 0.0)
     ratio = float(np.sqrt(np.mean(noise.wander**2) / np.mean(noise.white**2)))
-    return HandNoise(ratio, noise.correlation_time, nothing, 0.0)
+    return NoiseHypothesis(ratio, noise.correlation_time, nothing, 0.0)
 
 
-def _chi(selection: HandSelection, fit: HandFit, noise: Noise | None) -> float:
+def _chi(selection: Selection, fit: Fit, noise: Noise | None) -> float:
     """Return the sum of squares of a fit's residual, whitened by the expected noise and the scatter that is left."""
     expected = replace(_expected(selection, noise), scatter=selection.fits[-1].noise.scatter)
-    found = beside(selection.model.equations(fit.state), [expected])
+    found = project_out(selection.model.equations(fit.state), [expected])
     return float(np.sum(found.residual**2))
 
 
-def _over_noise(selection: HandSelection, fit: HandFit, noise: Noise | None) -> float:
+def _over_noise(selection: Selection, fit: Fit, noise: Noise | None) -> float:
     """Return the rms residual of the rests, of a fit, over that of noise alone."""
     equations = selection.model.equations(fit.state)
     at_rest = equations.rows(selection.model.rests_equations)
-    found = beside(at_rest, [_expected(selection, noise)])
+    found = project_out(at_rest, [_expected(selection, noise)])
     spare = max(len(at_rest.residual) - float(np.sum(found.basis[0] ** 2)), 1.0)
     return float(np.sqrt(np.sum(found.residual**2) / spare))
 
 
-def _wander(selection: HandSelection, noise: Noise | None) -> dict[str, Any]:
+def _wander(selection: Selection, noise: Noise | None) -> dict[str, Any]:
     """Return the wander and the scatter of the rests under which the whole model explains the readings best."""
-    found = beside(selection.model.equations(selection.fits[-1].state), selection.noises)
-    scores = found.log_likelihood(np.sum(found.residual**2, axis=1))
-    best = selection.noises[int(np.argmax(scores))]
+    found = project_out(selection.model.equations(selection.fits[-1].state), selection.hypotheses)
+    scores = found.scores()
+    best = selection.hypotheses[int(np.argmax(scores))]
     white = float(np.sqrt(np.mean(selection.model.white**2)))
     expected = None if noise is None else float(np.sqrt(np.mean(noise.wander**2)))
     inflated = False
     if expected is not None:
         most = INFLATED * expected / white
-        believed = [score for score, n in zip(scores, selection.noises, strict=True) if n.ratio <= most]
+        believed = [score for score, n in zip(scores, selection.hypotheses, strict=True) if n.ratio <= most]
         inflated = best.ratio > most and (not believed or bool(scores.max() - max(believed) > EVIDENCE))
     return {
         "ratio": float(best.ratio),

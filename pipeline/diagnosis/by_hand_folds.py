@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.estimation.multi_position.model import Model, State
-    from pipeline.estimation.multi_position.selection import HandSelection
+    from pipeline.estimation.multi_position.selection import Selection
     from pipeline.records import Noise, Recording, SensorCalibration
 
 FOLDS = 3
@@ -58,7 +58,7 @@ def with_all_rests(
         return accelerometer
 
 
-def held_out_errors(selection: HandSelection) -> list[float | None]:
+def held_out_errors(selection: Selection) -> list[float | None]:
     """Return the rms error, g or deg/s, of each of the selection's fits on rests that were left out of it in turn."""
     model = selection.model
     if model.held_out_error(selection.fits[0].state) is not None:  # a recording for validation
@@ -68,7 +68,7 @@ def held_out_errors(selection: HandSelection) -> list[float | None]:
     for found in selection.fits:
         squares: list[float] = []
         for part, held in _folds(model):
-            fitted = fit(part, found.state, selection.noises, near)
+            fitted = fit(part, found.state, selection.hypotheses, near)
             if len(fitted.residual) < fitted.rank + SPARE:
                 squares = []
                 break
@@ -78,7 +78,7 @@ def held_out_errors(selection: HandSelection) -> list[float | None]:
 
 
 def nested(
-    selection: HandSelection, start: SensorCalibration, configured: Sequence[str], noise: Noise | None,
+    selection: Selection, start: SensorCalibration, configured: Sequence[str], noise: Noise | None,
     sheet: Mapping[str, Any],
 ) -> dict[str, Any] | None:  # fmt: skip
     """Return what the whole procedure, selection included, is worth on rests that it does not see.

@@ -24,7 +24,7 @@ from pipeline.model.effects import catalogue
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.estimation.multi_position.selection import HandSelection
+    from pipeline.estimation.multi_position.selection import Selection
     from pipeline.estimation.ranking import Score
     from pipeline.model.effects.base import Effect
 
@@ -42,12 +42,12 @@ EXPERIMENTS = {  # where that of the effect asks for a table
 MORE = f"record {ENOUGH} rests or more, each in another orientation, all three axes inclined in most of them"
 
 
-def hidden_effects(selection: HandSelection, configured: Sequence[str]) -> dict[str, str]:
+def hidden_effects(selection: Selection, configured: Sequence[str]) -> dict[str, str]:
     """Return the effects that these recordings cannot show, each with the reason.
 
     Parameters
     ----------
-    selection : HandSelection
+    selection : Selection
     configured : sequence of str
         Effects of the model, which are not asked for.
     """
@@ -60,7 +60,7 @@ def hidden_effects(selection: HandSelection, configured: Sequence[str]) -> dict[
     return found
 
 
-def _reason(this: Effect, selection: HandSelection) -> str:
+def _reason(this: Effect, selection: Selection) -> str:
     model = selection.model
     refused = refusal(this, model.sensor, model.rests)
     if refused:
@@ -81,7 +81,7 @@ def _reason(this: Effect, selection: HandSelection) -> str:
     return "" if score.delta_bic > GATE_BIC else _faint(this, score, selection)
 
 
-def _faint(this: Effect, score: Score, selection: HandSelection) -> str:
+def _faint(this: Effect, score: Score, selection: Selection) -> str:
     """Return why an effect that did not show would not have; empty where it would."""
     gate = score.parameters * float(np.log(len(selection.fits[0].residual))) + GATE_BIC
     if selection.last.visible.get(this.name, selection.first.visible[this.name]) >= gate:
@@ -93,7 +93,7 @@ def _faint(this: Effect, score: Score, selection: HandSelection) -> str:
 
 
 def next_experiment(
-    selection: HandSelection,
+    selection: Selection,
     verdict: str,
     ranking: Sequence[Mapping[str, Any]],
     hidden: Mapping[str, str],
@@ -105,7 +105,7 @@ def next_experiment(
 
     Parameters
     ----------
-    selection : HandSelection
+    selection : Selection
     verdict : str
     ranking : sequence of mapping
         Entries of the diagnosis.
@@ -130,7 +130,7 @@ def next_experiment(
     return "none is needed: nothing that these recordings can show is missing"
 
 
-def suspects(selection: HandSelection, hidden: Mapping[str, str]) -> list[str]:
+def suspects(selection: Selection, hidden: Mapping[str, str]) -> list[str]:
     """Return the effects that these recordings cannot tell, and that could be what the residual holds.
 
     Such an effect shows in the equations, and at its limits it brings at least the share ``WORTH`` of the mean square

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.estimation.design import Term
-from pipeline.estimation.multi_position.likelihood import beside
+from pipeline.estimation.multi_position.likelihood import project_out
 from pipeline.estimation.selection import GATE_BIC
 from pipeline.model.effects.base import Effect, Layout, Owner, Parameter
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.estimation.multi_position.selection import HandSelection
+    from pipeline.estimation.multi_position.selection import Selection
     from pipeline.records import Motion
 
     Values = NDArray[np.float64]
@@ -60,25 +60,25 @@ class Curves(Effect):
         return self._curves(motion)
 
 
-def dependences(selection: HandSelection) -> list[dict[str, Any]]:
+def dependences(selection: Selection) -> list[dict[str, Any]]:
     """Return the covariates on which the residual still depends, each with its p-value, the likeliest first.
 
     Parameters
     ----------
-    selection : HandSelection
+    selection : Selection
     """
     from scipy.special import chdtrc  # noqa: PLC0415  (0.1 s that only a diagnosis pays)
 
     curves = _curves_of(selection)
     terms = [Term(c, np.zeros(len(c.parameters(selection.model.sensor)))) for c in curves]
     equations = selection.model.equations(selection.fits[-1].state, terms)
-    found = beside(equations, selection.noises)
+    found = project_out(equations, selection.hypotheses)
     before, at = found.of_model()
     named: dict[str, tuple[float, float]] = {}
     for j, this in enumerate(curves):
         count = found.count(j, at)
         factor = found.correction(j, at, count, equations.scatter) if count else 0.0
-        gain = factor * max(2.0 * (found.of_candidate(j)[0] - before), 0.0)
+        gain = factor * max(2.0 * (found.with_candidate(j)[0] - before), 0.0)
         delta = gain - count * float(np.log(len(equations.residual)))
         p = float(chdtrc(max(count, 1), gain))
         if delta > GATE_BIC and p * len(curves) < GATE_P and delta > named.get(this.name, (0.0, 1.0))[0]:
@@ -87,7 +87,7 @@ def dependences(selection: HandSelection) -> list[dict[str, Any]]:
     return [{"covariate": name, "p_value": p} for name, (_, p) in ordered]
 
 
-def _curves_of(selection: HandSelection) -> list[Curves]:
+def _curves_of(selection: Selection) -> list[Curves]:
     rests = selection.model.rests
     curves = []
     if np.ptp(rests.time) > LEAST_SPAN and rests.clock_shared:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.estimation.multi_position.fit import Limits, solve
+from pipeline.estimation.multi_position.fit import solve
 from pipeline.model.effects.base import Layout, unit_of
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.estimation.multi_position.selection import HandSelection
+    from pipeline.estimation.multi_position.selection import Selection
     from pipeline.model.effects.base import Effect
 
     Values = NDArray[np.float64]
@@ -31,12 +31,12 @@ if TYPE_CHECKING:
 AT_REST = 0.9  # share of a column's power
 
 
-def added_variable(selection: HandSelection) -> dict[str, Any] | None:
+def added_variable(selection: Selection) -> dict[str, Any] | None:
     """Return the added-variable plot of the first selected effect: its clearest coefficient on each axis.
 
     Parameters
     ----------
-    selection : HandSelection
+    selection : Selection
 
     Returns
     -------
@@ -53,7 +53,7 @@ def added_variable(selection: HandSelection) -> dict[str, Any] | None:
     equations = model.equations(found.state)
     columns = equations.columns
     white, _ = equations.whitened(found.noise, np.column_stack([columns, equations.residual]))
-    scale = solve(equations, found.noise, Limits(np.zeros(columns.shape[1]), np.zeros(columns.shape[1]))).scale
+    scale = solve(equations, found.noise, *np.zeros((2, columns.shape[1]))).scale
     rests = slice(0, model.rests_equations)
     size = float(np.median(equations.error[rests]))
     uncertainty = np.sqrt(np.diag(found.covariance))[first : first + len(term.values)]

@@ -29,7 +29,7 @@ from pipeline.errors import NotObservableError
 from pipeline.estimation.design import Start, Term
 from pipeline.estimation.effects_stage import AUTO
 from pipeline.estimation.generalized_least_squares import calibration_of, fit_terms
-from pipeline.estimation.multi_position.rests import by_hand
+from pipeline.estimation.multi_position.rests import is_multi_position
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import FAR_ABOVE, GATE_BIC, INFLATED, select
 from pipeline.model.effects import catalogue, effect
@@ -91,10 +91,10 @@ def diagnose(
         ``method_errors`` (``...method_errors``).
     """
     sensor = calibration.sensor
-    if by_hand(sensor, recordings):
-        from pipeline.diagnosis.by_hand import diagnose_by_hand  # noqa: PLC0415  (recordings by hand alone)
+    if is_multi_position(sensor, recordings):
+        from pipeline.diagnosis.by_hand import diagnose_multi_position  # noqa: PLC0415  (recordings by hand alone)
 
-        return diagnose_by_hand(calibration, recordings, noise, settings, accelerometer, validation=validation)
+        return diagnose_multi_position(calibration, recordings, noise, settings, accelerometer, validation=validation)
     wanted = settings["effects"][sensor]
     configured = [] if wanted == AUTO else list(wanted)
     observations = observe(sensor, recordings, settings["table"])

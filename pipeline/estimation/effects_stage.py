@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from pipeline.estimation.generalized_least_squares import fit_joint
-from pipeline.estimation.multi_position.rests import by_hand
+from pipeline.estimation.multi_position.rests import is_multi_position
 from pipeline.estimation.noise import noise_of
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import select
@@ -43,10 +43,10 @@ def fit_effects(
     if not wanted:
         return before
     noise = noise_of(sensor, recordings, settings)
-    if by_hand(sensor, recordings):
-        from pipeline.estimation.multi_position.result import fit_effects_by_hand  # noqa: PLC0415  (recordings by hand alone)
+    if is_multi_position(sensor, recordings):
+        from pipeline.estimation.multi_position.result import fit_effects_by_rests  # noqa: PLC0415  (recordings by hand alone)
 
-        return fit_effects_by_hand(before, recordings, noise, settings)
+        return fit_effects_by_rests(before, recordings, noise, settings)
     names = list(wanted)
     if wanted == AUTO:
         observations = observe(sensor, recordings, settings["table"])

@@ -17,8 +17,7 @@ import numpy as np
 from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.design import Term
-from pipeline.estimation.multi_position.equations import HandNoise
-from pipeline.estimation.multi_position.likelihood import beside
+from pipeline.estimation.multi_position.likelihood import NoiseHypothesis, log_likelihood, project_out
 from pipeline.estimation.multi_position.result import model_of
 from pipeline.estimation.multi_position.selection import select
 from pipeline.estimation.selection import GATE_BIC, GATE_P
@@ -30,8 +29,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.estimation.multi_position.likelihood import Beside
-    from pipeline.estimation.multi_position.selection import HandSelection
+    from pipeline.estimation.multi_position.likelihood import ProjectedCandidates
+    from pipeline.estimation.multi_position.selection import Selection
     from pipeline.planning.plan import SimulatedProcedure
     from pipeline.records import Noise
 
@@ -40,7 +39,7 @@ if TYPE_CHECKING:
 DRAWS = 64
 
 
-def select_by_hand(sensor: str, simulated: SimulatedProcedure) -> HandSelection:
+def select_in_rehearsal(sensor: str, simulated: SimulatedProcedure) -> Selection:
     """Return what the selection makes of a simulated procedure by hand, in which there is nothing to find.
 
     Raises
@@ -68,33 +67,33 @@ def select_by_hand(sensor: str, simulated: SimulatedProcedure) -> HandSelection:
     return select(model, start, [], noise, simulated.sheets[sensor])
 
 
-class HandExpectation:
+class ExpectedSelection:
     """What a selection by hand is expected to see.
 
     Parameters
     ----------
-    selection : HandSelection
+    selection : Selection
         Of a simulated.
     noise : Noise
         That the readings will have.
     """
 
-    def __init__(self, selection: HandSelection, noise: Noise) -> None:
+    def __init__(self, selection: Selection, noise: Noise) -> None:
         model = selection.model
         self.sensor = model.sensor
         self.limits = limits_or_none(selection.candidates, model.sensor, selection.limits)
         self.terms = [Term(this, v) for this in selection.candidates for v in this.starts(model.sensor)]
         self.names = [this.name for this in selection.candidates]
-        equations = model.equations(selection.fits[0].state.without_effects(), self.terms)
+        equations = model.equations(replace(selection.fits[0].state, terms=()), self.terms)
         ratio = float(np.sqrt(np.mean(noise.wander**2) / np.mean(noise.white**2)))
-        C = equations.covariance(HandNoise(ratio, noise.correlation_time, (0.0,) * model.kinds, 0.0))
+        C = equations.covariance(NoiseHypothesis(ratio, noise.correlation_time, (0.0,) * model.kinds, 0.0))
         rng = np.random.default_rng(0)
         drawn = np.linalg.cholesky(C) @ rng.standard_normal((len(C), DRAWS))
         together = replace(equations, candidates=[*equations.candidates, drawn])
-        self.found: Beside = beside(together, selection.noises)
+        self.found: ProjectedCandidates = project_out(together, selection.hypotheses)
         self.drawn = self.found.raw[-1]
         self.equations = len(C)
-        at_rest = self._log_likelihood(np.sum(self.drawn**2, axis=1))
+        at_rest = self._scores(np.sum(self.drawn**2, axis=1))
         self.at = int(np.argmax(np.mean(at_rest, axis=1)))
         self.counts = [self._count(j) for j in range(len(self.terms))]
         self.factors = [
@@ -107,12 +106,8 @@ class HandExpectation:
         shown = self.found.count(j, self.at)
         return shown + len(self.terms[j].effect.nonlinear) if shown else 0
 
-    def _log_likelihood(self, rss: Values) -> Values:
-        """Return log L of sums of squares, (t, s), as ``Beside.log_likelihood``."""
-        n = self.drawn.shape[1]
-        k = np.maximum(1.0, rss / n)
-        found: Values = -0.5 * (rss / k + n * np.log(k) + self.found.logarithm[:, None])
-        return found
+    def _scores(self, rss: Values) -> Values:
+        return log_likelihood(rss, self.drawn.shape[1], self.found.log_determinant[:, None])
 
     def detection(self, name: str, *, half_only: bool = False) -> Detection | None:
         """Return what would be found of an effect; None where rests and moves do not show it.
@@ -137,7 +132,7 @@ class HandExpectation:
         def bic(share: float, i: int, squares: tuple[Values, Values, Values]) -> Values:
             rss = total[0] + 2.0 * share * total[1] + share**2 * total[2]
             left = rss - (squares[0] + 2.0 * share * squares[1] + share**2 * squares[2])
-            gain = self._log_likelihood(left).max(axis=0) - self._log_likelihood(rss).max(axis=0)
+            gain = self._scores(left).max(axis=0) - self._scores(rss).max(axis=0)
             brought: Values = 2.0 * self.factors[i] * gain - self.counts[i] * float(np.log(self.equations))
             return brought
 
@@ -191,7 +186,7 @@ class HandExpectation:
 
     def _along(self, i: int, what: Values) -> Values:
         """Return draws or signals, (t, n, s), along the directions of candidate i: (t, p, s) array."""
-        found: Values = self.found.half[i].transpose(0, 2, 1) @ (self.found.raw[i].transpose(0, 2, 1) @ what)
+        found: Values = self.found.orthonormal[i].transpose(0, 2, 1) @ (self.found.raw[i].transpose(0, 2, 1) @ what)
         return found
 
     def _squares(self, i: int, signal: Values) -> tuple[Values, Values, Values]:

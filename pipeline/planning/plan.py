@@ -20,7 +20,7 @@ import numpy as np
 from pipeline.diagnosis.by_hand_hidden import hidden_effects
 from pipeline.diagnosis.observability import not_observable
 from pipeline.errors import NotObservableError
-from pipeline.estimation.multi_position.rests import by_hand
+from pipeline.estimation.multi_position.rests import is_multi_position
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import unselected
 from pipeline.model.effects import effect
@@ -33,7 +33,7 @@ from pipeline.simulation.description import read_config
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.planning.by_hand import HandExpectation
+    from pipeline.planning.by_hand import ExpectedSelection
     from pipeline.planning.detection_limits import Detection
     from pipeline.simulation.description import UnitDescription
     from pipeline.simulation.trajectory import Planned
@@ -109,14 +109,14 @@ def of_sensor(sensor: str, simulated: SimulatedProcedure, *, half_only: bool = F
     return document
 
 
-def _expectation(sensor: str, simulated: SimulatedProcedure) -> tuple[Expectation | HandExpectation, dict[str, str]]:
+def _expectation(sensor: str, simulated: SimulatedProcedure) -> tuple[Expectation | ExpectedSelection, dict[str, str]]:
     """Return what a selection is expected to find, and the effects that it cannot find, each with the reason."""
     noise, sheet = simulated.noise[sensor], simulated.sheets[sensor]
-    if by_hand(sensor, simulated.recordings):
-        from pipeline.planning.by_hand import HandExpectation, select_by_hand  # noqa: PLC0415  (by hand alone)
+    if is_multi_position(sensor, simulated.recordings):
+        from pipeline.planning.by_hand import ExpectedSelection, select_in_rehearsal  # noqa: PLC0415  (by hand alone)
 
-        selected = select_by_hand(sensor, simulated)
-        hand = HandExpectation(selected, noise)
+        selected = select_in_rehearsal(sensor, simulated)
+        hand = ExpectedSelection(selected, noise)
         return hand, hidden_effects(selected, [])
     selection = unselected(observe(sensor, simulated.recordings, simulated.table), [], noise, sheet)
     return Expectation(selection, noise), not_observable(selection, [])

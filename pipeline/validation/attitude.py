@@ -34,11 +34,11 @@ import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.estimation.design import Term
-from pipeline.estimation.multi_position.gyroscope import HandHeldGyroscope
+from pipeline.estimation.multi_position.gravity import observed_rests
+from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
 from pipeline.estimation.multi_position.model import State
 from pipeline.estimation.multi_position.moves import moves_of
-from pipeline.estimation.multi_position.observed import observed_rests
-from pipeline.estimation.multi_position.rests import HELD_OUT, ROLE, by_hand
+from pipeline.estimation.multi_position.rests import HELD_OUT, ROLE, is_multi_position
 from pipeline.model.compensation import Compensation
 from pipeline.model.effects import effect
 from pipeline.records import continuous, level_in_body
@@ -248,7 +248,7 @@ def gravity_direction(
         ``before`` and ``after`` the gyroscope's calibration), ``noise_floor_deg`` (the mean that white noise alone
         gives) and ``creeping_rests`` (in which the unit went on turning).
     """
-    if not by_hand("gyroscope", recordings):
+    if not is_multi_position("gyroscope", recordings):
         return {"reason": "not recorded by hand"}
     if accelerometer is None or gyroscope is None:
         return {"reason": "both sensors have to be calibrated"}
@@ -258,12 +258,12 @@ def gravity_direction(
         return {"reason": "no rest is held out"}
     rests, gravity = observed
     judged = replace(rests, held_out=~rests.held_out)
-    model = HandHeldGyroscope(judged, moves_of(recordings, judged), gravity, noise, fewest=1)
+    model = GyroscopeModel(judged, moves_of(recordings, judged), gravity, noise, fewest=1)
     if model.moves is None:
         return {"reason": "no move is held out"}
     terms = tuple(Term(effect(e.name), e.values) for e in gyroscope.effects)
-    before = model.missed(State(np.zeros(3), np.eye(3)))[0]
-    after, floor = model.missed(State(gyroscope.bias, gyroscope.matrix, terms))
+    before = model.direction_errors(State(np.zeros(3), np.eye(3)))[0]
+    after, floor = model.direction_errors(State(gyroscope.bias, gyroscope.matrix, terms))
     return {
         "reason": None,
         "moves": model.moves.count,

@@ -3,7 +3,7 @@
 At rest the reading is the bias; in a move, the integrated reading must turn the direction of gravity before it into
 that after it. The accelerometer is calibrated on the way, and gives the frame. The equations are those of
 ``estimation.multi_position.gyroscope``; both kinds are weighted by their own scatter, and moves that contradict
-the others have less weight (``pipeline.estimation.multi_position.outlying``).
+the others have less weight (``pipeline.estimation.multi_position.fit``).
 """
 
 from __future__ import annotations
@@ -14,15 +14,13 @@ import numpy as np
 
 from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.least_squares import certified
-from pipeline.estimation.multi_position.budget import budgeted_by_hand
-from pipeline.estimation.multi_position.equations import noises_about
 from pipeline.estimation.multi_position.fit import fit as fit_by_hand
-from pipeline.estimation.multi_position.gyroscope import FEWEST_MOVES
-from pipeline.estimation.multi_position.likelihood import NEW
+from pipeline.estimation.multi_position.fit import fit_robustly
+from pipeline.estimation.multi_position.gyroscope import FEWEST_MOVES, model_of
+from pipeline.estimation.multi_position.likelihood import NEW, prior_hypotheses
 from pipeline.estimation.multi_position.model import State
-from pipeline.estimation.multi_position.observed import model_of
-from pipeline.estimation.multi_position.outlying import described, fit_robustly
-from pipeline.estimation.multi_position.rests import ROLE, by_hand
+from pipeline.estimation.multi_position.rests import ROLE, is_multi_position
+from pipeline.estimation.multi_position.result import with_budget
 from pipeline.estimation.noise import noise_of, prior_of
 from pipeline.records import AXES, SensorCalibration, StageResult
 
@@ -63,7 +61,7 @@ def fit(
     NotObservableError
         If the moves are too few or too much alike.
     """
-    if not by_hand("gyroscope", recordings):
+    if not is_multi_position("gyroscope", recordings):
         raise CannotCalibrateError(f"rests and moves need a recording by hand with the gyroscope's readings: {ADVICE}")
     if not any(r.role == ROLE and r.accelerometer is not None for r in recordings):
         raise CannotCalibrateError(
@@ -80,8 +78,8 @@ def fit(
     start = State(np.average(model.rests.reading, axis=0, weights=model.rests.count), np.eye(3))
     _require_determined(model.equations(start).base)
     prior = prior_of("gyroscope", recordings, settings)
-    noises = noises_about(prior, float(np.mean(model.white)), model.kinds)
-    model, found, outlying = fit_robustly(model, lambda weighted: fit_by_hand(weighted, start, noises, {}))
+    noises = prior_hypotheses(prior, float(np.mean(model.white)), model.kinds)
+    model, found, outlying = fit_robustly(model, lambda weighted: fit_by_hand(weighted, start, noises, {}), recordings)
     assert model.moves is not None  # noqa: S101
     names = [f"bias_{a}" for a in AXES] + [f"matrix_{a}{b}" for a in AXES for b in AXES]
     _require_known(names, np.sqrt(np.diag(found.covariance)), model.moves.count)
@@ -100,8 +98,8 @@ def fit(
         "scatter_of_rests": found.noise.scatter[0],
         "scatter_of_moves": found.noise.scatter[1],
         "scatter_of_directions": found.noise.direction,
-        "moves_weighted_down": len(outlying.index),
-        "moves_outlying": described(outlying, model, recordings),
+        "moves_weighted_down": len(outlying),
+        "moves_outlying": outlying,
         "condition": found.condition,
         "degrees_of_freedom": float(found.degrees_of_freedom.min()),
     }
@@ -115,7 +113,7 @@ def fit(
         converged=found.converged,
         convergence=certified(found.cosine, found.condition, found.rank, len(found.covariance)),
     )
-    return budgeted_by_hand(calibration, found.covariance, found.degrees_of_freedom, model, found, settings)
+    return with_budget(calibration, found.covariance, found.degrees_of_freedom, model, found, settings)
 
 
 def _require_known(names: list[str], u: NDArray[np.float64], moves: int) -> None:

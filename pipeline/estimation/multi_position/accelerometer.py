@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.estimation.multi_position.equations import Equations
-from pipeline.estimation.multi_position.model import State, added, motion_of
+from pipeline.estimation.multi_position.model import Equations, State, effect_readings, motion_of
 from pipeline.estimation.multi_position.rests import HELD_OUT, rests_of
 
 if TYPE_CHECKING:
@@ -38,7 +37,7 @@ SETTLED = 1e-12  # g
 SMALLEST_NOISE = 1e-9  # g
 
 
-class RestingAccelerometer:
+class AccelerometerModel:
     """Equations of the accelerometer's rests.
 
     Parameters
@@ -73,7 +72,7 @@ class RestingAccelerometer:
     def equations(self, state: State, candidates: Sequence[Term] = ()) -> Equations:
         """Return the linear form at some parameters."""
         rests, K = self.rests, state.K
-        force, v = self.felt(state, rests)
+        force, v = self.specific_force(state, rests)
         length = np.linalg.norm(force, axis=1)
         n = force / length[:, None]
         along = n @ state.matrix
@@ -94,21 +93,21 @@ class RestingAccelerometer:
             effects=[columns(term) for term in state.terms],
             candidates=[columns(term) for term in candidates],
             scatter=np.square(np.median(error) / error)[None],
-            wander=hold,
+            bias=hold,
             start=rests.start,
             length=rests.length,
             joined=rests.joined,
             error=error,
         )
 
-    def felt(self, state: State, rests: Rests) -> tuple[Values, Values]:
+    def specific_force(self, state: State, rests: Rests) -> tuple[Values, Values]:
         """Return the specific force of each rest, g, and v: (m, 3) arrays."""
         v, K = rests.reading - state.bias, state.K
         force = v @ state.matrix.T
         for _ in range(ROUNDS if state.terms else 0):
             size = np.linalg.norm(force, axis=1, keepdims=True)
             motion = self._motion(self.gravity * force / size, rests)
-            v = rests.reading - state.bias - added(self.sensor, state.terms, motion, K)
+            v = rests.reading - state.bias - effect_readings(self.sensor, state.terms, motion, K)
             before, force = force, v @ state.matrix.T
             if np.abs(force - before).max() < SETTLED:
                 break
@@ -122,13 +121,13 @@ class RestingAccelerometer:
         """Return the rms error of |f| at rests that no fit sees, g; None where there are none."""
         if self.held is None or len(self.held.time) == 0:
             return None
-        force, _ = self.felt(state, self.held)
+        force, _ = self.specific_force(state, self.held)
         return float(np.sqrt(np.mean((np.linalg.norm(force, axis=1) - self.gravity) ** 2)))
 
-    def without(self, held: NDArray[np.bool_]) -> RestingAccelerometer:
+    def without(self, held: NDArray[np.bool_]) -> AccelerometerModel:
         """Return the model with some of its rests held out."""
         kept, judged = self.rests.select(~held), self.rests.select(held)
-        return RestingAccelerometer(kept, self.calibration, self.gravity, self.noise, judged)
+        return AccelerometerModel(kept, self.calibration, self.gravity, self.noise, judged)
 
     def _motion(self, force: Values, rests: Rests) -> Motion:
         return motion_of(rests.time, force, np.zeros_like(force), rests.temperature, still=True)
@@ -163,7 +162,7 @@ def model_of(
     calibration: SensorCalibration,
     noise: Noise | None,
     settings: Mapping[str, Any],
-) -> RestingAccelerometer | None:
+) -> AccelerometerModel | None:
     """Return the model of the recordings' rests, or None where they hold none.
 
     Parameters
@@ -180,4 +179,4 @@ def model_of(
         return None
     gravity = float(settings["table"].get("gravity_g") or 1.0)
     held = rests_of("accelerometer", recordings, settings, role=HELD_OUT) or rests.select(rests.held_out)
-    return RestingAccelerometer(rests.select(~rests.held_out), calibration, gravity, noise, held)
+    return AccelerometerModel(rests.select(~rests.held_out), calibration, gravity, noise, held)

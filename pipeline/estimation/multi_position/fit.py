@@ -1,58 +1,69 @@
-"""Base and effects fitted to rests and moves, by generalised least squares in Gauss-Newton rounds.
+"""Base and effects fitted to rests and moves by generalised least squares: Gauss-Newton, robust against single moves.
 
     step = (N + k P)^-1 (X^T C^-1 r - k P p),    covariance = k (N + k P)^-1,   N = X^T C^-1 X
 
-The step is taken at the most likely noise; the covariance is averaged over the noises by their restricted likelihood
-(``pipeline.estimation.engine``),
+The step is taken under the most likely hypothesis of the noise; the covariance is averaged over the hypotheses by their
+restricted likelihood (``pipeline.estimation.engine``),
 
     -2 log L_R = rss / k + nu log k + log det C + log det(N + k P),    k = max(1, rss / nu),   nu = n - p
 
 A few rests leave some combinations of parameters open: two of the nine cross-axis terms of an accelerometer at rest, or
-the amplitude of a warm-up that is still far from its end. So the last fit of effects that are plausible has the data
-sheet's limits of their parameters p, taken for two standard deviations, beside the equations, with the precision P; it
-is zero for bias, matrix and time constants, and where there is no limit. What the rests determine it does not move: its
-weight is the square of uncertainty over limit.
+the amplitude of a warm-up far from its end. So the last fit of plausible effects has the data sheet's limits of their
+parameters p, taken for two standard deviations, as prior with the precision P; it is zero for bias, matrix and time
+constants, and where there is no limit.
+
+A move is outlying where, with its two whitened residuals r_k and the scale s of the median move,
+
+    t_k = |r_k| / s,   s = median |r_k| / sqrt(2 log 2),   t_k^2 > 2 log(k / p)
+
+which one of k sound moves exceeds with the probability p. Where one is, all moves get the weights
+``min(1, (v + 2) / (v + t^2))`` of Student's t with v = 4 degrees of freedom: a move of weight w has 1/w times its
+variance. Source: Lange, Little & Taylor, JASA 84 (1989), 881-896.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import product
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pipeline.errors import NotObservableError
 from pipeline.estimation.engine import Posterior
 from pipeline.estimation.generalized_least_squares import parameter_names
-from pipeline.estimation.multi_position.likelihood import NEW, beside
+from pipeline.estimation.multi_position.likelihood import NEW, project_out
 from pipeline.estimation.multi_position.model import stepped
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from pipeline.estimation.multi_position.equations import Equations, HandNoise
-    from pipeline.estimation.multi_position.model import Model, State
+    from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
+    from pipeline.estimation.multi_position.likelihood import NoiseHypothesis
+    from pipeline.estimation.multi_position.model import Equations, Model, State
+    from pipeline.records import Recording
 
     Values = NDArray[np.float64]
+    Limits = Mapping[str, Values]  # effect to the limits of its parameters, infinite where there are none
 
-ROUNDS = 60
-SMALL_STEP = 3e-3  # of a standard uncertainty
-STALLED = 0.1
-HALVINGS = 12
-ROUNDING = 1e-9
+ROUNDS, HALVINGS = 60, 12
+SMALL_STEP = 3e-3  # of a standard uncertainty: the last step taken
+STALLED = 0.1  # of a standard uncertainty: a fit whose steps stay larger has not converged
+ROUNDING = 1e-9  # relative, of a sum of squares
 NONE = 1e-8  # share of its columns below which a combination of parameters is not determined
+FAR = 12.0  # of log L below the best: a weight of 6e-6
 STEPS = (3.0**0.5, 3.0**0.25, 3.0**0.125)  # factors of a scatter, on the way to its maximum
-SHARP = 0.5  # standard deviation of a scatter's logarithm, half a step of the grid's
-RARE = 1e-3  # weight of a level below which it is none of the average's
-FAR = 12.0  # of log L below the best, where a noise is not believed
+SHARP = 0.5  # standard deviation of a scatter's logarithm, half a step of the grid
+RARE = 1e-3  # weight of a level below which it does not change the average
+FALSE_ALARM, FREEDOM = 1e-3, 4.0  # p and v
+ROBUST_ROUNDS, SETTLED = 6, 0.05  # weights that change by less are final
 
 
 @dataclass(frozen=True)
-class HandFit:
-    """The model that explains rests and moves best.
+class Fit:
+    """The parameters that explain rests and moves best.
 
     Attributes
     ----------
@@ -60,23 +71,19 @@ class HandFit:
     covariance : (b + p, b + p) array
         Of the base parameters along the model's directions, and of the effects'.
     log_likelihood : float
-    noise : HandNoise
+    noise : NoiseHypothesis
         The most likely one.
     degrees_of_freedom : (b + p,) array
-        Of each of these parameters.
-    residual : (n,) array
-        Over the white noise of each equation.
-    error : (n,) array
-        That white noise.
+    residual, error : (n,) arrays
+        Residual over the white noise of each equation, and that white noise.
     rank : int
         Directions that the equations determine.
     rounds : int
     converged : bool
-    condition : float
-    cosine : float
-        Largest between the whitened residual and a column, with what is believed of the parameters.
-    candidates : tuple of (HandNoise, float, float)
-        Every noise that is believed, its weight, and its k.
+    condition, cosine : float
+        Of the whitened columns; the largest cosine between the whitened residual and a column.
+    hypotheses : tuple of (NoiseHypothesis, float, float)
+        Those of the average, the weight of each, and its k.
     precision : (b + p,) array
         P.
     """
@@ -84,7 +91,7 @@ class HandFit:
     state: State
     covariance: Values
     log_likelihood: float
-    noise: HandNoise
+    noise: NoiseHypothesis
     degrees_of_freedom: Values
     residual: Values
     error: Values
@@ -93,13 +100,13 @@ class HandFit:
     converged: bool
     condition: float
     cosine: float
-    candidates: tuple[tuple[HandNoise, float, float], ...]
+    hypotheses: tuple[tuple[NoiseHypothesis, float, float], ...]
     precision: Values
 
 
 @dataclass(frozen=True)
-class Solved:
-    """A step at one noise, and its covariance k (N + k P)^-1."""
+class Solution:
+    """A step under one hypothesis, and its covariance."""
 
     step: Values
     covariance: Values
@@ -111,52 +118,27 @@ class Solved:
     cosine: float
 
 
-@dataclass(frozen=True)
-class Limits:
-    """What is believed of the parameters before: precision P (diagonal) and the values p, base first."""
-
-    precision: Values
-    values: Values
-
-    def penalty(self) -> float:
-        """Return ``p^T P p``."""
-        return float(self.precision @ self.values**2)
-
-
-def fit(model: Model, start: State, noises: Sequence[HandNoise], limits: Mapping[str, Values]) -> HandFit:
-    """Fit bias, matrix and effects from given values.
-
-    Parameters
-    ----------
-    model : Model
-    start : State
-    noises : sequence of HandNoise
-    limits : mapping
-        Effect to the limits of its parameters, infinite where there are none.
-
-    Returns
-    -------
-    HandFit
-    """
+def fit(model: Model, start: State, hypotheses: Sequence[NoiseHypothesis], limits: Limits) -> Fit:
+    """Fit bias, matrix and effects from given values."""
     state, converged, rounds = start, False, 0
     equations = model.equations(state)
-    best = beside(equations, noises).of_model()[1]
+    best = project_out(equations, hypotheses).of_model()[1]
     while rounds < ROUNDS:
         rounds += 1
-        solved = solve(equations, noises[best], limits_at(model, state, limits))
-        state, equations, taken = _lowered(model, state, equations, noises[best], solved, limits)
+        solved = solve(equations, hypotheses[best], *_prior(model, state, limits))
+        state, equations, taken = _lowered(model, state, equations, hypotheses[best], solved, limits)
         uncertainty = np.sqrt(np.diag(solved.covariance))
         if np.all(np.abs(taken) <= np.maximum(SMALL_STEP * uncertainty, 1e-13)):
-            now = beside(equations, noises).of_model()[1]
+            now = project_out(equations, hypotheses).of_model()[1]
             if now == best or rounds > ROUNDS // 2:
                 converged = bool(np.all(np.abs(solved.step) <= np.maximum(STALLED * uncertainty, 1e-13)))
                 break
             best = now
-    return _assessed(state, equations, noises, limits_at(model, state, limits), (rounds, converged))
+    return _assessed(state, equations, hypotheses, _prior(model, state, limits), (rounds, converged))
 
 
-def limits_at(model: Model, state: State, limits: Mapping[str, Values]) -> Limits:
-    """Return the limits as precision, two standard deviations each, with the parameters' values."""
+def _prior(model: Model, state: State, limits: Limits) -> tuple[Values, Values]:
+    """Return P (its diagonal) and p."""
     base = model.directions.shape[1]
     precision, values = [np.zeros(base)], [np.zeros(base)]
     for term in state.terms:
@@ -164,48 +146,48 @@ def limits_at(model: Model, state: State, limits: Mapping[str, Values]) -> Limit
         limit = limits.get(term.effect.name, np.full(len(term.values), np.inf))
         precision.append(np.where(nonlinear, 0.0, (2.0 / limit) ** 2))
         values.append(term.values)
-    return Limits(np.concatenate(precision), np.concatenate(values))
+    return np.concatenate(precision), np.concatenate(values)
 
 
 def _lowered(  # noqa: PLR0917  (they are the problem)
-    model: Model,
-    state: State,
-    equations: Equations,
-    noise: HandNoise,
-    solved: Solved,
-    limits: Mapping[str, Values],
+    model: Model, state: State, equations: Equations, noise: NoiseHypothesis, solved: Solution, limits: Limits
 ) -> tuple[State, Equations, Values]:
-    """Take a step, halved while it makes the residual longer; after the last one there is none left to take."""
+    """Take a step, halved while it raises the sum of squares; zeros where no step lowers it."""
 
-    def length(at: State, there: Equations) -> float:
+    def squares(at: State, there: Equations) -> float:
         white = there.whitened(noise, there.residual[:, None])[0]
-        return float(np.sum(white**2)) / solved.scale + limits_at(model, at, limits).penalty()
+        precision, values = _prior(model, at, limits)
+        return float(np.sum(white**2)) / solved.scale + float(precision @ values**2)
 
-    before = length(state, equations)
+    before = squares(state, equations)
     for halving in range(HALVINGS):
         moved, taken = stepped(model, state, solved.step * 0.5**halving)
         there = model.equations(moved)
-        if length(moved, there) <= before * (1.0 + ROUNDING):
+        if squares(moved, there) <= before * (1.0 + ROUNDING):
             return moved, there, taken
     return state, equations, np.zeros(len(solved.step))
 
 
 def _assessed(
-    state: State, equations: Equations, noises: Sequence[HandNoise], limits: Limits, how: tuple[int, bool]
-) -> HandFit:
-    noises, likelihood = refined(equations, noises, limits)
-    every = [solve(equations, noise, limits) for noise in noises]
+    state: State,
+    equations: Equations,
+    hypotheses: Sequence[NoiseHypothesis],
+    prior: tuple[Values, Values],
+    how: tuple[int, bool],
+) -> Fit:
+    hypotheses, likelihood = refined(equations, hypotheses, prior)
+    every = [solve(equations, noise, *prior) for noise in hypotheses]
     best = int(np.argmax([s.log_likelihood for s in every]))
     restricted = np.array([s.restricted for s in every])
     weight = np.exp(restricted - restricted.max())
     weight /= weight.sum()
     spare = max(len(equations.residual) - every[best].rank, 1)
     covariance, freedom = Posterior(weight, np.array([s.covariance for s in every]), spare).averaged()
-    return HandFit(
+    return Fit(
         state,
         covariance,
         likelihood,
-        noises[best],
+        hypotheses[best],
         freedom,
         equations.residual,
         equations.error,
@@ -213,35 +195,30 @@ def _assessed(
         *how,
         every[best].condition,
         every[best].cosine,
-        tuple((noise, float(w), s.scale) for noise, w, s in zip(noises, weight, every, strict=True)),
-        limits.precision,
+        tuple((noise, float(w), s.scale) for noise, w, s in zip(hypotheses, weight, every, strict=True)),
+        prior[0],
     )
 
 
-def refined(equations: Equations, noises: Sequence[HandNoise], limits: Limits) -> tuple[list[HandNoise], float]:
-    """Return the noises that are believed, with levels of scatter as close as their uncertainty asks for.
+def refined(
+    equations: Equations, hypotheses: Sequence[NoiseHypothesis], prior: tuple[Values, Values]
+) -> tuple[list[NoiseHypothesis], float]:
+    """Return the hypotheses worth averaging, and the largest log likelihood over the given ones.
 
-    A scatter of many moves is known to a tenth or so, where a grid of factors of 3 or 4 would give a covariance that is
-    wrong by up to as much. So each scatter is led to the maximum of the restricted likelihood, by ever smaller factors;
-    where its logarithm has a standard deviation s there that is less than half a step of the grid, its levels are
-    ``exp(0, +-s, +-2 s)`` times the maximum, and otherwise those of the grid that are believed.
-
-    Returns
-    -------
-    list of HandNoise
-    float
-        The largest log likelihood over the given noises.
+    Many moves tell their scatter to a tenth or so; a grid of factors of 3 or 4 would make the covariance wrong by up to
+    as much. So each scatter is led to the maximum of the restricted likelihood by ever smaller factors. Where its
+    logarithm has a standard deviation s there that is less than half a step of the grid, its levels are
+    ``exp(0, +-s, +-2 s)`` times the maximum; otherwise they are those of the grid that have weight.
     """
-    found = beside(equations, noises)
-    scores = found.log_likelihood(np.sum(found.residual**2, axis=1))
-    noises = [noise for noise, score in zip(noises, scores, strict=True) if score > scores.max() - FAR]
+    scores = project_out(equations, hypotheses).scores()
+    near = [noise for noise, score in zip(hypotheses, scores, strict=True) if score > scores.max() - FAR]
 
-    def restricted(noise: HandNoise) -> float:
-        return solve(equations, noise, limits).restricted
+    def restricted(noise: NoiseHypothesis) -> float:
+        return solve(equations, noise, *prior).restricted
 
-    weight = np.array([restricted(noise) for noise in noises])
-    best, top = noises[int(np.argmax(weight))], float(weight.max())
-    weight = np.exp(weight - top)
+    found = np.array([restricted(noise) for noise in near])
+    best, top = near[int(np.argmax(found))], float(found.max())
+    weight = np.exp(found - top)
     for factor in STEPS:
         for j in (j for j, level in enumerate(best.levels) if level > 0.0):
             for other in (best.scaled(j, factor), best.scaled(j, 1.0 / factor)):
@@ -250,53 +227,53 @@ def refined(equations: Equations, noises: Sequence[HandNoise], limits: Limits) -
                     best, top = other, score
     levels = []
     for j, level in enumerate(best.levels):
-        given = np.array([noise.levels[j] for noise in noises])
-        kinds = np.unique(given)
-        believed = [float(k) for k in kinds if weight[given == k].sum() > RARE * weight.sum()]
+        given = np.array([noise.levels[j] for noise in near])
+        own = [float(k) for k in np.unique(given) if weight[given == k].sum() > RARE * weight.sum()]
         if level > 0.0:
             around = [restricted(best.scaled(j, factor)) for factor in (STEPS[-1], 1.0 / STEPS[-1])]
             bend = (2.0 * top - sum(around)) / np.log(STEPS[-1]) ** 2
             if bend > SHARP**-2:
-                believed = (level * np.exp(np.arange(-2.0, 3.0) / np.sqrt(bend))).tolist()
-        levels.append(believed)
-    wanders = {(n.ratio, n.time): n for n in noises}.values()
-    return [n.at(level) for n in wanders for level in product(*levels)], float(scores.max())
+                own = (level * np.exp(np.arange(-2.0, 3.0) / np.sqrt(bend))).tolist()
+        levels.append(own)
+    kinds = {(n.ratio, n.time): n for n in near}.values()
+    return [n.at(level) for n in kinds for level in product(*levels)], float(scores.max())
 
 
-def solve(equations: Equations, noise: HandNoise, limits: Limits) -> Solved:
-    """Solve for the step under one noise."""
+def solve(equations: Equations, noise: NoiseHypothesis, precision: Values, values: Values) -> Solution:
+    """Solve for the step under one hypothesis, with the prior precision P at the parameters p."""
     X = equations.columns
     n, p = X.shape
     white, logarithm = equations.whitened(noise, np.concatenate([X, equations.residual[:, None]], axis=1))
     X, r = white[:, :p], white[:, p]
     size = np.linalg.norm(X, axis=0)
     size = np.where(size > 0.0, size, 1.0)
-    values, vectors = np.linalg.eigh((X / size).T @ (X / size))
-    kept = values > NONE * values[-1]
-    along = (vectors[:, kept] / np.sqrt(values[kept])).T @ ((X / size).T @ r)
-    rank, rss = int(kept.sum()), max(float(r @ r - along @ along), 0.0)
+    gram, along = (X / size).T @ (X / size), (X / size).T @ r
+    w, V = np.linalg.eigh(gram)
+    kept = w > NONE * w[-1]
+    shown = (V[:, kept] / np.sqrt(w[kept])).T @ along
+    rank, rss = int(kept.sum()), max(float(r @ r - shown @ shown), 0.0)
     spare = max(n - rank, 1)
     k, k_free = max(1.0, rss / n), max(1.0, rss / spare)
-    believed = k_free * limits.precision
-    N = ((X / size).T @ (X / size)) + np.diag(believed / size**2)
-    values, vectors = np.linalg.eigh(N)
-    kept = values > 1e-14 * values[-1]
-    half = vectors[:, kept] / np.sqrt(values[kept]) / size[:, None]
-    inner = float(np.sum(np.log(values[kept]))) + 2.0 * float(np.sum(np.log(size)))
-    return Solved(
-        half @ (half.T @ (X.T @ r - believed * limits.values)),
+    believed = k_free * precision
+    w, V = np.linalg.eigh(gram + np.diag(believed / size**2))
+    kept = w > 1e-14 * w[-1]
+    half = V[:, kept] / np.sqrt(w[kept]) / size[:, None]
+    inner = float(np.sum(np.log(w[kept]))) + 2.0 * float(np.sum(np.log(size)))
+    gradient = X.T @ r - believed * values
+    return Solution(
+        half @ (half.T @ gradient),
         k_free * half @ half.T,
-        float(np.sqrt(values[-1] / max(values[0], 1e-300))),
+        float(np.sqrt(w[-1] / max(w[0], 1e-300))),
         -0.5 * (rss / k + n * float(np.log(k)) + logarithm) + noise.prior,
         -0.5 * (rss / k_free + spare * float(np.log(k_free)) + logarithm + inner) + noise.prior,
         k_free,
         rank,
-        float(np.max(np.abs(X.T @ r - believed * limits.values) / size)) / max(float(np.linalg.norm(r)), 1e-300),
+        float(np.max(np.abs(gradient) / size)) / max(float(np.linalg.norm(r)), 1e-300),
     )
 
 
-def plausible(model: Model, found: HandFit, limits: Mapping[str, Values]) -> bool:
-    """Return whether every effect is within its limits, as far as its uncertainty tells."""
+def plausible(model: Model, found: Fit, limits: Limits) -> bool:
+    """Return whether every effect is within its limits or its uncertainty reaches them."""
     uncertainty = np.sqrt(np.diag(found.covariance))
     at, within = model.directions.shape[1], True
     for term in found.state.terms:
@@ -307,22 +284,15 @@ def plausible(model: Model, found: HandFit, limits: Mapping[str, Values]) -> boo
     return within
 
 
-def require_observable(model: Model, found: HandFit, limits: Mapping[str, Values]) -> None:
-    """Refuse a fit with an effect of which rests and moves say nothing.
-
-    Raises
-    ------
-    NotObservableError
-        Naming the effects, or the parameters that nothing determines.
-    """
+def require_observable(model: Model, found: Fit, limits: Limits) -> None:
+    """Raise ``NotObservableError`` that names effects or parameters that rests and moves do not determine."""
     equations = model.equations(found.state)
-    limited = limits_at(model, found.state, limits).precision > 0.0
+    limited = _prior(model, found.state, limits)[0] > 0.0
     names = parameter_names(model.sensor, [term.effect for term in found.state.terms])
     pairs = zip(found.state.terms, equations.effects, strict=True)
     lost = [term.effect for term, Z in pairs if _explained(equations.base, Z)]
     scaled = equations.columns / np.maximum(np.linalg.norm(equations.columns, axis=0), 1e-300)
-    gram = scaled.T @ scaled + np.diag(limited.astype(float))
-    weak = np.linalg.eigh(gram)
+    weak = np.linalg.eigh(scaled.T @ scaled + np.diag(limited.astype(float)))
     open_ = np.abs(weak.eigenvectors[:, weak.eigenvalues < NONE])
     loose = [name for name, row in zip(names, open_[-len(names) :], strict=True) if np.any(row > 0.2)]
     if lost or loose:
@@ -334,8 +304,69 @@ def require_observable(model: Model, found: HandFit, limits: Mapping[str, Values
 
 
 def _explained(base: Values, Z: Values) -> bool:
-    """Return whether base columns explain all of an effect's."""
+    """Return whether base columns explain all columns of an effect."""
     size = np.linalg.norm(Z, axis=0)
     Q, _ = np.linalg.qr(base)
     left = np.linalg.norm(Z - Q @ (Q.T @ Z), axis=0)
     return bool(np.all(left <= NEW * np.where(size > 0.0, size, 1.0)))
+
+
+def fit_robustly(
+    model: GyroscopeModel, fitted: Callable[[GyroscopeModel], Fit], recordings: Sequence[Recording]
+) -> tuple[GyroscopeModel, Fit, list[dict[str, Any]]]:
+    """Fit rests and moves with weights of Student's t where a move is outlying.
+
+    Parameters
+    ----------
+    model : GyroscopeModel
+        With moves.
+    fitted : callable
+        Fits a model.
+    recordings : sequence of Recording
+
+    Returns
+    -------
+    GyroscopeModel, Fit
+        With the variance that the weights add.
+    list of dict
+        The outlying moves: ``recording, time_s, error_deg, over_noise, weight``.
+    """
+    found = fitted(model)
+    t, error = _over_noise(model, found)
+    limit = np.sqrt(2.0 * np.log(len(t) / FALSE_ALARM))
+    excess, weight = np.zeros(len(t)), np.ones(len(t))
+    any_outlying = bool(np.any(t > limit))
+    for _ in range(ROBUST_ROUNDS if any_outlying else 0):
+        before, weight = weight, np.minimum(1.0, (FREEDOM + 2.0) / (FREEDOM + t**2))
+        if np.abs(weight - before).max() < SETTLED:
+            break
+        variance = np.where(t > 0.0, (error / np.maximum(t, 1e-12)) ** 2, 0.0)
+        excess = variance * (1.0 / weight - 1.0)
+        model = model.with_excess(excess)
+        found = fitted(model)
+        t, error = _over_noise(model, found)
+    moves = model.moves
+    assert moves is not None  # noqa: S101
+    outlying = [
+        {
+            "recording": recordings[int(model.every.recording[moves.after[k]])].name,
+            "time_s": float(moves.time[k, 0]),
+            "error_deg": float(error[k]),
+            "over_noise": float(t[k]),
+            "weight": float(weight[k]),
+        }
+        for k in np.flatnonzero(t > limit)
+    ]
+    return model, found, outlying if any_outlying else []
+
+
+def _over_noise(model: GyroscopeModel, found: Fit) -> tuple[Values, Values]:
+    """Return t of each move, and its residual, deg."""
+    first = model.rests_equations
+    C = model.equations(found.state).covariance(found.noise)
+    error = found.error[first:].reshape(-1, 2)
+    r = found.residual[first:].reshape(-1, 2) * error
+    variance = np.diag(C)[first:].reshape(-1, 2) * error**2 - model.excess[:, None]
+    size = np.sqrt(np.sum(r**2 / variance, axis=1))
+    scale = float(np.median(size)) / np.sqrt(2.0 * np.log(2.0))
+    return size / max(scale, 1e-12), np.linalg.norm(r, axis=1)

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.estimation.multi_position.model import motion_of
+from pipeline.estimation.multi_position.rests import ROLE, rests_of
 from pipeline.estimation.rest_means import rest_means
 from pipeline.model.effects import effect
 from pipeline.model.measurement import compensate
@@ -28,7 +29,8 @@ from pipeline.signal.filter_noise import filter_autocovariance, variance_of_mean
 from pipeline.signal.rests import Rest
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
+    from typing import Any
 
     from numpy.typing import NDArray
 
@@ -69,6 +71,22 @@ class Gravity:
     ends: Values
     shared: Values
     creeping: NDArray[np.bool_]
+
+
+def observed_rests(
+    recordings: Sequence[Recording], accelerometer: SensorCalibration, settings: Mapping[str, Any], role: str = ROLE
+) -> tuple[Rests, Gravity] | None:
+    """Return the gyroscope's rests and gravity at them, or None where the recordings of a role hold none."""
+    felt = rests_of("accelerometer", recordings, settings, accelerometer, role)
+    turned = rests_of("gyroscope", recordings, settings, accelerometer, role)
+    if felt is None or turned is None:
+        return None
+    keys = [list(zip(r.recording.tolist(), r.span[:, 0].tolist(), strict=True)) for r in (felt, turned)]
+    both = set(keys[0]) & set(keys[1])
+    felt, turned = (r.select(np.array([key in both for key in k])) for r, k in zip((felt, turned), keys, strict=True))
+    if len(turned.time) == 0:
+        return None
+    return turned, gravity_of(recordings, felt, accelerometer)
 
 
 def gravity_of(recordings: Sequence[Recording], felt: Rests, accelerometer: SensorCalibration) -> Gravity:

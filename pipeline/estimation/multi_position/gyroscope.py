@@ -29,14 +29,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.errors import CannotCalibrateError, NotObservableError
+from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.multi_position.accelerometer import SMALLEST_NOISE, white_of
-from pipeline.estimation.multi_position.equations import Equations
-from pipeline.estimation.multi_position.model import State, added, motion_of
-from pipeline.estimation.multi_position.moves import tangents, to_the_end
+from pipeline.estimation.multi_position.gravity import observed_rests
+from pipeline.estimation.multi_position.model import Equations, State, effect_readings, motion_of
+from pipeline.estimation.multi_position.moves import moves_of, tangents, to_the_end
 from pipeline.model.rotation import skew
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -44,7 +46,7 @@ if TYPE_CHECKING:
     from pipeline.estimation.multi_position.gravity import Gravity
     from pipeline.estimation.multi_position.moves import Moves
     from pipeline.estimation.multi_position.rests import Rests
-    from pipeline.records import Motion, Noise
+    from pipeline.records import Motion, Noise, Recording, SensorCalibration
 
     Values = NDArray[np.float64]
 
@@ -53,7 +55,7 @@ ROUNDS = 6
 SETTLED_DPS = 1e-7
 
 
-class HandHeldGyroscope:
+class GyroscopeModel:
     """Equations of the gyroscope's rests and moves.
 
     Parameters
@@ -99,13 +101,13 @@ class HandHeldGyroscope:
         if self.moves is not None:
             pieces.append(self._of_moves(state, candidates))
         sizes = [len(piece["residual"]) for piece in pieces]
-        stretches = [piece["wander"].shape[2] for piece in pieces]
-        wander = np.zeros((3, sum(sizes), sum(stretches)))
+        stretches = [piece["bias"].shape[2] for piece in pieces]
+        bias = np.zeros((3, sum(sizes), sum(stretches)))
         scatter = np.zeros((len(pieces), sum(sizes)))
         row = column = 0
         for kind, piece in enumerate(pieces):
             own = slice(row, row + sizes[kind])
-            wander[:, own, column : column + stretches[kind]] = piece["wander"]
+            bias[:, own, column : column + stretches[kind]] = piece["bias"]
             scatter[kind, own] = np.square(np.median(piece["error"]) / piece["error"])
             row, column = own.stop, column + stretches[kind]
         recording = np.concatenate([piece["recording"] for piece in pieces])
@@ -120,7 +122,7 @@ class HandHeldGyroscope:
             effects=[np.concatenate(z) for z in zip(*(piece["effects"] for piece in pieces), strict=True)],
             candidates=[np.concatenate(z) for z in zip(*(piece["candidates"] for piece in pieces), strict=True)],
             scatter=scatter,
-            wander=wander,
+            bias=bias,
             start=stacked("start"),
             length=stacked("length"),
             joined=np.ones_like(same) if self.rests.clock_shared else same,
@@ -139,18 +141,18 @@ class HandHeldGyroscope:
             return None
         nothing = np.zeros_like(self.held_force)
         motion = motion_of(self.held.time, self.held_force, nothing, self.held.temperature, still=True)
-        left = self.held.reading - state.bias - added(self.sensor, state.terms, motion, state.K)
+        left = self.held.reading - state.bias - effect_readings(self.sensor, state.terms, motion, state.K)
         left -= self.held.creep @ state.K.T
         return float(np.sqrt(np.mean(np.sum((left @ state.matrix.T) ** 2, axis=1))))
 
-    def with_excess(self, variance: Values) -> HandHeldGyroscope:
+    def with_excess(self, variance: Values) -> GyroscopeModel:
         """Return the model with an error of its own for each move, of a variance in deg^2: (k,) array."""
         gravity, noise, fewest = self.known
-        out = HandHeldGyroscope(self.every, self.moves, gravity, noise, fewest)
+        out = GyroscopeModel(self.every, self.moves, gravity, noise, fewest)
         out.excess = variance
         return out
 
-    def without(self, held: NDArray[np.bool_]) -> HandHeldGyroscope:
+    def without(self, held: NDArray[np.bool_]) -> GyroscopeModel:
         """Return the model with some of its rests, and the moves that end at them, held out.
 
         Parameters
@@ -162,9 +164,9 @@ class HandHeldGyroscope:
         out[~self.every.held_out] = held
         moves = None if self.moves is None else self.moves.select(~out[self.moves.after])
         gravity, noise, fewest = self.known
-        return HandHeldGyroscope(replace(self.every, held_out=out), moves, gravity, noise, fewest)
+        return GyroscopeModel(replace(self.every, held_out=out), moves, gravity, noise, fewest)
 
-    def missed(self, state: State) -> tuple[Values, Values]:
+    def direction_errors(self, state: State) -> tuple[Values, Values]:
         """Return by how much each move misses the direction of gravity after it, and what noise alone gives, deg.
 
         Returns
@@ -186,13 +188,13 @@ class HandHeldGyroscope:
         rests, K = self.rests, state.K
         motion = motion_of(rests.time, self.force, np.zeros_like(self.force), rests.temperature, still=True)
         error = np.sqrt(rests.share[:, None]) * self.white
-        left = rests.reading - state.bias - added(self.sensor, state.terms, motion, K) - rests.creep @ K.T
+        left = rests.reading - state.bias - effect_readings(self.sensor, state.terms, motion, K) - rests.creep @ K.T
         m = len(rests.time)
         base = np.zeros((m, 3, 12))
         base[:, :, :3] = np.eye(3)
-        wander = np.zeros((3, m, 3, m))
+        bias = np.zeros((3, m, 3, m))
         for c in range(3):
-            wander[c, np.arange(m), c, np.arange(m)] = self.white[c] / error[:, c]
+            bias[c, np.arange(m), c, np.arange(m)] = self.white[c] / error[:, c]
 
         def columns(term: Term) -> Values:
             Z = term.effect.columns(self.sensor, motion, K, term.values) / error[:, :, None]
@@ -203,7 +205,7 @@ class HandHeldGyroscope:
             "base": (base / error[:, :, None]).reshape(3 * m, 12),
             "effects": [columns(term) for term in state.terms],
             "candidates": [columns(term) for term in candidates],
-            "wander": wander.reshape(3, 3 * m, m),
+            "bias": bias.reshape(3, 3 * m, m),
             "error": error.ravel(),
             "start": rests.start,
             "length": rests.length,
@@ -244,9 +246,9 @@ class HandHeldGyroscope:
         W = np.asarray(np.linalg.solve(np.linalg.cholesky(variance), np.eye(2)), np.float64)
         base = np.concatenate([-PM.sum(axis=1), np.einsum("ksei,ksj->keij", P, v).reshape(moves.count, 2, 9)], axis=2)
         n = 2 * moves.count
-        wander = np.zeros((3, moves.count, 2, moves.count))
+        bias = np.zeros((3, moves.count, 2, moves.count))
         held = -W @ PM.sum(axis=1) * self.white
-        wander[:, np.arange(moves.count), :, np.arange(moves.count)] = held.transpose(0, 2, 1)
+        bias[:, np.arange(moves.count), :, np.arange(moves.count)] = held.transpose(0, 2, 1)
 
         def columns(term: Term) -> Values:
             K = state.K
@@ -259,7 +261,7 @@ class HandHeldGyroscope:
             "base": (W @ base).reshape(n, 12),
             "effects": [columns(term) for term in state.terms],
             "candidates": [columns(term) for term in candidates],
-            "wander": wander.reshape(3, n, moves.count),
+            "bias": bias.reshape(3, n, moves.count),
             "error": np.sqrt(np.einsum("kii->ki", variance)).ravel(),
             "common": self._common(W, directions),
             "direction": self._of_directions(W, directions, np.sqrt(np.einsum("kii->ki", variance))),
@@ -301,7 +303,7 @@ class HandHeldGyroscope:
         rate, A = self._integrated(plain, state)
         v = plain
         for _ in range(ROUNDS if state.terms else 0):
-            v = plain - added(self.sensor, state.terms, self._motion(rate, A), K).reshape(plain.shape)
+            v = plain - effect_readings(self.sensor, state.terms, self._motion(rate, A), K).reshape(plain.shape)
             before = rate
             rate, A = self._integrated(v, state)
             if np.abs(rate - before).max() < SETTLED_DPS:
@@ -332,3 +334,49 @@ def _blocks(blocks: Sequence[Values | None], sizes: Sequence[int]) -> Values | N
             out[at : at + size, at : at + size] = block
         at += size
     return out
+
+
+def model_of(
+    recordings: Sequence[Recording],
+    calibration: SensorCalibration | None,
+    noise: Noise | None,
+    settings: Mapping[str, Any],
+    accelerometer: SensorCalibration | None = None,
+) -> GyroscopeModel | None:
+    """Return the model of the recordings' rests and moves, or None where they hold no rest.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+    calibration : SensorCalibration or None
+        Of the gyroscope: moves that its method found far off the others are left out.
+    noise : Noise or None
+    settings : mapping
+        Sections ``table`` and ``procedure``.
+    accelerometer : SensorCalibration, optional
+        Without it, the accelerometer is calibrated here.
+
+    Raises
+    ------
+    CannotCalibrateError
+        If the accelerometer cannot be calibrated.
+    """
+    if accelerometer is None:
+        try:
+            accelerometer = nonlinear_least_squares.fit(recordings, None, settings)
+        except NotObservableError as lack:
+            raise CannotCalibrateError(
+                f"the gyroscope by hand needs the direction of gravity by a calibrated accelerometer: {lack.message}"
+            ) from lack
+    observed = observed_rests(recordings, accelerometer, settings)
+    if observed is None:
+        return None
+    rests, gravity = observed
+    moves = moves_of(recordings, rests)
+    if moves is not None and calibration is not None:
+        told = [move for stage in calibration.stages for move in stage.details.get("moves_outlying", ())]
+        off = {(move["recording"], float(move["time_s"])) for move in told}
+        names = [recordings[int(i)].name for i in rests.recording[moves.after]]
+        keys = zip(names, moves.time[:, 0].tolist(), strict=True)
+        moves = moves.select(np.array([key not in off for key in keys]))
+    return GyroscopeModel(rests, moves, gravity, noise)

@@ -1,98 +1,199 @@
-"""Likelihoods of models on the linear form of rests and moves, and what an effect brings by them.
+"""Likelihoods of models of rests and moves, over a grid of noise hypotheses.
 
     -2 log L = rss / k + n log k + log det C,    rss = min_d (r - X d)^T C^-1 (r - X d),    k = max(1, rss / n)
 
-maximised over the noises of a grid, by each model for itself. Twice the gain in log L by v parameters is corrected as
-for a variance that only the residuals tell (Bartlett 1938; for one variance component, with the leverage's mean for
-1 - nu/n, it is ``nu + (v - 2) / 2`` over n times it), as nobody knows beforehand how firmly the unit rests:
+with the symbols of ``model``, maximised over the hypotheses for each model. Twice the gain in log L by v parameters is
+corrected for a variance that only the residuals show (Bartlett 1938):
 
     gain = (1 - h + (v - 2) / (2 n)) 2 (log L' - log L)
 
-where
-
-h  : mean leverage of the model with the effect, of the kinds of equations in which the effect shows
-nu : n less all parameters
-
-delta BIC is the gain less ``v log n``, and p that of chi squared with v degrees of freedom.
+where h is the mean leverage of the model with the effect, over the kinds of equations in which the effect shows.
+delta BIC is the gain less ``v log n``; p follows from chi squared with v degrees of freedom.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from itertools import pairwise
+from dataclasses import dataclass, replace
+from itertools import pairwise, product
 from typing import TYPE_CHECKING
 
 import numpy as np
+
+from pipeline.estimation.gauss_markov import SURE, selection_grid
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from pipeline.estimation.multi_position.equations import Equations, HandNoise
+    from pipeline.estimation.gauss_markov import Prior
+    from pipeline.estimation.multi_position.model import Equations
+    from pipeline.records import Noise
 
     Values = NDArray[np.float64]
 
-NEW = 1e-3  # share of a column's norm that those before it leave
+NEW = 1e-3  # share of a column's norm below which it adds no direction: rounding of the columns is below 1e-8
+# The grids below were chosen by the study of 500 recordings (tests/study/test_hand_held_study.py); ``fit.refined``
+# closes their steps where the data say more.
+UNLIKELY = -4.0
+FACTORS = 3.0 ** np.arange(-2.0, 3.0)  # of the bias instability of the prior
+RATIOS = (0.1, 0.3, 1.0)  # of bias instability to white noise where none is stated
+SCATTER = (0.0, 1.0, 3.0, 9.0, 27.0)  # of rests, of moves and of directions, for a covariance
+SELECTION_SCATTER = ((0.0, 2.0, 6.0, 20.0), (0.0, 4.0, 16.0))  # of rests, and of moves, where models are compared
 
 
 @dataclass(frozen=True)
-class Beside:
-    """Whitened candidates and residual after the model's own columns are taken out, under each of t noises.
+class NoiseHypothesis:
+    """One noise.
+
+    Attributes
+    ----------
+    ratio : float
+        q, bias over white noise.
+    time : float, s
+        Correlation time of the bias.
+    scatter : tuple of float
+        The a_j: of rests, and of moves.
+    belief : float
+        Prior log weight of the bias.
+    direction : float
+        c.
+    none : float
+        Prior log weight of each kind without scatter.
+    """
+
+    ratio: float
+    time: float
+    scatter: tuple[float, ...]
+    belief: float
+    direction: float = 0.0
+    none: float = 0.0
+
+    @property
+    def prior(self) -> float:
+        """Prior log weight."""
+        return self.belief + self.none * self.scatter.count(0.0)
+
+    @property
+    def levels(self) -> tuple[float, ...]:
+        """Scatter of each kind, and c."""
+        return *self.scatter, self.direction
+
+    def at(self, levels: Sequence[float]) -> NoiseHypothesis:
+        """Return the hypothesis at other levels."""
+        return replace(self, scatter=tuple(levels[:-1]), direction=levels[-1])
+
+    def scaled(self, j: int, factor: float) -> NoiseHypothesis:
+        """Return the hypothesis with one of its levels multiplied."""
+        return self.at([level * (factor if i == j else 1.0) for i, level in enumerate(self.levels)])
+
+
+def selection_hypotheses(noise: Noise | None, kinds: int) -> list[NoiseHypothesis]:
+    """Return the hypotheses over which models are compared: every bias instability with every scatter.
+
+    Parameters
+    ----------
+    noise : Noise or None
+        A static recording pins the bias instability.
+    kinds : int
+        Of scatter: that of rests, and that of moves.
+    """
+    settings = selection_grid(noise)
+    if kinds > 1:  # two kinds of scatter leave nothing to tell of a bias far from that of a static recording
+        settings = [s for s in settings if s.prior > UNLIKELY]
+    levels = list(product(*SELECTION_SCATTER[:kinds]))
+    found = [NoiseHypothesis(s.ratio, s.time, level, s.prior) for s in settings for level in levels]
+    without = [h for h in found if kinds > 1 and h.scatter[1] == 0.0]
+    return found + [replace(h, direction=c) for h in without for c in SELECTION_SCATTER[1][1:]]
+
+
+def prior_hypotheses(prior: Prior, white: float, kinds: int) -> list[NoiseHypothesis]:
+    """Return the hypotheses over which a covariance is averaged.
+
+    Parameters
+    ----------
+    prior : Prior
+        Of the bias instability.
+    white : float, unit of the sensor
+        White noise of a sample.
+    kinds : int
+        Of scatter.
+    """
+    bias = np.append(0.0, prior.wander * FACTORS if prior.wander > 0.0 else white * np.array(RATIOS))
+    pairs = zip((bias / white).tolist(), prior.log_belief(bias).tolist(), strict=True)
+    none = float(np.log(SURE * (len(SCATTER) - 1)))  # nobody states a scatter: none at all is believed first
+    levels = list(product(SCATTER, repeat=kinds))
+    found = [
+        NoiseHypothesis(ratio, prior.time, level, belief, none=none)
+        for ratio, belief in pairs
+        if np.isfinite(belief)
+        for level in levels
+    ]
+    without = [h for h in found if kinds > 1 and h.scatter[1] in {SCATTER[0], SCATTER[2]}]
+    return found + [replace(h, direction=c) for h in without for c in SCATTER[2:]]
+
+
+def log_likelihood(rss: Values, n: int, log_determinant: Values) -> Values:
+    """Return log L of sums of squares of n equations, with ``log det C`` less twice the prior."""
+    k = np.maximum(1.0, rss / n)
+    found: Values = -0.5 * (rss / k + n * np.log(k) + log_determinant)
+    return found
+
+
+@dataclass(frozen=True)
+class ProjectedCandidates:
+    """Whitened candidates and residual with the model's columns projected out, under each of t hypotheses.
 
     Attributes
     ----------
     raw : list of (t, n, p) array
-        What is left of each candidate's columns.
-    half : list of (t, p, p) array
-        ``raw @ half`` are orthonormal directions, zeros where a candidate shows fewer than it has columns.
+        Projected columns of each candidate.
+    orthonormal : list of (t, p, p) array
+        ``raw @ orthonormal`` are orthonormal directions; zeros where a candidate has fewer than columns.
     residual : (t, n) array
     basis : (t, n, b) array
         Orthonormal, of the model's columns.
-    logarithm : (t,) array
-        log det C, less twice the prior of the noise.
+    log_determinant : (t,) array
+        log det C, less twice the prior.
     """
 
     raw: list[Values]
-    half: list[Values]
+    orthonormal: list[Values]
     residual: Values
     basis: Values
-    logarithm: Values
-
-    def log_likelihood(self, rss: Values) -> Values:
-        """Return log L of a sum of squares under each noise: (t,) array."""
-        n = self.residual.shape[1]
-        k = np.maximum(1.0, rss / n)
-        found: Values = -0.5 * (rss / k + n * np.log(k) + self.logarithm)
-        return found
+    log_determinant: Values
 
     def of_model(self) -> tuple[float, int]:
-        """Return log L of the model, and the index of its best noise."""
-        scores = self.log_likelihood(np.sum(self.residual**2, axis=1))
+        """Return log L of the model, and the index of its best hypothesis."""
+        scores = self.scores()
         return float(scores.max()), int(np.argmax(scores))
 
-    def of_candidate(self, j: int) -> tuple[float, int]:
-        """Return log L with candidate j, and the index of its best noise."""
-        along = (self.residual[:, None, :] @ self.raw[j]) @ self.half[j]
-        gained = np.sum(along**2, axis=(1, 2))
-        scores = self.log_likelihood(np.sum(self.residual**2, axis=1) - gained)
+    def scores(self, explained: Values | float = 0.0) -> Values:
+        """Return log L under each hypothesis, less explained sums of squares: (t,) array."""
+        rss = np.sum(self.residual**2, axis=1) - explained
+        return log_likelihood(rss, self.residual.shape[1], self.log_determinant)
+
+    def with_candidate(self, j: int) -> tuple[float, int]:
+        """Return log L with candidate j, and the index of its best hypothesis."""
+        along = (self.residual[:, None, :] @ self.raw[j]) @ self.orthonormal[j]
+        scores = self.scores(np.sum(along**2, axis=(1, 2)))
         return float(scores.max()), int(np.argmax(scores))
 
     def count(self, j: int, at: int) -> int:
-        """Return how many directions candidate j shows under a noise."""
-        return int(np.any(self.half[j][at], axis=0).sum())
+        """Return how many directions candidate j has under a hypothesis."""
+        return int(np.any(self.orthonormal[j][at], axis=0).sum())
 
     def shown(self, j: int, at: int) -> Values:
-        """Return the orthonormal directions of candidate j under a noise: (n, p) array."""
-        return np.asarray(self.raw[j][at] @ self.half[j][at])
+        """Return the orthonormal directions of candidate j under a hypothesis: (n, p) array."""
+        return np.asarray(self.raw[j][at] @ self.orthonormal[j][at])
 
     def correction(self, j: int, at: int, added: int, kinds: Values) -> float:
-        """Return the factor on the gain by candidate j; 0 where it leaves fewer than two equations to judge it by.
+        """Return the factor on the gain by candidate j; 0 where fewer than two equations are left to judge it.
 
         Parameters
         ----------
         j, at : int
-            Candidate and noise.
+            Candidate and hypothesis.
         added : int
             Parameters, also those whose column is zero at their start.
         kinds : (s, n) array
@@ -108,34 +209,27 @@ class Beside:
         return max((spare + 0.5 * (added - 2)) / n, 0.0) if spare >= 2.0 - 1e-9 else 0.0
 
 
-def halves(columns: Values, sizes: Values) -> Values:
-    """Return what makes stacked columns orthonormal: (t, p, p) array; directions below ``NEW`` of the sizes are zeros.
-
-    Parameters
-    ----------
-    columns : (t, n, p) array
-    sizes : (t, p) array
-        Norms before something was taken out of the columns.
-    """
+def _orthonormalizers(columns: Values, sizes: Values) -> Values:
+    """Return the (t, p, p) factors that make (t, n, p) columns orthonormal; directions below ``NEW`` are zeros."""
     size = np.where(sizes > 0.0, sizes, 1.0)
     products = columns.transpose(0, 2, 1) @ columns / (size[:, :, None] * size[:, None, :])
     values, vectors = np.linalg.eigh(products)
     kept = values > NEW**2
-    half: Values = vectors * (kept / np.sqrt(np.where(kept, values, 1.0)))[:, None, :] / size[:, :, None]
-    return half
+    found: Values = vectors * (kept / np.sqrt(np.where(kept, values, 1.0)))[:, None, :] / size[:, :, None]
+    return found
 
 
-def beside(equations: Equations, noises: Sequence[HandNoise]) -> Beside:
-    """Return what is left beside the model's columns under every noise."""
+def project_out(equations: Equations, hypotheses: Sequence[NoiseHypothesis]) -> ProjectedCandidates:
+    """Whiten the equations under every hypothesis and project the model's columns out of candidates and residual."""
     model = equations.columns
     together = np.concatenate([model, *equations.candidates, equations.residual[:, None]], axis=1)
     edges = np.cumsum([model.shape[1], *(c.shape[1] for c in equations.candidates)])
-    whitened = [equations.whitened(noise, together) for noise in noises]
+    whitened = [equations.whitened(noise, together) for noise in hypotheses]
     white = np.array([w for w, _ in whitened])
     sizes = np.linalg.norm(white, axis=1)
-    basis = white[:, :, : edges[0]] @ halves(white[:, :, : edges[0]], sizes[:, : edges[0]])
+    basis = white[:, :, : edges[0]] @ _orthonormalizers(white[:, :, : edges[0]], sizes[:, : edges[0]])
     rest = white - basis @ (basis.transpose(0, 2, 1) @ white)
     blocks = [slice(start, stop) for start, stop in pairwise(edges.tolist())]
-    half = [halves(rest[:, :, block], sizes[:, block]) for block in blocks]
-    logarithm = np.array([log - 2.0 * noise.prior for (_, log), noise in zip(whitened, noises, strict=True)])
-    return Beside([rest[:, :, block] for block in blocks], half, rest[:, :, -1], basis, logarithm)
+    factors = [_orthonormalizers(rest[:, :, block], sizes[:, block]) for block in blocks]
+    log_determinant = np.array([log - 2.0 * h.prior for (_, log), h in zip(whitened, hypotheses, strict=True)])
+    return ProjectedCandidates([rest[:, :, b] for b in blocks], factors, rest[:, :, -1], basis, log_determinant)

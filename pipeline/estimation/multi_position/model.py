@@ -1,13 +1,33 @@
-"""What a model by hand is: parameters, and the linear form at them; see ``accelerometer`` and ``gyroscope``."""
+"""The model of one sensor in rests and moves, and its linear form at some parameters.
+
+    r = X d + e,    cov e = k C,    C = I + S + sum_j a_j^2 diag(g_j) + c^2 D + q^2 H R H^T
+
+where
+
+r   : (n,) residuals, each over the standard deviation that white noise gives it
+X   : (n, p) derivatives of the model with respect to its parameters, d their step
+S   : (n, n) errors of the accelerometer that equations of the gyroscope share
+g_j : (n,) variance of the scatter of the rests, or of the moves, beyond white noise (tremor), in units of the median
+      white error; a_j is its size
+D   : (n, n) errors of the direction of gravity at each rest, which two moves share, for errors of the size of the
+      median white error of a move; c is their size (a seat that gives way, a hand that leans)
+H   : (n, 3 t) derivatives with respect to the bias of each axis in each of t stretches of time, over its white noise
+R   : (t, t) covariance of a Gauss-Markov bias of unit variance, averaged over each stretch
+q   : standard deviation of that bias over white noise
+k   : at least 1: scatter that the hypotheses of a grid leave
+
+Nobody states how firmly a unit rests by hand: a, c, q and k are free in all comparisons (``likelihood``).
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from pipeline.estimation.design import Term
+from pipeline.estimation.gauss_markov import block_covariance
 from pipeline.model.effects import catalogue
 from pipeline.model.effects.base import Owner
 from pipeline.records import Motion
@@ -17,13 +37,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.estimation.multi_position.equations import Equations
+    from pipeline.estimation.multi_position.likelihood import NoiseHypothesis
     from pipeline.estimation.multi_position.rests import Rests
     from pipeline.model.effects.base import Effect
 
     Values = NDArray[np.float64]
-
-OWNERS = (Owner.SENSOR, Owner.RECORDING)
 
 
 @dataclass(frozen=True)
@@ -39,9 +57,92 @@ class State:
         """Inverse of the matrix: (3, 3) array."""
         return np.asarray(np.linalg.solve(self.matrix, np.eye(3)), np.float64)
 
-    def without_effects(self) -> State:
-        """Return bias and matrix alone."""
-        return replace(self, terms=())
+
+@dataclass(frozen=True)
+class Equations:
+    """The linear form at some parameters; see the module.
+
+    Attributes
+    ----------
+    residual : (n,) array
+    base : (n, b) array
+        Columns of bias and matrix.
+    effects, candidates : list of (n, p) array
+        Columns of the effects of the model, and of effects that are not in it.
+    scatter : (s, n) array
+        The g_j.
+    bias : (3, n, t) array
+        H, axis by axis.
+    start, length : (t,) arrays, s
+        The stretches of time.
+    joined : (t, t) array of bool
+        Whether the time between them is known.
+    error : (n,) array, g, deg/s or deg
+        Standard deviation of each equation by white noise.
+    common, direction : (n, n) array or None
+        S and D.
+    """
+
+    residual: Values
+    base: Values
+    effects: list[Values]
+    candidates: list[Values]
+    scatter: Values
+    bias: Values
+    start: Values
+    length: Values
+    joined: NDArray[np.bool_]
+    error: Values
+    common: Values | None = None
+    direction: Values | None = None
+    _kernels: dict[float, Values] = field(default_factory=dict, compare=False, repr=False)
+
+    @property
+    def columns(self) -> Values:
+        """Columns of the model: (n, b + p) array."""
+        return np.concatenate([self.base, *self.effects], axis=1)
+
+    def rows(self, count: int) -> Equations:
+        """Return the first equations alone."""
+        return replace(
+            self,
+            residual=self.residual[:count],
+            base=self.base[:count],
+            effects=[columns[:count] for columns in self.effects],
+            candidates=[columns[:count] for columns in self.candidates],
+            scatter=self.scatter[:, :count],
+            bias=self.bias[:, :count],
+            error=self.error[:count],
+            common=None if self.common is None else self.common[:count, :count],
+            direction=None if self.direction is None else self.direction[:count, :count],
+            _kernels={},
+        )
+
+    def covariance(self, noise: NoiseHypothesis) -> Values:
+        """Return C: (n, n) array."""
+        C = np.diag(1.0 + np.square(noise.scatter) @ self.scatter)
+        if self.common is not None:
+            C += self.common
+        if self.direction is not None and noise.direction:
+            C += noise.direction**2 * self.direction
+        return C + noise.ratio**2 * self._kernel(noise.time) if noise.ratio else C
+
+    def _kernel(self, time: float) -> Values:
+        """Return ``H R H^T`` for a correlation time: (n, n) array."""
+        if time not in self._kernels:
+            R = np.where(self.joined, block_covariance(self.start, self.length, time), 0.0)
+            self._kernels[time] = np.sum(self.bias @ R @ self.bias.transpose(0, 2, 1), axis=0)
+        return self._kernels[time]
+
+    def whitened(self, noise: NoiseHypothesis, values: Values) -> tuple[Values, float]:
+        """Return (n, p) values with ``L^-1`` applied, where ``L L^T = C``, and log det C."""
+        from scipy.linalg.lapack import dpotrf, dtrtrs  # noqa: PLC0415  (0.1 s that only fits pay)
+
+        L, failed = dpotrf(self.covariance(noise), lower=1)
+        assert failed == 0  # noqa: S101
+        solved, failed = dtrtrs(L, values, lower=1)
+        assert failed == 0  # noqa: S101
+        return solved, 2.0 * float(np.sum(np.log(np.diag(L))))
 
 
 class Model(Protocol):
@@ -52,13 +153,13 @@ class Model(Protocol):
     sensor : str
     rests : Rests
     kinds : int
-        Of scatter.
+        Of scatter: 1 for rests alone, 2 for rests and moves.
     rests_equations : int
         Equations of the rests; they come first.
     white : (3,) array
         Noise of a raw sample.
     directions : (12, b) array
-        What each base parameter does to bias and matrix (row by row).
+        Change of bias and matrix (row by row) by each base parameter.
     """
 
     sensor: str
@@ -73,7 +174,7 @@ class Model(Protocol):
         ...
 
     def samples(self) -> float:
-        """Return how many samples are behind the equations."""
+        """Return how many samples the equations use."""
         ...
 
     def held_out_error(self, state: State) -> float | None:
@@ -86,7 +187,7 @@ class Model(Protocol):
 
 
 def stepped(model: Model, state: State, step: Values) -> tuple[State, Values]:
-    """Return the parameters after a step, and what of it was taken: effects may refuse a part of it."""
+    """Return the parameters after a step, and the part of it that was taken: effects may refuse some."""
     count = model.directions.shape[1]
     change = model.directions @ step[:count]
     terms, taken, at = [], [step[:count]], count
@@ -101,7 +202,7 @@ def stepped(model: Model, state: State, step: Values) -> tuple[State, Values]:
 
 
 def motion_of(time: Values, force: Values, rate: Values, temperature: Values, *, still: bool) -> Motion:
-    """Return a motion that is known from the unit's own calibrated signals; derivatives are left at zero."""
+    """Return the motion that the unit's own calibrated signals show; derivatives are zero."""
     nothing = np.zeros_like(force)
     return Motion(
         time=time,
@@ -118,7 +219,7 @@ def motion_of(time: Values, force: Values, rate: Values, temperature: Values, *,
     )
 
 
-def added(sensor: str, terms: Sequence[Term], motion: Motion, K: Values) -> Values:
+def effect_readings(sensor: str, terms: Sequence[Term], motion: Motion, K: Values) -> Values:
     """Return what effects add to the readings: (n, 3) array."""
     total = np.zeros_like(motion.specific_force)
     for term in terms:
@@ -127,7 +228,7 @@ def added(sensor: str, terms: Sequence[Term], motion: Motion, K: Values) -> Valu
 
 
 def refusal(this: Effect, sensor: str, rests: Rests) -> str:
-    """Return why an effect can be no part of a model by hand; empty where it can."""
+    """Return why an effect can be no part of a model without a table; empty where it can."""
     unknown = [need for need in this.needs if need != "temperature"]
     checks = [
         (sensor not in this.sensors, f"{this.name} is no effect of the {sensor}"),
@@ -142,5 +243,13 @@ def refusal(this: Effect, sensor: str, rests: Rests) -> str:
 
 
 def candidates_for(sensor: str, rests: Rests, configured: Sequence[str]) -> list[Effect]:
-    """Return the effects that could be missing, as far as rests and moves can hold them."""
+    """Return the effects that could be missing and that rests and moves can show."""
     return [e for name, e in catalogue().items() if name not in configured and not refusal(e, sensor, rests)]
+
+
+def parameter_places(model: Model, count: int) -> Values:
+    """Return what base and effect parameters do to bias, matrix and effect parameters: (12 + p, b + p) array."""
+    base = model.directions.shape[1]
+    place = np.zeros((12 + count - base, count))
+    place[:12, :base], place[12:, base:] = model.directions, np.eye(count - base)
+    return place

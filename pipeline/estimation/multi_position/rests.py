@@ -99,7 +99,7 @@ class Rests:
         return np.ones_like(same) if self.clock_shared else same
 
 
-def by_hand(sensor: str, recordings: Sequence[Recording]) -> bool:
+def is_multi_position(sensor: str, recordings: Sequence[Recording]) -> bool:
     """Return whether a sensor was recorded by hand: rests and moves, and no motion of a table."""
     own = [r for r in recordings if r.reading(sensor) is not None and r.role != HELD_OUT]
     logged = any(r.table_angle is not None or r.table_attitude is not None for r in own)

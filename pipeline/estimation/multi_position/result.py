@@ -1,4 +1,9 @@
-"""A fit by hand as a calibration, and the last stage of a fit: base and effects together, configured or selected."""
+"""A fit to rests and moves as a calibration, with its uncertainty budget; and the stage ``effects`` of a fit.
+
+The Monte Carlo run of the budget is to second order of the model. The errors of the equations are drawn under every
+hypothesis of the noise by its weight, and solved for with the weights of that hypothesis, as the fit averages over
+them; the prior of the parameters is added as equations ``sqrt(P) p = 0 +- 1``.
+"""
 
 from __future__ import annotations
 
@@ -8,24 +13,41 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import NotObservableError
+from pipeline.estimation.engine import draw_normal
 from pipeline.estimation.least_squares import certified
-from pipeline.estimation.multi_position import accelerometer, observed
-from pipeline.estimation.multi_position.budget import budgeted_by_hand
-from pipeline.estimation.multi_position.equations import noises_for
+from pipeline.estimation.monte_carlo import beside_trials, quadratic_results, trials_of
+from pipeline.estimation.multi_position import accelerometer, gyroscope
 from pipeline.estimation.multi_position.fit import plausible, require_observable
-from pipeline.estimation.multi_position.model import refusal
+from pipeline.estimation.multi_position.likelihood import selection_hypotheses
+from pipeline.estimation.multi_position.model import parameter_places, refusal, stepped
 from pipeline.estimation.multi_position.selection import fit_configured, limits_of, select
+from pipeline.estimation.uncertainty_budget import combined, gravity_contribution, scatter_contribution, type_b
 from pipeline.model.effects import effect
-from pipeline.records import FittedEffect, SensorCalibration, StageResult
+from pipeline.records import NORMAL, FittedEffect, SensorCalibration, StageResult
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.estimation.multi_position.fit import HandFit
+    from numpy.typing import NDArray
+
+    from pipeline.estimation.multi_position.fit import Fit
     from pipeline.estimation.multi_position.model import Model
-    from pipeline.records import Noise, Recording
+    from pipeline.records import Contribution, Noise, Recording
+
+    Values = NDArray[np.float64]
 
 AUTO = "auto"
+STEP = 0.1  # of a standard uncertainty: the columns are differentiated where they are used
+REMARK = {
+    "accelerometer": "white noise, bias wander and what the rests scatter beyond both, as the residuals tell them",
+    "gyroscope": "white noise, bias wander, scatter of rests and moves, and the accelerometer's own calibration",
+}
+NOT_INCLUDED = {
+    "table angle, rate and orthogonality, levelling": "there is no table",
+    "quantisation": "contained in the noise of the readings, as the rests scatter",
+    "temperature": "the parameters hold at the temperature of these recordings; no accuracy of the thermometer is "
+    "stated",
+}
 
 
 def model_of(
@@ -35,7 +57,7 @@ def model_of(
     settings: Mapping[str, Any],
     other: SensorCalibration | None = None,
 ) -> Model | None:
-    """Return the model of a sensor by hand, or None where its recordings hold no rest.
+    """Return the model of the sensor of a calibration, or None where its recordings hold no rest.
 
     Parameters
     ----------
@@ -50,10 +72,10 @@ def model_of(
     """
     if calibration.sensor == "accelerometer":
         return accelerometer.model_of(recordings, calibration, noise, settings)
-    return observed.model_of(recordings, calibration, noise, settings, other)
+    return gyroscope.model_of(recordings, calibration, noise, settings, other)
 
 
-def fit_effects_by_hand(
+def fit_effects_by_rests(
     before: SensorCalibration, recordings: Sequence[Recording], noise: Noise | None, settings: Mapping[str, Any]
 ) -> SensorCalibration:
     """Fit the effects of ``settings["effects"]`` together with bias and matrix to rests and moves.
@@ -91,11 +113,11 @@ def fit_effects_by_hand(
         reason = refusal(effect(name), sensor, model.rests) if sensor in effect(name).sensors else ""
         if reason:
             raise NotObservableError(f"{name} cannot be fitted by hand: {reason}; take it out of effects.{sensor}")
-    noises = noises_for(noise, model.kinds)
+    hypotheses = selection_hypotheses(noise, model.kinds)
     limits = limits_of(sensor, sheet)
-    found = fit_configured(model, before, names, noises)
+    found = fit_configured(model, before, names, hypotheses)
     if plausible(model, found, limits):
-        found = fit_configured(model, before, names, noises, limits)
+        found = fit_configured(model, before, names, hypotheses, limits)
     if len(found.residual) <= found.rank:
         raise NotObservableError(
             f"{len(model.rests.time)} rests of the {sensor} are too few for {', '.join(names)} beside bias and matrix: "
@@ -106,15 +128,11 @@ def fit_effects_by_hand(
 
 
 def calibration_of(
-    model: Model, found: HandFit, before: SensorCalibration, settings: Mapping[str, Any]
+    model: Model, found: Fit, before: SensorCalibration, settings: Mapping[str, Any]
 ) -> SensorCalibration:
     """Return a fit as a calibration with the stage ``effects``."""
-    covariance = found.covariance
-    count = covariance.shape[0] - model.directions.shape[1]
-    place = np.zeros((12 + count, covariance.shape[0]))
-    place[:12, : model.directions.shape[1]] = model.directions
-    place[12:, model.directions.shape[1] :] = np.eye(count)
-    covariance = place @ covariance @ place.T
+    place = parameter_places(model, len(found.covariance))
+    covariance = place @ found.covariance @ place.T
     freedom = np.min(np.where(place != 0.0, found.degrees_of_freedom, np.inf), axis=1)
     uncertainty = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
     effects, parameters, at = [], {}, 12
@@ -148,4 +166,80 @@ def calibration_of(
         converged=found.converged,
         convergence=certified(found.cosine, found.condition, found.rank, len(found.covariance)),
     )
-    return budgeted_by_hand(calibration, covariance, freedom, model, found, settings)
+    return with_budget(calibration, covariance, freedom, model, found, settings)
+
+
+def with_budget(  # noqa: PLR0917  (what a fit by hand is)
+    calibration: SensorCalibration,
+    covariance: NDArray[np.float64],
+    degrees_of_freedom: NDArray[np.float64],
+    model: Model,
+    found: Fit,
+    settings: Mapping[str, Any],
+) -> SensorCalibration:
+    """Return a calibration with its uncertainty budget, of the covariance and its degrees of freedom by the residuals.
+
+    ``settings``: sections ``table`` (``gravity_g``, ``gravity_accuracy_g``, ``clock_accuracy_ppm``), ``uncertainty``.
+    """
+    sensor, size, table = calibration.sensor, len(calibration.parameter_names()), settings["table"]
+    scatter = scatter_contribution(covariance, np.inf, remark=REMARK[sensor])
+    lines = [scatter.with_freedom(degrees_of_freedom)]
+    missing = dict(NOT_INCLUDED)
+    if sensor == "accelerometer":
+        gravity = gravity_contribution(sensor, calibration.matrix, table, size)
+        lines += [gravity] if gravity else []
+        missing |= {} if gravity else {"local gravity": "table.gravity_accuracy_g is not stated"}
+    elif table.get("clock_accuracy_ppm") is None:
+        missing["time base"] = "table.clock_accuracy_ppm is not stated"
+    else:  # a rate is an angle over a time: dM = M de
+        effect = np.zeros((size, 1))
+        effect[3:12, 0] = 1e-6 * calibration.matrix.ravel()
+        lines.append(type_b("time base", NORMAL, float(table["clock_accuracy_ppm"]), "ppm", effect))
+    if sensor == "gyroscope":
+        missing["Earth's rotation"] = "not in the model: by hand nobody knows the heading; up to 0.0042 deg/s of bias"
+    complete, trials = combined(calibration, lines, missing), trials_of(settings)
+    return _with_monte_carlo(complete, model, found, trials, lines[1:]) if trials else complete
+
+
+def _with_monte_carlo(
+    calibration: SensorCalibration, model: Model, found: Fit, trials: int, direct: Sequence[Contribution]
+) -> SensorCalibration:
+    """Return a calibration whose budget also holds a Monte Carlo run; ``direct`` are its sources of type B."""
+    equations = model.equations(found.state)
+    X = equations.columns
+    n, p = X.shape
+    believed = np.flatnonzero(found.precision > 0.0)
+    rows = np.zeros((len(believed), p))
+    rows[np.arange(len(believed)), believed] = np.sqrt(found.precision[believed])
+    X, H = np.concatenate([X, rows]), np.zeros((n + len(believed), p, p))
+    H[:n] = _curvature(model, found, p)
+    candidates = [np.eye(len(X)) for _ in found.hypotheses]
+    for covariance, (noise, _, scale) in zip(candidates, found.hypotheses, strict=True):
+        covariance[:n, :n] = scale * equations.covariance(noise)
+    solvers = [quadratic_results(X, H, np.asarray(np.linalg.pinv(c, hermitian=True), float)) for c in candidates]
+    weight = np.array([w for _, w, _ in found.hypotheses])
+    place = parameter_places(model, p)
+    effects = [value for term in found.state.terms for value in term.values]
+    estimate = np.concatenate([found.state.bias, found.state.matrix.ravel(), effects])
+
+    def draw(rng: np.random.Generator, count: int) -> Values:
+        chosen, steps = rng.choice(len(weight), count, p=weight), np.empty((count, p))
+        for k in np.unique(chosen):
+            own = chosen == k
+            steps[own] = solvers[k](draw_normal(rng, candidates[k], int(np.count_nonzero(own))))
+        return np.asarray(estimate + steps @ place.T)
+
+    return beside_trials(calibration, draw, trials, direct)
+
+
+def _curvature(model: Model, found: Fit, parameters: int) -> Values:
+    """Return the derivative of the columns with respect to the parameters: (n, p, p) array, symmetric."""
+    slopes = []
+    for j, u in enumerate(np.sqrt(np.diag(found.covariance))):
+        step = np.zeros(parameters)
+        step[j] = STEP * u
+        (up, more), (down, less) = (stepped(model, found.state, sign * step) for sign in (1.0, -1.0))
+        change = model.equations(up).columns - model.equations(down).columns
+        slopes.append(change / (more[j] - less[j]) if step[j] > 0.0 else np.zeros_like(change))
+    H = np.stack(slopes, axis=2)
+    return np.asarray(0.5 * (H + H.transpose(0, 2, 1)))

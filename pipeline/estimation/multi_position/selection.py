@@ -2,10 +2,10 @@
 
     delta BIC > 10   and   m p < 0.01
 
-with the gain, delta BIC and p of ``estimation.multi_position.likelihood`` and m the number of candidates. After
-each acceptance all is fitted anew and every column is rebuilt there. An effect that would need ten times what the data
-sheet allows is no explanation of a few rests. Selected effects whose own delta BIC has become negative are dropped, and
-one that a rival replaces with delta BIC > 10 is exchanged.
+with the gain, delta BIC and p of ``likelihood`` and m the number of candidates. After each acceptance all parameters
+are fitted anew and every column is rebuilt. An effect that would need ten times its data-sheet limit is no explanation
+of a few rests. Selected effects whose own delta BIC has become negative are dropped; one that a rival replaces with
+delta BIC > 10 is exchanged.
 """
 
 from __future__ import annotations
@@ -17,9 +17,8 @@ import numpy as np
 
 from pipeline.estimation.design import Term
 from pipeline.estimation.generalized_least_squares import starts_of
-from pipeline.estimation.multi_position.equations import noises_for
-from pipeline.estimation.multi_position.fit import HandFit, fit
-from pipeline.estimation.multi_position.likelihood import NEW, beside
+from pipeline.estimation.multi_position.fit import Fit, fit
+from pipeline.estimation.multi_position.likelihood import NEW, project_out, selection_hypotheses
 from pipeline.estimation.multi_position.model import State, candidates_for
 from pipeline.estimation.ranking import Score
 from pipeline.estimation.selection import GATE_BIC, GATE_P, MOST
@@ -32,9 +31,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.estimation.multi_position.equations import Equations, HandNoise
-    from pipeline.estimation.multi_position.likelihood import Beside
-    from pipeline.estimation.multi_position.model import Model
+    from pipeline.estimation.multi_position.likelihood import NoiseHypothesis, ProjectedCandidates
+    from pipeline.estimation.multi_position.model import Equations, Model
     from pipeline.model.effects.base import Effect
     from pipeline.records import Noise, SensorCalibration
 
@@ -48,16 +46,16 @@ COMPETES = 0.6  # share of the best delta BIC above which an effect is fitted to
 
 @dataclass(frozen=True)
 class Scored:
-    """Every candidate beside a model.
+    """The scores of all candidates, given a model.
 
     Attributes
     ----------
     scores : dict of str to Score
-        Of those in which the equations show anything.
+        Of those that the equations show.
     visible : dict of str to float
-        Gain that each could reach on average with its parameters at their limits; infinite without limits.
+        Mean gain of each with its parameters at their limits; infinite without limits.
     shown : dict of str to array
-        Orthonormal directions of each at the model's best noise.
+        Orthonormal directions of each under the model's best hypothesis.
     spare : dict of str to float
         The factor on its gain; 0 where too few equations are left to judge it.
     signal : dict of str to array
@@ -72,7 +70,7 @@ class Scored:
 
 
 @dataclass
-class HandSelection:
+class Selection:
     """What was selected, and how every candidate did.
 
     Attributes
@@ -80,37 +78,33 @@ class HandSelection:
     names : list of str
     steps : dict of str to Score
         Of each selected effect when it was accepted.
-    fits : list of HandFit
+    fits : list of Fit
         Base and configured effects, then with each further selected one; the last is the whole model.
     first, last : Scored
-        Beside base and configured effects, and beside all that was selected.
+        Given base and configured effects, and given all that was selected.
     own : dict of str to Scored
-        Every candidate beside all selected effects but one.
+        Given all selected effects but one.
     model : Model
-    noises : list of HandNoise
+    hypotheses : list of NoiseHypothesis
     candidates : list of Effect
     limits : dict of str to array
     """
 
     names: list[str]
     steps: dict[str, Score]
-    fits: list[HandFit]
+    fits: list[Fit]
     first: Scored
     last: Scored
     own: dict[str, Scored]
     model: Model
-    noises: list[HandNoise]
+    hypotheses: list[NoiseHypothesis]
     candidates: list[Effect]
     limits: dict[str, Values]
 
 
 def select(
-    model: Model,
-    start: SensorCalibration,
-    configured: Sequence[str],
-    noise: Noise | None,
-    sheet: Mapping[str, Any],
-) -> HandSelection:
+    model: Model, start: SensorCalibration, configured: Sequence[str], noise: Noise | None, sheet: Mapping[str, Any]
+) -> Selection:
     """Select effects.
 
     Parameters
@@ -130,14 +124,14 @@ def fit_configured(
     model: Model,
     start: SensorCalibration,
     configured: Sequence[str],
-    noises: Sequence[HandNoise],
+    hypotheses: Sequence[NoiseHypothesis],
     limits: Mapping[str, Values] | None = None,
-) -> HandFit:
+) -> Fit:
     """Fit base and configured effects, from the best of their starts."""
     fits = []
     for terms in starts_of(configured, model.sensor, start):
         state = State(start.bias, start.matrix, tuple(Term(t.effect, np.array(t.values, float)) for t in terms))
-        fits.append(fit(model, state, noises, limits or {}))
+        fits.append(fit(model, state, hypotheses, limits or {}))
     return max(fits, key=lambda found: found.log_likelihood)
 
 
@@ -159,18 +153,18 @@ class _Search:
         sheet: Mapping[str, Any],
     ) -> None:
         self.model = model
-        self.noises = noises_for(noise, model.kinds)
+        self.hypotheses = selection_hypotheses(noise, model.kinds)
         self.limits = limits_of(model.sensor, sheet)
         self.effects = candidates_for(model.sensor, model.rests, configured)
         self.kept_near = {n: FAR * limit for n, limit in self.limits.items() if effect(n).nonlinear}
-        self.base = fit_configured(model, start, configured, self.noises, self.kept_near)
+        self.base = fit_configured(model, start, configured, self.hypotheses, self.kept_near)
         self.held = len(self.base.state.terms)
         self.names: list[str] = []
         self.steps: dict[str, Score] = {}
         self.fit = self.base
         self.known: dict[tuple[tuple[str, ...], tuple[str, ...]], Scored] = {}
 
-    def run(self) -> HandSelection:
+    def run(self) -> Selection:
         first = scored = self._scored([])
         for _ in range(ROUNDS):
             best = self._best(scored) if len(self.names) < MOST else None
@@ -180,7 +174,7 @@ class _Search:
             elif not self._exchange():
                 break
             scored = self._scored(self.names)
-        return HandSelection(
+        return Selection(
             self.names,
             self.steps,
             self._ladder(),
@@ -188,20 +182,20 @@ class _Search:
             scored,
             {name: self._own(name) for name in self.names},
             self.model,
-            self.noises,
+            self.hypotheses,
             self.effects,
             self.limits,
         )
 
     def _scored(self, names: Sequence[str]) -> Scored:
-        """Score every effect beside base, configured and some of the selected effects."""
+        """Score every effect given base, configured and some of the selected effects."""
         key = tuple(self.names), tuple(names)
         if key not in self.known:
             self.known[key] = self._score_all(names)
         return self.known[key]
 
     def _score_all(self, names: Sequence[str]) -> Scored:
-        terms, found, equations = self._beside(names)
+        terms, found, equations = self._projected(names)
         before, at = found.of_model()
         out = Scored({}, {}, {}, {}, {})
         for j, term in enumerate(terms):
@@ -210,7 +204,7 @@ class _Search:
                 continue
             added = count + len(term.effect.nonlinear)
             factor = found.correction(j, at, added, equations.scatter)
-            after, own = found.of_candidate(j)
+            after, own = found.with_candidate(j)
             gain = factor * max(2.0 * (after - before), 0.0)
             score = self._score(term, added, gain, found.raw[j][own], found.residual[own])
             score = replace(score, log_likelihood=after, setting=own, admissible=factor > 0.0)
@@ -223,8 +217,8 @@ class _Search:
         self._refine(out, names, before)
         return out
 
-    def _beside(self, names: Sequence[str]) -> tuple[list[Term], Beside, Equations]:
-        """Return the candidates beside some of the selected effects, and their columns."""
+    def _projected(self, names: Sequence[str]) -> tuple[list[Term], ProjectedCandidates, Equations]:
+        """Return the candidates with some of the selected effects projected out."""
         kept = [t for i, t in enumerate(self.fit.state.terms) if i < self.held or t.effect.name in names]
         fitted = {term.effect.name: term.values for term in self.fit.state.terms}
         terms = []
@@ -234,7 +228,7 @@ class _Search:
             elif this.name not in names:
                 terms += [Term(this, values) for values in this.starts(self.model.sensor)]
         equations = self.model.equations(replace(self.fit.state, terms=tuple(kept)), terms)
-        return terms, beside(equations, self.noises), equations
+        return terms, project_out(equations, self.hypotheses), equations
 
     def _score(self, term: Term, added: int, gain: float, raw: Values, residual: Values) -> Score:
         """Return the score of a candidate after one linear step."""
@@ -275,7 +269,7 @@ class _Search:
                 continue
             terms = [t for i, t in enumerate(self.fit.state.terms) if i < self.held or t.effect.name in names]
             start = replace(self.fit.state, terms=(*terms, Term(effect(score.name), score.values)))
-            found = fit(self.model, start, self.noises, self.kept_near)
+            found = fit(self.model, start, self.hypotheses, self.kept_near)
             gain = max(2.0 * (found.log_likelihood - before), 0.0) * scored.spare[score.name]
             scored.scores[score.name] = replace(
                 score,
@@ -307,13 +301,13 @@ class _Search:
         self.names.append(score.name)
         self.steps[score.name] = score
         terms = (*self.fit.state.terms, Term(effect(score.name), score.values))
-        self.fit = fit(self.model, replace(self.fit.state, terms=terms), self.noises, self.kept_near)
+        self.fit = fit(self.model, replace(self.fit.state, terms=terms), self.hypotheses, self.kept_near)
 
     def _remove(self, name: str) -> None:
         self.names.remove(name)
         del self.steps[name]
         terms = tuple(t for t in self.fit.state.terms if t.effect.name != name)
-        self.fit = fit(self.model, replace(self.base.state, terms=terms), self.noises, self.kept_near)
+        self.fit = fit(self.model, replace(self.base.state, terms=terms), self.hypotheses, self.kept_near)
 
     def _own(self, name: str) -> Scored:
         return self._scored([n for n in self.names if n != name])
@@ -337,12 +331,12 @@ class _Search:
                 return True
         return False
 
-    def _ladder(self) -> list[HandFit]:
+    def _ladder(self) -> list[Fit]:
         """Return the fits of the base and with each further selected effect."""
         fits = [self.base]
         for count in range(1, len(self.names)):
             terms = self.fit.state.terms[: self.held + count]
-            fits.append(fit(self.model, replace(self.fit.state, terms=terms), self.noises, self.kept_near))
+            fits.append(fit(self.model, replace(self.fit.state, terms=terms), self.hypotheses, self.kept_near))
         return [*fits, self.fit] if self.names else fits
 
 

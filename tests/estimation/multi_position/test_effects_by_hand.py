@@ -13,7 +13,7 @@ from scipy.special import stdtrit
 from pipeline.errors import NotObservableError
 from pipeline.estimation.effects_stage import fit_effects
 from pipeline.estimation.multi_position.accelerometer import model_of
-from pipeline.estimation.multi_position.equations import noises_for
+from pipeline.estimation.multi_position.likelihood import selection_hypotheses
 from pipeline.estimation.multi_position.selection import fit_configured, limits_of
 from pipeline.estimation.noise import estimate_noise
 from pipeline.validation.heldout import validate
@@ -151,7 +151,7 @@ def test_derivatives_of_the_rests_are_those_of_their_residuals() -> None:
     model = model_of(unit.recordings, before, None, unit.settings)
     assert model is not None
     limits = limits_of("accelerometer", unit.settings["sensor"]["accelerometer"])
-    state = fit_configured(model, before, names, noises_for(None, 1), limits).state
+    state = fit_configured(model, before, names, selection_hypotheses(None, 1), limits).state
     equations, step = model.equations(state), 1e-6
     for j in range(6):
         values = np.concatenate([t.values for t in state.terms])

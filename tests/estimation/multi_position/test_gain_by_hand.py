@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.special import chdtrc, fdtrc
 
-from pipeline.estimation.multi_position.equations import Equations, HandNoise
-from pipeline.estimation.multi_position.likelihood import beside
+from pipeline.estimation.multi_position.likelihood import NoiseHypothesis, project_out
+from pipeline.estimation.multi_position.model import Equations
 
-WHITE = [HandNoise(0.0, 1.0, (0.0,), 0.0)]
+WHITE = [NoiseHypothesis(0.0, 1.0, (0.0,), 0.0)]
 
 
 def equations_of(residual: np.ndarray, base: np.ndarray, candidate: np.ndarray) -> Equations:
@@ -26,9 +26,11 @@ def test_p_is_that_of_the_f_test_where_only_the_rests_tell_their_scatter(rests: 
     for size in (0.0, 8.0, 16.0):
         base, candidate = rng.standard_normal((rests, 9)), rng.standard_normal((rests, added))
         r = 30.0 * rng.standard_normal(rests) + size * candidate.sum(axis=1)
-        found = beside(equations_of(r, base, candidate), WHITE)
+        found = project_out(equations_of(r, base, candidate), WHITE)
         gain = (
-            2.0 * (found.of_candidate(0)[0] - found.of_model()[0]) * found.correction(0, 0, added, np.ones((1, rests)))
+            2.0
+            * (found.with_candidate(0)[0] - found.of_model()[0])
+            * found.correction(0, 0, added, np.ones((1, rests)))
         )
         before = r - base @ np.linalg.lstsq(base, r)[0]
         both = np.column_stack([base, candidate])
@@ -41,7 +43,7 @@ def test_p_is_that_of_the_f_test_where_only_the_rests_tell_their_scatter(rests: 
 
 def test_a_candidate_that_leaves_no_equation_to_judge_it_by_counts_nothing() -> None:
     rng = np.random.default_rng(3)
-    found = beside(
+    found = project_out(
         equations_of(rng.standard_normal(12), rng.standard_normal((12, 9)), rng.standard_normal((12, 2))), WHITE
     )
     assert found.correction(0, 0, 2, np.ones((1, 12))) == 0.0
@@ -50,5 +52,5 @@ def test_a_candidate_that_leaves_no_equation_to_judge_it_by_counts_nothing() -> 
 def test_a_candidate_that_the_base_holds_shows_nothing() -> None:
     rng = np.random.default_rng(4)
     base = rng.standard_normal((30, 9))
-    found = beside(equations_of(rng.standard_normal(30), base, base[:, :2] @ rng.standard_normal((2, 3))), WHITE)
+    found = project_out(equations_of(rng.standard_normal(30), base, base[:, :2] @ rng.standard_normal((2, 3))), WHITE)
     assert found.count(0, 0) == 0

@@ -14,9 +14,9 @@ from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.design import Term
 from pipeline.estimation.effects_stage import fit_effects
 from pipeline.estimation.gyroscope import rests_and_moves
+from pipeline.estimation.multi_position.gyroscope import model_of
 from pipeline.estimation.multi_position.model import State
 from pipeline.estimation.multi_position.moves import to_the_end
-from pipeline.estimation.multi_position.observed import model_of
 from pipeline.model.effects import effect
 from pipeline.simulation.trajectory import rotation_about
 
