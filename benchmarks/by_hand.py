@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from pipeline.estimation.accelerometer import nonlinear_least_squares
-from pipeline.estimation.effects_stage import fit_effects
+from pipeline.estimation.effects import fit as fit_effects
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.io.read import read_recordings
 from pipeline.simulation.description import read_config

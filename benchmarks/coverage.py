@@ -20,18 +20,20 @@ import argparse
 import os
 import time
 from dataclasses import replace
-from importlib import import_module
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 
+from pipeline.estimation.stages import fit_stage
 from pipeline.model.effects.base import truth
 from pipeline.model.kinematics import reference_motion
-from pipeline.records import Recording, SensorCalibration, StageResult
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, read_config
+
+if TYPE_CHECKING:
+    from pipeline.records import Recording, SensorCalibration
 
 COURSE = {
     "step_deg": 15.0,
@@ -96,13 +98,10 @@ def simulated(condition: str, table: str, procedure: str, seed: int, number: int
 
 
 def calibrated(sensor: str, stages: tuple[str, ...], recordings: list[Recording], settings: JSON) -> SensorCalibration:
-    """Run the last stage; of the staged method it follows the ones before by itself."""
+    """Run the stages, each on the result of the one before."""
     before = None
-    if "scale_factor" in stages:
-        before = SensorCalibration(sensor, stages=tuple(StageResult(name, {}) for name in stages[:-1]))
-        stages = stages[-1:]
     for name in stages:
-        before = import_module(f"pipeline.estimation.{sensor}.{name}").fit(recordings, before, settings)
+        before = fit_stage(sensor, name, recordings, before, settings)
     return cast("SensorCalibration", before)
 
 

@@ -27,7 +27,7 @@ from pipeline.diagnosis.verdict import evidence_of, judged, verdict_of_selection
 from pipeline.diagnosis.words import next_experiment
 from pipeline.errors import NotObservableError
 from pipeline.estimation.design import Start, Term
-from pipeline.estimation.effects_stage import AUTO
+from pipeline.estimation.effects import AUTO
 from pipeline.estimation.generalized_least_squares import calibration_of, fit_terms
 from pipeline.estimation.multi_position.rests import is_multi_position
 from pipeline.estimation.observations import observe

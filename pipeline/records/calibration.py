@@ -88,7 +88,7 @@ class SensorCalibration:
     freedom : (p,) array or None
         Effective degrees of freedom of each parameter; None: ``degrees_of_freedom`` for all.
     budget : dict or None
-        The uncertainty budget as published; see ``pipeline.estimation.budget``.
+        The uncertainty budget as published; see ``pipeline.estimation.uncertainty_budget``.
     convergence : dict or None
         Evidence that the estimate is a minimum: ``cosine``, the largest between the residual and a column of the
         Jacobian; ``condition`` and ``rank`` of its scaled columns; ``parameters``, their number.

@@ -1,16 +1,15 @@
 """Stage fit: one sensor, one stage of its method, on the result of the stage before it.
 
-The module ``pipeline.estimation.<sensor>.<stage>`` does the work: a new stage needs only such a module and its name in
-a method's list.
+``pipeline.estimation.stages`` finds the module that does the work.
 """
 
 from __future__ import annotations
 
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import CannotCalibrateError
+from pipeline.estimation.stages import fit_stage
 from pipeline.estimation.uncertainty_budget import with_stated
 from pipeline.files import read_json, write_json
 from pipeline.io.parquet import load_recordings
@@ -34,9 +33,8 @@ def process_unit(job: Job, unit: str, settings: dict[str, Any]) -> None:
     fitted = SensorCalibration.from_json(sensor, before) if before else None
     recordings = load_recordings(job.inputs["filter"] / f"{unit}.parquet")
     noises = load_noises(job.inputs["filter"], unit)
-    fit = import_module(f"pipeline.estimation.{sensor}.{stage}").fit
     try:
-        found = fit(recordings, fitted, settings | {"noise": noises})
+        found = fit_stage(sensor, stage, recordings, fitted, settings | {"noise": noises})
         if job.run["last"] != NOT_LAST:  # else the next stage would take it over, and it would count twice
             found = with_stated(found, recordings, settings)
         write_json(target, found.to_json())

@@ -17,7 +17,6 @@ import os
 import time
 from concurrent.futures import ProcessPoolExecutor
 from functools import cache
-from importlib import import_module
 from multiprocessing import get_context
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -26,8 +25,9 @@ from typing import TYPE_CHECKING, Any
 from pipeline.config import code_digest, load_campaign
 from pipeline.diagnosis.diagnose import diagnose
 from pipeline.errors import ConfigurationError
-from pipeline.estimation.effects_stage import fit_effects
+from pipeline.estimation.effects import fit as fit_effects
 from pipeline.estimation.noise import estimate_noise
+from pipeline.estimation.stages import fit_stage
 from pipeline.model.effects import leaving_out
 from pipeline.records import SENSORS
 from pipeline.study.bench import recordings_of, signals_left
@@ -191,7 +191,7 @@ def calibrated(recordings: list[Recording], sensor: str, settings: JSON) -> Sens
     """Return the calibration after all stages of the configured method."""
     found: SensorCalibration | None = None
     for stage in settings["method"]["stages"][sensor]:
-        found = import_module(f"pipeline.estimation.{sensor}.{stage}").fit(recordings, found, settings)
+        found = fit_stage(sensor, stage, recordings, found, settings)
     assert found is not None  # noqa: S101  (every method has a stage)
     return found
 

@@ -29,8 +29,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.estimation.accelerometer import nonlinear_least_squares, staged
-from pipeline.estimation.accelerometer.chain import follow
-from pipeline.estimation.accelerometer.extremes import (
+from pipeline.estimation.accelerometer.turn_extremes import (
     Turn,
     extremes_of_samples,
     extremes_of_sinusoids,
@@ -117,9 +116,10 @@ class Drawn:
             else extremes_of_sinusoids([[s.coefficients for s in fits] for fits in sinusoids_of(turns)])
         )
         row: Row = {}
-        for end, name in enumerate(staged.STAGES, 1):
-            chain = follow(extremes, staged.STAGES[:end], 1.0, as_printed=as_printed)
-            values = {k: v for k, (v, _) in chain.outcome.values.items()}
+        chain = staged.Corrected()
+        for name in staged.STAGES:
+            chain = staged.follow(extremes, [name], 1.0, as_printed=as_printed, start=chain)
+            values = {k: v for k, (v, _) in chain.values.items()}
             for axis in "xyz":
                 if name == "bias":
                     row[f"b_{axis}"] = values[f"b_{axis}"]
@@ -146,7 +146,7 @@ class Drawn:
         samples = response.samples_of(parts, turns)
         theta = response.weights_of(samples.rate, as_printed=False) @ samples.reading
         chain = gyroscope.follow(
-            response.Response(theta[0], theta[1:], samples.speed), gyroscope.STAGES, as_printed=False
+            response.Response(theta[0], theta[1:], samples.speed), list(gyroscope.STAGES), as_printed=False
         )
         integrated = turns_of(parts)
         U, Y = integrated.integral(integrated.rate), integrated.integral(integrated.reading - theta[0])

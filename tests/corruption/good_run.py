@@ -14,13 +14,13 @@ import json
 import sys
 from collections import defaultdict
 from concurrent.futures import ProcessPoolExecutor
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from pipeline.diagnosis.diagnose import diagnose
 from pipeline.errors import CannotCalibrateError, PipelineError
 from pipeline.estimation.noise import noise_of
+from pipeline.estimation.stages import fit_stage
 from pipeline.estimation.uncertainty_budget import with_stated
 from pipeline.model.effects import leaving_out
 from pipeline.preprocessing.checks import check_recordings
@@ -55,7 +55,7 @@ def fitted(recordings: Any, sensor: str, settings: Any) -> Any:
     found = None
     try:
         for stage in settings["method"]["stages"][sensor]:
-            found = import_module(f"pipeline.estimation.{sensor}.{stage}").fit(recordings, found, settings)
+            found = fit_stage(sensor, stage, recordings, found, settings)
             found = with_stated(found, recordings, settings)
     except CannotCalibrateError:
         return None

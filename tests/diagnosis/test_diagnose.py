@@ -14,7 +14,7 @@ from bench_session import CONTINUOUS, ONE_WAY, SIZE, STOP_AND_GO, THESIS, Course
 
 from pipeline.diagnosis.diagnose import diagnose
 from pipeline.diagnosis.words import in_words
-from pipeline.estimation.gyroscope import effects as gyroscope_stage
+from pipeline.estimation.effects import fit as fit_effects
 from pipeline.estimation.noise import estimate_noise
 from pipeline.records import Recording, SensorCalibration
 from pipeline.signal.filters import apply_filter
@@ -231,7 +231,7 @@ def test_recordings_without_a_table_cannot_be_diagnosed_and_say_so() -> None:
 
 def test_automatic_effects_are_fitted_and_the_diagnosis_tells_what_was_added() -> None:
     recordings = hidden("gyroscope", "g_sensitivity")
-    calibration = gyroscope_stage.fit(recordings, None, settings("gyroscope", "auto"))
+    calibration = fit_effects("gyroscope", recordings, None, settings("gyroscope", "auto"))
     assert [e.name for e in calibration.effects] == ["g_sensitivity"]
     noise = estimate_noise("gyroscope", recordings, SHEET["gyroscope"])
     part = diagnose(calibration, recordings, noise, settings("gyroscope", "auto"))

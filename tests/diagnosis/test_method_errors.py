@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +14,7 @@ from bench_session import BIAS, CONTINUOUS, STOP_AND_GO, Course, K, Session, rec
 from pipeline.diagnosis.diagnose import diagnose
 from pipeline.diagnosis.words import in_words
 from pipeline.estimation.noise import estimate_noise
+from pipeline.estimation.stages import fit_stage
 from pipeline.signal.filters import apply_filter
 from pipeline.validation.heldout import validate
 
@@ -43,7 +43,7 @@ def diagnosed(
     settings["method"] = config | {"as_printed": as_printed}
     calibration = None
     for stage in config["stages"][sensor]:
-        calibration = import_module(f"pipeline.estimation.{sensor}.{stage}").fit(recordings, calibration, settings)
+        calibration = fit_stage(sensor, stage, recordings, calibration, settings)
     assert calibration is not None
     noise = estimate_noise(sensor, recordings, SHEET[sensor])
     validation = validate(calibration, recordings, noise, settings)

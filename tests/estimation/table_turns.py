@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.signal import lfilter
 
+from pipeline.estimation.stages import fit_stage
 from pipeline.records import Recording, SensorCalibration
 
 if TYPE_CHECKING:
@@ -123,5 +123,5 @@ def run_stages(sensor: str, names: list[str], recordings: list[Recording], confi
     """Run the stages of a method, one after the other."""
     calibration = None
     for name in names:
-        calibration = import_module(f"pipeline.estimation.{sensor}.{name}").fit(recordings, calibration, config)
+        calibration = fit_stage(sensor, name, recordings, calibration, config)
     return calibration

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.estimation.accelerometer import nonlinear_least_squares
-from pipeline.estimation.reference import fit_reference
+from pipeline.estimation.reference_least_squares import fit
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, read_config
 
@@ -41,7 +41,7 @@ def _ratios(found: list[SensorCalibration], true: list[np.ndarray]) -> np.ndarra
 
 @pytest.mark.parametrize(("sensor", "shown"), [("accelerometer", 3.0), ("gyroscope", 1.0)])
 def test_the_noise_of_the_readings_is_the_sensor_s_and_not_the_table_s(sensor: str, shown: float) -> None:
-    found = [fit_reference(sensor, _unit(n)[0], None, SETTINGS) for n in range(UNITS)]
+    found = [fit(sensor, _unit(n)[0], None, SETTINGS) for n in range(UNITS)]
     white = np.array([f.stages[-1].details["white_noise"] for f in found])
     true = _unit(0)[1][sensor]["noise"]["white"]
     residual = np.array([f.stages[-1].details["residual_rms"] for f in found])
@@ -69,5 +69,5 @@ def test_the_length_of_gravity_is_not_charged_with_errors_of_the_attitude() -> N
 def test_an_accuracy_that_does_not_touch_the_gyroscope_changes_nothing() -> None:
     plain = {**SETTINGS, "table": {"gravity_g": 1.0}}
     level = {**SETTINGS, "table": {"gravity_g": 1.0, "levelling_deg": 5.0}}
-    first, second = (fit_reference("gyroscope", _unit(0)[0], None, settings) for settings in (plain, level))
+    first, second = (fit("gyroscope", _unit(0)[0], None, settings) for settings in (plain, level))
     np.testing.assert_array_equal(np.asarray(first.covariance), np.asarray(second.covariance))

@@ -11,7 +11,7 @@ from bench_session import BIAS, CONTINUOUS, ONE_WAY, SIZE, STOP_AND_GO, THESIS, 
 from scipy.special import stdtrit
 
 from pipeline.errors import ConfigurationError, NotObservableError
-from pipeline.estimation.accelerometer import effects as accelerometer_stage
+from pipeline.estimation.effects import fit as fit_effects
 from pipeline.estimation.gauss_markov import Products, Setting
 from pipeline.estimation.generalized_least_squares import fit_joint
 from pipeline.estimation.observations import observe
@@ -59,7 +59,7 @@ def test_the_order_of_the_effects_is_kept_with_units_and_expanded_uncertainties(
 
 def test_the_stage_passes_on_what_was_there_where_no_effect_is_asked_for() -> None:
     before = SensorCalibration("accelerometer", bias=np.ones(3))
-    assert accelerometer_stage.fit([], before, {"effects": {"accelerometer": []}}) is before
+    assert fit_effects("accelerometer", [], before, {"effects": {"accelerometer": []}}) is before
 
 
 def test_a_known_filter_acts_on_the_reference_too() -> None:

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from pipeline.estimation.accelerometer import nonlinear_least_squares, reference_least_squares
+from pipeline.estimation import reference_least_squares
+from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.engine import Posterior
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.monte_carlo import beside_trials, quadratic_results, through
@@ -94,7 +95,7 @@ def test_methods_by_hand_and_on_a_table_run_it_beside_their_budget() -> None:
     found = [
         nonlinear_least_squares.fit(unit.recordings, None, asked(unit.settings)),
         rests_and_moves.fit(unit.recordings, None, asked(unit.settings)),
-        reference_least_squares.fit(turns, None, asked(settings)),
+        reference_least_squares.fit("accelerometer", turns, None, asked(settings)),
     ]
     for calibration in found:
         budget = calibration.budget or {}

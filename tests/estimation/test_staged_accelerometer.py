@@ -7,7 +7,7 @@ import pytest
 from table_turns import Bench, run_stages, settings, specific_force, stepped_angle
 
 from pipeline.errors import CannotCalibrateError, ConfigurationError, NotObservableError
-from pipeline.estimation.accelerometer.scale_factor import fit as fit_scale_factor
+from pipeline.estimation.accelerometer.staged import fit as fit_stage
 from pipeline.estimation.correction import apply_correction
 from pipeline.records import SensorCalibration, StageResult, coverage_factor
 from pipeline.signal.filters import apply_filter
@@ -202,13 +202,12 @@ def test_what_shakes_a_moving_table_is_among_the_printed_extremes_and_not_in_fit
 
 def test_stated_uncertainty_covers_the_truth() -> None:
     # 80 units, 9 parameters each, 95 % claimed; four standard deviations of 80 independent units would be 0.10.
-    before = SensorCalibration("accelerometer", stages=tuple(StageResult(name, {}) for name in STAGES[:3]))
     rng = np.random.default_rng(7)
     hits = []
     for seed in range(80):
         K, bias, c = np.diag(rng.normal(1.0, 0.01, 3)), rng.normal(0, 0.05, 3), rng.normal(0, 0.003, 3)
         bench = Bench("accelerometer", bias, K, c=c, white=8e-4, wander_size=1e-4, seed=seed)
-        found = fit_scale_factor(bench.stop_and_go(20.0, 1.2), before, settings())
+        found = run_stages("accelerometer", STAGES, bench.stop_and_go(20.0, 1.2), settings())
         estimate = np.concatenate([found.bias, np.diag(found.matrix), found.effects[0].values])
         u = np.sqrt(np.diag(found.covariance))[[0, 1, 2, 3, 7, 11, 12, 13, 14]]
         error = estimate - np.concatenate([bias, 1.0 / np.diag(K), c])
@@ -285,7 +284,7 @@ def test_a_recording_about_another_axis_than_it_says_is_refused() -> None:
 def test_a_stage_of_another_method_cannot_come_before() -> None:
     before = SensorCalibration("accelerometer", stages=(StageResult("reference_least_squares", {}),))
     with pytest.raises(ConfigurationError, match="cannot follow 'reference_least_squares'"):
-        fit_scale_factor(Bench("accelerometer", BIAS, np.eye(3)).stop_and_go(), before, settings())
+        fit_stage("scale_factor", Bench("accelerometer", BIAS, np.eye(3)).stop_and_go(), before, settings())
 
 
 def test_the_result_survives_its_file() -> None:

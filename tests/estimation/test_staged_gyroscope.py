@@ -8,7 +8,7 @@ from table_turns import Bench, ramped_rate, run_stages, settings
 
 from pipeline.errors import CannotCalibrateError, ConfigurationError, NotObservableError
 from pipeline.estimation.correction import apply_correction
-from pipeline.estimation.gyroscope.scale_factor import fit as fit_scale_factor
+from pipeline.estimation.gyroscope.staged import fit as fit_stage
 from pipeline.model.kinematics import earth_rate
 from pipeline.records import SensorCalibration, StageResult, coverage_factor
 from pipeline.signal.filters import apply_filter
@@ -127,11 +127,10 @@ def test_earth_rotation_does_not_pass_for_bias_where_place_and_azimuth_are_known
 
 
 def test_stated_uncertainty_covers_the_truth() -> None:
-    before = SensorCalibration("gyroscope", stages=tuple(StageResult(name, {}) for name in STAGES[:2]))
     hits = []
     for seed in range(80):
         bench = Bench("gyroscope", BIAS, K, white=0.01, wander_size=0.003, seed=seed)
-        found = fit_scale_factor(bench.turns_at([100.0, -100.0]), before, settings())
+        found = run_stages("gyroscope", STAGES, bench.turns_at([100.0, -100.0]), settings())
         error = np.concatenate([found.bias - BIAS, (found.matrix - M.T).ravel()])
         u = np.sqrt(np.diag(found.covariance))
         hits.append(np.abs(error) <= coverage_factor(found.freedom) * u)
@@ -167,7 +166,7 @@ def test_an_axis_that_was_not_turned_about_is_named() -> None:
 def test_a_stage_of_another_method_cannot_come_before() -> None:
     before = SensorCalibration("gyroscope", stages=(StageResult("cholesky_lu", {}),))
     with pytest.raises(ConfigurationError, match="cannot follow 'cholesky_lu'"):
-        fit_scale_factor(Bench("gyroscope", BIAS, K).turns_at([60.0]), before, settings())
+        fit_stage("scale_factor", Bench("gyroscope", BIAS, K).turns_at([60.0]), before, settings())
 
 
 def test_ramps_are_no_part_of_a_steady_turn() -> None:
@@ -175,3 +174,13 @@ def test_ramps_are_no_part_of_a_steady_turn() -> None:
     used = calibrate(Bench("gyroscope", BIAS, K).turns_at([60.0])).stages[0].details["samples_used"]
     steady_or_resting = int(np.sum((rate == 60.0) | (rate == 0.0)))
     assert 0.85 * 3 * steady_or_resting < used <= 3 * steady_or_resting
+
+
+def test_a_stage_works_on_the_output_of_the_stage_before() -> None:
+    recordings = Bench("gyroscope", BIAS, K).turns_at([60.0])
+    before = run_stages("gyroscope", STAGES[:1], recordings, settings())
+    shifted = [{"subtract": (np.array(BIAS) + 0.5).tolist()}]
+    given = replace(before, bias=before.bias + 0.5, stages=(replace(before.stages[0], correction={"steps": shifted}),))
+    found = fit_stage(STAGES[1], recordings, given, settings())
+    assert found.bias == pytest.approx(np.array(BIAS) + 0.5, abs=1e-9)
+    assert found.stages[-1].correction["steps"][:1] == shifted

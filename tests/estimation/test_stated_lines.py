@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from table_turns import Bench, settings
 
-from pipeline.estimation.gyroscope import reference_least_squares
+from pipeline.estimation import reference_least_squares
 from pipeline.estimation.uncertainty_budget import with_stated
 from pipeline.io.parquet import save_recordings
 from pipeline.records import FittedEffect
@@ -30,7 +30,7 @@ WARM = (20.0, 26.0)  # degC, from the first sample to the last of each recording
 def fitted() -> tuple[SensorCalibration, list[Recording]]:
     turns = Bench("gyroscope", [0.3, -0.2, 0.5], K, white=0.01).turns_at([60.0, -60.0])
     warm = [replace(r, temperature=np.linspace(*WARM, r.samples)) for r in turns]
-    return reference_least_squares.fit(warm, None, settings()), warm
+    return reference_least_squares.fit("gyroscope", warm, None, settings()), warm
 
 
 def sheet(**stated: Any) -> dict[str, Any]:

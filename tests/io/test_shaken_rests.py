@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from bench_session import CONTINUOUS, SIZE, STOP_AND_GO, Session, record, values_of
 
-from pipeline.estimation.accelerometer import nonlinear_least_squares, reference_least_squares
+from pipeline.estimation.stages import fit_stage
 from pipeline.io.disturbances import leave_out_disturbances, leave_out_shaken_rests
 from pipeline.records import Note, Recording
 
@@ -17,7 +17,7 @@ SETTINGS = {
     "procedure": {"holdout_every": 0},
     "sensor": {"accelerometer": {"bias_wander": 1e-4, "wander_time_s": 100.0}},
 }
-METHODS = {"reference": reference_least_squares, "magnitude": nonlinear_least_squares}
+METHODS = {"reference": "reference_least_squares", "magnitude": "nonlinear_least_squares"}
 
 
 def note(code: str, rows: np.ndarray, detail: str) -> Note:
@@ -58,7 +58,7 @@ def test_half_a_dwell_that_was_disturbed_costs_the_calibration_nothing(
     assert "1 of " in kept[0].notes[0].detail
     assert kept[0].flags is not None
     for method in METHODS.values():
-        good, mended, wrong = (method.fit(r, None, SETTINGS) for r in (clean, kept, spoilt))
+        good, mended, wrong = (fit_stage("accelerometer", method, r, None, SETTINGS) for r in (clean, kept, spoilt))
         assert good.covariance is not None
         u = np.sqrt(np.diag(good.covariance))[:12]
         known = u > 0.0

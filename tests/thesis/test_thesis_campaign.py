@@ -8,10 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.config import load_campaign
-from pipeline.estimation.accelerometer import bias as accelerometer_bias
-from pipeline.estimation.accelerometer import misalignment, orthogonality
-from pipeline.estimation.accelerometer import scale_factor as accelerometer_scale_factor
-from pipeline.estimation.gyroscope import bias, cholesky_lu, orthogonality_and_misalignment, scale_factor
+from pipeline.estimation.stages import STAGED, fit_stage
 from pipeline.model.measurement import linear_truth
 from pipeline.records import Noise, Recording, SensorCalibration, coverage_factor
 from pipeline.signal.filters import apply_filter
@@ -25,8 +22,6 @@ from pipeline.validation.samples import samples_of_motion
 
 CAMPAIGN = Path(__file__).parents[2] / "data" / "thesis"
 PRINTED = CAMPAIGN / "printed"
-ACCELEROMETER = (orthogonality, misalignment, accelerometer_bias, accelerometer_scale_factor)
-GYROSCOPE = (bias, orthogonality_and_misalignment, scale_factor)
 
 
 @cache
@@ -51,11 +46,11 @@ def filtered(name: str) -> tuple[Recording, ...]:
     return tuple(apply_filter(r, settings) for r in recordings)
 
 
-def fitted(name: str, stages: tuple[Any, ...], method: str) -> SensorCalibration:
+def fitted(name: str, sensor: str, stages: tuple[str, ...], method: str) -> SensorCalibration:
     settings = loaded().units[f"{name}-{method}"].config
     calibration = None
     for stage in stages:
-        calibration = stage.fit(filtered(name), calibration, settings)
+        calibration = fit_stage(sensor, stage, filtered(name), calibration, settings)
     assert isinstance(calibration, SensorCalibration)
     return calibration
 
@@ -102,7 +97,7 @@ def test_a_difference_within_the_rounding_of_the_print_is_not_large() -> None:
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_the_accelerometer_s_stages_find_bias_and_scale_factor_of_the_truth(device: str) -> None:
-    found = fitted(f"{device}-continuous-1dps", ACCELEROMETER, "staged")
+    found = fitted(f"{device}-continuous-1dps", "accelerometer", STAGED["accelerometer"], "staged")
     row = printed_row("accel_parameters.csv", device, "continuous-1dps")
     told = [float(row[f"b_{a}_g"]) for a in "xyz"]
     assert np.abs(found.bias - told).max() < 0.002
@@ -112,7 +107,7 @@ def test_the_accelerometer_s_stages_find_bias_and_scale_factor_of_the_truth(devi
 @pytest.mark.parametrize("rate", [20, 200])
 @pytest.mark.parametrize("device", DEVICES)
 def test_the_gyroscope_s_stages_find_the_printed_bias_and_matrix(device: str, rate: int) -> None:
-    found = fitted(f"{device}-gyro-{rate}dps", GYROSCOPE, "staged")
+    found = fitted(f"{device}-gyro-{rate}dps", "gyroscope", STAGED["gyroscope"], "staged")
     row = printed_row("gyro_parameters.csv", device, f"gyro-{rate}dps")
     assert np.abs(found.bias - [float(row[f"b_{a}_dps"]) for a in "xyz"]).max() < 0.02
     told = np.array([[float(row[f"M{i}{j}"]) for j in (1, 2, 3)] for i in (1, 2, 3)])
@@ -122,8 +117,10 @@ def test_the_gyroscope_s_stages_find_the_printed_bias_and_matrix(device: str, ra
 @pytest.mark.parametrize(("device", "change"), [("mpu6050-1", 83.615), ("mpu6050-2", 78.859), ("stim300", 5.276)])
 def test_the_printed_advantage_over_cholesky_and_lu_is_the_missing_inversion(device: str, change: float) -> None:
     name = f"{device}-gyro-20dps"
-    staged = fitted(name, GYROSCOPE, "staged")
-    forward, inverted = (fitted(name, (bias, cholesky_lu), m) for m in ("cholesky-printed", "cholesky"))
+    staged = fitted(name, "gyroscope", STAGED["gyroscope"], "staged")
+    forward, inverted = (
+        fitted(name, "gyroscope", ("bias", "cholesky_lu"), m) for m in ("cholesky-printed", "cholesky")
+    )
     before, with_forward = mean_error(device, None), mean_error(device, forward)
     assert abs(100.0 * (before - with_forward) / before - change) < 10.0
     expanded = [

@@ -21,6 +21,7 @@ if Path(workflow.basedir, "pipeline").is_dir():
 
 from pipeline.config import code_digest, load_campaign, settings_file
 from pipeline.errors import PipelineError
+from pipeline.estimation.stages import stage_module
 from pipeline.io.files import recording_files
 from pipeline.outcome import outcome
 from pipeline.results_folder import finish_publishing, repetitions
@@ -148,7 +149,7 @@ def settings_of_fit(wildcards):
 def code_of_fit(wildcards):
     modules = (
         "pipeline.stages.fit",
-        f"pipeline.estimation.{wildcards.sensor}.{wildcards.stage}",
+        stage_module(wildcards.sensor, wildcards.stage),
     )
     return "".join(code_digest(module) for module in modules)
 

@@ -1,62 +1,275 @@
-"""The staged method of the accelerometer: what its stages have in common (Sudsanguan 2019, eqs 3.15-3.43).
+"""The staged method of the accelerometer, equation by equation (Sudsanguan 2019, eqs 3.15-3.43).
 
-The stages are followed one after the other (``pipeline.estimation.accelerometer.chain``), so the whole method is a
-function of a few coefficients, those of the sinusoids fitted to the turns. The covariance of all that comes out follows
-from theirs by the derivative of the whole chain (JCGM 100:2008, 5.2.2), taken by differences. As printed, the extremes
-are single samples, order statistics of the noise: the covariance is then that of synthetic turns, the fitted sinusoids
-with new noise of the size that the residuals have.
+Each stage works on the extremes of the turns (``pipeline.estimation.accelerometer.turn_extremes``) in the output of the
+stage before it, finds its own factors or offsets, and corrects the readings by them for the next:
+
+    orthogonality -> misalignment -> bias -> scale_factor
+
+The corrections so far have the contract's form, for each axis,
+
+    reading = bias + k u + c |u|,   k = (1/P + 1/N) / 2,   c = (1/P - 1/N) / 2,   matrix_ii = 1 / k
+
+where P and N are the products of all factors of the positive and the negative side, with both sides of the factors of
+orthogonality and misalignment averaged, and ``bias`` is the reading that is corrected to zero.
+
+The result is a function of the coefficients of the sinusoids fitted to the turns. Its covariance follows from theirs by
+the derivative of all stages up to this one (JCGM 100:2008, 5.2.2), by differences. As printed (``as_printed``, with the
+thesis's errata, to reproduce a table) the extremes are single samples, order statistics of the noise: the covariance is
+then that of synthetic turns, the fitted sinusoids with new noise of the size that the residuals have.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.errors import ConfigurationError
-from pipeline.estimation.accelerometer.chain import follow
-from pipeline.estimation.accelerometer.extremes import (
-    Extremes,
+from pipeline.errors import ConfigurationError, NotObservableError
+from pipeline.estimation.accelerometer.turn_extremes import (
+    by_turn,
+    certificate_of,
     extremes_of_samples,
     extremes_of_sinusoids,
     sinusoids_of,
     turns_of,
 )
-from pipeline.estimation.correction import apply_correction
+from pipeline.estimation.correction import apply_correction, two_sided
 from pipeline.estimation.engine import LinearMap, assess_noise
 from pipeline.estimation.gauss_markov import blocks_of_samples
-from pipeline.estimation.least_squares import ScaledColumns, certificate, certified
+from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.estimation.noise import prior_of
 from pipeline.estimation.table_errors import Reference, disturbance
 from pipeline.estimation.turns import parts_of
 from pipeline.estimation.uncertainty_budget import budgeted, combined, noise_contribution, scatter_contribution
 from pipeline.model.effects import effect
-from pipeline.records import FittedEffect, SensorCalibration, StageResult
+from pipeline.records import AXES, FittedEffect, SensorCalibration, StageResult
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from pipeline.estimation.accelerometer.chain import Chain
-    from pipeline.estimation.accelerometer.extremes import Turn
+    from pipeline.estimation.accelerometer.turn_extremes import Extremes, Turn
     from pipeline.estimation.engine import ResidualNoise
     from pipeline.estimation.gauss_markov import Prior
     from pipeline.estimation.turns import Sinusoid
     from pipeline.records import Contribution, Recording
 
-STAGES = ("orthogonality", "misalignment", "bias", "scale_factor")
-REPLICATES = 60
+    Values = NDArray[np.float64]
+    Quantities = dict[str, tuple[float, str]]
+
+REPLICATES = 60  # synthetic turns: their covariance is known to a tenth
 SEED = 20190508
 AS_PRINTED = "the printed variant takes single samples, through which no error of the table can be followed"
 STEP = 1e-7  # g, of the differences: truncation and rounding are then both about 1e-8 of the derivative
+ASYMMETRY = "scale_factor_asymmetry"
 
 
-def fit_stage(
+@dataclass(frozen=True)
+class Outcome:
+    """What one stage found.
+
+    Attributes
+    ----------
+    steps : list of dict
+        Its steps of the correction, see ``pipeline.estimation.correction``.
+    values : dict of str to (float, str)
+        Value and unit of each of its parameters.
+    positive, negative : (3,) array
+        Its factors in the contract's form.
+    subtracted : (3,) array, g
+        Its offset.
+    """
+
+    steps: list[dict[str, Any]]
+    values: Quantities
+    positive: Values = field(default_factory=lambda: np.ones(3))
+    negative: Values = field(default_factory=lambda: np.ones(3))
+    subtracted: Values = field(default_factory=lambda: np.zeros(3))
+
+
+def _per_axis(name: str, values: Values, unit: str) -> Quantities:
+    return {f"{name}_{axis}": (float(value), unit) for axis, value in zip(AXES, values, strict=True)}
+
+
+def _angles(names: tuple[str, ...], sides: Mapping[str, Values]) -> Quantities:
+    return {
+        f"{name}_{side}": (float(angle), "deg")
+        for side, degrees in sides.items()
+        for name, angle in zip(names, degrees, strict=True)
+    }
+
+
+GREEK = ("alpha", "beta", "gamma")
+
+
+def orthogonality(extremes: Extremes, gravity_g: float, *, as_printed: bool) -> Outcome:
+    """Return the factors of orthogonality (3.15-3.29).
+
+    In turns about x, y, z the upper extremes of the two other axes should be 90 deg apart; their excesses are
+
+        alpha_P = (A - B) - 90,   beta_P, gamma_P likewise;   alpha_N, beta_N, gamma_N of the lower extremes
+
+    where A and B are the table angles at which the first and the second axis of (y, z), (z, x), (x, y) read most.
+    Readings above the level reading are multiplied by O_P, those below by O_N; with x as the reference axis
+
+        O = diag(1, cos gamma, cos alpha cos beta)
+
+    As printed, (3.26) is ``O = diag(cos beta cos gamma, cos alpha cos gamma, cos alpha cos beta)``, which contradicts x
+    being the reference and every printed O_x = 1, and the side is chosen by the sign of the reading with its bias. A
+    filter delays both extremes of a pair by the same angle while the table turns evenly, so the excesses do not change.
+    """
+    del gravity_g
+
+    def factors(excess_deg: Values) -> Values:
+        a, b, c = np.cos(np.radians(excess_deg))
+        return np.array([b * c, a * c, a * b] if as_printed else [1.0, c, a * b])
+
+    positive, negative = factors(extremes.excess_high), factors(extremes.excess_low)
+    switch_at = np.zeros(3) if as_printed else extremes.a_zero
+    values = _per_axis("O_P", positive, "1") | _per_axis("O_N", negative, "1")
+    values |= _angles(GREEK, {"P": extremes.excess_high, "N": extremes.excess_low})
+    mean = (positive + negative) / 2.0
+    return Outcome([two_sided(positive, negative, switch_at)], values, mean, mean)
+
+
+def misalignment(extremes: Extremes, gravity_g: float, *, as_printed: bool) -> Outcome:
+    """Return the factors of misalignment (3.30-3.37).
+
+    While the table turns about an axis, that axis should stay level. Its reading gives the angle
+
+        alpha = asin(a_height / a_max)   of x, beta of y, gamma of z
+
+    and all axes are multiplied by ``M_P = cos alpha_P cos beta_P cos gamma_P``, negative readings by M_N. By default
+    a_height is the amplitude of the axis's swing while the table turns about it, independent of a bias, and a_max is
+    (a_max - a_min) / 2, the same on both sides: M_P = M_N. As printed a_height is the mean of the axis's readings, bias
+    included, over a_max for M_P and over |a_min| for M_N, and the side is chosen by the sign of the reading.
+    """
+    del gravity_g
+
+    def angles(largest: Values) -> Values:
+        ratio = extremes.height / largest
+        for axis, value in zip(AXES, ratio, strict=True):
+            if not abs(value) < 1.0:
+                raise NotObservableError(
+                    f"accelerometer {axis} reads {abs(value):.3g} times its largest reading while the table turns "
+                    f"about {axis}, where it should stay level: check sensor.axis_map, and which turn is about {axis}"
+                )
+        return np.asarray(np.arcsin(ratio))
+
+    if as_printed:
+        sides = {"P": angles(extremes.a_max), "N": angles(np.abs(extremes.a_min))}
+    else:
+        sides = dict.fromkeys("PN", angles((extremes.a_max - extremes.a_min) / 2.0))
+    positive, negative = (float(np.prod(np.cos(sides[side]))) * np.ones(3) for side in "PN")
+    values = _per_axis("M_P", positive, "1") | _per_axis("M_N", negative, "1")
+    values |= _angles(GREEK, {side: np.degrees(angle) for side, angle in sides.items()})
+    mean = (positive + negative) / 2.0
+    switch_at = np.zeros(3) if as_printed else extremes.a_zero
+    return Outcome([two_sided(positive, negative, switch_at)], values, mean, mean)
+
+
+def bias(extremes: Extremes, gravity_g: float, *, as_printed: bool) -> Outcome:
+    """Return the bias (3.38-3.39): ``a_bi = a_mis - b``, b = a_zero, the mean reading of each axis where level."""
+    del gravity_g, as_printed
+    b = extremes.a_zero
+    return Outcome([{"subtract": b.tolist()}], _per_axis("b", b, "g"), subtracted=b)
+
+
+def scale_factor(extremes: Extremes, gravity_g: float, *, as_printed: bool) -> Outcome:
+    """Return a scale factor for each side (3.40-3.43).
+
+        S_P = G / (a_max - a_zero),   S_N = G / |a_min - a_zero|,   a_sc = a_bi S
+
+    As printed it is ``G / a_max - a_zero``, and a_zero is subtracted once more in (3.42) and (3.43), without effect
+    after the bias stage, where a_zero is about zero.
+    """
+    a_max, a_min, a_zero = extremes.a_max, extremes.a_min, extremes.a_zero
+    if as_printed:
+        positive, negative = gravity_g / a_max - a_zero, gravity_g / np.abs(a_min) - a_zero
+        steps = [{"subtract": a_zero.tolist()}, two_sided(positive, negative, np.zeros(3))]
+    else:
+        positive, negative = gravity_g / (a_max - a_zero), gravity_g / np.abs(a_min - a_zero)
+        steps = [two_sided(positive, negative, a_zero)]
+    values = _per_axis("S_P", positive, "1") | _per_axis("S_N", negative, "1")
+    return Outcome(steps, values, positive, negative, a_zero if as_printed else np.zeros(3))
+
+
+STAGES = {f.__name__: f for f in (orthogonality, misalignment, bias, scale_factor)}
+
+
+@dataclass(frozen=True)
+class Corrected:
+    """The output of a stage: the correction so far in both forms, and the parameters of the last stage."""
+
+    steps: list[dict[str, Any]] = field(default_factory=list)
+    bias: Values = field(default_factory=lambda: np.zeros(3))
+    positive: Values = field(default_factory=lambda: np.ones(3))
+    negative: Values = field(default_factory=lambda: np.ones(3))
+    values: Quantities = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, previous: SensorCalibration | None) -> Corrected:
+        """Return the output of the stage before."""
+        if previous is None or not previous.stages:
+            return cls()
+        k = 1.0 / np.diag(previous.matrix)
+        c = sum((e.values for e in previous.effects if e.name == ASYMMETRY), np.zeros(3))
+        correction = previous.stages[-1].correction or {}
+        return cls(list(correction.get("steps", [])), previous.bias, 1.0 / (k + c), 1.0 / (k - c))
+
+    @property
+    def k(self) -> Values:
+        """Reading per g, mean of both sides: (3,) array."""
+        return (1.0 / self.positive + 1.0 / self.negative) / 2.0
+
+    @property
+    def c(self) -> Values:
+        """Half the difference of both sides: (3,) array."""
+        return (1.0 / self.positive - 1.0 / self.negative) / 2.0
+
+    def vector(self) -> Values:
+        """Return bias, matrix, c and the last stage's parameters in one vector."""
+        return np.concatenate(
+            [self.bias, np.diag(1.0 / self.k).ravel(), self.c, [value for value, _ in self.values.values()]]
+        )
+
+
+def follow(
+    extremes: Extremes, names: Sequence[str], gravity_g: float, *, as_printed: bool, start: Corrected | None = None
+) -> Corrected:
+    """Run stages one after the other, each on the output of the one before.
+
+    Parameters
+    ----------
+    extremes : Extremes
+        Of the uncorrected readings.
+    names : sequence of str
+        Stages, in order.
+    gravity_g : float, g
+    as_printed : bool
+    start : Corrected, optional
+        Output of the stage before the first.
+    """
+    found = start or Corrected()
+    for step in found.steps:
+        extremes = extremes.corrected(step, as_printed=as_printed)
+    for name in names:
+        own = STAGES[name](extremes, gravity_g, as_printed=as_printed)
+        for step in own.steps:
+            extremes = extremes.corrected(step, as_printed=as_printed)
+        positive, negative = found.positive * own.positive, found.negative * own.negative
+        found = Corrected(
+            found.steps + own.steps, found.bias + own.subtracted * found.k, positive, negative, own.values
+        )
+    return found
+
+
+def fit(
     name: str, recordings: Sequence[Recording], previous: SensorCalibration | None, settings: Mapping[str, Any]
 ) -> SensorCalibration:
-    """Run one stage of the staged method.
+    """Run one stage of the staged method on the output of the stage before.
 
     Parameters
     ----------
@@ -69,59 +282,85 @@ def fit_stage(
     settings : mapping
         Sections ``table``, ``method`` and ``sensor``.
 
-    Returns
-    -------
-    SensorCalibration
+    Raises
+    ------
+    CannotCalibrateError
+        If no recording of the accelerometer logs the table's motion.
+    NotObservableError
+        If there is no turn about one of the axes, or it does not show a sinusoid.
+    ConfigurationError
+        If the stage before is not one of this method.
     """
-    names = [*_stages_before(previous), name]
+    before = stages_before("accelerometer", previous, STAGES)
     as_printed = bool(settings["method"].get("as_printed", False))
     gravity_g = float(settings["table"].get("gravity_g", 1.0))
     parts = parts_of(recordings, "accelerometer", settings["table"], "the staged method")
     turns = turns_of(parts, as_printed=as_printed)
     sinusoids = sinusoids_of(turns)
     prior = prior_of("accelerometer", recordings, settings)
+    theta = np.concatenate([s.coefficients for channel in range(3) for s in (turn[channel] for turn in sinusoids)])
 
-    def run(extremes: Extremes) -> Chain:
-        return follow(extremes, names, gravity_g, as_printed=as_printed)
+    def chain(values: Values) -> Corrected:
+        extremes = extremes_of_sinusoids(by_turn(sinusoids, values))
+        return follow(extremes, [*before, name], gravity_g, as_printed=as_printed)
 
-    chain = run(extremes_of_samples(turns) if as_printed else extremes_of_sinusoids(_coefficients(sinusoids)))
-    fit = _linear_map(sinusoids, run)
-    noise = _noise(turns, fit, prior, settings["table"])
-    scatter = _resampled(turns, sinusoids, noise, run) if as_printed else noise_contribution(noise, fit, prior)
-    after = apply_correction({"steps": chain.steps}, np.concatenate([turn.reading for turn in turns]))
+    extremes = extremes_of_samples(turns) if as_printed else extremes_of_sinusoids(by_turn(sinusoids, theta))
+    found = follow(extremes, [name], gravity_g, as_printed=as_printed, start=Corrected.of(previous))
+    map_ = _linear_map(sinusoids, theta, chain)
+    noise = _noise(turns, map_, prior, settings["table"])
+    if as_printed:
+        scatter = _resampled(
+            turns, sinusoids, noise, lambda e: follow(e, [*before, name], gravity_g, as_printed=True).vector()
+        )
+    else:
+        scatter = noise_contribution(noise, map_, prior)
+    after = apply_correction({"steps": found.steps}, np.concatenate([turn.reading for turn in turns]))
     result = StageResult(
         name=name,
-        parameters=_parameters(chain, scatter.covariance),
+        parameters=with_uncertainty(found.values, scatter.covariance[15:, 15:]),
         residual_rms=float(np.sqrt(np.mean((np.linalg.norm(after, axis=1) - gravity_g) ** 2))),
-        correction={"steps": chain.steps},
+        correction={"steps": found.steps},
         details=_details(turns, noise, float(scatter.degrees_of_freedom.min())),
     )
     last = name == "scale_factor"
-    found = SensorCalibration(
+    calibration = SensorCalibration(
         sensor="accelerometer",
-        bias=chain.bias,
-        matrix=np.diag(1.0 / chain.k),
+        bias=found.bias,
+        matrix=np.diag(1.0 / found.k),
         stages=(*(previous.stages if previous else ()), result),
-        effects=(_asymmetry(chain),) if last else (),
-        convergence=_certificate(sinusoids),
+        effects=(_asymmetry(found),) if last else (),
+        convergence=certificate_of(sinusoids),
     )
     kept = slice(0, 15 if last else 12)
     if as_printed:
-        return combined(found, [scatter.of(kept)], {"everything but noise": AS_PRINTED})
+        return combined(calibration, [scatter.of(kept)], {"everything but noise": AS_PRINTED})
     motions = [motion for turn in turns for motion in turn.motions]
-    reference = Reference("accelerometer", motions, fit.results(kept), np.diag(chain.k), settings["table"])
+    reference = Reference("accelerometer", motions, map_.results(kept), np.diag(found.k), settings["table"])
 
-    def results(errors: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.array([run(extremes_of_sinusoids(_moved(sinusoids, e))).vector()[kept] for e in errors])
+    def results(errors: Values) -> Values:
+        return np.array([chain(theta + e).vector()[kept] for e in errors])
 
-    return budgeted(found, reference, noise, [scatter.of(kept)], settings, results)
+    return budgeted(calibration, reference, noise, [scatter.of(kept)], settings, results)
 
 
-def _parameters(chain: Chain, covariance: NDArray[np.float64]) -> dict[str, dict[str, Any]]:
-    own = np.sqrt(np.clip(np.diag(covariance)[15:], 0.0, None))
+def stages_before(sensor: str, previous: SensorCalibration | None, stages: Mapping[str, Any]) -> list[str]:
+    """Return the names of the stages so far; refuse what is no stage of the staged method."""
+    done = () if previous is None else previous.stages
+    unknown = [stage.name for stage in done if stage.name not in stages or stage.correction is None]
+    if unknown:
+        raise ConfigurationError(
+            f"a stage of the staged method cannot follow {unknown[0]!r}, which leaves no corrected readings for it; "
+            f"the stages of the {sensor} are {', '.join(stages)}"
+        )
+    return [stage.name for stage in done]
+
+
+def with_uncertainty(values: Quantities, covariance: Values) -> dict[str, dict[str, Any]]:
+    """Return the parameters of a stage as published."""
+    own = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
     return {
         name: {"value": value, "unit": unit, "standard_uncertainty": float(u)}
-        for (name, (value, unit)), u in zip(chain.outcome.values.items(), own, strict=True)
+        for (name, (value, unit)), u in zip(values.items(), own, strict=True)
     }
 
 
@@ -137,56 +376,16 @@ def _details(turns: Sequence[Turn], noise: ResidualNoise, freedom: float) -> dic
     }
 
 
-def _asymmetry(chain: Chain) -> FittedEffect:
-    asymmetry = effect("scale_factor_asymmetry")
-    return FittedEffect(
-        asymmetry.name,
-        {
-            parameter.name: {"value": float(value), "unit": parameter.unit}
-            for parameter, value in zip(asymmetry.parameters("accelerometer"), chain.c, strict=True)
-        },
-    )
+def _asymmetry(found: Corrected) -> FittedEffect:
+    names = effect(ASYMMETRY).parameters("accelerometer")
+    described = {p.name: {"value": float(v), "unit": p.unit} for p, v in zip(names, found.c, strict=True)}
+    return FittedEffect(ASYMMETRY, described)
 
 
-def _certificate(sinusoids: Sequence[Sequence[Sinusoid]]) -> dict[str, Any]:
-    """Return the certificate of the worst of the sinusoids' fits."""
-    every = [s for turn in sinusoids for s in turn]
-    parts = [certificate(s.columns, s.residuals, s.condition, s.columns.shape[1]) for s in every]
-    worst = {key: max(part[key] for part in parts) for key in ("cosine", "condition")}
-    count = sum(part["parameters"] for part in parts)
-    return certified(worst["cosine"], worst["condition"], count, count)
+def _noise(turns: Sequence[Turn], map_: LinearMap, prior: Prior, table: Mapping[str, Any]) -> ResidualNoise:
+    """Return the noise that all turns together show, by the residuals of ``y = b + K u + C |u|``.
 
-
-def _stages_before(previous: SensorCalibration | None) -> list[str]:
-    names = [] if previous is None else [stage.name for stage in previous.stages]
-    unknown = [name for name in names if name not in STAGES]
-    if unknown:
-        raise ConfigurationError(
-            f"a stage of the staged method cannot follow {unknown[0]!r}, which leaves no corrected readings for it; "
-            f"the stages of the accelerometer are {', '.join(STAGES)}"
-        )
-    return names
-
-
-def _coefficients(sinusoids: Sequence[Sequence[Sinusoid]]) -> list[list[NDArray[np.float64]]]:
-    return [[sinusoid.coefficients for sinusoid in turn] for turn in sinusoids]
-
-
-def _moved(sinusoids: Sequence[Sequence[Sinusoid]], errors: NDArray[np.float64]) -> list[list[NDArray[np.float64]]]:
-    """Return the coefficients with errors, which come channel by channel and in these turn by turn."""
-    moved, at = [[s.coefficients.copy() for s in turn] for turn in sinusoids], 0
-    for channel in range(3):
-        for turn in moved:
-            size = len(turn[channel])
-            turn[channel] += errors[at : at + size]
-            at += size
-    return moved
-
-
-def _noise(turns: Sequence[Turn], fit: LinearMap, prior: Prior, table: Mapping[str, Any]) -> ResidualNoise:
-    """Return what all turns together say of the noise: the residuals of ``y = b + K u + C |u|``.
-
-    A sinusoid of its own for each turn and channel would take up the wander from turn to turn.
+    A sinusoid of its own for each turn and channel would take up the bias from turn to turn.
     """
     motions = [motion for turn in turns for motion in turn.motions]
     u = np.concatenate([motion.specific_force for motion in motions])
@@ -195,53 +394,38 @@ def _noise(turns: Sequence[Turn], fit: LinearMap, prior: Prior, table: Mapping[s
     blocks = blocks_of_samples([used for turn in turns for used in turn.used])
     beta = ScaledColumns.of(X).solve(reading)
     residuals = reading - X @ beta
-    disturbed = disturbance(Reference("accelerometer", motions, fit, beta[1:4].T, table), residuals, blocks)
+    disturbed = disturbance(Reference("accelerometer", motions, map_, beta[1:4].T, table), residuals, blocks)
     return assess_noise(residuals, X, blocks, prior, disturbed)
 
 
-def _side_by_side(matrices: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Return a block-diagonal matrix."""
-    rows, columns = np.sum([m.shape for m in matrices], axis=0)
-    out = np.zeros((rows, columns))
-    i = j = 0
-    for m in matrices:
-        out[i : i + m.shape[0], j : j + m.shape[1]] = m
-        i, j = i + m.shape[0], j + m.shape[1]
-    return out
+def _linear_map(
+    sinusoids: Sequence[Sequence[Sinusoid]], theta: Values, chain: Callable[[Values], Corrected]
+) -> LinearMap:
+    """Return the map from readings to ``Corrected.vector``, by the derivative of all stages so far."""
+    from scipy.linalg import block_diag  # noqa: PLC0415  (0.1 s that only fits pay)
 
-
-def _linear_map(sinusoids: Sequence[Sequence[Sinusoid]], run: Callable[[Extremes], Chain]) -> LinearMap:
-    """Return the map from readings to ``Chain.vector``, by the derivative of the chain."""
-    coefficients = _coefficients(sinusoids)
-    here = run(extremes_of_sinusoids(coefficients)).vector()
-    weights, derivatives = [], []
-    for channel in range(3):
-        columns = []
-        for turn in range(3):
-            for j in range(len(coefficients[turn][channel])):
-                moved = [[c.copy() for c in channels] for channels in coefficients]
-                moved[turn][channel][j] += STEP
-                columns.append((run(extremes_of_sinusoids(moved)).vector() - here) / STEP)
-        derivatives.append(np.column_stack(columns))
-        weights.append(_side_by_side([turn[channel].weights for turn in sinusoids]))
-    return LinearMap((weights[0], weights[1], weights[2]), (derivatives[0], derivatives[1], derivatives[2]))
+    here = chain(theta).vector()
+    columns = np.stack([(chain(theta + STEP * e).vector() - here) / STEP for e in np.eye(len(theta))], axis=1)
+    x, y, z = (np.asarray(block_diag(*(turn[c].weights for turn in sinusoids))) for c in range(3))
+    J_x, J_y, J_z = np.split(columns, np.cumsum([len(x), len(y)]), axis=1)
+    return LinearMap((x, y, z), (J_x, J_y, J_z))
 
 
 def _resampled(
     turns: Sequence[Turn],
     sinusoids: Sequence[Sequence[Sinusoid]],
     noise: ResidualNoise,
-    run: Callable[[Extremes], Chain],
+    vector: Callable[[Extremes], Values],
 ) -> Contribution:
-    """Return the scatter of ``Chain.vector`` over synthetic turns."""
-    rng = np.random.default_rng(SEED)
-    means = [
-        turn.reading - np.column_stack([s.residuals for s in fits]) for turn, fits in zip(turns, sinusoids, strict=True)
-    ]
+    """Return the scatter of a function of the extremes over synthetic turns."""
+    pairs = list(zip(turns, sinusoids, strict=True))
+    means = [turn.reading - np.column_stack([s.residuals for s in fits]) for turn, fits in pairs]
     cuts = np.cumsum([len(turn.angle) for turn in turns])[:-1]
     vectors = []
-    for noisy in noise.draws(rng, REPLICATES):
-        added = np.split(noisy, cuts)
-        synthetic = [replace(turn, reading=mean + new) for turn, mean, new in zip(turns, means, added, strict=True)]
-        vectors.append(run(extremes_of_samples(synthetic)).vector())
+    for noisy in noise.draws(np.random.default_rng(SEED), REPLICATES):
+        synthetic = [
+            replace(turn, reading=mean + new)
+            for turn, mean, new in zip(turns, means, np.split(noisy, cuts), strict=True)
+        ]
+        vectors.append(vector(extremes_of_samples(synthetic)))
     return scatter_contribution(np.cov(np.array(vectors).T), REPLICATES - 1.0)

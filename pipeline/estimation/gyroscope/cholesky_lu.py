@@ -36,7 +36,7 @@ from pipeline.estimation.gauss_markov import blocks_of_samples
 from pipeline.estimation.gyroscope.integrated_turns import require_turns, turns_of
 from pipeline.estimation.least_squares import certified, solve_linear
 from pipeline.estimation.noise import prior_of
-from pipeline.estimation.reference import inverted
+from pipeline.estimation.reference_least_squares import inverted
 from pipeline.estimation.table_errors import Reference, disturbance
 from pipeline.estimation.turns import parts_of
 from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, scatter_contribution

@@ -1,40 +1,42 @@
-"""The staged method of the gyroscope: what its stages have in common (Sudsanguan 2019, eqs 3.44-3.53).
+"""The staged method of the gyroscope, equation by equation (Sudsanguan 2019, eqs 3.44-3.53).
 
 The readings are reduced to the means b at rest and the slopes R of steady turns
-(``pipeline.estimation.gyroscope.response``). A stage is a module of this package with a function
-``outcome(response, as_printed) -> Outcome`` and works on the response that the stages before it leave. The estimate is
-a function of b and R, which are linear in the readings, so its covariance follows from theirs by the derivative of the
-whole chain (JCGM 100:2008, 5.2.2).
+(``pipeline.estimation.gyroscope.response``). Each stage works on the response in the output of the stage before it:
+
+    bias -> orthogonality_and_misalignment -> scale_factor
+
+The estimate is a function of b and R, which are linear in the readings, so its covariance follows from theirs by the
+derivative of all stages so far (JCGM 100:2008, 5.2.2). ``as_printed`` is the thesis's variant with its errata.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from importlib import import_module
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.errors import ConfigurationError
+from pipeline.estimation.accelerometer.staged import stages_before, with_uncertainty
 from pipeline.estimation.correction import apply_correction
-from pipeline.estimation.engine import LinearMap, assess_noise
+from pipeline.estimation.engine import LinearMap, assess_noise, derivative
 from pipeline.estimation.gyroscope.response import Response, samples_of, weights_of
-from pipeline.estimation.least_squares import certified
+from pipeline.estimation.least_squares import ScaledColumns, certified
 from pipeline.estimation.noise import prior_of
 from pipeline.estimation.table_errors import Reference, disturbance
 from pipeline.estimation.turns import parts_of
 from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution
-from pipeline.records import SensorCalibration, StageResult
+from pipeline.records import AXES, SensorCalibration, StageResult
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
     from pipeline.records import Recording
 
-STAGES = ("bias", "orthogonality_and_misalignment", "scale_factor")
-STEP = 1e-5  # deg/s of b, and of R, of the central differences
+    Values = NDArray[np.float64]
+
+STEP = 1e-5  # deg/s of b, and of R, of the central differences: exact to 1e-10 for these functions of degree two
 
 
 @dataclass(frozen=True)
@@ -45,17 +47,64 @@ class Outcome:
     values: dict[str, tuple[float, str]]
 
 
+def bias(response: Response, *, as_printed: bool) -> Outcome:
+    """Return the bias (3.47-3.48): ``g_bi = g_r - b``, b the mean of the readings at rest.
+
+    The rests are those of the recordings made for the gyroscope, by the table's log, as in the thesis; the static
+    recording, perhaps far away in time and temperature, stands in only where these hold no rest.
+    """
+    del as_printed
+    values = {f"b_{axis}": (float(b), "deg/s") for axis, b in zip(AXES, response.rest, strict=True)}
+    return Outcome({"subtract": response.rest.tolist()}, values)
+
+
+def orthogonality_and_misalignment(response: Response, *, as_printed: bool) -> Outcome:
+    """Return the matrix of orthogonality and misalignment (3.49-3.51).
+
+        S M = diag(I),   M = S^-1 diag(I),   g_mis = g_bi M
+
+    where row i of S is the reading of (x, y, z), without bias, while the table turns about axis i at the rate I_i, and
+    readings g are row vectors; the contract's ``matrix`` acts on columns and is M transposed. With turns at several
+    rates and in both directions, S is I times the slopes of the readings against the signed rate, so ``M = R^-1``.
+    Printed is ``M = diag(I) S^-1`` (3.50), which (3.49) and (3.51) contradict; it differs only where the rates do.
+    """
+    response.require_turns()
+    rate = np.diag(response.rate)
+    S = rate @ response.slope
+    M = np.linalg.solve(S.T, rate).T if as_printed else np.linalg.solve(S, rate)
+    values = {f"M_{i + 1}{j + 1}": (float(M[i, j]), "1") for i in range(3) for j in range(3)}
+    return Outcome({"matrix": M.T.tolist()}, values)
+
+
+def scale_factor(response: Response, *, as_printed: bool) -> Outcome:
+    """Return the scale factors (3.52-3.53): ``S_i = I_i / (g_max - g_min)``, ``g_sc = g_mis S``.
+
+    g_max is the reading of axis i while the table turns about it at the rate I_i, and g_min its reading at rest. The
+    matrix of the stage before carries the scale already, so S is 1.000, as in every printed table. Printed is
+    ``I / g_max - g_min``, which differs only where g_min is not zero.
+    """
+    response.require_turns()
+    g_min = response.rest
+    g_max = g_min + response.rate * np.diag(response.slope)
+    scale = response.rate / g_max - g_min if as_printed else response.rate / (g_max - g_min)
+    values = {f"S_{axis}": (float(s), "1") for axis, s in zip(AXES, scale, strict=True)}
+    return Outcome({"matrix": np.diag(scale).tolist()}, values)
+
+
+STAGES = {f.__name__: f for f in (bias, orthogonality_and_misalignment, scale_factor)}
+
+
 @dataclass(frozen=True)
-class Chain:
-    """The stages up to one of them, followed: the correction so far, and what the last stage found."""
+class Corrected:
+    """The output of a stage: the correction so far, and the parameters of the last stage."""
 
-    steps: list[dict[str, Any]]
-    outcome: Outcome
+    steps: list[dict[str, Any]] = field(default_factory=list)
+    values: dict[str, tuple[float, str]] = field(default_factory=dict)
 
-    def contract(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def contract(self) -> tuple[Values, Values]:
         """Return bias and matrix of ``matrix @ (reading - bias)``, which all steps together are."""
-        offset: NDArray[np.float64] = np.zeros(3)
-        matrix: NDArray[np.float64] = np.eye(3)
+        offset: Values = np.zeros(3)
+        matrix: Values = np.eye(3)
         for step in self.steps:
             if "subtract" in step:
                 offset = offset + np.asarray(step["subtract"])
@@ -63,16 +112,41 @@ class Chain:
                 offset, matrix = np.asarray(step["matrix"]) @ offset, np.asarray(step["matrix"]) @ matrix
         return np.asarray(np.linalg.solve(matrix, offset), float), matrix
 
-    def vector(self) -> NDArray[np.float64]:
+    def vector(self) -> Values:
         """Return bias, matrix and the last stage's parameters in one vector."""
-        bias, matrix = self.contract()
-        return np.concatenate([bias, matrix.ravel(), [value for value, _ in self.outcome.values.values()]])
+        offset, matrix = self.contract()
+        return np.concatenate([offset, matrix.ravel(), [value for value, _ in self.values.values()]])
 
 
-def fit_stage(
+def follow(
+    response: Response, names: Sequence[str], *, as_printed: bool, start: Sequence[Mapping[str, Any]] = ()
+) -> Corrected:
+    """Run stages one after the other, each on the output of the one before.
+
+    Parameters
+    ----------
+    response : Response
+        Of the uncorrected readings.
+    names : sequence of str
+        Stages, in order.
+    as_printed : bool
+    start : sequence of mapping
+        The correction by the stages before the first.
+    """
+    found = Corrected([dict(step) for step in start])
+    for step in start:
+        response = response.corrected(step)
+    for name in names:
+        own = STAGES[name](response, as_printed=as_printed)
+        response = response.corrected(own.step)
+        found = Corrected([*found.steps, own.step], own.values)
+    return found
+
+
+def fit(
     name: str, recordings: Sequence[Recording], previous: SensorCalibration | None, settings: Mapping[str, Any]
 ) -> SensorCalibration:
-    """Run one stage of the staged method.
+    """Run one stage of the staged method on the output of the stage before.
 
     Parameters
     ----------
@@ -85,18 +159,16 @@ def fit_stage(
     settings : mapping
         Sections ``table``, ``method`` and ``sensor``.
 
-    Returns
-    -------
-    SensorCalibration
-
     Raises
     ------
     CannotCalibrateError
         If no recording of the gyroscope logs the table's motion.
     NotObservableError
         If there is no rest, or no steady turn about an axis that the stage needs.
+    ConfigurationError
+        If the stage before is not one of this method.
     """
-    names = [*_stages_before(previous), name]
+    before = stages_before("gyroscope", previous, STAGES)
     as_printed = bool(settings["method"].get("as_printed", False))
     samples = samples_of(parts_of(recordings, "gyroscope", settings["table"], "the staged method"), recordings)
     weights = weights_of(samples.rate, as_printed=as_printed)
@@ -105,22 +177,29 @@ def fit_stage(
     design = np.column_stack([np.ones(len(samples.rate)), samples.rate[:, samples.speed > 0]])
     residuals = samples.reading - theta[0] - samples.rate @ theta[1:]
 
-    def run(values: NDArray[np.float64]) -> Chain:
-        return follow(Response(values[0], values[1:], samples.speed), names, as_printed=as_printed)
+    def response(values: Values) -> Response:
+        b, slope = values.reshape(3, 4)[:, 0], values.reshape(3, 4)[:, 1:].T
+        return Response(b, slope, samples.speed)
 
-    chain = run(theta)
-    fit = _linear_map(theta, weights, run)
-    reference = Reference("gyroscope", samples.motions, fit, theta[1:].T, settings["table"])
+    def chain(values: Values) -> Values:
+        return follow(response(values), [*before, name], as_printed=as_printed).vector()
+
+    at = theta.T.ravel()
+    correction = (previous.stages[-1].correction or {}) if previous and previous.stages else {}
+    found = follow(response(at), [name], as_printed=as_printed, start=correction.get("steps", []))
+    x, y, z = np.split(derivative(chain, at, np.full(12, STEP)), 3, axis=1)
+    map_ = LinearMap((weights, weights, weights), (x, y, z))
+    reference = Reference("gyroscope", samples.motions, map_, theta[1:].T, settings["table"])
     disturbed = disturbance(reference, residuals, samples.blocks)
     noise = assess_noise(residuals, design, samples.blocks, prior, disturbed)
-    scatter = noise_contribution(noise, fit, prior)
-    after = apply_correction({"steps": chain.steps}, samples.reading)
+    scatter = noise_contribution(noise, map_, prior)
+    after = apply_correction({"steps": found.steps}, samples.reading)
     error = np.linalg.norm(after, axis=1) - np.linalg.norm(samples.rate, axis=1)
     result = StageResult(
         name=name,
-        parameters=_parameters(chain, scatter.covariance),
+        parameters=with_uncertainty(found.values, scatter.covariance[12:, 12:]),
         residual_rms=float(np.sqrt(np.mean(error**2))),
-        correction={"steps": chain.steps},
+        correction={"steps": found.steps},
         details={
             "samples_used": len(samples.reading),
             "samples_left_out": samples.total - len(samples.reading),
@@ -129,74 +208,19 @@ def fit_stage(
             "degrees_of_freedom": float(scatter.degrees_of_freedom.min()),
         },
     )
-    bias, matrix = chain.contract()
-    size = np.linalg.norm(design, axis=0)
-    condition = float(np.linalg.cond(np.linalg.qr(design / size, mode="r")))
-    found = SensorCalibration(
+    offset, matrix = found.contract()
+    condition, columns = ScaledColumns.of(design).condition, design.shape[1]
+    calibration = SensorCalibration(
         sensor="gyroscope",
-        bias=bias,
+        bias=offset,
         matrix=matrix,
         stages=(*(previous.stages if previous else ()), result),
-        convergence=certified(0.0, condition, design.shape[1], design.shape[1]) | {"closed_form": True},
+        convergence=certified(0.0, condition, columns, columns) | {"closed_form": True},
     )
     kept, K = slice(0, 12), np.asarray(np.linalg.solve(matrix, np.eye(3)))
-    reference = Reference("gyroscope", samples.motions, fit.results(kept), K, settings["table"])
+    reference = Reference("gyroscope", samples.motions, map_.results(kept), K, settings["table"])
 
-    def results(errors: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.array([run(theta + e.reshape(3, 4).T).vector()[kept] for e in errors])
+    def results(errors: Values) -> Values:
+        return np.array([chain(at + e)[kept] for e in errors])
 
-    return budgeted(found, reference, noise, [scatter.of(kept)], settings, results)
-
-
-def follow(response: Response, names: Sequence[str], *, as_printed: bool) -> Chain:
-    """Run stages one after the other, each on the output of the one before.
-
-    Parameters
-    ----------
-    response : Response
-        Of the uncorrected readings.
-    names : sequence of str
-        Stages, in order; at least one.
-    as_printed : bool
-    """
-    steps: list[dict[str, Any]] = []
-    for name in names:
-        outcome: Outcome = import_module(f"{__package__}.{name}").outcome(response, as_printed=as_printed)
-        response = response.corrected(outcome.step)
-        steps.append(outcome.step)
-    return Chain(steps, outcome)
-
-
-def _stages_before(previous: SensorCalibration | None) -> list[str]:
-    names = [] if previous is None else [stage.name for stage in previous.stages]
-    unknown = [name for name in names if name not in STAGES]
-    if unknown:
-        raise ConfigurationError(
-            f"a stage of the staged method cannot follow {unknown[0]!r}, which leaves no corrected readings for it; "
-            f"the stages of the gyroscope are {', '.join(STAGES)}"
-        )
-    return names
-
-
-def _linear_map(
-    theta: NDArray[np.float64], weights: NDArray[np.float64], run: Callable[[NDArray[np.float64]], Chain]
-) -> LinearMap:
-    """Return the map from readings to ``Chain.vector``, by the derivative of the chain."""
-    derivatives = []
-    for channel in range(3):
-        columns = []
-        for row in range(4):
-            up, down = theta.copy(), theta.copy()
-            up[row, channel] += STEP
-            down[row, channel] -= STEP
-            columns.append((run(up).vector() - run(down).vector()) / (2.0 * STEP))
-        derivatives.append(np.column_stack(columns))
-    return LinearMap((weights, weights, weights), (derivatives[0], derivatives[1], derivatives[2]))
-
-
-def _parameters(chain: Chain, covariance: NDArray[np.float64]) -> dict[str, dict[str, Any]]:
-    own = np.sqrt(np.clip(np.diag(covariance)[12:], 0.0, None))
-    return {
-        name: {"value": value, "unit": unit, "standard_uncertainty": float(u)}
-        for (name, (value, unit)), u in zip(chain.outcome.values.items(), own, strict=True)
-    }
+    return budgeted(calibration, reference, noise, [scatter.of(kept)], settings, results)

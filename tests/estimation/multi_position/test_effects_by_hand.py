@@ -11,7 +11,7 @@ from hand_session import WARM, Unit, hand_held
 from scipy.special import stdtrit
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.effects_stage import fit_effects
+from pipeline.estimation.effects import fit as fit_effects
 from pipeline.estimation.multi_position.accelerometer import model_of
 from pipeline.estimation.multi_position.likelihood import selection_hypotheses
 from pipeline.estimation.multi_position.selection import fit_configured, limits_of

@@ -12,7 +12,7 @@ from scipy.special import stdtrit
 
 from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.design import Term
-from pipeline.estimation.effects_stage import fit_effects
+from pipeline.estimation.effects import fit as fit_effects
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.multi_position.gyroscope import model_of
 from pipeline.estimation.multi_position.model import State

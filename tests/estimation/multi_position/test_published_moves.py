@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.estimation.accelerometer import nonlinear_least_squares
-from pipeline.estimation.effects_stage import fit_effects
+from pipeline.estimation.effects import fit as fit_effects
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.rest_means import split_rests

@@ -58,7 +58,7 @@ ADVICE = {
 }
 
 
-def fit_reference(
+def fit(
     sensor: str, recordings: Sequence[Recording], previous: SensorCalibration | None, settings: Mapping[str, Any]
 ) -> SensorCalibration:
     """Fit bias and matrix of a sensor against the table's motion.

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 AUTO = "auto"
 
 
-def fit_effects(
+def fit(
     sensor: str, recordings: Sequence[Recording], previous: SensorCalibration | None, settings: Mapping[str, Any]
 ) -> SensorCalibration:
     """Fit the effects of ``settings["effects"][sensor]`` together with bias and matrix, whatever the method was.

@@ -20,6 +20,7 @@ import numpy as np
 
 from pipeline.errors import NotObservableError
 from pipeline.estimation.correction import apply_step
+from pipeline.estimation.least_squares import certificate, certified
 from pipeline.estimation.turns import filtered_alike, fit_sinusoid, wrap
 from pipeline.records import AXES
 
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 
     from pipeline.estimation.turns import Part, Sinusoid
     from pipeline.records import Motion, Recording
+
+    Values = NDArray[np.float64]
 
 OTHERS = ((1, 2), (2, 0), (0, 1))  # first and second axis of a turn about x, y, z
 
@@ -50,45 +53,45 @@ class Extremes:
         What each axis reads while the table turns about it: by default the amplitude of its swing, as printed its mean.
     """
 
-    angle_high: NDArray[np.float64]
-    angle_low: NDArray[np.float64]
-    high: NDArray[np.float64]
-    low: NDArray[np.float64]
-    level: NDArray[np.float64]
-    height: NDArray[np.float64]
+    angle_high: Values
+    angle_low: Values
+    high: Values
+    low: Values
+    level: Values
+    height: Values
 
     @property
-    def a_max(self) -> NDArray[np.float64]:
+    def a_max(self) -> Values:
         """Largest reading of each axis, g."""
-        mean: NDArray[np.float64] = self.high.mean(axis=1)
+        mean: Values = self.high.mean(axis=1)
         return mean
 
     @property
-    def a_min(self) -> NDArray[np.float64]:
+    def a_min(self) -> Values:
         """Smallest reading of each axis, g."""
-        mean: NDArray[np.float64] = self.low.mean(axis=1)
+        mean: Values = self.low.mean(axis=1)
         return mean
 
     @property
-    def a_zero(self) -> NDArray[np.float64]:
+    def a_zero(self) -> Values:
         """Level reading of each axis, g."""
-        mean: NDArray[np.float64] = self.level.mean(axis=1)
+        mean: Values = self.level.mean(axis=1)
         return mean
 
     @property
-    def excess_high(self) -> NDArray[np.float64]:
+    def excess_high(self) -> Values:
         """alpha_P, beta_P, gamma_P: by how much the upper extremes of a turn are not 90 deg apart."""
         return wrap(self.angle_high[:, 0] - self.angle_high[:, 1] - 90.0)
 
     @property
-    def excess_low(self) -> NDArray[np.float64]:
+    def excess_low(self) -> Values:
         """alpha_N, beta_N, gamma_N: the same of the lower extremes."""
         return wrap(self.angle_low[:, 0] - self.angle_low[:, 1] - 90.0)
 
     def corrected(self, step: Mapping[str, Any], *, as_printed: bool) -> Self:
         """Return the extremes of readings after a step of a correction."""
 
-        def apply(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        def apply(values: Values) -> Values:
             return apply_step(step, values.T).T
 
         height = self.height
@@ -114,8 +117,8 @@ class Turn:
         By the table, at these samples.
     """
 
-    angle: NDArray[np.float64]
-    reading: NDArray[np.float64]
+    angle: Values
+    reading: Values
     used: list[tuple[Recording, NDArray[np.bool_]]]
     motions: list[Motion]
 
@@ -164,7 +167,7 @@ def sinusoids_of(turns: Sequence[Turn]) -> list[list[Sinusoid]]:
     ]
 
 
-def extremes_of_sinusoids(coefficients: Sequence[Sequence[NDArray[np.float64]]]) -> Extremes:
+def extremes_of_sinusoids(coefficients: Sequence[Sequence[Values]]) -> Extremes:
     """Return the extremes of fitted sinusoids.
 
     Parameters
@@ -207,3 +210,19 @@ def extremes_of_samples(turns: Sequence[Turn]) -> Extremes:
         level[axis, 4:] = turn.reading[np.concatenate([top, bottom]), axis]
         height[axis] = turn.reading[:, axis].mean()
     return Extremes(angle_high, angle_low, high, low, level, height)
+
+
+def by_turn(sinusoids: Sequence[Sequence[Sinusoid]], values: Values) -> list[list[Values]]:
+    """Return coefficients ``[turn][channel]`` of a vector in which they come channel by channel."""
+    sizes = [len(turn[channel].coefficients) for channel in range(3) for turn in sinusoids]
+    pieces = np.split(values, np.cumsum(sizes)[:-1])
+    return [[pieces[channel * len(sinusoids) + turn] for channel in range(3)] for turn in range(len(sinusoids))]
+
+
+def certificate_of(sinusoids: Sequence[Sequence[Sinusoid]]) -> dict[str, Any]:
+    """Return the certificate of the worst of the sinusoids' fits."""
+    every = [s for turn in sinusoids for s in turn]
+    parts = [certificate(s.columns, s.residuals, s.condition, s.columns.shape[1]) for s in every]
+    worst = {key: max(part[key] for part in parts) for key in ("cosine", "condition")}
+    count = sum(part["parameters"] for part in parts)
+    return certified(worst["cosine"], worst["condition"], count, count)

@@ -1,0 +1,64 @@
+"""Which function runs a stage of a fit.
+
+A stage is a module ``pipeline/estimation/<sensor>/<stage>.py`` with ``fit(recordings, previous, settings)``: a new
+stage needs only such a module and its name in a method's list. The stages of the staged method are functions of one
+module for each sensor, and some stages are the same for both sensors.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from pipeline.errors import CannotCalibrateError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.records import Recording, SensorCalibration
+
+STAGED = {
+    "accelerometer": ("orthogonality", "misalignment", "bias", "scale_factor"),
+    "gyroscope": ("bias", "orthogonality_and_misalignment", "scale_factor"),
+}
+OF_BOTH_SENSORS = ("reference_least_squares", "effects")
+NOT_WANTED = "not_wanted"  # the stage of a sensor whose method is null
+
+
+def stage_module(sensor: str, stage: str) -> str:
+    """Return the module that holds a stage."""
+    if stage in STAGED[sensor]:
+        return f"pipeline.estimation.{sensor}.staged"
+    if stage == NOT_WANTED:
+        return __name__
+    return f"pipeline.estimation.{stage}" if stage in OF_BOTH_SENSORS else f"pipeline.estimation.{sensor}.{stage}"
+
+
+def fit_stage(
+    sensor: str,
+    stage: str,
+    recordings: Sequence[Recording],
+    previous: SensorCalibration | None,
+    settings: Mapping[str, Any],
+) -> SensorCalibration:
+    """Run a stage on the result of the stage before.
+
+    Parameters
+    ----------
+    sensor, stage : str
+    recordings : sequence of Recording
+    previous : SensorCalibration or None
+    settings : mapping
+        The unit's part of the configuration.
+
+    Raises
+    ------
+    CannotCalibrateError
+        If the sensor's method is null, or the stage cannot use these recordings.
+    """
+    if stage == NOT_WANTED:
+        raise CannotCalibrateError(f"method.{sensor} is null: the configuration leaves this sensor uncalibrated")
+    fit = import_module(stage_module(sensor, stage)).fit
+    named = (stage,) if stage in STAGED[sensor] else (sensor,) if stage in OF_BOTH_SENSORS else ()
+    found: SensorCalibration = fit(*named, recordings, previous, settings)
+    return found
