@@ -1,4 +1,4 @@
-"""Tell what ingest makes of a file, and propose a profile for one that it does not know."""
+"""Print what ingest makes of a file, and propose a profile for one that it does not know."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ if TYPE_CHECKING:
     from pipeline.records import Recording
 
 DEFAULT_PROFILE = "canonical_csv"
-LOOKED_AT_BYTES = 1 << 25
-LOOKED_AT_FOLDERS = 4  # the log's, and a campaign's above raw/<unit>/
-ANOTHER_LAYOUT = ("missing_column", "no_header")
+SEARCHED_BYTES = 1 << 25
+SEARCHED_FOLDERS = 4  # the log's, and a campaign's above raw/<unit>/
+UNKNOWN_LAYOUT = ("missing_column", "no_header")
 EPILOG = """\
 A file of a campaign is read as the campaign's configuration says, any other with --ingest (canonical_csv) and, where
 --sensor is given, with its full scale. Nothing is written but what --save asks for.
 
-For a text log that the profile does not describe, a profile is proposed: each line with what speaks for it, and ???
+For a text log that the profile does not describe, a profile is proposed: each line with its evidence, and ???
 where you have to decide. It is never applied unasked: read it, save it, and name it.
 
 examples:
@@ -81,12 +81,12 @@ def main(argv: Sequence[str]) -> int:
     arguments = _parser().parse_args(argv)
     refused: list[tuple[Reading, PipelineError]] = []
     for reading in _readings(arguments.files, arguments.ingest, arguments.sensor):
-        error = _tell(reading)
+        error = _print_facts(reading)
         if error is not None:
             refused.append((reading, error))
-    unknown = [shape for reading, error in refused for shape in _layouts(reading, error)]
+    unknown = [layout for reading, error in refused for layout in _layouts(reading, error)]
     if unknown:
-        _tell_proposals(propose(unknown), refused[0][0].sensor, arguments.save)
+        _print_proposals(propose(unknown), refused[0][0].sensor, arguments.save)
     elif arguments.save:
         print(f"{arguments.save} was not written: there is nothing to propose")
     sys.stdout.flush()
@@ -187,7 +187,7 @@ def _named(profile: str, file: Path, campaign: Path | None) -> str:
     known = [root / "ingest" / f"{profile}.yaml" for root in (CONFIGS, *([campaign / "configs"] if campaign else []))]
     if Path(profile).suffix in (".yaml", ".yml") or any(place.is_file() for place in known):
         return profile
-    folders = [Path.cwd(), *list(file.resolve().parents)[:LOOKED_AT_FOLDERS]]
+    folders = [Path.cwd(), *list(file.resolve().parents)[:SEARCHED_FOLDERS]]
     places = [place for folder in folders for place in (folder, folder / "configs" / "ingest")]
     places += sorted(Path.cwd().glob("*/configs/ingest"))
     found = {f.resolve(): f.read_bytes() for place in places if (f := place / f"{profile}.yaml").is_file()}
@@ -215,7 +215,7 @@ def _composed(profile: str, sensor: str | None, campaign: Path | None) -> tuple[
     return config["ingest"], config["sensor"]
 
 
-def _tell(reading: Reading) -> PipelineError | None:
+def _print_facts(reading: Reading) -> PipelineError | None:
     """Print what ingest makes of files, and return its refusal."""
     print(f"{', '.join(map(str, reading.files))}\n  {'read with':<16}{reading.said}")
     try:
@@ -254,13 +254,13 @@ def _is_mcap(reading: Reading) -> bool:
 
 
 def _layouts(reading: Reading, error: PipelineError) -> list[TextLayout]:
-    """Return the shape of each text log that the profile does not describe."""
-    if not isinstance(error, IngestError) or error.code not in ANOTHER_LAYOUT:
+    """Return the layout of each text log that the profile does not describe."""
+    if not isinstance(error, IngestError) or error.code not in UNKNOWN_LAYOUT:
         return []
     found = []
     for file in reading.files:
         with file.open("rb") as stream:
-            data = stream.read(LOOKED_AT_BYTES)
+            data = stream.read(SEARCHED_BYTES)
         try:
             found.append(find_layout(data, str(file)))
         except IngestError as none:
@@ -268,7 +268,7 @@ def _layouts(reading: Reading, error: PipelineError) -> list[TextLayout]:
     return found
 
 
-def _tell_proposals(proposals: Sequence[Proposal], sensor: dict[str, Any], save: Path | None) -> None:
+def _print_proposals(proposals: Sequence[Proposal], sensor: dict[str, Any], save: Path | None) -> None:
     """Print the proposed profiles, what they would make of the files, and save the only one."""
     if save is not None and len(proposals) > 1:
         raise ConfigurationError(f"{len(proposals)} profiles are proposed and --save writes one: check fewer files")
@@ -282,7 +282,7 @@ def _tell_proposals(proposals: Sequence[Proposal], sensor: dict[str, Any], save:
             ingest = proposal.ingest(name)
             groups = [[Path(f) for f in proposal.files]] if proposal.parts else [[Path(f)] for f in proposal.files]
             for group in groups:
-                _tell(Reading(group, ingest, sensor, "the proposed profile"))
+                _print_facts(Reading(group, ingest, sensor, "the proposed profile"))
         else:
             print(f"Fill in {UNKNOWN} for {', '.join(proposal.unknown())}.")
         if save is not None:

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.config.compose import RUN_SETTINGS, nearest
 from pipeline.config.user_effects import ONLY_FROM_THE_COMMAND_LINE, PYTHON
 from pipeline.errors import ConfigurationError
-from pipeline.io.file_access import not_regular
+from pipeline.io.files import not_regular
 from pipeline.io.yaml_file import read_yaml
 
 if TYPE_CHECKING:

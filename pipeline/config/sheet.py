@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.config.compose import GROUPS
 from pipeline.config.user_effects import ONLY_FROM_THE_COMMAND_LINE, PYTHON
 from pipeline.errors import ConfigurationError
-from pipeline.io.file_access import not_regular
-from pipeline.io.files import wrong_name
+from pipeline.io.files import not_regular, wrong_name
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import ConfigurationError, PipelineError
 from pipeline.files import CONFIGS
-from pipeline.io.file_access import not_regular
+from pipeline.io.files import not_regular
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence

@@ -23,7 +23,7 @@ from pipeline.io.csv_times import (
     time_column,
     whole_times,
 )
-from pipeline.io.file_access import unchanged
+from pipeline.io.files import unchanged
 from pipeline.io.ingest_settings import AUTO, COMMENTED, DROP, GAP, WHITESPACE
 from pipeline.io.text_blocks import TextBlocks
 from pipeline.records import Note

@@ -1,8 +1,10 @@
-"""Which files a unit's recordings lie in.
+"""Files of users: which ones hold a unit's recordings, what their names may be, and safe access to them.
 
 A procedure names a recording's file without suffix; the first kind of file that exists is taken, ``.csv`` before
 ``.gcsv`` before ``.mcap``. A name with a suffix is taken as it is. Where the ingest profile says that a recording comes
 in several ``parts`` (files of one logger, joined on time), these stand in place of the ``.csv``.
+
+Only regular files are opened: opening a FIFO would wait forever, and a device may never end.
 
 Only the standard library is imported here: the Snakefile asks for the files of thousands of units while it is parsed.
 """
@@ -11,19 +13,47 @@ from __future__ import annotations
 
 import os
 import re
+import stat
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.errors import ConfigurationError
+from pipeline.errors import ConfigurationError, IngestError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
 SUFFIXES = (".csv", ".gcsv", ".mcap")
 FILE = "{file}"
 UNIT_NAME = re.compile(r"[A-Za-z0-9._-]+")
 LONGEST_NAME = 200  # a file name has at most 255 bytes; the longest of a unit's adds 41 (_accelerometer_unknown.yaml)
 OF_STAGES = (".failed", ".noise", ".calibration")  # <unit>.failed.json and others lie beside <unit>.json
+KINDS = {
+    stat.S_IFDIR: "a directory",
+    stat.S_IFIFO: "a FIFO",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+}
+UTF_16 = "UTF-16 text: save it as UTF-8"
+# First bytes of files that are no text logs, and what to do.
+FOREIGN = {
+    b"\x89MCAP": "an MCAP file: give it the suffix .mcap",
+    b"\x1f\x8b": "a gzip file: decompress it first",
+    b"\x28\xb5\x2f\xfd": "a zstd file: decompress it first",
+    b"BZh": "a bzip2 file: decompress it first",
+    b"\xfd7zXZ": "an xz file: decompress it first",
+    b"PK\x03\x04": "a zip or Excel file: export it as text",
+    b"\xd0\xcf\x11\xe0": "an Excel file of the old kind: export it as text",
+    b"SQLite format 3": "an SQLite database (a ROS 2 bag of the old kind): convert it to MCAP",
+    b"#ROSBAG": "a ROS 1 bag: convert it to MCAP",
+    b"\x89HDF": "an HDF5 or MATLAB file: export it as text",
+    b"MATLAB 7.3": "an HDF5 file (MATLAB 7.3): export it as text",
+    b"MATLAB 5.0": "a MATLAB file: export it as text",
+    b"PAR1": "a Parquet file: export it as text",
+    b"\xff\xfe": UTF_16,
+    b"\xfe\xff": UTF_16,
+}
 
 
 def recording_files(procedure: Mapping[str, Any], ingest: Mapping[str, Any], folder: Path) -> dict[str, list[Path]]:
@@ -104,3 +134,75 @@ def wrong_name(name: str) -> str:
         return f"has {len(name)} characters; {LONGEST_NAME} is the limit, as file names are made of it"
     ending = next((e for e in OF_STAGES if name.endswith(e)), "")
     return f"a name cannot end in {ending}, which marks files of another kind" if ending else ""
+
+
+def not_regular(path: Path) -> str:
+    """Return why a path cannot be read as a file, empty for a regular file or a link to one.
+
+    Raises
+    ------
+    OSError
+        If the path does not exist, or a folder above it cannot be searched.
+    """
+    try:
+        kind = stat.S_IFMT(path.stat().st_mode)
+    except FileNotFoundError:
+        if not os.path.lexists(path):
+            raise
+        return f"is a symbolic link to {path.readlink()}, which does not exist; correct the link or remove it"
+    if kind == stat.S_IFREG:
+        return ""
+    return f"is {KINDS.get(kind, 'no regular file')}; a regular file, or a symbolic link to one, is expected"
+
+
+def read_text(path: Path, largest: int, what: str) -> str:
+    """Return the text of a UTF-8 file of at most ``largest`` bytes; ``what`` it holds is named in refusals.
+
+    Raises
+    ------
+    ConfigurationError
+        If it is no regular file, cannot be read, is not UTF-8, or is larger.
+    """
+    try:
+        other = not_regular(path)
+        if other:
+            raise ConfigurationError(other, str(path))
+        with path.open("rb") as stream:
+            content = stream.read(largest + 1)
+        text = content.decode("utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigurationError(f"cannot be read: {error}", str(path)) from None
+    if len(content) > largest:
+        raise ConfigurationError(f"has more than {largest} bytes, the limit for {what}", str(path))
+    return text
+
+
+@contextmanager
+def unchanged(path: Path) -> Iterator[None]:
+    """Refuse a log that is no regular file, cannot be opened, is empty, or changes while it is read."""
+    try:
+        other = not_regular(path)
+        if other:
+            raise IngestError(other, str(path), fault="unreadable")
+        before = path.stat()
+        if before.st_size == 0:
+            raise IngestError("the file is empty (0 bytes)", str(path), fault="empty")
+        yield
+        after = path.stat()
+    except OSError as error:
+        raise IngestError(f"cannot be read: {error.strerror or error}", str(path), fault="unreadable") from error
+    if (before.st_size, before.st_mtime_ns, before.st_ino) != (after.st_size, after.st_mtime_ns, after.st_ino):
+        raise IngestError(
+            f"the file changed while it was read ({before.st_size} bytes, then {after.st_size})",
+            str(path),
+            fault="changed",
+            hint="is it still being recorded or copied? Run again when that is done",
+        )
+
+
+def refuse_foreign(start: bytes, path: str) -> None:
+    """Refuse a file whose first bytes are those of another kind of file."""
+    for magic, what in FOREIGN.items():
+        if start.startswith(magic):
+            fault = "utf16" if what == UTF_16 else "foreign"
+            raise IngestError(f"not a text log but {what}", path, fault=fault)

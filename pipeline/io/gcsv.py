@@ -23,7 +23,7 @@ from fractions import Fraction
 from typing import TYPE_CHECKING
 
 from pipeline.errors import IngestError
-from pipeline.io.file_access import refuse_foreign, unchanged
+from pipeline.io.files import refuse_foreign, unchanged
 from pipeline.io.ingest_settings import Column, CsvFormat
 from pipeline.io.units import ATTITUDE, COUNTS, DEGREES, TRIADS
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from pipeline.errors import IngestError
 from pipeline.io.channel_table import ChannelTable
-from pipeline.io.file_access import unchanged
+from pipeline.io.files import unchanged
 from pipeline.io.mcap_channels import MAPPED, TopicDecoder, kind_of, topic_of
 from pipeline.io.mcap_reader import McapReader
 from pipeline.io.mcap_settings import HEADER, OWN

@@ -24,7 +24,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, ChunkIndex, DataEnd, Footer, Header, Metadata, Schema, Statistics
 
 from pipeline.errors import IngestError
-from pipeline.io.file_access import FOREIGN
+from pipeline.io.files import FOREIGN
 from pipeline.io.mcap_chunk import Run, split, unpack
 from pipeline.io.mcap_records import MAGIC, RECORD_HEAD, attachment, message_index, parsed
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.errors import IngestError
-from pipeline.io.file_access import UTF_16, refuse_foreign
+from pipeline.io.files import UTF_16, refuse_foreign
 from pipeline.records import Note
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from pipeline.errors import ConfigurationError
-from pipeline.io.file_access import read_text
+from pipeline.io.files import read_text
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from pipeline.errors import ConfigurationError, InputError, MissingInputError
-from pipeline.io.file_access import not_regular
+from pipeline.io.files import not_regular
 from pipeline.model.effects import effect_of
 from pipeline.records import SENSOR_UNITS, SENSORS, FittedEffect, SensorCalibration
 

@@ -49,7 +49,7 @@ def facts(recording: Recording, sensor: Mapping[str, Any] | None = None) -> list
         low, high = float(recording.temperature.min()), float(recording.temperature.max())
         lines.append(("temperature", f"{low:.4g} to {high:.4g} degC" if high > low else f"{low:.4g} degC throughout"))
     lines += _table(recording)
-    lines.append(("rests", _rests_describe_note(recording, rests)))
+    lines.append(("rests", _describe_rests(recording, rests)))
     lines.append(("clipping", _clipping(recording, sensor or {})))
     lines += _units(recording, rests)
     lines += [("notes" if i == 0 else "", text) for i, text in enumerate(_notes(recording.notes))]
@@ -133,7 +133,7 @@ def _table(recording: Recording) -> list[Line]:
     return [("table", "; ".join(found))] if found else []
 
 
-def _rests_describe_note(recording: Recording, rests: Sequence[tuple[int, int]]) -> str:
+def _describe_rests(recording: Recording, rests: Sequence[tuple[int, int]]) -> str:
     if not rests:
         return "none found"
     lengths = np.array([b - a for a, b in rests]) * recording.interval
@@ -211,11 +211,11 @@ def _units(recording: Recording, rests: Sequence[tuple[int, int]]) -> list[Line]
 def _notes(notes: Sequence[Note]) -> list[str]:
     if not notes:
         return ["none"]
-    lines = [describe_note(n) for n in notes[:LISTED_NOTES]]
+    lines = [_describe_note(n) for n in notes[:LISTED_NOTES]]
     return lines + ([f"and {len(notes) - LISTED_NOTES} more"] if len(notes) > LISTED_NOTES else [])
 
 
-def describe_note(note: Note) -> str:
+def _describe_note(note: Note) -> str:
     """Return a note as one line."""
     count = f" x {note.count}" if note.count > 1 else ""
     last = f" to {note.last}" if note.last != note.first else ""

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from pipeline.errors import ConfigurationError, MissingInputError, PipelineError
-from pipeline.io.file_access import read_text
+from pipeline.io.files import read_text
 from pipeline.io.yaml_file import load_yaml
 from pipeline.model.effects.base import Effect
 from pipeline.model.effects.declaration import read_declaration
