@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 
 from pipeline.model.effects import effect
 from pipeline.model.effects.base import truth
-from pipeline.records import AXES, Recording
+from pipeline.records import AXES, Motion, Recording
 from pipeline.simulation.procedures import Course, plan
 from pipeline.simulation.scene import ALTERATIONS, Scene, alter
 from pipeline.simulation.sensor import Environment
@@ -186,3 +186,23 @@ def _noise(sensor: str, times: list[np.ndarray], session: Session, rng: np.rando
         session.white * WHITE[sensor] * rng.standard_normal((len(t), 3)) + session.wander * WANDER[sensor] * wander[i]
         for t, i in zip(times, at, strict=True)
     ]
+
+
+def random_motion(seed: int, n: int = 5) -> Motion:
+    """Return samples at which every signal has a random value."""
+    rng = np.random.default_rng(seed)
+    level = np.linalg.qr(rng.standard_normal((n, 3, 3)))[0]
+    return Motion(
+        time=np.sort(rng.uniform(0, 3600, n)),
+        specific_force=rng.uniform(-2, 2, (n, 3)),
+        angular_rate=rng.uniform(-300, 300, (n, 3)),
+        angular_acceleration=rng.uniform(-500, 500, (n, 3)),
+        specific_force_rate=rng.uniform(-3, 3, (n, 3)),
+        temperature=rng.uniform(-30, 80, n),
+        angle=rng.uniform(-400, 400, n),
+        rate=rng.uniform(-200, 200, n),
+        axis=int(rng.integers(3)),
+        still=np.zeros(n, bool),
+        level=level,
+        direction=np.linalg.qr(rng.standard_normal((n, 3, 3)))[0][:, 0],
+    )

@@ -10,31 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bench_session import random_motion
 
 from pipeline.model.effects import built_in
-from pipeline.records import Motion
 
 STORED = np.load(Path(__file__).parent / "data" / "columns_of_effects.npz")
 CASES = sorted({tuple(key.split(".")[:3]) for key in STORED.files if key.endswith(".columns")})
-
-
-def motion(seed: int, n: int = 5) -> Motion:
-    rng = np.random.default_rng(seed)
-    level = np.linalg.qr(rng.standard_normal((n, 3, 3)))[0]
-    return Motion(
-        time=np.sort(rng.uniform(0, 3600, n)),
-        specific_force=rng.uniform(-2, 2, (n, 3)),
-        angular_rate=rng.uniform(-300, 300, (n, 3)),
-        angular_acceleration=rng.uniform(-500, 500, (n, 3)),
-        specific_force_rate=rng.uniform(-3, 3, (n, 3)),
-        temperature=rng.uniform(-30, 80, n),
-        angle=rng.uniform(-400, 400, n),
-        rate=rng.uniform(-200, 200, n),
-        axis=int(rng.integers(3)),
-        still=np.zeros(n, bool),
-        level=level,
-        direction=np.linalg.qr(rng.standard_normal((n, 3, 3)))[0][:, 0],
-    )
 
 
 @pytest.mark.parametrize(("name", "sensor", "seed"), CASES)
@@ -44,8 +25,8 @@ def test_columns_and_readings_are_those_of_the_equation_in_python(name: str, sen
     K = np.eye(3) + 0.05 * rng.standard_normal((3, 3))
     values = rng.uniform(0.1, 1.0, len(effect.parameters(sensor)))
     for what, found in (
-        ("columns", effect.columns(sensor, motion(int(seed)), K, values)),
-        ("reading", effect.reading(sensor, motion(int(seed)), K, values)),
+        ("columns", effect.columns(sensor, random_motion(int(seed)), K, values)),
+        ("reading", effect.reading(sensor, random_motion(int(seed)), K, values)),
     ):
         expected = STORED[f"{name}.{sensor}.{seed}.{what}"]
         np.testing.assert_allclose(found, expected, rtol=1e-14, atol=1e-14 * np.abs(expected).max())
