@@ -13,14 +13,16 @@ other recordings, or four times the data sheet's white noise where there are non
 limits: six standard deviations of ``bias_wander``, ``bias_drift`` over the recording, ``bias_temperature`` times the
 range of the temperature, ``warm_up``; and 6 times the usual scatter, as if all noise of a block had a memory.
 
-A static recording whose scatter is more than twice that of the rests of the other recordings gets the note
-``N-REFERENCE``: its noise is not that of the others. Rests are those of the table's log, or the quietest tenth of a
-recording by hand. White noise grows with the square root of the sampling rate, which is allowed for.
+A static recording is held against the rests of the unit's other recordings, which are those of the table's log, or the
+quietest tenth of a recording by hand. It gets the note ``N-REFERENCE`` where
 
-An axis that is constant where the motion requires it to vary is refused. In a turn by half a turn or more about a
-level axis each of the axes across it goes through gravity's whole range once
-at least, so that the middle nine tenths of its readings span more than 0.2 of it; the gyroscope's axis spans the
-table's rate. Percentiles are not moved by single glitches.
+    its scatter is more than twice theirs on an axis, or less than half of theirs on all axes, or
+    its gyroscope's mean is outside the range of the table's rests by more than 6 standard deviations of a rest's mean,
+        Earth's rate and the data sheet's limits of a bias that changes: the slow changes above, ``g_sensitivity`` and
+        ``g_squared_sensitivity``, as the unit may lie in another attitude.
+
+Its noise and bias are then not those of the others: it may be of another unit. White noise grows with the square root
+of the sampling rate, which is allowed for.
 """
 
 from __future__ import annotations
@@ -30,6 +32,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.model.kinematics import EARTH_RATE_DPS
 from pipeline.preprocessing.evidence import LEAST_RATE_DPS, axis_index, place, quantiles, rate_of_turn, refusal
 from pipeline.records import AXES, SENSORS, Note
 from pipeline.signal.rests import RATE_AT_REST_DPS, rests_from_table, runs
@@ -48,6 +51,7 @@ FEWEST_OF_REST, RESTS = 8, 3  # samples of a rest, and rests of a recording, by 
 LOUDER = 4.0  # the scatter of 16 samples of white noise is so large in fewer than 1 of 10^9 blocks
 QUARTER_SIZE, UNUSUAL, WIDEST = 0.6745, 5.0, 0.4  # quartile of a normal distribution; its standard deviations
 OF_RESTS, OF_SHEET = 2.0, 4.0  # a bench that runs is louder than a unit on a desk; data sheets state typical noise
+STEPPED_DEG = 0.1  # between two samples of a rest: five times what RATE_AT_REST_DPS turns in a second
 SIGNIFICANT = 6.0  # standard deviations, as in pipeline.signal.rests
 FEWEST_SAMPLES = 60  # as of pipeline.estimation.noise, which tells no noise by fewer
 SHORTEST_S = 10.0  # in which a wander of 100 s changes by a third of its size
@@ -69,34 +73,64 @@ def check_static(recordings: Sequence[Recording], settings: Mapping[str, Any]) -
     IngestError
         If too little of it rests.
     """
-    return [_doubted(_resting(r, recordings, settings), recordings) if r.role == "static" else r for r in recordings]
+    sheets = settings.get("sensor") or {}
+    return [
+        _doubted(_resting(r, recordings, settings), recordings, sheets) if r.role == "static" else r for r in recordings
+    ]
 
 
-def _doubted(recording: Recording, recordings: Sequence[Recording]) -> Recording:
-    """Return a static recording, with the note ``N-REFERENCE`` where it is louder than the rests of the others."""
+def _doubted(recording: Recording, recordings: Sequence[Recording], sheets: Mapping[str, Any]) -> Recording:
+    """Return a static recording, with the note ``N-REFERENCE`` where it contradicts the rests of the others."""
     others = [r for r in recordings if r.role != "static" and r.samples > 1]
     if recording.samples < FEWEST_SAMPLES or not others:
         return recording
-    faster = np.sqrt(max(1.0, max(r.interval for r in others) / recording.interval))
-    notes = []
+    intervals = np.array([r.interval for r in others]) / recording.interval
+    faster, slower = np.sqrt(max(1.0, intervals.max())), np.sqrt(max(1.0, 1.0 / intervals.min()))
+    details = []
     for sensor in SENSORS:
-        reading, known = recording.reading(sensor), _of_rests(recordings, sensor)
-        known = _of_quiet_blocks(recordings, sensor) if known is None else known
-        if reading is None or known is None:
-            continue
-        blocks = _blocks(recording, reading)
-        if not len(blocks):
+        reading, rests = recording.reading(sensor), _rests_of(recordings, sensor)
+        if reading is None or not len(rests) or not len(blocks := _blocks(recording, reading)):
             continue
         step = np.abs(np.diff(reading, axis=0))
-        known = np.maximum(known, np.where(step > 0.0, step, np.inf).min(axis=0, initial=np.inf))
-        ratio = float(np.max(np.median(blocks.std(axis=1, ddof=1), axis=0) / known))
-        if ratio > OF_RESTS * faster:
-            detail = (
-                f"the {sensor} scatters {ratio:.3g} times as much as in the rests of the other recordings; "
+        step = np.where(step > 0.0, step, np.inf).min(axis=0, initial=np.inf)
+        own, usual = np.median(blocks.std(axis=1, ddof=1), axis=0), np.median(rests[:, 0], axis=0)
+        louder, quieter = float(np.max(own / np.maximum(usual, step))), float(np.min(usual / np.maximum(own, step)))
+        if louder > OF_RESTS * faster:
+            details.append(
+                f"the {sensor} scatters {louder:.3g} times as much as in the rests of the other recordings; "
                 "its noise would be taken for that of all"
             )
-            notes.append(Note("N-REFERENCE", recording.samples, 0, 0, detail))
+        elif quieter > OF_RESTS * slower:
+            details.append(
+                f"the {sensor} scatters at most {1.0 / quieter:.2g} times as much as in the rests of the other "
+                "recordings: if the recording is of another unit, the noise of this one is underestimated"
+            )
+        if sensor == "gyroscope":
+            sheet = sheets.get(sensor) or {}
+            means, mean = rests[:, 1], np.median(blocks.mean(axis=1), axis=0)
+            away = float(np.max([means.min(axis=0) - mean, mean - means.max(axis=0)]))
+            most = SIGNIFICANT * float(usual.max()) / np.sqrt(FEWEST_OF_REST) + _bias_change(
+                [recording, *others], sheet
+            )
+            if sheet and away > most:
+                details.append(
+                    f"the {sensor} reads {away:.3g} deg/s beyond all rests of the other recordings, where the data "
+                    f"sheet allows {most:.3g}: is the static recording of this unit?"
+                )
+    notes = [Note("N-REFERENCE", recording.samples, 0, 0, detail) for detail in details]
     return replace(recording, notes=(*recording.notes, *notes)) if notes else recording
+
+
+def _bias_change(recordings: Sequence[Recording], sheet: Mapping[str, Any]) -> float:
+    """Return by how much the gyroscope's reading at rest can change between recordings, deg/s."""
+    effects = sheet.get("effects") or {}
+    attitude = 2.0 * float(effects.get("g_sensitivity") or 0.0) + float(effects.get("g_squared_sensitivity") or 0.0)
+    warmth = [r.temperature for r in recordings]
+    known = [t for t in warmth if t is not None]
+    change = float(np.ptp(np.concatenate(known))) if len(known) == len(warmth) else UNKNOWN_DEGC
+    duration = max(r.time[-1] for r in recordings) - min(r.time[0] for r in recordings)
+    duration = max(float(duration), sum(float(r.time[-1] - r.time[0]) for r in recordings))
+    return attitude + 2.0 * EARTH_RATE_DPS + _slow(sheet, change, duration)
 
 
 def _blocks(recording: Recording, reading: Array) -> Array:
@@ -158,17 +192,18 @@ def _moving(
     usual, middle = np.percentile(scatter, [25.0, 50.0], axis=0)
     spread = np.minimum(np.log(middle / np.maximum(usual, np.finfo(float).tiny)) / QUARTER_SIZE, WIDEST)
     louder = np.maximum(LOUDER, np.exp((QUARTER_SIZE + UNUSUAL) * spread))
-    known = _of_rests(recordings, sensor)
+    rests = _rests_of(recordings, sensor, by_hand=False)
     white = float(sheet.get("noise_density") or 0.0) * np.sqrt(0.5 / recording.interval)
-    if known is not None:
-        usual = np.minimum(usual, OF_RESTS * np.maximum(known, white))
+    if len(rests):
+        usual = np.minimum(usual, OF_RESTS * np.maximum(np.median(rests[:, 0], axis=0), white))
     elif white:
         usual = np.minimum(usual, OF_SHEET * white)
     step = np.abs(np.diff(blocks.reshape(-1, 3), axis=0))
     usual = np.maximum(usual, 0.5 * np.where(step > 0.0, step, np.inf).min(axis=0, initial=np.inf))
     loud = scatter / usual
     away = np.abs(means - np.median(means, axis=0))
-    allowed = _slow(recording, sheet) + SIGNIFICANT * usual
+    change = UNKNOWN_DEGC if recording.temperature is None else float(np.ptp(recording.temperature))
+    allowed = _slow(sheet, change, float(recording.time[-1] - recording.time[0])) + SIGNIFICANT * usual
     moving = np.any(loud > louder, axis=1) | np.any(away > allowed, axis=1)
     if np.any(loud > louder):
         return moving, f"the {sensor} scatters {loud.max():.3g} times as usual"
@@ -178,12 +213,9 @@ def _moving(
     )
 
 
-def _slow(recording: Recording, sheet: Mapping[str, Any]) -> float:
-    """Return by how much a bias can change at rest."""
+def _slow(sheet: Mapping[str, Any], change: float, duration: float) -> float:
+    """Return by how much a bias can change at rest, for a change of temperature (degC) and a duration (s)."""
     effects = sheet.get("effects") or {}
-    warmth = recording.temperature
-    change = UNKNOWN_DEGC if warmth is None else float(np.ptp(warmth))
-    duration = float(recording.time[-1] - recording.time[0])
     return (
         SIGNIFICANT * float(sheet.get("bias_wander") or 0.0)
         + float(effects.get("bias_drift") or 0.0) * duration
@@ -192,26 +224,42 @@ def _slow(recording: Recording, sheet: Mapping[str, Any]) -> float:
     )
 
 
-def _of_rests(recordings: Sequence[Recording], sensor: str) -> Array | None:
-    """Return the scatter in the table's rests of the other recordings: (3,) array; None where there are none."""
+def _rests_of(recordings: Sequence[Recording], sensor: str, *, by_hand: bool = True) -> Array:
+    """Return scatter and mean of the rests of the other recordings: (k, 2, 3) array; k = 0 where there are none.
+
+    They are rests of the table's log; where there are none, ``by_hand`` takes the quietest tenth of recordings by hand,
+    whose mean is not known (NaN).
+    """
     found = []
     for recording in recordings:
         reading = recording.reading(sensor)
         if reading is None or recording.role == "static" or recording.axis is None:
             continue
-        rests = [r for r in rests_from_table(recording) if r.stop - r.start >= FEWEST_OF_REST]
-        found += [reading[r.start : r.stop].std(axis=0, ddof=1) for r in rests[:: len(rests) // RESTS + 1]]
-    return np.median(found, axis=0) if found else None
+        rests = [piece for piece in _still_rows(recording) if len(piece) >= FEWEST_OF_REST]
+        found += [_moments(reading[None, rows]) for rows in rests[:: len(rests) // RESTS + 1]]
+    if not found and by_hand:
+        for recording in recordings:
+            reading = recording.reading(sensor) if recording.role == "rests" else None
+            if reading is None or len(blocks := _blocks(recording, reading)) < 10:
+                continue
+            scatter = np.percentile(blocks.std(axis=1, ddof=1), 10.0, axis=0)
+            found.append(np.stack([scatter, np.full(3, np.nan)])[None])
+    return np.concatenate(found) if found else np.zeros((0, 2, 3))
 
 
-def _of_quiet_blocks(recordings: Sequence[Recording], sensor: str) -> Array | None:
-    """Return the scatter of the quietest tenth of the recordings by hand: (3,) array; None where there are none."""
-    found = [
-        np.percentile(_blocks(r, reading).std(axis=1, ddof=1), 10.0, axis=0)
-        for r in recordings
-        if r.role == "rests" and (reading := r.reading(sensor)) is not None and len(_blocks(r, reading)) >= 10
-    ]
-    return np.median(found, axis=0) if found else None
+def _still_rows(recording: Recording) -> list[NDArray[np.intp]]:
+    """Return the rows of each rest of the table's log, cut where the table stepped between two samples."""
+    found = []
+    for rest in rests_from_table(recording):
+        rows = np.arange(rest.start, rest.stop)
+        angle = np.zeros(len(rows)) if recording.table_angle is None else recording.table_angle[rows]
+        found += np.split(rows, np.flatnonzero(np.abs(np.diff(angle)) > STEPPED_DEG) + 1)
+    return found
+
+
+def _moments(blocks: Array) -> Array:
+    """Return the standard deviations and means of (k, n, 3) blocks: (k, 2, 3) array."""
+    return np.stack([blocks.std(axis=1, ddof=1), blocks.mean(axis=1)], axis=1)
 
 
 HALF_TURN_DEG = 180.0

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from bad_units import SETTINGS, cases, sound
 
+from pipeline.diagnosis.verdict import doubts_of
 from pipeline.errors import IngestError
 from pipeline.preprocessing.at_rest import check_static
 from pipeline.preprocessing.checks import check_recordings
@@ -19,6 +20,7 @@ from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import read_config, read_description
 from pipeline.study.bench import recordings_of
 from pipeline.study.cases import FAMILIES, draw
+from pipeline.study.run import settings_of
 
 if TYPE_CHECKING:
     from pipeline.records import Note
@@ -81,8 +83,12 @@ def test_no_family_of_the_blind_study_is_refused_or_noted() -> None:
         assert not notes_of(unit, check_recordings(unit, SETTINGS)), family
 
 
-@pytest.mark.parametrize(("times", "codes"), [(1.0, []), (1.5, []), (3.0, ["N-REFERENCE"])])
-def test_a_static_recording_louder_than_the_rests_by_hand_is_in_doubt(times: float, codes: list[str]) -> None:
+@pytest.mark.parametrize(
+    ("times", "codes"), [(1.0, []), (1.5, []), (0.7, []), (3.0, ["N-REFERENCE"]), (0.3, ["N-REFERENCE"])]
+)
+def test_a_static_recording_louder_or_quieter_than_the_rests_by_hand_is_in_doubt(
+    times: float, codes: list[str]
+) -> None:
     rng = np.random.default_rng(8)
     turning = np.repeat(np.arange(40) % 2, 100)[:, None] * [30.0, 0.0, 0.0]
     noise = 0.05 * rng.standard_normal((4000, 3))
@@ -91,3 +97,12 @@ def test_a_static_recording_louder_than_the_rests_by_hand_is_in_doubt(times: flo
     static = Recording("static", "static", None, (5000 + np.arange(3000)) * 10**7, gyroscope=own)
     found = check_static([by_hand, static], {"sensor": {"gyroscope": {"bias_wander": 0.01}}})[1]
     assert [n.code for n in found.notes] == codes
+
+
+@pytest.mark.parametrize(("number", "doubts"), [(1, 0), (0, 2), (3, 1)])
+def test_a_static_recording_of_another_unit_is_in_doubt(number: int, doubts: int) -> None:
+    """Case 0 is of a STIM300, which is quieter; case 3 of another MPU-6050, whose gyroscope has another bias."""
+    own, other = (recordings_of(draw("null_normal", n, 31)) for n in (1, number))
+    static = next(r for r in other if r.role == "static")
+    checked = check_static([static if r.role == "static" else r for r in own], settings_of("mpu6050"))
+    assert len(doubts_of("accelerometer", checked)) == doubts
