@@ -37,6 +37,7 @@ MOSTLY = 0.5  # share of the residual's excess that selected effects must explai
 BELIEVED = 3  # effects at once; more are what the catalogue makes of physics that it does not hold
 UNKNOWN_SHARE = 0.03  # of the gain in 2 log L by what was selected, above which what is left is worth naming
 WORSE = 0.3  # of the noise's mean square, by which what was selected may raise the held-out error's at most
+HELPFUL = 0.1  # share of the held-out error's mean square that each effect worth a try takes away
 QUIET = 0.6  # times the noise: a residual below it contradicts the noise of the rests
 COMPARED = ("bias", "scale_factor", "non_orthogonality", "rotation")  # parts compared with the uncertainty of both fits
 FREE = ("reference_least_squares", "nonlinear_least_squares", "cholesky_lu")  # methods that leave bias and matrix free
@@ -379,8 +380,23 @@ def judged(document: dict[str, Any], e: Evidence) -> dict[str, Any]:
         step += f"; then {of_unknown(document['unexplained'])}" if document["unexplained"] else ""
     elif verdict == "unexplained" != e.found:
         step = of_unknown(document["unexplained"])
-    offered = {} if verdict == "missing_effect" else {"override": ""}
+    offered = {} if _offered(verdict, document, e) else {"override": ""}
     return document | {"verdict": verdict, "reason": reason} | ({"next_experiment": step} if step else {}) | offered
+
+
+def _offered(verdict: str, document: Mapping[str, Any], e: Evidence) -> bool:
+    """Return whether to offer the selected effects.
+
+    Where they are not what the verdict names, they are worth a try only if they are plausible and held-out motion says
+    that they are a part of what is missing.
+    """
+    if verdict != "unexplained" or e.implausible or len(e.selected) > BELIEVED:
+        return verdict == "missing_effect"
+    entries = {entry["effect"]: entry for entry in document["ranking"]}
+    errors = [
+        (entries[name]["held_out_error_before"], entries[name]["held_out_error_after"]) for name in document["selected"]
+    ]
+    return bool(errors) and all(None not in pair and pair[1] ** 2 < (1.0 - HELPFUL) * pair[0] ** 2 for pair in errors)
 
 
 def _next_step(verdict: str, e: Evidence) -> str:

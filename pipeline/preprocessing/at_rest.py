@@ -16,7 +16,8 @@ range of the temperature, ``warm_up``; and 6 times the usual scatter, as if all 
 A static recording is held against the rests of the unit's other recordings, which are those of the table's log, or the
 quietest tenth of a recording by hand. It gets the note ``N-REFERENCE`` where
 
-    its scatter is more than twice theirs on an axis, or less than half of theirs on all axes, or
+    its scatter is more than twice theirs on an axis,
+    its white noise, by successive differences, is less than half of theirs on all axes, or
     its gyroscope's mean is outside the range of the table's rests by more than 6 standard deviations of a rest's mean,
         Earth's rate and the data sheet's limits of a bias that changes: the slow changes above, ``g_sensitivity`` and
         ``g_squared_sensitivity``, as the unit may lie in another attitude.
@@ -93,8 +94,9 @@ def _doubted(recording: Recording, recordings: Sequence[Recording], sheets: Mapp
             continue
         step = np.abs(np.diff(reading, axis=0))
         step = np.where(step > 0.0, step, np.inf).min(axis=0, initial=np.inf)
-        own, usual = np.median(blocks.std(axis=1, ddof=1), axis=0), np.median(rests[:, 0], axis=0)
-        louder, quieter = float(np.max(own / np.maximum(usual, step))), float(np.min(usual / np.maximum(own, step)))
+        own, usual = np.median(_moments(blocks), axis=0), np.median(rests, axis=0)
+        louder = float(np.max(own[0] / np.maximum(usual[0], step)))
+        quieter = float(np.min(usual[1] / np.maximum(own[1], step)))
         if louder > OF_RESTS * faster:
             details.append(
                 f"the {sensor} scatters {louder:.3g} times as much as in the rests of the other recordings; "
@@ -102,14 +104,14 @@ def _doubted(recording: Recording, recordings: Sequence[Recording], sheets: Mapp
             )
         elif quieter > OF_RESTS * slower:
             details.append(
-                f"the {sensor} scatters at most {1.0 / quieter:.2g} times as much as in the rests of the other "
+                f"the {sensor} has at most {1.0 / quieter:.2g} times the white noise of the rests of the other "
                 "recordings: if the recording is of another unit, the noise of this one is underestimated"
             )
         if sensor == "gyroscope":
             sheet = sheets.get(sensor) or {}
-            means, mean = rests[:, 1], np.median(blocks.mean(axis=1), axis=0)
-            away = float(np.max([means.min(axis=0) - mean, mean - means.max(axis=0)]))
-            most = SIGNIFICANT * float(usual.max()) / np.sqrt(FEWEST_OF_REST) + _bias_change(
+            means = rests[:, 2]
+            away = float(np.max([means.min(axis=0) - own[2], own[2] - means.max(axis=0)]))
+            most = SIGNIFICANT * float(usual[0].max()) / np.sqrt(FEWEST_OF_REST) + _bias_change(
                 [recording, *others], sheet
             )
             if sheet and away > most:
@@ -225,7 +227,7 @@ def _slow(sheet: Mapping[str, Any], change: float, duration: float) -> float:
 
 
 def _rests_of(recordings: Sequence[Recording], sensor: str, *, by_hand: bool = True) -> Array:
-    """Return scatter and mean of the rests of the other recordings: (k, 2, 3) array; k = 0 where there are none.
+    """Return ``_moments`` of the rests of the other recordings: (k, 3, 3) array; k = 0 where there are none.
 
     They are rests of the table's log; where there are none, ``by_hand`` takes the quietest tenth of recordings by hand,
     whose mean is not known (NaN).
@@ -242,9 +244,9 @@ def _rests_of(recordings: Sequence[Recording], sensor: str, *, by_hand: bool = T
             reading = recording.reading(sensor) if recording.role == "rests" else None
             if reading is None or len(blocks := _blocks(recording, reading)) < 10:
                 continue
-            scatter = np.percentile(blocks.std(axis=1, ddof=1), 10.0, axis=0)
-            found.append(np.stack([scatter, np.full(3, np.nan)])[None])
-    return np.concatenate(found) if found else np.zeros((0, 2, 3))
+            scatter, white, _ = np.percentile(_moments(blocks), 10.0, axis=0)
+            found.append(np.stack([scatter, white, np.full(3, np.nan)])[None])
+    return np.concatenate(found) if found else np.zeros((0, 3, 3))
 
 
 def _still_rows(recording: Recording) -> list[NDArray[np.intp]]:
@@ -258,8 +260,13 @@ def _still_rows(recording: Recording) -> list[NDArray[np.intp]]:
 
 
 def _moments(blocks: Array) -> Array:
-    """Return the standard deviations and means of (k, n, 3) blocks: (k, 2, 3) array."""
-    return np.stack([blocks.std(axis=1, ddof=1), blocks.mean(axis=1)], axis=1)
+    """Return scatter, white noise and mean of (k, n, 3) blocks: (k, 3, 3) array.
+
+    The white noise is that of successive differences, to which slow changes add nothing (J. von Neumann, Annals of
+    Mathematical Statistics 12 (1941), 367-395).
+    """
+    white = np.sqrt(np.mean(np.diff(blocks, axis=1) ** 2, axis=1) / 2.0)
+    return np.stack([blocks.std(axis=1, ddof=1), white, blocks.mean(axis=1)], axis=1)
 
 
 HALF_TURN_DEG = 180.0

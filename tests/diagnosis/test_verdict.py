@@ -60,7 +60,9 @@ def test_the_first_that_applies_is_said_with_its_numbers(evidence: Evidence, ver
     assert words in reason
     assert bool(words) == bool(reason)
     document: dict[str, Any] = {"verdict": evidence.found, "next_experiment": "none is needed", "unexplained": []}
-    said = judged(document | {"override": "effects.gyroscope=[g_sensitivity]"}, evidence)
+    nothing = {"effect": "g_sensitivity", "held_out_error_before": None, "held_out_error_after": None}
+    document |= {"selected": evidence.selected, "ranking": [nothing], "override": "effects.gyroscope=[g_sensitivity]"}
+    said = judged(document, evidence)
     step = said["next_experiment"]
     assert (step == "none is needed") == (verdict in {"nothing_missing", "missing_effect"} or verdict == evidence.found)
     assert bool(said["override"]) == (verdict == "missing_effect")
@@ -80,6 +82,20 @@ def test_a_recording_of_another_unit_is_unexplained_with_a_reason_and_nothing_is
     assert any(not entry["plausible"] for entry in found["ranking"] if entry["effect"] in found["selected"])
     row = summary_row("U1", {}, None, {"accelerometer": found}, {})
     assert (row["accelerometer_verdict"], row["accelerometer_selected"]) == ("unexplained", None)
+
+
+@pytest.mark.parametrize(
+    ("after", "implausible", "offered"),
+    [(0.2, (), True), (0.2, ("g_sensitivity",), False), (0.99, (), False), (None, (), False)],
+)
+def test_of_an_unexplained_sensor_only_what_held_out_motion_confirms_is_offered(
+    after: float | None, implausible: Any, offered: Any
+) -> None:
+    entry = {"effect": "g_sensitivity", "held_out_error_before": 1.0, "held_out_error_after": after}
+    document: dict[str, Any] = {"ranking": [entry], "selected": ["g_sensitivity"], "unexplained": []}
+    document |= {"verdict": "unexplained", "next_experiment": "", "override": "effects.gyroscope=[g_sensitivity]"}
+    said = judged(document, replace(MISSING, found="unexplained", implausible=implausible))
+    assert (said["verdict"], bool(said["override"])) == ("unexplained", offered)
 
 
 def test_only_held_out_errors_with_an_interval_decide() -> None:
