@@ -36,14 +36,8 @@ SENSORS = ("accelerometer", "gyroscope")
 class Change:
     """What differs between two states of a unit.
 
-    Attributes
-    ----------
-    added, removed : dict of str to list of str
-        Effects of each sensor.
-    settings : list of str
-        Other settings, each as ``key: before -> after``.
-    other : list of str
-        What else differs: recordings, configuration, whether the unit was calibrated.
+    ``added``, ``removed``: effects of each sensor; ``settings``: others, each as ``key: before -> after``; ``other``:
+    recordings, configuration, whether the unit was calibrated.
     """
 
     added: dict[str, list[str]]
@@ -65,15 +59,7 @@ class Change:
 def unit_state(
     calibration: JSON, validation: JSON | None, diagnosis: JSON | None, overrides: Mapping[str, str]
 ) -> JSON:
-    """Return the state of a unit.
-
-    Parameters
-    ----------
-    calibration, validation, diagnosis : dict
-        As in their files; the last two may be None.
-    overrides : mapping of str to str
-        Key to value of what overrides the unit's settings.
-    """
+    """Return the state of a unit, from its published documents and the overrides of its settings (key to value)."""
     files = "".join(str(f.get("sha256")) for f in calibration.get("inputs") or [])
     state = {
         "status": calibration.get("status"),
@@ -112,20 +98,19 @@ def read_history(results: Path) -> list[JSON]:
         except (OSError, ValueError, KeyError, TypeError):
             known = False
         if not known:
-            raise InputError("is no history of runs: remove it, or the whole folder to begin anew", str(file))
+            raise InputError("is no history of runs: remove it, or the whole folder", str(file))
         entries.append(entry)
     return sorted(entries, key=lambda e: int(e["run"]))
 
 
 def record(results: Path, units: Mapping[str, JSON], settings: Mapping[str, Any]) -> list[JSON]:
-    """Append the state of all units to the history, where it differs from the last one; return all entries.
+    """Append the states of the units (name to state) that differ from the last ones; return all entries.
 
     Parameters
     ----------
     results : Path
         Of the campaign.
     units : mapping of str to dict
-        Unit to its state.
     settings : mapping
         Of the run.
 
@@ -177,17 +162,14 @@ def difference(before: JSON, after: JSON) -> Change:
     same = not (settings or other or any(added.values()) or any(removed.values()))
     if before and same:
         moved = before.get("config_sha256") != after.get("config_sha256")
-        other.append("other values in the files of the configuration" if moved else "computed anew")
+        other.append("other values in the files of the configuration" if moved else "computed again")
     return Change(added, removed, settings, other)
 
 
 def dropped(entries: Sequence[JSON]) -> list[tuple[str, str, str, int]]:
     """Return which effects the last run no longer has: unit, sensor, effect, and the run before that had it."""
-    if not entries:
-        return []
-    found = []
-    states = of_units(entries)
-    for unit in entries[-1]["units"]:
+    found, states = [], of_units(entries)
+    for unit in entries[-1]["units"] if entries else []:
         if len(states[unit]) > 1:
             (run, before), (_, after) = states[unit][-2:]
             removed = difference(before, after).removed

@@ -70,7 +70,7 @@ def render(
         Of the run, for the commands to continue with.
     """
     findings = findings_of(rows)
-    table = pd.DataFrame(rows).reindex(columns=list(dict.fromkeys([*COLUMNS, *(k for row in rows for k in row)])))
+    frame = pd.DataFrame(rows).reindex(columns=list(dict.fromkeys([*COLUMNS, *(k for row in rows for k in row)])))
     judged = [row.get("pass") for row in rows]
     text: str = template("campaign.html").render(
         campaign=campaign,
@@ -87,14 +87,14 @@ def render(
         passed=judged.count(True),
         not_passed=judged.count(False),
         judged=any(row.get("pass") is not None for row in rows if row["status"] == "ok"),
-        fleet=[m for s in SENSORS if (m := _medians(s, "all units", table))],
-        lots=_lots(table),
+        fleet=[m for s in SENSORS if (m := _medians(s, "all units", frame))],
+        lots=_lots(frame),
         groups=[
             (f"Serial {serial}", [rows[i] for i in same.index])
-            for serial, same in table[table["serial"].fillna("") != ""].groupby("serial", sort=False)
+            for serial, same in frame[frame["serial"].fillna("") != ""].groupby("serial", sort=False)
             if len(same) > 1
         ],
-        figures=[f for sensor in SENSORS if (f := _fleet_figure(sensor, table))],
+        figures=[f for sensor in SENSORS if (f := _fleet_figure(sensor, frame))],
         statistics=statistics if statistics and len(rows) >= FEWEST_UNITS else None,
         far_shown=FAR_SHOWN,
         far=FAR,
@@ -124,9 +124,9 @@ def _causes(failures: list[JSON]) -> list[tuple[str, list[str]]]:
     return sorted(causes.items(), key=lambda c: -len(c[1]))
 
 
-def _medians(sensor: str, name: str, table: pd.DataFrame) -> JSON | None:
+def _medians(sensor: str, name: str, frame: pd.DataFrame) -> JSON | None:
     """Return the medians of the errors, the verdicts and the missing effects of some units."""
-    known = table[table[f"{sensor}_error_after"].notna()]
+    known = frame[frame[f"{sensor}_error_after"].notna()]
     if known.empty:
         return None
     figures = ("error_before", "error_after", "noise_floor")
@@ -145,15 +145,15 @@ def _medians(sensor: str, name: str, table: pd.DataFrame) -> JSON | None:
     }
 
 
-def _selected(sensor: str, table: pd.DataFrame) -> Counter[str]:
+def _selected(sensor: str, frame: pd.DataFrame) -> Counter[str]:
     """Return in how many units each effect is missing."""
-    names = (name for names in table[f"{sensor}_selected"].dropna() for name in str(names).split(";"))
+    names = (name for names in frame[f"{sensor}_selected"].dropna() for name in str(names).split(";"))
     return Counter(plain(name) for name in names if name)
 
 
-def _lots(table: pd.DataFrame) -> list[JSON]:
+def _lots(frame: pd.DataFrame) -> list[JSON]:
     """Return the medians lot by lot."""
-    lots = {lot: of for lot, of in table.groupby("lot", sort=False) if lot}
+    lots = {lot: of for lot, of in frame.groupby("lot", sort=False) if lot}
     if not 1 < len(lots) <= MOST_LOTS:
         return []
     return [m for s in SENSORS for lot, of in lots.items() if (m := _medians(s, f"lot {lot}", of))]
@@ -170,15 +170,15 @@ def _fleet_values(rows: list[JSON]) -> JSON:
     }
 
 
-def _fleet_figure(sensor: str, table: pd.DataFrame) -> Figure | None:
+def _fleet_figure(sensor: str, frame: pd.DataFrame) -> Figure | None:
     """Draw each unit's error before and after as a dot, in the order of ``units.csv``; None for few units."""
-    unit, order = SENSOR_UNITS[sensor], np.arange(1.0, len(table) + 1)
-    errors = (pd.to_numeric(table[f"{sensor}_{name}"]) for name in ("error_before", "error_after", "noise_floor"))
+    unit, order = SENSOR_UNITS[sensor], np.arange(1.0, len(frame) + 1)
+    errors = (pd.to_numeric(frame[f"{sensor}_{name}"]) for name in ("error_before", "error_after", "noise_floor"))
     before, after, floor = (v.where(v > 0).to_numpy(float) for v in errors)
     known = np.isfinite(after)
     if known.sum() < FEWEST_UNITS:
         return None
-    complete = known & (table[f"{sensor}_verdict"] == "nothing_missing").to_numpy(bool)
+    complete = known & (frame[f"{sensor}_verdict"] == "nothing_missing").to_numpy(bool)
     layers: list[Layer] = [Dots(order, before, 3), Dots(order, floor, 4)]
     legend = [("c3", "before"), ("c4", "noise floor")]
     for chosen, colour, name in (
@@ -188,11 +188,11 @@ def _fleet_figure(sensor: str, table: pd.DataFrame) -> Figure | None:
         if chosen.any():
             layers.append(Dots(order[chosen], after[chosen], colour))
             legend.append((f"c{colour}", name))
-    missing = _selected(sensor, table).most_common()
+    missing = _selected(sensor, frame).most_common()
     effects = ", ".join(f"{name} ({count} unit{'s' if count != 1 else ''})" for name, count in missing)
     words = f"Missing effects: {effects}." if effects else "No effect is named as missing."
     middle = [number(float(np.nanmedian(v))) if np.isfinite(v).any() else "not known" for v in (before, after, floor)]
-    finding = f"{sensor.capitalize()}: {_farthest(table['unit'].tolist(), after / floor, int(known.sum()))}"
+    finding = f"{sensor.capitalize()}: {_farthest(frame['unit'].tolist(), after / floor, int(known.sum()))}"
     drawn = chart(
         f"fleet-{sensor}",
         finding,

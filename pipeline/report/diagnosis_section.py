@@ -43,8 +43,8 @@ SIGNALS = {
     "temperature": "temperature, degC",
     "time": "time since power-on, s",
     "speed": "magnitude of the angular rate, deg/s",
-    "rate": "rate of the table, deg/s",
-    "angle": "table angle, deg",
+    "rate": "angular rate of the rate table, deg/s",
+    "angle": "angle of the rate table, deg",
     **{f"f{a}": f"specific force along {a}, g" for a in AXES},
     **{f"w{a}": f"angular rate about {a}, deg/s" for a in AXES},
 }

@@ -93,7 +93,7 @@ def _spread(values: pd.DataFrame) -> pd.Series:
 
 def _distributions(values: pd.DataFrame, _: pd.DataFrame) -> Iterable[tuple[str, JSON]]:
     low, middle, high = values.quantile([0.05, 0.5, 0.95]).to_numpy()
-    table = pd.DataFrame({
+    frame = pd.DataFrame({
         "median": middle,
         "robust_standard_deviation": _spread(values),
         "quantile_05": low,
@@ -101,7 +101,7 @@ def _distributions(values: pd.DataFrame, _: pd.DataFrame) -> Iterable[tuple[str,
         "smallest": values.min(),
         "largest": values.max(),
     })  # fmt: skip
-    for name, count, row in zip(table.index, values.count(), table.to_dict("records"), strict=True):
+    for name, count, row in zip(frame.index, values.count(), frame.to_dict("records"), strict=True):
         yield name, {"units": int(count), **row}
 
 
@@ -177,11 +177,11 @@ STATISTICS = {
 
 def missing_effects(rows: Sequence[JSON]) -> list[str]:
     """Return a sentence for each missing effect: in how many units, and from which lots."""
-    table = pd.DataFrame(rows).reindex(columns=["lot", *(f"{s}_{c}" for s in SENSORS for c in ("verdict", "selected"))])
-    lots = table["lot"].replace("", None).value_counts()
+    frame = pd.DataFrame(rows).reindex(columns=["lot", *(f"{s}_{c}" for s in SENSORS for c in ("verdict", "selected"))])
+    lots = frame["lot"].replace("", None).value_counts()
     sentences = []
     for sensor in SENSORS:
-        judged = table[table[f"{sensor}_verdict"].notna()]
+        judged = frame[frame[f"{sensor}_verdict"].notna()]
         effects = judged[f"{sensor}_selected"].fillna("").astype(str).str.split(";").explode()
         for name, count in effects[effects != ""].value_counts().items():
             of = judged.loc[effects.index[effects == name], "lot"].replace("", None).value_counts()

@@ -159,7 +159,7 @@ def held_out_over_time(
         panels,
         "time, s",
     )
-    what = "specific force minus gravity" if sensor == "accelerometer" else "angular rate minus the table's rate"
+    what = "specific force minus gravity" if sensor == "accelerometer" else "angular rate minus that of the rate table"
     caption = (
         f"Magnitude of the {what}, before and after calibration, in a recording that no fit used. Below: after "
         "calibration, with a band of ±2 noise floors."
@@ -184,9 +184,9 @@ def attitude_over_time(found: JSON) -> Figure | None:
     panels = [_attitude_panel(curve, "drift", "gyroscope alone, deg")]
     words = f"Gyroscope alone after {after}: {number(drift['before'])} deg before, {number(drift['after'])} deg after."
     caption = (
-        f"Angle to the table's attitude in {found['recording']}, which no fit used, on a logarithmic axis. Above: the "
-        f"gyroscope integrated from the table's attitude at the start (the figure of {after} is the root mean square "
-        "over all starts)."
+        f"Angle to the attitude of the rate table in {found['recording']}, which no fit used, on a logarithmic axis. "
+        f"Above: the gyroscope integrated from this attitude at the start (the figure of {after} is the root mean "
+        "square over all starts)."
     )
     if tilt:
         panels.append(_attitude_panel(curve, "tilt", "fused tilt, deg"))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from jinja2 import Environment, FileSystemLoader, Template
 from markupsafe import Markup
 
-from pipeline.report.numbers import measured, number, percent, plain, probability, typeset
+from pipeline.report.numbers import measured, number, percent, plain, probability, typeset, unit_text
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -38,7 +38,7 @@ def template(name: str) -> Template:
     """Return a template by its file name."""
     environment = _Pages(loader=FileSystemLoader(FOLDER), autoescape=True, trim_blocks=True, lstrip_blocks=True)
     filters = {"number": number, "measured": measured, "percent": percent, "probability": probability}
-    environment.filters.update(filters, typeset=typeset, words=plain, figure=_figure)
+    environment.filters.update(filters, typeset=typeset, words=plain, figure=_figure, unit=unit_text)
     environment.globals["asset"] = asset
     return environment.get_template(name)
 

@@ -74,83 +74,22 @@ def parameter_texts(parameters: JSON | None) -> list[str]:
     return texts
 
 
-def budget_of(part: JSON) -> JSON | None:
-    """Return what the table of the uncertainty budget shows, None where a calibration has none.
-
-    Parameters
-    ----------
-    part : dict
-        The sensor's part of the calibration.
+def monte_carlo_of(part: JSON) -> JSON | None:
+    """Return what the page shows of the Monte Carlo run beside the uncertainty budget; None where there is none.
 
     Returns
     -------
     dict or None
-        ``sources``: a row each; ``parameters``: a row each, with one cell for every source; ``not_included``;
-        ``trials``: the Monte Carlo run, or None.
+        ``finding``, a sentence, and ``rows``, the index of each uncertain parameter.
     """
-    budget = part.get("uncertainty_budget")
-    if not budget:
-        return None
-    lines = budget["contributions"]
-    return {
-        "sources": [_source(line) for line in lines],
-        "parameters": [
-            {
-                "name": _budget_name(name),
-                "unit": unit_text(unit),
-                "contributions": [number(line["contribution"][j], 2) for line in lines],
-                "standard": number(budget["standard_uncertainty"][j], 2),
-                "freedom": _freedom(budget["effective_degrees_of_freedom"][j]),
-                "factor": number(budget["coverage_factor"][j], 3),
-                "expanded": number(budget["expanded_uncertainty"][j], 2),
-            }
-            for j, (name, unit) in enumerate(zip(budget["parameters"], budget["units"], strict=True))
-        ],
-        "not_included": budget["not_included"],
-        "trials": _trials(budget),
-    }
-
-
-def _budget_name(name: str) -> str:
-    return plain(name).replace(".", ": ")
-
-
-def _freedom(value: float | None) -> str:
-    return "\N{INFINITY}" if value is None or value > 1e6 else number(value, 3)
-
-
-def _source(line: JSON) -> JSON:
-    """Return the row of one source; of its parts, those that contribute more than a thousandth of the largest."""
-    u = line["standard_uncertainty"]
-    worst = {name: max(values) for name, values in (line.get("parts") or {}).items()}
-    largest = max(worst.values(), default=0.0) or 1.0
-    return {
-        "name": line["source"],
-        "type": line["type"],
-        "distribution": line["distribution"],
-        "input": NOTHING if u is None else f"{number(u, 2)} {unit_text(line['unit'])}".rstrip(),
-        "inputs": NOTHING if u is None else line["independent_inputs"],
-        "remark": line.get("remark") or "",
-        "parts": [name for name, size in worst.items() if size > 1e-3 * largest],
-    }
-
-
-def _trials(budget: JSON) -> JSON | None:
-    """Return the Monte Carlo run as a sentence and a row for each uncertain parameter, None where there is none."""
+    budget = part.get("uncertainty_budget") or {}
     run = budget.get("monte_carlo")
     if not run:
         return None
     if not run["trials"]:
         return {"finding": f"No Monte Carlo run: {run['reason']}.", "rows": []}
-    rows = []
-    for j, name in enumerate(budget["parameters"]):
-        U = run["expanded_uncertainty"][j]
-        if U > 0.0:
-            ends = {end: run[end][j] - run["estimate"][j] for end in ("low", "high")}
-            row = {"name": _budget_name(name), "validated": run["validated"][j], "U": number(U, 2)}
-            row |= {end: f"{'+' if v > 0 else ''}{number(v, 2)}" for end, v in ends.items()}
-            rows.append(row | {key: number(run[key][j], 2) for key in ("d_low", "d_high", "tolerance")})
-    validated = sum(row["validated"] for row in rows)
+    rows = [j for j, U in enumerate(run["expanded_uncertainty"]) if U > 0.0]
+    validated = sum(run["validated"][j] for j in rows)
     digit = "second" if run["digits"] == 2 else "first"
     finding = (
         f"Monte Carlo, {run['trials']:,} trials: the interval of {validated} of {len(rows)} parameters agrees with the "

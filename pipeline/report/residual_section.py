@@ -7,9 +7,9 @@ The prediction passes the filter of the readings, so that the filter's lag is no
 Covariates: e is averaged in bins of angle, rate, force, temperature and time, with the standard error of white noise.
 The mean of ``(mean / standard error)^2`` is about 1 where e does not depend on the covariate, and orders the charts.
 
-Harmonics of the turn: ``e = sum_k a_k cos kA + b_k sin kA`` over the table angle A, amplitude ``sqrt(a_k^2 + b_k^2)``.
+Harmonics of the turn: ``e = sum_k a_k cos kA + b_k sin kA`` over the angle A of the rate table, amplitude ``sqrt(a_k^2 + b_k^2)``.
 1 cycle a turn is misalignment, tilt or encoder, 2 and 4 are quadratic nonlinearity or scale factor asymmetry, 3 is
-cubic nonlinearity; more are gears and steps of the table.
+cubic nonlinearity; more are gears and steps of the rate table.
 """
 
 from __future__ import annotations
@@ -337,7 +337,7 @@ def measurement_and_model(sensor: str, residual: Residual, noise: JSON | None) -
         f"{sensor}: measurement and model. {finding}",
         f"Root mean square of the residual: {', '.join(map(number, rms.tolist()))} {unit} on x, y, z.",
         panels,
-        "table angle, deg" if turns else "time, s",
+        "angle of the rate table, deg" if turns else "time, s",
         kind="angle" if turns else "",
     )
     return Figure(drawn, caption, (*AXES_LEGEND, ("c5", "model")), finding)

@@ -1,4 +1,4 @@
-"""One row a unit: ``summary.csv`` and the table of the campaign's page.
+"""One row a unit: ``summary.csv`` and the frame of the campaign's page.
 
 Columns: those of every campaign in the order of ``COLUMNS``, then the user's own columns of ``units.csv``. A column of
 the user's whose name is taken gets ``sheet_`` before it.
@@ -91,8 +91,8 @@ def write_summary(path: Path, rows: list[JSON]) -> None:
     import pandas as pd  # noqa: PLC0415  (0.4 s, and summary_row is used without it)
 
     columns = list(dict.fromkeys([*COLUMNS, *(key for row in rows for key in row)]))
-    table = pd.DataFrame([{key: _cell(value) for key, value in row.items()} for row in rows], columns=columns)
-    write_atomically(path, table.to_csv(index=False, lineterminator="\n"))
+    frame = pd.DataFrame([{key: _cell(value) for key, value in row.items()} for row in rows], columns=columns)
+    write_atomically(path, frame.to_csv(index=False, lineterminator="\n"))
 
 
 def _cell(value: object) -> object:

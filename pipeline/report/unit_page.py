@@ -23,7 +23,7 @@ from pipeline.report.held_out_section import (
 )
 from pipeline.report.noise_section import allan
 from pipeline.report.pages import template
-from pipeline.report.parameter_section import budget_of, convergence_of, matrix_rows, parameter_rows, stage_rows
+from pipeline.report.parameter_section import convergence_of, matrix_rows, monte_carlo_of, parameter_rows, stage_rows
 from pipeline.report.recording_section import environment, recording_rows, rest_rows, rests_logged, segments
 from pipeline.report.residual_section import measurement_and_model, residual_figures, residuals
 
@@ -127,7 +127,7 @@ def _sensor(
         "noise_figure": allan(sensor, recordings, noise, sheet, found.get("wander")),
         "matrix": matrix_rows(part),
         "parameters": parameter_rows(part, sheet),
-        "budget": budget_of(part),
+        "monte_carlo": monte_carlo_of(part),
         "convergence": convergence_of(part),
         "stages": stage_rows(part),
         "rests": rest_rows(part),

@@ -1,6 +1,6 @@
 "use strict";
-// Charts that answer: values at the pointer or by arrow keys, zoom by dragging, series that can be left out, a large view.
-// Everything is read back from the drawn paths and from data-scale (low, high, start, stop, kind, label) of each axis.
+// Interactive charts: values at the pointer or by arrow keys, zoom by dragging, series switched off, enlarged view.
+// Values are read from the drawn paths and from data-scale (low, high, start, stop, kind, label) of each axis.
 const SVG = "http://www.w3.org/2000/svg", SUBDIVISION = 10;
 const scaleOf = (element) => {
   const [low, high, start, stop, kind, ...label] = element.dataset.scale.split(",");

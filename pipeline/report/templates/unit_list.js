@@ -1,6 +1,6 @@
 "use strict";
-// Sorting tables, and the table of all units: only some of its rows stand in the page, as a browser lays out slowly what
-// it must show; the others wait in a template.
+// The list of all units: sorting and filter. Only some rows are in the page, as a browser lays out long tables slowly; the
+// others are in a template.
 const text = (row, column) => row.cells[column].textContent.trim().replaceAll("\u2212", "-");
 const collator = new Intl.Collator(undefined, { numeric: true });
 function sorted(rows, column, down) { // empty cells last
