@@ -7,7 +7,8 @@ The prediction passes the filter of the readings, so that the filter's lag is no
 Covariates: e is averaged in bins of angle, rate, force, temperature and time, with the standard error of white noise.
 The mean of ``(mean / standard error)^2`` is about 1 where e does not depend on the covariate, and orders the charts.
 
-Harmonics of the turn: ``e = sum_k a_k cos kA + b_k sin kA`` over the angle A of the rate table, amplitude ``sqrt(a_k^2 + b_k^2)``.
+Harmonics of the turn: ``e = sum_k a_k cos kA + b_k sin kA`` over the angle A of the rate table, with the amplitude
+``sqrt(a_k^2 + b_k^2)``.
 1 cycle a turn is misalignment, tilt or encoder, 2 and 4 are quadratic nonlinearity or scale factor asymmetry, 3 is
 cubic nonlinearity; more are gears and steps of the rate table.
 """
