@@ -36,14 +36,13 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
+    import pandas as pd
     from numpy.typing import NDArray
 
     from pipeline.thesis.results import JSON, Results
 
     Floats = NDArray[np.float64]
     from collections.abc import Mapping
-
-    from pipeline.thesis.seeds import Row
 
 
 @dataclass(frozen=True)
@@ -175,13 +174,13 @@ class Scatter:
         return float(np.sqrt(max(0.0, self.printed**2 - self.seeds[LOST] ** 2)))
 
 
-def scatters(printed: Path, rows: Sequence[Row]) -> list[Scatter]:
+def scatters(printed: Path, rows: pd.DataFrame) -> list[Scatter]:
     """Return the scatter of O, S and b of each device on the precise table.
 
     Parameters
     ----------
     printed : Path
-    rows : sequence of dict
+    rows : DataFrame
         Of the study over seeds.
     """
     tables = [row for table in read_printed(printed / "accel_parameters.csv").values() for row in table]
@@ -189,7 +188,7 @@ def scatters(printed: Path, rows: Sequence[Row]) -> list[Scatter]:
     for device in DEVICES:
         own = [r for r in tables if r["device"].lower() == device and r["rate_table"] == "acutronic"]
         sets = {set_of(r["device"], r["rate_table"], procedure_of(r)) for r in own}
-        found = [r for r in rows if r["set"] in sets and r["method"] == "printed"]
+        found = rows[rows["set"].isin(sets) & (rows["method"] == "printed")]
         for quantity in QUANTITIES:
             centre = _centre(device, quantity, own)
             unit = "_g" if quantity == "b" else ""
@@ -211,13 +210,12 @@ def _centre(device: str, quantity: str, printed: Sequence[Mapping[str, str]]) ->
     return dict(zip("xyz", TRUE_SCALE[device], strict=True))
 
 
-def _values(rows: Sequence[Row], quantity: str, centre: Mapping[str, float], cause: int) -> list[list[float]]:
-    factor = {"S": "M"}.get(quantity)
-    return [
-        [r[f"{quantity}_{a}"] * (r[factor] if factor else 1.0) for a in centre] for r in rows if r["cause"] == cause
-    ]
+def _values(rows: pd.DataFrame, quantity: str, centre: Mapping[str, float], cause: int) -> Floats:
+    own = rows[rows["cause"] == cause]
+    values = own[[f"{quantity}_{a}" for a in centre]].to_numpy()
+    return np.asarray(values * own[["M"]].to_numpy() if quantity == "S" else values)
 
 
-def _size(values: Sequence[Sequence[float]], centre: Mapping[str, float]) -> float:
+def _size(values: Sequence[Sequence[float]] | Floats, centre: Mapping[str, float]) -> float:
     deviation = np.array(values, float) - np.array(list(centre.values()))
     return float(np.sqrt(np.mean(deviation**2)))

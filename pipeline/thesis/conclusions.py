@@ -20,8 +20,9 @@ from pipeline.thesis.seeds import INTERVAL_S, TIME_CONSTANT_S
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
+    import pandas as pd
+
     from pipeline.report.comparison import Estimate
-    from pipeline.thesis.seeds import Row
 
 LOST = 2  # index in recorded.CAUSES: what the campaign has
 CONFIRMED, REFUTED, NONE, OPEN = "confirmed", "refuted", "no difference", "not decided"
@@ -89,29 +90,27 @@ class Conclusion:
 class Errors:
     """Held-out errors of the study by set, method and seed."""
 
-    def __init__(self, rows: Sequence[Row]) -> None:
-        self._errors: dict[tuple[str, str], dict[int, float]] = {}
-        for row in rows:
-            if row["cause"] == LOST and row["error"] is not None:
-                self._errors.setdefault((row["set"], row["method"]), {})[int(row["seed"])] = row["error"]
+    def __init__(self, rows: pd.DataFrame) -> None:
+        judged = rows[(rows["cause"] == LOST) & rows["error"].notna()]
+        self._errors = judged.set_index(["set", "method", "seed"])["error"].sort_index()
 
     def mean(self, name: str, method: str) -> Estimate:
         """Return the mean over seeds."""
-        return _mean(self._errors[name, method].values())
+        return _mean(self._errors[name, method])
 
     def line(self, what: str, smaller: tuple[str, str], larger: tuple[str, str]) -> Line:
         """Return the comparison of what the thesis says has the smaller and the larger error."""
         first = self._errors[smaller]
-        return _compared(what, first, self._errors[larger], SMALLEST * _mean(first.values()).value)
+        return _compared(what, first, self._errors[larger], SMALLEST * _mean(first).value)
 
     def growth(self, what: str, device: str, smaller: str, larger: str) -> Line:
         """Return the comparison of how two methods' errors grow from continuous 1 to 30 deg/s."""
         grown = []
         for method in (smaller, larger):
             slow, fast = (self._errors[f"{device}-continuous-{rate}dps", method] for rate in (1, 30))
-            grown.append({seed: fast[seed] - slow[seed] for seed in fast if seed in slow})
+            grown.append((fast - slow).dropna())
         fastest = self._errors[f"{device}-continuous-30dps", larger]
-        return _compared(what, grown[0], grown[1], SMALLEST * _mean(fastest.values()).value)
+        return _compared(what, grown[0], grown[1], SMALLEST * _mean(fastest).value)
 
     def extreme(self, names: Sequence[str], method: str, *, largest: bool) -> str:
         """Return the set with the smallest or the largest mean."""
@@ -124,22 +123,22 @@ def _mean(values: Iterable[float]) -> Estimate:
     return found
 
 
-def _compared(what: str, first: dict[int, float], second: dict[int, float], smallest: float) -> Line:
+def _compared(what: str, first: pd.Series[float], second: pd.Series[float], smallest: float) -> Line:
     """Compare what has the smaller with what has the larger value, seed by seed."""
-    difference = _mean(second[seed] - first[seed] for seed in first if seed in second)
+    difference = _mean((second - first).dropna())
     low, high = difference.interval
     verdict = CONFIRMED if low > 0.0 else REFUTED if high < 0.0 else OPEN
     if max(abs(low), abs(high)) < smallest:
         verdict = NONE
-    return Line(what, _mean(first.values()), _mean(second.values()), difference, verdict)
+    return Line(what, _mean(first), _mean(second), difference, verdict)
 
 
-def conclusions(rows: Sequence[Row]) -> list[Conclusion]:
+def conclusions(rows: pd.DataFrame) -> list[Conclusion]:
     """Return the verdicts on what the thesis concludes.
 
     Parameters
     ----------
-    rows : sequence of dict
+    rows : DataFrame
         Of the study over seeds.
     """
     errors = Errors(rows)

@@ -14,13 +14,12 @@ from pipeline.thesis.seeds import TIME_CONSTANT_S
 from pipeline.thesis.tables import read_printed
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
     from pathlib import Path
 
+    import pandas as pd
     from numpy.typing import NDArray
 
     from pipeline.thesis.results import Results
-    from pipeline.thesis.seeds import Row
 
 BANGKOK = 9.783  # m/s^2
 STANDARD = 9.80665  # m/s^2
@@ -36,14 +35,14 @@ class Erratum:
     evidence: str
 
 
-def errata(printed: Path, results: Results, rows: Sequence[Row]) -> list[Erratum]:
+def errata(printed: Path, results: Results, rows: pd.DataFrame) -> list[Erratum]:
     """Return the errata with their evidence.
 
     Parameters
     ----------
     printed : Path
     results : Results
-    rows : sequence of dict
+    rows : DataFrame
         Of the study over seeds.
     """
     return [
@@ -180,7 +179,7 @@ def _cosines(results: Results) -> Erratum:
     )
 
 
-def _delay(rows: Sequence[Row]) -> Erratum:
+def _delay(rows: pd.DataFrame) -> Erratum:
     errors = Errors(rows)
     methods = {"the filter": "staged", "one of the same gain without delay": "same-gain", "none": "unfiltered"}
     found = [

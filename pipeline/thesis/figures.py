@@ -26,10 +26,11 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
+    import pandas as pd
+
     from pipeline.records import Noise
     from pipeline.thesis.agreement import Scatter
     from pipeline.thesis.results import Results
-    from pipeline.thesis.seeds import Row
 
 PROCEDURES = {"accelerometer": (*STOPS, *CONTINUOUS), "gyroscope": RATES}
 BELOW = {
@@ -46,7 +47,7 @@ COLOURS = ("c0", "c1", "c2", "c3")
 
 
 def all_figures(
-    printed: Path, results: Results, rows: Sequence[Row], scatter: Sequence[Scatter], noise: Noise
+    printed: Path, results: Results, rows: pd.DataFrame, scatter: Sequence[Scatter], noise: Noise
 ) -> list[Figure]:
     """Return the figures in the order of the thesis's groups, numbered on the page.
 
@@ -54,7 +55,7 @@ def all_figures(
     ----------
     printed : Path
     results : Results
-    rows : sequence of dict
+    rows : DataFrame
         Of the study over seeds.
     scatter : sequence of Scatter
     noise : Noise
@@ -202,7 +203,7 @@ def _tables(results: Results, told: dict[tuple[str, str, str], float]) -> Figure
     return Figure(svg, "MPU6050 (1).", legend, "The home-made table leaves more of the error")
 
 
-def _speed(rows: Sequence[Row]) -> Figure:
+def _speed(rows: pd.DataFrame) -> Figure:
     """Draw the error of continuous rotation by rate, behind each filter."""
     errors = Errors(rows)
     points = []

@@ -85,7 +85,7 @@ def render(campaign: Path, folder: Path) -> str:
             for s in scatter
         ],
         causes=CAUSES,
-        seeds=len({r["seed"] for r in rows}),
+        seeds=rows["seed"].nunique(),
         cells=sum(t["cells"] for t in tables),
         large=sum(t["large"] for t in tables),
     )

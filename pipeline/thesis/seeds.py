@@ -21,12 +21,12 @@ table errs anew each time, and is simulated anew.
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 
 from pipeline.estimation.accelerometer import nonlinear_least_squares, staged
 from pipeline.estimation.accelerometer.turn_extremes import (
@@ -66,6 +66,7 @@ COLUMNS = ("set", "seed", "cause", "method", *FOUND, "error")
 TIME_CONSTANT_S = 0.12  # of campaign.yaml
 INTERVAL_S = 0.12  # of simulation.yaml
 SAME_GAIN_S = (np.sqrt(INTERVAL_S**2 + 2.0 * TIME_CONSTANT_S * (INTERVAL_S + TIME_CONSTANT_S)) - INTERVAL_S) / 2.0
+# Causes of disturbance; each includes those before it.
 SHEET = "noise of the data sheet, up to half the sampling rate"
 WHOLE = "noise of the sensor's whole bandwidth, folded into the samples"
 LOST = "and samples lost on the radio link"
@@ -119,7 +120,7 @@ class Drawn:
         chain = staged.Corrected()
         for name in staged.STAGES:
             chain = staged.follow(extremes, [name], 1.0, as_printed=as_printed, start=chain)
-            values = {k: v for k, (v, _) in chain.values.items()}
+            values = {k: v for k, (v, _) in chain.values.items()}  # noqa: PD011  (no DataFrame)
             for axis in "xyz":
                 if name == "bias":
                     row[f"b_{axis}"] = values[f"b_{axis}"]
@@ -238,24 +239,12 @@ def sets_of(campaign: Path) -> list[str]:
 
 def write_rows(path: Path, rows: Sequence[Row]) -> None:
     """Write rows as CSV, with five digits."""
-    with path.open("w", encoding="utf-8", newline="") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(COLUMNS)
-        for row in rows:
-            values = [row.get(c, "") for c in COLUMNS]
-            writer.writerow([f"{v:.5g}" if isinstance(v, float) else v for v in values])
+    pd.DataFrame(rows, columns=COLUMNS).to_csv(path, index=False, float_format="%.5g", lineterminator="\n")
 
 
-def read_rows(path: Path) -> list[Row]:
-    """Read rows back; a value that is not there is None."""
-    text = ("set", "method")
-    with path.open(encoding="utf-8", newline="") as stream:
-        return [
-            {k: v if k in text else float(v) if v else None for k, v in row.items()} for row in csv.DictReader(stream)
-        ]
-
-
-# What disturbs the readings, one cause after the other added.
+def read_rows(path: Path) -> pd.DataFrame:
+    """Read rows back; a value that is not there is NaN."""
+    return pd.read_csv(path)
 
 
 @dataclass(frozen=True)

@@ -134,7 +134,8 @@ def test_the_printed_advantage_over_cholesky_and_lu_is_the_missing_inversion(dev
 
 @pytest.mark.parametrize("name", ["mpu6050-2-continuous-30dps", "stim300-gyro-200dps"])
 def test_the_study_over_seeds_comes_out_as_it_is_kept(name: str) -> None:
-    kept = [row for row in read_rows(CAMPAIGN / "seeds.csv") if row["set"] == name and row["seed"] == 7]
+    rows = read_rows(CAMPAIGN / "seeds.csv")
+    kept = rows[(rows["set"] == name) & (rows["seed"] == 7)].to_dict("records")
     again = list(study(CAMPAIGN, [name], [7]))
     assert len(kept) == len(again) > 0
     for one, other in zip(kept, again, strict=True):
