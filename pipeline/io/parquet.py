@@ -1,7 +1,7 @@
 """Recordings to Parquet and back, one file a unit, its recordings one after the other.
 
 Columns that came as counts stay integers, ``value = (count - offset) * scale`` on loading; those that would not come
-back to the last bit are stored as doubles. Page checksums guard the data; a CRC-32 of every recording's columns and one
+back to the last bit are stored as doubles. Page checksums guard the data. A CRC-32 of each recording's columns and one
 of the metadata guard what page checksums do not cover (lengths, offsets, types, scales). Writing the same recordings
 again gives the same bytes.
 
@@ -17,7 +17,9 @@ from __future__ import annotations
 import json
 import os
 import zlib
+from contextlib import contextmanager
 from dataclasses import asdict
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,16 +31,17 @@ from pipeline.io.units import ACCELEROMETER, ATTITUDE, CHANNELS, GYROSCOPE, deco
 from pipeline.records import Encoding, Note, Recording
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 AGAIN = "the same command once more makes it again"
 ROW_GROUP = 1_000_000  # samples
 KEY, KEY_CRC = b"recordings", b"recordings_crc32"
 BLOCKS = {"accelerometer": ACCELEROMETER, "gyroscope": GYROSCOPE, "table_attitude": ATTITUDE}
+PLAIN = ("name", "role", "axis", "setup", "up", "source", "filter", "clock_shared")  # fields stored as JSON
 SINGLES = ("temperature", "table_angle", "table_rate", "flags")
 COLUMNS = ("time_ns", *CHANNELS, "flags")
 PAGE_ENCODINGS = {"f": "BYTE_STREAM_SPLIT", "i": "DELTA_BINARY_PACKED", "u": "PLAIN"}
@@ -83,39 +86,114 @@ def save_recordings(path: Path, recordings: Sequence[Recording]) -> None:
     temporary.replace(path)
 
 
-def load_recordings(path: Path, *, times_alone: bool = False) -> list[Recording]:
+def load_recordings(path: Path) -> list[Recording]:
     """Read the recordings of a unit, each bit as it was saved.
 
-    Parameters
-    ----------
-    path : Path
-    times_alone : bool
-        Leave out every column but the times, and with them the check of the whole: enough to say what was recorded.
+    The times are read at once, every other channel when it is used first: a stage decodes what it needs, once.
 
     Raises
     ------
     InputError
-        If the file does not exist, is damaged or of a schema that is not known.
+        If the file does not exist, is damaged or of a schema that is not known; here, or when a channel is used first.
     """
-    try:
-        with parquet.ParquetFile(path, page_checksum_verification=True) as file:
-            metadata = file.schema_arrow.metadata or {}
-            data = _checked_metadata(metadata, str(path))
-            table = file.read(["time_ns"] if times_alone else None, use_threads=False)
-    except InputError:
-        raise
-    except Exception as error:  # damaged lengths and names surface as errors of many kinds
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise DamagedFileError(f"cannot be read, it is missing or damaged ({reason}); {AGAIN}", str(path)) from error
-    recordings, start = [], 0
-    for entry in data["recordings"]:
-        if times_alone:
-            entry |= {"columns": ["time_ns"], "encodings": {}, "crc32": None}
-        recordings.append(_recording(entry, table.slice(start, entry["rows"]), str(path)))
+    stored = _StoredColumns(path)
+    recordings: list[Recording] = []
+    start = 0
+    for entry in stored.entries:
+        recordings.append(_StoredRecording.of(entry, stored, start))
         start += entry["rows"]
-    if start != table.num_rows:
-        raise _damaged(f"{table.num_rows} rows where {start} are expected", str(path))
+    if start != stored.rows:
+        raise stored.damaged(f"{stored.rows} rows where {start} are expected")
     return recordings
+
+
+class _StoredColumns:
+    """The columns of a file, each decoded once for all recordings."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = str(path)
+        with self._guarded():
+            self._file = parquet.ParquetFile(path, page_checksum_verification=True)
+            metadata, self.rows = self._file.schema_arrow.metadata or {}, self._file.metadata.num_rows
+        self._columns: dict[str, Any] = {}
+        text = metadata.get(KEY)
+        if text is None:
+            raise InputError("holds no recordings: it was not written by ingest or filter", self.path)
+        if metadata.get(KEY_CRC) != str(zlib.crc32(text)).encode():
+            raise self.damaged("its description does not match its checksum")
+        data: dict[str, Any] = json.loads(text)
+        if data["schema_version"] != SCHEMA_VERSION:
+            raise InputError(
+                f"schema_version {data['schema_version']} is not known to this version ({SCHEMA_VERSION}); "
+                "delete the results and run again",
+                self.path,
+            )
+        self.entries: list[dict[str, Any]] = data["recordings"]
+
+    def read(self, entry: dict[str, Any], names: Sequence[str], start: int) -> list[NDArray[Any]]:
+        """Return columns of the recording whose rows begin at ``start``."""
+        new = [name for name in names if name not in self._columns]
+        if new:
+            with self._guarded():
+                table = self._file.read(new, use_threads=False)
+                for name in new:
+                    column = table.column(name)
+                    self._columns[name] = column if column.null_count else column.to_numpy()
+        return [self._part(entry, name, start) for name in names]
+
+    def _part(self, entry: dict[str, Any], name: str, start: int) -> NDArray[Any]:
+        """Return the rows of a recording in a decoded column."""
+        rows, column = entry["rows"], self._columns[name]
+        if not isinstance(column, np.ndarray):  # other recordings lack it: their rows are null
+            column, start = column.slice(start, rows).to_numpy(), 0
+        part: NDArray[Any] = column[start : start + rows]
+        if len(part) != rows or zlib.crc32(part.view(np.uint8).data) != entry["crc32"][name]:
+            raise self.damaged(f"{name} of the recording {entry['name']} does not match its checksum")
+        if name in entry["encodings"]:
+            return decode(part.astype(np.float64), Encoding(**entry["encodings"][name]))
+        return part
+
+    def damaged(self, reason: str) -> DamagedFileError:
+        """Return the error of a damaged file."""
+        return DamagedFileError(f"the file is damaged: {reason}; {AGAIN}", self.path)
+
+    @contextmanager
+    def _guarded(self) -> Iterator[None]:
+        """Name the file where pyarrow fails: damaged lengths and names surface as errors of many kinds."""
+        try:
+            yield
+        except Exception as error:
+            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            what = f"cannot be read, it is missing or damaged ({reason}); {AGAIN}"
+            raise DamagedFileError(what, self.path) from error
+
+
+class _StoredRecording(Recording):
+    """A recording whose channels, below, are decoded when they are used first."""
+
+    @classmethod
+    def of(cls, entry: dict[str, Any], stored: _StoredColumns, start: int) -> Recording:
+        """Return the recording that an entry of the file's description describes."""
+        recording = cls.__new__(cls)
+        vars(recording).update(
+            {n: entry[n] for n in PLAIN},
+            time_ns=stored.read(entry, ["time_ns"], start)[0],
+            notes=tuple(Note(**n) for n in entry["notes"]),
+            encodings={n: Encoding(**e) for n, e in entry["encodings"].items()},
+            stored=lambda names: stored.read(entry, names, start) if names[0] in entry["crc32"] else None,
+        )
+        return recording
+
+    def channels(self, names: Sequence[str]) -> NDArray[Any] | None:
+        """Return a channel, or a block of three or four; None if the file does not hold it."""
+        columns = vars(self)["stored"](names)
+        return None if columns is None else columns[0] if len(names) == 1 else np.column_stack(columns)
+
+
+for _name, _channels in {**BLOCKS, **{name: (name,) for name in SINGLES}}.items():
+    _property = cached_property(partial(_StoredRecording.channels, names=_channels))
+    _property.__set_name__(_StoredRecording, _name)
+    setattr(_StoredRecording, _name, _property)
 
 
 def _columns_of(recording: Recording) -> dict[str, NDArray[Any]]:
@@ -158,19 +236,11 @@ def _metadata(
 ) -> dict[bytes, bytes]:
     entries = [
         {
-            "name": recording.name,
-            "role": recording.role,
-            "axis": recording.axis,
-            "setup": recording.setup,
-            "up": recording.up,
+            **{name: getattr(recording, name) for name in PLAIN},
             "rows": recording.samples,
-            "columns": list(columns),
-            "crc32": _crc(columns.values()),
+            "crc32": {n: zlib.crc32(column.view(np.uint8).data) for n, column in columns.items()},
             "encodings": {n: asdict(e) for n, e in sorted(recording.encodings.items()) if n in counts},
-            "source": recording.source,
             "notes": [asdict(n) for n in recording.notes],
-            "filter": recording.filter,
-            "clock_shared": recording.clock_shared,
         }
         for recording, columns in zip(recordings, stored, strict=True)
     ]
@@ -185,61 +255,3 @@ def _plain(value: object) -> object:
     if isinstance(value, np.ndarray):
         return value.tolist()
     raise TypeError(f"{type(value).__name__} cannot be stored in a recording's metadata")
-
-
-def _crc(columns: Iterable[NDArray[Any]]) -> int:
-    value = 0
-    for column in columns:
-        value = zlib.crc32(np.ascontiguousarray(column).view(np.uint8).data, value)
-    return value
-
-
-def _checked_metadata(metadata: dict[bytes, bytes], path: str) -> dict[str, Any]:
-    text = metadata.get(KEY)
-    if text is None:
-        raise InputError("holds no recordings: it was not written by ingest or filter", path)
-    if metadata.get(KEY_CRC) != str(zlib.crc32(text)).encode():
-        raise _damaged("its description does not match its checksum", path)
-    data: dict[str, Any] = json.loads(text)
-    if data["schema_version"] != SCHEMA_VERSION:
-        raise InputError(
-            f"schema_version {data['schema_version']} is not known to this version ({SCHEMA_VERSION}); "
-            "delete the results and run again",
-            path,
-        )
-    return data
-
-
-def _recording(entry: dict[str, Any], table: Any, path: str) -> Recording:  # noqa: ANN401  (pyarrow has no types)
-    missing = sorted(set(entry["columns"]) - set(table.column_names))
-    if missing or table.num_rows != entry["rows"]:
-        raise _damaged(f"columns {missing} missing, or {table.num_rows} rows of {entry['rows']}", path)
-    columns = {n: table.column(n).to_numpy() for n in entry["columns"]}
-    if entry["crc32"] not in {None, _crc(columns.values())}:
-        raise _damaged(f"recording {entry['name']} does not match its checksum", path)
-    encodings = {n: Encoding(**e) for n, e in entry["encodings"].items()}
-    for name, encoding in encodings.items():
-        columns[name] = decode(columns[name].astype(np.float64), encoding)
-    blocks = {
-        name: np.column_stack([columns[c] for c in channels]) if channels[0] in columns else None
-        for name, channels in BLOCKS.items()
-    }
-    return Recording(
-        name=entry["name"],
-        role=entry["role"],
-        axis=entry["axis"],
-        setup=entry.get("setup", ""),
-        up=entry.get("up", ""),
-        time_ns=columns["time_ns"],
-        **blocks,
-        **{n: columns.get(n) for n in SINGLES},
-        source=entry["source"],
-        notes=tuple(Note(**n) for n in entry["notes"]),
-        filter=entry["filter"],
-        encodings=encodings,
-        clock_shared=entry["clock_shared"],
-    )
-
-
-def _damaged(reason: str, path: str) -> DamagedFileError:
-    return DamagedFileError(f"the file is damaged: {reason}; {AGAIN}", path)

@@ -98,5 +98,5 @@ def inputs(path: Path) -> list[dict[str, Any]]:
             "duration_s": round(float(r.time[-1] - r.time[0]), 6) if r.samples else 0.0,
             "notes": [vars(n) for n in r.notes],
         }
-        for r in load_recordings(path, times_alone=True)
+        for r in load_recordings(path)
     ]

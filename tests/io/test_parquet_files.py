@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from pyarrow import parquet
-from sample_logs import SENSOR, assert_same_bits, make_recording, procedure, profile
+from sample_logs import SENSOR, assert_same_bits, channels, make_recording, procedure, profile
 
 from pipeline.errors import InputError
 from pipeline.io.parquet import load_recordings, save_recordings
@@ -158,6 +158,8 @@ def test_flipped_bit_never_changes_a_value_in_silence(tmp_path: Path) -> None:
         file.write_bytes(damaged)
         try:
             loaded = load_recordings(file)
+            for recording in loaded:
+                channels(recording)  # each is decoded when it is used first
         except InputError:
             refused += 1
             continue
@@ -180,6 +182,24 @@ def test_file_that_ends_early_is_refused(tmp_path: Path) -> None:
         file.write_bytes(whole[:length])
         with pytest.raises(InputError, match="missing or damaged"):
             load_recordings(file)
+
+
+def test_a_channel_is_decoded_when_it_is_used_first_and_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    decoded: list[list[str] | None] = []
+    read = parquet.ParquetFile.read
+
+    def counted(self: Any, columns: list[str] | None = None, **options: Any) -> Any:
+        decoded.append(columns)
+        return read(self, columns, **options)
+
+    monkeypatch.setattr(parquet.ParquetFile, "read", counted)
+    save_recordings(tmp_path / "a.parquet", unit())
+    loaded = load_recordings(tmp_path / "a.parquet")
+    assert [r.samples for r in loaded] == [120, 7, 33]
+    assert decoded == [["time_ns"]]
+    for recording in loaded * 2:
+        assert recording.accelerometer is not None
+    assert decoded[1:] == [["accel_x", "accel_y", "accel_z"]]
 
 
 def test_missing_file_is_refused(tmp_path: Path) -> None:
