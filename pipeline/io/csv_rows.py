@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 
 LINES_BELOW = 60  # after a header that lacks columns, searched for one that has them
 LINES, EXACT = -1, -2  # in place of a column's index: numbers of the lines, times in ns
+LONGEST_HEAD = 1 << 24  # bytes, before the first row
 MOST_REFUSED = 10_000  # bad lines after which the rest of the file is not searched for more
 
 
@@ -148,6 +149,7 @@ class _RowReader:
         self.row_count = 0  # bad ones as well
         self.columns = _Columns()
         self.faults: list[Fault] = []
+        self.refused: list[Fault] = []
         self.last_row: tuple[int, str] | None = None
 
     def add(self, data: bytes, lines: range) -> None:
@@ -157,6 +159,8 @@ class _RowReader:
             return
         self.head += data
         found = self._find_layout()
+        if found is None and len(self.head) > LONGEST_HEAD:
+            raise self._no_rows()
         if found is not None:
             self.layout, self.head = found[0], b""
             self._add_rows(*found)
@@ -284,10 +288,13 @@ class _RowReader:
         self, layout: Layout, body: bytes, lines: NDArray[np.int64]
     ) -> tuple[bytes, NDArray[np.int64], dict[int, NDArray[np.float64]]]:
         """Return the valid rows of a block, and keep the faults of the others."""
-        found = list(find_faults(layout, body, lines, self.last_row))
+        found = []
+        for fault in find_faults(layout, body, lines, self.last_row):
+            found.append(fault)
+            self.refused += [fault] if fault.kind not in self.allowed else []
+            if len(self.refused) > MOST_REFUSED:
+                raise refusal(layout, self.refused, more=True)
         self.faults += found
-        if sum(f.kind not in self.allowed for f in self.faults) > MOST_REFUSED:
-            raise refusal(layout, [f for f in self.faults if f.kind not in self.allowed], more=True)
         bad = np.isin(lines, [f.line for f in found if not f.parted_before])
         parts = body.split(b"\n")
         self.last_row = None if bad[-1] else (int(lines[-1]), parts[-2].decode("utf-8", "replace"))
@@ -324,7 +331,7 @@ class _RowReader:
         cut = {final.line} if final.short and final.line == end else set()
         tail = [f for f in self.faults if f.line in cut or f.parted_before in cut]
         others = [f for f in self.faults if f not in tail and f.kind != "restarted"]
-        refused = [f for f in self.faults if f not in tail and f.kind not in self.allowed]
+        refused = [f for f in self.refused if f not in tail]
         if refused:
             raise refusal(layout, refused)
         if len(others) > checks.repaired_rows * self.row_count:

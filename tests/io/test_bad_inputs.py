@@ -12,6 +12,7 @@ from bad_logs import FILE, TABLE_ANGLE, VALUES, Case, cases
 from sample_logs import SENSOR, procedure
 
 from pipeline.errors import ConfigurationError, InputError, MissingInputError
+from pipeline.io import text_blocks
 from pipeline.io.csv_parse import Layout
 from pipeline.io.ingest_settings import check_ingest
 from pipeline.io.parquet import load_recordings, save_recordings
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from pipeline.records import Recording
 
 CASES = cases()
+OF_LINES = ("05", "07", "08", "09", "10", "12", "13", "15", "17", "24", "25", "34", "35")
 PAGE = Path(__file__).parents[2] / "docs" / "bad_inputs.md"
 
 
@@ -98,6 +100,21 @@ def test_bad_input_is_repaired_with_a_note_that_travels(tmp_path: Path, number: 
     for row, bit in case.flags.items():
         assert found.flags is not None
         assert found.flags[row] & bit, (row, bit)
+
+
+@pytest.mark.parametrize("number", [n for n in CASES if n[:2] in OF_LINES])
+def test_the_size_of_the_blocks_changes_nothing(tmp_path: Path, number: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    case = CASES[number]
+    write(tmp_path, case, number)
+    results = []
+    for size in (1 << 20, 20_011):
+        monkeypatch.setattr(text_blocks, "BLOCK_BYTES", size)
+        try:
+            found = read(tmp_path, case)
+            results.append((found.notes, found.time_ns.tolist(), str(found.accelerometer), str(found.gyroscope)))
+        except (InputError, ConfigurationError) as error:
+            results.append((error.code, error.message, error.file))
+    assert results[0] == results[1]
 
 
 def test_notes_on_rows_name_their_lines_and_times(tmp_path: Path) -> None:
