@@ -48,7 +48,7 @@ class Format(BaseModel):
     matrix : dict
         Sensor to what the format holds of its matrix; ``full`` by default.
     holds : list of str
-        Effects that the format carries, beside bias and matrix; ``any``: the template deals with all of them.
+        Effects that the format carries in addition to bias and matrix; ``any``: the template deals with all of them.
     approximates : dict of str to str
         Effect that the format carries in part, to how well.
     says, adds, adds_with_temperature : list of str

@@ -114,7 +114,7 @@ class EncoderTrajectory:
         return np.where(whole, step, s), np.where(whole, mean, a), np.where(whole, mean, b), bent
 
     def _at_samples(self, slope: Values) -> Values:
-        """Return the acceleration at the samples: of an explained interval beside it, else of the nearest rates."""
+        """Return the acceleration at the samples: of an adjacent explained interval, else by the nearest rates."""
         known = np.zeros((2, len(self.time)))
         weight = np.zeros((2, len(self.time)))
         known[0, :-1], weight[0, :-1] = self._before, self.explained

@@ -106,14 +106,14 @@ def compensate(
     motion: Motion,
     effects: Sequence[FittedEffect] | None = None,
 ) -> NDArray[np.float64]:
-    """Return the truth that a sensor's readings tell, beside a motion that is known otherwise.
+    """Return the truth by a sensor's readings; the rest of the motion is known.
 
     Parameters
     ----------
     calibration : SensorCalibration
     reading : (n, 3) array, g or deg/s
     motion : Motion
-        Its truth of this very sensor is not looked at: that is solved for.
+        Its truth of this sensor is not used: it is solved for.
     effects : sequence of FittedEffect, optional
         Those to take off; by default all of the calibration that belong to the sensor.
 

@@ -1,15 +1,15 @@
-"""Effects of one setup: of a table, of a mounting or of a switching-on that a part of the recordings has to itself.
+"""Effects of one session: of one table, one mounting or one switching-on, where the recordings come from several.
 
-    z = z_effect where the recording was made in that setup, 0 elsewhere
+    z = z_effect in the recordings of that session, 0 in the others
 
-A procedure names the setup of each recording; ``<effect>@<setup>`` is the effect there. So recordings on several tables
-or in several sessions are one estimate of one sensor, with what is each table's own beside it. Two more exist in a
-setup alone, as in a single one they are the matrix and the bias:
+A procedure names the session of each recording (``setup``); ``<effect>@<setup>`` is the effect there. So recordings of
+several sessions give one estimate of one sensor, together with the errors of each table. Two effects exist in a session
+only; in a single session they are part of the matrix and of the bias:
 
-    mounting : z = K (exp([theta]x)^T - 1) u: the unit is turned by the vector theta, deg, against where it was
-    bias     : z = db: the bias is another one, as after switching off and on
+    mounting : z = K (exp([theta]x)^T - 1) u: the unit is rotated by the vector theta, deg, against the other sessions
+    bias     : z = db: the bias has changed, as after switching off and on
 
-One setup is without them, the reference of the others. The leans of a table's axes contain the mounting.
+One session is without them: the reference of the others. The leans of a table's axes contain the mounting.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ if TYPE_CHECKING:
     Values = NDArray[np.float64]
 
 SEPARATOR = "@"
-STEP_DEG = 1e-3
+STEP_DEG = 1e-3  # of the central difference of a rotation: its error is (step^2 / 6) rad = 5e-11
 EXPERIMENT = "the same turns in another setup"
 
 
 class _Mounting(Effect):
-    """How a setup holds the unit, against the others."""
+    """The mounting of a session against that of the others."""
 
     name = "mounting"
     owner = Owner.MOUNTING
@@ -63,7 +63,7 @@ class _Mounting(Effect):
 
 
 class _Bias(Effect):
-    """The difference of a setup's bias to that of the others."""
+    """The difference of the bias of a session to that of the others."""
 
     name = "bias"
     owner = Owner.MOUNTING

@@ -1,7 +1,7 @@
 """The catalogue of physical effects: every file of ``configs/effect/`` that ships is one.
 
-There is no list to extend: ``catalogue()`` finds the files. Effects of a user's own, of the same schema, are registered
-beside them; they are known to this process alone.
+There is no list to extend: ``catalogue()`` finds the files. Effects of a user's own have the same schema; they are
+registered in the process that uses them.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def catalogue() -> dict[str, Effect]:
 
 @contextmanager
 def leaving_out(names: Iterable[str]) -> Iterator[None]:
-    """Take effects out of the catalogue for a while, as if nobody knew of them; for studies of the diagnosis."""
+    """Take effects out of the catalogue for a while, as unknown effects in studies of the diagnosis."""
     fresh = set(names) - _left_out
     _left_out.update(fresh)
     try:

@@ -1,14 +1,12 @@
-"""What an effect is.
-
-An effect adds to the reading of a sensor:
+"""The interface of an effect: what every physical effect on the readings of a sensor provides.
 
     reading = bias + K @ truth + z(motion, K; p),    K = matrix^-1
 
-where ``p`` are its parameters and ``z`` vanishes at ``p = 0``. It says its value and its derivative; both in the
-measurement direction, from a motion that has no noise, so that fitting it is linear wherever the physics is.
+where ``p`` are the parameters of the effect and ``z`` vanishes at ``p = 0``. An effect provides z and dz/dp, as functions
+of a motion without noise, so that its fit is linear wherever the physics is.
 
-Effects of timing move the motion instead: ``reading(t) = bias + K @ truth' + z(motion')``, where the primed motion is
-what the sensor felt at the sample's time stamp (``Effect.moved``).
+Effects of timing change the motion instead: ``reading(t) = bias + K @ truth' + z(motion')``, where the primed motion acts
+on the sensor at the sample's time stamp (``Effect.moved``).
 """
 
 from __future__ import annotations
@@ -69,7 +67,7 @@ class Effect(abc.ABC):
         The sensors to which it applies.
     layout : Layout
     needs : tuple of str
-        What the recording must hold beside a motion: ``temperature``, ``angle``, ``rate``, ``level``.
+        What the recording must hold in addition to a motion: ``temperature``, ``angle``, ``rate``, ``level``.
     needs_clock : bool
         Whether the time between the recordings must be known.
     needs_motion : bool
@@ -157,7 +155,7 @@ class Effect(abc.ABC):
         return added
 
     def moved(self, motion: Motion, values: NDArray[np.float64]) -> Motion:
-        """Return the motion that the sensor felt at the time stamps; effects that are not of timing leave it."""
+        """Return the motion that acts on the sensor at the time stamps; only effects of timing change it."""
         del values
         return motion
 

@@ -281,7 +281,7 @@ def _contradiction(declared: Declaration) -> tuple[tuple[str, ...], str] | None:
 
 
 def _wrong_term(declared: Declaration, name: str, term: Term) -> tuple[tuple[str, ...], str] | None:
-    """Return what is wrong with one term beside the rest of the file."""
+    """Return how one term contradicts the rest of the file."""
     path = ("terms", name)
     not_in_a_log = sorted(s for s in term.signals if not SIGNALS[s].c)
     if not term.signals:

@@ -19,6 +19,7 @@ import numpy as np
 
 from pipeline.model.effects.base import Layout, truth, truth_rate
 from pipeline.model.effects.formula_effect import DeclaredEffect
+from pipeline.model.kinematics import NODES, WEIGHTS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
     from pipeline.records import Motion
 
 PPM = 1e-6
-NODES, WEIGHTS = np.polynomial.laguerre.laggauss(4)
 STEP_S = 1e-5  # of the central difference: its rounding is 1e-11 of u per second
 
 
@@ -163,7 +163,7 @@ class LowPassLag(_Timing):
         return np.asarray(slope @ K.T)[:, :, None]
 
     def moved(self, motion: Motion, values: NDArray[np.float64]) -> Motion:
-        """Return the motion that a sensor with this lag feels."""
+        """Return the motion behind a first-order lag."""
         if values[0] <= 0.0:
             return motion
         if motion.at_lag is not None:
@@ -195,5 +195,5 @@ class LowPassLag(_Timing):
     def _moved_at(
         self, motion: Motion, values: NDArray[np.float64], offset: float | NDArray[np.float64] = 0.0
     ) -> Motion:
-        """Return what the sensor feels at ``time + offset``."""
+        """Return the motion behind the lag at ``time + offset``."""
         return self.moved(shifted(motion, offset), values)
