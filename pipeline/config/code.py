@@ -12,11 +12,13 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipeline.files import CONFIGS
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
 PACKAGE = Path(__file__).resolve().parents[1]
-EFFECTS = PACKAGE.parent / "configs" / "effect"  # what pipeline.model.effects.files reads
+EFFECTS = CONFIGS / "effect"  # what pipeline.model.effects.files reads
 
 
 @cache

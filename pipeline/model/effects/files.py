@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from pipeline.errors import ConfigurationError, MissingInputError, PipelineError
+from pipeline.files import CONFIGS
 from pipeline.io.files import read_text
 from pipeline.io.yaml_file import load_yaml
 from pipeline.model.effects.base import Effect
@@ -29,7 +30,7 @@ from pipeline.model.effects.formula_effect import FormulaEffect
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-FOLDER = Path(__file__).resolve().parents[3] / "configs" / "effect"
+FOLDER = CONFIGS / "effect"
 BUILT_IN = re.compile(r"^built_in: true", re.MULTILINE)
 LARGEST_BYTES, LARGEST_SIZE = 16384, 1000  # of one file; the largest that ships has 2 kB and 70 values
 OF_PYTHON = ("name", "owner", "layout", "meaning", "excitation", "experiment", "source")
