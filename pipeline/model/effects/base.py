@@ -2,8 +2,8 @@
 
     reading = bias + K @ truth + z(motion, K; p),    K = matrix^-1
 
-where ``p`` are the parameters of the effect and ``z`` vanishes at ``p = 0``. An effect provides z and dz/dp for a motion
-without noise, so that its fit is linear wherever the physics is.
+where ``p`` are the parameters of the effect and ``z`` vanishes at ``p = 0``. An effect provides z and dz/dp for a
+motion without noise, so that its fit is linear wherever the physics is.
 
 Effects of timing change the motion instead: ``reading(t) = bias + K @ truth' + z(motion')``, where the primed motion
 acts on the sensor at the sample's time stamp (``Effect.moved``).
