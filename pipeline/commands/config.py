@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from pipeline.config.campaign import find_campaign, load_layers
+from pipeline.config.campaign import find_campaign
 from pipeline.config.compose import Composer, Problem, nearest, parse
+from pipeline.config.layers import load_layers
 from pipeline.config.origins import trace
+from pipeline.config.sheet import read_sheet
 from pipeline.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -31,7 +33,8 @@ def main(argv: Sequence[str]) -> int:
     arguments = parser.parse_args(argv)
     directory = find_campaign(arguments.campaign)
     composer = Composer(directory, arguments.python_effect)
-    layers, _ = load_layers(directory, {"overrides": arguments.overrides}, composer)
+    given = {"overrides": arguments.overrides}
+    layers = load_layers(directory, given, read_sheet(directory / "units.csv"), composer.options["sensor"])
     if arguments.unit not in layers.sheet.rows:
         known = nearest(arguments.unit, layers.sheet.rows)
         raise ConfigurationError(f"no unit {arguments.unit!r}{known}", str(directory / "units.csv"))

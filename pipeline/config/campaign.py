@@ -10,10 +10,9 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.config.campaign_file import as_list, read_campaign_file, split_run_settings
 from pipeline.config.comparisons import resolve_comparisons
 from pipeline.config.compose import Composer, Problem, default_of_run, nearest, parse
-from pipeline.config.layers import Layers, check_models_and_lots, read_devices, unit_overrides
+from pipeline.config.layers import as_list, load_layers
 from pipeline.config.sheet import read_sheet
 from pipeline.config.stage_settings import config_sha256
 from pipeline.config.user_effects import PYTHON
@@ -129,9 +128,8 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
     for name in (str(directory), str(settings.get("results", ""))):
         if any(unicodedata.category(character) in ("Cc", "Cs") for character in name):
             raise ConfigurationError(f"{name!r}: a path without control characters, in UTF-8, is expected; rename it")
-    composer = Composer(directory, as_list(settings.get(PYTHON, []), PYTHON, "paths of Python files"))
-    layers, of_run = load_layers(directory, settings, composer)
-    own_file = layers.campaign
+    composer = Composer(directory, as_list(settings.get(PYTHON, []), PYTHON, "a list of paths of Python files"))
+    layers = load_layers(directory, settings, read_sheet(directory / "units.csv"), composer.options["sensor"])
     units: dict[str, UnitRow] = {}
     problems: dict[str, list[str]] = {}
     for name, row in layers.sheet.rows.items():
@@ -144,9 +142,9 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
                 problems.setdefault(line, []).append(name)
     if problems:
         raise ConfigurationError(_one_message(problems), str(directory / "units.csv"))
-    batches, chains = cut_batches(units, batch_size(of_run))
+    batches, chains = cut_batches(units, batch_size(layers.of_run))
     results = Path(str(settings.get("results", "results"))) / directory.name
-    compare = resolve_comparisons(own_file.compare, units, str(directory / "campaign.yaml"))
+    compare = resolve_comparisons(layers.campaign.compare, units, str(directory / "campaign.yaml"))
     return Campaign(
         directory.name,
         directory,
@@ -155,22 +153,10 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
         batches,
         chains,
         compare,
-        own_file.simulation,
+        layers.simulation,
         settings,
-        own_file.page,
+        layers.campaign.page,
     )
-
-
-def load_layers(directory: Path, settings: Mapping[str, Any], composer: Composer) -> tuple[Layers, list[str]]:
-    """Return the overrides of all units, and those of the run."""
-    sheet = read_sheet(directory / "units.csv")
-    file = directory / "campaign.yaml"
-    own_file = read_campaign_file(file)
-    check_models_and_lots(own_file, sheet, composer.options["sensor"], str(file))
-    from_command = as_list(settings.get("overrides", []), "overrides")
-    per_unit = unit_overrides(settings.get("unit_overrides", {}), sheet.rows)
-    of_run, from_command = split_run_settings([*own_file.of_run, *from_command])
-    return Layers(sheet, own_file, read_devices(directory, sheet), from_command, per_unit), of_run
 
 
 def find_campaign(name: str) -> Path:

@@ -1,35 +1,81 @@
-"""The overrides of each unit, layer by layer, weakest first, each with the place that it comes from.
+"""The overrides of each unit, weakest first, each with the place where it stands.
 
     campaign.yaml < models < lots < devices/<name>.yaml < units.csv < overrides= < unit_overrides=
 
 where
 
     models, lots : keys of ``campaign.yaml``: the name of a sensor config, or a lot of ``units.csv``, to overrides
-    devices      : folder of the campaign with a file ``{overrides: [...]}`` for a serial or a unit of ``units.csv``;
-                   the file of a unit is stronger than that of its serial
+    devices      : folder with a file ``{overrides: [...]}`` for a serial or a unit of ``units.csv``; the file of a unit
+                   is stronger than that of its serial
     units.csv    : the columns that name a config of a group, then those of the column ``overrides``
+
+``campaign.yaml``, all of it optional::
+
+    overrides: [filter=rc_low_pass]   # Hydra overrides of every unit, and settings of the run
+    models: {mpu6050: [filter=none]}  # of the units of a sensor model
+    lots: {"12": [filter.order=2]}    # of the units of a production lot
+    compare: [[U1, U2]]               # what the campaign's page compares; see pipeline.config.comparisons
+    simulate: true                    # the run makes the recordings, from simulation.yaml beside this file
+    page: thesis                      # the run makes this page too, beside the campaign's own
 """
 
 from __future__ import annotations
 
+import os
 import re
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, TypeVar
 
-from pipeline.config.campaign_file import as_list, split_run_settings, unknown_key
-from pipeline.config.compose import GROUPS, Problem, default_option, nearest, parse
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+
+from pipeline.config.compose import GROUPS, RUN_SETTINGS, Problem, default_option, nearest, parse
+from pipeline.config.user_effects import ONLY_FROM_THE_COMMAND_LINE, PYTHON
 from pipeline.errors import ConfigurationError
+from pipeline.io.files import not_regular
 from pipeline.io.yaml_file import read_yaml
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
-    from pipeline.config.campaign_file import CampaignFile
     from pipeline.config.sheet import Sheet
 
 DEVICES = "devices"
 BETWEEN_OVERRIDES = re.compile(r';(?=(?:[^"]*"[^"]*")*[^"]*$)')  # a semicolon outside double quotes
+SIMULATION = "simulation.yaml"
+LIST = "a list of overrides KEY=VALUE"
+Overrides = Annotated[
+    list[str],
+    BeforeValidator(lambda value: [value] if isinstance(value, str) else value or []),
+    Field(description=LIST),
+]
+ByName = Annotated[
+    dict[Annotated[str, BeforeValidator(str)], Overrides],
+    BeforeValidator(lambda value: value or {}),
+    Field(description="a mapping of names to lists of overrides"),
+]
+
+
+class DeviceFile(BaseModel):
+    """A file of ``devices/``. The description of a field says what a refused value should be."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+    overrides: Overrides = []
+
+
+class CampaignFile(DeviceFile):
+    """``campaign.yaml``."""
+
+    models: ByName = {}
+    lots: ByName = {}
+    compare: Annotated[
+        list[Any], BeforeValidator(lambda value: value or []), Field(description="a list of comparisons")
+    ] = []
+    simulate: bool = Field(default=False, description="true or false")
+    page: Literal["thesis"] | None = Field(default=None, description="thesis (python -m pipeline thesis page)")
+
+
+File = TypeVar("File", bound=DeviceFile)
 
 
 class Layer(NamedTuple):
@@ -47,91 +93,171 @@ class Layers:
     ----------
     sheet : Sheet
     campaign : CampaignFile
+        Its ``overrides`` without those of the run.
+    of_run : list of str
+        Settings of the run, from ``campaign.yaml`` and the command line.
     devices : dict of str to list of str
         Serial or unit to the overrides of its file.
     command : list of str
         ``overrides=`` of the command line.
     per_unit : dict of str to list of str
         ``unit_overrides=`` of the command line.
+    simulation : Path or None
+        The description from which the run makes the recordings; None where they are recorded.
     """
 
     sheet: Sheet
     campaign: CampaignFile
-    devices: dict[str, list[str]] = field(default_factory=dict)
-    command: list[str] = field(default_factory=list)
-    per_unit: dict[str, list[str]] = field(default_factory=dict)
+    of_run: list[str]
+    devices: dict[str, list[str]]
+    command: list[str]
+    per_unit: dict[str, list[str]]
+    simulation: Path | None
 
     def of(self, unit: str) -> list[Layer]:
         """Return a unit's overrides, weakest first."""
         row, line = self.sheet.rows[unit], f"units.csv line {self.sheet.lines[unit]}"
         own = [o for o in map(str.strip, BETWEEN_OVERRIDES.split(row.get("overrides", ""))) if o]
         lot = row.get("lot", "")
-        above = [
-            *_from(f"campaign.yaml, lots, {lot}", self.campaign.lots.get(lot, ())),
-            *(
-                layer
-                for name in dict.fromkeys([row.get("serial", ""), unit])
-                for layer in _from(f"{DEVICES}/{name}.yaml", self.devices.get(name, ()))
-            ),
-            *(Layer(f"{line}, column {g}", f"{g}={row[g]}") for g in GROUPS if row.get(g)),
-            *_from(f"{line}, column overrides", own),
-            *_from("command line, overrides=", self.command),
-            *_from("command line, unit_overrides=", self.per_unit.get(unit, ())),
-        ]
-        below = _from("campaign.yaml", self.campaign.of_units)
-        if not self.campaign.models:
-            return [*below, *above]
-        model = self._model([*below, *above])
-        return [*below, *_from(f"campaign.yaml, models, {model}", self.campaign.models.get(model, ())), *above]
-
-    def _model(self, layers: Iterable[Layer]) -> str:
-        """Return the sensor config that a unit ends up with."""
-        chosen = [text.partition("=")[2].strip() for _, text in layers if text.partition("=")[0].strip() == "sensor"]
-        return chosen[-1] if chosen else default_option("sensor")
+        below = _layers("campaign.yaml", self.campaign.overrides)
+        above = _layers(f"campaign.yaml, lots, {lot}", self.campaign.lots.get(lot, ()))
+        for name in dict.fromkeys([row.get("serial", ""), unit]):
+            above += _layers(f"{DEVICES}/{name}.yaml", self.devices.get(name, ()))
+        above += [Layer(f"{line}, column {g}", f"{g}={row[g]}") for g in GROUPS if row.get(g)]
+        above += _layers(f"{line}, column overrides", own)
+        above += _layers("command line, overrides=", self.command)
+        above += _layers("command line, unit_overrides=", self.per_unit.get(unit, ()))
+        if self.campaign.models:
+            sensors = [text.partition("=")[2].strip() for _, text in [*below, *above] if key_of(text) == "sensor"]
+            model = sensors[-1] if sensors else default_option("sensor")
+            below += _layers(f"campaign.yaml, models, {model}", self.campaign.models.get(model, ()))
+        return [*below, *above]
 
 
-def read_devices(directory: Path, sheet: Sheet) -> dict[str, list[str]]:
-    """Read ``devices/*.yaml`` of a campaign: serial or unit to overrides.
+def load_layers(directory: Path, settings: Mapping[str, Any], sheet: Sheet, sensors: Iterable[str]) -> Layers:
+    """Read the overrides of a campaign and of the command line.
+
+    Parameters
+    ----------
+    directory : Path
+        Of the campaign.
+    settings : mapping
+        Of ``--config``: ``overrides`` and ``unit_overrides``.
+    sheet : Sheet
+    sensors : iterable of str
+        Names of the sensor configs.
 
     Raises
     ------
     ConfigurationError
-        In one message, for each file that is not as it should be or concerns no unit.
+        Naming the file and the key.
     """
-    files = sorted((directory / DEVICES).glob("*.yaml"))
-    if not files:
-        return {}
+    path = directory / "campaign.yaml"
+    file = _read(path, CampaignFile) if os.path.lexists(path) else CampaignFile()
+    _check_models_and_lots(file, sheet, set(sensors), str(path))
+    in_file, units = _split(file.overrides)
+    on_command_line, command = _split(as_list(settings.get("overrides", []), "overrides"))
+    simulation = path.with_name(SIMULATION) if file.simulate else None
+    if simulation and not os.path.lexists(simulation):
+        raise ConfigurationError(f"simulate: true needs {SIMULATION} beside it, which does not exist", str(path))
+    problem = not_regular(simulation) if simulation else None
+    if problem:
+        raise ConfigurationError(problem, str(simulation))
+    campaign = file.model_copy(update={"overrides": units})
+    per_unit = _unit_overrides(settings.get("unit_overrides", {}), sheet.rows)
+    devices = _read_devices(directory, sheet)
+    return Layers(sheet, campaign, [*in_file, *on_command_line], devices, command, per_unit, simulation)
+
+
+def as_list(value: Any, where: str, what: str = LIST) -> list[str]:  # noqa: ANN401  (the user's)
+    """Return overrides as a list: a list of strings as it is, a plain string as one."""
+    if isinstance(value, str):
+        value = [value]
+    if not isinstance(value, (list, tuple)) or not all(isinstance(v, str) for v in value):
+        raise ConfigurationError(f"{where}: {what} is expected, got {value!r}")
+    return list(value)
+
+
+def key_of(text: str) -> str:
+    """Return the key of an override ``KEY=VALUE``."""
+    return str(text).partition("=")[0].strip().lstrip("+")
+
+
+def _layers(origin: str, texts: Iterable[str]) -> list[Layer]:
+    return [Layer(origin, text) for text in texts]
+
+
+def _split(overrides: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Split overrides into those of the run and those of units."""
+    run = [o for o in overrides if key_of(o) in RUN_SETTINGS]
+    return run, [o for o in overrides if o not in run]
+
+
+def _read(path: Path, model: type[File]) -> File:
+    content = read_yaml(path) or {}
+    if not isinstance(content, dict):
+        raise ConfigurationError("a mapping is expected, for example 'overrides: [filter=rc_low_pass]'", str(path))
+    if PYTHON in content:
+        raise ConfigurationError(f"{PYTHON}: {ONLY_FROM_THE_COMMAND_LINE}", str(path))
+    try:
+        return model.model_validate(content)
+    except ValidationError as errors:
+        error = errors.errors()[0]
+    key, *below = error["loc"]
+    if error["type"] == "extra_forbidden":
+        raise ConfigurationError(f"{key}: unknown key{nearest(str(key), model.model_fields)}", str(path))
+    value = content[key]
+    if below and isinstance(value, dict):
+        raise ConfigurationError(f"{key}, {below[0]}: {LIST} is expected, got {value.get(below[0])!r}", str(path))
+    raise ConfigurationError(f"{key}: {model.model_fields[str(key)].description} is expected, got {value!r}", str(path))
+
+
+def _read_devices(directory: Path, sheet: Sheet) -> dict[str, list[str]]:
+    """Read ``devices/*.yaml``: serial or unit to overrides; all files that are refused are named in one message."""
     known = set(sheet.rows) | {row["serial"] for row in sheet.rows.values() if row.get("serial")}
     found, problems = {}, []
-    for file in files:
+    for file in sorted((directory / DEVICES).glob("*.yaml")):
+        if file.stem not in known:
+            problems.append(f"{file}: no unit or serial {file.stem!r} in units.csv{nearest(file.stem, known)}")
+            continue
         try:
-            found[file.stem] = _device(file, known)
+            run, found[file.stem] = _split(_read(file, DeviceFile).overrides)
         except ConfigurationError as error:
-            problems.append(f"{error.file or file}: {error.message}")
+            problems.append(str(error))
+            continue
+        if run:
+            problems.append(f"{file}: {run[0]}: is a setting of the run, not of a device; set it in campaign.yaml")
     if problems:
         more = [f"and {len(problems) - 5} more files"] * (len(problems) > 5)
         raise ConfigurationError("the configuration is refused:\n  " + "\n  ".join([*problems[:5], *more]))
     return found
 
 
-def check_models_and_lots(campaign: CampaignFile, sheet: Sheet, sensors: Iterable[str], file: str) -> None:
-    """Refuse overrides of models and lots that do not exist, and models that choose another model.
-
-    Raises
-    ------
-    ConfigurationError
-    """
+def _check_models_and_lots(campaign: CampaignFile, sheet: Sheet, sensors: set[str], file: str) -> None:
+    """Refuse overrides of models and lots that do not exist, of the run, and models that choose another model."""
     lots = {row["lot"] for row in sheet.rows.values() if row.get("lot")}
-    for key, named, known in (("models", campaign.models, set(sensors)), ("lots", campaign.lots, lots)):
+    for key, what, named, known in (
+        ("models", "sensor config", campaign.models, sensors),
+        ("lots", "lot of units.csv", campaign.lots, lots),
+    ):
         for name, overrides in named.items():
             if name not in known:
-                what = "sensor config" if key == "models" else "lot of units.csv"
                 raise ConfigurationError(f"{key}: no {what} is called {name!r}{nearest(name, known)}", file)
-            if key == "models" and any(_key(o) == "sensor" for o in overrides):
+            run, _ = _split(overrides)
+            if run:
+                raise ConfigurationError(f"{key}, {name}: {run[0]} is a setting of the run, not of units", file)
+            if key == "models" and any(_parsed_key(o) == "sensor" for o in overrides):
                 raise ConfigurationError(f"models, {name}: the overrides of a model cannot choose another", file)
 
 
-def unit_overrides(value: Any, rows: Mapping[str, Any]) -> dict[str, list[str]]:  # noqa: ANN401
+def _parsed_key(text: str) -> str:
+    try:
+        return parse(text)[0]
+    except Problem as problem:
+        raise ConfigurationError(str(problem)) from problem
+
+
+def _unit_overrides(value: Any, rows: Mapping[str, Any]) -> dict[str, list[str]]:  # noqa: ANN401
     """Check ``unit_overrides``: unit name to a list of overrides, of units that exist."""
     if not isinstance(value, dict):
         form = """'unit_overrides={U1: [filter.cutoff_hz=5, "effects.gyroscope=[g_sensitivity]"]}'"""
@@ -140,27 +266,3 @@ def unit_overrides(value: Any, rows: Mapping[str, Any]) -> dict[str, list[str]]:
         if str(name) not in rows:
             raise ConfigurationError(f"unit_overrides: no unit {name!r} in units.csv{nearest(str(name), rows)}")
     return {str(name): as_list(v, f"unit_overrides of {name}") for name, v in value.items()}
-
-
-def _from(origin: str, texts: Iterable[str]) -> list[Layer]:
-    return [Layer(origin, text) for text in texts]
-
-
-def _key(text: str) -> str:
-    try:
-        return parse(text)[0]
-    except Problem as problem:
-        raise ConfigurationError(str(problem)) from problem
-
-
-def _device(file: Path, known: set[str]) -> list[str]:
-    if file.stem not in known:
-        raise ConfigurationError(f"no unit or serial {file.stem!r} in units.csv{nearest(file.stem, known)}")
-    content = read_yaml(file) or {}
-    if not isinstance(content, dict):
-        raise ConfigurationError("a mapping is expected, for example 'overrides: [filter.cutoff_hz=5]'")
-    unknown_key(content, ("overrides",))
-    run, overrides = split_run_settings(as_list(content.get("overrides") or [], "overrides"))
-    if run:
-        raise ConfigurationError(f"{run[0]}: is a setting of the run, not of a device; set it in campaign.yaml")
-    return overrides

@@ -90,7 +90,7 @@ def test_the_model_is_the_one_that_a_unit_ends_up_with(fleet: Path) -> None:
     [
         ("campaign.yaml", "models: {mpu605: [filter=none]}", "models: no sensor config is called 'mpu605'; nearest"),
         ("campaign.yaml", "models: {mpu6050: [sensor=stim300]}", "models, mpu6050: the overrides of a model cannot"),
-        ("campaign.yaml", "models: [filter=none]", "models: names with a list of overrides each are expected"),
+        ("campaign.yaml", "models: [filter=none]", "models: a mapping of names to lists of overrides is expected"),
         ("campaign.yaml", "lots: {L3: [filter=none]}", "lots: no lot of units.csv is called 'L3'"),
         ("campaign.yaml", "lots: {L1: [batch_size=3]}", "lots, L1: batch_size=3 is a setting of the run"),
         ("devices/S9.yaml", "overrides: []", "no unit or serial 'S9' in units.csv"),
