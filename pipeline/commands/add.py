@@ -58,9 +58,7 @@ def change(arguments: argparse.Namespace, *, remove: bool) -> int:
     composer = Composer(directory, as_list(given.get(PYTHON, []), PYTHON, "a list of paths of Python files"))
     layers = load_layers(directory, given, read_sheet(directory / "units.csv"), composer.options["sensor"])
     wanted = _wanted(arguments, directory.name)
-    edits = [
-        edit_effects(directory, unit, effects, layers, composer, remove=remove) for unit, effects in wanted.items()
-    ]
+    edits = [edit_effects(unit, effects, layers, composer, remove=remove) for unit, effects in wanted.items()]
     for edit in edits:
         _apply(edit)
     settings = {"campaign": arguments.campaign, **given}
@@ -143,4 +141,4 @@ def _apply(edit: Edit) -> None:
     except OSError as error:
         raise ConfigurationError(f"cannot be written: {error.strerror}", str(edit.file)) from error
     end = "removed" if edit.text is None else "written"
-    print("\n".join([*edit.said, f"  {edit.file} {end}"]))
+    print("\n".join([*edit.changes, f"  {edit.file} {end}"]))

@@ -89,7 +89,8 @@ def _profile(calibration: Path, ingest: str | None) -> LogProfile:
     profile = LogProfile.of_calibration(document, str(calibration))
     if ingest is None:
         return profile
-    from pipeline.config.compose import Composer, Problem  # noqa: PLC0415  (0.3 s that few logs need)
+    from pipeline.config.compose import Composer  # noqa: PLC0415  (0.3 s that few logs need)
+    from pipeline.config.options import Problem  # noqa: PLC0415  (0.3 s that few logs need)
 
     composer = Composer(Path())
     sensor = document.get("sensor")

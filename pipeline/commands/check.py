@@ -13,7 +13,8 @@ from shutil import copyfile
 from typing import TYPE_CHECKING, Any
 
 from pipeline.config.campaign import load_campaign
-from pipeline.config.compose import Composer, Problem
+from pipeline.config.compose import Composer
+from pipeline.config.options import Problem
 from pipeline.errors import ConfigurationError, IngestError, PipelineError
 from pipeline.files import CONFIGS, write_atomically
 from pipeline.io.files import FILE, candidate_files

@@ -1,55 +1,60 @@
-"""Print a unit's resolved configuration with the origin of each value."""
+"""Print a unit's resolved configuration with the origin of each value.
+
+A value stands in the file of a group's option or in ``configs/config.yaml``, or the strongest override of it, or of a
+branch above it, has set it; a key that stands nowhere has the schema's default.
+"""
 
 from __future__ import annotations
 
 import argparse
+from itertools import takewhile
 from typing import TYPE_CHECKING, Any
 
 import yaml
 
 from pipeline.config.campaign import find_campaign
-from pipeline.config.compose import Composer, Problem, nearest, parse
+from pipeline.config.compose import Composer
 from pipeline.config.layers import load_layers
-from pipeline.config.origins import trace
+from pipeline.config.options import GROUPS, Problem, default_option, nearest, parse, read_option
 from pipeline.config.sheet import read_sheet
 from pipeline.errors import ConfigurationError
+from pipeline.files import CONFIGS
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from pipeline.config.layers import Layer
-    from pipeline.config.origins import Value
 
+Key = tuple[str, ...]  # the path of a value
 COLUMN = 56  # where the origins stand
 
 
 def main(argv: Sequence[str]) -> int:
     """Run ``python -m pipeline config UNIT [OVERRIDE ...]``; what is printed is YAML."""
-    parser = argparse.ArgumentParser(prog="python -m pipeline config", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m pipeline config", description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("unit", metavar="UNIT", help="a unit of units.csv")
     parser.add_argument("overrides", metavar="KEY=VALUE", nargs="*", help="as overrides= of snakemake --config")
     parser.add_argument("--campaign", default="demo", help="a campaign's name or directory (default: demo)")
     parser.add_argument("--python-effect", action="append", default=[], metavar="FILE", help="as python_effects=")
     arguments = parser.parse_args(argv)
-    directory = find_campaign(arguments.campaign)
+    directory, unit = find_campaign(arguments.campaign), arguments.unit
     composer = Composer(directory, arguments.python_effect)
+    sheet = read_sheet(directory / "units.csv")
+    if unit not in sheet.rows:
+        raise ConfigurationError(f"no unit {unit!r}{nearest(unit, sheet.rows)}", str(directory / "units.csv"))
     given = {"overrides": arguments.overrides}
-    layers = load_layers(directory, given, read_sheet(directory / "units.csv"), composer.options["sensor"])
-    if arguments.unit not in layers.sheet.rows:
-        known = nearest(arguments.unit, layers.sheet.rows)
-        raise ConfigurationError(f"no unit {arguments.unit!r}{known}", str(directory / "units.csv"))
-    of_unit = layers.of(arguments.unit)
+    layers = load_layers(directory, given, sheet, composer.options["sensor"]).of(unit)
     try:
-        values = trace(composer, arguments.unit, of_unit)
+        config = composer.unit(unit, [text for _, text in layers])
     except Problem as problem:
-        raise ConfigurationError(f"unit {arguments.unit}: {problem}", str(directory / "units.csv")) from None
-    print(f"# Unit {arguments.unit} of campaign {directory}")
-    print("\n".join([*_told(of_unit), *_tree(values)]))
+        raise ConfigurationError(f"unit {unit}: {problem}", str(directory / "units.csv")) from None
+    print(f"# Unit {unit} of campaign {directory}")
+    print("\n".join([*_overrides(layers), *_tree(config, _origins(composer, layers), composer)]))
     return 0
 
 
-def _told(layers: Sequence[Layer]) -> list[str]:
-    """Return the overrides of the unit, and which of them come to nothing."""
+def _overrides(layers: Sequence[Layer]) -> list[str]:
+    """Return the overrides of the unit, and which of them a stronger one replaces."""
     if not layers:
         return ["# No overrides: all values are defaults."]
     keys = [parse(text)[0] for _, text in layers]
@@ -61,22 +66,65 @@ def _told(layers: Sequence[Layer]) -> list[str]:
     return lines
 
 
-def _tree(values: Sequence[Value]) -> list[str]:
+def _tree(config: Mapping[str, Any], origins: Mapping[Key, str], composer: Composer) -> list[str]:
     """Return the values as YAML, each with its origin as a comment."""
     lines: list[str] = []
-    above: tuple[str, ...] = ()
-    for value in values:
-        *branch, leaf = value.key
-        same = 0
-        while same < min(len(branch), len(above)) and branch[same] == above[same]:
-            same += 1
+    above: Key = ()
+    for key, value in _leaves(config, ()):
+        *branch, leaf = key
+        same = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(branch, above, strict=False)))
         lines += [f"{'  ' * depth}{branch[depth]}:" for depth in range(same, len(branch))]
         above = tuple(branch)
-        said = f"{'  ' * len(branch)}{leaf}: {_written(value.value)}"
-        lines.append(f"{said:<{COLUMN}} # {value.origin}")
+        text: str = yaml.safe_dump(value, default_flow_style=True, width=10_000, sort_keys=False)
+        line = f"{'  ' * len(branch)}{leaf}: {text.removesuffix(chr(10)).removesuffix(chr(10) + '...')}"
+        lines.append(f"{line:<{COLUMN}} # {_origin(key, origins, config, composer)}")
     return lines
 
 
-def _written(value: Any) -> str:  # noqa: ANN401  (any value of a configuration)
-    text: str = yaml.safe_dump(value, default_flow_style=True, width=10_000, sort_keys=False)
-    return text.removesuffix("\n").removesuffix("\n...")
+def _leaves(node: Mapping[str, Any], above: Key) -> Iterator[tuple[Key, Any]]:
+    for key, value in node.items():
+        if isinstance(value, dict) and value:
+            yield from _leaves(value, (*above, str(key)))
+        else:
+            yield (*above, str(key)), value
+
+
+def _origins(composer: Composer, layers: Sequence[Layer]) -> dict[Key, str]:
+    """Return where each key, or a branch above it, was set last; a group's ``name`` tells what chose the option."""
+    groups, _ = composer.split([text for _, text in layers])
+    chosen = composer.complete(groups)
+    procedure = chosen.get("procedure", default_option("procedure"))
+    chosen_by = {"table": f"default of procedure {procedure}"}
+    chosen_by["method"] = f"default of table {chosen['table']} with procedure {procedure}"
+    origins: dict[Key, str] = {}
+    for group in GROUPS:
+        option = chosen.get(group) or default_option(group)
+        for key, value in _leaves(read_option(group, option, tuple(composer.searchpath)), (group,)):
+            reference = f", {value}" if isinstance(value, str) and "${" in value else ""
+            origins[key] = _file(composer, group, option) + reference
+        origins[group, "name"] = chosen_by.get(group, "default, configs/config.yaml")
+    defaults = read_option("", "config", ())
+    origins |= {key: "configs/config.yaml" for key, _ in _leaves(defaults, ()) if key[0] != "defaults"}
+    for origin, text in layers:
+        name, value = parse(text)
+        path = (name, "name") if name in GROUPS and isinstance(value, str) else tuple(name.split("."))
+        origins = {k: o for k, o in origins.items() if k[: len(path)] != path} | {path: origin}
+    return origins
+
+
+def _file(composer: Composer, group: str, option: str) -> str:
+    own = any((root / group / f"{option}.yaml").is_file() for root in composer.searchpath)
+    return f"{'the campaign, ' if own else ''}{CONFIGS.name}/{group}/{option}.yaml"
+
+
+def _origin(key: Key, origins: Mapping[Key, str], config: Mapping[str, Any], composer: Composer) -> str:
+    if key == ("unit",):
+        return "units.csv"
+    if key[0] == "user_effects":
+        return "effects of the campaign's own"
+    if key[:2] == ("method", "stages"):
+        return _file(composer, "method", config["method"][key[2]])
+    found = next((origins[key[:length]] for length in range(len(key), 0, -1) if key[:length] in origins), None)
+    if found is None and key[0] == "sensor" and key[2:3] == ("effects",):
+        return "limits of the campaign's own effects"
+    return found or "not set anywhere: the default"

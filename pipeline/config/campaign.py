@@ -11,18 +11,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.config.comparisons import resolve_comparisons
-from pipeline.config.compose import Composer, Problem, default_of_run, nearest, parse
+from pipeline.config.compose import Composer
 from pipeline.config.layers import as_list, load_layers
+from pipeline.config.options import Problem, default_of_run, nearest, parse
 from pipeline.config.sheet import read_sheet
 from pipeline.config.stage_settings import config_sha256
 from pipeline.config.user_effects import PYTHON
 from pipeline.errors import ConfigurationError
 from pipeline.files import SHIPPED
+from pipeline.history import SENSORS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-SMALLEST_BATCH, LARGEST_BATCH = 10, 160
+SMALLEST_BATCH, LARGEST_BATCH = 10, 160  # units: some seconds a job; a minute, so that a fleet fills its cores
 
 
 @dataclass(frozen=True)
@@ -47,10 +49,8 @@ class Campaign:
     Attributes
     ----------
     name : str
-        Under which its results are found.
-    directory : Path
-    results : Path
-        ``<results>/<name>``.
+        Last part of its directory; its results are in ``<results>/<name>``.
+    directory, results : Path
     units : dict of str to UnitRow
         In the order of ``units.csv``.
     batches : dict of str to list of str
@@ -60,11 +60,11 @@ class Campaign:
     compare : list
         What the campaign's page compares, resolved to groups of units.
     simulation : Path or None
-        The description that the run makes the recordings from; None where they are recorded.
+        The description from which the run makes the recordings; None where they are recorded.
     settings : mapping
         What ``snakemake --config`` gave.
     page : str or None
-        A page of its own that the campaign asks for, beside the campaign's.
+        A page that the campaign asks for beside its own.
     """
 
     name: str
@@ -72,11 +72,11 @@ class Campaign:
     results: Path
     units: dict[str, UnitRow]
     batches: dict[str, list[str]]
-    chains: dict[str, dict[str, list[str]]] = field(default_factory=dict)
-    compare: list[Any] = field(default_factory=list)
-    simulation: Path | None = None
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    page: str | None = None
+    chains: dict[str, dict[str, list[str]]]
+    compare: list[Any]
+    simulation: Path | None
+    settings: Mapping[str, Any]
+    page: str | None
 
     @property
     def recorded(self) -> Path:
@@ -145,18 +145,8 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
     batches, chains = cut_batches(units, batch_size(layers.of_run))
     results = Path(str(settings.get("results", "results"))) / directory.name
     compare = resolve_comparisons(layers.campaign.compare, units, str(directory / "campaign.yaml"))
-    return Campaign(
-        directory.name,
-        directory,
-        results,
-        units,
-        batches,
-        chains,
-        compare,
-        layers.simulation,
-        settings,
-        layers.campaign.page,
-    )
+    page, simulation = layers.campaign.page, layers.simulation
+    return Campaign(directory.name, directory, results, units, batches, chains, compare, simulation, settings, page)
 
 
 def find_campaign(name: str) -> Path:
@@ -197,24 +187,22 @@ def cut_batches(
     by_chain: dict[str, list[str]] = {}
     for name, unit in units.items():
         method = unit.config["method"]
-        named = [method["name"], *(method[sensor] or f"no_{sensor}" for sensor in ("accelerometer", "gyroscope"))]
-        parts = dict.fromkeys(named)
-        by_chain.setdefault("+".join(parts), []).append(name)
+        named = [method["name"], *(method[sensor] or f"no_{sensor}" for sensor in SENSORS)]
+        by_chain.setdefault("+".join(dict.fromkeys(named)), []).append(name)
     batches: dict[str, list[str]] = {}
     chains: dict[str, dict[str, list[str]]] = {}
     for chain, names in by_chain.items():
-        rest = names
-        for number in count():
-            now = size or min(max(SMALLEST_BATCH, len(names) - len(rest)), LARGEST_BATCH)
-            batch = f"{chain}-{number + 1:04d}"
-            batches[batch], rest = rest[:now], rest[now:]
+        start = 0
+        for number in count(1):
+            stop = start + (size or min(max(SMALLEST_BATCH, start), LARGEST_BATCH))
+            batch = f"{chain}-{number:04d}"
+            batches[batch] = names[start:stop]
             configs = [units[n].config for n in batches[batch]]
-            chains[batch] = {
-                sensor: configs[0]["method"]["stages"][sensor]
-                + (["effects"] if any(c["effects"][sensor] for c in configs) else [])
-                for sensor in ("accelerometer", "gyroscope")
-            }
-            if not rest:
+            effects = {sensor: any(c["effects"][sensor] for c in configs) for sensor in SENSORS}
+            stages = configs[0]["method"]["stages"]
+            chains[batch] = {sensor: stages[sensor] + ["effects"] * effects[sensor] for sensor in SENSORS}
+            start = stop
+            if start >= len(names):
                 break
     return batches, chains
 

@@ -24,7 +24,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-from pipeline.config.compose import GROUPS, nearest
+from pipeline.config.options import GROUPS, nearest
 from pipeline.errors import ConfigurationError
 
 if TYPE_CHECKING:

@@ -11,50 +11,40 @@ sections that no override of theirs changes.
 
 from __future__ import annotations
 
-import difflib
 import json
 import re
-from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any
 
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import HydraException, OverrideParseException
+from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from pydantic import ValidationError
 
-from pipeline.config.references import check_references, with_references
+from pipeline.config.options import (
+    GROUPS,
+    RUN_SETTINGS,
+    Problem,
+    default_option,
+    mapping_of,
+    nearest,
+    parse,
+    read_option,
+    with_references,
+)
 from pipeline.config.schema import SECTIONS, Unit
 from pipeline.config.user_effects import ONLY_FROM_THE_COMMAND_LINE, PYTHON, UserEffects, load_user_effects
 from pipeline.errors import ConfigurationError
 from pipeline.files import CONFIGS
 from pipeline.io.ingest_settings import check_ingest
-from pipeline.io.yaml_file import read_yaml
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Sequence
     from pathlib import Path
 
-GROUPS = ("sensor", "table", "procedure", "method", "filter", "ingest", "certificate")
-RUN_SETTINGS = ("batch_size",)
 NOT_WANTED = "not_wanted"  # stage of a sensor whose method is null
-LARGEST_CONFIG = 10_000  # values of a group's option; the largest that ships has 160
 OF_A_SETUP = ("mounting", "bias")  # effects that exist as one setup's own alone (pipeline.model.sessions)
-NUMBER = re.compile(r"([a-z_][a-z_0-9]*(?:\.[A-Za-z_][A-Za-z_0-9]*)*)=(-?(?:0|[1-9][0-9]*)(\.[0-9]+)?)")
-
-
-class Problem(Exception):  # noqa: N818  (one of many: they are collected, then raised as one ConfigurationError)
-    """One thing that is wrong with a configuration."""
-
-
-def nearest(name: str, known: Iterable[str]) -> str:
-    """Return a hint at the nearest valid name, and all of them where there are few."""
-    known = sorted(known)
-    close = difflib.get_close_matches(name, known, 1, 0.5)
-    hint = f"; nearest: {close[0]}" if close else ""
-    return f"{hint}; valid: {', '.join(known)}" if len(known) <= 12 else hint
 
 
 class Composer:
@@ -74,10 +64,11 @@ class Composer:
     """
 
     def __init__(self, campaign: Path, python_effects: Sequence[str] = ()) -> None:
+        self.campaign = campaign
         own = campaign / "configs"
         self.searchpath = [own.resolve()] if own.is_dir() else []
         for file in sorted(own.rglob("*.yaml")):  # before Hydra opens any of them
-            _mapping_of(file)
+            mapping_of(file)
         self.options = {
             group: {f.stem for root in (CONFIGS, *self.searchpath) for f in (root / group).glob("*.yaml")}
             for group in GROUPS
@@ -291,74 +282,6 @@ def _check_setup(name: str, setup: str, procedure: dict[str, Any]) -> None:
 def _quoted(folder: Path) -> str:
     """Return a folder as a text of Hydra's grammar, which gives commas, braces and quotes meanings of their own."""
     return "'" + re.sub(r"(\\*)('|$)", lambda m: m[1] * 2 + "\\'" * bool(m[2]), f"file://{folder}") + "'"
-
-
-@lru_cache(maxsize=100_000)
-def parse(text: str) -> tuple[str, Any]:
-    """Parse one Hydra override to its key and value.
-
-    A plain number, which is what differs from unit to unit, is read without Hydra's parser: that costs 0.6 ms each.
-
-    Raises
-    ------
-    Problem
-        If it is no override, a sweep or a deletion.
-    """
-    number = NUMBER.fullmatch(text)
-    if number:
-        key, value, fraction = number.groups()
-        return key, float(value) if fraction else int(value)
-    return _parse_with_hydra(text)
-
-
-def _parse_with_hydra(text: str) -> tuple[str, Any]:
-    hint = "; write KEY=VALUE, for example filter.cutoff_hz=5"
-    if text.startswith("["):
-        raise Problem(f'{text!r} is not a list of overrides; quote each one: \'overrides=["a=1","b=[x,y]"]\'')
-    try:
-        override = _hydras_parser().parse_override(text)
-    except (OverrideParseException, HydraException) as error:
-        raise Problem(f"{text!r} is not a Hydra override ({str(error).splitlines()[0]}){hint}") from error
-    if override.is_sweep_override() or override.is_delete():
-        raise Problem(f"{text!r} is a {'sweep' if override.is_sweep_override() else 'deletion'}; give one value{hint}")
-    return override.key_or_group, override.value()
-
-
-@cache
-def _hydras_parser() -> OverridesParser:
-    return OverridesParser.create()
-
-
-@cache
-def read_option(group: str, option: str, searchpath: tuple[Path, ...]) -> dict[str, Any]:
-    """Return what the file of a group's option holds; nothing where there is none."""
-    for root in (*searchpath, CONFIGS):
-        file = root / group / f"{option}.yaml"
-        if file.is_file():
-            return {str(k): v for k, v in _mapping_of(file).items()}
-    return {}
-
-
-def _mapping_of(file: Path) -> dict[Any, Any]:
-    content = read_yaml(file, LARGEST_CONFIG)
-    if not isinstance(content, dict):
-        raise ConfigurationError("a mapping of settings is expected", str(file))
-    check_references(content, str(file))
-    return content
-
-
-@cache
-def default_option(group: str) -> str:
-    """Return the option of a group where nothing chooses one."""
-    for entry in _mapping_of(CONFIGS / "config.yaml")["defaults"]:
-        if not isinstance(entry, str) and group in entry:
-            return str(entry[group])
-    raise KeyError(group)
-
-
-def default_of_run(name: str) -> Any:  # noqa: ANN401  (a setting's type is its own)
-    """Return the default of a setting of the run."""
-    return _mapping_of(CONFIGS / "config.yaml")[name]
 
 
 def _set(tree: dict[str, Any], path: list[str], value: Any) -> None:  # noqa: ANN401

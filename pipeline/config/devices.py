@@ -1,4 +1,4 @@
-"""Effects of one unit, added to or taken from its file ``<campaign>/devices/<unit>.yaml``.
+"""Effects of one unit, added to or removed from its file ``<campaign>/devices/<unit>.yaml``.
 
 The file keeps its comments and its other content: an entry is replaced where it stands, or a new one is put behind the
 last. A layer that is stronger than the file (``units.csv``, the command line) would make the edit ineffective, so it is
@@ -7,14 +7,14 @@ refused with the place to edit.
 
 from __future__ import annotations
 
+import functools
 import json
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import yaml
 
-from pipeline.config.compose import Problem, nearest, parse
-from pipeline.config.layers import DEVICES
+from pipeline.config.layers import DEVICES, key_of
+from pipeline.config.options import Problem, nearest, parse
 from pipeline.errors import ConfigurationError
 from pipeline.records import SENSORS
 
@@ -28,22 +28,12 @@ if TYPE_CHECKING:
 KEY = "overrides"
 
 
-@dataclass(frozen=True)
-class Edit:
-    """What a device file is to hold.
-
-    Attributes
-    ----------
-    file : Path
-    text : str or None
-        Its new content; None where it is to be removed.
-    said : list of str
-        What changes, one line for each effect.
-    """
+class Edit(NamedTuple):
+    """A device file, its new content (None: it is removed), and a line on each effect."""
 
     file: Path
     text: str | None
-    said: list[str]
+    changes: list[str]
 
 
 def sensor_and_effect(text: str) -> tuple[str, str]:
@@ -63,20 +53,12 @@ def sensor_and_effect(text: str) -> tuple[str, str]:
 
 
 def edit_effects(
-    directory: Path,
-    unit: str,
-    effects: Sequence[tuple[str, str]],
-    layers: Layers,
-    composer: Composer,
-    *,
-    remove: bool = False,
+    unit: str, effects: Sequence[tuple[str, str]], layers: Layers, composer: Composer, *, remove: bool = False
 ) -> Edit:
     """Return the unit's device file with effects added or removed.
 
     Parameters
     ----------
-    directory : Path
-        Of the campaign.
     unit : str
     effects : sequence of (str, str)
         Sensor and effect.
@@ -91,28 +73,40 @@ def edit_effects(
     ConfigurationError
         If the unit or an effect is unknown, a stronger layer sets the effects, or the file cannot be edited.
     """
-    file = _file(directory, unit, layers)
+    file = _file(unit, layers, composer.campaign)
     text = file.read_bytes().decode() if file.is_file() else ""  # line ends as they are
     of_unit = layers.of(unit)
-    said: list[str] = []
+    changes: list[str] = []
     for sensor in dict.fromkeys(sensor for sensor, _ in effects):
         key = f"effects.{sensor}"
-        _refuse_stronger(of_unit, key, directory, unit)
+        _refuse_stronger(of_unit, key, composer.campaign, unit)
         weaker = _value([layer for layer in of_unit if layer.origin != f"{DEVICES}/{unit}.yaml"], key)
         now = _value(of_unit, key)
-        names = [name for s, name in effects if s == sensor]
-        wanted = _removed(unit, key, now, names, said) if remove else _added(unit, key, now, names, said)
+        wanted = list(now)
+        for name in (name for s, name in effects if s == sensor):
+            if not remove:
+                changes.append(
+                    f"unit {unit}: {f'{key} has {name} already' if name in now else f'{name} added to {key}'}"
+                )
+                wanted += [name] * (name not in wanted)
+            elif name in now:
+                changes.append(f"unit {unit}: {name} removed from {key}")
+                wanted.remove(name)
+            else:
+                known = f"it has {', '.join(now)}" if now else "it has none"
+                raise ConfigurationError(f"unit {unit}: {name} is not among its {key}; {known}")
+        override = f"{key}=[{','.join(wanted)}]"
         try:
-            composer.unit(unit, [*(layer.text for layer in of_unit), _override(key, wanted)])
+            composer.unit(unit, [*(layer.text for layer in of_unit), override])
         except Problem as problem:
             raise ConfigurationError(f"unit {unit}: {problem}") from None
         if wanted != now:
-            text = set_override(text, key, None if wanted == weaker else _override(key, wanted), str(file))
-    kept = any(line.strip() not in ("", f"{KEY}:", f"{KEY}: []") for line in text.splitlines())
-    return Edit(file, text if kept else None, said)
+            text = set_override(text, key, None if wanted == weaker else override, str(file))
+    empty = all(line.strip() in ("", f"{KEY}:", f"{KEY}: []") for line in text.splitlines())
+    return Edit(file, None if empty else text, changes)
 
 
-def _file(directory: Path, unit: str, layers: Layers) -> Path:
+def _file(unit: str, layers: Layers, directory: Path) -> Path:
     """Return the device file of a unit, which must exist and share its name with no serial of another."""
     rows, sheet = layers.sheet.rows, str(directory / "units.csv")
     if unit not in rows:
@@ -122,21 +116,6 @@ def _file(directory: Path, unit: str, layers: Layers) -> Path:
         both = f"{DEVICES}/{unit}.yaml would concern {', '.join(others)} too, whose serial is {unit}"
         raise ConfigurationError(f"{both}: give the unit or the serial another name", sheet)
     return directory / DEVICES / f"{unit}.yaml"
-
-
-def _added(unit: str, key: str, now: Sequence[str], names: Sequence[str], said: list[str]) -> list[str]:
-    told = [f"{key} has {name} already" if name in now else f"{name} added to {key}" for name in names]
-    said += [f"unit {unit}: {text}" for text in told]
-    return list(dict.fromkeys([*now, *names]))
-
-
-def _removed(unit: str, key: str, now: Sequence[str], names: Sequence[str], said: list[str]) -> list[str]:
-    for name in names:
-        if name not in now:
-            known = f"it has {', '.join(now)}" if now else "it has none"
-            raise ConfigurationError(f"unit {unit}: {name} is not among its {key}; {known}")
-        said.append(f"unit {unit}: {name} removed from {key}")
-    return [name for name in now if name not in names]
 
 
 def set_override(text: str, key: str, override: str | None, file: str) -> str:
@@ -157,14 +136,10 @@ def set_override(text: str, key: str, override: str | None, file: str) -> str:
     ConfigurationError
         If the file has a form that cannot be edited in place.
     """
-    before = _listed(text)
-    wanted = [entry for entry in before if _key(entry) != key] if override is None else []
-    if override is not None:
-        wanted = [override if _key(entry) == key else entry for entry in before]
-        wanted += [override] * (override not in wanted)
+    wanted = _changed([(entry, entry) for entry in _overrides(text)], key, override, override)
     edited = _edited(text, key, override)
     try:
-        as_wanted = _listed(edited) == wanted
+        as_wanted = _overrides(edited) == wanted
     except (yaml.YAMLError, ConfigurationError):
         as_wanted = False
     if not as_wanted:
@@ -173,57 +148,55 @@ def set_override(text: str, key: str, override: str | None, file: str) -> str:
     return edited
 
 
+def _changed(entries: Sequence[tuple[str, str]], key: str, override: str | None, written: str | None) -> list[str]:
+    """Return the texts of entries (value, text), that of the key replaced by ``written``, added or (None) removed."""
+    if override is None or written is None:
+        return [text for value, text in entries if key_of(value) != key]
+    texts = [written if key_of(value) == key else text for value, text in entries]
+    return texts if written in texts else [*texts, written]
+
+
 def _edited(text: str, key: str, override: str | None) -> str:
-    """Return the text with the entry replaced, added or removed where YAML says that it stands."""
+    """Return the text with the entry changed where YAML says that it stands; unchanged where a comment would go."""
     root = yaml.compose(text, yaml.SafeLoader)
     pairs = root.value if isinstance(root, yaml.MappingNode) else []
     node = next((value for name, value in pairs if name.value == KEY), None)
-    quoted = json.dumps(override, ensure_ascii=False)
+    written = None if override is None else json.dumps(override, ensure_ascii=False)
     if node is None:
         end = "" if not text or text.endswith("\n") else "\n"
-        return f"{text}{end}{KEY}:\n  - {quoted}\n"
+        return f"{text}{end}{KEY}:\n  - {written}\n"
+    if isinstance(node, yaml.SequenceNode) and not node.flow_style:
+        return _edited_lines(text, node.value, key, written)
     start, stop = node.start_mark.index, node.end_mark.index
     if isinstance(node, yaml.ScalarNode):  # one override as a text, or nothing
-        entries = [entry for entry in [node.value] if entry and node.tag.endswith(":str")]
-        kept = [json.dumps(e, ensure_ascii=False) for e in entries if _key(e) != key]
-        kept += [quoted] * (override is not None)
-        space = " " if text[:start].endswith(":") else ""
-        return f"{text[:start]}{space}[{', '.join(kept)}]{text[stop:]}"
-    items = node.value
-    found = [item for item in items if _key(item.value) == key]
-    if found and override is not None:
-        first, last = found[-1].start_mark.index, found[-1].end_mark.index
-        return text[:first] + quoted + text[last:]
-    if override is None:
-        return _without(text, node, found)
-    if node.flow_style:
-        comma = ", " if items else ""
-        return f"{text[: stop - 1].rstrip().rstrip(',')}{comma}{quoted}{text[stop - 1 :]}"
-    last = items[-1].end_mark.index
-    line_end = text.find("\n", last)
-    line_end = len(text) if line_end < 0 else line_end
-    indent = " " * (items[0].start_mark.column - 2)
-    return f"{text[:line_end]}\n{indent}- {quoted}{text[line_end:] or chr(10)}"
+        entries = [(node.value, json.dumps(node.value, ensure_ascii=False))] if node.tag.endswith(":str") else []
+    else:
+        entries = [(item.value, text[item.start_mark.index : item.end_mark.index]) for item in node.value]
+        if "#" in functools.reduce(lambda rest, entry: rest.replace(entry[1], "", 1), entries, text[start:stop]):
+            return text
+    space = " " if text[:start].endswith(":") else ""
+    return f"{text[:start]}{space}[{', '.join(_changed(entries, key, override, written))}]{text[stop:]}"
 
 
-def _without(text: str, node: yaml.SequenceNode, found: Sequence[yaml.Node]) -> str:
-    """Return the text without some items of a list; a block list loses their lines."""
+def _edited_lines(text: str, items: Sequence[yaml.Node], key: str, written: str | None) -> str:
+    """Return the text with an item of a block list replaced, added behind the last, or (None) removed with its line."""
+    found = [item for item in items if key_of(item.value) == key]
     for item in reversed(found):
         first, last = item.start_mark.index, item.end_mark.index
-        if node.flow_style:
-            rest = text[last:].lstrip()
-            if rest.startswith(","):
-                text = text[:first] + rest[1:].lstrip()
-            else:
-                text = text[:first].rstrip().removesuffix(",") + text[last:]
-        else:
-            line = text.rfind("\n", 0, first) + 1
+        if written is None:
             after = text.find("\n", last)
-            text = text[:line] + (text[after + 1 :] if after >= 0 else "")
-    return text
+            text = text[: text.rfind("\n", 0, first) + 1] + (text[after + 1 :] if after >= 0 else "")
+        else:
+            text = text[:first] + written + text[last:]
+    if found or written is None:
+        return text
+    end = text.find("\n", items[-1].end_mark.index)
+    end = len(text) if end < 0 else end
+    indent = " " * (items[0].start_mark.column - 2)
+    return f"{text[:end]}\n{indent}- {written}{text[end:] or chr(10)}"
 
 
-def _listed(text: str) -> list[str]:
+def _overrides(text: str) -> list[str]:
     content = yaml.safe_load(text) or {}
     if not isinstance(content, dict):
         raise ConfigurationError("a mapping is expected")
@@ -234,7 +207,7 @@ def _listed(text: str) -> list[str]:
 def _refuse_stronger(layers: Sequence[Layer], key: str, directory: Path, unit: str) -> None:
     """Refuse where a layer above the device file sets the effects."""
     for origin, text in layers:
-        if _key(text) not in (key, "effects"):
+        if key_of(text) not in (key, "effects"):
             continue
         if origin.startswith("units.csv line"):
             line = origin.removeprefix("units.csv line ").split(",")[0]
@@ -266,11 +239,3 @@ def _value(layers: Sequence[Layer], key: str) -> list[str]:
             )
         found = [str(v) for v in value]
     return found
-
-
-def _override(key: str, effects: Sequence[str]) -> str:
-    return f"{key}=[{','.join(effects)}]"
-
-
-def _key(text: str) -> str:
-    return str(text).partition("=")[0].strip().lstrip("+")

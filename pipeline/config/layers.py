@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
-from pipeline.config.compose import GROUPS, RUN_SETTINGS, Problem, default_option, nearest, parse
+from pipeline.config.options import GROUPS, RUN_SETTINGS, Problem, default_option, nearest, parse
 from pipeline.config.user_effects import ONLY_FROM_THE_COMMAND_LINE, PYTHON
 from pipeline.errors import ConfigurationError
 from pipeline.io.files import not_regular

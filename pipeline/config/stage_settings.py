@@ -1,7 +1,7 @@
-"""Each stage's own part of the configuration, in a file that is named after its content.
+"""The settings that each stage reads, in a file named after its content.
 
-A job cannot read a setting that is not in its part, and the name of the file is a parameter of its rule; so changing a
-setting reruns exactly the stages that read it. What is the same for all units of a batch stands in it once.
+A job cannot read other settings, and the name of the file is a parameter of its rule; so a changed setting reruns
+exactly the stages that read it. Settings that all units of a batch share stand in the file once, under ``common``.
 """
 
 from __future__ import annotations
@@ -22,101 +22,57 @@ if TYPE_CHECKING:
     from pipeline.config.campaign import Campaign
 
 # Dotted keys that a stage reads; {sensor} is the sensor that the stage is about.
-ACCURACIES = (
-    "angle_accuracy_deg",
-    "rate_accuracy",
-    "orthogonality_deg",
-    "wobble_deg",
-    "levelling_deg",
-    "gravity_accuracy_g",
-    "azimuth_accuracy_deg",
-    "clock_accuracy_ppm",
-)
 BOTH = ("accelerometer", "gyroscope")
 NOISE = ("noise_density", "bias_wander", "wander_time_s")
+FIT_OF_TABLE = (
+    "motion", "gravity_g", "latitude_deg", "azimuth_deg", "angle_accuracy_deg", "rate_accuracy", "orthogonality_deg",
+    "wobble_deg", "levelling_deg", "gravity_accuracy_g", "azimuth_accuracy_deg", "clock_accuracy_ppm",
+)  # fmt: skip
+FIT_OF_SENSOR = (
+    "full_scale", "counts_per_unit", *NOISE, "effects.bias_temperature", "effects.scale_factor_temperature",
+    "repeatability_bias", "repeatability_scale_factor",
+)  # fmt: skip
 FIT = (
-    "table.motion",
-    "table.gravity_g",
-    "table.latitude_deg",
-    "table.azimuth_deg",
-    *(f"table.{key}" for key in ACCURACIES),
-    "procedure.holdout_every",
-    "method.{sensor}",
-    "method.as_printed",
-    "sensor.{sensor}.full_scale",
-    "sensor.{sensor}.counts_per_unit",
-    *(f"sensor.{{sensor}}.{key}" for key in NOISE),
-    *(f"sensor.{{sensor}}.effects.{key}" for key in ("bias_temperature", "scale_factor_temperature")),
-    *(f"sensor.{{sensor}}.{key}" for key in ("repeatability_bias", "repeatability_scale_factor")),
-    "sensor.temperature_accuracy_degc",
+    *(f"table.{key}" for key in FIT_OF_TABLE),
+    *(f"sensor.{{sensor}}.{key}" for key in FIT_OF_SENSOR),
+    "sensor.temperature_accuracy_degc", "procedure.holdout_every", "method.{sensor}", "method.as_printed",
     "uncertainty.monte_carlo",
-)
-SENSORS_AND_TABLE = ("sensor", "table", "procedure.holdout_every")
-# Effects that explain a departure of table, clock or gyroscope, whose limits the checks of the recordings read.
+)  # fmt: skip
+# Effects that explain a departure of table, clock or gyroscope: the checks of the recordings read their limits.
 LIMITS_OF_CHECKS = (
-    "time_offset",
-    "low_pass_lag",
-    "clock_rate",
-    "table_encoder_error",
-    "table_rate_ripple",
-    "table_backlash",
-    "table_tilt",
-    "table_axis_nonorthogonality",
-    "g_sensitivity",
-    "g_squared_sensitivity",
-    "bias_drift",
-    "bias_temperature",
-    "warm_up",
-)
+    "time_offset", "low_pass_lag", "clock_rate", "table_encoder_error", "table_rate_ripple", "table_backlash",
+    "table_tilt", "table_axis_nonorthogonality", "g_sensitivity", "g_squared_sensitivity", "bias_drift",
+    "bias_temperature", "warm_up",
+)  # fmt: skip
+INGEST_OF_TABLE = (
+    "motion", "gravity_g", "rate_accuracy", "sense", "zero_deg", "angle_accuracy_deg", "orthogonality_deg",
+)  # fmt: skip
+INGEST_OF_SENSOR = (
+    "axis_map", "full_scale", "bias", "scale_factor", "cross_axis", *NOISE,
+    *(f"effects.{name}" for name in LIMITS_OF_CHECKS),
+)  # fmt: skip
+SENSORS_AND_TABLE = ("sensor", "table", "procedure.holdout_every")
 READS: dict[str, tuple[str, ...]] = {
     "ingest": (
-        "ingest",
-        "procedure.folder",
-        "procedure.recordings",
-        "procedure.mounting_tolerance_deg",
-        "table.motion",
-        "table.rate_accuracy",
-        "table.sense",
-        "table.zero_deg",
-        "table.angle_accuracy_deg",
-        "table.orthogonality_deg",
-        "sensor.axis_map",
-        *(f"sensor.{sensor}.{key}" for sensor in BOTH for key in ("axis_map", "full_scale")),
-        *(f"sensor.{sensor}.effects.{name}" for sensor in BOTH for name in LIMITS_OF_CHECKS),
-        *(f"sensor.{sensor}.{key}" for sensor in BOTH for key in ("bias", "scale_factor", "cross_axis", *NOISE)),
-        "table.gravity_g",
+        "ingest", "procedure.folder", "procedure.recordings", "procedure.mounting_tolerance_deg", "sensor.axis_map",
+        *(f"table.{key}" for key in INGEST_OF_TABLE),
+        *(f"sensor.{sensor}.{key}" for sensor in BOTH for key in INGEST_OF_SENSOR),
     ),
     "filter": ("filter", *(f"sensor.{sensor}.{key}" for sensor in BOTH for key in NOISE)),
     "fit": FIT,
     "effects": (*FIT, "effects.{sensor}", "sensor.{sensor}.effects"),
     "calibration": (
-        "sensor.name",
-        "sensor.axis_map",
-        "sensor.accelerometer",
-        "sensor.gyroscope",
-        "table.name",
-        "procedure.name",
-        "method",
-        "ingest.csv",
-        "ingest.mcap",
-        "config_sha256",
+        "sensor.name", "sensor.axis_map", "sensor.accelerometer", "sensor.gyroscope", "table.name", "procedure.name",
+        "method", "ingest.csv", "ingest.mcap", "config_sha256",
     ),
     "validate": (*SENSORS_AND_TABLE, "limits"),
     "diagnose": (*SENSORS_AND_TABLE, "effects", "method"),
     "export": ("sensor", "table.gravity_g"),
     "report": (
-        "sensor",
-        "table",
-        "procedure",
-        "method",
-        "filter",
-        "ingest",
-        "effects",
-        "limits",
-        "certificate",
+        "sensor", "table", "procedure", "method", "filter", "ingest", "effects", "limits", "certificate",
         "config_sha256",
     ),
-}
+}  # fmt: skip
 WITH_DIGEST = [stage for stage, keys in READS.items() if "config_sha256" in keys]
 
 
@@ -126,7 +82,7 @@ def config_sha256(config: Mapping[str, Any]) -> str:
 
 
 def select_settings(config: Mapping[str, Any], stage: str, sensor: str = "") -> dict[str, Any]:
-    """Return what a stage reads of a unit's configuration.
+    """Return the settings of a unit that a stage reads.
 
     Parameters
     ----------
@@ -156,7 +112,7 @@ def _paths(stage: str, sensor: str) -> list[list[str]]:
 
 @dataclass(frozen=True)
 class SettingsFile:
-    """A stage's part of the configuration of some units, as a file that is named after its content."""
+    """The settings of some units that a stage reads, as a file that is named after its content."""
 
     path: Path
     content: bytes
@@ -171,7 +127,7 @@ class SettingsFile:
 def settings_file(
     campaign: Campaign, stage: str, units: Sequence[str], sensor: str = "", again: int = 0
 ) -> SettingsFile:
-    """Return a stage's part of the configuration of some units.
+    """Return the settings of some units that a stage reads.
 
     Parameters
     ----------
@@ -182,20 +138,20 @@ def settings_file(
     sensor : str
         The sensor of a stage of a fit.
     again : int
-        How often the job is repeated because what it wrote has been changed (``pipeline.results_folder``).
+        How often the job is repeated because its output was edited (``pipeline.results_folder``).
     """
     if stage == "gather":
         content = _of_gather(campaign)
     else:
         rows = [campaign.units[u] for u in units]
         digests = [{"config_sha256": r.config_sha256} if stage in WITH_DIGEST else {} for r in rows]
-        parts = {r.name: select_settings(r.config | d, stage, sensor) for r, d in zip(rows, digests, strict=True)}
+        settings = {r.name: select_settings(r.config | d, stage, sensor) for r, d in zip(rows, digests, strict=True)}
         if stage == "report":
-            for unit, each in parts.items():
+            for unit, each in settings.items():
                 row = campaign.units[unit].row
                 each["row"] = {c: row[c] for c in ("serial", "lot", "date") if row.get(c)}
                 each["run"] = campaign.run_settings(unit)
-        content = dict(zip(("common", "units"), in_common(parts), strict=True))
+        content = dict(zip(("common", "units"), in_common(settings), strict=True))
         content |= effects_for(stage, sensor, [r.config for r in rows])
     if stage in ("ingest", "report"):
         content["campaign"] = campaign.name
@@ -209,23 +165,23 @@ def settings_file(
     return SettingsFile(path, text)
 
 
-def in_common(parts: Mapping[str, dict[str, Any]]) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-    """Split the parts of units in what all of them have, and what each has beside it.
+def in_common(settings: Mapping[str, dict[str, Any]]) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+    """Split the settings of units into those that all share and the rest of each.
 
-    ``pipeline.stages.batch.merge_common`` puts them together again.
+    ``pipeline.stages.batch.merge_common`` merges them again.
     """
-    if len(parts) < 2:
-        return {}, dict(parts)
-    first, *others = parts.values()
+    if len(settings) < 2:
+        return {}, dict(settings)
+    first, *others = settings.values()
     shared: dict[str, Any] = {}
-    own = {unit: dict(each) for unit, each in parts.items()}
+    own = {unit: dict(each) for unit, each in settings.items()}
     for key, value in first.items():
         if all(key in each and each[key] == value for each in others):
             shared[key] = value
             for each in own.values():
                 del each[key]
-        elif all(isinstance(each.get(key), dict) for each in parts.values()):
-            shared[key], below = in_common({unit: each[key] for unit, each in parts.items()})
+        elif all(isinstance(each.get(key), dict) for each in settings.values()):
+            shared[key], below = in_common({unit: each[key] for unit, each in settings.items()})
             for unit, each in own.items():
                 each[key] = below[unit]
     return shared, own

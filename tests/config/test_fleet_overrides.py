@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from pipeline.__main__ import main
 from pipeline.config import Campaign, load_campaign
-from pipeline.config.compose import _parse_with_hydra, parse
+from pipeline.config.options import _parse_with_hydra, parse
 from pipeline.config.stage_settings import in_common, select_settings
 from pipeline.errors import ConfigurationError
 from pipeline.stages.batch import merge_common

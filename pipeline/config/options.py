@@ -1,0 +1,172 @@
+r"""The options of Hydra groups, overrides and references, as files and the command line hold them.
+
+A reference ``${group.key}`` in a value stands for the value of that setting, and ``\${`` for the characters ``${``.
+OmegaConf does not resolve them: its resolvers, such as ``${oc.env:NAME}``, would put the environment of whoever runs a
+campaign into its pages, and it takes 64 ms to build a unit's configuration. A reference names a value or a list of
+values, and none that is a reference itself; so the cost of a file grows with its size.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from functools import cache, lru_cache
+from typing import TYPE_CHECKING, Any
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException, OverrideParseException
+
+from pipeline.errors import ConfigurationError
+from pipeline.files import CONFIGS
+from pipeline.io.yaml_file import read_yaml
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from pathlib import Path
+
+GROUPS = ("sensor", "table", "procedure", "method", "filter", "ingest", "certificate")
+RUN_SETTINGS = ("batch_size",)
+LARGEST_CONFIG = 10_000  # values of a group's option; the largest that ships has 160
+NUMBER = re.compile(r"([a-z_][a-z_0-9]*(?:\.[A-Za-z_][A-Za-z_0-9]*)*)=(-?(?:0|[1-9][0-9]*)(\.[0-9]+)?)")
+TOKEN = re.compile(r"(\\\$\{)|\$\{\s*([A-Za-z_]\w*(?:\.\w+)+)\s*\}|\$\{")
+LONGEST = 10_000  # characters of a value with references; names and units are meant
+FORM = "a reference is ${group.key}, for example ${sensor.accelerometer.counts_per_unit}"
+
+
+class Problem(Exception):  # noqa: N818  (one of many: they are collected, then raised as one ConfigurationError)
+    """One thing that is wrong with a configuration."""
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Return a hint at the nearest valid name, and all of them where there are few."""
+    known = sorted(known)
+    close = difflib.get_close_matches(name, known, 1, 0.5)
+    hint = f"; nearest: {close[0]}" if close else ""
+    return f"{hint}; valid: {', '.join(known)}" if len(known) <= 12 else hint
+
+
+@lru_cache(maxsize=100_000)
+def parse(text: str) -> tuple[str, Any]:
+    """Parse one Hydra override to its key and value.
+
+    A plain number, which is what differs from unit to unit, is read without Hydra's parser: that costs 0.6 ms each.
+
+    Raises
+    ------
+    Problem
+        If it is no override, a sweep or a deletion.
+    """
+    number = NUMBER.fullmatch(text)
+    if number:
+        key, value, fraction = number.groups()
+        return key, float(value) if fraction else int(value)
+    return _parse_with_hydra(text)
+
+
+def _parse_with_hydra(text: str) -> tuple[str, Any]:
+    hint = "; write KEY=VALUE, for example filter.cutoff_hz=5"
+    if text.startswith("["):
+        raise Problem(f'{text!r} is not a list of overrides; quote each one: \'overrides=["a=1","b=[x,y]"]\'')
+    try:
+        override = _hydras_parser().parse_override(text)
+    except (OverrideParseException, HydraException) as error:
+        raise Problem(f"{text!r} is not a Hydra override ({str(error).splitlines()[0]}){hint}") from error
+    if override.is_sweep_override() or override.is_delete():
+        raise Problem(f"{text!r} is a {'sweep' if override.is_sweep_override() else 'deletion'}; give one value{hint}")
+    return override.key_or_group, override.value()
+
+
+@cache
+def _hydras_parser() -> OverridesParser:
+    return OverridesParser.create()
+
+
+@cache
+def read_option(group: str, option: str, searchpath: tuple[Path, ...]) -> dict[str, Any]:
+    """Return what the file of a group's option holds; nothing where there is none."""
+    for root in (*searchpath, CONFIGS):
+        file = root / group / f"{option}.yaml"
+        if file.is_file():
+            return {str(k): v for k, v in mapping_of(file).items()}
+    return {}
+
+
+def mapping_of(file: Path) -> dict[Any, Any]:
+    """Read the file of an option; raises ``ConfigurationError`` if it is no mapping or holds a resolver."""
+    content = read_yaml(file, LARGEST_CONFIG)
+    if not isinstance(content, dict):
+        raise ConfigurationError("a mapping of settings is expected", str(file))
+    check_references(content, str(file))
+    return content
+
+
+@cache
+def default_option(group: str) -> str:
+    """Return the option of a group where nothing chooses one."""
+    for entry in mapping_of(CONFIGS / "config.yaml")["defaults"]:
+        if not isinstance(entry, str) and group in entry:
+            return str(entry[group])
+    raise KeyError(group)
+
+
+def default_of_run(name: str) -> Any:  # noqa: ANN401  (a setting's type is its own)
+    """Return the default of a setting of the run."""
+    return mapping_of(CONFIGS / "config.yaml")[name]
+
+
+def check_references(value: Any, where: str | None = None) -> None:  # noqa: ANN401  (any YAML value)
+    """Refuse ``${...}`` that is more than the name of a setting, anywhere below a value.
+
+    Raises
+    ------
+    ConfigurationError
+        Naming the text.
+    """
+    if isinstance(value, dict):
+        for key, below in value.items():
+            check_references(key, where)
+            check_references(below, where)
+    elif isinstance(value, list):
+        for below in value:
+            check_references(below, where)
+    elif isinstance(value, str) and any(not escaped and not name for escaped, name in TOKEN.findall(value)):
+        raise ConfigurationError(f"{value[:200]!r}: {FORM}; resolvers such as ${{oc.env:NAME}} are not read", where)
+
+
+def with_references(node: Any, root: dict[str, Any]) -> Any:  # noqa: ANN401  (dict, list or value)
+    """Return a copy of a node in which each reference is replaced by what it names in the tree ``root``.
+
+    Raises
+    ------
+    ConfigurationError
+        If a reference names no setting, a group of settings, or a setting that is a reference too.
+    """
+    if isinstance(node, dict):
+        return {key: with_references(below, root) for key, below in node.items()}
+    if isinstance(node, list):
+        return [with_references(below, root) for below in node]
+    if not isinstance(node, str) or "${" not in node:
+        return node
+    check_references(node)
+    whole = TOKEN.fullmatch(node)
+    if whole and whole.group(2):
+        return _named(whole.group(2), root, node)
+    text, end = "", 0
+    for token in TOKEN.finditer(node):
+        text += node[end : token.start()] + ("${" if token.group(1) else str(_named(token.group(2), root, node)))
+        end = token.end()
+        if len(text) > LONGEST:
+            raise ConfigurationError(f"{node[:200]!r}: has more than {LONGEST} characters with its references")
+    return text + node[end:]
+
+
+def _named(name: str, root: dict[str, Any], text: str) -> Any:  # noqa: ANN401
+    found: Any = root
+    for key in name.split("."):
+        if not isinstance(found, dict) or key not in found:
+            raise ConfigurationError(f"{text[:200]!r}: no setting is called {name}")
+        found = found[key]
+    values = found if isinstance(found, list) else [found]
+    if any(isinstance(v, (dict, list)) or (isinstance(v, str) and "${" in v) for v in values):
+        raise ConfigurationError(f"{text[:200]!r}: {name} is a group of settings or a reference; name one value")
+    return found
