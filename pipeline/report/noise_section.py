@@ -87,7 +87,7 @@ def allan(
     filtered = "" if recording.filter.get("name", "none") == "none" else ", after the filter"
     rest = f"{recording.name}, {number(len(values) * recording.interval)} s at rest{filtered}."
     legend = (*AXES_LEGEND, *((f"c{colour}", name) for name, _, colour, _ in curves))
-    return Figure(drawn, f"{rest} {_words(noise, wander, unit)}", legend, finding)
+    return Figure(drawn, f"{rest} {_noise_sentences(noise, wander, unit)}", legend, finding)
 
 
 def longest_rest(sensor: str, recordings: list[Recording]) -> tuple[Recording, NDArray[np.float64]] | None:
@@ -184,7 +184,7 @@ def _finding(noise: JSON | None, sheet: JSON, interval: float, unit: str) -> str
     return f"{head}, {number(ratio, 2)} × that of the data sheet{cause}"
 
 
-def _words(noise: JSON | None, wander: JSON | None, unit: str) -> str:
+def _noise_sentences(noise: JSON | None, wander: JSON | None, unit: str) -> str:
     """Return white noise and wander, at rest and as the fit needed them."""
     said = ""
     if noise and noise.get("white"):

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pipeline.records import AXES
+from pipeline.report.numbers import plain
 
 JSON = dict[str, Any]
 NO_UNCERTAINTY: JSON = {"bias": [None] * 3, "matrix": [[None] * 3] * 3}
@@ -38,7 +39,7 @@ class Parameter(NamedTuple):
     def words(self) -> str:
         """The name for a page: ``bias x``, ``g sensitivity: G_xy``."""
         effect, dot, symbol = self.name.rpartition(".")
-        return f"{effect.replace('_', ' ')}: {symbol}" if dot else self.name.replace("_", " ")
+        return f"{plain(effect)}: {symbol}" if dot else plain(self.name)
 
 
 def fitted_parameters(part: JSON) -> list[Parameter]:
