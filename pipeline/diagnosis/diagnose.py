@@ -92,7 +92,7 @@ def diagnose(
     """
     sensor = calibration.sensor
     if is_multi_position(sensor, recordings):
-        from pipeline.diagnosis.by_hand import diagnose_multi_position  # noqa: PLC0415  (recordings by hand alone)
+        from pipeline.diagnosis.multi_position import diagnose_multi_position  # noqa: PLC0415  (recordings by hand alone)
 
         return diagnose_multi_position(calibration, recordings, noise, settings, accelerometer, validation=validation)
     wanted = settings["effects"][sensor]

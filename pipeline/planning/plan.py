@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.diagnosis.by_hand_hidden import hidden_effects
 from pipeline.diagnosis.observability import not_observable
+from pipeline.diagnosis.unobservable_effects import hidden_effects
 from pipeline.errors import NotObservableError
 from pipeline.estimation.multi_position.rests import is_multi_position
 from pipeline.estimation.observations import observe
@@ -33,8 +33,8 @@ from pipeline.simulation.description import read_config
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.planning.by_hand import ExpectedSelection
     from pipeline.planning.detection_limits import Detection
+    from pipeline.planning.multi_position import ExpectedSelection
     from pipeline.simulation.description import UnitDescription
     from pipeline.simulation.trajectory import Planned
 
@@ -113,7 +113,7 @@ def _expectation(sensor: str, simulated: SimulatedProcedure) -> tuple[Expectatio
     """Return what a selection is expected to find, and the effects that it cannot find, each with the reason."""
     noise, sheet = simulated.noise[sensor], simulated.sheets[sensor]
     if is_multi_position(sensor, simulated.recordings):
-        from pipeline.planning.by_hand import ExpectedSelection, select_in_rehearsal  # noqa: PLC0415  (by hand alone)
+        from pipeline.planning.multi_position import ExpectedSelection, select_in_rehearsal  # noqa: PLC0415  (by hand alone)
 
         selected = select_in_rehearsal(sensor, simulated)
         hand = ExpectedSelection(selected, noise)

@@ -1,11 +1,16 @@
-"""What the residual of hand-held rests depends on beside the catalogue.
+"""Residuals of rests: covariates on which they depend, and the added-variable plot of the first selected effect.
 
-Curves in one covariate at a time, each with coefficients of its own in every axis, beside base and chosen effects:
+A covariate is tested by curves with coefficients of their own in every axis, given base and selected effects:
 
     time, temperature : Chebyshev polynomials of degree 1 to d over their span, d = 2 and 3
     specific_force    : those of degree 4 and 5 of the axis' own component; the catalogue has those below
 
-A covariate is named where one of its tests has delta BIC > 10 and m p < 1e-3, m the number of all tests.
+It is named where one of its tests has delta BIC > 10 and m p < 1e-3, m the number of all tests.
+
+The plot shows one coefficient gamma, a point a rest. With x its column and r the residual, both whitened by the most
+likely noise, and x~ what all other columns leave of x, the points ``(x~, gamma x~ + r)`` have a line of least squares
+with the slope gamma (Frisch, Waugh and Lovell; see ``pipeline.diagnosis.residual_plots``). Both are shown times the
+median white error of a rest, in the sensor's unit.
 """
 
 from __future__ import annotations
@@ -15,12 +20,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.estimation.design import Term
+from pipeline.estimation.multi_position.fit import solve
 from pipeline.estimation.multi_position.likelihood import project_out
 from pipeline.estimation.selection import GATE_BIC
-from pipeline.model.effects.base import Effect, Layout, Owner, Parameter
+from pipeline.model.effects.base import Effect, Layout, Owner, Parameter, unit_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
@@ -30,6 +36,7 @@ if TYPE_CHECKING:
     Values = NDArray[np.float64]
 
 GATE_P = 1e-3
+AT_REST = 0.9  # share of a column's power
 LEAST_SPAN = 1.0  # s or degC
 
 
@@ -114,3 +121,68 @@ def _along(of: Callable[[Motion], Values | None], values: Values, degree: int) -
 
 def _force(motion: Motion) -> Values:
     return np.asarray(np.polynomial.chebyshev.chebvander(motion.specific_force, 5)[:, :, 4:], np.float64)
+
+
+def added_variable(selection: Selection) -> dict[str, Any] | None:
+    """Return the added-variable plot of the first selected effect: its clearest coefficient on each axis.
+
+    Returns
+    -------
+    dict or None
+        ``effect, unit, panels``, each panel with ``axis, parameter, unit, value, standard_uncertainty`` and, a number
+        a rest, ``x, mean, standard_error``; None where nothing is selected or it shows mostly in the moves.
+    """
+    if not selection.names:
+        return None
+    model, found = selection.model, selection.fits[-1]
+    order = [term.effect.name for term in found.state.terms].index(selection.names[0])
+    term = found.state.terms[order]
+    first = model.directions.shape[1] + sum(len(t.values) for t in found.state.terms[:order])
+    equations = model.equations(found.state)
+    columns = equations.columns
+    white, _ = equations.whitened(found.noise, np.column_stack([columns, equations.residual]))
+    scale = solve(equations, found.noise, *np.zeros((2, columns.shape[1]))).scale
+    rests = slice(0, model.rests_equations)
+    size = float(np.median(equations.error[rests]))
+    uncertainty = np.sqrt(np.diag(found.covariance))[first : first + len(term.values)]
+    described = term.effect.parameters(model.sensor)
+    panels = []
+    for axis, j in _clearest(term.effect, model.sensor, np.abs(term.values) / uncertainty):
+        left = _left(white[:, :-1], first + j)
+        if np.sum(left[rests] ** 2) < AT_REST * np.sum(left**2):
+            return None
+        points = (term.values[j] * left + white[:, -1])[rests] * size
+        shown = np.argsort(left[rests], kind="stable")
+        panels.append(
+            {
+                "axis": axis,
+                "parameter": described[j].name,
+                "unit": described[j].unit,
+                "value": float(term.values[j]),
+                "standard_uncertainty": float(uncertainty[j]),
+                "x": (left[rests] * size)[shown].tolist(),
+                "mean": points[shown].tolist(),
+                "standard_error": [size * float(np.sqrt(scale))] * len(shown),
+            }
+        )
+    return {"effect": selection.names[0], "unit": unit_of(model.sensor), "panels": panels}
+
+
+def _left(columns: Values, j: int) -> Values:
+    """Return what the other columns leave of column j: (n,) array."""
+    others = np.delete(columns, j, axis=1)
+    size = np.linalg.norm(others, axis=0)
+    found = np.linalg.lstsq(others / np.where(size > 0.0, size, 1.0), columns[:, j], rcond=1e-8)[0]
+    return np.asarray(columns[:, j] - others / np.where(size > 0.0, size, 1.0) @ found)
+
+
+def _clearest(effect: Effect, sensor: str, clear: Values) -> Sequence[tuple[str, int]]:
+    """Return the clearest linear coefficient on each axis, all of one unit; one alone where the axes share them."""
+    described = effect.parameters(sensor)
+    clear = np.where([p.name in effect.nonlinear for p in described], -1.0, clear)
+    best = int(np.argmax(clear))
+    if effect.layout == Layout.SHARED:
+        return [("x", best)]
+    clear = np.where([p.unit == described[best].unit for p in described], clear, -1.0)
+    of_axis = np.flatnonzero([p.name not in effect.nonlinear for p in described]).reshape(3, -1)
+    return [(axis, int(own[np.argmax(clear[own])])) for axis, own in zip("xyz", of_axis, strict=True)]

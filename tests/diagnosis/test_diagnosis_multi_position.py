@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from hand_session import WARM, Unit, hand_held
+from hand_simulator import Hand, draw
 
+from pipeline.diagnosis.diagnose import diagnose
 from pipeline.diagnosis.words import in_words
+from pipeline.estimation.accelerometer import nonlinear_least_squares
+from pipeline.estimation.noise import estimate_noise
 
 NAMED = [
     ("mpu6050", "accelerometer", "scale_factor_asymmetry"),
@@ -159,3 +164,14 @@ def test_a_part_is_json_and_is_told_in_words() -> None:
     text = " ".join(in_words(json.loads(json.dumps(part)), "accelerometer"))
     assert "misses quadratic nonlinearity" in text
     assert "there is no table" in text
+
+
+def test_a_drift_that_a_short_recording_hides_is_given_the_time_that_shows_it() -> None:
+    """Drifts of half the limit are found in 500 s, and not in 280 s (tests/study/test_hand_held_study.py)."""
+    drawn = draw(Hand(rests=20), 1)
+    noise = estimate_noise("accelerometer", [drawn.recording], drawn.settings["sensor"]["accelerometer"])
+    calibration = nonlinear_least_squares.fit([drawn.recording], None, drawn.settings)
+    found = diagnose(calibration, [drawn.recording], noise, drawn.settings)["not_observable"]
+    (reason,) = [entry["reason"] for entry in found if entry["effect"] == "bias_drift"]
+    (minutes,) = re.findall(r"within (\d+) min", reason)
+    assert 4.0 < float(minutes) < 9.0

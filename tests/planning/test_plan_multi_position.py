@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.estimation.selection import GATE_BIC
-from pipeline.planning.by_hand import select_in_rehearsal
 from pipeline.planning.changes import changes
+from pipeline.planning.multi_position import select_in_rehearsal
 from pipeline.planning.plan import ROOM, of_sensor, simulate_procedure
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription
