@@ -26,7 +26,7 @@ from pipeline.diagnosis.residual_plots import plots
 from pipeline.diagnosis.verdict import evidence_of, judged, verdict_of_selection
 from pipeline.diagnosis.words import next_experiment
 from pipeline.errors import NotObservableError
-from pipeline.estimation.design import Start, Term
+from pipeline.estimation.design import BASE, Start
 from pipeline.estimation.effects import AUTO
 from pipeline.estimation.generalized_least_squares import calibration_of, fit_terms
 from pipeline.estimation.multi_position.rests import is_multi_position
@@ -48,6 +48,8 @@ if TYPE_CHECKING:
     from pipeline.estimation.selection import Selection
     from pipeline.records import Recording, SensorCalibration
     from pipeline.validation.samples import Samples
+
+    Values = NDArray[np.float64]
 
 ALIKE = 0.8  # share of an effect's signal that another reproduces, from which on it is a look-alike
 CLOSE = 1.1  # mean square of a residual over that of noise, under which there is no excess to share
@@ -269,7 +271,7 @@ def _entry(
     selection: Selection,
     name: str,
     steps: Sequence[tuple[Fit, float | None]],
-    explained: NDArray[np.float64],
+    explained: Values,
     noise: Noise | None,
 ) -> dict[str, Any]:
     """Return one line of the ranking."""
@@ -280,26 +282,25 @@ def _entry(
         (without, before), (within, after) = steps[step], steps[step + 1]
         drop = without.residual_rms**2 - within.residual_rms**2
     else:
-        drop = _drop(selection, name, explained)
+        best = max(explained[j] for j in selection.first.indices(name))
+        drop = float(best / selection.first.samples * np.mean(selection.start.scale**2))
+    values, uncertainty, plausible = _estimates(selection, score)
+    described = effect(name).parameters(selection.observations.sensor)
     return {
         "effect": name,
         "delta_bic": score.delta_bic,
         "p_value": score.p_value,
-        "parameters": _parameters(selection, score),
+        "parameters": {
+            p.name: {"value": float(v), "unit": p.unit, "standard_uncertainty": float(u) if u > 0 else None}
+            for p, v, u in zip(described, values, uncertainty, strict=True)
+        },
         "explained_share": _share(drop, selection, noise),
         "held_out_error_before": before,
         "held_out_error_after": after,
         "look_alikes": _look_alikes(selection, score),
-        "plausible": _plausible(selection, score),
+        "plausible": plausible,
         **({"meaning": effect(name).meaning} if effect(name).definition else {}),
     }
-
-
-def _drop(selection: Selection, name: str, explained: NDArray[np.float64]) -> float:
-    """Return by how much an effect alone would lower the mean square of the residual."""
-    first = selection.first
-    best = max(explained[j] for j in first.indices(name))
-    return float(best / first.samples * np.mean(selection.start.scale**2))
 
 
 def _share(drop: float, selection: Selection, noise: Noise | None) -> float:
@@ -312,38 +313,19 @@ def _share(drop: float, selection: Selection, noise: Noise | None) -> float:
     return float(np.clip(drop / excess, 0.0, 1.0)) if excess > 0 else 0.0
 
 
-def _final(selection: Selection, name: str) -> tuple[Term, int] | None:
-    at = 12
+def _estimates(selection: Selection, score: Score) -> tuple[Values, Values, bool]:
+    """Return values, standard uncertainties and plausibility: of the fit of all selected, or of the effect alone."""
+    at = BASE
     for term in selection.fit.terms:
-        if term.effect.name == name and name in selection.names:
-            return term, at
-        at += len(term.values)
-    return None
-
-
-def _parameters(selection: Selection, score: Score) -> dict[str, dict[str, Any]]:
-    """Return the estimates: of the fit of all selected effects, or of the effect alone."""
-    sensor = selection.observations.sensor
-    values, uncertainty = score.values, score.uncertainty
-    final = _final(selection, score.name)
-    if final is not None:
-        term, at = final
-        values = term.values
-        uncertainty = np.sqrt(np.clip(np.diag(selection.fit.covariance)[at : at + len(values)], 0.0, None))
-    described = catalogue()[score.name].parameters(sensor)
-    return {
-        p.name: {"value": float(v), "unit": p.unit, "standard_uncertainty": float(u) if u > 0 else None}
-        for p, v, u in zip(described, values, uncertainty, strict=True)
-    }
-
-
-def _plausible(selection: Selection, score: Score) -> bool:
-    limits, final = selection.limits.get(score.name), _final(selection, score.name)
-    if limits is None or final is None:
-        return score.plausible
-    term, at = final
-    uncertainty = np.sqrt(np.clip(np.diag(selection.fit.covariance)[at : at + len(term.values)], 0.0, None))
-    return bool(np.all(np.abs(term.values) - 2.0 * uncertainty <= limits))
+        own = slice(at, at + len(term.values))
+        if term.effect.name == score.name and score.name in selection.names:
+            uncertainty = np.sqrt(np.clip(np.diag(selection.fit.covariance)[own], 0.0, None))
+            limits = selection.limits.get(score.name)
+            if limits is None:
+                return term.values, uncertainty, score.plausible
+            return term.values, uncertainty, bool(np.all(np.abs(term.values) - 2.0 * uncertainty <= limits))
+        at = own.stop
+    return score.values, score.uncertainty, score.plausible
 
 
 def _look_alikes(selection: Selection, score: Score) -> list[dict[str, Any]]:

@@ -48,24 +48,13 @@ OWNERS = {"harmonic": "table", "ripple": "table", "band": "table"}
 
 @dataclass(frozen=True)
 class FittedForm:
-    """The best functional form in one covariate.
-
-    Attributes
-    ----------
-    covariate : str
-    form : Form
-    gain : Gain
-    coefficients : (3, r) array
-        Zero on the axes that are left out.
-    sizes : (3,) array
-        Amplitude, height or whole change on each axis, unit of the sensor; signed where a sign has a meaning.
-    """
+    """The best functional form in one covariate."""
 
     covariate: str
     form: Form
     gain: Gain
-    coefficients: Values
-    sizes: Values
+    coefficients: Values  # (3, r), zero on the axes that are left out
+    sizes: Values  # (3,): amplitude, height or whole change, unit of the sensor; signed where a sign has a meaning
 
 
 def unexplained(selection: Selection) -> list[dict[str, Any]]:

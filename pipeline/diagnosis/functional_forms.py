@@ -46,28 +46,14 @@ UNITS = {"temperature": "degC", "time": "s", "speed": "deg/s", "angle": "deg"}
 
 @dataclass(frozen=True)
 class Form:
-    """A functional form that is tried.
-
-    Attributes
-    ----------
-    kind : str
-    signal : str
-    formulas : tuple of str
-        One for each coefficient.
-    scanned : int
-        How many nonlinear parameters were scanned to find it.
-    figures : dict
-        Those parameters: ``at``, ``width``, ``low``, ``high``, ``cycles``, ``order``, ``constant``, ``grows``.
-    combination : dict of int to float
-        The scan's columns whose combination is the form; empty: its own formula is the column.
-    """
+    """A functional form that is tried."""
 
     kind: str
     signal: str
-    formulas: tuple[str, ...]
-    scanned: int
-    figures: dict[str, Any] = field(default_factory=dict)
-    combination: dict[int, float] = field(default_factory=dict)
+    formulas: tuple[str, ...]  # one for each coefficient
+    scanned: int  # how many nonlinear parameters were scanned to find it
+    figures: dict[str, Any] = field(default_factory=dict)  # those: at, width, low, high, cycles, order, constant, grows
+    combination: dict[int, float] = field(default_factory=dict)  # of the scan's columns; empty: its own formula
 
 
 def columns_of(formulas: Iterable[str], sensor: str) -> Curves:

@@ -33,27 +33,12 @@ OF_A_TABLE = {"angle": "no angle of a table", "rate": "no rate of a table", "lev
 
 @dataclass(frozen=True)
 class Facts:
-    """What the recordings did.
+    """What the recordings did."""
 
-    Attributes
-    ----------
-    temperature : bool
-        Whether every recording holds one.
-    span : float, degC
-        Of the temperature.
-    moving : bool
-        Whether any used sample moves.
-    fastest : float, deg/s
-    one_way : bool
-        Whether the turns about no axis go in both directions.
-    clock_shared : bool
-    """
-
-    temperature: bool
-    span: float
-    moving: bool
-    fastest: float
-    one_way: bool
+    temperature: bool  # whether every recording holds one
+    span: float  # of the temperature, degC
+    moving: bool  # whether any used sample moves
+    one_way: bool  # whether the turns about no axis go in both directions
     clock_shared: bool
 
 
@@ -62,7 +47,6 @@ def facts_of(observations: Observations) -> Facts:
     warmth = [part.motion.temperature for part in observations.parts]
     known = [t for t in warmth if t is not None]
     span = float(np.ptp(np.concatenate(known))) if known else 0.0
-    rates = [np.abs(part.motion.angular_rate).max(axis=1) for part in observations.parts]
     moving = any(np.any(~part.motion.still) for part in observations.parts)
     ways: dict[int, set[int]] = {}
     for part in observations.parts:
@@ -73,7 +57,6 @@ def facts_of(observations: Observations) -> Facts:
         temperature=len(known) == len(warmth),
         span=span,
         moving=moving,
-        fastest=float(max(r.max() for r in rates)),
         one_way=moving and not any(len(w) == 2 for w in ways.values()),
         clock_shared=observations.clock_shared,
     )

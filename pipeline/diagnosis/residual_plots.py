@@ -271,23 +271,12 @@ def _places(c: int, count: int) -> NDArray[np.intp]:
 
 @dataclass(frozen=True)
 class Bins:
-    """Those of equal bins that hold something.
+    """Those of 40 equal bins of a covariate that hold something."""
 
-    Attributes
-    ----------
-    cell : (n,) array of int
-        Bin of each row; one beyond the last where the covariate is not known.
-    row_weight : (n,) array
-    weight : (b,) array
-        Of the rows in a bin together.
-    centre : (b,) array
-        Weighted mean of the covariate.
-    """
-
-    cell: NDArray[np.intp]
-    row_weight: Values
-    weight: Values
-    centre: Values
+    cell: NDArray[np.intp]  # (n,), bin of each row; one beyond the last where the covariate is not known
+    row_weight: Values  # (n,)
+    weight: Values  # (b,), of the rows in a bin together
+    centre: Values  # (b,), weighted mean of the covariate
 
     @classmethod
     def of(cls, values: Values, weight: Values) -> Bins:

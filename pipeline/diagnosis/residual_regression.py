@@ -53,23 +53,12 @@ ROUNDING = float(np.finfo(np.float64).eps) / 2.0  # u
 
 @dataclass(frozen=True)
 class FittedModel:
-    """The columns and the residual of a selection's fit, at all rows.
+    """The columns and the residual of a selection's fit, at all rows."""
 
-    Attributes
-    ----------
-    base : (n, 4) array
-        1, and what K acts on: the truth and the effects that the axes share.
-    effects : (n, 3, p) array
-        Derivatives by every parameter of every effect, on each axis.
-    residual : (n, 3) array, unit of the sensor
-    motions : list of Motion
-        Of each part, after all effects of timing.
-    """
-
-    base: Values
-    effects: Values
-    residual: Values
-    motions: list[Motion]
+    base: Values  # (n, 4): 1, and what K acts on: the truth and the effects that the axes share
+    effects: Values  # (n, 3, p): derivatives by every parameter of every effect, on each axis
+    residual: Values  # (n, 3), unit of the sensor
+    motions: list[Motion]  # of each part, after all effects of timing
 
     @classmethod
     def of(cls, selection: Selection) -> FittedModel:
@@ -104,21 +93,12 @@ def _of_part(selection: Selection, part: Part, terms: Sequence[Term]) -> tuple[V
 
 @dataclass(frozen=True)
 class Gain:
-    """What a functional form explains.
-
-    Attributes
-    ----------
-    delta_bic, p_value : float
-    axes : tuple of int
-        On which it acts.
-    setting : int
-        Index of its best noise setting.
-    """
+    """What a functional form explains."""
 
     delta_bic: float
     p_value: float
-    axes: tuple[int, ...]
-    setting: int
+    axes: tuple[int, ...]  # on which it acts
+    setting: int  # index of its best noise setting
 
 
 class ProjectedCurves:

@@ -64,58 +64,27 @@ class HeldOut:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What decides.
-
-    Attributes
-    ----------
-    sensor : str
-    found : str
-        Verdict of the selection alone.
-    selected : sequence of str
-        Effects.
-    over_noise, left_over_noise : float or None
-        Residual of the fit over the noise, without and with what was selected.
-    published : HeldOut or None
-        Of the unit's calibration.
-    free, full : HeldOut or None
-        Of a free fit of the same recordings, and with the selected effects; of filtered recordings against the
-        filtered reference.
-    doubts : sequence of str
-        What the recordings' checks say of the reference.
-    approximations : sequence of str
-        In what the method's matrix and bias differ from those of a free fit (``pipeline.diagnosis.method_errors``).
-    unknown : sequence of str
-        Covariates on which the residual depends beside what was selected.
-    implausible : sequence of str
-        Selected effects with parameters beyond the sensor's limits, where these are not accepted
-        (``sensor.<sensor>.accept_implausible``).
-    held_out : mapping or None
-        ``error_before, error_after, floor`` on held-out motion of the selection's own fits.
-    method : str
-    as_printed : bool
-        Whether the method takes the equations of the founding document as printed.
-    filtered : bool
-    on_table : bool
-        Whether the fit is to a table's motion; a few rests by hand may leave a small residual by chance.
-    """
+    """What decides the verdict on a sensor."""
 
     sensor: str
-    found: str
+    found: str  # verdict of the selection alone
     selected: Sequence[str] = ()
-    over_noise: float | None = None
-    left_over_noise: float | None = None
-    published: HeldOut | None = None
-    free: HeldOut | None = None
-    full: HeldOut | None = None
-    doubts: Sequence[str] = ()
-    approximations: Sequence[str] = ()
-    unknown: Sequence[str] = ()
-    implausible: Sequence[str] = ()
-    held_out: Mapping[str, float] | None = None
+    over_noise: float | None = None  # residual of the fit over the noise, without what was selected
+    left_over_noise: float | None = None  # and with it
+    published: HeldOut | None = None  # of the unit's calibration
+    free: HeldOut | None = (
+        None  # of a free fit of the same recordings, where these are filtered against the same filter
+    )
+    full: HeldOut | None = None  # and with the selected effects
+    doubts: Sequence[str] = ()  # what the recordings' checks say of the reference
+    approximations: Sequence[str] = ()  # what the method's matrix and bias lack (``pipeline.diagnosis.method_errors``)
+    unknown: Sequence[str] = ()  # covariates on which the residual depends beside what was selected
+    implausible: Sequence[str] = ()  # selected effects beyond the sensor's limits, where that is not accepted
+    held_out: Mapping[str, float] | None = None  # ``error_before, error_after, floor`` of the selection's own fits
     method: str = ""
-    as_printed: bool = False
+    as_printed: bool = False  # whether the method takes the equations of the founding document as printed
     filtered: bool = False
-    on_table: bool = True
+    on_table: bool = True  # a few rests by hand may leave a small residual by chance
 
 
 def verdict_of_selection(
@@ -261,17 +230,12 @@ def decide(e: Evidence) -> tuple[str, str]:
     if e.published and e.published.above:
         return _above(e, e.published)
     if e.found == "unexplained" or (e.found == "missing_effect" and e.implausible):
-        return "unexplained", why_unexplained(e)
+        return "unexplained", _why_unexplained(e)
     return (e.found, "") if e.found == "missing_effect" else _within(e)
 
 
-def why_unexplained(e: Evidence) -> str:
-    """Return why no effect of the catalogue explains the residual, as sentences.
-
-    Parameters
-    ----------
-    e : Evidence
-    """
+def _why_unexplained(e: Evidence) -> str:
+    """Return why no effect of the catalogue explains the residual, as sentences."""
     names, unit = listed([plain(name) for name in e.selected]), unit_of(e.sensor)
     found = []
     if e.implausible:
@@ -295,13 +259,18 @@ def why_unexplained(e: Evidence) -> str:
     left = e.left_over_noise if e.selected else e.over_noise
     if left is not None and (left > EXPLAINED or not found):
         found.append(f"The residual of the fit{beside} is {left:.3g} times the noise.")
-    return " ".join(found)
+    return " ".join(found) or "No effect of the catalogue explains the residual."
 
 
 def _within(e: Evidence) -> tuple[str, str]:
     """Return the verdict where no effect was found and the held-out error is not above its interval."""
     if e.published and e.published.below:
-        return "floor_in_doubt", _too_low(e, e.published)
+        unit, held = unit_of(e.sensor), e.published
+        return "floor_in_doubt", (
+            f"On held-out motion the error is {held.error:.3g} {unit}, less than the noise that was found would leave "
+            f"({held.low:.3g} to {held.high:.3g} {unit}): the noise estimate is too large, and may hide an effect. "
+            "Check that the unit did not move in the recording that the noise is taken from."
+        )
     if e.on_table and e.found == "nothing_missing" and e.over_noise is not None and e.over_noise < QUIET:
         return "floor_in_doubt", (
             f"The residual of the fit is {e.over_noise:.2g} times the noise that was found. Noise cannot be larger at "
@@ -324,7 +293,7 @@ def _above(e: Evidence, published: HeldOut) -> tuple[str, str]:
     if e.found == "missing_effect" and not (e.implausible or (e.full and e.full.above)):
         return "missing_effect", ""
     if e.found == "unexplained" or e.implausible:
-        return "unexplained", f"{told}. {why_unexplained(e)}"
+        return "unexplained", f"{told}. {_why_unexplained(e)}"
     free = e.free or published
     same = e.method == "reference_least_squares" and not e.filtered  # the calibration is the free fit
     if e.as_printed or not (free.above or same):
@@ -355,15 +324,6 @@ def _of_method(e: Evidence) -> str:
     return f"{found}{against}: {culprit} the rest."
 
 
-def _too_low(e: Evidence, published: HeldOut) -> str:
-    unit = unit_of(e.sensor)
-    return (
-        f"On held-out motion the error is {published.error:.3g} {unit}, less than the noise that was found would leave "
-        f"({published.low:.3g} to {published.high:.3g} {unit}): the noise estimate is too large, and may hide an "
-        "effect. Check that the unit did not move in the recording that the noise is taken from."
-    )
-
-
 def judged(document: dict[str, Any], e: Evidence) -> dict[str, Any]:
     """Return a diagnosis with the verdict that the evidence leads to, the reason, and what to do next.
 
@@ -392,10 +352,8 @@ def _offered(verdict: str, document: Mapping[str, Any], e: Evidence) -> bool:
     """
     if verdict != "unexplained" or e.implausible or len(e.selected) > BELIEVED:
         return verdict == "missing_effect"
-    entries = {entry["effect"]: entry for entry in document["ranking"]}
-    errors = [
-        (entries[name]["held_out_error_before"], entries[name]["held_out_error_after"]) for name in document["selected"]
-    ]
+    entries = [entry for entry in document["ranking"] if entry["effect"] in document["selected"]]
+    errors = [(entry["held_out_error_before"], entry["held_out_error_after"]) for entry in entries]
     return bool(errors) and all(None not in pair and pair[1] ** 2 < (1.0 - HELPFUL) * pair[0] ** 2 for pair in errors)
 
 

@@ -38,20 +38,10 @@ POSITIONS = 2
 
 @dataclass(frozen=True)
 class Change:
-    """One thing to record more.
+    """One thing to record more."""
 
-    Attributes
-    ----------
-    what : str
-        As advice to the reader.
-    options : str
-        Of the command line that do it; empty where none does.
-    unit : UnitDescription
-    extra : tuple of Planned
-    """
-
-    what: str
-    options: str
+    what: str  # as advice to the reader
+    options: str  # of the command line that do it; empty where none does
     unit: UnitDescription
     extra: tuple[Planned, ...] = ()
 
@@ -128,26 +118,15 @@ def _anywhere(unit: UnitDescription, course: Course) -> Iterator[Change]:
 
 @dataclass(frozen=True)
 class Gain:
-    """What a change would bring.
-
-    Attributes
-    ----------
-    change : Change
-    minutes : float
-        More at the table.
-    shown : tuple of str
-        ``sensor.effect`` that become observable; one of the table only if neither sensor showed it.
-    told : tuple of str
-        Those that would no longer be taken for a look-alike.
-    factor : float
-        Geometric mean of the new smallest sizes over the old ones, of effects that are observable in both.
-    """
+    """What a change would bring."""
 
     change: Change
-    minutes: float
-    shown: tuple[str, ...]
-    told: tuple[str, ...]
-    factor: float
+    minutes: float  # more at the table
+    shown: tuple[
+        str, ...
+    ]  # ``sensor.effect`` that become observable; one of the table only if neither sensor showed it
+    told: tuple[str, ...]  # those that would no longer be taken for a look-alike
+    factor: float  # geometric mean of the new smallest sizes over the old ones, of effects observable in both
 
 
 def best_changes(unit: UnitDescription, before: Document) -> list[Gain]:

@@ -63,30 +63,15 @@ TIED = 1e-3  # deviation of a difference in 2 log L below which two effects are 
 
 @dataclass(frozen=True)
 class Detection:
-    """What a procedure would find of one effect; sizes as shares of its limits.
-
-    Attributes
-    ----------
-    effect : str
-    unit_sizes : (p,) array
-        Size of each parameter at share 1; 0 for time constants, which are fixed.
-    found, sure : float
-        Where half of the cases, and 95 %, pass the gate; infinite where none does.
-    named : float
-        Where half of the cases pass it and no look-alike is preferred.
-    taken_for : str or None
-        The look-alike that is preferred at the size ``found``.
-    look_alikes : dict of str to float
-        Effect to the share of the signal that it reproduces, largest first, above 0.8.
-    """
+    """What a procedure would find of one effect; sizes as shares of its limits."""
 
     effect: str
-    unit_sizes: Values
-    found: float
-    sure: float
-    named: float
-    taken_for: str | None
-    look_alikes: dict[str, float]
+    unit_sizes: Values  # (p,), size of each parameter at share 1; 0 for time constants, which are fixed
+    found: float  # where half of the cases pass the gate; infinite where none does
+    sure: float  # where 95 % do
+    named: float  # where half of the cases pass it and no look-alike is preferred
+    taken_for: str | None  # the look-alike that is preferred at the size ``found``
+    look_alikes: dict[str, float]  # effect to the share of the signal that it reproduces, largest first
 
 
 def smallest(probability: Callable[[float], Values], wanted: float) -> float:

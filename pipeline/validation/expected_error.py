@@ -69,29 +69,15 @@ ENOUGH = 2000  # samples of a recording that stand for all: its directions and r
 
 @dataclass(frozen=True)
 class LinearizedSamples:
-    """Held-out samples of one recording with the derivative of their calibrated readings.
+    """Held-out samples of one recording with the derivative of their calibrated readings."""
 
-    Attributes
-    ----------
-    time : (n,) array, s
-    white, wander : (n, 3) arrays
-        Variances of white noise and wander, per reading axis.
-    truth : (n, 3) array, g or deg/s
-    derivative : (n, 3, p) array
-        J, of the parameters of the calibration's covariance.
-    number : int
-        Samples of the recording, of which these are some.
-    alike : float
-        How many samples share one value of the white noise, by the filter.
-    """
-
-    time: Values
-    white: Values
-    wander: Values
-    truth: Values
-    derivative: Values
-    number: int
-    alike: float = 1.0
+    time: Values  # (n,), s
+    white: Values  # (n, 3), variance of white noise per reading axis
+    wander: Values  # (n, 3), variance of wander
+    truth: Values  # (n, 3), g or deg/s
+    derivative: Values  # (n, 3, p): J, of the parameters of the calibration's covariance
+    number: int  # samples of the recording, of which these are some
+    alike: float = 1.0  # samples that share one value of the white noise, by the filter
 
 
 def linearized(
@@ -153,25 +139,13 @@ def _changed_parameters(calibration: SensorCalibration) -> Iterator[tuple[int, S
 
 @dataclass(frozen=True)
 class _Uncertain:
-    """What is random beside the white noise.
+    """What is random beside the white noise."""
 
-    Attributes
-    ----------
-    covariance : (p + 1, p + 1) array
-        Of the parameters and of the scale of the table's rate.
-    noise : Noise
-    coarse : (3,) array
-        Variance of rounding that is no part of the white noise.
-    drift : (3,) array
-        Variance of a drift beside the wander.
-    drift_time : float, s
-    """
-
-    covariance: Values
+    covariance: Values  # (p + 1, p + 1), of the parameters and of the scale of the table's rate
     noise: Noise
-    coarse: Values
-    drift: Values
-    drift_time: float
+    coarse: Values  # (3,), variance of rounding that is no part of the white noise
+    drift: Values  # (3,), variance of a drift beside the wander
+    drift_time: float  # s
 
 
 def expected_rms_error(
@@ -245,24 +219,14 @@ def _covariance(calibration: SensorCalibration, table: Mapping[str, Any]) -> Val
 
 @dataclass(frozen=True)
 class _QuadraticForm:
-    """Traces of the form of the mean squared error.
+    """Traces of the form of the mean squared error."""
 
-    Attributes
-    ----------
-    white, within : (2,) arrays
-        ``tr Q`` and ``tr Q^2`` of white noise, and of wander within blocks.
-    doubt : float
-        One over the number of samples that determined the white noise.
-    first, second, third : (3,), (3, 3) and (3, 3, 3) arrays
-        Traces of products of the Q of parameters, of wander and of drift.
-    """
-
-    white: Values
-    within: Values
-    doubt: float
-    first: Values
-    second: Values
-    third: Values
+    white: Values  # (2,): tr Q and tr Q^2 of white noise
+    within: Values  # (2,): of wander within blocks
+    doubt: float  # one over the number of samples that determined the white noise
+    first: Values  # (3,): tr Q of parameters, of wander and of drift
+    second: Values  # (3, 3): traces of products of two
+    third: Values  # (3, 3, 3): of three
 
     def cumulants(self, factor: Values) -> Values:
         """Return k_1 to k_3, (3, k), for factors of the variances of parameters, wander, drift, white noise: (4, k)."""

@@ -38,42 +38,22 @@ RAW = 0.05  # by which scale and axes of sensors may differ before calibration: 
 
 @dataclass(frozen=True)
 class Samples:
-    """Samples of one recording on which a calibration is judged.
-
-    Attributes
-    ----------
-    sensor : str
-    time : (n,) array, s
-    reading : (n, 3) array, g or deg/s
-    magnitude : (n,) array, same unit
-        What the norm should be.
-    white, wander : (n, 3) arrays, unit squared
-        Variances of white noise behind the filter and of wander, per reading axis.
-    motion : Motion or None
-        By the reference, where the attitude is known.
-    other : (n, 3) array or None
-        Readings of the other sensor.
-    temperature : (n,) array, degC, or None
-    resting : bool
-        Whether each sample is the mean of a rest.
-    alike : float
-        How many samples share one value of the white noise, by the filter: ``sum_l r_l^2 / r_0^2`` over all lags.
-    earth_left_out : bool
-        Whether Earth's rotation is configured and missing in the magnitude, as no attitude is known.
-    """
+    """Samples of one recording on which a calibration is judged."""
 
     sensor: str
-    time: NDArray[np.float64]
-    reading: NDArray[np.float64]
-    magnitude: NDArray[np.float64]
-    white: NDArray[np.float64]
-    wander: NDArray[np.float64]
-    motion: Motion | None
-    other: NDArray[np.float64] | None
-    temperature: NDArray[np.float64] | None
-    resting: bool = False
-    alike: float = 1.0
-    earth_left_out: bool = False
+    time: NDArray[np.float64]  # (n,), s
+    reading: NDArray[np.float64]  # (n, 3), g or deg/s
+    magnitude: NDArray[np.float64]  # (n,), that of the reference
+    white: NDArray[np.float64]  # (n, 3), variance of white noise behind the filter, per reading axis
+    wander: NDArray[np.float64]  # (n, 3), variance of wander
+    motion: Motion | None  # by the reference, where the attitude is known
+    other: NDArray[np.float64] | None  # (n, 3), readings of the other sensor
+    temperature: NDArray[np.float64] | None  # (n,), degC
+    resting: bool = False  # whether each sample is the mean of a rest
+    alike: float = 1.0  # samples that share one value of the white noise, by the filter: sum_l r_l^2 / r_0^2 over lags
+    earth_left_out: bool = (
+        False  # whether Earth's rotation is configured and, without an attitude, not in the magnitude
+    )
 
     @property
     def variance(self) -> NDArray[np.float64]:
