@@ -61,19 +61,20 @@ class TextBlocks:
         """
         rest = b""
         for chunk in self._chunks():
-            data = rest + chunk
-            end = data.rfind(b"\n") + 1
+            end = chunk.rfind(b"\n") + 1
             if not end:  # lines may end in carriage returns alone; the last may be the first half of CRLF
-                end = data.rfind(b"\r", 0, len(data) - 1) + 1
-            rest = data[end:]
+                chunk, rest = rest + chunk, b""  # noqa: PLW2901
+                end = chunk.rfind(b"\r", 0, len(chunk) - 1) + 1
+            block = b"".join((rest, memoryview(chunk)[:end])) if end else b""
+            rest = chunk[end:]
             if len(rest) > LONGEST_LINE:
                 raise IngestError(
                     f"not a text log: no line ends within {LONGEST_LINE} bytes",
                     f"{self._path}:{self._line}",
                     fault="foreign",
                 )
-            if end:
-                yield self._lines(data[:end])
+            if block:
+                yield self._lines(block)
         if rest:
             data, lines = self._lines(rest)
             if not data.endswith(b"\n"):
