@@ -366,15 +366,7 @@ def assess_noise(
 
 
 def _in_subspace(basis: Values, z: Values, blocks: Blocks, settings: Sequence[Setting]) -> tuple[Values, Values]:
-    """Return log det and weighted squares of ``z ~ N(0, I + q E)`` in a subspace that mixes the channels, dense.
-
-    Parameters
-    ----------
-    basis : (3 m, r) array
-    z : (r,) array
-    blocks : Blocks
-    settings : sequence of Setting
-    """
+    """Return log det and weighted squares of ``z ~ N(0, I + q E)`` in a subspace that mixes the channels, dense."""
     root = np.sqrt(blocks.weight)
     logarithm, squares = np.empty(len(settings)), np.empty(len(settings))
     channels = basis.reshape(3, len(root), -1)

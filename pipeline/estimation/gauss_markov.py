@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.records import Noise, Recording
+    from pipeline.records import Noise
 
     Values = NDArray[np.float64]
 
@@ -50,7 +50,6 @@ TIME_FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)  # correlation times tried, in those o
 TIME_PRIOR = (0.1, 0.2, 0.4, 0.2, 0.1)
 RATIOS = np.append(0.0, 10.0 ** np.arange(-2.4, 0.85, 0.1))  # ratios tried of the bias to the white noise of a sample
 RANDOM_WALK = 8.0  # times the correlation time seen, with the same variance of short differences
-BLOCKS = 100  # of a fit's samples: enough to resolve correlation times down to a hundredth of the recordings
 FAST_S = 25.0  # correlation time below which ``information`` replaces the model, as its blocks last seconds
 
 
@@ -214,41 +213,6 @@ class Blocks:
         """Return B: (m, m) array."""
         covariance: Values = block_covariance(self.start, self.length, tau) * (self.clock[:, None] == self.clock)
         return covariance
-
-
-def blocks_of_samples(parts: Sequence[tuple[Recording, NDArray[np.bool_]]]) -> Blocks:
-    """Cut the chosen samples of recordings, stacked in their order, into about ``BLOCKS`` blocks of equal size.
-
-    Parameters
-    ----------
-    parts : sequence of (Recording, (n,) array of bool)
-        Each recording and which of its samples are used.
-    """
-    used = [int(keep.sum()) for _, keep in parts]
-    size = max(1, -(-sum(used) // BLOCKS))
-    first, start, length, clock, row = [], [], [], [], 0
-    known: dict[str, tuple[int, float]] = {}
-    for number, ((recording, keep), samples) in enumerate(zip(parts, used, strict=True), start=1):
-        if samples == 0:
-            continue
-        time = recording.time[keep]
-        begin = np.arange(0, samples, size)
-        first.append(begin + row)
-        start.append(time[begin])
-        length.append(time[np.minimum(begin + size, samples) - 1] - time[begin] + recording.interval)
-        clock.append(np.full(len(begin), 0 if recording.clock_shared else _clock(recording, number, known)))
-        row += samples
-    firsts = np.concatenate(first)
-    weight = np.diff(np.append(firsts, row)).astype(float)
-    return Blocks(firsts, weight, np.concatenate(start), np.concatenate(length), np.concatenate(clock))
-
-
-def _clock(recording: Recording, number: int, known: dict[str, tuple[int, float]]) -> int:
-    """Return the clock of a recording: its own, or that of its session's recording before; ``known`` holds those."""
-    before, end = known.get(recording.setup, (number, np.inf))
-    clock = before if recording.setup and recording.time[0] > end else number
-    known[recording.setup] = clock, float(recording.time[-1])
-    return clock
 
 
 class GaussMarkov:

@@ -21,7 +21,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.errors import ConfigurationError, NotObservableError
+from pipeline.errors import NotObservableError
+from pipeline.estimation.candidates import parameter_names, require_available, starts_of
 from pipeline.estimation.design import BASE, BASE_NAMES, Design, Start, Term, motions_of, ordinary_base
 from pipeline.estimation.engine import Posterior, ResidualNoise
 from pipeline.estimation.gauss_markov import WHITE, Setting, selection_grid
@@ -30,9 +31,7 @@ from pipeline.estimation.noise import static_or_sheet
 from pipeline.estimation.observations import observe, weighted
 from pipeline.estimation.table_errors import Reference
 from pipeline.estimation.uncertainty_budget import budgeted, combined, noise_contribution, scatter_contribution
-from pipeline.model.effects import effect
 from pipeline.model.effects.base import Layout, truth
-from pipeline.model.sessions import OWN
 from pipeline.records import FittedEffect, SensorCalibration, StageResult
 
 if TYPE_CHECKING:
@@ -41,7 +40,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.estimation.observations import Observations
-    from pipeline.model.effects.base import Effect
     from pipeline.records import Noise, Recording
 
 ROUNDS = 25
@@ -110,10 +108,6 @@ def fit_terms(observations: Observations, terms: Sequence[Term], start: Start, s
     start : Start
     settings : sequence of Setting
         Noises over which the likelihood is maximised.
-
-    Returns
-    -------
-    Fit
     """
     terms = [Term(term.effect, np.array(term.values, float), full=True) for term in terms]
     bias, K = start.bias.copy(), start.K.copy()
@@ -251,7 +245,7 @@ def _solve(design: Design, observations: Observations, settings: Sequence[Settin
     )
 
 
-def residual_noise(design: Design, observations: Observations, settings: Sequence[Setting]) -> ResidualNoise:
+def _residual_noise(design: Design, observations: Observations, settings: Sequence[Setting]) -> ResidualNoise:
     """Weight hypotheses about the noise by their restricted likelihood, given a design of full rank at its solution."""
     size = np.where(design.sizes()[:-1] > 0, design.sizes()[:-1], 1.0)
     products, logarithms = design.products(settings)
@@ -264,42 +258,6 @@ def residual_noise(design: Design, observations: Observations, settings: Sequenc
     logarithms = logarithms + np.linalg.slogdet(gram)[1]
     found = ResidualNoise.of(observations.blocks, settings, logarithms, variance, free, observations.weight)
     return replace(found, white_variance=found.white_variance * design.scale**2)
-
-
-def starts_of(names: Sequence[str], sensor: str, known: SensorCalibration | None = None) -> list[list[Term]]:
-    """Return the terms from which a fit starts, every combination of the effects' starts.
-
-    Parameters
-    ----------
-    names : sequence of str
-    sensor : str
-    known : SensorCalibration, optional
-        Its fitted effects start where they are.
-
-    Raises
-    ------
-    ConfigurationError
-        If an effect is unknown, named twice, contained in another, or not one of this sensor.
-    """
-    if len(set(names)) != len(names):
-        raise ConfigurationError(f"effects.{sensor} names an effect twice: {', '.join(names)}")
-    for name in names:
-        within = [n for n in effect(name).contains if n in names]
-        if within:
-            raise ConfigurationError(
-                f"effects.{sensor} names {name} and {within[0]}, which it contains: name one of them"
-            )
-    fitted = {} if known is None else {e.name: e.values for e in known.effects}
-    combinations: list[list[Term]] = [[]]
-    for name in names:
-        this = effect(name)
-        if sensor not in this.sensors:
-            raise ConfigurationError(
-                f"effects.{sensor} names {name}, which is an effect of the {this.sensors[0]} alone"
-            )
-        values = [fitted[name]] if name in fitted else this.starts(sensor)
-        combinations = [[*before, Term(this, v)] for before in combinations for v in values]
-    return combinations
 
 
 def fit_best(
@@ -347,37 +305,6 @@ def require_observable(observations: Observations, fit: Fit, scale: NDArray[np.f
         )
 
 
-def parameter_names(sensor: str, effects: Sequence[Effect]) -> list[str]:
-    """Return ``<effect>.<parameter>`` for each parameter."""
-    return [f"{e.name}.{p.name}" for e in effects for p in e.parameters(sensor)]
-
-
-def _require_available(observations: Observations, names: Sequence[str]) -> None:
-    setups = {part.motion.setup for part in observations.parts}
-    for own in OWN:
-        if setups <= {name.partition("@")[2] for name in names if name.startswith(f"{own}@")}:
-            base = "matrix" if own == "mounting" else "bias"
-            raise NotObservableError(
-                f"{own} of its own in every setup ({', '.join(sorted(setups))}) cannot be told from the {base}: "
-                "leave it out for one of them, the reference of the others"
-            )
-    for name in names:
-        this = effect(name)
-        lacking = [need for need in this.needs if all(getattr(p.motion, need) is None for p in observations.parts)]
-        without = [p.name for p in observations.parts for need in this.needs if getattr(p.motion, need) is None]
-        if lacking or ("temperature" in this.needs and without):
-            raise NotObservableError(
-                f"{name} needs {', '.join(lacking or ['temperature'])}, which "
-                f"{'no recording holds' if lacking else 'is missing in ' + ', '.join(without)}; "
-                f"record it, or take {name} out of effects.{observations.sensor}"
-            )
-        if this.needs_clock and not observations.clock_shared:
-            raise NotObservableError(
-                f"{name} needs the time between the recordings, but their times overlap (each starts at 0?): "
-                f"record them on one clock, or take {name} out of effects.{observations.sensor}"
-            )
-
-
 def fit_joint(  # noqa: PLR0917  (the interface that the stages and the diagnosis share)
     sensor: str,
     recordings: Sequence[Recording],
@@ -417,7 +344,7 @@ def fit_joint(  # noqa: PLR0917  (the interface that the stages and the diagnosi
     combinations = starts_of(effects, sensor, start)
     observations = weighted(observe(sensor, recordings, settings["table"]), noise)
     base = ordinary_base(observations, noise)
-    _require_available(observations, effects)
+    require_available(observations, effects)
     grid = selection_grid(noise, RATIOS, TIMES)
     fit = fit_best(observations, combinations, base, grid)
     require_observable(observations, fit, base.scale)
@@ -479,7 +406,7 @@ def calibration_of(  # noqa: PLR0917  (what a fit with effects is)
     design = _at(observations, fit.terms, fit.bias, fit.K, np.maximum(fit.scale, 1e-300))
     first = design.linear_map(fit.setting)
     prior = static_or_sheet(noise, (settings.get("sensor") or {}).get(sensor) or {})
-    errors = residual_noise(design, observations, prior.grid(float(np.sqrt(np.mean(design.scale**2)))))
+    errors = _residual_noise(design, observations, prior.grid(float(np.sqrt(np.mean(design.scale**2)))))
     whole = first.then(change)
     reference = Reference(sensor, [part.motion for part in observations.parts], whole, fit.K, settings["table"])
     values = np.concatenate([fit.bias, fit.K.ravel(), *(term.values for term in fit.terms)])

@@ -31,11 +31,10 @@ import numpy as np
 
 from pipeline.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.engine import LinearMap, assess_noise
-from pipeline.estimation.gauss_markov import blocks_of_samples
 from pipeline.estimation.least_squares import ScaledColumns, certificate
 from pipeline.estimation.noise import prior_of
 from pipeline.estimation.table_errors import Reference, disturbance
-from pipeline.estimation.turns import parts_of, settled
+from pipeline.estimation.turns import blocks_of_samples, parts_of, settled
 from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution
 from pipeline.model.effects.base import truth
 from pipeline.records import AXES, SensorCalibration, StageResult
@@ -72,10 +71,6 @@ def fit(
         Only its stages are kept.
     settings : mapping
         Sections ``table`` and ``sensor``.
-
-    Returns
-    -------
-    SensorCalibration
 
     Raises
     ------
@@ -192,11 +187,11 @@ def _require_observable(sensor: str, X: NDArray[np.float64]) -> float:
 
 def _linear_map(weights: NDArray[np.float64], matrix: NDArray[np.float64]) -> LinearMap:
     """Return the map from readings to bias and matrix."""
-    x, y, z = (derivative_of_matrix(matrix, channel) for channel in range(3))
+    x, y, z = (_derivative_of_matrix(matrix, channel) for channel in range(3))
     return LinearMap((weights, weights, weights), (x, y, z))
 
 
-def derivative_of_matrix(matrix: NDArray[np.float64], channel: int) -> NDArray[np.float64]:
+def _derivative_of_matrix(matrix: NDArray[np.float64], channel: int) -> NDArray[np.float64]:
     """Return the derivative of bias and matrix with respect to bias and row of K of a channel: (12, 4) array."""
     J = np.zeros((12, 4))
     J[channel, 0] = 1.0

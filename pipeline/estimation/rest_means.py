@@ -62,10 +62,6 @@ def split_rests(recording: Recording, every: int) -> RestSplit:
     recording : Recording
         By the table's log where it has one, else by its readings.
     every : int
-
-    Returns
-    -------
-    RestSplit
     """
     rests = rests_from_table(recording) or find_rests(recording)
     sound = [rest for rest in rests if rest.accepted]
@@ -151,12 +147,6 @@ def rest_means(
 
     By hand a unit may creep: the mean over its directions is too short, and is made longer by that (see
     ``pipeline.signal.creep``).
-
-    Parameters
-    ----------
-    recording : Recording
-    rests : sequence of Rest
-    sensor : str
 
     Returns
     -------

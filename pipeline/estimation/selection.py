@@ -24,13 +24,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.estimation.candidates import candidates_for, limits_of, starts_of
 from pipeline.estimation.design import BASE, Start, Term, ordinary_base
 from pipeline.estimation.gauss_markov import selection_grid
-from pipeline.estimation.generalized_least_squares import Fit, fit_best, fit_terms, starts_of
+from pipeline.estimation.generalized_least_squares import Fit, fit_best, fit_terms
 from pipeline.estimation.observations import weighted
 from pipeline.estimation.ranking import Ranking, Score
-from pipeline.model.effects import catalogue, effect
-from pipeline.model.effects.base import parameter_limits
+from pipeline.model.effects import effect
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
 
     from pipeline.estimation.gauss_markov import Setting
     from pipeline.estimation.observations import Observations
-    from pipeline.model.effects.base import Effect
     from pipeline.records import Noise, SensorCalibration
 
 GATE_BIC = 10.0
@@ -58,7 +57,6 @@ HIGHEST_GATE = 30.0
 FAR_ABOVE = 2.0  # times the noise: the residual of a model that misses more than the catalogue holds
 WORTH_NAMING = 0.05  # share of such a residual's excess that an effect must explain
 ANOTHER_K = 2e-3  # change of K that changes the columns of effects that the axes share
-SECOND = {"accelerometer": (), "gyroscope": ("table_encoder_error",)}  # exact look-alikes of a likelier effect
 
 
 @dataclass
@@ -104,44 +102,6 @@ class Selection:
         return [self.ranking.indices(name)[0] for name in self.names]
 
 
-def limits_of(sensor: str, sheet: Mapping[str, Any]) -> dict[str, NDArray[np.float64]]:
-    """Return the limits of plausibility of every effect's parameters, absolute values.
-
-    Parameters
-    ----------
-    sensor : str
-    sheet : mapping
-        ``effects`` of the sensor's data sheet: ``<effect>`` for all its parameters, ``<effect>_<parameter>`` for one
-        or, without the axis, for some of them.
-    """
-    given = sheet.get("effects") or {}
-    found = {}
-    for name, this in catalogue().items():
-        limits = parameter_limits(this, sensor, given) if sensor in this.sensors else np.array([np.inf])
-        if np.all(np.isfinite(limits)):
-            found[name] = limits
-    return found
-
-
-def candidates_for(observations: Observations, configured: Sequence[str]) -> list[Effect]:
-    """Return the effects that could be missing and whose needs the recordings meet."""
-    found = []
-    for name, this in catalogue().items():
-        if name in configured or observations.sensor not in this.sensors or observations.sensor in this.unseen:
-            continue
-        if name == "earth_rotation" and observations.earth:
-            continue
-        if this.needs_clock and not observations.clock_shared:
-            continue
-        complete = all(part.motion.temperature is not None for part in observations.parts)
-        if "temperature" in this.needs and not complete:
-            continue
-        if any(this.available(part.motion) for part in observations.parts):
-            found.append(this)
-    second = SECOND[observations.sensor]
-    return sorted(found, key=lambda e: (e.name in second, e.name))
-
-
 def select(
     observations: Observations,
     configured: Sequence[str],
@@ -161,10 +121,6 @@ def select(
         The sensor's section of the configuration.
     known : SensorCalibration, optional
         Its effects are starts for the configured ones.
-
-    Returns
-    -------
-    Selection
     """
     return _Search(observations, configured, noise, sheet, known).run()
 
@@ -173,9 +129,7 @@ def unselected(
     observations: Observations, configured: Sequence[str], noise: Noise | None, sheet: Mapping[str, Any]
 ) -> Selection:
     """Return a selection before its first round: the base and the candidates' products, no effect scored yet."""
-    search = _Search(observations, configured, noise, sheet, None)
-    state = search.fit, search.base, search.first, search.ranking
-    return Selection([], {}, {}, *state, observations, search.start, search.settings, search.limits)
+    return _Search(observations, configured, noise, sheet, None).found({})
 
 
 class _Search:
@@ -214,19 +168,13 @@ class _Search:
             if self._other_delay():
                 self._forward(alone)
                 self._fit_selected()
-        return Selection(
-            self.names,
-            self.steps,
-            alone,
-            self.fit,
-            self.base,
-            self.first,
-            self.ranking,
-            self.observations,
-            self.start,
-            self.settings,
-            self.limits,
-        )
+        return self.found(alone)
+
+    def found(self, alone: dict[str, Score]) -> Selection:
+        """Return what is selected so far."""
+        state = self.fit, self.base, self.first, self.ranking
+        known = self.observations, self.start, self.settings, self.limits
+        return Selection(self.names, self.steps, alone, *state, *known)
 
     def _forward(self, alone: dict[str, Score]) -> None:
         for _ in range(3 * MOST):
@@ -375,12 +323,17 @@ class _Search:
         scores = {s.name: s for s in self.ranking.scores(others, self.limits)}
         return scores[name].delta_bic if name in scores else float("-inf")
 
+    def _forget(self, gone: Sequence[str]) -> None:
+        """Take effects out of what is selected and fitted."""
+        self.names = [name for name in self.names if name not in gone]
+        for name in gone:
+            del self.steps[name]
+        self.fit = replace(self.fit, terms=tuple(t for t in self.fit.terms if t.effect.name not in gone))
+
     def _drop(self) -> None:
         for name in list(self.names):
             if not effect(name).moves and self._own(name) < 0.0:
-                self.names.remove(name)
-                del self.steps[name]
-                self.fit = replace(self.fit, terms=tuple(t for t in self.fit.terms if t.effect.name != name))
+                self._forget([name])
                 if effect(name).nonlinear:
                     self._refit()
 
@@ -397,17 +350,12 @@ class _Search:
             size = np.sqrt(np.diag(covariance))
             known = size > 0
             z = (term.values / np.where(known, size, 1.0))[known]
-            correlation = (covariance / np.outer(np.where(known, size, 1.0), np.where(known, size, 1.0)))[known][
-                :, known
-            ]
+            correlation = (covariance / np.outer(*[np.where(known, size, 1.0)] * 2))[np.ix_(known, known)]
             wald = float(z @ np.linalg.lstsq(correlation, z, rcond=1e-9)[0])
             if wald < len(z) * float(np.log(self.ranking.samples)):
                 refuted.append(term.effect.name)
-        for name in refuted:
-            self.names.remove(name)
-            del self.steps[name]
+        self._forget(refuted)
         if refuted:
-            self.fit = replace(self.fit, terms=tuple(t for t in self.fit.terms if t.effect.name not in refuted))
             self._refit()
 
     def _merge(self) -> None:
@@ -421,10 +369,8 @@ class _Search:
                 if self._criterion([*kept, general.name]) > self._criterion(self.names) - GATE_BIC:
                     scores = self.ranking.scores(self._selected(kept), self.limits)
                     self.steps[general.name] = next(s for s in scores if s.name == general.name)
-                    del self.steps[part], self.steps[other]
-                    self.names = [general.name if n == part else n for n in self.names if n != other]
-                    gone = (part, other)
-                    self.fit = replace(self.fit, terms=tuple(t for t in self.fit.terms if t.effect.name not in gone))
+                    self.names[self.names.index(part)] = general.name
+                    self._forget([part, other])
                     self._refit()
                     return
 
@@ -447,8 +393,7 @@ class _Search:
                 rival = rivals[0]
                 self.names[self.names.index(name)] = rival.name
                 self.steps[rival.name] = rival
-                del self.steps[name]
-                self.fit = replace(self.fit, terms=tuple(t for t in self.fit.terms if t.effect.name != name))
+                self._forget([name])
                 self._refit()
                 self._drop_refuted()
                 return True

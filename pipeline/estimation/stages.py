@@ -10,7 +10,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from pipeline.errors import CannotCalibrateError
+from pipeline.errors import CannotCalibrateError, ConfigurationError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -62,3 +62,15 @@ def fit_stage(
     named = (stage,) if stage in STAGED[sensor] else (sensor,) if stage in OF_BOTH_SENSORS else ()
     found: SensorCalibration = fit(*named, recordings, previous, settings)
     return found
+
+
+def stages_before(sensor: str, previous: SensorCalibration | None, stages: Mapping[str, Any]) -> list[str]:
+    """Return the names of the stages so far; refuse what is no stage of the staged method."""
+    done = () if previous is None else previous.stages
+    unknown = [stage.name for stage in done if stage.name not in stages or stage.correction is None]
+    if unknown:
+        raise ConfigurationError(
+            f"a stage of the staged method cannot follow {unknown[0]!r}, which leaves no corrected readings for it; "
+            f"the stages of the {sensor} are {', '.join(stages)}"
+        )
+    return [stage.name for stage in done]

@@ -124,11 +124,6 @@ def table_errors(reference: Reference, estimated: Sequence[str] = ()) -> tuple[l
     reference : Reference
     estimated : sequence of str
         Effects of the fit: what one of them estimates is no input any more.
-
-    Returns
-    -------
-    errors : list of StatedError
-    not_included : dict of str to str
     """
     effects = {
         "table angle": _angle,

@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import CannotCalibrateError, NotObservableError
+from pipeline.estimation.gauss_markov import Blocks
 from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.model.kinematics import earth_rate, reference_motion
 from pipeline.signal.rests import runs
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
 
     from pipeline.records import Motion, Recording
 
+BLOCKS = 100  # of a fit's samples: enough to resolve correlation times down to a hundredth of the recordings
 DISTINCT_DIRECTION_G = 0.01
 ROUNDS = 12
 SAME_PHASE = 1e-12  # rad
@@ -95,10 +97,6 @@ def parts_of(recordings: Sequence[Recording], sensor: str, table: Mapping[str, A
     table : mapping
     method : str
         Name of the method, for the message.
-
-    Returns
-    -------
-    list of Part
 
     Raises
     ------
@@ -204,10 +202,6 @@ def fit_sinusoid(angle_deg: NDArray[np.float64], reading: NDArray[np.float64], *
     where : str
         Channel and turn, for the message.
 
-    Returns
-    -------
-    Sinusoid
-
     Raises
     ------
     NotObservableError
@@ -242,3 +236,38 @@ def _factors(columns: NDArray[np.float64], where: str) -> ScaledColumns:
         f"{where} does not show a sinusoid: {n} samples over too few angles; turn the table once around, stopping at "
         "four angles or more, so that the axis points up and down and is level in between"
     )
+
+
+def blocks_of_samples(parts: Sequence[tuple[Recording, NDArray[np.bool_]]]) -> Blocks:
+    """Cut the chosen samples of recordings, stacked in their order, into about ``BLOCKS`` blocks of equal size.
+
+    Parameters
+    ----------
+    parts : sequence of (Recording, (n,) array of bool)
+        Each recording and which of its samples are used.
+    """
+    used = [int(keep.sum()) for _, keep in parts]
+    size = max(1, -(-sum(used) // BLOCKS))
+    first, start, length, clock, row = [], [], [], [], 0
+    known: dict[str, tuple[int, float]] = {}
+    for number, ((recording, keep), samples) in enumerate(zip(parts, used, strict=True), start=1):
+        if samples == 0:
+            continue
+        time = recording.time[keep]
+        begin = np.arange(0, samples, size)
+        first.append(begin + row)
+        start.append(time[begin])
+        length.append(time[np.minimum(begin + size, samples) - 1] - time[begin] + recording.interval)
+        clock.append(np.full(len(begin), 0 if recording.clock_shared else _clock(recording, number, known)))
+        row += samples
+    firsts = np.concatenate(first)
+    weight = np.diff(np.append(firsts, row)).astype(float)
+    return Blocks(firsts, weight, np.concatenate(start), np.concatenate(length), np.concatenate(clock))
+
+
+def _clock(recording: Recording, number: int, known: dict[str, tuple[int, float]]) -> int:
+    """Return the clock of a recording: its own, or that of its session's recording before; ``known`` holds those."""
+    before, end = known.get(recording.setup, (number, np.inf))
+    clock = before if recording.setup and recording.time[0] > end else number
+    known[recording.setup] = clock, float(recording.time[-1])
+    return clock

@@ -149,7 +149,7 @@ def gravity_contribution(sensor: str, matrix: Values, table: Mapping[str, Any], 
     return type_b("local gravity", NORMAL, float(u), "g", effect)
 
 
-def table_contributions(
+def _table_contributions(
     reference: Reference, estimated: Sequence[str] = ()
 ) -> tuple[list[Contribution], dict[str, str]]:
     """Return the contribution of each stated accuracy of the table, and why the others are not included."""
@@ -214,7 +214,7 @@ def budgeted(  # noqa: PLR0917  (what a fit on a table is)
     """
     sensor = calibration.sensor
     counts = ((settings.get("sensor") or {}).get(sensor) or {}).get("counts_per_unit")
-    found, absent = table_contributions(reference, estimated)
+    found, absent = _table_contributions(reference, estimated)
     lines, missing = list(contributions), {"temperature": TEMPERATURE, "time base": TIME_BASE}
     if noise.row_weight is None:
         rounded = quantisation(noise, reference.fit, counts, SENSOR_UNITS[sensor])
@@ -229,7 +229,7 @@ def budgeted(  # noqa: PLR0917  (what a fit on a table is)
     if not trials:
         return complete
     first = reference.fit.first()
-    stated, _ = table_contributions(replace(reference, fit=first), estimated)
+    stated, _ = _table_contributions(replace(reference, fit=first), estimated)
     again = None if isinstance(rounded, str) else quantisation(noise, first, counts, SENSOR_UNITS[sensor])
     covariances = [c.covariance for c in (*stated, again) if isinstance(c, Contribution)]
     draw = through(noise.posterior(first), covariances, results)
@@ -319,6 +319,15 @@ def _temperature(
         kind = NORMAL if fitted is not None else RECTANGULAR
         lines.append(type_b(f"temperature ({name.replace('_', ' ')})", kind, u, "degC", effect * slope, how))
     return lines
+
+
+def stage_parameters(values: Mapping[str, tuple[float, str]], covariance: Values) -> dict[str, dict[str, Any]]:
+    """Return the parameters of a stage as published."""
+    own = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
+    return {
+        name: {"value": value, "unit": unit, "standard_uncertainty": float(u)}
+        for (name, (value, unit)), u in zip(values.items(), own, strict=True)
+    }
 
 
 def _with_uncertainty(

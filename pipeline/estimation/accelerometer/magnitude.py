@@ -125,10 +125,6 @@ def fit_ellipsoid(orientations: Orientations, gravity_g: float, free: Mask) -> E
     gravity_g : float, g
     free : (9,) array of bool
 
-    Returns
-    -------
-    Ellipsoid
-
     Raises
     ------
     NotObservableError

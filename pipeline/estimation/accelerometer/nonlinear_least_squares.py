@@ -29,13 +29,12 @@ from pipeline.estimation.accelerometer.magnitude import (
 from pipeline.estimation.accelerometer.orientations import orientations_of, without
 from pipeline.estimation.accelerometer.rest_scatter import RestErrors, rest_candidates, rest_scatter
 from pipeline.estimation.engine import LinearMap, Posterior, assess_noise
-from pipeline.estimation.gauss_markov import blocks_of_samples
 from pipeline.estimation.least_squares import ScaledColumns, certified
 from pipeline.estimation.monte_carlo import beside_trials, quadratic_results, through, trials_of, without_trials
 from pipeline.estimation.noise import prior_of
 from pipeline.estimation.rest_means import describe_rests
 from pipeline.estimation.table_errors import Reference, disturbance
-from pipeline.estimation.turns import table_motion
+from pipeline.estimation.turns import blocks_of_samples, table_motion
 from pipeline.estimation.uncertainty_budget import (
     combined,
     gravity_contribution,
@@ -80,10 +79,6 @@ def fit(
         The result of the stage before; only its stages are kept.
     settings : mapping
         Sections ``table`` (``gravity_g``), ``procedure`` (``holdout_every``) and ``sensor``.
-
-    Returns
-    -------
-    SensorCalibration
 
     Raises
     ------

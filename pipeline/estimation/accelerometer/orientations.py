@@ -83,10 +83,6 @@ def orientations_of(recordings: Sequence[Recording], settings: Mapping[str, Any]
     settings : mapping
         Sections ``table`` and ``procedure``.
 
-    Returns
-    -------
-    Orientations
-
     Raises
     ------
     CannotCalibrateError

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.errors import ConfigurationError, NotObservableError
+from pipeline.errors import NotObservableError
 from pipeline.estimation.accelerometer.turn_extremes import (
     by_turn,
     certificate_of,
@@ -36,12 +36,18 @@ from pipeline.estimation.accelerometer.turn_extremes import (
 )
 from pipeline.estimation.correction import apply_correction, two_sided
 from pipeline.estimation.engine import LinearMap, assess_noise
-from pipeline.estimation.gauss_markov import blocks_of_samples
 from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.estimation.noise import prior_of
+from pipeline.estimation.stages import stages_before
 from pipeline.estimation.table_errors import Reference, disturbance
-from pipeline.estimation.turns import parts_of
-from pipeline.estimation.uncertainty_budget import budgeted, combined, noise_contribution, scatter_contribution
+from pipeline.estimation.turns import blocks_of_samples, parts_of
+from pipeline.estimation.uncertainty_budget import (
+    budgeted,
+    combined,
+    noise_contribution,
+    scatter_contribution,
+    stage_parameters,
+)
 from pipeline.model.effects import effect
 from pipeline.records import AXES, FittedEffect, SensorCalibration, StageResult
 
@@ -317,7 +323,7 @@ def fit(
     after = apply_correction({"steps": found.steps}, np.concatenate([turn.reading for turn in turns]))
     result = StageResult(
         name=name,
-        parameters=with_uncertainty(found.values, scatter.covariance[15:, 15:]),
+        parameters=stage_parameters(found.values, scatter.covariance[15:, 15:]),
         residual_rms=float(np.sqrt(np.mean((np.linalg.norm(after, axis=1) - gravity_g) ** 2))),
         correction={"steps": found.steps},
         details=_details(turns, noise, float(scatter.degrees_of_freedom.min())),
@@ -341,27 +347,6 @@ def fit(
         return np.array([chain(theta + e).vector()[kept] for e in errors])
 
     return budgeted(calibration, reference, noise, [scatter.of(kept)], settings, results)
-
-
-def stages_before(sensor: str, previous: SensorCalibration | None, stages: Mapping[str, Any]) -> list[str]:
-    """Return the names of the stages so far; refuse what is no stage of the staged method."""
-    done = () if previous is None else previous.stages
-    unknown = [stage.name for stage in done if stage.name not in stages or stage.correction is None]
-    if unknown:
-        raise ConfigurationError(
-            f"a stage of the staged method cannot follow {unknown[0]!r}, which leaves no corrected readings for it; "
-            f"the stages of the {sensor} are {', '.join(stages)}"
-        )
-    return [stage.name for stage in done]
-
-
-def with_uncertainty(values: Quantities, covariance: Values) -> dict[str, dict[str, Any]]:
-    """Return the parameters of a stage as published."""
-    own = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
-    return {
-        name: {"value": value, "unit": unit, "standard_uncertainty": float(u)}
-        for (name, (value, unit)), u in zip(values.items(), own, strict=True)
-    }
 
 
 def _details(turns: Sequence[Turn], noise: ResidualNoise, freedom: float) -> dict[str, Any]:

@@ -32,13 +32,12 @@ import numpy as np
 
 from pipeline.errors import ConfigurationError
 from pipeline.estimation.engine import LinearMap, assess_noise
-from pipeline.estimation.gauss_markov import blocks_of_samples
 from pipeline.estimation.gyroscope.integrated_turns import require_turns, turns_of
 from pipeline.estimation.least_squares import certified, solve_linear
 from pipeline.estimation.noise import prior_of
 from pipeline.estimation.reference_least_squares import inverted
 from pipeline.estimation.table_errors import Reference, disturbance
-from pipeline.estimation.turns import parts_of
+from pipeline.estimation.turns import blocks_of_samples, parts_of
 from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, scatter_contribution
 from pipeline.records import AXES, SensorCalibration, StageResult
 
@@ -57,7 +56,7 @@ STEP = 1e-6
 
 
 @dataclass(frozen=True)
-class Factors:
+class _Factors:
     """S, T and M of a forward matrix ``A = S T M``: (3,), (3, 3) and (3, 3) arrays."""
 
     S: Values
@@ -78,10 +77,6 @@ def fit(
         The result of the stage ``bias``.
     settings : mapping
         Sections ``table``, ``method`` (``as_printed``) and ``sensor``.
-
-    Returns
-    -------
-    SensorCalibration
 
     Raises
     ------
@@ -152,20 +147,16 @@ def fit(
     return budgeted(found, reference, noise, lines, settings, results)
 
 
-def factorise(A: Values) -> Factors:
+def factorise(A: Values) -> _Factors:
     """Return S (positive), T (unit lower triangular) and M (orthonormal) with ``A = S T M``.
 
     Parameters
     ----------
     A : (3, 3) array, not singular
-
-    Returns
-    -------
-    Factors
     """
     L = np.linalg.cholesky(A @ A.T)
     S = np.diag(L).copy()
-    return Factors(S, L / S[:, None], np.linalg.solve(L, A))
+    return _Factors(S, L / S[:, None], np.linalg.solve(L, A))
 
 
 def _matrix(A: Values, *, as_printed: bool) -> Values:
@@ -214,7 +205,7 @@ def _derivative(theta: Values, channel: int, *, as_printed: bool) -> Values:
     return np.column_stack(columns)
 
 
-def _parameters(factors: Factors, covariance: Values) -> dict[str, dict[str, Any]]:
+def _parameters(factors: _Factors, covariance: Values) -> dict[str, dict[str, Any]]:
     values = {f"S_{axis}": float(s) for axis, s in zip(AXES, factors.S, strict=True)}
     values |= {f"T_{AXES[i]}{AXES[j]}": float(factors.T[i, j]) for i, j in zip(*np.tril_indices(3, -1), strict=True)}
     values |= {f"M_{AXES[i]}{AXES[j]}": float(factors.M[i, j]) for i in range(3) for j in range(3)}

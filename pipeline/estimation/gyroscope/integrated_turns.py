@@ -73,16 +73,7 @@ class Turns:
 
 
 def turns_of(parts: Sequence[Part]) -> Turns:
-    """Stack the samples at rest and in turns of some recordings.
-
-    Parameters
-    ----------
-    parts : sequence of Part
-
-    Returns
-    -------
-    Turns
-    """
+    """Stack the samples at rest and in turns of some recordings."""
     readings, rates, rests, weights, turns, chosen, motions = [], [], [], [], [], [], []
     found = left_out = 0
     for part in parts:

@@ -19,8 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import ConfigurationError, NotObservableError
-from pipeline.estimation.gauss_markov import blocks_of_samples
-from pipeline.estimation.turns import steady_turns
+from pipeline.estimation.turns import blocks_of_samples, steady_turns
 from pipeline.records import AXES, motion_at_rest
 from pipeline.signal.rests import runs
 

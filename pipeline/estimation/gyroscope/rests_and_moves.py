@@ -50,10 +50,6 @@ def fit(
     settings : mapping
         Sections ``table`` (``gravity_g``), ``procedure`` (``holdout_every``) and ``sensor``.
 
-    Returns
-    -------
-    SensorCalibration
-
     Raises
     ------
     CannotCalibrateError

@@ -16,15 +16,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.estimation.accelerometer.staged import stages_before, with_uncertainty
 from pipeline.estimation.correction import apply_correction
 from pipeline.estimation.engine import LinearMap, assess_noise, derivative
 from pipeline.estimation.gyroscope.response import Response, samples_of, weights_of
 from pipeline.estimation.least_squares import ScaledColumns, certified
 from pipeline.estimation.noise import prior_of
+from pipeline.estimation.stages import stages_before
 from pipeline.estimation.table_errors import Reference, disturbance
 from pipeline.estimation.turns import parts_of
-from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution
+from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, stage_parameters
 from pipeline.records import AXES, SensorCalibration, StageResult
 
 if TYPE_CHECKING:
@@ -197,7 +197,7 @@ def fit(
     error = np.linalg.norm(after, axis=1) - np.linalg.norm(samples.rate, axis=1)
     result = StageResult(
         name=name,
-        parameters=with_uncertainty(found.values, scatter.covariance[12:, 12:]),
+        parameters=stage_parameters(found.values, scatter.covariance[12:, 12:]),
         residual_rms=float(np.sqrt(np.mean(error**2))),
         correction={"steps": found.steps},
         details={

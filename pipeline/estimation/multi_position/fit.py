@@ -30,8 +30,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import NotObservableError
+from pipeline.estimation.candidates import parameter_names
 from pipeline.estimation.engine import Posterior
-from pipeline.estimation.generalized_least_squares import parameter_names
 from pipeline.estimation.multi_position.likelihood import NEW, project_out
 from pipeline.estimation.multi_position.model import stepped
 

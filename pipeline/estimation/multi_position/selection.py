@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.estimation.candidates import starts_of
 from pipeline.estimation.design import Term
-from pipeline.estimation.generalized_least_squares import starts_of
 from pipeline.estimation.multi_position.fit import Fit, fit
 from pipeline.estimation.multi_position.likelihood import NEW, project_out, selection_hypotheses
 from pipeline.estimation.multi_position.model import State, candidates_for
