@@ -82,7 +82,7 @@ def section(comparison: JSON, figures: Sequence[JSON], name: str) -> JSON:
 
 
 def _row(c: Compared, measure: str) -> JSON:
-    """Return the line of a group in the frame of a measure, as text."""
+    """Return the line of a group in the table of a measure, as text."""
     count, (low, high), held_out = len(c.group.figures), c.interval, measure == "after"
     before, floor = c.group.mean("before"), c.group.mean("noise_floor") if held_out else None
     verdicts = Counter(plain(v) for v in c.group.figures["verdict"] if v)

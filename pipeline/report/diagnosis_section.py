@@ -127,7 +127,7 @@ def _ranking_finding(entries: Sequence[JSON], selected: Sequence[str]) -> str:
     return f"{head}, but {nearest}" if close else f"{head}; of the others, {nearest}"
 
 
-def symlog(value: float) -> float:
+def _symlog(value: float) -> float:
     """Return ``v / 10`` where ``|v| <= 10``, else ``sign(v) (1 + log10(|v| / 10))``."""
     return value / GATE if abs(value) <= GATE else math.copysign(1.0 + math.log10(abs(value) / GATE), value)
 
@@ -137,18 +137,18 @@ def _ranking_content(shown: Sequence[JSON], selected: Sequence[str], hidden: Seq
     brackets = _brackets(shown, selected)
     values = [_evidence(r) for r in shown]
     low = max(min(*values, 0.0), LOWEST)
-    x = Axis(symlog(low), symlog(max(*values, GATE * 2.0)), LEFT, WIDTH - NUMBERS - BRACKET * len(brackets))
+    x = Axis(_symlog(low), _symlog(max(*values, GATE * 2.0)), LEFT, WIDTH - NUMBERS - BRACKET * len(brackets))
     bottom = TOP + ROW * len(shown)
     ticks = [v for v in (-100.0, -10.0) if low <= v] + [0.0]
-    ticks += [10.0**k for k in range(1, 9) if symlog(10.0**k) <= x.high]
-    gate = x.pixels(symlog(GATE))
-    out = [f'<path class="grid" d="{"".join(f"M{x.pixels(symlog(t)):.1f} {TOP}V{bottom}" for t in ticks)}"/>']
+    ticks += [10.0**k for k in range(1, 9) if _symlog(10.0**k) <= x.high]
+    gate = x.pixels(_symlog(GATE))
+    out = [f'<path class="grid" d="{"".join(f"M{x.pixels(_symlog(t)):.1f} {TOP}V{bottom}" for t in ticks)}"/>']
     out += [_ranking_bar(r, x, TOP + ROW * i, selected) for i, r in enumerate(shown)]
     out.append(f'<path class="level" d="M{gate:.1f} {TOP}V{bottom}"/>')
     out.append(text(max(gate, LEFT + 32), TOP - 5, "threshold 10", "m"))
     for tick in ticks:
         words = f"{tick:.0f}" if abs(tick) < 1e5 else f"1e{math.log10(tick):.0f}"
-        out.append(text(max(x.pixels(symlog(tick)), LEFT + 6), bottom + 13, words.replace("-", MINUS), "m"))
+        out.append(text(max(x.pixels(_symlog(tick)), LEFT + 6), bottom + 13, words.replace("-", MINUS), "m"))
     out.append(text((LEFT + x.stop) / 2, bottom + 28, "ΔBIC (linear to ±10, logarithmic beyond)", "m"))
     for k, members in enumerate(brackets):
         at = x.stop + NUMBERS + BRACKET * k
@@ -168,7 +168,7 @@ def _ranking_content(shown: Sequence[JSON], selected: Sequence[str], hidden: Seq
 
 def _ranking_bar(entry: JSON, x: Axis, top: float, selected: Sequence[str]) -> str:
     value = _evidence(entry)
-    zero, end = x.pixels(0.0), x.pixels(symlog(value))
+    zero, end = x.pixels(0.0), x.pixels(_symlog(value))
     implausible = value > GATE and not entry.get("plausible", True)
     out = text(LEFT, top + 11, plain(entry["effect"]) + " (beyond the data sheet)" * implausible, "b")
     out += f'<path class="bar c{_colour(entry, selected)}" d="M{zero:.1f} {top + 15}H{end:.1f}v9H{zero:.1f}z"/>'
@@ -224,7 +224,7 @@ def added_variable(sensor: str, found: JSON) -> Figure | None:
     finding += ", and the points follow the line" if straight else "; some points leave the line"
     what = best["parameter"] if len({p["parameter"] for p in shown["panels"]}) == 1 else "each parameter"
     slopes = "; ".join(dict.fromkeys(_coefficient(p) for p in shown["panels"]))
-    x_unit = column_unit(best["unit"], unit)
+    x_unit = _column_unit(best["unit"], unit)
     drawn = chart(
         f"{sensor}-added-variable",
         f"{sensor}: {finding}",
@@ -251,7 +251,7 @@ def _coefficient(panel: JSON) -> str:
     return f"{panel['parameter']} = {value} {unit_text(panel['unit'])}".rstrip()
 
 
-def column_unit(parameter: str, unit: str) -> str:
+def _column_unit(parameter: str, unit: str) -> str:
     """Return the unit of the column that a parameter multiplies: the sensor's unit over the parameter's unit."""
     if parameter == unit:
         return ""

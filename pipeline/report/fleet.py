@@ -82,7 +82,7 @@ def fleet_statistics(rows: Sequence[JSON], fitted: Mapping[str, Mapping[str, Par
                 about = {"sensor": model, "method": method, "parameter": name, "unit": units[name]}
                 out[key].append(about | found)
     out["far"].sort(key=lambda f: -abs(f["z"]))
-    out["missing"] = missing_effects(rows)
+    out["missing"] = _missing_effects(rows)
     return out
 
 
@@ -175,7 +175,7 @@ STATISTICS = {
 }
 
 
-def missing_effects(rows: Sequence[JSON]) -> list[str]:
+def _missing_effects(rows: Sequence[JSON]) -> list[str]:
     """Return a sentence for each missing effect: in how many units, and from which lots."""
     frame = pd.DataFrame(rows).reindex(columns=["lot", *(f"{s}_{c}" for s in SENSORS for c in ("verdict", "selected"))])
     lots = frame["lot"].replace("", None).value_counts()

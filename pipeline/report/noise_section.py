@@ -63,7 +63,7 @@ def allan(
     wander : dict or None
         That of the diagnosis: the wander that its fit needed.
     """
-    found = longest_rest(sensor, recordings)
+    found = _longest_rest(sensor, recordings)
     if found is None:
         return None
     (recording, values), unit = found, SENSOR_UNITS[sensor]
@@ -90,7 +90,7 @@ def allan(
     return Figure(drawn, f"{rest} {_noise_sentences(noise, wander, unit)}", legend, finding)
 
 
-def longest_rest(sensor: str, recordings: list[Recording]) -> tuple[Recording, NDArray[np.float64]] | None:
+def _longest_rest(sensor: str, recordings: list[Recording]) -> tuple[Recording, NDArray[np.float64]] | None:
     """Return the recording with the longest rest, a static one if there is one, and the readings in it."""
     best: tuple[Recording, NDArray[np.float64]] | None = None
     for recording in sorted(recordings, key=lambda r: r.role != "static"):

@@ -112,7 +112,7 @@ def white_noise(residual: Residual, noise: JSON | None) -> NDArray[np.float64]:
 
 
 @dataclass(frozen=True)
-class BinnedMean:
+class _BinnedMean:
     """Means of a residual in bins of a covariate: centres (m,), means and standard errors (m, 3); NaN in empty bins."""
 
     centre: NDArray[np.float64]
@@ -126,7 +126,7 @@ class BinnedMean:
         return float(ratio.mean(axis=0).max())
 
 
-def binned_mean(covariate: NDArray[np.float64], error: NDArray[np.float64]) -> BinnedMean | None:
+def _binned_mean(covariate: NDArray[np.float64], error: NDArray[np.float64]) -> _BinnedMean | None:
     """Return means of ``error`` (n, 3) in 36 equal bins of the covariate (n,); None where it does not vary."""
     known = np.isfinite(covariate) & np.isfinite(error).all(axis=1)
     if not known.all():
@@ -144,7 +144,7 @@ def binned_mean(covariate: NDArray[np.float64], error: NDArray[np.float64]) -> B
     between = np.sum(mean[filled] ** 2 * count[filled, None], axis=0) / count[filled].sum()
     scatter = np.sqrt(np.maximum(np.mean(error**2, axis=0) - between, 0.0)) + 1e-300
     centre = low + (np.arange(BINS) + 0.5) * (high - low) / BINS
-    return BinnedMean(centre, mean, scatter / np.sqrt(count)[:, None])
+    return _BinnedMean(centre, mean, scatter / np.sqrt(count)[:, None])
 
 
 COVARIATES: dict[str, Callable[[Residual], NDArray[np.float64] | None]] = {
@@ -158,23 +158,23 @@ COVARIATES: dict[str, Callable[[Residual], NDArray[np.float64] | None]] = {
 }
 
 
-def covariates(found: list[Residual], wander: NDArray[np.float64]) -> dict[str, BinnedMean]:
+def covariates(found: list[Residual], wander: NDArray[np.float64]) -> dict[str, _BinnedMean]:
     """Return binned means over all recordings by covariate, the largest excess first.
 
     Of the components of the specific force only the one with the largest excess is returned.
     """
-    out: dict[str, BinnedMean] = {}
+    out: dict[str, _BinnedMean] = {}
     for label, value in COVARIATES.items():
         pairs = [(v, r.error) for r in found if (v := value(r)) is not None]
         if pairs:
-            binned = binned_mean(np.concatenate([v for v, _ in pairs]), np.concatenate([e for _, e in pairs]))
+            binned = _binned_mean(np.concatenate([v for v, _ in pairs]), np.concatenate([e for _, e in pairs]))
             out |= {label: binned} if binned else {}
     order = sorted(out, key=lambda label: -out[label].excess(wander))
     forces = [label for label in order if label.startswith("specific force")]
     return {label: out[label] for label in order if label not in forces[1:]}
 
 
-def angle_bins(angle: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _angle_bins(angle: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return in which of 36 bins of a turn each of (n,) angles (deg) is, and how many are in each bin."""
     cell = (np.mod(angle, 360.0) * (BINS / 360.0)).astype(np.int64) % BINS
     return cell, np.bincount(cell, minlength=BINS)
@@ -188,7 +188,7 @@ def harmonics(residual: Residual) -> NDArray[np.float64] | None:
     angle = residual.motion.angle
     if angle is None:
         return None
-    cell, count = angle_bins(angle)
+    cell, count = _angle_bins(angle)
     if not count.all():
         return None
     mean = np.stack([np.bincount(cell, e, BINS) / count for e in residual.error.T], 1)
@@ -221,7 +221,7 @@ def harmonic_noise(
     turns = max(float(np.abs(np.diff(motion.angle)).sum()) / 360.0, 1.0)
     frequency = np.arange(HARMONICS + 1) * turns / duration
     spectrum = 2.0 * float(wander.max()) ** 2 * time / (1.0 + (2.0 * np.pi * frequency * time) ** 2)
-    of_white = float(white.max()) ** 2 * float(np.mean(1.0 / np.maximum(angle_bins(motion.angle)[1], 1))) / BINS
+    of_white = float(white.max()) ** 2 * float(np.mean(1.0 / np.maximum(_angle_bins(motion.angle)[1], 1))) / BINS
     spread = np.sqrt(2.0 * of_white + 2.0 * spectrum / duration)
     spread[0] = np.hypot(np.sqrt(of_white), wander.max())  # a mean, not an amplitude
     level: NDArray[np.float64] = ONE_IN_A_THOUSAND * spread
@@ -249,7 +249,7 @@ def residual_figures(sensor: str, found: list[Residual], noise: JSON | None) -> 
     return figures
 
 
-def _covariate(sensor: str, label: str, mean: BinnedMean, wander: NDArray[np.float64]) -> Figure:
+def _covariate(sensor: str, label: str, mean: _BinnedMean, wander: NDArray[np.float64]) -> Figure:
     """Draw the binned means of each axis with the band of the wander."""
     unit, (name, covariate_unit) = SENSOR_UNITS[sensor], label.split(", ")
     words, excess = name.replace("force ", "force along "), mean.excess(wander)

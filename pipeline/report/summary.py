@@ -1,4 +1,4 @@
-"""One row a unit: ``summary.csv`` and the frame of the campaign's page.
+"""One row a unit: ``summary.csv`` and the table of the campaign's page.
 
 Columns: those of every campaign in the order of ``COLUMNS``, then the user's own columns of ``units.csv``. A column of
 the user's whose name is taken gets ``sheet_`` before it.

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from pipeline.records import Recording
-from pipeline.report.diagnosis_section import added_variable, column_unit, ranking, symlog, unexplained
+from pipeline.report.diagnosis_section import _column_unit, _symlog, added_variable, ranking, unexplained
 from pipeline.report.held_out_section import error_steps
-from pipeline.report.noise_section import allan, deviations, expected, longest_rest
+from pipeline.report.noise_section import _longest_rest, allan, deviations, expected
 from pipeline.report.residual_section import harmonic_noise, harmonics, residual_figures, residuals
 from pipeline.report.unit_page import render
 
@@ -54,9 +54,9 @@ def test_bars_end_where_their_evidence_is_and_the_gate_stands_at_ten() -> None:
     gate = float(LEVEL.search(figure.svg).group(1))  # type: ignore[union-attr]
     for (_, start, end), value in zip(bars, (2000.0, 200.0, 5.0), strict=True):
         assert start == zero
-        assert (end - zero) / (gate - zero) == pytest.approx(symlog(value), abs=0.01)
-    assert symlog(10.0) == 1.0
-    assert symlog(-1000.0) == -3.0
+        assert (end - zero) / (gate - zero) == pytest.approx(_symlog(value), abs=0.01)
+    assert _symlog(10.0) == 1.0
+    assert _symlog(-1000.0) == -3.0
     assert "1 more has less evidence" in figure.caption
 
 
@@ -121,7 +121,7 @@ def test_the_line_of_an_added_variable_has_the_parameter_as_its_slope() -> None:
     ],
 )
 def test_what_a_parameter_multiplies_has_the_unit_that_makes_a_reading(parameter: str, unit: str, column: str) -> None:
-    assert column_unit(parameter, unit) == column
+    assert _column_unit(parameter, unit) == column
 
 
 def test_the_unexplained_is_drawn_with_its_shape_and_says_where_the_points_leave_it() -> None:
@@ -198,7 +198,7 @@ def test_the_words_beside_the_allan_deviation_say_what_was_found_and_whether_it_
     assert "inflated" not in calm.caption
     assert "1.5 × that of the data sheet" in calm.finding
     assert allan("accelerometer", recordings[1:], noise, sheet, wander) is None
-    assert longest_rest("gyroscope", recordings) is None
+    assert _longest_rest("gyroscope", recordings) is None
 
 
 def test_noise_alone_stays_below_the_dashes_of_the_harmonics(unit: Unit) -> None:

@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 from scipy import stats
 
-from pipeline.report.fleet import fleet_statistics, missing_effects, unit_parameters, write_parameters
+from pipeline.report.fleet import _missing_effects, fleet_statistics, unit_parameters, write_parameters
 from pipeline.report.parameters import Parameter
 
 if TYPE_CHECKING:
@@ -109,7 +109,7 @@ def test_missing_effects_are_counted_with_the_lot_that_they_come_from() -> None:
         rows[i]["gyroscope_selected"] = "g_sensitivity"
     for i in (1, 21, 31, 32, 33, 34):
         rows[i]["gyroscope_selected"] = "warm_up;bias_drift"
-    assert missing_effects(rows) == [
+    assert _missing_effects(rows) == [
         "missing effect: g_sensitivity (7 of 100 units, gyroscope), all from lot 7 (7 of its 10)",
         "missing effect: warm_up (6 of 100 units, gyroscope), 4 of them from lot 3 (4 of its 10)",
         "missing effect: bias_drift (6 of 100 units, gyroscope), 4 of them from lot 3 (4 of its 10)",
