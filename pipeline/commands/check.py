@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from pipeline.records import Recording
 
 DEFAULT_PROFILE = "canonical_csv"
-SEARCHED_BYTES = 1 << 25
+SEARCHED_BYTES = 1 << 25  # of a log, for its layout
 SEARCHED_FOLDERS = 4  # the log's, and a campaign's above raw/<unit>/
 UNKNOWN_LAYOUT = ("missing_column", "no_header")
 EPILOG = """\

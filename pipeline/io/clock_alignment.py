@@ -46,15 +46,15 @@ if TYPE_CHECKING:
 
     Values = NDArray[np.float64]
 
-SMALLEST_CORRELATION = 0.9
-BLOCKS_S = (1.0, 4.0)
+SMALLEST_CORRELATION = 0.9  # at most 19 % of the variance of the rates is not explained, 1 - 0.9^2
+BLOCKS_S = (1.0, 4.0)  # about the length of a ramp of the rate, and longer than it
 COARSE_S = 0.01  # step of the grid of offsets
 MOST_PLACES, WORTH_A_LOOK = 40, 0.3  # offsets refined, and their least correlation relative to the best
-SAMPLES_OF_A_LOOK = 20_000
+SAMPLES_OF_A_LOOK = 20_000  # bounds the cost of up to 40 offsets
 AMBIGUOUS = 1.1  # ratio of the second-best mean squared residual to the best
 SHARED = 0.5  # share of the shorter log that both have to cover
-STEPS, ROUNDING_S = 20, 1e-9
-FEWEST_BLOCKS = 3.0
+STEPS, ROUNDING_S = 20, 1e-9  # Gauss-Newton stops below 1 ns, the resolution of the times
+FEWEST_BLOCKS = 3.0  # bounds the factor nu / (nu - 2), the variance of Student's t, for few blocks
 RESOLVED = 0.005  # of the table's interval: between its samples the motion is interpolated
 
 

@@ -35,9 +35,9 @@ if TYPE_CHECKING:
 
     Values = NDArray[np.float64]
 
-STEP_S = 0.005
+STEP_S = 0.005  # grid of the program and of its derivative, half the interval of a log at 100 Hz
 BEFORE_S = 1.0  # rest that is added at both ends
-ROUNDS = 12
+ROUNDS = 12  # iterations at most; they end where no move changes by 1 us
 FARTHEST = 0.5  # of the rest beside a move
 
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from pipeline.io.ingest_settings import CsvFormat
 
-LONGEST_LINE = 1 << 20
+LONGEST_LINE = 1 << 20  # bytes, of a line before the data
 DECIMALS = 12  # far below any sensor's resolution, above the rounding of a double
 
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from pipeline.io.ingest_settings import Column
 
-LISTED = 5
+LISTED = 5  # lines named in a refusal
 LEAVE_A_GAP = "ingest.csv.bad_rows=drop leaves a gap in place of such rows"
 HINTS = {
     "bad_row": LEAVE_A_GAP,

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from pipeline.io.csv_rows import Rows
     from pipeline.io.ingest_settings import Checks, Column, CsvFormat
 
-EXACT_BELOW_S = 1e6
+EXACT_BELOW_S = 1e6  # half a nanosecond is 2^-53 of 4.5e6 s
 LONGEST_S = 9.2e9  # int64 nanoseconds end at 292 years
 DECIMAL_DIGITS = {"s": 9, "ms": 6, "us": 3, "ns": 0}
 COARSEST = 0.01  # of the median interval

@@ -45,23 +45,24 @@ if TYPE_CHECKING:
     Array = NDArray[np.float64]
     Index = NDArray[np.intp]
 
+# 10 and 7 standard deviations: below 3e-12 by chance for normal noise; half of L as a margin.
 BEYOND, ALLOWED, JUMP = 10.0, 1.5, 7.0
-MEDIAN_SIZE = 1.4826
+MEDIAN_SIZE = 1.4826  # 1 / (the 75 % quantile of the normal distribution): standard deviation over median |x|
 AROUND_S, FEWEST_AROUND = 0.5, 6  # on either side
-REST_S, FEWEST_OF_REST = 2.0, 40
-LATE_S = 0.1
-WINDOWS = 40
+REST_S, FEWEST_OF_REST = 2.0, 40  # where the unit rests, more samples make the median more precise
+LATE_S = 0.1  # a delay of a low-cost filter or of the log
+WINDOWS = 40  # of a recording, to find the usual scatter of its rests
 LEVER_M, STANDARD_GRAVITY = 0.1, 9.80665
 STILL_DEG = 0.05  # turned within a window that is at rest
 STILL_BY_HAND_DEG = 0.5  # as a gyroscope with noise and bias adds it up
 SAME_EVENT = 5  # samples between two that belong to one event; an event of several is widened by 2
 
-PIECE_S, SETTLING_S = 2.0, 0.3
-AT_REST_DPS = 0.02
+PIECE_S, SETTLING_S = 2.0, 0.3  # as the module's description states
+AT_REST_DPS = 0.02  # assumed noise of the rates of table encoders at rest
 FEWEST = 4  # samples of a piece
 FEWEST_PIECES = 8  # by which the usual scatter is known
-RATIO = 4.0
-SIGNIFICANT, TAIL = 6.0, 18.0
+RATIO = 4.0  # a scatter twice the usual one
+SIGNIFICANT, TAIL = 6.0, 18.0  # P(chi^2 > nu + 6 sqrt(2 nu) + 18) < exp(-9) (Laurent and Massart 2000, lemma 1)
 LARGEST_SHARE = 0.1  # of the pieces
 
 

@@ -32,9 +32,9 @@ if TYPE_CHECKING:
 TABLE_TIME = "table_time"
 FEWEST_ROWS = 6  # the quintic spline needs them
 FINEST_S, FINEST_OF_ATTITUDE_S = 0.0025, 0.01  # steps of the grid; only the rate of one axis is known to bend
-MOST_POINTS = 1 << 18
+MOST_POINTS = 1 << 18  # bounds memory and the cost of correlation; a power of 2 for the transform
 BENT = 8.0  # times the median change of slope
-RESTING_DPS = 0.5
+RESTING_DPS = 0.5  # smallest range of the rate that is called a motion
 SAME_SIGN = 0.9  # correlation of the logged rate with the slope of the angle
 
 

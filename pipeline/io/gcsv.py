@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from pipeline.io.ingest_settings import Checks
 
 FIRST_LINES = (b"GYROFLOW IMU LOG", b"CAMERA IMU LOG")
-LONGEST_HEADER = 1 << 16
+LONGEST_HEADER = 1 << 16  # bytes that are searched for the line of names
 LAST_VERSION = "1.3"
 EXTRA = {
     "temperature_degc": ("temperature", "degC"),

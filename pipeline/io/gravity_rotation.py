@@ -31,18 +31,18 @@ if TYPE_CHECKING:
 
     from pipeline.io.channel_table import ChannelTable
 
-BLOCK_S = 0.25
-SHORTEST_BLOCK = 5
+BLOCK_S = 0.25  # two blocks make the shortest rest, half a second
+SHORTEST_BLOCK = 5  # samples, for a variance
 STILL = 9.0  # times the 10th percentile of the variance
 SMALLEST_VARIANCE = 1e-7  # relative to the square of the specific force
-LARGEST_DRIFT_DEG = 2.0
-BINS = 64
-LONGEST_MOVE_S = 30.0
-SMALLEST_TURN_DEG = 20.0
-FEWEST_MOVES = 3
-MOST_MOVES = 40
-MOST_SAMPLES = 200_000
-FITS_DEG, FAILS_DEG = 15.0, 30.0
+LARGEST_DRIFT_DEG = 2.0  # between the ends of a rest; more is slow motion
+BINS = 64  # a half turn rotates by less than 3 deg in each
+LONGEST_MOVE_S = 30.0  # a bias of 0.5 deg/s then adds 15 deg, what still fits
+SMALLEST_TURN_DEG = 20.0  # above what fits, so that no rotation at all fails
+FEWEST_MOVES = 3  # for a median
+MOST_MOVES = 40  # bounds the cost
+MOST_SAMPLES = 200_000  # bounds the cost
+FITS_DEG, FAILS_DEG = 15.0, 30.0  # the next possible unit misses by tens of degrees
 
 
 @dataclass(frozen=True)

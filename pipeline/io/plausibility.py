@@ -28,11 +28,11 @@ if TYPE_CHECKING:
     from pipeline.io.channel_table import ChannelTable
     from pipeline.records import Note
 
-FORCE_RANGE_G = (0.3, 3.0)
-QUATERNION_TOLERANCE = 0.01
-RATE_TOLERANCE = 0.2
+FORCE_RANGE_G = (0.3, 3.0)  # about 1 g at rest; another unit is off by 9.8 or 1000
+QUATERNION_TOLERANCE = 0.01  # components rounded to two decimals
+RATE_TOLERANCE = 0.2  # another unit of time is off by 1000
 ENOUGH = 200_000  # samples that a median is taken of
-TURNING_DPS = 5.0
+TURNING_DPS = 5.0  # below, the bias of a low-cost gyroscope is of the same size
 
 
 def examine(

@@ -26,17 +26,17 @@ if TYPE_CHECKING:
     from pipeline.records import Note
 
 GAP, CLIPPED, STUCK = np.uint16(1), np.uint16(2), np.uint16(4)
-GAP_INTERVALS = 1.5
-JITTER_NOTED, JITTER_TOO_LARGE = 0.2, 0.5
-FULL_SCALE_MARGIN = 1.2
+GAP_INTERVALS = 1.5  # half way to one missing sample
+JITTER_NOTED, JITTER_TOO_LARGE = 0.2, 0.5  # rms, relative to the median interval; spectra need regular samples
+FULL_SCALE_MARGIN = 1.2  # sensors read up to a fifth past their nominal range
 RAIL = 1e-4  # relative; the top code of 16 bits lies 3e-5 below full scale
 BEYOND = 1e-3  # relative; with nominal counts per unit the top code lies up to so far above
 UNIT_NAMES = {"accelerometer": "g", "gyroscope": "deg/s"}
-WINDOW = 64
-BY_CHANCE = 1e-6
-SHORTEST_RUN = 20
-QUIET = 0.5
-DEAD_ROWS = 1000
+WINDOW = 64  # samples in which the share of equal neighbours is counted
+BY_CHANCE = 1e-6  # expected number of such runs in the recording
+SHORTEST_RUN = 20  # samples; the estimate of p from windows of 64 is too coarse for less
+QUIET = 0.5  # share of equal neighbours at which noise is below the resolution
+DEAD_ROWS = 1000  # shorter recordings may be constant by their resolution
 
 
 def flag_gaps(table: ChannelTable, flags: NDArray[np.uint16], checks: Checks) -> list[Note]:

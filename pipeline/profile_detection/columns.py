@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 COUNTING = 0.98  # share of steps by exactly 1
 SCATTER = 0.2  # of intervals over their median: times of arrival, not of sampling
-TEMPERATURE_RANGE = (-60.0, 130.0)
+TEMPERATURE_RANGE = (-60.0, 130.0)  # degC, of electronics and their tests
 
 WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d")
 MERGED = re.compile(r"(a|ac|acc|accl|accel|f|g|gy|gyr|gyro|w|omega|rot)([xyz])")

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
     from mcap.records import Channel, Schema
 
-MOST_FIELDS = 24
-LONGEST_LIST = 4
+MOST_FIELDS = 24  # listed of a message
+LONGEST_LIST = 4  # elements listed of an array
 
 
 def topic_lines(path: Path, *, fields: bool) -> list[tuple[str, str]]:

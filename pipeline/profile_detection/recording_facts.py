@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     from pipeline.records import Note, Recording
 
 ENOUGH = 500_000  # samples that rests and moves are looked for in
-FEWEST_SAMPLES = 3
-PLATEAU = 3  # samples
+FEWEST_SAMPLES = 3  # of a rest, for a variance
+PLATEAU = 3  # samples at the largest value; noise repeats it less often
 AS_SAID, ABOUT_AS_SAID = 0.1, 0.35  # of the angle; an accelerometer that is not calibrated leaves some degrees
-LABEL = 16
-WIDTH = 118
+LABEL = 16  # width of the labels, characters
+WIDTH = 118  # characters of a line
 LISTED_NOTES = 20
 
 Line = tuple[str, str]

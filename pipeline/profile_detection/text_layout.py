@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-LINES_TRIED = 400
-MOST_ROWS = 200_000
+LINES_TRIED = 400  # with each separator
+MOST_ROWS = 200_000  # read as numbers; bounds the cost
 FEWEST_ROWS = FEWEST_COLUMNS = 3
 SEPARATORS = (",", ";", "\t", "|", " ")
 NUMBER = {

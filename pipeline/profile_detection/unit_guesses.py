@@ -28,17 +28,18 @@ CLOSE = 0.12  # bias and scale factor of a low-cost sensor in one position
 CLOSE_BY_TABLE = 0.05  # scale factor of a low-cost sensor (MPU-6050: 3 %), and a unit that leans on the table
 FOLLOWED = 0.3  # share of the rates' rms that the table's rate leaves at most: axes lean, and rates are noisy
 CLOSE_BY_TURNS = 0.2  # those of both sensors, in few moves
-USUAL_COUNTS_PER_G = (16384.0, 8192.0, 4096.0, 2048.0, 1024.0, 256.0)
+USUAL_COUNTS_PER_G = (16384.0, 8192.0, 4096.0, 2048.0, 1024.0, 256.0)  # 2, 4, 8, 16 g in 16 bits, and 12 or 10 bits
+# 16 bits for 250, 500, 1000, 2000, 4000 deg/s (InvenSense, Bosch).
 USUAL_COUNTS_PER_DPS = (131.0, 65.5, 32.8, 16.4, 8.2)
-OFFSETS = (0.0, 32768.0, 8192.0, 2048.0)
+OFFSETS = (0.0, 32768.0, 8192.0, 2048.0)  # middle of 16, 14 and 12 bits without a sign
 SCALES = np.geomspace(1.0, 1000.0, 481)
 ASSUMED_HZ = 100.0  # where the time is not known
-CONVINCING_DEG = 12.0
-TOO_FAST_FOR_RADIANS = 40.0
+CONVINCING_DEG = 12.0  # below half of the residual angle of the next usual scale in a quarter turn
+TOO_FAST_FOR_RADIANS = 40.0  # rad/s, 2300 deg/s: beyond the range of usual sensors
 BURSTS = 0.1  # mean over median interval, from which both are told
-RATES_HZ = (5.0, 20_000.0)
+RATES_HZ = (5.0, 20_000.0)  # sampling rates of inertial sensors
 SINCE_1970_S = (1e9, 4e9)  # 2001 to 2096
-FEWEST_RESTS_FOR_A_SPHERE = 9
+FEWEST_RESTS_FOR_A_SPHERE = 9  # twice the four unknowns, and one
 
 
 @dataclass(frozen=True)
