@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     Values = NDArray[np.float64]
 
 CLEARLY = 10.0  # delta BIC for a further harmonic, or for time in place of what changes with it
-MOST_HARMONICS = 3
+MOST_HARMONICS = 3  # at once; further ones are found once these are added
 REFINED = 40  # forms of a scan, best first on all three axes, for which the axes are then chosen
 FAR_MORE = 0.1  # of what slow effects gain, by which a form in their place must gain more
 MUCH = 40.0  # delta BIC by which it must be better in any case

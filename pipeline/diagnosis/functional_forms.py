@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     Values = NDArray[np.float64]
 
 CYCLES = range(1, 13)
-ORDER = 5
-PLACES = 40
+ORDER = 5  # as DEGREE of the tests that find a dependence (pipeline.diagnosis.residual_dependence)
+PLACES = 40  # a step is then placed to 1/80 of the span before the fine scan
 FINE = 12  # places to each side of the best, down to a twelfth of the coarse distance
 WIDTHS = (0.25, 0.5, 1.0, 2.0, 4.0)  # of the coarse distance
 CONSTANTS = tuple(np.geomspace(0.06, 1.5, 9))  # of the span; steps of 1.5, then FACTORS about the best

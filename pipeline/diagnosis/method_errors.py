@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     Errors = dict[str, tuple[Values, Values]]  # by cause: of the vector (n, 3), and of its magnitude (n,)
 
 FREE = ("reference_least_squares", "effects")  # stages that leave bias and matrix free
-LEAST_SHARE = 0.02
+LEAST_SHARE = 0.02  # of the mean square: a part that adds less than 1 % to the rms error is not named
 SURE = 5.0  # standard uncertainties: 9 elements of 10^4 units exceed them by chance less than once in 10
 COSINES = (
     "the stages orthogonality and misalignment multiply readings by cosines, which changes a scale factor a little and "

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from pipeline.model.effects.base import Effect
     from pipeline.records import Motion
 
-LEAST_SPAN_DEGC = 1.0
+LEAST_SPAN_DEGC = 1.0  # twice the step of a coarse thermometer, 0.5 degC
 OF_A_TABLE = {"angle": "no angle of a table", "rate": "no rate of a table", "level": "nothing that tells the heading"}
 
 

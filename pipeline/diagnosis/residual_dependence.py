@@ -43,11 +43,11 @@ if TYPE_CHECKING:
     Tests = tuple[list[str], Values, NDArray[np.intp], float]
 
 GATE_BIC = 10.0  # "very strong" of R. E. Kass and A. E. Raftery, JASA 90 (1995), 773-795
-GATE_P = 1e-3
-DEGREE = 5
+GATE_P = 1e-3  # probability of naming a covariate of a complete model, over all tests (Bonferroni)
+DEGREE = 5  # up to four turning points over the span; faster changes are steps
 FEWEST, MOST = 3, 8  # periods a turn: one and two look like base and catalogue
 LEAST_RIPPLE = 2  # one is an effect of the catalogue
-PLACES = 16
+PLACES = 16  # of a test for a step: the nearest one is within 1/32 of the span
 SLOW = ("bias_drift", "bias_temperature", "bias_temperature_quadratic", "scale_factor_temperature", "warm_up")
 EQUATION = 0.05  # of what slow effects gain: less may be the error of a smoothed temperature where it turns
 ABOVE = 1.1  # times the white noise: a residual that may hold something sudden

@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
 OWN = 4  # columns of the base on each axis
 RANK = 1e-11  # of singular values: columns that are the same to rounding
-BINS = 40
+BINS = 40  # points that a plot shows apart
 DIGITS = 5  # more than a plot shows
 CURVE = 60  # points of a suggested form
 LEAST_SHARE = 0.01  # of the information on a coefficient that the axes share, for an axis to be shown

@@ -27,13 +27,13 @@ if TYPE_CHECKING:
     from pipeline.simulation.description import UnitDescription
     from pipeline.simulation.procedures import Course
 
-FASTER_DPS = (100.0, 200.0)
-CLEARLY_FASTER = 1.3
+FASTER_DPS = (100.0, 200.0)  # rates that are proposed, within a low-cost range of 250 deg/s
+CLEARLY_FASTER = 1.3  # than the procedure's fastest rate, for a rate to be proposed
 WITHIN = 0.9  # of the gyroscope's full scale: its bias needs the rest
-MOTION_S, MOTION_DPS = 120.0, 100.0
-UPRIGHT_DPS = 60.0
-LONG_REST_S = 600.0
-POSITIONS = 2
+MOTION_S, MOTION_DPS = 120.0, 100.0  # of the random motion that is proposed
+UPRIGHT_DPS = 60.0  # one turn about an upright z in 6 s
+LONG_REST_S = 600.0  # six correlation times of a typical wander (configs/sensor)
+POSITIONS = 2  # times as many rests
 
 
 @dataclass(frozen=True)

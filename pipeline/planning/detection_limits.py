@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
 STEPS = 14  # of bisection: a factor of 1e11 to 0.2 %
 LEAST, LARGEST = 1e-8, 1e3  # share of the limits
-ALMOST_SURE = 0.95
+ALMOST_SURE = 0.95  # share of the cases in which the size ``sure`` is found
 ALIKE = 0.8  # share of a signal from which on an effect is listed as a look-alike
 PARTLY = 0.3  # share of a signal below which an effect cannot be preferred for having fewer parameters
 MOST_SIGNS = 32  # patterns of signs; the mean over them is then within 0.1 of that over all (standard error of a share)

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from pipeline.simulation.description import UnitDescription
     from pipeline.simulation.trajectory import Planned
 
-SEED = 0
+SEED = 0  # of the simulated noise: a plan is the same each time
 # The middle of what is drawn at random for a simulated unit: it warms up by some degrees in a room that changes little.
 ROOM: dict[str, Any] = {
     "ambient": 25.0, "warm_up": 4.5, "warm_up_time": 300.0, "drift": 0.3,

@@ -11,9 +11,9 @@ if TYPE_CHECKING:
 
     from pipeline.planning.changes import Gain
 
-CLEARLY_LARGER = 1.2
+CLEARLY_LARGER = 1.2  # times the smallest size, from which on the size that is named by itself is printed
 CLEARLY_SMALLER = 99.5  # per cent
-TOP = 3
+TOP = 3  # changes that are printed
 
 
 def in_words(document: Mapping[str, Any]) -> list[str]:

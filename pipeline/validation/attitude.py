@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-MINUTE = 60.0
+MINUTE = 60.0  # s over which a drift is stated
 STARTS = 60  # of the minutes over which a drift is averaged
 SHORTEST = 10.0  # s: a drift over less than that is mostly noise
 CURVE = 120  # points of the published curves
