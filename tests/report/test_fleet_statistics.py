@@ -74,6 +74,11 @@ def test_a_fleet_without_serials_lots_and_dates_has_distributions_only() -> None
     assert fleet_statistics([], {})["distributions"] == []
 
 
+def test_a_parameter_that_no_unit_fits_is_in_the_distributions_only() -> None:
+    told = fleet_statistics(*fleet(np.zeros(30)))
+    assert [key for key, value in told.items() if value] == ["distributions"]
+
+
 def test_a_drift_over_the_date_is_found_with_its_size() -> None:
     rng = np.random.default_rng(4)
     values = rng.normal(0.0, 0.1, 200) + 0.002 * np.arange(200)
