@@ -7,7 +7,7 @@ import re
 import sys
 import tempfile
 import textwrap
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from shutil import copyfile
 from typing import TYPE_CHECKING, Any
@@ -59,22 +59,23 @@ exit code: 0 if ingest reads every file, 2 if it refuses one or does not know it
 
 @dataclass
 class Reading:
-    """How some files are read as one recording."""
+    """Files that are read as one recording, and the sections of a configuration that say how."""
 
     files: list[Path]
-    ingest: dict[str, Any]
-    sensor: dict[str, Any]
+    settings: dict[str, Any]
     said: str
-    entry: dict[str, Any] = field(default_factory=lambda: {"role": "rests", "axis": None})
-    name: str = ""
-    bench: dict[str, Any] = field(default_factory=dict)
 
     @property
-    def settings(self) -> dict[str, Any]:
-        """What checks of a recording read of a unit's configuration."""
-        procedure = {"recordings": {self.name: self.entry}} | {k: v for k, v in self.bench.items() if k != "table"}
-        table = self.bench.get("table", {})
-        return {"procedure": procedure, "table": table, "sensor": self.sensor, "ingest": self.ingest}
+    def is_mcap(self) -> bool:
+        """Whether the recording is an MCAP file."""
+        return self.files[0].suffix == ".mcap"
+
+
+def _reading_of_file(files: list[Path], ingest: dict[str, Any], sensor: dict[str, Any], said: str) -> Reading:
+    """Return how files that belong to no campaign are read: as rests without a table."""
+    recordings = {files[0].stem: {"role": "rests", "axis": None}}
+    settings = {"procedure": {"recordings": recordings}, "table": {}, "sensor": sensor, "ingest": ingest}
+    return Reading(files, settings, said)
 
 
 def main(argv: Sequence[str]) -> int:
@@ -87,7 +88,7 @@ def main(argv: Sequence[str]) -> int:
             refused.append((reading, error))
     unknown = [layout for reading, error in refused for layout in _layouts(reading, error)]
     if unknown:
-        _print_proposals(propose(unknown), refused[0][0].sensor, arguments.save)
+        _print_proposals(propose(unknown), refused[0][0].settings["sensor"], arguments.save)
     elif arguments.save:
         print(f"{arguments.save} was not written: there is nothing to propose")
     sys.stdout.flush()
@@ -131,7 +132,7 @@ def _readings(files: Sequence[Path], profile: str | None, sensor: str | None) ->
         ingest, sheet = _composed(chosen, sensor, campaign)
         said = f"ingest={ingest['name']}" + (f", sensor={sensor}" if sensor else "")
         parts = [p["file"] for p in (ingest["csv"] or {}).get("parts") or []]
-        readings += [Reading(group, ingest, sheet if sensor else {}, said) for group in _grouped(others, parts)]
+        readings += [_reading_of_file(g, ingest, sheet if sensor else {}, said) for g in _grouped(others, parts)]
     return readings
 
 
@@ -166,11 +167,9 @@ def _of_campaign(directory: Path | None) -> list[Reading]:
             said = f"unit {name} of campaign {campaign.name}, recording {recording}: "
             said += f"ingest={config['ingest']['name']}, sensor={config['sensor']['name']}"
             tolerance = config["procedure"]["mounting_tolerance_deg"]
-            bench = {"table": config["table"], "mounting_tolerance_deg": tolerance}
-            found = [[(folder / f).resolve() for f in files] for files in candidates]
-            readings += [
-                Reading(files, config["ingest"], config["sensor"], said, entry, recording, bench) for files in found
-            ]
+            procedure = {"recordings": {recording: entry}, "mounting_tolerance_deg": tolerance}
+            settings = {"procedure": procedure, **{k: config[k] for k in ("table", "sensor", "ingest")}}
+            readings += [Reading([(folder / f).resolve() for f in files], settings, said) for files in candidates]
     return readings
 
 
@@ -218,23 +217,23 @@ def _composed(profile: str, sensor: str | None, campaign: Path | None) -> tuple[
 
 def _print_facts(reading: Reading) -> PipelineError | None:
     """Print what ingest makes of files, and return its refusal."""
+    settings = reading.settings
+    ((name, entry),) = settings["procedure"]["recordings"].items()
     print(f"{', '.join(map(str, reading.files))}\n  {'read with':<16}{reading.said}")
     try:
-        table = read_table(reading.files, reading.ingest)
-        checks = checks_of(reading.ingest)
-        name = reading.name or reading.files[0].stem
-        recording = to_recording(name, reading.entry, table, reading.sensor, checks)
-        parts = cut(recording, reading.entry.get("windows")) if recording.role == "session" else []
-        checked = check_recordings(parts or [recording], reading.settings)
+        table = read_table(reading.files, settings["ingest"])
+        recording = to_recording(name, entry, table, settings["sensor"], checks_of(settings["ingest"]))
+        parts = cut(recording, entry.get("windows")) if recording.role == "session" else []
+        checked = check_recordings(parts or [recording], settings)
         parts, recording = (checked, recording) if parts else ([], checked[0])
     except PipelineError as error:
-        topics = topic_lines(reading.files[0], fields=error.code == "missing_topic") if _is_mcap(reading) else []
+        topics = topic_lines(reading.files[0], fields=error.code == "missing_topic") if reading.is_mcap else []
         place = _place(error.file, reading.files)
         print(as_text([("REFUSED", f"{place}{error.message}"), ("code", error.code), *topics]) + "\n")
         return error
-    topics = topic_lines(reading.files[0], fields=False) if _is_mcap(reading) else []
+    topics = topic_lines(reading.files[0], fields=False) if reading.is_mcap else []
     segments = [("segments" if i == 0 else "", f"{p.name}: {_segment(p)}") for i, p in enumerate(parts)]
-    print(as_text([*topics, *facts(recording, reading.sensor), *segments]) + "\n")
+    print(as_text([*topics, *facts(recording, settings["sensor"]), *segments]) + "\n")
     return None
 
 
@@ -248,10 +247,6 @@ def _place(file: str | None, files: Sequence[Path]) -> str:
         return ""
     line = file.removeprefix(f"{files[0]}:") if len(files) == 1 else file
     return f"line {line}: " if line.isdigit() else f"{file}: "
-
-
-def _is_mcap(reading: Reading) -> bool:
-    return reading.files[0].suffix == ".mcap"
 
 
 def _layouts(reading: Reading, error: PipelineError) -> list[TextLayout]:
@@ -283,7 +278,7 @@ def _print_proposals(proposals: Sequence[Proposal], sensor: dict[str, Any], save
             ingest = proposal.ingest(name)
             groups = [[Path(f) for f in proposal.files]] if proposal.parts else [[Path(f)] for f in proposal.files]
             for group in groups:
-                _print_facts(Reading(group, ingest, sensor, "the proposed profile"))
+                _print_facts(_reading_of_file(group, ingest, sensor, "the proposed profile"))
         else:
             print(f"Fill in {UNKNOWN} for {', '.join(proposal.unknown())}.")
         if save is not None:
