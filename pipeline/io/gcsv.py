@@ -18,11 +18,13 @@ the name states. A recording without an accelerometer holds ``t,gx,gy,gz``.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
 from pipeline.errors import IngestError
+from pipeline.io.axes import to_body_axes
+from pipeline.io.csv_read import read_one
 from pipeline.io.files import refuse_foreign, unchanged
 from pipeline.io.ingest_settings import Column, CsvFormat
 from pipeline.io.units import ATTITUDE, COUNTS, DEGREES, TRIADS
@@ -44,44 +46,23 @@ EXTRA = {
 }
 
 
-@dataclass(frozen=True)
-class Description:
-    """What the head of a ``.gcsv`` file says.
-
-    Attributes
-    ----------
-    format : CsvFormat
-    orientation : tuple of str
-        Body axis that each reading axis x, y, z points along, as ``sensor.axis_map``.
-    facts : dict of str to str
-        All lines of the head.
-    """
-
-    format: CsvFormat
-    orientation: tuple[str, str, str]
-    facts: dict[str, str]
-
-
 def read_gcsv(path: Path, checks: Checks) -> ChannelTable:
-    """Read a ``.gcsv`` file, in the axes that its orientation says; raw counts stay integers.
+    """Return the channels of a ``.gcsv`` file in the axes of its orientation; raw counts stay integers.
 
     Raises
     ------
     IngestError
         If the head is not that of such a file, or as for any text log.
     """
-    from pipeline.io.axes import to_body_axes  # noqa: PLC0415
-    from pipeline.io.csv_read import read_one  # noqa: PLC0415
-
-    description = describe(path)
-    table = read_one(path, description.format, checks)
-    table = to_body_axes(table, dict.fromkeys(TRIADS, description.orientation))
-    kept = {k: v for k, v in description.facts.items() if k in ("id", "note", "fwversion", "vendor", "orientation")}
+    names, facts, line = _read_head(path)
+    table = read_one(path, _format(names, facts, line, path), checks)
+    table = to_body_axes(table, dict.fromkeys(TRIADS, _orientation(facts, path)))
+    kept = {k: v for k, v in facts.items() if k in ("id", "note", "fwversion", "vendor", "orientation")}
     return replace(table, source={**table.source, "gcsv": kept})
 
 
-def describe(path: Path) -> Description:
-    """Read the head of a ``.gcsv`` file."""
+def _read_head(path: Path) -> tuple[list[str], dict[str, str], int]:
+    """Return the names of the columns, all facts that the head states, and the number of its lines before the names."""
     with unchanged(path), path.open("rb") as stream:
         start = stream.read(LONGEST_HEADER)
     refuse_foreign(start[:16], str(path))
@@ -96,7 +77,7 @@ def describe(path: Path) -> Description:
     for number, line in enumerate(lines[1:], 1):
         cells = [c.strip() for c in line.decode("utf-8", "replace").split(",")]
         if cells[0] in ("t", "time"):
-            return Description(_format(cells, facts, number, path), _orientation(facts, path), facts)
+            return cells, facts, number
         if len(cells) > 1:
             facts[cells[0]] = ",".join(cells[1:])
     raise IngestError("the head of the file has no line of column names (t,gx,gy,gz,...)", str(path), fault="gcsv")

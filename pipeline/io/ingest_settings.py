@@ -7,7 +7,6 @@ and the order of columns are never guessed from the file.
 from __future__ import annotations
 
 import difflib
-import math
 from collections.abc import Iterable, Mapping
 from fractions import Fraction
 from typing import Annotated, Any, Literal, Self, TypeVar
@@ -198,11 +197,6 @@ def refuse_unknown(where: str, entries: Mapping[str, Any], allowed: tuple[str, .
             near = difflib.get_close_matches(str(key), allowed, 1)
             hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(allowed)}"
             raise ConfigurationError(f"{where}.{key} is unknown; {hint}")
-
-
-def is_number(value: object) -> bool:
-    """Return whether a value is a finite number."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def checks_of(ingest: Mapping[str, Any]) -> Checks:
