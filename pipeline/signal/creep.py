@@ -1,15 +1,14 @@
-"""How a unit tilts within a rest by hand: steadily, as its seat gives way or a hand tires.
+"""Creep: the slow, steady tilt of a unit within a rest, as its seat gives way or a hand tires.
 
 A body that turns at the rate omega sees gravity u turn by ``du/dt = -omega x u``, so that the accelerometer shows the
-two components of omega across gravity, and nothing of the third:
+two components of omega across gravity:
 
     omega_across = (du/dt) x u
 
 du/dt is the slope of the readings of a rest; with white noise s of a sample, n samples and a rest of T seconds its
-standard deviation is ``s sqrt(12 / n) / T`` on each axis. The readings less a parabola in time tell s: a creep that
-passes for noise would hide what the noise hides.
-
-A mean over directions that spread by the variance v (rad^2, both axes together) is short by v/2 of its length.
+standard deviation is ``s sqrt(12 / n) / T`` on each axis. s follows from the readings less a parabola in time, so that
+creep does not count as noise. A mean over directions that spread by the variance v (rad^2, both axes together) is too
+short by the share v/2.
 """
 
 from __future__ import annotations
@@ -67,14 +66,14 @@ class Creep:
 
 
 def believed_rates(creeps: Sequence[Creep]) -> tuple[Values, Values, float]:
-    """Return what to believe of the rates across gravity in the rests of one recording.
+    """Return the posterior rates across gravity in the rests of one recording.
 
-    With the variance c^2 of a component between the rests, as the measured rates w of standard uncertainty e show it,
+    With the variance c^2 of a component between the rests, estimated from rates w of standard uncertainty e,
 
         rate = w c^2 / (c^2 + e^2),   error^2 = c^2 e^2 / (c^2 + e^2),   c^2 = mean(|w|^2 / 2 - e^2)
 
-    and c = 0 where noise alone explains the rates: ``|w|^2 / (2 e^2)`` has mean and variance 1 then. Nothing tells the
-    three axes apart: c is the standard deviation of the rate about gravity, too, which the accelerometer does not show.
+    and c = 0 where noise alone explains the rates: ``|w|^2 / (2 e^2)`` has mean and variance 1 then. The rate about
+    gravity, which the accelerometer does not show, has the standard deviation c, too.
 
     Returns
     -------
@@ -97,8 +96,8 @@ def believed_rates(creeps: Sequence[Creep]) -> tuple[Values, Values, float]:
 def along_gravity(time: Values, force: Values) -> tuple[Values, bool]:
     """Return the readings of a rest along its mean, (n,) array, g, and whether the unit creeps in it.
 
-    A tilt by theta changes the component along gravity by theta times the bias across it, which no calibration has told
-    yet; so of a rest in which the unit creeps it is less its parabola in time.
+    A tilt by theta changes the component along gravity by theta times the bias across it, which is not known yet: where
+    the unit creeps, a parabola in time is subtracted.
     """
     mean = force.mean(axis=0)
     along = force @ (mean / np.linalg.norm(mean))

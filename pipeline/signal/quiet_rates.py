@@ -1,26 +1,23 @@
 """Where the gyroscope turns although the accelerometer is quiet: turns about the vertical, and the ends of moves.
 
-Gravity in the body does not change in a turn about the vertical, and little in the last 0.3 s of a move. With the mean
-rate m and the variance v of a short window about each sample, the unit turns where
+With the mean rate m and the variance v of a short window about each sample, the unit turns where
 
     max_c |m_c - r_c| > max(q s_c / sqrt(n), q d_c)    or    sum_c v_c > q^2 V
 
 where
 
     n   : samples of the window, 0.2 s and at least 3
-    r   : median of m in the stretch that the accelerometer calls quiet, so that bias, g-sensitivity and a steady creep
-          drop out; where it is off the median of the stretches around it by more than the limit of a rest's rate, the
-          stretch is mostly a turn, and that median stands for it
-    s_c : white noise of a sample, by the differences of successive samples: median |y[i+1] - y[i]| / (0.6745 sqrt 2)
-    d_c : 1.4826 times the median of |m_c - r_c| in the stretch, which is the standard deviation of m where the unit
-          rests for more than half of it, with the tremor of a hand in it; q d_c is no more than what a hand trembles
+    r   : median of m in the stretch that the accelerometer calls quiet, which contains bias, g-sensitivity and a steady
+          creep; where it departs from the median of the stretches around it by more than the limit of a rest's rate,
+          the stretch is mostly a turn, and that median replaces it
+    s_c : white noise of a sample: median |y[i+1] - y[i]| / (0.6745 sqrt 2)
+    d_c : 1.4826 times the median of |m_c - r_c| in the stretch: the standard deviation of m, tremor of a hand included,
+          where the unit rests for more than half of the stretch; q d_c is limited to a hand's largest tremor
     V   : median of sum_c v_c in the stretch: noise and tremor
-    q   : 6: of 10^5 windows of three axes, noise alone takes 6e-4 for a turn
+    q   : 6: of 10^5 windows of three axes, noise alone passes in 6e-4
 
-Of a stretch that is mostly a turn, d and V are the medians of all stretches.
-
-A stretch is cut where the unit turns. Pieces between which it turned by less than the limit of a rest are one rest, of
-which the longest is kept.
+Of a stretch that is mostly a turn, d and V are the medians of all stretches. A stretch is cut where the unit turns. Of
+pieces between which it turned by less than the limit of a rest, the longest is kept.
 """
 
 from __future__ import annotations

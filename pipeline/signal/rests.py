@@ -1,7 +1,7 @@
 """Rests in a recording: from a table's log, or from the sensor's own readings.
 
-By the readings (after Tedaldi, Pretto & Menegatti, ICRA 2014, section IV): a sample rests where the variance of the
-specific force in a short window, summed over the axes, stays under a multiple of the sensor's own,
+By the readings (after Tedaldi, Pretto & Menegatti, ICRA 2014, section IV), a sample rests where the variance of the
+specific force in a short window, summed over the axes, is below a multiple of the sensor's own,
 
     v[n] = sum_axes var(f[n .. n+W-1]) < m v_0
 
@@ -11,11 +11,10 @@ where
     v_0 : the noise: the 5th percentile of v, so that no part of the recording has to be known to rest
     m   : the multiple, from the widest range over which the number of rests stays the same
 
-A rest is trimmed by W at its start. Where there is a gyroscope, it has to be quiet, too
-(``pipeline.signal.quiet_rates``): a turn about the vertical leaves the specific force as it is. A rest in which the
-sensor still turned or shook would spoil a mean, and is refused: its angular rate stands off that of the neighbouring
-rests, its direction moves, or it scatters beyond the noise. A turn by an angle theta shortens the mean of a vector by
-theta^2 / 24, for 2 deg by 5e-5: 0.05 mg.
+A rest is trimmed by W at its start. A gyroscope must be quiet, too (``pipeline.signal.quiet_rates``), as a turn about
+the vertical does not change the specific force. A rest in which the sensor still turned or shook is refused: its angular
+rate departs from that of the neighbouring rests, its direction moves, or it scatters beyond the noise. A turn by theta
+shortens the mean of a vector by theta^2 / 24, for 2 deg by 5e-5: 0.05 mg.
 """
 
 from __future__ import annotations
@@ -38,15 +37,13 @@ if TYPE_CHECKING:
 RATE_AT_REST_DPS = 0.02
 SETTLING_S = 0.3
 
-WINDOW_S = 0.5
+WINDOW_S = 0.5  # shorter than a rest, longer than a tremor's period (8 to 12 Hz)
 GAP_S = 1.0
 SHORTEST_REST_S = 1.0
-MULTIPLES = np.geomspace(4.0, 1000.0, 25)
+MULTIPLES = np.geomspace(4.0, 1000.0, 25)  # of a variance: 2 to 30 times the noise, in steps of an eighth
 SMALLEST_VARIANCE = 1e-12  # g^2, keeps the multiple of a noise-free recording above rounding
 NEIGHBOURS = 5
-# Limits of a rest that is averaged. That of its rate, 0.7 deg/s off its neighbours, stands beside the data: a hand-held
-# rest of a consumer gyroscope differs by its g-sensitivity (0.1 deg/s/g) and tremor (0.3 deg/s over some seconds).
-TURN_LIMIT_DEG = 2.0
+TURN_LIMIT_DEG = 2.0  # 0.05 mg, see above
 # A steady tilt is modelled up to this rate (``pipeline.signal.creep``); units in real hands and on soft seats creep by
 # up to 0.3 deg/s.
 CREEP_LIMIT_DPS, STEADY_LIMIT_DEG = 0.5, 10.0

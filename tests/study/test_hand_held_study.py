@@ -115,7 +115,8 @@ def mean_squares(case: str, found: list[dict[str, Any]]) -> dict[str, list[dict[
 def study(case: str, count: int) -> dict[str, list[dict[str, Any]]]:
     """Return what was judged of so many recordings of a case, by sensor."""
     found = []
-    for seed in range(10_000, 10_000 + count):
+    first = 10_000 + 1_000 * list(CASES).index(case)  # other units in each case
+    for seed in range(first, first + count):
         drawn = draw(CASES[case][0], seed)
         found.append(judged(one_sensor(drawn, "accelerometer") if seed % ALONE == 0 else drawn))
     return mean_squares(case, found)

@@ -1,6 +1,5 @@
-"""Base and effects from hand-held rests and moves, where no table says what the body did.
+"""Calibration by rests and moves (multi-position), where no table logged the motion.
 
-A rest tells the length of gravity to the accelerometer, and rate zero to the gyroscope; a move tells the gyroscope that
-it must turn the direction of gravity before it into that after it. The models of both sensors are brought to one linear
-form (``equations``), on which fit and selection work.
+At rest the specific force has the magnitude of gravity and the rate is zero; the integrated rate of a move must rotate
+gravity before it onto gravity after it. Both sensors are brought to one linear form (``model``).
 """

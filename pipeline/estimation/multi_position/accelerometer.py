@@ -1,4 +1,4 @@
-"""The accelerometer at rest: the length of what it feels is that of gravity.
+"""The accelerometer at rest: its specific force has the magnitude of gravity.
 
     r = (G' - |f|) / s_e,   f = M v,   v = y - b - z(f),   G'^2 = G^2 + 2 s^2 w
     d|f|/db = -n^T M,   d|f|/dM_ij = n_i v_j,   d|f|/dp = -n^T M dz/dp,   n = f / |f|
@@ -6,10 +6,9 @@
 where
 
     y   : (3,) mean reading of a rest, g; w its share of a sample's variance s^2
-    b, M: bias, g, and matrix, here ``M = Q L`` with the rotation Q left as it is and L lower triangular: the length of
-          gravity says nothing of how the sensor is mounted
-    z   : effects, at the force that has the length of gravity; p their parameters
-    s_e : by how much white noise scatters |f|: ``s_e^2 = w sum_c (M^T n)_c^2 s_c^2``
+    b, M: bias, g, and matrix ``M = Q L``: |f| determines the lower triangular L, and not the rotation Q, which is kept
+    z   : effects, at the force of the magnitude of gravity; p their parameters
+    s_e : standard deviation of |f| by white noise: ``s_e^2 = w sum_c (M^T n)_c^2 s_c^2``
 """
 
 from __future__ import annotations
@@ -165,14 +164,7 @@ def model_of(
 ) -> AccelerometerModel | None:
     """Return the model of the recordings' rests, or None where they hold none.
 
-    Parameters
-    ----------
-    recordings : sequence of Recording
-    calibration : SensorCalibration
-        Of the accelerometer's method.
-    noise : Noise or None
-    settings : mapping
-        Sections ``table`` and ``procedure``.
+    ``calibration`` is that of the accelerometer's method; ``settings`` hold the sections ``table`` and ``procedure``.
     """
     rests = rests_of("accelerometer", recordings, settings, calibration)
     if rests is None:

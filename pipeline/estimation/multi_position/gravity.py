@@ -1,16 +1,15 @@
 """The direction of gravity before and after every move, by the calibrated accelerometer.
 
-    u = u_mean -+ (w x u_mean) T / 2,   or that of the half second next to the move where it is off by more than 4 s
+    u = u_mean -+ (w x u_mean) T / 2,   or that of the half second next to the move where it differs by more than 4 s
 
 where
 
     u_mean : direction of the rest's mean, T its length
-    w      : rate at which the unit creeps, as far as the rests show one (``pipeline.signal.creep.believed_rates``);
-             what is not known of it is an error of each end
-    s      : standard deviation that white noise gives the mean of the half second, across u
+    w      : rate at which the unit creeps (``pipeline.signal.creep.believed_rates``)
+    s      : standard deviation of the mean of the half second by white noise, across u
 
-A unit in a hand, or on a soft support, creeps after it was set down, and not always steadily. Then half a second of the
-accelerometer is where the move ended, but is noisier than the mean, so that it is taken only where it differs.
+A unit in a hand or on a soft support creeps after it was set down, not always steadily. The half second next to a move
+then shows where the move ended, with more noise than the mean.
 """
 
 from __future__ import annotations
@@ -77,48 +76,43 @@ def observed_rests(
     recordings: Sequence[Recording], accelerometer: SensorCalibration, settings: Mapping[str, Any], role: str = ROLE
 ) -> tuple[Rests, Gravity] | None:
     """Return the gyroscope's rests and gravity at them, or None where the recordings of a role hold none."""
-    felt = rests_of("accelerometer", recordings, settings, accelerometer, role)
-    turned = rests_of("gyroscope", recordings, settings, accelerometer, role)
-    if felt is None or turned is None:
+    of_force = rests_of("accelerometer", recordings, settings, accelerometer, role)
+    of_rate = rests_of("gyroscope", recordings, settings, accelerometer, role)
+    if of_force is None or of_rate is None:
         return None
-    keys = [list(zip(r.recording.tolist(), r.span[:, 0].tolist(), strict=True)) for r in (felt, turned)]
+    keys = [list(zip(r.recording.tolist(), r.span[:, 0].tolist(), strict=True)) for r in (of_force, of_rate)]
     both = set(keys[0]) & set(keys[1])
-    felt, turned = (r.select(np.array([key in both for key in k])) for r, k in zip((felt, turned), keys, strict=True))
-    if len(turned.time) == 0:
+    of_force, of_rate = (
+        r.select(np.array([key in both for key in k])) for r, k in zip((of_force, of_rate), keys, strict=True)
+    )
+    if len(of_rate.time) == 0:
         return None
-    return turned, gravity_of(recordings, felt, accelerometer)
+    return of_rate, gravity_of(recordings, of_force, accelerometer)
 
 
-def gravity_of(recordings: Sequence[Recording], felt: Rests, accelerometer: SensorCalibration) -> Gravity:
-    """Return gravity at the rests of the accelerometer.
-
-    Parameters
-    ----------
-    recordings : sequence of Recording
-    felt : Rests
-    accelerometer : SensorCalibration
-    """
-    white = float(np.mean(felt.white**2))
-    force = _force(felt.reading, felt, accelerometer)
+def gravity_of(recordings: Sequence[Recording], rests: Rests, accelerometer: SensorCalibration) -> Gravity:
+    """Return gravity at the rests of the accelerometer."""
+    white = float(np.mean(rests.white**2))
+    force = _force(rests.reading, rests, accelerometer)
     u = _unit(force)
-    ends, moved, noise = [], np.zeros(len(u), bool), felt.share.copy()
+    ends, moved, noise = [], np.zeros(len(u), bool), rests.share.copy()
     for at_start in (True, False):
-        reading, share = _near(recordings, felt, at_start=at_start)
-        near = _unit(_force(reading, felt, accelerometer))
-        half = (0.5 if at_start else -0.5) * felt.length[:, None]
-        steady = _unit(u + half * np.cross(np.radians(felt.creep), u))  # du/dt = -w x u
+        reading, share = _near(recordings, rests, at_start=at_start)
+        near = _unit(_force(reading, rests, accelerometer))
+        half = (0.5 if at_start else -0.5) * rests.length[:, None]
+        steady = _unit(u + half * np.cross(np.radians(rests.creep), u))  # du/dt = -w x u
         creeps = np.linalg.norm(near - steady, axis=1) > SIGNIFICANT * np.sqrt(share * white)
         ends.append(np.where(creeps[:, None], near, steady))
         noise = np.where(creeps, np.maximum(noise, share), noise)
         moved |= np.linalg.norm(near - u, axis=1) > SIGNIFICANT * np.sqrt(share * white)
     between = [float(stage.details.get("scatter_between_rests") or 0.0) for stage in accelerometer.stages]
     spread = np.sqrt(noise * white + max(between, default=0.0) ** 2)
-    unsure = np.linalg.norm(force, axis=1) * np.radians(felt.creep_error) * 0.5 * felt.length
-    return Gravity(force, ends[0], ends[1], spread, unsure, _of_calibration(accelerometer, felt.reading), moved)
+    unsure = np.linalg.norm(force, axis=1) * np.radians(rests.creep_error) * 0.5 * rests.length
+    return Gravity(force, ends[0], ends[1], spread, unsure, _of_calibration(accelerometer, rests.reading), moved)
 
 
-def _force(reading: Values, felt: Rests, accelerometer: SensorCalibration) -> Values:
-    motion = motion_of(felt.time, reading, np.zeros_like(reading), felt.temperature, still=True)
+def _force(reading: Values, rests: Rests, accelerometer: SensorCalibration) -> Values:
+    motion = motion_of(rests.time, reading, np.zeros_like(reading), rests.temperature, still=True)
     known = [e for e in accelerometer.effects if not effect(e.name).moves]
     return compensate(accelerometer, reading, motion, known)
 
@@ -128,13 +122,13 @@ def _unit(force: Values) -> Values:
     return unit
 
 
-def _near(recordings: Sequence[Recording], felt: Rests, *, at_start: bool) -> tuple[Values, Values]:
+def _near(recordings: Sequence[Recording], rests: Rests, *, at_start: bool) -> tuple[Values, Values]:
     """Return the mean reading next to a move, (m, 3), and its variance over that of a sample, (m,)."""
-    reading, share = felt.reading.copy(), felt.share.copy()
-    for index in np.unique(felt.recording):
-        recording, own = recordings[index], np.flatnonzero(felt.recording == index)
+    reading, share = rests.reading.copy(), rests.share.copy()
+    for index in np.unique(rests.recording):
+        recording, own = recordings[index], np.flatnonzero(rests.recording == index)
         size = max(FEWEST_NEAR, round(NEAR_S / recording.interval))
-        spans = [(a, min(a + size, b)) if at_start else (max(b - size, a), b) for a, b in felt.span[own].tolist()]
+        spans = [(a, min(a + size, b)) if at_start else (max(b - size, a), b) for a, b in rests.span[own].tolist()]
         means, counts = rest_means(recording, [Rest(a, b) for a, b in spans])
         known = counts > 0
         reading[own[known]] = means[known]

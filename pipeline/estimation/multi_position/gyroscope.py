@@ -1,4 +1,4 @@
-"""The gyroscope by hand: at rest it feels nothing, and a move must turn gravity before into gravity after.
+"""The gyroscope: at rest the rate is zero; the integrated rate of a move rotates gravity before it onto that after it.
 
     at rest:  r = (y - b - z - K w) / s_e,     dr/db = -1/s_e,   dr/dp = -dz/dp / s_e
     a move:   r = W E^T (u_after - A_0 u_before),   omega = M (y - b - z)
@@ -6,20 +6,18 @@
 where
 
     y, b, M : reading and bias, deg/s, and matrix
-    z, p    : effects and their parameters, with the specific force of the accelerometer, at rest and as it is turned on
-    w       : rate at which a unit creeps in a rest, across gravity as the accelerometer shows it (K = M^-1). Of that
-              about gravity no more is known than that it is as large; see ``pipeline.signal.creep.believed_rates``
-    u       : direction of gravity by the calibrated accelerometer; A_0 as in ``estimation.multi_position.moves``
-    E       : two directions across u_after; W whitens what noise of the gyroscope, integrated, what it turned between
-              its samples, and noise of the accelerometer leave there
+    z, p    : effects and their parameters, with the accelerometer's specific force, at rest and rotated along a move
+    w       : rate at which a unit creeps in a rest, across gravity by the accelerometer (K = M^-1); the rate about
+              gravity is unknown and as large (``pipeline.signal.creep.believed_rates``)
+    u       : direction of gravity by the calibrated accelerometer (``gravity``); A_0 as in ``moves``
+    E       : two directions across u_after; W whitens the integrated noise of the gyroscope, the uncertainty of the
+              rate between samples, and the noise of the accelerometer
 
-The errors of u are those of the rests' means, which two moves share, and those of the accelerometer's calibration,
-which all share: ``du = (1 - u u^T) (M_a dy - M_a db_a + dM_a v_a) / G``. A unit that still settles or is let go turns
-by some tenths of a degree within a rest: then u is not of the rest's mean but of its half second next to the move
-(``pipeline.estimation.multi_position.gravity``).
+Two moves share the error of a rest's direction, and all share those of the accelerometer's calibration:
+``du = (1 - u u^T) (M_a dy - M_a db_a + dM_a v_a) / G``. The frame is that of the accelerometer's matrix. One move does
+not show a turn about the vertical; other moves do, as the vertical is elsewhere in the body.
 
-Source of the moves: Tedaldi, Pretto & Menegatti, ICRA 2014, eq. 12. A turn about the vertical says nothing in one move,
-but in another move it does, as the vertical is elsewhere in the body. The frame is that of the accelerometer's matrix.
+Source: Tedaldi, Pretto & Menegatti, ICRA 2014, eq. 12.
 """
 
 from __future__ import annotations
@@ -153,13 +151,7 @@ class GyroscopeModel:
         return out
 
     def without(self, held: NDArray[np.bool_]) -> GyroscopeModel:
-        """Return the model with some of its rests, and the moves that end at them, held out.
-
-        Parameters
-        ----------
-        held : (m,) array of bool
-            Of the rests that are not held out already.
-        """
+        """Return the model with ``held`` of its own rests, and the moves that end at them, held out."""
         out = self.every.held_out.copy()
         out[~self.every.held_out] = held
         moves = None if self.moves is None else self.moves.select(~out[self.moves.after])
@@ -167,14 +159,9 @@ class GyroscopeModel:
         return GyroscopeModel(replace(self.every, held_out=out), moves, gravity, noise, fewest)
 
     def direction_errors(self, state: State) -> tuple[Values, Values]:
-        """Return by how much each move misses the direction of gravity after it, and what noise alone gives, deg.
+        """Return the angle of each move between integrated and measured gravity, and its mean by noise alone, deg.
 
-        Returns
-        -------
-        error : (k,) array
-            Angle between the integrated and the felt direction.
-        noise : (k,) array
-            Mean of that angle under white noise of both sensors, and the scatter of the accelerometer's rests.
+        The noise is white noise of both sensors and the scatter of the accelerometer's rests; both are (k,) arrays.
         """
         assert self.moves is not None  # noqa: S101
         A = self._turned(state)[2]
@@ -349,17 +336,12 @@ def model_of(
     ----------
     recordings : sequence of Recording
     calibration : SensorCalibration or None
-        Of the gyroscope: moves that its method found far off the others are left out.
+        Of the gyroscope: moves that its method found outlying are left out.
     noise : Noise or None
     settings : mapping
         Sections ``table`` and ``procedure``.
     accelerometer : SensorCalibration, optional
-        Without it, the accelerometer is calibrated here.
-
-    Raises
-    ------
-    CannotCalibrateError
-        If the accelerometer cannot be calibrated.
+        Without it, the accelerometer is calibrated here; ``CannotCalibrateError`` where that fails.
     """
     if accelerometer is None:
         try:

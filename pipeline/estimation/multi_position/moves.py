@@ -1,24 +1,24 @@
-"""Moves between rests: how the gyroscope's readings turn the direction of gravity.
+"""Moves between rests: how the gyroscope's readings rotate the direction of gravity.
 
     dR/dt = R [omega]x,   R[k+1] = R[k] exp [phi_k]x,   phi_k = (omega_k + omega_k+1) dt/2 + omega_k x omega_k+1 dt^2/12
     u_end = A_0 u_start,   A_k = R_end^T R_k,   du_end = u_end x sum_k A_k domega_k w_k
 
 where
 
-    omega : angular rate in the body frame, rad/s; between two samples a straight line (Savage 1998, coning term)
+    omega : angular rate in the body frame, rad/s; linear between two samples (Savage 1998, coning term)
     u     : unit vector along the specific force, in the body frame
-    A_k   : takes vectors from the body at sample k to the body at the end of the move
+    A_k   : rotates vectors from the body at sample k to the body at the end of the move
     w_k   : weight of sample k in an integral by the trapezoidal rule, s
 
-Sampled slowly, a hand's accelerations begin and end between two samples. Where the rate bends there by s (deg/s^2), a
-share p of an interval behind the sample before, the second differences at both are ``d = (1 - p) s dt`` and
-``d' = p s dt``, and the rule is off by
+At low sampling rates a hand's accelerations begin and end between two samples. Where the rate bends there by s
+(deg/s^2), a share p of an interval after the sample before, the second differences at both are ``d = (1 - p) s dt`` and
+``d' = p s dt``, and the error of the rule is
 
     s dt^2 p (1 - p) / 2 = dt d d' / (d + d') / 2
 
-which is taken off the readings where both stand out of the noise. Two bends the same way make four such differences in
-a row; or three, where they share a sample and cannot be told apart: then the rule is off by 0.12 d dt more (rms, both
-places anywhere) with d that is left over. More than four in a row are a rate that bends smoothly, and nothing is done.
+It is subtracted from the readings where both exceed the noise. Two bends in one sense make four such differences in a
+row; or three, where they share a sample and cannot be separated: that adds an error of 0.12 d dt (rms, both places
+uniform) with the d that remains. More than four in a row are a rate that bends smoothly, and nothing is done.
 """
 
 from __future__ import annotations
@@ -91,15 +91,9 @@ class Moves:
 
 
 def moves_of(recordings: Sequence[Recording], rests: Rests) -> Moves | None:
-    """Return the moves of which the rest at the end is for the fit, or None where there is none.
+    """Return the moves that end at a rest of the fit, or None where there is none; ``rests`` are all of the gyroscope.
 
     Left out are those with clipped, stuck or missing readings, with a gap, or longer than a minute.
-
-    Parameters
-    ----------
-    recordings : sequence of Recording
-    rests : Rests
-        All of the gyroscope, also those held out.
     """
     found = []
     for i, j in zip(range(len(rests.time) - 1), range(1, len(rests.time)), strict=True):
@@ -139,20 +133,14 @@ def moves_of(recordings: Sequence[Recording], rests: Rests) -> Moves | None:
 
 
 def _bends(reading: Values, weight: Values, least: float) -> tuple[Values, Values]:
-    """Return what bends between samples make the trapezoidal rule take too much, and what stays in doubt.
+    """Return the excess of the trapezoidal rule by bends between samples, as rates, and its standard uncertainty.
 
     Parameters
     ----------
     reading : (k, s, 3) array, deg/s
     weight : (k, s) array, s
     least : float, deg/s
-        Smaller second differences are none.
-
-    Returns
-    -------
-    taken : (k, s, 3) array, deg/s
-        As rates.
-    doubt : (k, s, 3) array, deg
+        Second differences below it are noise.
     """
     second = np.diff(np.pad(reading, ((0, 0), (1, 1), (0, 0)), mode="edge"), n=2, axis=1)
     second[np.linalg.norm(second, axis=2) < least] = 0.0

@@ -1,6 +1,6 @@
-"""The rests that a fit by hand sees of one sensor: their mean readings, times and temperatures.
+"""The rests of one sensor that a fit uses: mean readings, times and temperatures.
 
-Used are the rests that the accelerometer's method uses: sound, and not held out for validation.
+These are the rests of the accelerometer's method: valid, and not held out for validation.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ class Rests:
 
 
 def is_multi_position(sensor: str, recordings: Sequence[Recording]) -> bool:
-    """Return whether a sensor was recorded by hand: rests and moves, and no motion of a table."""
+    """Return whether a sensor was recorded in rests and moves, without the motion of a table."""
     own = [r for r in recordings if r.reading(sensor) is not None and r.role != HELD_OUT]
     logged = any(r.table_angle is not None or r.table_attitude is not None for r in own)
     return any(r.role == ROLE for r in own) and not logged
