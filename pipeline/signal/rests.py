@@ -12,9 +12,9 @@ where
     m   : the multiple, from the widest range over which the number of rests stays the same
 
 A rest is trimmed by W at its start. A gyroscope must be quiet, too (``pipeline.signal.quiet_rates``), as a turn about
-the vertical does not change the specific force. A rest in which the sensor still turned or shook is refused: its angular
-rate departs from that of the neighbouring rests, its direction moves, or it scatters beyond the noise. A turn by theta
-shortens the mean of a vector by theta^2 / 24, for 2 deg by 5e-5: 0.05 mg.
+the vertical does not change the specific force. A rest in which the sensor still turned or shook is refused: its
+angular rate departs from that of the neighbouring rests, its direction moves, or it scatters beyond the noise. A turn
+by theta shortens the mean of a vector by theta^2 / 24, for 2 deg by 5e-5: 0.05 mg.
 """
 
 from __future__ import annotations
