@@ -90,7 +90,7 @@ class CampaignResults:
 
         Columns: ``unit, serial, lot, date, status`` ("ok", "failed"), ``error, sensor, method``; for each sensor
         ``<sensor>_error_before``, ``_error_after`` (rms), ``_mean_abs_before``, ``_mean_abs_after``, ``_noise_floor``
-        (g or deg/s), ``_verdict``, ``_selected`` (effects, joined by ";"), ``_reason``, ``_implausible``; ``pass``;
+        (g or deg/s), ``_verdict``, ``_selected`` (missing, joined by ";"), ``_reason``, ``_implausible``; ``pass``;
         and the user's own columns of ``units.csv``.
         """
         file = self.folder / "summary.csv"

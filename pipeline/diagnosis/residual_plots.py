@@ -59,7 +59,10 @@ SIGNALS = {"rate": "speed", "specific_force": "u"}  # against which a covariate 
 
 
 def plots(
-    selection: Selection, unexplained: Sequence[Mapping[str, Any]], noise: Noise | None, beside: Selection | None = None
+    selection: Selection,
+    unexplained: Sequence[Mapping[str, Any]],
+    noise: Noise | None,
+    reported: Selection | None = None,
 ) -> JSON:
     """Return the points of a diagnosis's plots, few enough to be kept in its document.
 
@@ -70,7 +73,7 @@ def plots(
     unexplained : sequence of mapping
         Entries of the diagnosis: ``covariate``, and ``axes, formulas, coefficients`` of the suggested form.
     noise : Noise or None
-    beside : Selection, optional
+    reported : Selection, optional
         The one that the diagnosis reports, where it is another: with the suggested form in its base.
 
     Returns
@@ -81,14 +84,14 @@ def plots(
         the slope, with ``unit, value, standard_uncertainty``; those of the unexplained, where a form is suggested,
         ``curve_x, curve``.
     """
-    reported = beside or selection
-    told = [entry for entry in unexplained if not entry.get("explained_by")][:MOST]
+    reported = reported or selection
+    shown = [entry for entry in unexplained if not entry.get("explained_by")][:MOST]
     found: JSON = {"added_variable": None, "unexplained": []}
     if reported.names:
         found["added_variable"] = _added_variable(_Columns(reported), reported)
-    if told:
+    if shown:
         regression = _Columns(selection)
-        found["unexplained"] = [_unexplained(regression, selection, entry, noise) for entry in told]
+        found["unexplained"] = [_unexplained(regression, selection, entry, noise) for entry in shown]
     return found
 
 
@@ -105,9 +108,11 @@ def _added_variable(regression: _Columns, selection: Selection) -> JSON:
     products = regression.all_products(selection.start.scale, fit.setting)
     chosen = _clearest(regression, term, at, np.abs(term.values) / uncertainty, sensor)
     left_of = [regression.left_of_column(c, at + j, products) for c, j in chosen]
-    told = np.array([regression.weight @ x**2 / sigma[c] ** 2 for (c, _), x in zip(chosen, left_of, strict=True)])
+    information = np.array(
+        [regression.weight @ x**2 / sigma[c] ** 2 for (c, _), x in zip(chosen, left_of, strict=True)]
+    )
     panels = []
-    for (c, j), left, share in zip(chosen, left_of, told / told.sum(), strict=True):
+    for (c, j), left, share in zip(chosen, left_of, information / information.sum(), strict=True):
         if term.effect.layout == Layout.SHARED and share < LEAST_SHARE:
             continue
         value, bins = float(term.values[j]), Bins.of(left, regression.weight)

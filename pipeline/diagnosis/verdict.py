@@ -286,25 +286,25 @@ def _within(e: Evidence) -> tuple[str, str]:
 
 def _above(e: Evidence, published: HeldOut) -> tuple[str, str]:
     unit = unit_of(e.sensor)
-    told = (
+    text = (
         f"On held-out motion the error is {published.error:.3g} {unit}; noise and stated uncertainties leave at most "
         f"{published.high:.3g} {unit}"
     )
     if e.found == "missing_effect" and not (e.implausible or (e.full and e.full.above)):
         return "missing_effect", ""
     if e.found == "unexplained" or e.implausible:
-        return "unexplained", f"{told}. {_why_unexplained(e)}"
+        return "unexplained", f"{text}. {_why_unexplained(e)}"
     free = e.free or published
     same = e.method == "reference_least_squares" and not e.filtered  # the calibration is the free fit
     if e.as_printed or not (free.above or same):
-        return "left_by_method", f"{told}. {_of_method(e)}"
+        return "left_by_method", f"{text}. {_of_method(e)}"
     left = e.left_over_noise if e.selected else e.over_noise
     if e.full and e.selected:
-        told += f", and with what was selected {e.full.error:.3g} {unit} stay, against at most {e.full.high:.3g}"
+        text += f", and with what was selected {e.full.error:.3g} {unit} stay, against at most {e.full.high:.3g}"
     if left is not None and left > EXPLAINED:
-        return "unexplained", f"{told}. The residual of the fit is {left:.3g} times the noise, too."
+        return "unexplained", f"{text}. The residual of the fit is {left:.3g} times the noise, too."
     return "reference_in_doubt", (
-        f"{told}. Yet the recordings of the fit are explained to their noise, so that fit and held-out recording "
+        f"{text}. Yet the recordings of the fit are explained to their noise, so that fit and held-out recording "
         "contradict each other: check that the held-out recording is of this unit in the same mounting, and the rate, "
         "attitude and clock that the table logged in it. An effect that the recordings of the fit cannot show (not "
         "observable) may act in the held-out motion, too."
