@@ -6,9 +6,8 @@ import argparse
 import json
 import sys
 from collections import Counter
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pipeline.diagnosis.words import in_words
 from pipeline.errors import InputError, MissingInputError
@@ -23,21 +22,8 @@ if TYPE_CHECKING:
 JSON = dict[str, Any]
 
 
-@dataclass(frozen=True)
-class Told:
-    """What is to be explained.
-
-    Attributes
-    ----------
-    files : dict of str to Path
-        Unit to its diagnosis.
-    failures : dict of str to dict
-        Unit that failed to its entry of ``failures.json``.
-    settings : dict
-        Of the last run.
-    results : str
-        Folder of the results of all campaigns.
-    """
+class Selection(NamedTuple):
+    """What is explained: diagnoses and failures by unit, settings of the last run, folder of all results."""
 
     files: dict[str, Path]
     failures: dict[str, JSON]
@@ -52,21 +38,21 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("units", metavar="UNIT", nargs="*", help="units to explain (default: all)")
     parser.add_argument("--results", type=Path, default=Path("results"), help="where results are (default: results)")
     arguments = parser.parse_args(argv)
-    told = find(arguments.campaign, arguments.units, arguments.results)
-    documents = {unit: _read(file) for unit, file in told.files.items()}
+    selection = find(arguments.campaign, arguments.units, arguments.results)
+    documents = {unit: _diagnosis(file) for unit, file in selection.files.items()}
     texts = [
-        explain(unit, document, _beside(told.files[unit], "validations"), told)
-        + _implausible(_beside(told.files[unit], "calibrations"))
+        explain(unit, document, _beside(selection.files[unit], "validations"), selection)
+        + _implausible(_beside(selection.files[unit], "calibrations"))
         for unit, document in documents.items()
     ]
-    texts += [_failed(unit, failure) for unit, failure in told.failures.items()]
+    texts += [_failed(unit, failure) for unit, failure in selection.failures.items()]
     if len(texts) > 1:
-        texts.insert(0, "\n".join(_summary(documents, told)) + "\n")
+        texts.insert(0, "\n".join(_summary(documents, selection)) + "\n")
     sys.stdout.write("\n".join(texts))
     return 0
 
 
-def find(campaign: str, units: Sequence[str], results: Path) -> Told:
+def find(campaign: str, units: Sequence[str], results: Path) -> Selection:
     """Return the diagnoses and failures meant.
 
     Raises
@@ -76,12 +62,13 @@ def find(campaign: str, units: Sequence[str], results: Path) -> Told:
     """
     given = Path(campaign)
     if given.is_file():
-        return _told({given.stem: given}, {}, given.parent.parent)
+        return _selection({given.stem: given}, {}, given.parent.parent)
     folders = [folder for folder in (given, results / given.name) if (folder / "diagnoses").is_dir()]
     if not folders:
         raise MissingInputError(f"no diagnoses in {given} or {results / given.name}; run the campaign first")
     files = {file.stem: file for file in _in_order(folders[0])}
-    failures = {failure["unit"]: failure for failure in _failures(folders[0])}
+    file = folders[0] / "failures.json"
+    failures = {failure["unit"]: failure for failure in (_json(file, "list of failures") if file.is_file() else [])}
     absent = [unit for unit in units if unit not in files and unit not in failures]
     if absent:
         known = ", ".join(sorted([*files, *failures])[:12])
@@ -89,7 +76,7 @@ def find(campaign: str, units: Sequence[str], results: Path) -> Told:
             f"no diagnosis of unit {', '.join(absent)}; there are those of {known}", str(folders[0] / "diagnoses")
         )
     chosen = set(units) or {*files, *failures}
-    return _told(
+    return _selection(
         {unit: file for unit, file in files.items() if unit in chosen and unit not in failures},
         {unit: failure for unit, failure in failures.items() if unit in chosen},
         folders[0],
@@ -103,7 +90,7 @@ def _in_order(folder: Path) -> list[Path]:
     return [files[unit] for unit in dict.fromkeys([*order, *files]) if unit in files]
 
 
-def explain(unit: str, document: JSON, validation: JSON, told: Told) -> str:
+def explain(unit: str, document: JSON, validation: JSON, selection: Selection) -> str:
     """Return a unit's diagnosis as text, with the error of its held-out motion and the commands that add effects."""
     unit = document.get("unit", unit)
     lines = [unit]
@@ -112,20 +99,20 @@ def explain(unit: str, document: JSON, validation: JSON, told: Told) -> str:
         lines.append(f"  {sensor}")
         verdict, *rest = in_words(part, sensor)
         lines += [f"    {sentence}" for sentence in [verdict, *_held_out(validation.get(sensor)), *rest]]
-        commands = commands_of(part or {}, sensor, unit, told.settings, told.results)
+        commands = commands_of(part or {}, sensor, unit, selection.settings, selection.results)
         if commands:
             lines += [f"    To {commands['verb']}:", f"      {commands['add']}"]
             lines += [f"    To {commands['verb']} for one run only:", f"      {commands['once']}"]
     return "\n".join(lines) + "\n"
 
 
-def _told(files: dict[str, Path], failures: dict[str, JSON], folder: Path) -> Told:
+def _selection(files: dict[str, Path], failures: dict[str, JSON], folder: Path) -> Selection:
     entries = read_history(folder)
     settings = entries[-1].get("settings") if entries else None
-    return Told(files, failures, settings or {"campaign": folder.name}, str(folder.parent))
+    return Selection(files, failures, settings or {"campaign": folder.name}, str(folder.parent))
 
 
-def _summary(documents: Mapping[str, JSON], told: Told) -> list[str]:
+def _summary(documents: Mapping[str, JSON], selection: Selection) -> list[str]:
     """Return the verdicts by sensor and effect, and how to continue."""
     findings = [
         Finding(unit, sensor, document[sensor]["verdict"], document[sensor]["selected"])
@@ -136,9 +123,9 @@ def _summary(documents: Mapping[str, JSON], told: Told) -> list[str]:
     counts = Counter(finding.verdict.replace("_", " ") for finding in findings).most_common()
     counted = ", ".join(f"{count} {verdict}" for verdict, count in counts)
     lines = [f"{len(findings)} sensors of {len(documents)} units: {counted}", *verdict_lines(findings)]
-    if told.failures:
-        lines.append(f"failed: {', '.join(told.failures)}")
-    continued = next_commands(findings, told.settings, told.results)[:-1]  # the last is this command
+    if selection.failures:
+        lines.append(f"failed: {', '.join(selection.failures)}")
+    continued = next_commands(findings, selection.settings, selection.results)[:-1]  # the last is this command
     return [*lines, *[f"{what}: {command}" for what, command in continued]]
 
 
@@ -150,17 +137,6 @@ def _failed(unit: str, failure: Mapping[str, Any]) -> str:
         f"    {where}{failure.get('message')}\n"
         "  Correct the file or the setting, then run the same command again.\n"
     )
-
-
-def _failures(folder: Path) -> list[JSON]:
-    file = folder / "failures.json"
-    try:
-        found: list[JSON] = json.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        return []
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise InputError(f"is no list of failures: {error}", str(file)) from error
-    return found
 
 
 def _held_out(part: JSON | None) -> list[str]:
@@ -179,18 +155,19 @@ def _implausible(calibration: JSON) -> str:
 def _beside(diagnosis: Path, folder: str) -> JSON:
     """Return the unit's file in another folder of the same results; nothing where there is none."""
     file = diagnosis.parent.parent / folder / diagnosis.name
-    try:
-        found: JSON = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError):
-        return {}
+    found: JSON = _json(file, "result of a run") if file.is_file() else {}
     return found
 
 
-def _read(file: Path) -> JSON:
-    try:
-        document = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise InputError(f"is no diagnosis: {error}", str(file)) from error
+def _diagnosis(file: Path) -> JSON:
+    document: JSON = _json(file, "diagnosis")
     if not isinstance(document, dict) or not set(SENSORS) <= set(document):
         raise InputError("is no diagnosis: it does not speak of accelerometer and gyroscope", str(file))
     return document
+
+
+def _json(file: Path, what: str) -> Any:  # noqa: ANN401
+    try:
+        return json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise InputError(f"is no {what}: {error}", str(file)) from error
