@@ -1,4 +1,4 @@
-"""Lay out an empty campaign with comments."""
+"""Create an empty campaign with comments."""
 
 from __future__ import annotations
 

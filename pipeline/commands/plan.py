@@ -1,4 +1,4 @@
-"""Tell what a procedure could find before it is recorded."""
+"""Predict which effects a procedure could find, before it is recorded."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lay what the founding document printed beside what comes out here, and judge its conclusions over many seeds."""
+"""Compare the results with those printed in the thesis, and judge its conclusions over many seeds."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 EPILOG = """\
-page    what a run of the campaign does: lays the results in DIR beside the printed figures of the campaign
-seeds   draws the campaign's recordings anew with every seed and writes FILE (data/thesis/seeds.csv is made by
+page    what a run of the campaign does: compares the results in DIR with the printed figures of the campaign
+seeds   simulates the campaign's recordings with every seed and writes FILE (data/thesis/seeds.csv is made by
         python -m pipeline thesis seeds --campaign data/thesis --output data/thesis/seeds.csv; 10 minutes)
 """
 

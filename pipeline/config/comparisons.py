@@ -81,7 +81,7 @@ class _Problem(Exception):  # noqa: N818  (one of many: they are collected)
 
 
 class _Resolver:
-    """Finds the units that an entry speaks of.
+    """Finds the units that an entry names.
 
     Parameters
     ----------

@@ -157,7 +157,7 @@ def _changed(entries: Sequence[tuple[str, str]], key: str, override: str | None,
 
 
 def _edited(text: str, key: str, override: str | None) -> str:
-    """Return the text with the entry changed where YAML says that it stands; unchanged where a comment would go."""
+    """Return the text with the entry changed in place; unchanged where a comment would be lost."""
     root = yaml.compose(text, yaml.SafeLoader)
     pairs = root.value if isinstance(root, yaml.MappingNode) else []
     node = next((value for name, value in pairs if name.value == KEY), None)

@@ -57,7 +57,7 @@ ByName = Annotated[
 
 
 class DeviceFile(BaseModel):
-    """A file of ``devices/``. The description of a field says what a refused value should be."""
+    """A file of ``devices/``. The description of a field is what its refusal says is expected."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
     overrides: Overrides = []

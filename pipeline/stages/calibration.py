@@ -65,7 +65,7 @@ def judged(sensor: str, fit: dict[str, Any], sheet: dict[str, Any]) -> dict[str,
 
 
 def header(unit: str, settings: dict[str, Any]) -> dict[str, Any]:
-    """Return what a calibration document says of a unit before anything of it is fitted."""
+    """Return the part of a calibration document that does not depend on the fit."""
     return {
         "schema_version": 1,
         "unit": unit,

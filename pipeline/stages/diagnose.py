@@ -1,4 +1,4 @@
-"""Stage diagnose: which physical effect is missing, as far as the recordings can tell."""
+"""Stage diagnose: which physical effects are missing from each sensor's model."""
 
 from __future__ import annotations
 

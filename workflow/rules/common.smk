@@ -160,7 +160,7 @@ def is_last_stage(wildcards):
 
 
 def recordings(wildcards):
-    """Return a digest of which recordings a batch has, how large and how old: they are too many to be told one by one."""
+    """Return a digest of the names, sizes and times of a batch's recordings, which are too many to be listed."""
     digest = hashlib.sha256()
     for unit in [] if CAMPAIGN.simulation else CAMPAIGN.batches[wildcards.batch]:
         config = CAMPAIGN.units[unit].config

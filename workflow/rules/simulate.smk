@@ -1,4 +1,4 @@
-# The recordings of a campaign that is simulated (simulate: true in its campaign.yaml): made anew, and not kept in data/.
+# The recordings of a simulated campaign (simulate: true in its campaign.yaml).
 SIMULATED = f"{RESULTS}/simulated"
 
 if CAMPAIGN.simulation:

@@ -1,4 +1,4 @@
-# What the founding document printed beside the results of its campaign (page: thesis in campaign.yaml).
+# The results of the thesis's campaign compared with what it printed (page: thesis in campaign.yaml).
 if CAMPAIGN.page == "thesis":
 
     rule thesis:
