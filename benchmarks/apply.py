@@ -42,7 +42,7 @@ def write_calibration(path: Path, effects: dict[str, dict[str, float]]) -> None:
     from pipeline.model.effects import effect  # noqa: PLC0415
 
     generator = np.random.default_rng(2)
-    document: dict[str, Any] = {"unit": "U1", "sensor": "mpu6050", "status": "ok", "error": None}
+    document: dict[str, Any] = {"unit": "U1", "sensor": "mpu6050", "status": "ok", "schema_version": 1, "error": None}
     for sensor in ("accelerometer", "gyroscope"):
         chosen = []
         for name, size in effects.get(sensor, {}).items():
@@ -79,10 +79,10 @@ def write_mcap(path: Path, samples: int) -> None:
     """Write what a recorder writes: quantised readings in zstd chunks, and a temperature ten times a second."""
     from mcap.writer import Writer  # noqa: PLC0415
 
-    from pipeline.io.ros2_messages import DEFINITIONS, IMU, TEMPERATURE, _Template, imu_table  # noqa: PLC0415  # noqa: PLC0415
+    from pipeline.io.ros2_messages import DEFINITIONS, IMU, TEMPERATURE, _Message, imu_table  # noqa: PLC0415
 
     generator = np.random.default_rng(1)
-    warm = _Template("imu")
+    warm = _Message("imu")
     warm.doubles(2)
     with path.open("wb") as stream:
         writer = Writer(stream, chunk_size=1 << 20)
@@ -100,7 +100,7 @@ def write_mcap(path: Path, samples: int) -> None:
             for i, (stamp, row) in enumerate(zip(stamps.tolist(), imu_table(stamps, force, rate), strict=True)):
                 writer.add_message(imu, stamp, row.tobytes(), stamp)
                 if i % 100 == 0:
-                    writer.add_message(temperature, stamp, warmth[i], stamp)
+                    writer.add_message(temperature, stamp, warmth[i].tobytes(), stamp)
         writer.finish()
 
 

@@ -38,8 +38,10 @@ class Block:
     signals : dict
         ``accelerometer`` and ``gyroscope``, (n, 3) arrays in g and deg/s, body axes; ``time``, (n,) array in s;
         ``temperature``, (n,) array in degC. Absent signals are left out.
-    file, place : str
-        For messages: the file, with its line where it has lines; else the place in the file.
+    file : callable
+        Returns the file for a message, with its line where it has lines.
+    place : str
+        The place in a file without lines, for a message.
     position : int
         Bytes of the file up to the end of the block.
     content : object
@@ -47,7 +49,7 @@ class Block:
     """
 
     signals: dict[str, NDArray[Any]]
-    file: str
+    file: Callable[[], str]
     place: str
     position: int
     content: Any
@@ -153,7 +155,7 @@ def compensate_log(
             try:
                 found = stream.apply(**block.signals)
             except PipelineError as error:
-                raise type(error)(error.message + block.place, block.file) from None
+                raise type(error)(error.message + block.place, block.file()) from None
             readings = {s: getattr(found, s) for s in given}
             checks.add(given, readings, block.signals.get("time"))
             log.write(block, readings, calibrated)

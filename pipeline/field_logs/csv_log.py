@@ -6,6 +6,7 @@ The columns that the profile names as readings are replaced by calibrated ones i
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -67,8 +68,12 @@ class CsvLog:
                     readings = [block.columns[i] for s in SENSORS for i in self.places.get(s, [])]
                     checks.check_decimals(readings, self.settings.decimal)
                 signals = self._signals(block, head, rows)
-                yield Block(signals, f"{self.source}:{block.line_of(0)}", "", raw.tell(), (block, head))
+                file = partial(self._line, block)
+                yield Block(signals, file, "", raw.tell(), (block, head))
                 rows += block.rows
+
+    def _line(self, block: TextBlock) -> str:
+        return f"{self.source}:{block.line_of(0)}"
 
     def write(self, block: Block, readings: Readings, _changed: set[str]) -> None:
         """Write the block with calibrated numbers in place of the raw ones; missing ones stay as they were written."""

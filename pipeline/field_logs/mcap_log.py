@@ -125,7 +125,9 @@ class McapLog:
             warmth = self.temperatures.at(rows.starts, signals["time"], warmth, self.origin_ns)
         if warmth is not None:
             signals["temperature"] = warmth
-        return Block(signals, str(self.source), f" ({rows.place})", self.reader.position, (rows, time_ns, turned))
+        return Block(
+            signals, lambda: str(self.source), f" ({rows.place})", self.reader.position, (rows, time_ns, turned)
+        )
 
     def write(self, block: Block, readings: Readings, changed: set[str]) -> None:
         """Add the calibrated messages of a block after its run."""
