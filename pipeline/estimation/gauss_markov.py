@@ -247,25 +247,33 @@ class GaussMarkov:
         assert info == 0  # noqa: S101  (T is a covariance)
         self.log_determinant: Values = np.sum(np.log(self._d.reshape(h.shape)) + 2.0 * np.log(h), axis=1)
 
-    def _differences(self, columns: Values) -> tuple[Values, Values]:
-        """Return w of (m, p) columns and ``T^-1 w``, at every setting: (p, g, m) arrays."""
+    def products(self, columns: Values) -> Values:
+        """Return ``A^T C^-1 A`` of (m, p) columns: (g, p, p) array."""
+        # blocks, columns, settings: numpy is fast where the last axis is long and contiguous
+        half, phi, below = (np.ascontiguousarray(v.T) for v in (self._half, self._phi, self._e_by_setting()))
+        z = columns[self._order][:, :, None] / half[:, None, :]
+        z[1:] -= phi[:, None, :] * z[:-1]
+        for k in range(1, len(z)):  # T = L D L^T: z = L^-1 w
+            z[k] -= below[k - 1] * z[k - 1]
+        z /= np.sqrt(np.ascontiguousarray(self._d.reshape(self._half.shape).T))[:, None, :]
+        whitened = np.ascontiguousarray(z.transpose(2, 1, 0))
+        found: Values = whitened @ whitened.transpose(0, 2, 1)
+        return found
+
+    def _e_by_setting(self) -> Values:
+        """Return the subdiagonal of L at every setting: (g, m - 1) array."""
+        below: Values = np.append(self._e, 0.0).reshape(self._half.shape)[:, :-1]
+        return below
+
+    def solve(self, columns: Values) -> Values:
+        """Return ``C^-1 A`` of (m, p) columns: (g, m, p) array."""
         from scipy.linalg.lapack import dpttrs  # noqa: PLC0415  (as above)
 
         w = columns.T[:, None, self._order] / self._half
         w[:, :, 1:] -= self._phi * w[:, :, :-1]
         solved, info = dpttrs(self._d, self._e, w.reshape(len(w), -1).T)
         assert info == 0  # noqa: S101
-        return w, np.asarray(solved.T).reshape(w.shape)
-
-    def products(self, columns: Values) -> Values:
-        """Return ``A^T C^-1 A`` of (m, p) columns: (g, p, p) array."""
-        w, solved = self._differences(columns)
-        found: Values = w.transpose(1, 0, 2) @ solved.transpose(1, 2, 0)
-        return found
-
-    def solve(self, columns: Values) -> Values:
-        """Return ``C^-1 A`` of (m, p) columns: (g, m, p) array."""
-        _, solved = self._differences(columns)
+        solved = np.asarray(solved.T).reshape(w.shape)
         solved[:, :, :-1] -= self._phi * solved[:, :, 1:]
         found = np.empty((*self._half.shape, len(solved)))
         found[:, self._order] = (solved / self._half).transpose(1, 2, 0)
@@ -301,7 +309,7 @@ class GaussMarkov:
         pairs follow by one recursion.
         """
         shape = self._half.shape
-        d, e = self._d.reshape(shape), np.append(self._e, 0.0).reshape(shape)[:, :-1]
+        d, e = self._d.reshape(shape), self._e_by_setting()
         inverse = 1.0 / d  # diagonal of T^-1
         for k in range(shape[1] - 2, -1, -1):
             inverse[:, k] += e[:, k] ** 2 * inverse[:, k + 1]

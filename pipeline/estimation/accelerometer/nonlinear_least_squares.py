@@ -4,7 +4,7 @@
 
 with the bias b, the scale factors S and the unit lower triangular misalignment T: x of the sensor is x of the body, and
 its y lies in the plane of x and y, since the length of gravity says nothing of how the sensor is mounted. The
-orientations need not be known. See ``pipeline.estimation.accelerometer.magnitude`` for the equations.
+orientations need not be known. See ``pipeline.estimation.accelerometer.ellipsoid_fit`` for the equations.
 
 A misalignment that the orientations do not determine, as in six positions, is left at zero, and the result says so. On
 a table the errors of the rows are correlated by the bias wander, whose covariance is that of
@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.accelerometer.magnitude import (
+from pipeline.estimation.accelerometer.ellipsoid_fit import (
     COLUMNS,
     MISALIGNMENT,
     NAMES,
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.estimation.accelerometer.magnitude import Ellipsoid
+    from pipeline.estimation.accelerometer.ellipsoid_fit import Ellipsoid
     from pipeline.estimation.accelerometer.orientations import Orientations
     from pipeline.estimation.engine import ResidualNoise
     from pipeline.estimation.gauss_markov import Prior

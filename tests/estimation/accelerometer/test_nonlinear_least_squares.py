@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import CannotCalibrateError, NotObservableError
-from pipeline.estimation.accelerometer.magnitude import derivative_of, error_of
+from pipeline.estimation.accelerometer.ellipsoid_fit import derivative_of, error_of
 from pipeline.estimation.accelerometer.nonlinear_least_squares import fit
 from pipeline.estimation.correction import apply_correction
 from pipeline.estimation.rest_means import held_out_rests, rest_means
