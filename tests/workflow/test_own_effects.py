@@ -104,7 +104,9 @@ def test_validation_words_page_and_exports_know_it(bench: Bench) -> None:
     assert "A loose part of the sensor tips over with gravity." in words
     assert "loose_part" in (bench.results / "reports" / "known.html").read_text()
     header = (bench.results / "exports" / "known" / "calibration.h").read_text()
-    taken_off = re.findall(r"r\[\d\] -= \(imu_real\)(\S+) \* \(imu_real\)tanh\(\(8\.0 \* f\[2\]\)\)", header)
+    taken_off = re.findall(
+        r"r\[\d\] -= \(imu_real\)(\S+) \* \(imu_real\)tanh\(\(\(imu_real\)8\.0 \* f\[2\]\)\)", header
+    )
     assert len(taken_off) == 3
     np.testing.assert_allclose(np.array(taken_off, float), 0.01, rtol=0.05)
     assert "Of the bench, not of the gyroscope: gear_mesh." in header
