@@ -33,19 +33,10 @@ BLOCK_BYTES = 1 << 21  # of a text log: 20,000 rows, whose arrays take some 10 M
 class Block:
     """Samples of a log.
 
-    Attributes
-    ----------
-    signals : dict
-        ``accelerometer`` and ``gyroscope``, (n, 3) arrays in g and deg/s, body axes; ``time``, (n,) array in s;
-        ``temperature``, (n,) array in degC. Absent signals are left out.
-    file : callable
-        Returns the file for a message, with its line where it has lines.
-    place : str
-        The place in a file without lines, for a message.
-    position : int
-        Bytes of the file up to the end of the block.
-    content : object
-        Whatever the format needs to write the block.
+    ``signals``: ``accelerometer`` and ``gyroscope``, (n, 3) arrays in g and deg/s, body axes; ``time``, s, and
+    ``temperature``, degC, (n,) arrays; absent signals are left out. ``file`` returns file and line for a message,
+    ``place`` is the place in a file without lines. ``position``: bytes up to the end of the block. ``content``: what
+    the format needs to write the block.
     """
 
     signals: dict[str, NDArray[Any]]
@@ -57,19 +48,10 @@ class Block:
 
 @dataclass
 class Result:
-    """What was compensated.
+    """What was compensated with the calibration of ``unit``.
 
-    Attributes
-    ----------
-    unit : str
-        Name of the unit whose calibration was applied.
-    samples : int
-    sensors : list of str
-        Those whose readings the log holds.
-    topic : str
-        Of the calibrated messages in an MCAP log.
-    notes, warnings : list of str
-        Facts about the output, and what contradicts that this calibration belongs to this log.
+    ``sensors``: those whose readings the log holds. ``topic``: of the calibrated messages in an MCAP log. ``notes``:
+    facts about the output. ``warnings``: what contradicts that this calibration belongs to this log.
     """
 
     unit: str

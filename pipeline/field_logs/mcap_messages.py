@@ -27,22 +27,10 @@ SENSOR_OF = {channels: sensor for sensor, channels in TRIADS.items()}
 
 
 def replaced(rows: Rows, decoder: ChannelDecoder, truths: Truths, channel: int) -> NDArray[np.uint8] | list[bytes]:
-    """Return copies of Imu messages in which the readings of some sensors are replaced.
+    """Return copies of Imu messages, whole records, in which the readings of some sensors are replaced.
 
-    Parameters
-    ----------
-    rows : Rows
-        The messages, as ``decoder`` has read them last.
-    decoder : ChannelDecoder
-    truths : dict of str to (n, 3) array, g or deg/s
-        Sensor to its calibrated readings.
-    channel : int
-        Number of the channel of the new messages.
-
-    Returns
-    -------
-    (n, size) array of uint8, or list of bytes
-        A record for each message.
+    ``decoder`` has read the messages last; ``truths`` are (n, 3) calibrated readings, g or deg/s; ``channel`` is the
+    number of the channel of the copies.
     """
     numbers = _numbers(truths)
     if decoder.layout is not None:

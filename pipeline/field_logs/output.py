@@ -22,13 +22,7 @@ KINDS = {".mcap": "MCAP", ".csv": "text", ".txt": "text"}
 
 
 def require_apart(source: Path, target: Path) -> None:
-    """Refuse a log that is no file, and an output that cannot be made or would overwrite the log.
-
-    Parameters
-    ----------
-    source : Path
-    target : Path
-        ``-`` is standard output.
+    """Refuse a log that is no file, and an output (``-``: standard output) that cannot be made or would overwrite it.
 
     Raises
     ------
@@ -82,7 +76,7 @@ class Output:
 
     def write(self, data: bytes | memoryview) -> None:
         """Write all of it."""
-        with _told(self.target):
+        with _named(self.target):
             self.stream.write(data)
 
 
@@ -93,11 +87,6 @@ def replacing(target: Path) -> Iterator[Output]:
     A symbolic link stays, and the file to which it points is replaced, with its permissions kept. Standard output,
     pipes and devices are written to as they are.
 
-    Parameters
-    ----------
-    target : Path
-        ``-`` is standard output.
-
     Raises
     ------
     InputError
@@ -105,7 +94,7 @@ def replacing(target: Path) -> Iterator[Output]:
     """
     descriptor, part = _descriptor(target), None
     file = target if descriptor is not None else target.resolve()
-    with _told(target):
+    with _named(target):
         if descriptor is not None:
             sys.stdout.flush()
             stream = os.fdopen(os.dup(descriptor), "wb")
@@ -116,7 +105,7 @@ def replacing(target: Path) -> Iterator[Output]:
             stream = part.open("wb")
     try:
         yield Output(stream, target)
-        with _told(target):
+        with _named(target):
             stream.close()
             if part is not None:
                 if file.exists():
@@ -130,7 +119,7 @@ def replacing(target: Path) -> Iterator[Output]:
 
 
 @contextmanager
-def _told(target: Path) -> Iterator[None]:
+def _named(target: Path) -> Iterator[None]:
     try:
         yield
     except BrokenPipeError:

@@ -28,17 +28,10 @@ if TYPE_CHECKING:
 
 
 class Temperatures:
-    """Temperatures of a log, run by run.
+    """Temperatures of a log, run by run; the log is read first up to its first temperature.
 
-    Parameters
-    ----------
-    settings : McapFormat
-    path : Path
-        The log, which is read up to the first temperature.
-    readings : str or None
-        Topic of the readings.
-    smoothing : float, s
-        Memory of the line through the temperature's past; 0 takes the last one.
+    ``readings`` is the topic of the readings, ``smoothing`` the memory, s, of the line through the temperature's past;
+    0 takes the last temperature.
 
     Raises
     ------
@@ -102,14 +95,8 @@ class Temperatures:
     def at(self, starts: NDArray[np.int64], time: Values, beside: Values | None, origin_ns: int) -> Values:
         """Return the temperature at the readings of a run: (n,) array, degC.
 
-        Parameters
-        ----------
-        starts : (n,) array of int64
-            Places of the readings in the run.
-        time : (n,) array, s, from ``origin_ns``
-        beside : (n,) array, degC, or None
-            The temperature in the readings' own messages.
-        origin_ns : int
+        ``starts`` are the places of the readings in the run, ``time`` their times, s, from ``origin_ns``, ``beside``
+        the temperatures in the readings' own messages.
         """
         if beside is not None:
             return self.line.apply(time, beside) if self.smoothing > 0 else beside

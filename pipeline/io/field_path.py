@@ -24,17 +24,7 @@ _LAST = re.compile(r"(.*?)(?:\[([^\[\]]+)\])?")
 
 @dataclass(frozen=True)
 class FieldPath:
-    """A path, cut into its steps.
-
-    Attributes
-    ----------
-    text : str
-        As written.
-    base : str
-        Without the last index.
-    index : int, str or None
-        The last index: a number, a name, ``*``, or none.
-    """
+    """A path: its text, the base without the last index, and that index (a number, a name, ``*``, or None)."""
 
     text: str
     base: str

@@ -55,14 +55,7 @@ def topic_of(kind: str, settings: McapFormat) -> str | None:
 
 
 class TopicDecoder:
-    """Decoder of one topic.
-
-    Parameters
-    ----------
-    topic, kind : str
-    settings : McapFormat
-    path : str
-        File, for messages.
+    """Decoder of one topic; ``path`` names the file in messages.
 
     Attributes
     ----------

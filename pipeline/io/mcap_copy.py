@@ -40,23 +40,14 @@ if TYPE_CHECKING:
 ZSTD_LEVEL = -3  # twice as fast as 1 on calibrated messages, and as small as the recorders' 3: benchmarks/apply.py
 
 
-class Sink(Protocol):
-    """What bytes are written to."""
-
-    def write(self, data: bytes | memoryview, /) -> object:
-        """Write all of them."""
+class _Sink(Protocol):
+    def write(self, data: bytes, /) -> object: ...
 
 
 class McapCopy:
-    """The file that is written.
+    """The file that is written, in order, to ``out``."""
 
-    Parameters
-    ----------
-    out : file
-        Empty; bytes are written to it in order.
-    """
-
-    def __init__(self, out: Sink) -> None:
+    def __init__(self, out: _Sink) -> None:
         self.out = out
         self.position = self.crc = 0
         self.compression = ""  # of the last chunk
@@ -117,16 +108,7 @@ class McapCopy:
         self.times = [min([*self.times, int(times.min())]), max([*self.times, int(times.max())])]
 
     def add(self, table: NDArray[np.uint8] | list[bytes], before: Iterable[McapRecord], channel: int) -> None:
-        """Add messages of one channel.
-
-        Parameters
-        ----------
-        table : (n, size) array of uint8, or list of bytes
-            Whole records.
-        before : iterable of records
-            Definitions that must precede them.
-        channel : int
-        """
+        """Add messages of one channel, whole records as rows of bytes or a list, after the definitions ``before``."""
         head = bytes_of(before)
         if isinstance(table, np.ndarray):
             body: bytes | memoryview = table.data.cast("B")

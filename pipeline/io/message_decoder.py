@@ -42,16 +42,9 @@ FindLayout = Callable[[bytes], MessageLayout]
 
 @dataclass(frozen=True)
 class Wanted:
-    """What is read of a message.
+    """What is read of a message: the number of each column, and the moment (None: the recorder's time is used).
 
-    Attributes
-    ----------
-    values : dict of str to FieldPath
-        Column to the path of its number.
-    time : FieldPath or None
-        The moment of the measurement; None where the recorder's time is used.
-    time_unit : str
-        Of a moment that is one number.
+    ``time_unit`` is that of a moment which is one number.
     """
 
     values: Mapping[str, FieldPath]
@@ -63,13 +56,7 @@ class Wanted:
 class Batch:
     """Columns of the messages of one channel in one run.
 
-    Attributes
-    ----------
-    time_ns : (n,) array of int64, or None
-    values : dict of str to (n,) array of float64
-        NaN where the message has an empty list in place of the number.
-    absent : dict of str to (n,) array of bool
-        Which rows those are; columns without such rows are left out.
+    A value is NaN where the message has an empty list in its place. ``absent`` marks these rows of a column.
     """
 
     time_ns: NDArray[np.int64] | None
@@ -78,14 +65,7 @@ class Batch:
 
 
 class ChannelDecoder:
-    """Decoder of one channel.
-
-    Parameters
-    ----------
-    channel, schema : Channel, Schema or None
-    wanted : Wanted
-    path : str
-        File, for messages.
+    """Decoder of one channel; ``path`` names the file in messages.
 
     Raises
     ------

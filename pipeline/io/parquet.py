@@ -48,14 +48,7 @@ PAGE_ENCODINGS = {"f": "BYTE_STREAM_SPLIT", "i": "DELTA_BINARY_PACKED", "u": "PL
 
 
 def save_recordings(path: Path, recordings: Sequence[Recording]) -> None:
-    """Write the recordings of a unit.
-
-    Parameters
-    ----------
-    path : Path
-        Replaced at once, never half written.
-    recordings : sequence of Recording
-    """
+    """Write the recordings of a unit; the file is replaced at once, never half written."""
     stored = [_columns_of(r) for r in recordings]
     counts = _encode_counts(recordings, stored)
     names = [c for c in COLUMNS if any(c in s for s in stored)] or ["time_ns"]

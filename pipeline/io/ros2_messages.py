@@ -126,13 +126,7 @@ class _Message:
 
 
 def write_mcap(path: Path, recording: Recording) -> None:
-    """Write a recording as ROS 2 messages; channels that it does not hold are left out.
-
-    Parameters
-    ----------
-    path : Path
-        Replaced at once, never half written.
-    recording : Recording
+    """Write a recording as ROS 2 messages; the file is replaced at once, never half written.
 
     Raises
     ------

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 MULTIPLE = 4.0
 LOW_COST_BIAS = {"accelerometer": 0.08 / 2.0, "gyroscope": 20.0 / 250.0}  # share of the range
 LOW_COST_SCALE, LOW_COST_CROSS = 0.03, 0.02
-ALIKE = 0.1  # relative spread of the three scale factors that have one cause
+EQUAL_SPREAD = 0.1  # relative spread of the three scale factors that have one cause
 NEAR = 0.03  # relative distance from a factor by which it is recognised, as a low-cost scale factor's limit
 FACTORS = {
     "accelerometer": {
@@ -55,21 +55,10 @@ Entry = dict[str, Any]
 
 
 def implausible(sensor: str, part: Mapping[str, Any], sheet: Mapping[str, Any]) -> list[Entry]:
-    """Return the fitted parameters of a sensor that are beyond its data sheet.
+    """Return the fitted parameters of a sensor that are beyond its data sheet, the largest ratio first.
 
-    Parameters
-    ----------
-    sensor : str
-    part : mapping
-        Its part of ``calibrations/<unit>.json``.
-    sheet : mapping
-        Its part of the configuration: ``full_scale``, ``bias``, ``scale_factor``, ``cross_axis``, ``effects``.
-
-    Returns
-    -------
-    list of dict
-        ``parameter``, ``value``, ``unit``, ``limit`` of the data sheet, ``ratio`` of the two and ``likely_cause``; the
-        largest ratio first.
+    ``part`` is the sensor's part of ``calibrations/<unit>.json``, ``sheet`` its part of the configuration. An entry has
+    ``parameter``, ``value``, ``unit``, ``limit`` of the data sheet, ``ratio`` of the two and ``likely_cause``.
     """
     K = np.linalg.inv(np.array(part["matrix"], float))
     squares, axes = np.linalg.eigh(K @ K.T)
@@ -125,7 +114,7 @@ def _of_effects(
 def _scale_cause(sensor: str, factors: np.ndarray) -> str:
     """Return what scale factors far from 1 nearly always come from."""
     mean = float(np.mean(factors))
-    if np.ptp(factors) > ALIKE * mean:
+    if np.ptp(factors) > EQUAL_SPREAD * mean:
         return "another column, counts per unit or axis map of this axis, or a damaged axis"
     unit = next((u for f, u in FACTORS[sensor].items() if abs(mean / f - 1.0) < NEAR), None)
     if unit is not None:
