@@ -31,14 +31,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import ConfigurationError
-from pipeline.estimation.engine import LinearMap, assess_noise
+from pipeline.estimation.engine import LinearMap, assess_noise, derivative
 from pipeline.estimation.gyroscope.integrated_turns import require_turns, turns_of
 from pipeline.estimation.least_squares import certified, solve_linear
 from pipeline.estimation.noise import prior_of
 from pipeline.estimation.reference_least_squares import inverted
 from pipeline.estimation.table_errors import Reference, disturbance
 from pipeline.estimation.turns import blocks_of_samples, parts_of
-from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, scatter_contribution
+from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, scatter_contribution, stage_parameters
 from pipeline.records import AXES, SensorCalibration, StageResult
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     Values = NDArray[np.float64]
 
 NAME = "cholesky_lu"
-STEP = 1e-6
+STEP = 1e-6  # of the central differences: truncation and rounding are below 1e-9 of the derivative
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def fit(
     matrix = _matrix(A, as_printed=as_printed)
     result = StageResult(
         name=NAME,
-        parameters=_parameters(factors, scatter.covariance + given),
+        parameters=stage_parameters(_values(factors), (scatter.covariance + given)[12:, 12:]),
         residual_rms=_residual_rms(turns, previous.bias, matrix),
         correction={"steps": [{"subtract": previous.bias.tolist()}, {"matrix": matrix.tolist()}]},
         details={
@@ -178,42 +178,26 @@ def _linear_map(turns: Turns, A: Values, previous: SensorCalibration, *, as_prin
     lever = np.array([1.0, *(-weights[1:].sum(axis=1))])
     if from_rests:
         weights += lever[:, None] * np.where(turns.rest, 1.0 / turns.rest.sum(), 0.0)
-    theta, given = np.column_stack([previous.bias, A]), np.zeros((27, 27))
-    x, y, z = (_derivative(theta, channel, as_printed=as_printed) for channel in range(3))
+    theta, given = np.column_stack([previous.bias, A]).ravel(), np.zeros((27, 27))
+
+    def results(values: Values) -> Values:
+        channels = values.reshape(3, 4)
+        found = [value for value, _ in _values(factorise(channels[:, 1:])).values()]
+        return np.concatenate([channels[:, 0], _matrix(channels[:, 1:], as_printed=as_printed).ravel(), found])
+
+    x, y, z = np.split(derivative(results, theta, np.full(12, STEP)), 3, axis=1)
     if not from_rests and previous.covariance is not None:
         for channel, J in enumerate((x, y, z)):
             given += previous.covariance[channel, channel] * np.outer(J @ lever, J @ lever)
     return LinearMap((weights, weights, weights), (x, y, z)), given
 
 
-def _derivative(theta: Values, channel: int, *, as_printed: bool) -> Values:
-    """Return the derivative of all results with respect to bias and row of A of one channel: (27, 4) array."""
-
-    def results(values: Values) -> Values:
-        A = values[:, 1:]
-        factors = factorise(A)
-        matrix = _matrix(A, as_printed=as_printed)
-        T = factors.T[np.tril_indices(3, -1)]
-        return np.concatenate([values[:, 0], matrix.ravel(), factors.S, T, factors.M.ravel()])
-
-    columns = []
-    for k in range(4):
-        up, down = theta.copy(), theta.copy()
-        up[channel, k] += STEP
-        down[channel, k] -= STEP
-        columns.append((results(up) - results(down)) / (2.0 * STEP))
-    return np.column_stack(columns)
-
-
-def _parameters(factors: _Factors, covariance: Values) -> dict[str, dict[str, Any]]:
-    values = {f"S_{axis}": float(s) for axis, s in zip(AXES, factors.S, strict=True)}
-    values |= {f"T_{AXES[i]}{AXES[j]}": float(factors.T[i, j]) for i, j in zip(*np.tril_indices(3, -1), strict=True)}
-    values |= {f"M_{AXES[i]}{AXES[j]}": float(factors.M[i, j]) for i in range(3) for j in range(3)}
-    own = np.sqrt(np.clip(np.diag(covariance)[12:], 0.0, None))
-    return {
-        name: {"value": value, "unit": "1", "standard_uncertainty": float(u)}
-        for (name, value), u in zip(values.items(), own, strict=True)
-    }
+def _values(factors: _Factors) -> dict[str, tuple[float, str]]:
+    """Return S, T below its diagonal and M, with their unit."""
+    below = list(zip(*np.tril_indices(3, -1), strict=True))
+    values = {f"S_{axis}": (float(s), "1") for axis, s in zip(AXES, factors.S, strict=True)}
+    values |= {f"T_{AXES[i]}{AXES[j]}": (float(factors.T[i, j]), "1") for i, j in below}
+    return values | {f"M_{AXES[i]}{AXES[j]}": (float(factors.M[i, j]), "1") for i in range(3) for j in range(3)}
 
 
 def _residual_rms(turns: Turns, bias: Values, matrix: Values) -> float:
