@@ -162,6 +162,25 @@ class FormulaEffect(DeclaredEffect):
             "record one, or take the effect out of the configuration"
         )
 
+    def reading(
+        self, sensor: str, motion: Motion, K: NDArray[np.float64], values: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return what the effect adds to the reading, summed term by term: (n, 3) array, g or deg/s."""
+        if self.layout == Layout.SHARED:
+            return super().reading(sensor, motion, K, values)
+        signals = {name: self._signal(name, sensor, motion) for name in self._names}
+        added, product = np.zeros((2, 3, len(motion.time))).transpose(0, 2, 1)  # axis by axis in memory
+        for term, coefficients in zip(self._terms, values.reshape(3, -1).T, strict=True):
+            for axis, formula in term.formula.of.items():
+                if any(signals[name] is None for name in formula.signals):
+                    continue
+                at = slice(AXES.index(axis), AXES.index(axis) + 1) if axis else slice(None)
+                np.multiply(formula(_of_axis(signals, axis)), coefficients[at], out=product[:, at])
+                added[:, at] += product[:, at]
+        if not np.isfinite(added).all():
+            self._check_finite(signals, motion)
+        return added
+
     def _check_finite(self, signals: dict[str, Any], motion: Motion) -> None:
         """Refuse a formula that is not finite where its signals are."""
         for term in self._terms:
