@@ -17,12 +17,15 @@ q   : standard deviation of that bias over white noise
 k   : at least 1: scatter that the hypotheses of a grid leave
 
 Nobody states how firmly a unit rests by hand: a, c, q and k are free in all comparisons (``likelihood``).
+
+Both sensors' models have: ``kinds`` of scatter (1: rests; 2: rests and moves), ``rests_equations`` (they come first),
+``white`` noise of a raw sample, and ``directions``, (12, b): change of bias and matrix by each base parameter.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -37,10 +40,13 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from pipeline.estimation.multi_position.accelerometer import AccelerometerModel
+    from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
     from pipeline.estimation.multi_position.likelihood import NoiseHypothesis
     from pipeline.estimation.multi_position.rests import Rests
     from pipeline.model.effects.base import Effect
 
+    Model: TypeAlias = AccelerometerModel | GyroscopeModel
     Values = NDArray[np.float64]
 
 
@@ -143,47 +149,6 @@ class Equations:
         solved, failed = dtrtrs(L, values, lower=1)
         assert failed == 0  # noqa: S101
         return solved, 2.0 * float(np.sum(np.log(np.diag(L))))
-
-
-class Model(Protocol):
-    """The equations of one sensor.
-
-    Attributes
-    ----------
-    sensor : str
-    rests : Rests
-    kinds : int
-        Of scatter: 1 for rests alone, 2 for rests and moves.
-    rests_equations : int
-        Equations of the rests; they come first.
-    white : (3,) array
-        Noise of a raw sample.
-    directions : (12, b) array
-        Change of bias and matrix (row by row) by each base parameter.
-    """
-
-    sensor: str
-    rests: Rests
-    kinds: int
-    rests_equations: int
-    white: Values
-    directions: Values
-
-    def equations(self, state: State, candidates: Sequence[Term] = ()) -> Equations:
-        """Return the linear form at some parameters."""
-        ...
-
-    def samples(self) -> float:
-        """Return how many samples the equations use."""
-        ...
-
-    def held_out_error(self, state: State) -> float | None:
-        """Return the rms error at rests that no fit sees, g or deg/s; None where there are none."""
-        ...
-
-    def without(self, held: NDArray[np.bool_]) -> Model:
-        """Return the model with some of its rests, and the moves before them, held out."""
-        ...
 
 
 def stepped(model: Model, state: State, step: Values) -> tuple[State, Values]:
