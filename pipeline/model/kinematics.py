@@ -39,8 +39,8 @@ if TYPE_CHECKING:
 
     from pipeline.records import Recording
 
-VAGUE_DPS = 0.01
-EARTH_RATE_DPS = 360.0 / 86164.0905
+VAGUE_DPS = 0.01  # the noise of a gyroscope's sample; below it a doubtful rate does no harm
+EARTH_RATE_DPS = 360.0 / 86164.0905  # a sidereal day, s
 UP_AT_ZERO = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
 # Rows: level x, y, z axes in the body frame at table angle 0, for turns about x, y, z.
 LEVEL_AT_ZERO = np.array([np.eye(3), np.eye(3), [[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]])

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-REFERENCE_TEMPERATURE = 25.0
-STANDARD_GRAVITY = 9.80665
+REFERENCE_TEMPERATURE = 25.0  # degC, that of data sheets
+STANDARD_GRAVITY = 9.80665  # m/s^2, ISO 80000-3
 
 
 class Owner(StrEnum):

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 NAME = re.compile(r"[a-z][a-z0-9_]{0,49}")
 TERM = re.compile(r"[A-Za-z](?=.{0,19}$)[A-Za-z0-9_]*\*?[A-Za-z0-9_]*")
 RESERVED = ("auto", "all", "none")
-MOST_TERMS, LONGEST_TEXT, LONGEST_UNIT = 12, 500, 30
+MOST_TERMS, LONGEST_TEXT, LONGEST_UNIT = 12, 500, 30  # above every shipped effect; they bound pages and fits
 
 
 def _text(longest: int) -> Callable[[object], str]:
