@@ -184,6 +184,7 @@ def solve_nonlinear(
     sigma: float | None = None,
     names: Sequence[str] | None = None,
     iterations: int = 50,
+    far: bool = True,
 ) -> LeastSquaresResult:
     """Minimise ``|residuals(x)|``.
 
@@ -198,6 +199,8 @@ def solve_nonlinear(
         As in ``solve_linear``.
     iterations : int
         Limit on the number of Gauss-Newton steps.
+    far : bool
+        Whether the start may be far off, so that a trust region is tried where Gauss-Newton steps fail.
 
     Returns
     -------
@@ -218,10 +221,10 @@ def solve_nonlinear(
                 "check the readings for values that are not finite"
             )
         x, r, J, factors = _gauss_newton(residuals, jacobian, np.array(start, float), iterations)
-        if factors.rank < len(x) or not _certified(x, r, J, factors):
+        if far and (factors.rank < len(x) or not _certified(x, r, J, factors)):
             from scipy.optimize import least_squares  # noqa: PLC0415  (0.5 s that only starts from far off need)
 
-            far = least_squares(
+            approach = least_squares(
                 residuals,
                 start,
                 jac=jacobian,
@@ -232,7 +235,9 @@ def solve_nonlinear(
                 gtol=1e-15,
                 max_nfev=100 * iterations,
             )
-            x, r, J, factors = _gauss_newton(residuals, jacobian, far.x, iterations)
+            found = _gauss_newton(residuals, jacobian, approach.x, iterations)
+            if found[3].rank == len(x) and _certified(*found):  # else the way along a valley has no end
+                x, r, J, factors = found
     factors.require_full_rank(names)
     return _result(x, r, J, factors, sigma)
 
