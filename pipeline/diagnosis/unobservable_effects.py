@@ -7,9 +7,9 @@ at the sensor's limits the mean gain,
     f n log(1 + lambda / n),   lambda = sum_j limit_j^2 |column_j|^2,   f the factor of the gain,
 
 stays below the gate ``v log n + 10`` (see ``pipeline.estimation.multi_position.likelihood``). lambda of a drift of the
-bias grows as the square of the time between the first rest and the last, so that the time that shows it is known. (With
-20 rests of an MPU-6050 in 110 s lambda is 12, of 167 that the gate asks for. Of simulated drifts of half the limit, 0 of
-4 are found in 4 minutes, 14 of 16 in 8, and 16 of 16 in 11.)
+bias grows as the square of the time between the first rest and the last, so that the time that shows it is known.
+(With 20 rests of an MPU-6050 in 110 s lambda is 12, of 167 that the gate asks for. Of simulated drifts of half the
+limit, 0 of 4 are found in 4 minutes, 14 of 16 in 8, and 16 of 16 in 11.)
 """
 
 from __future__ import annotations
