@@ -1,0 +1,37 @@
+"""The documents name files and functions that exist."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+DOCUMENTS = [
+    *sorted((ROOT / "docs").glob("*.md")),
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "workflow/README.md")),
+]
+PATH = re.compile(r"`((?:pipeline|configs|tests|workflow|benchmarks|docs)/[^`\s]*)`")
+PLACEHOLDER = re.compile(r"<|[A-Z]{4}|/my_")  # configs/effect/NAME.yaml, configs/effect/<name>.yaml, my_laboratory
+LINK = re.compile(r"\]\((?!http|#)([^)#]+)")
+FUNCTION = re.compile(r"`([\w.]+)`\s+(?:in|\()\s*`(pipeline/[\w/]+\.py)`")
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda file: file.name)
+def test_files_that_a_document_names_exist(document: Path) -> None:
+    text = document.read_text()
+    named = [path for path in PATH.findall(text) if not PLACEHOLDER.search(path)]
+    missing = [path for path in named if not list(ROOT.glob(path.rstrip("/")))]
+    missing += [link for link in LINK.findall(text) if not (document.parent / link).exists()]
+    assert not missing
+
+
+def test_functions_that_the_architecture_names_exist() -> None:
+    text = (ROOT / "docs" / "architecture.md").read_text()
+    named = FUNCTION.findall(text)
+    missing = [
+        (name, file)
+        for name, file in named
+        if not re.search(rf"^\s*(def|class) {name.rpartition('.')[2]}\b", (ROOT / file).read_text(), re.MULTILINE)
+    ]
+    assert len(named) > 20
+    assert not missing
