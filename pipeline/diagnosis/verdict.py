@@ -5,9 +5,10 @@ that applies:
 
     reference_in_doubt  a check of the recordings says so (note ``N-REFERENCE``), or the fit is explained to its noise
                         and the held-out motion is not: the recordings contradict each other
-    missing_effect      plausible effects were selected, and with them the held-out error lies in its interval
-    unexplained         the residual of the fit, or the held-out error, is above what noise leaves, and no effect within
-                        the sensor's limits explains it
+    missing_effect      effects were selected, and with them the held-out error lies in its interval; effects beyond
+                        the sensor's limits only where they lower the held-out error
+    unexplained         the residual of the fit, or the held-out error, is above what noise leaves, and no effect
+                        explains it
     floor_in_doubt      the held-out error is below its interval, or the residual far below the noise
     left_by_method      the error is above, but that of a free fit of the same recordings is not; or the method's matrix
                         or bias differs from that of a free fit by more than both fits' noise, which the error of the
@@ -229,9 +230,28 @@ def decide(e: Evidence) -> tuple[str, str]:
         return "reference_in_doubt", f"A check of the recordings contradicts the reference: {'; '.join(e.doubts)}."
     if e.published and e.published.above:
         return _above(e, e.published)
-    if e.found == "unexplained" or (e.found == "missing_effect" and e.implausible):
+    if e.found == "unexplained" or (e.found == "missing_effect" and _unconfirmed(e)):
         return "unexplained", _why_unexplained(e)
-    return (e.found, "") if e.found == "missing_effect" else _within(e)
+    return (e.found, _beyond(e)) if e.found == "missing_effect" else _within(e)
+
+
+def _unconfirmed(e: Evidence) -> bool:
+    """Return whether effects beyond the sensor's limits were selected that do not lower the held-out error."""
+    if not e.implausible or e.held_out is None:
+        return False
+    return e.held_out["error_after"] ** 2 > (1.0 - HELPFUL) * e.held_out["error_before"] ** 2
+
+
+def _beyond(e: Evidence) -> str:
+    """Return which selected effects exceed the limits of the sensor, as a sentence."""
+    if not e.implausible:
+        return ""
+    beyond = listed([plain(name) for name in e.implausible])
+    return (
+        f"To explain the residual, {beyond} would have to exceed the limits of the sensor's data sheet: a recording of "
+        "another unit, a wrong range or physics beyond the catalogue looks like that. If the sensor is known to exceed "
+        f"its data sheet, set sensor.{e.sensor}.accept_implausible=true."
+    )
 
 
 def _why_unexplained(e: Evidence) -> str:
@@ -239,12 +259,7 @@ def _why_unexplained(e: Evidence) -> str:
     names, unit = listed([plain(name) for name in e.selected]), unit_of(e.sensor)
     found = []
     if e.implausible:
-        beyond = listed([plain(name) for name in e.implausible])
-        found.append(
-            f"To explain the residual, {beyond} would have to exceed the limits of the sensor's data sheet: a "
-            "recording of another unit, a wrong range or physics beyond the catalogue looks like that. If the sensor "
-            f"is known to exceed its data sheet, set sensor.{e.sensor}.accept_implausible=true."
-        )
+        found.append(_beyond(e))
     if _made_worse(e.held_out) and e.held_out:
         before, after = e.held_out["error_before"], e.held_out["error_after"]
         found.append(f"With {names} the error on held-out motion rises from {before:.3g} to {after:.3g} {unit}.")
@@ -290,9 +305,9 @@ def _above(e: Evidence, published: HeldOut) -> tuple[str, str]:
         f"On held-out motion the error is {published.error:.3g} {unit}; noise and stated uncertainties leave at most "
         f"{published.high:.3g} {unit}"
     )
-    if e.found == "missing_effect" and not (e.implausible or (e.full and e.full.above)):
-        return "missing_effect", ""
-    if e.found == "unexplained" or e.implausible:
+    if e.found == "missing_effect" and not (_unconfirmed(e) or (e.full and e.full.above)):
+        return "missing_effect", _beyond(e)
+    if e.found == "unexplained" or _unconfirmed(e):
         return "unexplained", f"{text}. {_why_unexplained(e)}"
     free = e.free or published
     same = e.method == "reference_least_squares" and not e.filtered  # the calibration is the free fit

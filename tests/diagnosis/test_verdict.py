@@ -24,6 +24,13 @@ MISSING = replace(NOTHING, found="missing_effect", selected=("g_sensitivity",), 
 STAGED = replace(NOTHING, published=ABOVE, free=INSIDE, method="staged")
 
 
+BEYOND = replace(MISSING, implausible=("g_sensitivity",))
+
+
+def held_out(after: float) -> dict[str, float]:
+    return {"error_before": 1.0, "error_after": after, "floor": 0.3}
+
+
 @pytest.mark.parametrize(
     ("evidence", "verdict", "words"),
     [
@@ -42,8 +49,10 @@ STAGED = replace(NOTHING, published=ABOVE, free=INSIDE, method="staged")
         (replace(NOTHING, found="unexplained", published=ABOVE), "unexplained", "at most 1.2 deg/s"),
         (replace(NOTHING, found="unexplained"), "unexplained", "1 times the noise"),
         (replace(NOTHING, found="unexplained", unknown=("time",)), "unexplained", "depends on time"),
-        (replace(MISSING, implausible=("g_sensitivity",)), "unexplained", "data sheet"),
-        (replace(MISSING, implausible=("g_sensitivity",), published=ABOVE, full=INSIDE), "unexplained", "data sheet"),
+        (replace(BEYOND, held_out=held_out(after=0.99)), "unexplained", "data sheet"),
+        (replace(BEYOND, held_out=held_out(after=0.99), published=ABOVE, full=INSIDE), "unexplained", "data sheet"),
+        (replace(BEYOND, held_out=held_out(after=0.3)), "missing_effect", "data sheet"),
+        (replace(BEYOND, held_out=held_out(after=0.3), published=ABOVE, full=INSIDE), "missing_effect", "data sheet"),
         (STAGED, "left_by_method", "the method staged leaves the rest"),
         (replace(STAGED, filtered=True), "left_by_method", "the method staged and the filter leave the rest"),
         (replace(STAGED, filtered=True, method="reference_least_squares"), "left_by_method", "the filter, which"),
