@@ -11,6 +11,7 @@ import pytest
 
 from pipeline import load_calibration
 from pipeline.exports import export
+from pipeline.model.compensation import SMOOTHING_S
 from pipeline.model.effects import catalogue, effect
 from pipeline.model.effects.base import Owner
 from pipeline.model.effects.files import effect_from
@@ -106,11 +107,11 @@ def document(effects: dict[str, dict[str, float]]) -> dict[str, Any]:
 
 
 def samples(n: int = 300) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Specific force, angular rate, temperature, time; at rest in between."""
+    """Specific force, angular rate, temperature, time; at rest in between, and over the end of a stretch of time."""
     rng = np.random.default_rng(8)
     rate = rng.uniform(-200, 200, (n, 3))
     rate[100:130] = [1.7, -0.9, 0.4]
-    time = 3.0 + 0.01 * np.arange(n) + 1e-3 * rng.uniform(size=n)
+    time = 4.0 * SMOOTHING_S - 1.5 + 0.01 * np.arange(n) + 1e-3 * rng.uniform(size=n)
     return rng.uniform(-1.5, 1.5, (n, 3)), rate, 30.0 + 0.5 * time + 0.1 * rng.standard_normal(n), time
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from mcap.writer import Writer
 from pipeline.errors import IngestError
 from pipeline.io.mcap import read_mcap
 from pipeline.io.mcap_settings import mcap_format
+from pipeline.io.timestamps import of_number
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -49,6 +51,14 @@ def read(
         writer.finish()
     topics = {"/imu": {**FIELDS, "time": {"field": "t", "unit": unit}}}
     return read_mcap(path / "log.mcap", mcap_format({"mcap": {"topics": topics, **mcap}}))
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("s", 10**9), ("ms", 10**6), ("us", 10**3)])
+def test_a_moment_that_is_a_double_is_rounded_to_the_nearest_nanosecond(unit: str, scale: int) -> None:
+    moments = np.float64(EPOCH / scale) + np.random.default_rng(2).uniform(-5.0, 5.0, 200)
+    expected = [round(Fraction(moment) * scale) for moment in moments.tolist()]
+    assert of_number(moments, unit).tolist() == expected
+    assert of_number(-moments, unit).tolist() == [-t for t in expected]
 
 
 def test_nanoseconds_since_1970_keep_their_last_digit(tmp_path: Path) -> None:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from bench_session import K, Session, record
+from scipy.spatial.transform import Rotation
 
 from pipeline.errors import ConfigurationError, InputError
 from pipeline.model.effects import effect
@@ -95,6 +98,27 @@ def test_backlash_puts_the_angle_behind_in_the_direction_of_the_turn() -> None:
         added = effect("table_backlash").reading("accelerometer", motion, ONE, np.array([0.1, 0.0, 0.0]))
         angle = np.radians(motion.angle - 0.1 * np.sign(rate))
         np.testing.assert_allclose((motion.specific_force + added)[:, 1], np.sin(angle), atol=2e-6)
+
+
+@pytest.mark.parametrize("up", ["", "+z", "-z"])
+def test_a_leaning_turn_axis_turns_gravity_about_itself(up: str) -> None:
+    recording, lean = replace(turn("z"), up=up), np.array([0.05, -0.03])
+    motion, values = reference_motion(recording), np.concatenate([np.zeros(4), lean])
+    added = effect("table_axis_nonorthogonality").reading("accelerometer", motion, ONE, values)
+    axis = np.append(np.radians(lean), 1.0)  # what the two body axes after z, x and y, add to it
+    back = Rotation.from_rotvec(np.outer(-np.radians(motion.angle), axis / np.linalg.norm(axis)))
+    expected = back.apply(motion.specific_force[0])
+    np.testing.assert_allclose(motion.specific_force + added, expected, atol=3e-6)  # of second order
+
+
+@pytest.mark.parametrize("name", ["validation", "gyro_x"])
+def test_the_rate_of_the_specific_force_is_its_derivative(name: str) -> None:
+    recording = next(r for r in record(Session(1)) if r.name == name)
+    motion = reference_motion(recording)
+    assert motion is not None
+    slope = np.gradient(motion.specific_force, motion.time, axis=0)
+    assert np.abs(slope).max() > 0.3
+    assert np.percentile(np.abs(motion.specific_force_rate - slope), 90.0) < 0.01 * np.abs(slope).max()
 
 
 def test_direction_of_a_step_between_samples_is_kept_at_rest() -> None:

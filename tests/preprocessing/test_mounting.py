@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from benches import BIAS, INTERVAL_S, Setup, recordings_of, settings_of
+from benches import BIAS, INTERVAL_S, RATE, Setup, recordings_of, settings_of
 from benches import K as TRUE_K
 from scipy.spatial.transform import Rotation
 
@@ -201,6 +201,19 @@ def test_a_vertical_turn_axis_is_stated_or_refused() -> None:
         assert np.max(np.abs(reading - BIAS["accelerometer"] - force @ TRUE_K["accelerometer"].T)) < 5 * 8e-4
     with pytest.raises(IngestError, match="about a vertical axis gravity does not turn"):
         check_mounting(recordings_of(upright)[:1], {"procedure": {"recordings": {"accel_x": {"up": "+x"}}}})
+
+
+@pytest.mark.parametrize("up", ["+x", ""])
+@pytest.mark.parametrize("sense", [1, -1])
+def test_where_gravity_does_not_turn_the_gyroscope_tells_the_sense(up: str, sense: int) -> None:
+    recording = Setup("x", up, sense).recording("gyroscope")
+    if not up:
+        recording = replace(recording, accelerometer=None)
+    (checked,) = check_mounting([recording], {"procedure": {"recordings": {"gyro_x": {"up": up, "sense": sense}}}})
+    assert checked.table_rate == pytest.approx(RATE)
+    with pytest.raises(IngestError, match=f"gyro_x.sense={sense}") as caught:
+        check_mounting([recording], {"procedure": {"recordings": {"gyro_x": {"up": up, "sense": -sense}}}})
+    assert caught.value.code == "wrong_sense"
 
 
 def test_what_a_short_arc_does_not_tell_is_said_and_not_guessed() -> None:

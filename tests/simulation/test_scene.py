@@ -93,6 +93,7 @@ def test_effects_of_timing_and_of_the_table_in_python_have_exact_geometry() -> N
     physical = {name: kind for name, kind in catalogue().items() if kind.owner in (Owner.MOUNTING, Owner.TABLE)}
     in_python = {name for name, kind in physical.items() if not isinstance(kind, FormulaEffect)}
     assert in_python <= set(ALTERATIONS) <= set(physical)
+    assert set(ALTERATIONS) == set(SIZES)
 
 
 @pytest.mark.parametrize("name", sorted(ALTERATIONS))

@@ -146,6 +146,13 @@ def test_noise_floor_is_the_error_that_noise_alone_leaves(sensor: str, settings:
     assert part["vector_noise_floor"] == pytest.approx(np.sqrt(np.mean(vectors)), rel=0.003 + 3.0 * spread)
 
 
+def test_the_floor_of_vectors_is_the_trace_of_their_covariance() -> None:
+    matrix, white = np.array([[1.0, 0.3, 0.0], [0.0, 1.0, 0.2], [0.0, 0.0, 1.0]]), np.array([1e-3, 3e-3, 9e-3])
+    c = replace(calibration("accelerometer"), matrix=matrix)
+    part = validate(c, [read(held_out(300), accelerometer=c)], Noise(white, np.zeros(3), 100.0, "static"), SETTINGS)
+    assert part["vector_noise_floor"] ** 2 == pytest.approx(np.trace(matrix * white**2 @ matrix.T), rel=1e-9)
+
+
 @pytest.mark.parametrize("sensor", SENSORS)
 def test_a_perfect_calibration_leaves_the_floor(sensor: str) -> None:
     c, recording = calibration(sensor), held_out(2000, calm=30.0)

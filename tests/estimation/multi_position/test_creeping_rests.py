@@ -11,6 +11,7 @@ from pipeline.estimation.multi_position.rests import rests_of
 from pipeline.records import Recording, SensorCalibration
 
 NOISE = 5e-4
+TICK = 0.00996  # s; rounded to ms, one step in 25 is 9 ms and the others 10 ms
 
 
 def set_down(creep_deg: float, seed: int = 3) -> Recording:
@@ -56,7 +57,7 @@ def turning(time: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("kind", ["rounded", "late", "irregular", "dropped"])
 def test_the_readings_tell_whether_stamps_or_a_regular_clock_are_right(kind: str) -> None:
-    rng, regular = np.random.default_rng(1), 0.009999 * np.arange(400)
+    rng, regular = np.random.default_rng(1), TICK * np.arange(400)
     true = regular + 2e-3 * rng.random(400) if kind == "irregular" else regular
     true = np.delete(true, 200) if kind == "dropped" else true
     late = 3e-3 * rng.random(len(true)) * (np.arange(len(true)) % 3 != 2)
@@ -65,4 +66,19 @@ def test_the_readings_tell_whether_stamps_or_a_regular_clock_are_right(kind: str
     if kind in {"irregular", "dropped"}:
         assert np.array_equal(found, stamps)
     else:
-        assert np.abs(np.diff(found) - 0.009999).max() < 1e-5
+        assert np.abs(np.diff(found) - TICK).max() < 1e-5
+
+
+def test_where_the_readings_do_not_tell_only_stamps_that_a_file_rounds_are_regular() -> None:
+    rng, regular = np.random.default_rng(1), TICK * np.arange(400)
+    resting = NOISE * rng.standard_normal((400, 3))
+    late = regular + 3e-3 * rng.random(400) * (np.arange(400) % 3 != 2)
+    for stamps, expected in ((np.round(regular, 3), regular), (late, late)):
+        (found,) = clocks_of(stamps, resting, [slice(0, 400)], np.full(3, NOISE))
+        assert np.abs(np.diff(found) - np.diff(expected)).max() < 1e-5
+
+
+def test_a_rest_lasts_from_its_first_sample_to_the_interval_after_its_last() -> None:
+    felt = rests_of("accelerometer", [set_down(0.0)], {"procedure": {"holdout_every": 0}})
+    assert felt is not None
+    assert felt.length == pytest.approx(0.01 * np.diff(felt.span)[:, 0])
