@@ -79,8 +79,10 @@ class Layout:
             table = self.parse(body, dict.fromkeys(wanted, pa.float64()))
         except pa.ArrowInvalid:
             return None
-        found: dict[int, NDArray[np.float64]] = {i: table.column(str(i)).to_numpy() for i in wanted}
-        valid = table.num_rows == rows and all(bool(np.isfinite(values).all()) for values in found.values())
+        columns = [table.column(str(i)).combine_chunks() for i in wanted]
+        values = [np.asarray(np.from_dlpack(c), np.float64) for c in columns]  # to_numpy would import pandas: 0.25 s
+        found = dict(zip(wanted, values, strict=True))
+        valid = table.num_rows == rows and all(bool(np.isfinite(v).all()) for v in values)
         return found if valid else None
 
     def _quoted_numbers(self, body: bytes) -> bool:

@@ -74,13 +74,17 @@ def check_static(recordings: Sequence[Recording], settings: Mapping[str, Any]) -
     IngestError
         If too little of it rests.
     """
-    sheets = settings.get("sensor") or {}
+    if all(r.role != "static" for r in recordings):
+        return list(recordings)
+    sheets, rests = settings.get("sensor") or {}, _rests_of(recordings)
     return [
-        _doubted(_resting(r, recordings, settings), recordings, sheets) if r.role == "static" else r for r in recordings
+        _doubted(_resting(r, rests, sheets), recordings, rests, sheets) if r.role == "static" else r for r in recordings
     ]
 
 
-def _doubted(recording: Recording, recordings: Sequence[Recording], sheets: Mapping[str, Any]) -> Recording:
+def _doubted(
+    recording: Recording, recordings: Sequence[Recording], rests_of: Mapping[str, Array], sheets: Mapping[str, Any]
+) -> Recording:
     """Return a static recording, with the note ``N-REFERENCE`` where it contradicts the rests of the others."""
     others = [r for r in recordings if r.role != "static" and r.samples > 1]
     if recording.samples < FEWEST_SAMPLES or not others:
@@ -89,7 +93,9 @@ def _doubted(recording: Recording, recordings: Sequence[Recording], sheets: Mapp
     faster, slower = np.sqrt(max(1.0, intervals.max())), np.sqrt(max(1.0, 1.0 / intervals.min()))
     details = []
     for sensor in SENSORS:
-        reading, rests = recording.reading(sensor), _rests_of(recordings, sensor)
+        reading, rests = recording.reading(sensor), rests_of[sensor]
+        if not len(rests):
+            rests = _rests_by_hand(recordings, sensor)
         if reading is None or not len(rests) or not len(blocks := _blocks(recording, reading)):
             continue
         step = np.abs(np.diff(reading, axis=0))
@@ -142,7 +148,7 @@ def _blocks(recording: Recording, reading: Array) -> Array:
     return reading[: count * size].reshape(count, size, 3)
 
 
-def _resting(recording: Recording, recordings: Sequence[Recording], settings: Mapping[str, Any]) -> Recording:
+def _resting(recording: Recording, rests_of: Mapping[str, Array], sheets: Mapping[str, Any]) -> Recording:
     size = max(FEWEST_OF_BLOCK, round(BLOCK_S / recording.interval)) if recording.samples > 1 else FEWEST_OF_BLOCK
     count = recording.samples // size
     if count < 2:
@@ -157,8 +163,8 @@ def _resting(recording: Recording, recordings: Sequence[Recording], settings: Ma
         reading = recording.reading(sensor)
         if reading is None:
             continue
-        sheet = (settings.get("sensor") or {}).get(sensor) or {}
-        found, what = _moving(recording, sensor, reading[: count * size].reshape(count, size, 3), sheet, recordings)
+        blocks = reading[: count * size].reshape(count, size, 3)
+        found, what = _moving(recording, sensor, blocks, sheets.get(sensor) or {}, rests_of[sensor])
         why = why or (what if found.any() else "")
         moving |= found
     if not moving.any():
@@ -186,7 +192,7 @@ def _resting(recording: Recording, recordings: Sequence[Recording], settings: Ma
 
 
 def _moving(
-    recording: Recording, sensor: str, blocks: Array, sheet: Mapping[str, Any], recordings: Sequence[Recording]
+    recording: Recording, sensor: str, blocks: Array, sheet: Mapping[str, Any], rests: Array
 ) -> tuple[NDArray[np.bool_], str]:
     """Return which blocks a sensor moves in, and the largest sign of it in words."""
     unit = "g" if sensor == "accelerometer" else "deg/s"
@@ -194,7 +200,6 @@ def _moving(
     usual, middle = np.percentile(scatter, [25.0, 50.0], axis=0)
     spread = np.minimum(np.log(middle / np.maximum(usual, np.finfo(float).tiny)) / QUARTER_SIZE, WIDEST)
     louder = np.maximum(LOUDER, np.exp((QUARTER_SIZE + UNUSUAL) * spread))
-    rests = _rests_of(recordings, sensor, by_hand=False)
     white = float(sheet.get("noise_density") or 0.0) * np.sqrt(0.5 / recording.interval)
     if len(rests):
         usual = np.minimum(usual, OF_RESTS * np.maximum(np.median(rests[:, 0], axis=0), white))
@@ -226,37 +231,38 @@ def _slow(sheet: Mapping[str, Any], change: float, duration: float) -> float:
     )
 
 
-def _rests_of(recordings: Sequence[Recording], sensor: str, *, by_hand: bool = True) -> Array:
-    """Return ``_moments`` of the rests of the other recordings: (k, 3, 3) array; k = 0 where there are none.
-
-    They are rests of the table's log; where there are none, ``by_hand`` takes the quietest tenth of recordings by hand,
-    whose mean is not known (NaN).
-    """
-    found = []
+def _rests_of(recordings: Sequence[Recording]) -> dict[str, Array]:
+    """Return for each sensor ``_moments`` of the rests of the table's log: (k, 3, 3) array; k = 0 without any."""
+    found: dict[str, list[Array]] = {sensor: [np.zeros((0, 3, 3))] for sensor in SENSORS}
     for recording in recordings:
-        reading = recording.reading(sensor)
-        if reading is None or recording.role == "static" or recording.axis is None:
+        if recording.role == "static" or recording.axis is None:
             continue
         rests = [piece for piece in _still_rows(recording) if len(piece) >= FEWEST_OF_REST]
-        found += [_moments(reading[None, rows]) for rows in rests[:: len(rests) // RESTS + 1]]
-    if not found and by_hand:
-        for recording in recordings:
-            reading = recording.reading(sensor) if recording.role == "rests" else None
-            if reading is None or len(blocks := _blocks(recording, reading)) < 10:
-                continue
-            scatter, white, _ = np.percentile(_moments(blocks), 10.0, axis=0)
-            found.append(np.stack([scatter, white, np.full(3, np.nan)])[None])
-    return np.concatenate(found) if found else np.zeros((0, 3, 3))
+        for sensor in SENSORS:
+            reading = recording.reading(sensor)
+            if reading is not None:
+                found[sensor] += [_moments(reading[None, rows]) for rows in rests[:: len(rests) // RESTS + 1]]
+    return {sensor: np.concatenate(moments) for sensor, moments in found.items()}
+
+
+def _rests_by_hand(recordings: Sequence[Recording], sensor: str) -> Array:
+    """Return ``_moments`` of the quietest tenth of each recording by hand, whose mean is not known (NaN)."""
+    found = [np.zeros((0, 3, 3))]
+    for recording in recordings:
+        reading = recording.reading(sensor) if recording.role == "rests" else None
+        if reading is None or len(blocks := _blocks(recording, reading)) < 10:
+            continue
+        scatter, white, _ = np.percentile(_moments(blocks), 10.0, axis=0)
+        found.append(np.stack([scatter, white, np.full(3, np.nan)])[None])
+    return np.concatenate(found)
 
 
 def _still_rows(recording: Recording) -> list[NDArray[np.intp]]:
     """Return the rows of each rest of the table's log, cut where the table stepped between two samples."""
-    found = []
-    for rest in rests_from_table(recording):
-        rows = np.arange(rest.start, rest.stop)
-        angle = np.zeros(len(rows)) if recording.table_angle is None else recording.table_angle[rows]
-        found += np.split(rows, np.flatnonzero(np.abs(np.diff(angle)) > STEPPED_DEG) + 1)
-    return found
+    rows = np.concatenate([np.arange(0), *(np.arange(r.start, r.stop) for r in rests_from_table(recording))])
+    angle = np.zeros(len(rows)) if recording.table_angle is None else recording.table_angle[rows]
+    stepped = np.abs(np.diff(angle)) > STEPPED_DEG
+    return np.split(rows, np.flatnonzero((np.diff(rows) > 1) | stepped) + 1)
 
 
 def _moments(blocks: Array) -> Array:
