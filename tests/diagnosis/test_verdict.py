@@ -46,6 +46,8 @@ def held_out(after: float) -> dict[str, float]:
         (replace(MISSING, published=ABOVE, full=ABOVE, left_over_noise=3.0), "unexplained", "3 times the noise"),
         (replace(MISSING, published=BELOW), "missing_effect", ""),
         (replace(MISSING, doubts=("validation: off",)), "reference_in_doubt", "validation: off"),
+        (replace(MISSING, doubts=("off",), published=ABOVE, full=INSIDE), "reference_in_doubt", "reference: off"),
+        (replace(NOTHING, doubts=("off",), found="unexplained"), "reference_in_doubt", "reference: off"),
         (replace(NOTHING, found="unexplained", published=ABOVE), "unexplained", "at most 1.2 deg/s"),
         (replace(NOTHING, found="unexplained"), "unexplained", "1 times the noise"),
         (replace(NOTHING, found="unexplained", unknown=("time",)), "unexplained", "depends on time"),

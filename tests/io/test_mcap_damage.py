@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from io import BytesIO
 from typing import TYPE_CHECKING
 
 import pytest
-from damaged_logs import RECORDERS, Tally, cuts, flips, log_of, messages_of, same_bits, table_of
+from damaged_logs import RECORDERS, Tally, cuts, flips, log_of, messages_of, read_messages, same_bits, table_of
+from mcap.writer import Writer
 
 from pipeline.errors import IngestError
 
@@ -53,6 +55,26 @@ def test_cut_log_gives_its_complete_chunks_on_request(tmp_path: Path, recorder: 
         assert same_bits(table, replace(truth, time_ns=truth.time_ns[:rows], values=beginning))
     assert len(kept) > 5
     assert max(kept) == len(truth.time_ns)  # of a file that has lost nothing but its end
+
+
+@pytest.mark.parametrize("of_channel", [False, True])
+@pytest.mark.parametrize("change", [-1, 1])
+def test_a_summary_that_counts_other_messages_is_refused(change: int, *, of_channel: bool) -> None:
+    stream = BytesIO()
+    writer = Writer(stream)
+    writer.start()
+    channel = writer.register_channel("/imu", "json", 0)
+    for n in range(5):
+        writer.add_message(channel, n, b"{}", n)
+    counts = writer._Writer__statistics  # type: ignore[attr-defined]
+    if of_channel:
+        counts.channel_message_counts[channel] += change
+    else:
+        counts.message_count += change
+        counts.channel_message_counts.clear()
+    writer.finish()
+    with pytest.raises(IngestError, match=rf"the summary says {5 if of_channel else 5 + change} messages"):
+        read_messages(stream.getvalue())
 
 
 def test_cut_log_without_chunks_is_refused_even_on_request(tmp_path: Path) -> None:

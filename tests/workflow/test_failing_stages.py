@@ -13,7 +13,7 @@ import pytest
 from pipeline import results_folder
 from pipeline.config import load_campaign, settings_file
 from pipeline.config.campaign import Campaign
-from pipeline.stages import batch, gather
+from pipeline.stages import batch, gather, verdict
 from pipeline.stages import report as report_stage
 
 STAGES = ("ingest", "filter", "fit", "calibration", "validate", "diagnose", "export", "report", "gather")
@@ -104,6 +104,21 @@ def test_a_fault_in_any_stage_fails_its_unit_alone(published: tuple[Campaign, Pa
         assert unit in index
         assert not any((results / f / f"{unit}.json").exists() for f in ("validations", "diagnoses", "certificates"))
         assert not (results / "exports" / unit).exists()
+
+
+def test_a_run_with_failed_units_ends_with_1_and_names_each(
+    published: tuple[Campaign, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mark = tmp_path / "complete.json"
+    given = ["--results", str(published[1]), "--output", str(mark), "--failures"]
+    assert verdict.main([*given, str(published[1] / "batches" / "gathered.json")]) == 1
+    said = capsys.readouterr().err
+    assert all(f"  at_{stage}: " in said for stage in STAGES)
+    assert "good" not in said
+    assert not mark.exists()
+    (tmp_path / "none.json").write_text("[]")
+    assert verdict.main([*given, str(tmp_path / "none.json")]) == 0
+    assert mark.exists()
 
 
 def contents(results: Path) -> dict[str, bytes]:

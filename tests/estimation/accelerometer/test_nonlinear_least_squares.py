@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from pipeline.errors import CannotCalibrateError, NotObservableError
-from pipeline.estimation.accelerometer.ellipsoid_fit import derivative_of, error_of
+from pipeline.estimation.accelerometer.ellipsoid_fit import derivative_of, error_of, fit_ellipsoid
 from pipeline.estimation.accelerometer.nonlinear_least_squares import fit
+from pipeline.estimation.accelerometer.orientations import Orientations
 from pipeline.estimation.correction import apply_correction
 from pipeline.estimation.rest_means import held_out_rests, rest_means
 from pipeline.records import Recording, SensorCalibration, StageResult, coverage_factor
@@ -210,24 +211,12 @@ def test_earlier_stages_are_kept_and_the_result_survives_its_file() -> None:
 
 
 def test_noise_within_a_rest_does_not_lengthen_gravity() -> None:
-    """Noise across a vector lengthens it by s^2 / G: 0.4 mg for single samples of 20 mg."""
-    rng = np.random.default_rng(8)
-    turns = _continuous(rng)
-    noisy = [
-        Recording(
-            r.name,
-            r.role,
-            r.axis,
-            r.time_ns,
-            accelerometer=np.asarray(r.accelerometer) + 0.02 * rng.normal(size=(1000, 3)),
-            table_angle=r.table_angle,
-            table_rate=r.table_rate,
-        )
-        for r in turns
-    ]
-    calibration = fit(noisy, None, _settings())
-    scale = np.diag(calibration.matrix) / np.diag(MATRIX)
-    assert np.mean(scale) - 1.0 == pytest.approx(0.0, abs=3 * 0.02 / np.sqrt(3000.0))
+    """The mean of 4 samples with noise of 0.1 g has the variance 0.0025 along each of both directions across it."""
+    mean, four = np.sqrt(0.998**2 + 2.0 * 0.0025) * _spread(24), np.full(24, 4)
+    rests = Orientations(mean, four, 0.1, (), np.zeros(0, np.intp), by_hand=True, rests=(), held_out=(), left_out=())
+    found = fit_ellipsoid(rests, 0.998, np.ones(9, np.bool_))
+    assert found.matrix == pytest.approx(np.eye(3), abs=1e-9)
+    assert found.bias == pytest.approx(np.zeros(3), abs=1e-9)
 
 
 def test_a_rest_that_contradicts_the_others_is_left_out_with_its_reason() -> None:
