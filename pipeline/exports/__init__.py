@@ -15,13 +15,13 @@ extend.
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
 import yaml
 from jinja2 import Environment, StrictUndefined, Template
-from pydantic import BaseModel, ConfigDict
 
 from pipeline.exports.c_effects import plan_of
 from pipeline.exports.sensors import FUNCTIONS, ExportedSensor, before_use, final_errors, missing, plain
@@ -32,7 +32,8 @@ TEMPLATES = Path(__file__).parent / "templates"
 Matrix = Literal["full", "diagonal", "none"]
 
 
-class Format(BaseModel):
+@dataclass(frozen=True, kw_only=True)
+class Format:
     """What a format can hold.
 
     Attributes
@@ -59,22 +60,20 @@ class Format(BaseModel):
         Sensor to file name, where each sensor has a file of its own.
     """
 
-    model_config = ConfigDict(extra="forbid")
-
     consumer: str
     equation: str
     source: str
     units: dict[str, Literal["g", "m/s^2", "deg/s", "rad/s"]]
-    needs: list[str] = []
-    needs_counts: list[str] = []
-    matrix: dict[str, Matrix] = {}
-    holds: list[str] = []
-    approximates: dict[str, str] = {}
+    needs: list[str] = field(default_factory=list)
+    needs_counts: list[str] = field(default_factory=list)
+    matrix: dict[str, Matrix] = field(default_factory=dict)
+    holds: list[str] = field(default_factory=list)
+    approximates: dict[str, str] = field(default_factory=dict)
     says: list[str]
-    adds: list[str] = []
-    adds_with_temperature: list[str] = []
+    adds: list[str] = field(default_factory=list)
+    adds_with_temperature: list[str] = field(default_factory=list)
     errors: str | None = None
-    files: dict[str, str] = {}
+    files: dict[str, str] = field(default_factory=dict)
 
 
 @cache
@@ -133,7 +132,7 @@ def export(
     """Return the files of one format, by name: none where it can hold nothing of this unit."""
     declared, template = formats()[name]
     if declared.files:
-        parts = {file: declared.model_copy(update=_alone(declared, s)) for s, file in declared.files.items()}
+        parts = {file: replace(declared, **_alone(declared, s)) for s, file in declared.files.items()}
     else:
         parts = {name: declared}
     texts = {file: _rendered(part, template, calibration, settings, validation) for file, part in parts.items()}

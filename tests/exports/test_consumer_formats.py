@@ -2,15 +2,17 @@
 
 import json
 import re
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
+from pydantic import TypeAdapter
 
 from pipeline import load_calibration
-from pipeline.exports import export_all, formats
+from pipeline.exports import Format, export_all, formats
 from pipeline.records import SENSORS, FittedEffect, SensorCalibration
 
 G0, RADIAN = 9.80665, np.pi / 180.0
@@ -256,3 +258,9 @@ def test_every_format_says_what_it_leaves_out(tmp_path: Path) -> None:
             path = tmp_path / declared.files.get("accelerometer", name)
             assert "Left out of this format, accelerometer: quadratic_nonlinearity" in path.read_text(), path.name
     assert len(formats()) < len(list(tmp_path.iterdir()))
+
+
+def test_the_declarations_of_the_formats_have_their_types() -> None:
+    adapter = TypeAdapter(Format)
+    for name, (declared, _) in formats().items():
+        assert adapter.validate_python(asdict(declared)) == declared, name

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import re
 import sys
+from dataclasses import replace
 from functools import cache, partial
 from importlib import import_module
 from importlib.abc import ExecutionLoader
@@ -117,7 +118,7 @@ def effect_from(
     if declared.name in built_in_files():
         place = f"{where}:{line}" if (line := lines().get(("name",))) else where
         raise ConfigurationError(f"name: a built-in effect is called {declared.name}; give yours another name", place)
-    own = declared.model_copy(update={"source": declared.source or f"the user's own, {where}"})
+    own = replace(declared, source=declared.source or f"the user's own, {where}")
     source = {**definition, "sensors": list(declared.sensors)}
     return FormulaEffect(own, source | ({"axes": list(declared.axes)} if "axes" in definition else {}))
 

@@ -220,7 +220,8 @@ def _fill(out: NDArray[np.float64], formula: Formula, signals: dict[str, Any]) -
 
 def _formula_of(term: Term, axis: int) -> Formula:
     """Return the formula of a term for one axis."""
-    return term.formula.of[AXES[axis]] if AXES[axis] in term.formula.of else term.formula.of[""]
+    formulas: dict[str, Formula] = term.formula.of
+    return formulas[AXES[axis]] if AXES[axis] in formulas else formulas[""]
 
 
 def _layout(declared: Declaration) -> Layout:
