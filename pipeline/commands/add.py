@@ -30,11 +30,12 @@ EPILOG = """\
 examples:
   python -m pipeline add demo mpu6050-2-hidden gyroscope.g_sensitivity
   python -m pipeline add my_bench U1 gyroscope.g_sensitivity accelerometer.lever_arm --no-run
-  python -m pipeline add my_fleet --missing                 each unit gets what its own diagnosis found to be missing
-  python -m pipeline add my_fleet --missing g_sensitivity   only this effect, in the units that miss it
+  python -m pipeline add my_fleet --missing                 to each unit, the missing effects of its own diagnosis
+  python -m pipeline add my_fleet --missing g_sensitivity   only this effect, in the units where it is missing
   python -m pipeline remove demo mpu6050-2-hidden gyroscope.g_sensitivity
 
-The effects of units.csv and of the command line are stronger than the file: they are refused with the place to edit.
+Effects that are set in units.csv or on the command line override the file: the command is then refused, and names the
+place to edit.
 """
 
 
@@ -46,7 +47,7 @@ def main(argv: Sequence[str]) -> int:
         nargs="?",
         const="",
         metavar="EFFECT",
-        help="add to every unit what the results of the last run say is missing (or only EFFECT of it)",
+        help="add to every unit the effects that are missing by the last run (or only EFFECT)",
     )
     return change(parser.parse_args(argv), remove=False)
 
@@ -104,7 +105,7 @@ def _wanted(arguments: argparse.Namespace, campaign: str) -> dict[str, list[tupl
     found = {row["unit"]: _missing(row, missing) for row in read_summary(folder)}
     found = {unit: effects for unit, effects in found.items() if effects}
     if not found:
-        raise ConfigurationError(f"no unit misses {missing or 'an effect'}", str(file))
+        raise ConfigurationError(f"{missing or 'an effect'} is missing in no unit", str(file))
     return found
 
 

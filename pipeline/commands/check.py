@@ -1,4 +1,4 @@
-"""Print what ingest makes of a file, and propose a profile for one that it does not know."""
+"""Print the content, notes and refusals of a file at ingest; propose a profile for an unknown text log."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ SEARCHED_BYTES = 1 << 25  # of a log, for its layout
 SEARCHED_FOLDERS = 4  # the log's, and a campaign's above raw/<unit>/
 UNKNOWN_LAYOUT = ("missing_column", "no_header")
 EPILOG = """\
-A file of a campaign is read as the campaign's configuration says, any other with --ingest (canonical_csv) and, where
---sensor is given, with its full scale. Nothing is written but what --save asks for.
+A file of a campaign is read by the campaign's configuration. Any other file is read by the profile --ingest (default:
+canonical_csv) and, with --sensor, the full scale of that sensor. Only --save writes a file.
 
-For a text log that the profile does not describe, a profile is proposed: each line with its evidence, and ???
-where you have to decide. It is never applied unasked: read it, save it, and name it.
+For a text log that the profile does not describe, a profile is proposed, with the evidence for each line and ??? where
+you must decide. A run uses it only after you save it and name it in the configuration.
 
 examples:
   python -m pipeline check log.csv
@@ -53,13 +53,13 @@ examples:
   python -m pipeline check raw/*.mcap --sensor mpu6050
   snakemake --cores 2 --config campaign=my_bench 'overrides=[ingest=my_logger]'
 
-exit code: 0 if ingest reads every file, 2 if it refuses one or does not know its layout.
+exit code: 0 if ingest reads every file, 2 if a file is refused or its layout is unknown.
 """
 
 
 @dataclass
 class Reading:
-    """Files that are read as one recording, and the sections of a configuration that say how."""
+    """Files that are read as one recording, and the sections of the configuration by which they are read."""
 
     files: list[Path]
     settings: dict[str, Any]
@@ -90,7 +90,7 @@ def main(argv: Sequence[str]) -> int:
     if unknown:
         _print_proposals(propose(unknown), refused[0][0].settings["sensor"], arguments.save)
     elif arguments.save:
-        print(f"{arguments.save} was not written: there is nothing to propose")
+        print(f"{arguments.save} was not written: no profile is proposed")
     sys.stdout.flush()
     for reading, error in refused:
         print(f"python -m pipeline check: {error.file or reading.files[0]}: refused ({error.code})", file=sys.stderr)
@@ -146,7 +146,7 @@ def _grouped(files: Sequence[Path], parts: Sequence[str]) -> list[list[Path]]:
         patterns = [re.escape(p).replace(re.escape(FILE), "(.+)") for p in parts]
         found = next((m for p in patterns if (m := re.fullmatch(p, file.name))), None)
         if found is None:
-            raise ConfigurationError(f"suits none of the profile's parts ({', '.join(parts)})", str(file))
+            raise ConfigurationError(f"matches none of the profile's parts ({', '.join(parts)})", str(file))
         stem = found.group(1) if found.groups() else ""
         groups[file.parent / stem] = [file.parent / p.replace(FILE, stem) for p in parts]
     return list(groups.values())
@@ -216,7 +216,7 @@ def _composed(profile: str, sensor: str | None, campaign: Path | None) -> tuple[
 
 
 def _print_facts(reading: Reading) -> PipelineError | None:
-    """Print what ingest makes of files, and return its refusal."""
+    """Print content and notes of a recording, or its refusal, which is returned."""
     settings = reading.settings
     ((name, entry),) = settings["procedure"]["recordings"].items()
     print(f"{', '.join(map(str, reading.files))}\n  {'read with':<16}{reading.said}")
@@ -265,7 +265,7 @@ def _layouts(reading: Reading, error: PipelineError) -> list[TextLayout]:
 
 
 def _print_proposals(proposals: Sequence[Proposal], sensor: dict[str, Any], save: Path | None) -> None:
-    """Print the proposed profiles, what they would make of the files, and save the only one."""
+    """Print each proposed profile and the files as it reads them; with ``save``, write the only one."""
     if save is not None and len(proposals) > 1:
         raise ConfigurationError(f"{len(proposals)} profiles are proposed and --save writes one: check fewer files")
     name = "my_logger" if save is None else save.stem
@@ -283,12 +283,12 @@ def _print_proposals(proposals: Sequence[Proposal], sensor: dict[str, Any], save
             print(f"Fill in {UNKNOWN} for {', '.join(proposal.unknown())}.")
         if save is not None:
             write_atomically(save, text)
-            print(f"Saved as {save}; nothing uses it yet.")
+            print(f"Saved as {save}. No configuration uses it yet.")
         print(NEXT.format(name=name))
 
 
 NEXT = """\
-If every line is right, save it (--save FILE) in configs/ingest/{name}.yaml of your campaign, and look once more with
-python -m pipeline check FILE --ingest {name}; a run uses it with the override ingest={name} or by the column
-ingest of units.csv.
+If every line is right, save it (--save FILE) as configs/ingest/{name}.yaml of your campaign, and check it by
+python -m pipeline check FILE --ingest {name}. A run uses it with the override ingest={name}, or with {name} in the
+column ingest of units.csv.
 """

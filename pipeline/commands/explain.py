@@ -23,7 +23,7 @@ JSON = dict[str, Any]
 
 
 class Selection(NamedTuple):
-    """What is explained: diagnoses and failures by unit, settings of the last run, folder of all results."""
+    """Diagnoses and failures by unit, settings of the last run, folder of all results."""
 
     files: dict[str, Path]
     failures: dict[str, JSON]
@@ -53,7 +53,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def find(campaign: str, units: Sequence[str], results: Path) -> Selection:
-    """Return the diagnoses and failures meant.
+    """Return the diagnoses and failures of the units.
 
     Raises
     ------
@@ -143,12 +143,12 @@ def _held_out(part: JSON | None) -> list[str]:
     if not part or not part["steps"]:
         return []
     error, floor, unit = part["steps"][-1]["rms_error"], part["noise_floor"], part["unit"]
-    ratio = f", {error / floor:.3g} times what noise alone leaves" if floor else ""
-    return [f"As calibrated in this run, held-out motion errs by {error:.3g} {unit} rms of the magnitude{ratio}."]
+    ratio = f", {error / floor:.3g} times the noise floor" if floor else ""
+    return [f"In this run, the rms error of the magnitude on held-out motion is {error:.3g} {unit}{ratio}."]
 
 
 def _implausible(calibration: JSON) -> str:
-    """Return what in a calibration is far beyond the data sheet."""
+    """Return the parameters of a calibration that are far beyond the data sheet, as lines."""
     return "".join(f"  {line}\n" for sensor in SENSORS for line in sentences(sensor, calibration.get(sensor)))
 
 
@@ -162,7 +162,7 @@ def _beside(diagnosis: Path, folder: str) -> JSON:
 def _diagnosis(file: Path) -> JSON:
     document: JSON = _json(file, "diagnosis")
     if not isinstance(document, dict) or not set(SENSORS) <= set(document):
-        raise InputError("is no diagnosis: it does not speak of accelerometer and gyroscope", str(file))
+        raise InputError("is no diagnosis: the keys accelerometer and gyroscope are missing", str(file))
     return document
 
 

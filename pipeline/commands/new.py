@@ -33,7 +33,7 @@ overrides:
 def main(argv: Sequence[str]) -> int:
     """Run ``python -m pipeline new DIR``."""
     parser = argparse.ArgumentParser(prog="python -m pipeline new", description=__doc__)
-    parser.add_argument("directory", type=Path, metavar="DIR", help="the campaign's directory; made if need be")
+    parser.add_argument("directory", type=Path, metavar="DIR", help="the campaign's directory (created if need be)")
     parser.add_argument("--sensor", default="generic", help="sensor model of the example row (default: generic)")
     parser.add_argument("--table", help="table of the example row (default: that of the procedure)")
     parser.add_argument("--procedure", default="three_axis_turns", help="procedure (default: three_axis_turns)")
@@ -41,7 +41,7 @@ def main(argv: Sequence[str]) -> int:
     arguments = parser.parse_args(argv)
     sheet = arguments.directory / "units.csv"
     if sheet.exists():
-        raise InputError("exists; a campaign is not laid out over another one", str(sheet))
+        raise InputError("exists already; choose a directory without a campaign", str(sheet))
     sensor = _option("sensor", arguments.sensor)
     procedure = _option("procedure", arguments.procedure)
     table_name = arguments.table or procedure["table"]
@@ -54,7 +54,7 @@ def main(argv: Sequence[str]) -> int:
     )
     row = f"{arguments.unit},,,,{arguments.sensor},{table_name},{arguments.procedure},"
     sheet.write_text(f"{HEADER}\n{row}\n", encoding="utf-8")
-    print(f"{sheet}: one row a unit; recordings go to {folder} (its README.md says which)")
+    print(f"{sheet}: one row for each unit; put the recordings into {folder} (its README.md lists them)")
     print(_accuracy(table_name, table))
     print(f"then: {run_command({'campaign': str(arguments.directory)})}")
     return 0
@@ -70,24 +70,24 @@ def _option(group: str, name: str) -> dict[str, Any]:
 
 
 def _accuracy(name: str, table: dict[str, Any]) -> str:
-    """Return which accuracy the results take for granted, and how to state another."""
+    """Return the accuracy of the table that the results assume, and how to state another."""
     if table["motion"] == "none":
-        return f"table {name}: none; the unit is set down or held by hand"
+        return f"table {name}: there is no table; the unit is placed by hand"
     others = ", ".join(sorted(f.stem for f in (CONFIGS / "table").glob("*.yaml") if f.stem != name))
     angle, rate = f"{table['angle_accuracy_deg']:g} deg", f"{100 * table['rate_accuracy']:g} %"
     return (
-        f"table {name}: its angles are taken as right within {angle}, its rates within {rate} (standard uncertainty); "
-        f"for another table, write {others} or a file of your own in configs/table/ into the column table"
+        f"table {name}: accuracy of its angles {angle}, of its rates {rate} (standard uncertainties); "
+        f"for another table, write {others} or the name of your own file in configs/table/ into the column table"
     )
 
 
 def _ranges(name: str, sensor: dict[str, Any]) -> str:
-    """Return how to set other ranges than those of the sensor's file, as comments."""
+    """Return comments that show how to set other ranges than those of the sensor's file."""
     units = {"accelerometer": "g", "gyroscope": "deg/s"}
     held = ", ".join(f"{s} +-{sensor[s]['full_scale']:g} {unit}" for s, unit in units.items())
     lines = [
         "",
-        f"# The sensor {name} is taken at the ranges {held}. For others, twice as large here:",
+        f"# The file of the sensor {name} states the ranges {held}. Example for ranges twice as large:",
         "# models:",
     ]
     lines.append(f"#   {name}:")
@@ -106,9 +106,9 @@ def _recordings(name: str, procedure: dict[str, Any]) -> str:
         lines.append(f"- `{recording['file']}.csv`: {recording['role']}{axis}{optional}")
     columns = "time_s, accel_x_g, accel_y_g, accel_z_g, gyro_x_dps, gyro_y_dps, gyro_z_dps"
     optional = "temperature_degc, table_angle_deg, table_rate_dps, table_qw, table_qx, table_qy, table_qz"
-    lines += ["", f"Columns of a canonical CSV: {columns}, and where known {optional}.", ""]
+    lines += ["", f"Columns of a canonical CSV: {columns}, and optionally {optional}.", ""]
     lines += ["Other columns, units and raw counts: describe them in an ingest config.", ""]
-    lines += ["Which face points up at table angle 0 and which way the angle counts: docs/mounting.md.", ""]
+    lines += ["Face that points up at table angle 0, and direction in which the angle counts: docs/mounting.md.", ""]
     return "\n".join(lines)
 
 

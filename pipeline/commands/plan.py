@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 FILE = "simulation.yaml"
 EPILOG = """\
 For each effect: the smallest size that this procedure would find in half of the units, at the noise of the sensor's
-data sheet; its share of the data sheet's limit; what looks like it; and up to which size it would be taken for that.
+data sheet; its share of the data sheet's limit; effects with a similar signal; and up to which size one of these would
+be named in its place.
 
 examples:
   python -m pipeline plan
@@ -78,18 +79,18 @@ def _parser() -> argparse.ArgumentParser:
         "--from", dest="source", type=Path, default=None, metavar="FILE", help="procedure as a simulation's description"
     )
     add("--campaign", type=Path, default=None, metavar="DIR", help=f"likewise, from DIR/{FILE}")
-    add("--unit", default=None, metavar="NAME", help="which unit of the description (the first)")
+    add("--unit", default=None, metavar="NAME", help="a unit of the description (default: the first)")
     add("--effect", dest="effects", action="append", type=Path, default=[], metavar="FILE",
-        help="an effect of your own (YAML); those of the campaign are read anyway")  # fmt: skip
-    add("--against", default=None, metavar="OPTIONS", help="a second procedure: what differs from the first, in quotes")
+        help="an effect of your own (YAML); those of the campaign are always included")  # fmt: skip
+    add("--against", default=None, metavar="OPTIONS", help="a second procedure: the options that differ, in quotes")
     add("--json", action="store_true", default=False, help="print the plan as JSON")
-    add("--no-extra", dest="extra", action="store_false", default=True, help="leave out what to record more")
+    add("--no-extra", dest="extra", action="store_false", default=True, help="propose no additional recordings")
     add_recording_options(parser)
     return parser
 
 
 def _register_effects(arguments: Mapping[str, Any]) -> None:
-    """Take effects of the user's own among the candidates."""
+    """Add the user's own effects to the candidates."""
     campaign: Path | None = arguments["campaign"]
     beside = sorted((campaign / "effects").glob("*.yaml")) if campaign is not None else []
     for own in read_effect_files([*beside, *arguments["effects"]]).values():

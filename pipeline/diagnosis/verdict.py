@@ -248,9 +248,9 @@ def _beyond(e: Evidence) -> str:
         return ""
     beyond = listed([plain(name) for name in e.implausible])
     return (
-        f"To explain the residual, {beyond} would have to exceed the limits of the sensor's data sheet: a recording of "
-        "another unit, a wrong range or physics beyond the catalogue looks like that. If the sensor is known to exceed "
-        f"its data sheet, set sensor.{e.sensor}.accept_implausible=true."
+        f"To explain the residual, {beyond} would have to exceed the limits of the sensor's data sheet. Possible causes: "
+        "a recording of another unit, a wrong range, an effect that is not in the catalogue. If the sensor is known to "
+        f"exceed its data sheet, set sensor.{e.sensor}.accept_implausible=true."
     )
 
 
@@ -268,9 +268,10 @@ def _why_unexplained(e: Evidence) -> str:
             f"It takes {len(e.selected)} effects together to explain the residual, more than a unit usually has: the "
             "true one may not be in the catalogue."
         )
-    beside = f" beside {names}" if e.selected else ""
+    beside = f" with {names}" if e.selected else ""
     if e.unknown:
-        found.append(f"The residual depends on {listed([plain(n) for n in e.unknown])}{beside} as no effect does.")
+        depends = listed([plain(n) for n in e.unknown])
+        found.append(f"The residual{beside} depends on {depends} in a form that no effect of the catalogue has.")
     left = e.left_over_noise if e.selected else e.over_noise
     if left is not None and (left > EXPLAINED or not found):
         found.append(f"The residual of the fit{beside} is {left:.3g} times the noise.")
@@ -282,18 +283,18 @@ def _within(e: Evidence) -> tuple[str, str]:
     if e.published and e.published.below:
         unit, held = unit_of(e.sensor), e.published
         return "floor_in_doubt", (
-            f"On held-out motion the error is {held.error:.3g} {unit}, less than the noise that was found would leave "
-            f"({held.low:.3g} to {held.high:.3g} {unit}): the noise estimate is too large, and may hide an effect. "
+            f"On held-out motion the error is {held.error:.3g} {unit}, less than by the noise estimate "
+            f"({held.low:.3g} to {held.high:.3g} {unit}): this estimate is too large, and may hide an effect. "
             "Check that the unit did not move in the recording that the noise is taken from."
         )
     if e.on_table and e.found == "nothing_missing" and e.over_noise is not None and e.over_noise < QUIET:
         return "floor_in_doubt", (
-            f"The residual of the fit is {e.over_noise:.2g} times the noise that was found. Noise cannot be larger at "
+            f"The residual of the fit is {e.over_noise:.2g} times the noise estimate. Noise cannot be larger at "
             "rest than in turns: check that the unit did not move in the static recording, and record it again."
         )
     if e.found == "nothing_missing" and e.approximations:
         return "left_by_method", (
-            f"The method {e.method} leaves errors that a free fit of the same recordings does not: "
+            f"The method {e.method} causes errors that a free fit of the same recordings does not have: "
             f"{', '.join(name.replace('_', ' ') for name in e.approximations)}."
         )
     return e.found, ""
@@ -302,8 +303,8 @@ def _within(e: Evidence) -> tuple[str, str]:
 def _above(e: Evidence, published: HeldOut) -> tuple[str, str]:
     unit = unit_of(e.sensor)
     text = (
-        f"On held-out motion the error is {published.error:.3g} {unit}; noise and stated uncertainties leave at most "
-        f"{published.high:.3g} {unit}"
+        f"On held-out motion the error is {published.error:.3g} {unit}; noise and stated uncertainties explain at "
+        f"most {published.high:.3g} {unit}"
     )
     if e.found == "missing_effect" and not (_unconfirmed(e) or (e.full and e.full.above)):
         return "missing_effect", _beyond(e)
@@ -315,32 +316,32 @@ def _above(e: Evidence, published: HeldOut) -> tuple[str, str]:
         return "left_by_method", f"{text}. {_of_method(e)}"
     left = e.left_over_noise if e.selected else e.over_noise
     if e.full and e.selected:
-        text += f", and with what was selected {e.full.error:.3g} {unit} stay, against at most {e.full.high:.3g}"
+        text += f"; with the selected effects it is {e.full.error:.3g} {unit}, against at most {e.full.high:.3g}"
     if left is not None and left > EXPLAINED:
         return "unexplained", f"{text}. The residual of the fit is {left:.3g} times the noise, too."
     return "reference_in_doubt", (
-        f"{text}. Yet the recordings of the fit are explained to their noise, so that fit and held-out recording "
-        "contradict each other: check that the held-out recording is of this unit in the same mounting, and the rate, "
-        "attitude and clock that the table logged in it. An effect that the recordings of the fit cannot show (not "
-        "observable) may act in the held-out motion, too."
+        f"{text}. The residual of the fit is noise alone, so fit and held-out recording contradict each other: check "
+        "that the held-out recording is of this unit in the same mounting, and check the rate, attitude and clock that "
+        "the table logged in it. The cause may also be an effect that the recordings of the fit cannot show (not "
+        "observable)."
     )
 
 
 def _of_method(e: Evidence) -> str:
     if e.as_printed:
-        return f"The method {e.method} takes equations as they are printed, with their errata (as_printed)."
+        return f"The method {e.method} uses the equations as printed, with their errata (as_printed)."
     if e.free is None:
-        return f"The method {e.method} leaves it."
-    found = f"A free fit of the same recordings leaves {e.free.error:.3g} {unit_of(e.sensor)}"
+        return f"The method {e.method} causes it."
+    found = f"The error of a free fit of the same recordings is {e.free.error:.3g} {unit_of(e.sensor)}"
     if e.filtered and e.method in FREE:
-        return f"{found} against the filtered reference: the filter, which delays and smooths, leaves the rest."
-    culprit = f"the method {e.method} and the filter leave" if e.filtered else f"the method {e.method} leaves"
+        return f"{found} against the filtered reference: delay and smoothing by the filter cause the rest."
+    causes = f"the method {e.method} and the filter cause" if e.filtered else f"the method {e.method} causes"
     against = " against the filtered reference" if e.filtered else ""
-    return f"{found}{against}: {culprit} the rest."
+    return f"{found}{against}: {causes} the rest."
 
 
 def judged(document: dict[str, Any], e: Evidence) -> dict[str, Any]:
-    """Return a diagnosis with the verdict that the evidence leads to, the reason, and what to do next.
+    """Return a diagnosis with the verdict by the evidence, its reason, and what to do next.
 
     Parameters
     ----------
@@ -351,7 +352,7 @@ def judged(document: dict[str, Any], e: Evidence) -> dict[str, Any]:
     verdict, reason = decide(e)
     step = _next_step(verdict, e)
     if verdict == "unexplained" and e.implausible:
-        step = "check that every recording is of this unit in one mounting, and its range and units"
+        step = "check that every recording is of this unit in one mounting, and check its range and units"
         step += f"; then {of_unknown(document['unexplained'])}" if document["unexplained"] else ""
     elif verdict == "unexplained" != e.found:
         step = of_unknown(document["unexplained"])
@@ -362,8 +363,7 @@ def judged(document: dict[str, Any], e: Evidence) -> dict[str, Any]:
 def _offered(verdict: str, document: Mapping[str, Any], e: Evidence) -> bool:
     """Return whether to offer the selected effects.
 
-    Where they are not what the verdict names, they are worth a try only if they are plausible and held-out motion says
-    that they are a part of what is missing.
+    Where the verdict is ``unexplained``, only plausible effects are offered that each reduce the held-out error.
     """
     if verdict != "unexplained" or e.implausible or len(e.selected) > BELIEVED:
         return verdict == "missing_effect"

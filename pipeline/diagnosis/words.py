@@ -15,21 +15,21 @@ UNKNOWN = {
     "temperature": "repeat the sequence at two steady temperatures, and while it heats and cools",
     "time": "return to the first pose at the end, and repeat the sequence once the unit is warm",
     "rate": "turn at several rates in both directions",
-    "angle": "turn a second time with the unit remounted at another angle: an error of the table stays with the table",
+    "angle": "turn again with the unit remounted at another angle: errors of the table stay at the same table angles",
     "specific_force": "record rests in which all three axes are inclined, and more than 1 g if you can",
 }
 FAR_OFF = (
-    "check the table against its log first (steps, play, rate, vibration) and the mounting: the residual is far above "
-    "the noise and depends on nothing that is recorded"
+    "check the table against its log first (steps, backlash, rate, vibration) and the mounting: the residual is far "
+    "above the noise and does not depend on any recorded quantity"
 )
 VERDICTS = {
     "nothing_missing": "Nothing that these recordings can show is missing in the model of the {sensor}.",
     "missing_effect": "The model of the {sensor} misses {effects}.",
-    "unexplained": "The {sensor} shows something that no plausible effect of the catalogue explains.",
+    "unexplained": "The residual of the {sensor} exceeds noise, and no plausible effect of the catalogue explains it.",
     "not_enough_data": "The recordings cannot show whether an effect of the {sensor} is missing.",
     "reference_in_doubt": "The reference of the {sensor} is in doubt: recordings contradict each other.",
     "floor_in_doubt": "The noise estimate of the {sensor} is in doubt: it may be too large and hide an effect.",
-    "left_by_method": "The {sensor} is explained; approximations of its method or filter leave more than noise.",
+    "left_by_method": "The model explains the {sensor}; approximations of method or filter cause errors above noise.",
 }
 
 
@@ -54,7 +54,7 @@ def in_words(part: Mapping[str, Any] | None, sensor: str) -> list[str]:
     if wander.get("inflated"):
         lines.append(
             f"The fitted bias wander is {wander['standard_deviation']:.2g} {unit_of(sensor)}, against "
-            f"{wander['expected']:.2g} expected: the noise model may have taken up a slow effect that is missing."
+            f"{wander['expected']:.2g} expected: it may include a slow effect that is missing in the model."
         )
     lines += [_method_error(error, sensor) for error in part.get("method_errors") or []]
     if part["not_observable"]:
@@ -92,15 +92,15 @@ def _selected(entry: Mapping[str, Any], sensor: str, *, with_form: bool) -> list
     bic = f"(delta BIC {entry['delta_bic']:.0f})"
     lines = [f"{head} It explains {share:.0f} % of the excess over the noise {bic}."]
     if not entry["plausible"]:
-        lines.append("That is beyond the sensor's data sheet: something else probably looks like it.")
+        lines.append("That exceeds the limit of the sensor's data sheet; the cause may be another, similar effect.")
     if entry["look_alikes"]:
         alike = ", ".join(f"{plain(a['effect'])} ({100 * a['share']:.0f} %)" for a in entry["look_alikes"])
-        lines.append(f"Its signal looks much like that of {alike}.")
+        lines.append(f"Its signal is similar to that of {alike}.")
     before, after = entry["held_out_error_before"], entry["held_out_error_after"]
     if before is not None and after is not None:
-        beside = ", the form below fitted with it" if with_form else ""
+        beside = ", with the functional form below fitted too" if with_form else ""
         lines.append(
-            f"On held-out motion the rms error goes from {before:.4g} to {after:.4g} {unit_of(sensor)}{beside}."
+            f"It changes the rms error on held-out motion from {before:.4g} to {after:.4g} {unit_of(sensor)}{beside}."
         )
     return lines
 
@@ -113,15 +113,15 @@ def _value(name: str, parameter: Mapping[str, Any]) -> str:
 
 
 def _unknown(part: Mapping[str, Any], sensor: str) -> list[str]:
-    """Return on what the residual depends, in which functional form, and how to try that as an effect."""
+    """Return the quantities on which the residual depends, the functional form, and how to try it as an effect."""
     lines = []
     for found in part["unexplained"]:
         if found.get("explained_by"):
             continue
         form = f": {found['shape']} (delta BIC {found['delta_bic']:.0f})" if found.get("shape") else ""
         p = f"p = {found['p_value']:.1g}" if found["p_value"] > 0 else "p < 1e-300"
-        beyond = " beyond that" if part["selected"] else ""
-        lines.append(f"The residual depends on {plain(found['covariate'])} ({p}){beyond}{form}.")
+        which = "remaining residual" if part["selected"] else "residual"
+        lines.append(f"The {which} depends on {plain(found['covariate'])} ({p}){form}.")
     effect = part.get("suggested_effect")
     if effect:
         file = part.get("suggested_file", f"<unit>_{sensor}_unknown.yaml")
@@ -133,16 +133,16 @@ def _unknown(part: Mapping[str, Any], sensor: str) -> list[str]:
 
 
 def _held_out(part: Mapping[str, Any], sensor: str) -> list[str]:
-    """Return what held-out motion says against what was selected."""
+    """Return the error that remains on held-out motion with the selected effects, where it is above the noise."""
     held = part.get("held_out")
     if not held or held["error_after"] < STAYS * held["floor"]:
         return []
     ratio = held["error_after"] / held["floor"]
     error = f"{held['error_after']:.3g} {unit_of(sensor)}"
-    line = f"On held-out motion an error of {error} is left, {ratio:.3g} times the noise."
+    line = f"The remaining error on held-out motion is {error}, {ratio:.3g} times the noise."
     if held["error_after"] > held["error_before"]:
-        return [line, "That is more than without it: what was selected is not what is missing."]
-    return [line, "Either something else is missing too, or an effect with a similar signal is the right one."]
+        return [line, "It is larger than without the selected effects: they are not the missing ones."]
+    return [line, "Either another effect is missing too, or an effect with a similar signal is the right one."]
 
 
 def _method_error(error: Mapping[str, Any], sensor: str) -> str:
@@ -161,7 +161,7 @@ def _hidden(part: Mapping[str, Any]) -> str:
     hidden = part["not_observable"]
     reasons = {entry["reason"] for entry in hidden}
     if not part["ranking"] and len(reasons) == 1:
-        return f"No effect can be seen: {hidden[0]['reason']}."
+        return f"No effect is observable: {hidden[0]['reason']}."
     each = "; ".join(f"{plain(e['effect'])} ({e['reason'].split('; it needs ')[0]})" for e in hidden)
     return f"Not observable: {each}."
 
@@ -193,15 +193,15 @@ def next_experiment(
     if selected:
         return _of_selected({entry["effect"]: entry for entry in ranking}, selected)
     if one_way:
-        return "make every turn in the other direction too: it shows five effects that one direction hides"
+        return "make every turn in the other direction too: five effects are observable only in both directions"
     shown = next((name for name in ("bias_temperature", "lever_arm", "time_offset") if name in hidden), None)
     if shown:
-        return f"to see {plain(shown)}: record {catalogue()[shown].excitation}"
+        return f"to make {plain(shown)} observable: record {catalogue()[shown].excitation}"
     return "none is needed: nothing that these recordings can show is missing"
 
 
 def of_unknown(unknown: Sequence[Mapping[str, Any]]) -> str:
-    """Return what would show on what the residual depends.
+    """Return the experiment that would show on which quantity the residual depends.
 
     Parameters
     ----------
@@ -211,7 +211,7 @@ def of_unknown(unknown: Sequence[Mapping[str, Any]]) -> str:
     if not unknown:
         return FAR_OFF
     covariate = str(unknown[0]["covariate"])
-    return f"to find out on what the residual depends beside {plain(covariate)}: {UNKNOWN[covariate]}"
+    return f"to find other quantities than {plain(covariate)} on which the residual depends: {UNKNOWN[covariate]}"
 
 
 def _of_selected(entries: Mapping[str, Mapping[str, Any]], selected: Sequence[str]) -> str:

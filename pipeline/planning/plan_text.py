@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
     from pipeline.planning.changes import Gain
 
-CLEARLY_LARGER = 1.2  # times the smallest size, from which on the size that is named by itself is printed
+CLEARLY_LARGER = 1.2  # times the smallest size, from which on the size at which an effect is named is printed
 CLEARLY_SMALLER = 99.5  # per cent
 TOP = 3  # changes that are printed
 
@@ -42,11 +42,11 @@ def _of_sensor(sensor: str, part: Mapping[str, Any]) -> list[str]:
         return [f"{sensor}: nothing can be planned: {part['reason']}"]
     noise, unit = part["noise"], part["unit"]
     lines = [f"{sensor} (noise {noise['white']:.2g} {unit} a sample, bias wander {noise['wander']:.2g} {unit})"]
-    head = ["effect", "smallest size", "of limit", "looks like", "note"]
+    head = ["effect", "smallest size", "of limit", "similar signal", "note"]
     if part["effects"]:
         lines += aligned([head, *(_row(entry) for entry in part["effects"])])
     if part["not_observable"]:
-        lines.append("  cannot be seen:")
+        lines.append("  not observable:")
         lines += aligned([[e["effect"], e["reason"]] for e in part["not_observable"]])
     return lines
 
@@ -63,15 +63,15 @@ def _row(entry: Mapping[str, Any]) -> list[str]:
 
 
 def _note(entry: Mapping[str, Any]) -> str:
-    """Return up to which size an effect would be taken for another."""
+    """Return up to which size another effect would be named in place of this one."""
     named, smallest, taken = entry["named"], entry["smallest"], entry["taken_for"]
     limit = None if entry["share_of_limit"] is None else smallest / entry["share_of_limit"]
     never = named is None or (limit is not None and named > limit)
     if taken:
-        return f"taken for {taken}" + ("" if never else f" below {size(named, entry['unit'])}")
+        return f"named as {taken}" + ("" if never else f" below {size(named, entry['unit'])}")
     if never:
-        return "not told from its look-alikes"
-    return f"by its name from {size(named, entry['unit'])}" if named > CLEARLY_LARGER * smallest else ""
+        return "not distinguishable from those"
+    return f"named from {size(named, entry['unit'])}" if named > CLEARLY_LARGER * smallest else ""
 
 
 def size(value: float, unit: str) -> str:
@@ -128,8 +128,8 @@ def helps_most(gains: Sequence[Gain]) -> list[str]:
     """
     useful = [gain for gain in gains if gain.shown or gain.told or 100.0 * gain.factor < CLEARLY_SMALLER]
     if not useful:
-        return ["what to record more: nothing of what was tried shows more"] if gains else []
-    lines = ["what to record more, the most helpful first:"]
+        return ["additional recordings: none of those examined shows more"] if gains else []
+    lines = ["additional recordings, the most helpful first:"]
     for number, gain in enumerate(useful[:TOP], start=1):
         options = f" ({gain.change.options})" if gain.change.options else ""
         lines.append(f"  {number}. {gain.change.what}{options}: {gain.minutes:+.1f} min")
@@ -138,12 +138,13 @@ def helps_most(gains: Sequence[Gain]) -> list[str]:
 
 
 def _brought(gain: Gain) -> str:
-    """Return what a change brings; the factor is a mean over effects and sensors."""
+    """Return the effect of a change on what can be found; the factor is a mean over effects and sensors."""
     parts = [f"shows {_listed(gain.shown)}"] if gain.shown else []
-    parts += [f"tells {_listed(gain.told)} from what looks like it"] if gain.told else []
+    parts += [f"distinguishes {_listed(gain.told)} from similar effects"] if gain.told else []
     percent = 100.0 * gain.factor
     whose = "the others" if parts else "effects"
-    parts.append(f"finds {whose} " + (f"at {percent:.0f} % of the size" if percent < CLEARLY_SMALLER else "no earlier"))
+    smaller = percent < CLEARLY_SMALLER
+    parts.append(f"finds {whose} " + (f"at {percent:.0f} % of the size" if smaller else "at the same size"))
     return "; ".join(parts)
 
 

@@ -113,4 +113,4 @@ def test_the_held_out_error_of_the_run_is_told_beside_what_noise_alone_leaves(
     gyroscope = {"unit": "deg/s", "noise_floor": 0.011, "steps": [{"rms_error": 4.0}, {"rms_error": 0.022}]}
     (folder / "U2.json").write_text(json.dumps({"accelerometer": None, "gyroscope": gyroscope}))
     assert main([str(results / "bench"), "U2"]) == 0
-    assert "errs by 0.022 deg/s rms of the magnitude, 2 times what noise alone leaves" in capsys.readouterr().out
+    assert "on held-out motion is 0.022 deg/s, 2 times the noise floor" in capsys.readouterr().out

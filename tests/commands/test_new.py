@@ -14,7 +14,7 @@ def test_the_table_is_named_with_its_accuracy_and_other_ranges_are_set_as_the_co
     directory = tmp_path / "my bench"
     assert main([str(directory), "--sensor", "mpu6050", "--table", "mark2"]) == 0
     said = capsys.readouterr().out
-    assert "table mark2: its angles are taken as right within 0.3 deg, its rates within 1 %" in said
+    assert "table mark2: accuracy of its angles 0.3 deg, of its rates 1 %" in said
     assert said.splitlines()[-1] == f"then: snakemake --cores 2 --config 'campaign={directory}'"
     assert (directory / "units.csv").read_text().splitlines() == [
         "unit,serial,lot,date,sensor,table,procedure,overrides",
@@ -36,7 +36,7 @@ def test_without_a_choice_the_table_of_the_procedure_is_written_down(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main([str(tmp_path / "a")]) == 0
-    assert "table acutronic: its angles are taken as right within 0.00028 deg" in capsys.readouterr().out
+    assert "table acutronic: accuracy of its angles 0.00028 deg" in capsys.readouterr().out
     assert main([str(tmp_path / "b"), "--procedure", "multi_position"]) == 0
-    assert "table hand: none; the unit is set down or held by hand" in capsys.readouterr().out
+    assert "table hand: there is no table" in capsys.readouterr().out
     assert load_campaign({"campaign": str(tmp_path / "b")}).units["U1"].config["table"]["name"] == "hand"
