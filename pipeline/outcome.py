@@ -135,7 +135,7 @@ def next_commands(
         ((unit, effects),) = missing.items()
         lines.append(("to add what is missing", add_command(settings, unit, effects, results)))
     elif missing:
-        lines.append(("to add to each what it misses", add_missing_command(settings, results)))
+        lines.append(("to add to each unit its missing effects", add_missing_command(settings, results)))
     if any(f.verdict != "nothing_missing" for f in findings):
         lines.append(("for the evidence", explain_command(settings, results)))
     return lines

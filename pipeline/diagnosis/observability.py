@@ -113,7 +113,7 @@ def _steady(facts: Facts) -> str:
 def _faint(this: Effect, selection: Selection) -> str:
     unit = this.parameters(selection.observations.sensor)[0].unit
     limit = selection.limits[this.name][0]
-    return f"even at its limit of {limit:.2g}{'' if unit == '1' else ' ' + unit} it would hide in the noise"
+    return f"even at its limit of {limit:.2g}{'' if unit == '1' else ' ' + unit} it would be below the noise"
 
 
 def _unexcited(this: Effect, facts: Facts) -> str:

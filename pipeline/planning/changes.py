@@ -106,13 +106,13 @@ def _by_hand(unit: UnitDescription, course: Course) -> Iterator[Change]:
         more = POSITIONS * course.positions
         yield _with(unit, f"rest in {more} positions", f"--positions {more}", positions=more)
     else:
-        what = f"rest in {course.positions} positions, inclined each in another way, in their place"
+        what = f"in place of these, rest in {course.positions} positions, each with another inclination"
         yield Change(what, "--procedure multi_position", replace(unit, procedure="multi_position"))
 
 
 def _anywhere(unit: UnitDescription, course: Course) -> Iterator[Change]:
     if course.static_s < LONG_REST_S:
-        what = f"a long rest of {LONG_REST_S / 60.0:g} min, to pin the noise"
+        what = f"a long rest of {LONG_REST_S / 60.0:g} min, to determine the noise"
         yield _with(unit, what, f"--static {LONG_REST_S:g}", static_s=LONG_REST_S)
 
 

@@ -148,7 +148,7 @@ def _faint(sensor: str, found: Detection) -> str:
     unit = this.parameters(sensor)[0].unit
     limit = f"{found.unit_sizes[0]:.2g}{'' if unit == '1' else ' ' + unit}"
     times = f", {found.found:.2g} times that would show" if np.isfinite(found.found) else ""
-    return f"even at its limit of {limit} it would hide in the noise{times}; it needs {this.excitation}"
+    return f"even at its limit of {limit} it would be below the noise{times}; it needs {this.excitation}"
 
 
 @dataclass(frozen=True)
@@ -219,7 +219,7 @@ def _warnings(simulated: SimulatedProcedure) -> list[str]:
     if simulated.table["motion"] == "commanded":
         angle = float(simulated.table["angle_accuracy_deg"])
         found.append(
-            f"the table logs its program, not what it did: angle errors of {angle:g} deg read as "
+            f"the table logs its program, not its motion: angle errors of {angle:g} deg read as "
             f"{1000.0 * np.radians(angle):.2g} mg, and sizes below that are only found if they repeat from stop to stop"
         )
     return found

@@ -149,7 +149,7 @@ def _proposal(parts: list[Columns]) -> Proposal:
     layouts = [c.layout for c in parts]
     proposal = Proposal([s.path for s in layouts], layouts, _csv_section(layouts[0]), [{} for _ in parts])
     if layouts[0].rate_hz is not None:
-        proposal.evidence["rate_hz"] = f"the file says {layouts[0].rate_line!r}"
+        proposal.evidence["rate_hz"] = f"the file states {layouts[0].rate_line!r}"
     for columns in parts:
         proposal.remarks += columns.remarks
         if columns.layout.odd_rows:
@@ -167,7 +167,9 @@ def _proposal(parts: list[Columns]) -> Proposal:
         by_table = _by_table(parts, rate)
         _add("gyroscope", parts, proposal, by_table or rate_unit(rate, moves, why_none, timed=time_s is not None))
     if force is None and rate is None:
-        proposal.remarks.append("no three columns look like an accelerometer or a gyroscope: name them in columns")
+        proposal.remarks.append(
+            "no three columns have the values of an accelerometer or a gyroscope: name them in columns"
+        )
     for columns, entries in zip(parts, proposal.columns, strict=True):
         _others(columns, entries, proposal)
     return proposal
@@ -246,7 +248,7 @@ def _moves(
     if not steady:
         return [], "the rows are not one series in time, so the turns of gravity cannot tell the unit"
     moves = moves_of(force, rate, time_s if time_s is not None else np.arange(len(rate)) / ASSUMED_HZ)
-    return moves, "" if moves else "no move between rests turns gravity and tells the unit"
+    return moves, "" if moves else "no move between rests rotates gravity, which would show the unit"
 
 
 def _by_table(parts: list[Columns], rate: NDArray[np.float64]) -> Guess | None:

@@ -59,7 +59,7 @@ def test_the_diagonal_matrix_of_the_staged_method_leaves_mounting_and_non_orthog
     E = calibration.matrix @ K["accelerometer"] - np.eye(3)
     found = by_name(part)
     assert part["verdict"] == "left_by_method"
-    assert "A free fit of the same recordings leaves" in part["reason"]
+    assert "The error of a free fit of the same recordings is" in part["reason"]
     assert "reference_least_squares" in part["next_experiment"]
     assert set(found) == {"rotation", "non_orthogonality"}
     assert found["rotation"]["size"] == pytest.approx(np.degrees(np.abs(E - E.T).max() / 2.0), rel=0.05)
@@ -136,6 +136,6 @@ def test_a_bias_that_a_method_gets_wrong_is_told_with_its_size() -> None:
 def test_words_put_the_errors_on_the_method_and_not_on_the_sensor() -> None:
     _, part = diagnosed("staged", "accelerometer", recordings_of())
     text = "\n".join(in_words(part, "accelerometer"))
-    assert "The accelerometer is explained; approximations of its method" in text
+    assert "The model explains the accelerometer; approximations of method" in text
     assert "of the method, not of the sensor: rotation (" in text
     assert "eqs 3.15-3.37" in text

@@ -50,7 +50,7 @@ def test_turns_in_one_direction_show_no_asymmetry_of_the_gyroscope(one_way: dict
 
 def test_an_effect_below_the_noise_even_at_its_limit_is_said_to_hide() -> None:
     reason = _reasons(plan_of(replace(ONE_WAY, sensor="stim300"))["gyroscope"])["cubic_nonlinearity"]
-    assert reason.startswith("even at its limit of 2.5e-09 1/(deg/s)^2 it would hide in the noise")
+    assert reason.startswith("even at its limit of 2.5e-09 1/(deg/s)^2 it would be below the noise")
 
 
 def test_the_other_direction_helps_most_where_turns_go_in_one(one_way: dict[str, Any]) -> None:
