@@ -24,7 +24,7 @@ from pipeline.history import SENSORS
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-SMALLEST_BATCH, LARGEST_BATCH = 10, 160  # units: some seconds a job; a minute, so that a fleet fills its cores
+SMALLEST_BATCH, LARGEST_BATCH = 25, 160  # units: seconds a job, as long as its start; a minute, to fill all cores
 
 
 @dataclass(frozen=True)
@@ -181,7 +181,7 @@ def cut_batches(
     """Cut units of one chain of stages into batches, in the order of the sheet.
 
     Appending units touches the last batch of their chain only. Whether effects are fitted does not cut batches anew:
-    a batch has the stage if any of its units asks for it. Without a size, a batch is as large as all before it, from 10
+    a batch has the stage if any of its units asks for it. Without a size, a batch is as large as all before it, from 25
     to 160 units: a bench runs side by side, and a fleet does not spend its time on starting jobs.
     """
     by_chain: dict[str, list[str]] = {}

@@ -138,8 +138,8 @@ def test_batches_grow_along_the_sheet_and_appending_still_touches_the_last_one_o
     rows = "unit\n" + "".join(f"U{i:03d}\n" for i in range(450))
     directory = campaign(tmp_path, rows)
     before = load(directory).batches
-    assert [len(units) for units in before.values()] == [10, 10, 20, 40, 80, 160, 130]
-    (directory / "units.csv").write_text(rows + "".join(f"V{i}\n" for i in range(60)))
+    assert [len(units) for units in before.values()] == [25, 25, 50, 100, 160, 90]
+    (directory / "units.csv").write_text(rows + "".join(f"V{i}\n" for i in range(100)))
     after = load(directory).batches
     last, new = list(after)[-2:]
     assert {b for b, u in after.items() if before.get(b) != u} == {last, new}

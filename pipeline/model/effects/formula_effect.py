@@ -46,6 +46,7 @@ class DeclaredEffect(Effect):
 
     def __init__(self, declared: Declaration, definition: dict[str, Any] | None = None) -> None:
         self.declared, self.definition = declared, definition
+        self._parameters: dict[str, tuple[Parameter, ...]] = {}
         self.name, self.owner, self.sensors = declared.name, declared.owner, declared.sensors
         self.contains, self.needs_both_directions = declared.contains, declared.needs_both_directions
         self.meaning = declared.meaning
@@ -54,7 +55,9 @@ class DeclaredEffect(Effect):
 
     def parameters(self, sensor: str) -> tuple[Parameter, ...]:
         """Return the parameters that the file declares."""
-        return self.declared.parameters_of(sensor)
+        if sensor not in self._parameters:
+            self._parameters[sensor] = self.declared.parameters_of(sensor)
+        return self._parameters[sensor]
 
     def limits(self, sensor: str) -> dict[str, float]:
         """Return the limits that the file declares, keyed as those of a data sheet; its own name: the largest."""
