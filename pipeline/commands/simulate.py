@@ -33,7 +33,7 @@ examples:
 An effect is hidden in one sensor (accelerometer.NAME) or in both (NAME); without a size it has the typical one of the
 sensor's configuration with random signs, with one number that size, with several its parameters' values.
 An effect of your own is hidden likewise, by the name of its file DIR/effects/NAME.yaml (docs/effects_of_your_own.md).
-In simulation.yaml a unit may also hide a formula that the campaign does not know, for a diagnosis to wonder at:
+In simulation.yaml a unit may also have a formula that is no effect of the campaign, to test the diagnosis:
   effects: {gyroscope.gear_mesh: {terms: {A: {formula: "cos(5 * radians(angle))", unit: deg/s}}, values: 0.03}}
 The truth is written to DIR/truth/<unit>.json.
 """

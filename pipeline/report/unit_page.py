@@ -34,11 +34,11 @@ JSON = dict[str, Any]
 VERDICTS = {
     "nothing_missing": "Nothing significant is missing from the model.",
     "missing_effect": "A physical effect is missing from the model.",
-    "unexplained": "Something is missing that no known effect explains.",
-    "not_enough_data": "The recording is too short to say what is missing.",
-    "left_by_method": "The sensor is explained; approximations of its method or filter leave more than noise.",
+    "unexplained": "The residual exceeds noise, and no plausible effect of the catalogue explains it.",
+    "not_enough_data": "The recordings cannot show whether an effect is missing.",
+    "left_by_method": "The model explains the sensor; approximations of method or filter cause errors above noise.",
     "reference_in_doubt": "The reference is in doubt: recordings contradict each other.",
-    "floor_in_doubt": "The noise is in doubt: its estimate may be too large and hide an effect.",
+    "floor_in_doubt": "The noise estimate is in doubt: it may be too large and hide an effect.",
 }
 
 
