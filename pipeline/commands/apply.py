@@ -84,7 +84,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _profile(calibration: Path, ingest: str | None) -> LogProfile:
-    """Return how the log is laid out: as the unit's recordings, or as a named profile says."""
+    """Return the layout of the log: that of the unit's recordings, or that of a named profile."""
     document = read_calibration(calibration)
     profile = LogProfile.of_calibration(document, str(calibration))
     if ingest is None:

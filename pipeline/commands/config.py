@@ -90,7 +90,7 @@ def _leaves(node: Mapping[str, Any], above: Key) -> Iterator[tuple[Key, Any]]:
 
 
 def _origins(composer: Composer, layers: Sequence[Layer]) -> dict[Key, str]:
-    """Return where each key, or a branch above it, was set last; a group's ``name`` tells what chose the option."""
+    """Return the origin of each key, or of the branch above it; that of an option is at the ``name`` of its group."""
     groups, _ = composer.split([text for _, text in layers])
     chosen = composer.complete(groups)
     procedure = chosen.get("procedure", default_option("procedure"))

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 EPILOG = f"""\
 families: {", ".join(FAMILIES)}
 
-The truth goes to DIR/truth.jsonl, which the diagnosis never reads, what it says to DIR/results.jsonl. A case that is
-there is not run again, so the same command goes on where it was interrupted; take a new directory after a change of the
+The truth is written to DIR/truth.jsonl, which the diagnosis never reads, the diagnoses to DIR/results.jsonl. A case with
+a result is not run again, so the same command continues an interrupted study; use a new directory after a change of the
 code. A case takes one to three seconds.
 """
 

@@ -3,8 +3,8 @@
 The held-out error of a complete calibration lies in the interval of ``pipeline.validation.expected_error``. The first
 that applies:
 
-    reference_in_doubt  a check of the recordings says so (note ``N-REFERENCE``), or the fit is explained to its noise
-                        and the held-out motion is not: the recordings contradict each other
+    reference_in_doubt  a check of the recordings found a contradiction (note ``N-REFERENCE``), or the residual of the
+                        fit is noise alone and the held-out error is above its interval
     missing_effect      effects were selected, and with them the held-out error lies in its interval; effects beyond
                         the sensor's limits only where they lower the held-out error
     unexplained         the residual of the fit, or the held-out error, is above what noise leaves, and no effect
@@ -220,7 +220,7 @@ def evidence_of(  # noqa: PLR0917  (what a diagnosis is made of)
 
 
 def decide(e: Evidence) -> tuple[str, str]:
-    """Return the verdict, and why as one or two sentences; empty where the selection says it.
+    """Return the verdict and its reason as one or two sentences; empty where the selection is the reason.
 
     Parameters
     ----------
