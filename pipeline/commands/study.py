@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 EPILOG = f"""\
 families: {", ".join(FAMILIES)}
 
-The truth is written to DIR/truth.jsonl, which the diagnosis never reads, the diagnoses to DIR/results.jsonl. A case with
-a result is not run again, so the same command continues an interrupted study; use a new directory after a change of the
-code. A case takes one to three seconds.
+The truth is written to DIR/truth.jsonl, which the diagnosis never reads; the diagnoses to DIR/results.jsonl. A case
+with a result is not run again, so the same command continues an interrupted study; use a new directory after a
+change of the code. A case takes one to three seconds.
 """
 
 
