@@ -23,6 +23,7 @@ from pipeline.diagnosis.functional_form_search import select_with_form, suggeste
 from pipeline.diagnosis.method_errors import method_errors
 from pipeline.diagnosis.observability import facts_of, not_observable
 from pipeline.diagnosis.residual_plots import plots
+from pipeline.diagnosis.unobservable_effects import not_enough_data
 from pipeline.diagnosis.verdict import evidence_of, judged, verdict_of_selection
 from pipeline.diagnosis.words import next_experiment
 from pipeline.errors import NotObservableError
@@ -31,7 +32,7 @@ from pipeline.estimation.effects import AUTO
 from pipeline.estimation.generalized_least_squares import calibration_of, fit_terms
 from pipeline.estimation.multi_position.rests import is_multi_position
 from pipeline.estimation.observations import observe
-from pipeline.estimation.selection import FAR_ABOVE, GATE_BIC, INFLATED, select
+from pipeline.estimation.selection import ALIKE, EVIDENCE, FAR_ABOVE, GATE_BIC, INFLATED, select
 from pipeline.model.effects import catalogue, effect
 from pipeline.records import Noise
 from pipeline.validation.error_breakdown import with_known_effects
@@ -51,9 +52,8 @@ if TYPE_CHECKING:
 
     Values = NDArray[np.float64]
 
-ALIKE = 0.8  # share of an effect's signal that another reproduces, from which on it is a look-alike
 CLOSE = 1.1  # mean square of a residual over that of noise, under which there is no excess to share
-EVIDENCE = 5.0  # difference in log L: a Bayes factor of 150, "very strong" (Kass and Raftery, JASA 90, 1995)
+TURNS = "record turns about all three axes on a table whose angle and rate are logged"
 LEAST_RATIO = 0.03  # of the white noise: the smallest wander of the selection's settings
 
 
@@ -103,7 +103,7 @@ def diagnose(
     try:
         selection = select(observations, configured, noise, settings["sensor"][sensor], calibration)
     except NotObservableError as reason:
-        nothing = _nothing(sensor, configured, reason.message)
+        nothing = not_enough_data(sensor, configured, reason.message, TURNS) | {"held_out": None}
         return judged(nothing, evidence_of(nothing, sensor, recordings, noise, settings, validation))
     unknown = unexplained(selection)
     reported = select_with_form(selection, unknown, configured, noise, settings["sensor"][sensor])
@@ -130,25 +130,6 @@ def diagnose(
     )
     left = _over_noise(selection.fit, recordings, noise)
     return judged(document, replace(found, left_over_noise=left))
-
-
-def _nothing(sensor: str, configured: list[str], reason: str) -> dict[str, Any]:
-    names = [n for n, this in catalogue().items() if sensor in this.sensors and n not in configured]
-    return {
-        "verdict": "not_enough_data",
-        "residual_over_noise": None,
-        "selected": [],
-        "ranking": [],
-        "not_observable": [{"effect": name, "reason": reason} for name in names],
-        "unexplained": [],
-        "suggested_effect": None,
-        "method_errors": [],
-        "next_experiment": "record turns about all three axes on a table whose angle and rate are logged",
-        "override": "",
-        "configured": configured,
-        "wander": None,
-        "held_out": None,
-    }
 
 
 def _document(

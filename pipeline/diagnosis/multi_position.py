@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.diagnosis.residual_trends import added_variable, dependences
-from pipeline.diagnosis.unobservable_effects import hidden_effects, next_experiment, nothing_to_see
+from pipeline.diagnosis.unobservable_effects import hidden_effects, next_experiment, not_enough_data
 from pipeline.diagnosis.verdict import evidence_of, judged
 from pipeline.errors import CannotCalibrateError, PipelineError
 from pipeline.estimation.accelerometer import nonlinear_least_squares
@@ -27,7 +27,7 @@ from pipeline.estimation.multi_position.fit import fit
 from pipeline.estimation.multi_position.likelihood import NoiseHypothesis, project_out
 from pipeline.estimation.multi_position.result import AUTO, calibration_of, model_of
 from pipeline.estimation.multi_position.selection import FAR, select
-from pipeline.estimation.selection import GATE_BIC, INFLATED
+from pipeline.estimation.selection import ALIKE, EVIDENCE, GATE_BIC, INFLATED
 from pipeline.model.effects import effect
 
 if TYPE_CHECKING:
@@ -41,9 +41,7 @@ if TYPE_CHECKING:
     from pipeline.estimation.ranking import Score
     from pipeline.records import Noise, Recording, SensorCalibration
 
-ALIKE = 0.8
 FAR_ABOVE = 10.0  # times the noise: no unit that somebody sets down or holds rests so badly
-EVIDENCE = 5.0
 FOLDS = 3
 SPARE = 2  # equations beyond the parameters, from which on a fold is judged
 
@@ -93,7 +91,7 @@ def diagnose_multi_position(
     except CannotCalibrateError as lack:
         model, why = None, lack.message
     if model is None:
-        nothing = nothing_to_see(sensor, configured, why)
+        nothing = not_enough_data(sensor, configured, why)
         return judged(nothing, evidence_of(nothing, sensor, recordings, noise, settings, validation))
     sheet = settings["sensor"][sensor]
     selection = select(model, calibration, configured, noise, sheet)

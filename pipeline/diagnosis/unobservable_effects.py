@@ -186,8 +186,19 @@ def _of_selected(entries: Mapping[str, Mapping[str, Any]], selected: Sequence[st
     return f"to tell {_plain(name)} from {others}: {experiment}"
 
 
-def nothing_to_see(sensor: str, configured: list[str], reason: str) -> dict[str, Any]:
-    """Return the document of recordings that tell nothing, for one reason."""
+def not_enough_data(sensor: str, configured: list[str], reason: str, experiment: str = MORE) -> dict[str, Any]:
+    """Return the diagnosis of recordings that show no effect.
+
+    Parameters
+    ----------
+    sensor : str
+    configured : list of str
+        Effects that the configuration already models.
+    reason : str
+        Why no other effect is observable.
+    experiment : str
+        The recording that would show effects; by default that of rests and moves.
+    """
     names = [n for n, this in catalogue().items() if sensor in this.sensors and n not in configured]
     return {
         "verdict": "not_enough_data",
@@ -197,11 +208,11 @@ def nothing_to_see(sensor: str, configured: list[str], reason: str) -> dict[str,
         "not_observable": [{"effect": name, "reason": reason} for name in names],
         "unexplained": [],
         "suggested_effect": None,
-        "next_experiment": MORE,
+        "method_errors": [],
+        "next_experiment": experiment,
         "override": "",
         "configured": configured,
         "wander": None,
-        "method_errors": [],
     }
 
 

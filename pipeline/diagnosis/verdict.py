@@ -73,10 +73,8 @@ class Evidence:
     over_noise: float | None = None  # residual of the fit over the noise, without what was selected
     left_over_noise: float | None = None  # and with it
     published: HeldOut | None = None  # of the unit's calibration
-    free: HeldOut | None = (
-        None  # of a free fit of the same recordings, where these are filtered against the same filter
-    )
-    full: HeldOut | None = None  # and with the selected effects
+    free: HeldOut | None = None  # of a free fit of the same recordings; filtered ones against the filtered reference
+    full: HeldOut | None = None  # of the free fit with the selected effects
     doubts: Sequence[str] = ()  # what the recordings' checks say of the reference
     approximations: Sequence[str] = ()  # what the method's matrix and bias lack (``pipeline.diagnosis.method_errors``)
     unknown: Sequence[str] = ()  # covariates on which the residual depends beside what was selected

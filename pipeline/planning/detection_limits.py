@@ -36,7 +36,7 @@ import numpy as np
 
 from pipeline.estimation.gauss_markov import GaussMarkov, Setting
 from pipeline.estimation.ranking import RIDGE
-from pipeline.estimation.selection import DELAYS, GATE_BIC, GATE_P
+from pipeline.estimation.selection import ALIKE, DELAYS, GATE_BIC, GATE_P
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -54,7 +54,6 @@ if TYPE_CHECKING:
 STEPS = 14  # of bisection: a factor of 1e11 to 0.2 %
 LEAST, LARGEST = 1e-8, 1e3  # share of the limits
 ALMOST_SURE = 0.95  # share of the cases in which the size ``sure`` is found
-ALIKE = 0.8  # share of a signal from which on an effect is listed as a look-alike
 PARTLY = 0.3  # share of a signal below which an effect cannot be preferred for having fewer parameters
 MOST_SIGNS = 32  # patterns of signs; the mean over them is then within 0.1 of that over all (standard error of a share)
 ROUNDING = 1e-6  # share of a signal below which what is left of it is rounding

@@ -20,8 +20,8 @@ from pipeline.estimation.design import Term
 from pipeline.estimation.multi_position.likelihood import NoiseHypothesis, log_likelihood, project_out
 from pipeline.estimation.multi_position.result import model_of
 from pipeline.estimation.multi_position.selection import select
-from pipeline.estimation.selection import GATE_BIC, GATE_P
-from pipeline.planning.detection_limits import ALIKE, ALMOST_SURE, PARTLY, Detection, limits_or_none, smallest
+from pipeline.estimation.selection import ALIKE, GATE_BIC, GATE_P
+from pipeline.planning.detection_limits import ALMOST_SURE, PARTLY, Detection, limits_or_none, smallest
 from pipeline.records import SensorCalibration
 
 if TYPE_CHECKING:

@@ -57,6 +57,13 @@ SIGNIFICANT = 6.0  # standard deviations, as in pipeline.signal.rests
 FEWEST_SAMPLES = 60  # as of pipeline.estimation.noise, which tells no noise by fewer
 SHORTEST_S = 10.0  # in which a wander of 100 s changes by a third of its size
 UNKNOWN_DEGC = 5.0  # change of temperature in some minutes of a room, where none is logged
+HALF_TURN_DEG = 180.0
+SPANNED = 0.2  # of what the motion requires
+INNER = (0.05, 0.95)  # shares of the samples
+COPIED = 0.5  # share of the changes of an axis that are another's to the last digit
+LEVEL_G = 0.5  # of the axes across a turn together, from which gravity turns in the body
+FEWEST = 32
+SHORT = {"accelerometer": "accel", "gyroscope": "gyro"}
 
 
 def check_static(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> list[Recording]:
@@ -273,15 +280,6 @@ def _moments(blocks: Array) -> Array:
     """
     white = np.sqrt(np.mean(np.diff(blocks, axis=1) ** 2, axis=1) / 2.0)
     return np.stack([blocks.std(axis=1, ddof=1), white, blocks.mean(axis=1)], axis=1)
-
-
-HALF_TURN_DEG = 180.0
-SPANNED = 0.2  # of what the motion requires
-INNER = (0.05, 0.95)  # shares of the samples
-COPIED = 0.5  # share of the changes of an axis that are another's to the last digit
-LEVEL_G = 0.5  # of the axes across a turn together, from which gravity turns in the body
-FEWEST = 32
-SHORT = {"accelerometer": "accel", "gyroscope": "gyro"}
 
 
 def check_axes(recordings: Sequence[Recording]) -> None:

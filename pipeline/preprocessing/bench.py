@@ -52,6 +52,15 @@ if TYPE_CHECKING:
 
 FEWEST_AT_REST = 10
 ACROSS = np.cross(UP_AT_ZERO, np.eye(3))  # u x a: what points up at 90 deg
+# Smallest eigenvalue of the mean square of (cos A, sin A) beside a constant: reached by an arc of 110 deg. Below, a
+# nonlinearity of 0.5 % (MPU-6050 product specification 3.4) would turn p by more than 3 deg.
+LEAST_COVERAGE = 0.017
+SMALLEST_SHARE = 1e-6  # of the largest eigenvalue, below which a function of the rate is one of the others
+LARGEST_UNCERTAINTY = 0.02  # g, of p and q: 1 deg
+CHANGING = 0.1  # standard deviation over largest rate, from which a rate changes enough to be followed
+SLOWEST_DPS = 0.1  # standard deviation of a rate that can be followed
+LARGEST_BIAS_DPS = 20.0  # zero-rate output of consumer MEMS (MPU-6050 product specification)
+ALIKE = 0.9  # correlation of a gyroscope axis with the rate from which its gain is evidence
 
 
 @dataclass(frozen=True)
@@ -191,17 +200,6 @@ def nearest_axis(direction: NDArray[np.float64]) -> str:
 def off_axis_deg(direction: NDArray[np.float64]) -> float:
     """Return the angle between a direction and the signed axis that it is nearest to, deg."""
     return float(np.degrees(np.arccos(np.clip(np.max(np.abs(direction)) / np.linalg.norm(direction), -1.0, 1.0))))
-
-
-# Smallest eigenvalue of the mean square of (cos A, sin A) beside a constant: reached by an arc of 110 deg. Below, a
-# nonlinearity of 0.5 % (MPU-6050 product specification 3.4) would turn p by more than 3 deg.
-LEAST_COVERAGE = 0.017
-SMALLEST_SHARE = 1e-6  # of the largest eigenvalue, below which a function of the rate is one of the others
-LARGEST_UNCERTAINTY = 0.02  # g, of p and q: 1 deg
-CHANGING = 0.1  # standard deviation over largest rate, from which a rate changes enough to be followed
-SLOWEST_DPS = 0.1  # standard deviation of a rate that can be followed
-LARGEST_BIAS_DPS = 20.0  # zero-rate output of consumer MEMS (MPU-6050 product specification)
-ALIKE = 0.9  # correlation of a gyroscope axis with the rate from which its gain is evidence
 
 
 @dataclass(frozen=True)

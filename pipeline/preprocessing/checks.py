@@ -38,6 +38,11 @@ if TYPE_CHECKING:
 
     from pipeline.records import Recording
 
+FEWEST, APART = 20, 8
+DIGITS = 10  # of 16 bits of counts in any unit, 5 are significant; twice that
+OF_DECIMALS = 200  # samples by which the decimals are told: a finer reading ends in a zero in a tenth of them
+MIX = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio (Knuth, TAOCP 3, 6.4): spreads sums of bit patterns
+
 
 def check_recordings(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> list[Recording]:
     """Return the recordings of a unit, their turns by the convention, with notes on what was found.
@@ -58,12 +63,6 @@ def check_recordings(recordings: Sequence[Recording], settings: Mapping[str, Any
     check_axes(recordings)
     turns, delays = check_turns(check_static(recordings, settings), settings)
     return check_motion(check_mounting(turns, settings), delays, settings)
-
-
-FEWEST, APART = 20, 8
-DIGITS = 10  # of 16 bits of counts in any unit, 5 are significant; twice that
-OF_DECIMALS = 200  # samples by which the decimals are told: a finer reading ends in a zero in a tenth of them
-MIX = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio (Knuth, TAOCP 3, 6.4): spreads sums of bit patterns
 
 
 def check_shared_rows(recordings: Sequence[Recording]) -> None:

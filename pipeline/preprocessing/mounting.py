@@ -42,6 +42,8 @@ if TYPE_CHECKING:
 TOLERANCE_DEG = 5.0
 TIME_OFFSET_S = 0.04  # largest plausible one where the sensor's config states none: as in configs/sensor/*.yaml
 AGREES_G = 0.7  # of 1 g, within 45 deg of the axis
+BIAS_DEG = 6.0  # zero that a bias of 0.1 g feigns where all rests are at one angle
+UNLIKE = 0.5  # gain of the stated axis over that of another one, below which the other one turned
 
 
 def check_mounting(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> list[Recording]:
@@ -187,10 +189,6 @@ def _applied(turn: Turn, doubts: Sequence[Note]) -> Recording:
         encodings=encodings,
         notes=tuple(notes),
     )
-
-
-BIAS_DEG = 6.0  # zero that a bias of 0.1 g feigns where all rests are at one angle
-UNLIKE = 0.5  # gain of the stated axis over that of another one, below which the other one turned
 
 
 @dataclass(frozen=True)

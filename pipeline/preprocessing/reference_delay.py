@@ -46,11 +46,12 @@ SURE = 5.0  # standard deviations of what the ends of the window add
 
 @dataclass(frozen=True)
 class Delay:
-    """How late a sensor is, s, and the interval to which its recording determines that.
+    """Delay of the sensor against the table's log, and the interval of delays that the recording allows.
 
     Attributes
     ----------
     best, low, high : float, s
+        Positive where the sensor is late.
     """
 
     best: float
@@ -65,7 +66,7 @@ class Delay:
 def delay_of(
     recording: Recording, channels: Sequence[Channel], limits: Limits, settings: Mapping[str, Any]
 ) -> Delay | None:
-    """Return how late the sensor is against the table's log; refuse what no effect explains.
+    """Return the delay of the sensor against the table's log; refuse a delay that no effect explains.
 
     Between two channels of the table ``time_offset`` and ``low_pass_lag`` allow a delay; the sensor's clock, which runs
     off by ``clock_rate`` since power-on, adds to that of the sensor.
@@ -104,7 +105,7 @@ def check_delays(found: Sequence[tuple[Recording, Delay]], limits: Limits) -> No
     """Refuse a recording whose delay is not that of the one offset and the one clock that a unit's recordings share.
 
     Some tau and e with ``|tau| <= time_offset + low_pass_lag`` and ``|e| <= clock_rate`` have to lie, as ``tau + e t``,
-    in the interval of every recording at some time t of it. Otherwise that recording is refused without which they do.
+    in the interval of every recording at some time t of it. If not, the recording is refused whose removal allows it.
     """
     if len(found) < 2 or not all(r.clock_shared for r, _ in found):
         return

@@ -53,6 +53,9 @@ NOISE_C_G = 4e-3  # likewise in c: half of a K2 of 6e-3 1/g (twice 0.3 %), or 8 
 CLEARLY, OF_TWO_MORE = 1.0, 4.0  # chi-square by which leans have to be better than seats: 1 sigma; 2 sigma with tilt
 FITS = 33.0  # chi-square of at most 13 degrees of freedom with a probability of 0.002
 GAUGE = 1e-6  # weight that makes the seats those of the smallest sum of squares
+QUARTERS = np.array([0.0, 90.0, 180.0, 270.0])
+# Largest plausible tilt (deg), lean (deg) and time offset (s) where the sensor's config states none.
+LIMITS = {"table_tilt": 1.0, "table_axis_nonorthogonality": 1.0, "time_offset": 0.04}
 
 
 @dataclass(frozen=True)
@@ -203,9 +206,6 @@ def _of_quarters(values: Vector) -> Vector:
     return np.concatenate([(at_0 - at_180) / 2.0, (at_90 - at_270) / 2.0, values.mean(axis=0)])
 
 
-QUARTERS = np.array([0.0, 90.0, 180.0, 270.0])
-
-
 def _tilt_columns(turn: Conventional) -> Vector:
     """Return the derivative by the tilt about level x and y, 1/deg: (9, 2) array, as ``effects/table_tilt.py``."""
     level = turn_about_axis(level_at_zero(turn.axis), turn.axis, -QUARTERS)
@@ -254,10 +254,6 @@ def _unit(vector: Vector) -> Vector:
 def letters(vector: Vector) -> str:
     """Return a rotation in words: its parts about x, y and z."""
     return ", ".join(f"{v:+.2f} deg about {a}" for a, v in zip(AXES, vector, strict=True))
-
-
-# Largest plausible tilt (deg), lean (deg) and time offset (s) where the sensor's config states none.
-LIMITS = {"table_tilt": 1.0, "table_axis_nonorthogonality": 1.0, "time_offset": 0.04}
 
 
 def seat_notes(turns: Sequence[Turn], table: Mapping[str, Any], sensor: Mapping[str, Any]) -> dict[str, list[Note]]:

@@ -42,6 +42,10 @@ SHORTEST_STATIC_S, SHORTEST_FREE_S = 60.0, 10.0
 SLOWER = 1.2
 FEWEST_OF_A_SPLINE, AGREES = 6, 0.05
 SHORT_NAMES = {"accelerometer": "accel", "gyroscope": "gyro", "validation": "validation", "static": "static"}
+ONE_AXIS = 0.8
+ENCODER_AGREES_DEG, ENCODER_AGREES = 5.0, 0.1
+HALF_A_TURN_DEG = 180.0
+HANDLED_DPS, NEAR_A_MOVE_S = 3.0, 0.5
 
 
 @dataclass(frozen=True)
@@ -241,12 +245,6 @@ def _static(
     if (longest[1] - longest[0]) * recording.interval < SHORTEST_STATIC_S:
         return []
     return [Segment(*longest, "static", None, "a long rest")]
-
-
-ONE_AXIS = 0.8
-ENCODER_AGREES_DEG, ENCODER_AGREES = 5.0, 0.1
-HALF_A_TURN_DEG = 180.0
-HANDLED_DPS, NEAR_A_MOVE_S = 3.0, 0.5
 
 
 @dataclass(frozen=True)

@@ -54,6 +54,8 @@ COLUMNS = ("unit", "serial", "lot", "date", "sensor", "table", "procedure", "met
 CAMPAIGN = "# Hydra overrides for all units of this campaign.\noverrides: []\n"
 # By hand, rests are longer and moves faster than on a table, and there is no held-out motion with a reference.
 BY_HAND = Course(dwell_s=4.0, step_rate_dps=60.0, acceleration_dps2=200.0, validation_s=0.0)
+FILE, PROGRAM = "file", "program"
+INGEST = "table_log"
 
 
 def write_campaign(
@@ -268,8 +270,6 @@ def _write_json(path: Path, content: dict[str, Any]) -> None:
     path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
-FILE, PROGRAM = "file", "program"
-INGEST = "table_log"
 NO_TABLE: dict[str, Any] = {"table_angle": None, "table_rate": None, "table_attitude": None}
 
 

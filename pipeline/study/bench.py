@@ -66,6 +66,8 @@ AMPLITUDE = {
     "exponential": {"accelerometer": 3e-3, "gyroscope": 0.6},
     "band": {"accelerometer": 2e-3, "gyroscope": 0.05},
 }
+USED = ("accelerometer", "gyroscope")
+GAUSS_MARKOV = ("normal", "wander")
 
 
 def recordings_of(case: Case) -> list[Recording]:
@@ -196,10 +198,6 @@ def _added(recording: Recording, sensor: str, values: NDArray[np.float64]) -> Re
     if sensor == "accelerometer":
         return replace(recording, accelerometer=reading + values)
     return replace(recording, gyroscope=reading + values)
-
-
-USED = ("accelerometer", "gyroscope")
-GAUSS_MARKOV = ("normal", "wander")
 
 
 def signals_left(case: Case) -> dict[str, float]:

@@ -34,6 +34,16 @@ signal. What each family hides: `pipeline/study/cases.py`; how: `pipeline/study/
 "Nothing hidden" counts each sensor of a unit by itself. "Taken out of the catalogue" counts the units of which the
 whole catalogue names the hidden effect and knows none with over 95 % of its signal.
 """
+SIZE_TEXT = "Selected first, of n, on the MPU-6050 at the size of its data sheet and at shares of it."
+SIGNAL_TEXT = """\
+Every hidden effect by lambda: what a perfect diagnosis, to which noise and equation are known, would gain in 2 log L by
+it beside the others (`pipeline/study/bench.py`). A selection asks for 40 to 100, by its number of parameters."""
+MISS_TEXT = "In brackets lambda."
+SHAPE_HEAD = ["hidden", "n", "unexplained", "other warning", "silent", "nothing", "most often said", "excess gone"]
+SHAPE_TEXT = """\
+Where the temperature only rises, a curve of the temperature and one of the time are the same: what is said silently is
+then a substitute, whose worth is the share of the held-out excess that it takes away (last column)."""
+DATA_SHEET = "Median of the size drawn; one number is for all parameters. A warm-up's time constant is 90 to 400 s."
 
 
 def page(cases: Sequence[Pair], command: str) -> str:
@@ -137,18 +147,6 @@ def _data_sheet() -> list[list[str]]:
                 faint = " (hides in the noise)" if name in FAINT[model][sensor] else ""
                 rows.append([model, sensor, f"`{name}`{faint}", text, ", ".join(units)])
     return rows
-
-
-SIZE_TEXT = "Selected first, of n, on the MPU-6050 at the size of its data sheet and at shares of it."
-SIGNAL_TEXT = """\
-Every hidden effect by lambda: what a perfect diagnosis, to which noise and equation are known, would gain in 2 log L by
-it beside the others (`pipeline/study/bench.py`). A selection asks for 40 to 100, by its number of parameters."""
-MISS_TEXT = "In brackets lambda."
-SHAPE_HEAD = ["hidden", "n", "unexplained", "other warning", "silent", "nothing", "most often said", "excess gone"]
-SHAPE_TEXT = """\
-Where the temperature only rises, a curve of the temperature and one of the time are the same: what is said silently is
-then a substitute, whose worth is the share of the held-out excess that it takes away (last column)."""
-DATA_SHEET = "Median of the size drawn; one number is for all parameters. A warm-up's time constant is 90 to 400 s."
 
 
 def confusions(cases: Iterable[Pair]) -> Counter[tuple[str, str, str]]:

@@ -43,6 +43,7 @@ if TYPE_CHECKING:
 TRUTH, RESULTS = "truth.jsonl", "results.jsonl"
 JSON = dict[str, Any]
 Planned = tuple[str, int, int]
+HELD_OUT = ("single", "pairs", "triples", "one_axis", "shape", "cycle")
 
 
 def run_study(
@@ -124,9 +125,6 @@ def read_lines(path: Path) -> list[JSON]:
     if not path.is_file():
         return []
     return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line]
-
-
-HELD_OUT = ("single", "pairs", "triples", "one_axis", "shape", "cycle")
 
 
 def judge(case: Case) -> list[JSON]:
