@@ -36,43 +36,31 @@ class InputError(PipelineError):
 
 
 class IngestError(InputError):
-    """A recording cannot be used as it is; ``code`` is that of ``docs/bad_inputs.md``.
+    """A recording cannot be used as it is.
 
     Parameters
     ----------
     message : str
         What is wrong and where, with the facts.
-    file : str, optional
-    fault : str
-        The code: ``not_a_number``, ``wrong_sense``, ``checksum`` ...
+    code : str
+        That of ``docs/bad_inputs.md``: ``not_a_number``, ``wrong_sense`` ...
     offset : int, optional
-        Byte of the file at which the fault was found.
+        Byte of the file at which the error was found.
     hint : str
         What to do about it.
 
     Attributes
     ----------
-    message : str
-        Fact, byte and hint in one line.
     fact : str
-        What is wrong, without byte and hint.
+        The message without byte and hint.
     """
 
     def __init__(
-        self,
-        message: str,
-        file: str | None = None,
-        *,
-        fault: str = "damaged",
-        offset: int | None = None,
-        hint: str = "",
+        self, message: str, file: str | None = None, *, code: str = "damaged", offset: int | None = None, hint: str = ""
     ) -> None:
         place = "" if offset is None else f" (byte {offset})"
         super().__init__(f"{message}{place}" + (f"; {hint}" if hint else ""), file)
-        self.code = fault
-        self.fact = message
-        self.offset = offset
-        self.hint = hint
+        self.code, self.fact = code, message
 
 
 class MissingInputError(InputError):

@@ -40,9 +40,8 @@ def main(argv: Sequence[str]) -> int:
     compensation = load(arguments.calibration, arguments.python_effects)
     require_apart(arguments.log, arguments.output)
     if arguments.output.exists() and arguments.output.samefile(arguments.calibration):
-        raise InputError(
-            "the output would overwrite the calibration; choose another file for -o", str(arguments.output)
-        )
+        message = "the output would overwrite the calibration; choose another file for -o"
+        raise InputError(message, str(arguments.output))
     profile = _profile(arguments.calibration, arguments.ingest)
     progress = Progress(arguments.log)
     result = compensate_log(

@@ -105,9 +105,8 @@ class CsvLog:
                 raise InputError(f"the header names {twice[0]} more than once", where)
             if present and len(present) < len(wanted):
                 missing = ", ".join(str(c.column) for c in wanted if c not in present)
-                raise InputError(
-                    f"the header names {', '.join(str(c.column) for c in present)}, but not {missing}", where
-                )
+                message = f"the header names {', '.join(str(c.column) for c in present)}, but not {missing}"
+                raise InputError(message, where)
             if present:
                 self.places[signal] = [i for c in present if (i := _index(c, names)) is not None]
         if not any(sensor in self.places for sensor in SENSORS):

@@ -80,12 +80,11 @@ class McapLog:
         sensors = {c for triad in TRIADS.values() for c in triad}
         found = [t for t, fields in self.settings.topics.items() if sensors & set(fields)]
         if len(found) != 1:
-            raise IngestError(
+            message = (
                 f"the profile takes the readings from {len(found)} topics ({', '.join(found)}); apply needs both "
-                "sensors in the same messages",
-                str(self.source),
-                fault="unsupported",
+                "sensors in the same messages"
             )
+            raise IngestError(message, str(self.source), code="unsupported")
         return found[0]
 
     def _holds_readings(self, rows: Rows, topic: str | None) -> bool:
@@ -98,12 +97,11 @@ class McapLog:
         if self.readings is None or channel.topic == self.readings.topic:
             return self.readings is not None
         if is_imu and topic is None:
-            raise IngestError(
+            message = (
                 f"2 topics are of type {IMU}: {self.readings.topic}, {channel.topic}; choose one in "
-                "ingest.mcap.imu_topic",
-                str(self.source),
-                fault="ambiguous",
+                "ingest.mcap.imu_topic"
             )
+            raise IngestError(message, str(self.source), code="ambiguous")
         return False
 
     def _block(self, rows: Rows) -> Block:
@@ -170,12 +168,9 @@ class McapLog:
             kinds = {c.topic: schemas[c.schema_id].name if c.schema_id in schemas else "no type" for c in channels}
             listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(kinds.items()))
             named = self._named_topic() or f"a topic of type {IMU}"
-            raise IngestError(
-                f"no messages on {named}; the file has {listed or 'none'}",
-                str(self.source),
-                fault="missing_topic",
-                hint="ingest.mcap.topics of a profile (--ingest) reads other types by their fields",
-            )
+            message = f"no messages on {named}; the file has {listed or 'none'}"
+            hint = "ingest.mcap.topics of a profile (--ingest) reads other types by their fields"
+            raise IngestError(message, str(self.source), code="missing_topic", hint=hint)
         topic = self.readings.topic
         made = {m.metadata.get("topic"): m.metadata.get("unit") for m in self.reader.metadata if m.name == METADATA}
         if topic in made:

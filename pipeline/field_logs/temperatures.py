@@ -62,12 +62,11 @@ class Temperatures:
                 known = self.values[np.isfinite(self.values)]
                 if known.size:
                     return float(known[0])
-        raise IngestError(
-            f"the calibration has effects of temperature, but the log holds no messages of {self.topic or TEMPERATURE}",
-            str(self.path),
-            fault="missing_topic",
-            hint="name the topic in ingest.mcap.temperature_topic of a profile (--ingest)",
+        message = (
+            f"the calibration has effects of temperature, but the log holds no messages of {self.topic or TEMPERATURE}"
         )
+        hint = "name the topic in ingest.mcap.temperature_topic of a profile (--ingest)"
+        raise IngestError(message, str(self.path), code="missing_topic", hint=hint)
 
     def take(self, run: list[Rows], reader: McapReader) -> None:
         """Decode the temperatures of a run."""

@@ -100,7 +100,7 @@ def fit_clocks(sensor: ChannelTable, log: ChannelTable) -> ClockFit:
         If the sensor has no gyroscope, or the two logs do not show the same motion, or show it at several times alike.
     """
     if "gyro_x" not in sensor.values:
-        raise IngestError("a table's log with its own clock needs a gyroscope to be aligned", log.path, fault="no_sync")
+        raise IngestError("a table's log with its own clock needs a gyroscope to be aligned", log.path, code="no_sync")
     signals = signals_of(log)
     sensed = _sensor_signals(sensor, signals)
     look = sensed.part(slice(None, None, max(1, len(sensed.time) // SAMPLES_OF_A_LOOK)))
@@ -113,20 +113,18 @@ def fit_clocks(sensor: ChannelTable, log: ChannelTable) -> ClockFit:
         if fit.correlation > SMALLEST_CORRELATION:
             break
     if not fit.correlation > SMALLEST_CORRELATION:
-        raise IngestError(
+        message = (
             "the table's log does not show the motion that the gyroscope read "
-            f"(correlation {fit.correlation:.2f} at best)",
-            log.path,
-            fault="no_sync",
-            hint="do both logs belong to one recording, and are their units right?",
+            f"(correlation {fit.correlation:.2f} at best)"
         )
+        hint = "do both logs belong to one recording, and are their units right?"
+        raise IngestError(message, log.path, code="no_sync", hint=hint)
     if len(order) > 1 and left[order[1]] < AMBIGUOUS * left[order[0]]:
-        raise IngestError(
-            f"the motion repeats itself: the table's log fits at {best:.3f} and {places[int(order[1])]:.3f} s alike",
-            log.path,
-            fault="no_sync",
-            hint="let it cover the whole recording, or begin and end the recording with a turn of its own",
+        message = (
+            f"the motion repeats itself: the table's log fits at {best:.3f} and {places[int(order[1])]:.3f} s alike"
         )
+        hint = "let it cover the whole recording, or begin and end the recording with a turn of its own"
+        raise IngestError(message, log.path, code="no_sync", hint=hint)
     return fit
 
 

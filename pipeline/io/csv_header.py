@@ -65,9 +65,8 @@ def find_columns(names: list[str], settings: CsvFormat, where: str, below: dict[
     """
     twice = sorted({n for n in names if n and names.count(n) > 1})
     if twice:
-        raise IngestError(
-            f"column name {', '.join(twice)} stands more than once in the header", where, fault="duplicate_column"
-        )
+        message = f"column name {', '.join(twice)} stands more than once in the header"
+        raise IngestError(message, where, code="duplicate_column")
     found: list[tuple[Column, int]] = []
     lacking: list[Column] = []
     for column in settings.columns:
@@ -84,12 +83,9 @@ def find_columns(names: list[str], settings: CsvFormat, where: str, below: dict[
         numbers = bool(settings.header) and all(
             NUMBER.fullmatch(n) for name in names for n in re.split(r"[;\t| ]+", name)
         )
-        raise IngestError(
-            _missing_message(missing, names),
-            where,
-            fault="no_header" if numbers else "missing_column",
-            hint=_what_to_do(missing, names, settings, below, numbers=numbers),
-        )
+        message = _missing_message(missing, names)
+        hint = _what_to_do(missing, names, settings, below, numbers=numbers)
+        raise IngestError(message, where, code="no_header" if numbers else "missing_column", hint=hint)
     return found
 
 
@@ -117,12 +113,11 @@ def _channels_of_absent_sensor(missing: list[Column], found: list[tuple[Column, 
 def _check_unit(column: Column, name: str, where: str) -> None:
     stated = unit_in_brackets(name)
     if stated is not None and stated != column.unit and stated in UNITS[column.channel]:
-        raise IngestError(
+        message = (
             f"the header says that {name!r} is in {stated}, ingest.csv.columns.{column.channel}.unit says "
-            f"{column.unit}; one of them is wrong",
-            where,
-            fault="unit_contradiction",
+            f"{column.unit}; one of them is wrong"
         )
+        raise IngestError(message, where, code="unit_contradiction")
 
 
 def _missing_message(missing: list[str], names: list[str]) -> str:

@@ -119,7 +119,7 @@ def refusal(layout: Layout, faults: Sequence[Fault], *, more: bool = False) -> I
         if len(others) > 1:
             said += f": {', '.join(others[: LISTED - 1])}{' ..' if len(others) >= LISTED else ''}"
         said += ")"
-    return IngestError(worst.message + said, f"{layout.path}:{worst.line}", fault=worst.kind, hint=HINTS[worst.kind])
+    return IngestError(worst.message + said, f"{layout.path}:{worst.line}", code=worst.kind, hint=HINTS[worst.kind])
 
 
 def find_faults(

@@ -37,7 +37,7 @@ def read_csv(paths: Sequence[Path], formats: Sequence[CsvFormat], checks: Checks
     Raises
     ------
     IngestError
-        With ``path:line`` where a line is at fault.
+        With ``path:line`` of the line concerned.
     """
     tables = [read_one(path, layout, checks or Checks()) for path, layout in zip(paths, formats, strict=True)]
     same = [t for t, layout in zip(tables, formats, strict=True) if not layout.own_clock]
@@ -113,17 +113,15 @@ def _check_same_times(first: ChannelTable, other: ChannelTable) -> None:
     rows = min(len(first.time_ns), len(other.time_ns))
     differs = np.flatnonzero(first.time_ns[:rows] != other.time_ns[:rows])
     if differs.size == 0:
-        raise IngestError(
+        message = (
             f"{other.source['rows']} rows, but {first.path} has {first.source['rows']}; parts of one recording need "
-            "the same times",
-            other.path,
-            fault="other_times",
+            "the same times"
         )
+        raise IngestError(message, other.path, code="other_times")
     row = int(differs[0])
-    raise IngestError(
+    message = (
         f"time {other.time_ns[row] / 1e9:.9g} s differs from {first.time_ns[row] / 1e9:.9g} s in {first.place(row)}; "
-        "parts of one recording need the same times",
-        other.place(row),
-        fault="other_times",
-        hint="a table's log with a clock of its own is marked own_clock: true",
+        "parts of one recording need the same times"
     )
+    hint = "a table's log with a clock of its own is marked own_clock: true"
+    raise IngestError(message, other.place(row), code="other_times", hint=hint)

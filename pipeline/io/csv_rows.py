@@ -92,7 +92,7 @@ def read_rows(path: Path, settings: CsvFormat, checks: Checks) -> Rows:
     Raises
     ------
     IngestError
-        With ``path:line`` where a line is at fault.
+        With ``path:line`` of the line concerned.
     """
     with unchanged(path), path.open("rb") as stream:
         text = TextBlocks(stream, str(path), keep_nul=settings.bad_rows == DROP)
@@ -245,12 +245,11 @@ class _RowReader:
         """Return the text of the last comment before the data."""
         above = [number for number in self.comments if number < line]
         if not above:
-            raise IngestError(
+            message = (
                 f"no line that starts with {self.settings.comment!r} stands before the data, where ingest.csv.header "
-                "looks for the column names",
-                self.path,
-                fault="no_header",
+                "looks for the column names"
             )
+            raise IngestError(message, self.path, code="no_header")
         text = self.head.split(b"\n")[above[-1] - 1].decode("utf-8")
         text = text.lstrip().removeprefix(self.settings.comment or "")
         return " ".join(text.split()) if self.settings.delimiter == WHITESPACE else text
@@ -266,9 +265,9 @@ class _RowReader:
         skipped, count = self.settings.skip_lines, self.head.count(b"\n")
         if count < skipped:
             message = f"the file ends within the {skipped} lines that ingest.csv.skip_lines skips"
-            return IngestError(message, self.path, fault="no_rows")
+            return IngestError(message, self.path, code="no_rows")
         found = f"header on line {skipped + 1}, " if self.settings.header is True and count > skipped else ""
-        return IngestError(f"{found}0 data rows; at least 2 are needed", self.path, fault="no_rows")
+        return IngestError(f"{found}0 data rows; at least 2 are needed", self.path, code="no_rows")
 
     def _add_rows(self, layout: Layout, body: bytes, lines: NDArray[np.int64]) -> None:
         numbers = layout.numbers(body, len(lines)) if len(lines) else {}
@@ -303,7 +302,7 @@ class _RowReader:
         numbers = layout.numbers(body, len(lines)) if len(lines) else {}
         if not bad.any() or numbers is None:
             place = f"{self.path}:{lines[0]}"
-            raise IngestError("cannot be read as numbers: its rows cannot be told apart", place, fault="not_a_number")
+            raise IngestError("cannot be read as numbers: its rows cannot be told apart", place, code="not_a_number")
         return body, lines, numbers
 
     def _exact_times(

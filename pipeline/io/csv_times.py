@@ -91,11 +91,8 @@ def times_of(rows: Rows, settings: CsvFormat) -> NDArray[np.int64]:
     unit_s = float(tick_ns) / 1e9 if tick_ns is not None else seconds_per_unit(column.unit)
     row = int(np.argmax(np.abs(values)))
     if abs(values[row]) * unit_s >= LONGEST_S:
-        raise IngestError(
-            f"time {values[row] * unit_s:g} s is out of range; is {column.unit} the unit of column {name}?",
-            rows.place(row),
-            fault="wrong_rate",
-        )
+        message = f"time {values[row] * unit_s:g} s is out of range; is {column.unit} the unit of column {name}?"
+        raise IngestError(message, rows.place(row), code="wrong_rate")
     if rows.exact_ns is None:
         return whole_times(values, column.unit, tick_ns)
     _refuse_coarse(values, rows.exact_ns, column.unit, name, rows.layout.path)
@@ -115,13 +112,11 @@ def _refuse_coarse(values: NDArray[np.float64], exact_ns: NDArray[np.int64], uni
     zeros = next(z for z in range(18, -1, -1) if not np.any(exact_ns % 10**z))
     resolution = spacing if np.array_equal(exact_ns, values.astype(np.int64) * scale) else 10.0**zeros
     if resolution >= spacing / 10 and resolution > COARSEST * step:
-        raise IngestError(
+        message = (
             f"the times in column {name} have passed through floating-point numbers, which are {spacing:g} ns apart "
-            f"at {values[0]:.3g} {unit}: more than {COARSEST:.0%} of the median interval of {step:g} ns",
-            path,
-            fault="coarse_time",
-            hint="log them as integers",
+            f"at {values[0]:.3g} {unit}: more than {COARSEST:.0%} of the median interval of {step:g} ns"
         )
+        raise IngestError(message, path, code="coarse_time", hint="log them as integers")
 
 
 def in_order(
@@ -181,7 +176,7 @@ def over_budget(error: IngestError, touched: int, rows: int, checks: Checks) -> 
         f"{touched} of {rows} rows would have to be repaired, more than the share of {checks.repaired_rows:g} that "
         "ingest.checks.repaired_rows allows"
     )
-    return IngestError(error.fact, error.file, fault=error.code, hint=hint)
+    return IngestError(error.fact, error.file, code=error.code, hint=hint)
 
 
 def _repeated(rows: Rows, time_ns: NDArray[np.int64], order: NDArray[np.intp], error: IngestError) -> NDArray[np.intp]:
@@ -194,12 +189,9 @@ def _repeated(rows: Rows, time_ns: NDArray[np.int64], order: NDArray[np.intp], e
             if error.code != "duplicate_time":
                 raise error
             row = int(max(here[differ[0]], before[differ[0]]))
-            raise IngestError(
-                f"time repeats {time_ns[row] / 1e9:.9g} s in rows that differ ({twice.size} such times)",
-                rows.place(row),
-                fault="duplicate_time",
-                hint="time has to increase; has the time enough digits, or were two logs merged?",
-            ) from error
+            message = f"time repeats {time_ns[row] / 1e9:.9g} s in rows that differ ({twice.size} such times)"
+            hint = "time has to increase; has the time enough digits, or were two logs merged?"
+            raise IngestError(message, rows.place(row), code="duplicate_time", hint=hint) from error
     return np.asarray(twice, np.intp)
 
 
@@ -240,11 +232,8 @@ def _one_session(
     resets = {int(r) + 1 for r in np.flatnonzero(steps < -longest)} - wrapped
     starts = sorted({0, *resets, *rows.restarts} - {len(time_ns)})
     if session > len(starts):
-        raise IngestError(
-            f"ingest.csv.session is {session}, and the log was started {len(starts)} times",
-            rows.layout.path,
-            fault="session",
-        )
+        message = f"ingest.csv.session is {session}, and the log was started {len(starts)} times"
+        raise IngestError(message, rows.layout.path, code="session")
     start, stop = [*starts, len(time_ns)][session - 1 : session + 1]
     index = np.arange(start, stop)
     first, last = int(rows.lines[start]), int(rows.lines[stop - 1])

@@ -128,9 +128,8 @@ def align(sensor: ChannelTable, log: ChannelTable) -> ChannelTable:
     log = unwrapped(log)
     t, own = seconds_of(sensor), seconds_of(log)
     if len(own) < FEWEST_ROWS:
-        raise IngestError(
-            f"the table's log has {len(own)} rows; at least {FEWEST_ROWS} are needed", log.path, fault="no_sync"
-        )
+        message = f"the table's log has {len(own)} rows; at least {FEWEST_ROWS} are needed"
+        raise IngestError(message, log.path, code="no_sync")
     if signals_of(log).resting:
         tau = np.clip(t, 0.0, own[-1])
         note = Note("N-SYNC", len(t), 0, 0, "the table rests throughout its log: there is no motion to align by")
@@ -139,7 +138,7 @@ def align(sensor: ChannelTable, log: ChannelTable) -> ChannelTable:
     tau = fit.table_time(t)
     inside = np.flatnonzero((tau >= 0) & (tau <= own[-1]))
     if inside.size < 2:
-        raise IngestError("no time is covered by both logs", log.path, fault="no_sync")
+        raise IngestError("no time is covered by both logs", log.path, code="no_sync")
     rows = slice(int(inside[0]), int(inside[-1]) + 1)
     clock = {
         "offset_s": float(log.time_ns[0] - sensor.time_ns[0]) / 1e9 + fit.offset,
@@ -217,7 +216,7 @@ def signals_of(log: ChannelTable) -> Signals:
     if "table_rate" in found:
         rate = found["table_rate"](grid)
         return Signals(step, rate[:, None], np.zeros((len(grid), 0)), interval, magnitude=bool(rate.min() >= 0))
-    raise IngestError("the table's log holds neither rate, angle nor attitude", log.path, fault="no_sync")
+    raise IngestError("the table's log holds neither rate, angle nor attitude", log.path, code="no_sync")
 
 
 def seconds_of(table: ChannelTable) -> Values:

@@ -183,26 +183,23 @@ def unchanged(path: Path) -> Iterator[None]:
     try:
         other = not_regular(path)
         if other:
-            raise IngestError(other, str(path), fault="unreadable")
+            raise IngestError(other, str(path), code="unreadable")
         before = path.stat()
         if before.st_size == 0:
-            raise IngestError("the file is empty (0 bytes)", str(path), fault="empty")
+            raise IngestError("the file is empty (0 bytes)", str(path), code="empty")
         yield
         after = path.stat()
     except OSError as error:
-        raise IngestError(f"cannot be read: {error.strerror or error}", str(path), fault="unreadable") from error
+        raise IngestError(f"cannot be read: {error.strerror or error}", str(path), code="unreadable") from error
     if (before.st_size, before.st_mtime_ns, before.st_ino) != (after.st_size, after.st_mtime_ns, after.st_ino):
-        raise IngestError(
-            f"the file changed while it was read ({before.st_size} bytes, then {after.st_size})",
-            str(path),
-            fault="changed",
-            hint="is it still being recorded or copied? Run again when that is done",
-        )
+        message = f"the file changed while it was read ({before.st_size} bytes, then {after.st_size})"
+        hint = "is it still being recorded or copied? Run again when that is done"
+        raise IngestError(message, str(path), code="changed", hint=hint)
 
 
 def refuse_foreign(start: bytes, path: str) -> None:
     """Refuse a file whose first bytes are those of another kind of file."""
     for magic, what in FOREIGN.items():
         if start.startswith(magic):
-            fault = "utf16" if what == UTF_16 else "foreign"
-            raise IngestError(f"not a text log but {what}", path, fault=fault)
+            code = "utf16" if what == UTF_16 else "foreign"
+            raise IngestError(f"not a text log but {what}", path, code=code)

@@ -68,11 +68,8 @@ def _read_head(path: Path) -> tuple[list[str], dict[str, str], int]:
     refuse_foreign(start[:16], str(path))
     lines = start.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n").split(b"\n")
     if not any(lines[0].startswith(first) for first in FIRST_LINES):
-        raise IngestError(
-            f"not a .gcsv file: it starts with {lines[0][:40]!r}, GYROFLOW IMU LOG is expected",
-            f"{path}:1",
-            fault="gcsv",
-        )
+        message = f"not a .gcsv file: it starts with {lines[0][:40]!r}, GYROFLOW IMU LOG is expected"
+        raise IngestError(message, f"{path}:1", code="gcsv")
     facts: dict[str, str] = {}
     for number, line in enumerate(lines[1:], 1):
         cells = [c.strip() for c in line.decode("utf-8", "replace").split(",")]
@@ -80,15 +77,14 @@ def _read_head(path: Path) -> tuple[list[str], dict[str, str], int]:
             return cells, facts, number
         if len(cells) > 1:
             facts[cells[0]] = ",".join(cells[1:])
-    raise IngestError("the head of the file has no line of column names (t,gx,gy,gz,...)", str(path), fault="gcsv")
+    raise IngestError("the head of the file has no line of column names (t,gx,gy,gz,...)", str(path), code="gcsv")
 
 
 def _format(names: list[str], facts: dict[str, str], skip: int, path: Path) -> CsvFormat:
     version = facts.get("version", "1")
     if version.split(".")[0] != "1":
-        raise IngestError(
-            f"version {version} of .gcsv is not known; known are 1 to {LAST_VERSION}", str(path), fault="gcsv"
-        )
+        message = f"version {version} of .gcsv is not known; known are 1 to {LAST_VERSION}"
+        raise IngestError(message, str(path), code="gcsv")
     rate = 1.0 / float(Fraction(_number(facts, "tscale", path)))
     columns = [Column(channel="time", column=names[0], unit=COUNTS, counts_per_unit=rate)]
     for sensor, letter, scale, factor in (("gyroscope", "g", "gscale", DEGREES), ("accelerometer", "a", "ascale", 1.0)):
@@ -106,9 +102,8 @@ def _number(facts: dict[str, str], key: str, path: Path) -> str:
     text = facts.get(key, "")
     if not re.fullmatch(r"\+?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", text) or float(text) == 0:
         what = f"is {text!r}" if text else "is missing"
-        raise IngestError(
-            f"{key} {what}; a positive number is expected in the head of the file", str(path), fault="gcsv"
-        )
+        message = f"{key} {what}; a positive number is expected in the head of the file"
+        raise IngestError(message, str(path), code="gcsv")
     return text
 
 
@@ -116,9 +111,8 @@ def _orientation(facts: dict[str, str], path: Path) -> tuple[str, str, str]:
     """Return the axis map of an orientation: body axis j is the reading named by letter j."""
     text = facts.get("orientation", "XYZ")
     if sorted(text.lower()) != ["x", "y", "z"]:
-        raise IngestError(
-            f"orientation is {text!r}; it names X, Y and Z once each, small where turned round", str(path), fault="gcsv"
-        )
+        message = f"orientation is {text!r}; it names X, Y and Z once each, small where turned round"
+        raise IngestError(message, str(path), code="gcsv")
     found = {
         letter.lower(): ("+" if letter.isupper() else "-") + body for letter, body in zip(text, "xyz", strict=True)
     }

@@ -67,19 +67,19 @@ class _Topic:
     """The messages of one topic as they come; an error in them matters only if the topic is used."""
 
     decoder: TopicDecoder
-    fault: IngestError | None = None
+    error: IngestError | None = None
     times: list[NDArray[np.int64]] = field(default_factory=list)
     recorded: list[NDArray[np.int64]] = field(default_factory=list)
     values: dict[str, list[NDArray[Any]]] = field(default_factory=dict)
 
     def read(self, rows: Rows, reader: McapReader) -> None:
         """Decode the messages of a run."""
-        if self.fault is not None:
+        if self.error is not None:
             return
         try:
             batch = self.decoder.read(rows, reader)
         except IngestError as error:
-            self.fault = error
+            self.error = error
             return
         self.recorded.append(rows.heads["log_time"].astype(np.int64))
         if batch.time_ns is not None:
@@ -95,20 +95,17 @@ class _Topic:
         IngestError
             If a message could not be decoded, or the times cannot be.
         """
-        if self.fault is not None:
-            raise self.fault
+        if self.error is not None:
+            raise self.error
         topic, path, decoders = self.decoder.topic, self.decoder.path, self.decoder.decoders.values()
         values = {n: np.concatenate(self.values.pop(n)) for n in list(self.values)}
         recorded = np.concatenate(self.recorded)
         time = np.concatenate(self.times) if self.times else recorded
         if self.times:
             if not time.any() and len(time) > 1:
-                raise IngestError(
-                    f"topic {topic}: all header stamps are 0; the sensor's own times are needed",
-                    path,
-                    fault="bad_time",
-                    hint="if the recorder's times are good enough, set ingest.mcap.time_source=log_time",
-                )
+                message = f"topic {topic}: all header stamps are 0; the sensor's own times are needed"
+                hint = "if the recorder's times are good enough, set ingest.mcap.time_source=log_time"
+                raise IngestError(message, path, code="bad_time", hint=hint)
             check_plausible(topic, time, recorded, settings.clock_difference_s, path)
         order, found = in_order(topic, time, list(values.values()), settings.reorder_s, path)
         notes += found
@@ -181,12 +178,11 @@ class _Log:
         """Return the named topic, or the only topic of a type; None if there is none and none is required."""
         found = [t for t in self.topics.values() if t.decoder.kind == kind]
         if len(found) > 1:
-            raise IngestError(
+            message = (
                 f"{len(found)} topics are of type {kind}: {', '.join(t.decoder.topic for t in found)}; choose one in "
-                "ingest.mcap",
-                self.path,
-                fault="ambiguous",
+                "ingest.mcap"
             )
+            raise IngestError(message, self.path, code="ambiguous")
         if required and not found:
             named = topic_of(kind, self.settings)
             self._refuse_missing(f"no topic {named} of type {kind}" if named else f"no topic of type {kind}", kind)
@@ -195,7 +191,7 @@ class _Log:
     def _refuse_missing(self, what: str, kind: str) -> NoReturn:
         listed = ", ".join(text for _, text in self._listed()) or "no topics"
         hint = "ingest.mcap.topics reads other types by their fields" if kind == IMU else ""
-        raise IngestError(f"{what}; the file has {listed}", self.path, fault="missing_topic", hint=hint)
+        raise IngestError(f"{what}; the file has {listed}", self.path, code="missing_topic", hint=hint)
 
     def _listed(self) -> list[tuple[str, str]]:
         """Return all topics, and each with its type."""
@@ -268,13 +264,12 @@ class _Log:
             self.end_ns = min(self.end_ns, int(series.time_ns[-1]))
         unmatched = np.flatnonzero((series.time_ns[index] != base.time_ns) & (base.time_ns <= self.end_ns))
         if unmatched.size:
-            raise IngestError(
+            message = (
                 f"{unmatched.size} of {len(index)} Imu messages have no message of equal stamp on {series.topic}, the "
-                f"first at {base.time_ns[unmatched[0]] / 1e9:.9g} s; the table has to be logged with the Imu's stamps",
-                self.path,
-                fault="bad_time",
-                hint="or, where its clock is another one, set ingest.mcap.table_clock=own",
+                f"first at {base.time_ns[unmatched[0]] / 1e9:.9g} s; the table has to be logged with the Imu's stamps"
             )
+            hint = "or, where its clock is another one, set ingest.mcap.table_clock=own"
+            raise IngestError(message, self.path, code="bad_time", hint=hint)
         extra = len(series.time_ns) - len(index)
         if extra > 0:
             detail = f"messages on {series.topic} between the Imu's were not used"
@@ -286,12 +281,11 @@ class _Log:
             wrong = np.flatnonzero(~np.isfinite(numbers))
             if wrong.size:
                 row = int(wrong[0])
-                raise IngestError(
+                message = (
                     f"{channel} is {numbers[row]} at {base.time_ns[row] / 1e9:.9g} s ({wrong.size} such samples); "
-                    "finite numbers are expected",
-                    self.path,
-                    fault="bad_message",
+                    "finite numbers are expected"
                 )
+                raise IngestError(message, self.path, code="bad_message")
 
     def _note_container(self) -> None:
         if not self.reader.verified:

@@ -92,11 +92,8 @@ class TopicDecoder:
         recorded = rows.heads["log_time"]
         if (recorded > LARGEST_NS).any():
             number = self.count + int(np.argmax(recorded > LARGEST_NS)) + 1
-            raise IngestError(
-                f"message {number} on {self.topic}: the recorder's time of {recorded.max()} ns is none",
-                self.path,
-                fault="bad_time",
-            )
+            message = f"message {number} on {self.topic}: the recorder's time of {recorded.max()} ns is none"
+            raise IngestError(message, self.path, code="bad_time")
         if rows.channel not in self.decoders:
             channel = reader.channels[rows.channel]
             schema = reader.schemas.get(channel.schema_id)
@@ -109,9 +106,8 @@ class TopicDecoder:
         absent = {name for name, is_absent in self._absent.items() if is_absent}
         absent |= {c for vector in absent & set(VECTORS) for c in VECTORS[vector][0]}
         if self.kind == IMU and absent >= set(VECTORS):
-            raise IngestError(
-                f"topic {self.topic} says that both quantities are absent (covariance -1)", self.path, fault="absent"
-            )
+            message = f"topic {self.topic} says that both quantities are absent (covariance -1)"
+            raise IngestError(message, self.path, code="absent")
         values = {c: self._in_unit(c, batch.values[c]) for c in self.fields if c not in absent}
         return Batch(batch.time_ns, values)
 
@@ -122,11 +118,8 @@ class TopicDecoder:
         if changed.size:
             covariance = name in VECTORS
             what = f"{name} is absent (covariance -1)" if covariance else f"{self.wanted.values[name].text} is empty"
-            raise IngestError(
-                f"{what} in some messages on {self.topic}, see message {self.count + int(changed[0]) + 1}",
-                self.path,
-                fault="absent" if covariance else "bad_message",
-            )
+            message = f"{what} in some messages on {self.topic}, see message {self.count + int(changed[0]) + 1}"
+            raise IngestError(message, self.path, code="absent" if covariance else "bad_message")
 
     def _in_unit(self, channel: str, numbers: NDArray[np.float64]) -> NDArray[np.float64]:
         if channel in self.encodings:

@@ -148,7 +148,7 @@ class McapReader:
                 f"truncated or damaged MCAP file: {reason}; {self.count} messages in {len(self.chunks)} chunks were "
                 "readable before",
                 self.path,
-                fault="checksum" if "checksum" in reason else "incomplete" if "missing" in reason else "damaged",
+                code="checksum" if "checksum" in reason else "incomplete" if "missing" in reason else "damaged",
                 offset=self._start,
                 hint=COPY_AGAIN,
             ) from error
@@ -203,9 +203,8 @@ class McapReader:
     def _take_in(self, opcode: int, content: bytes) -> None:
         """Read a record of the data section other than a message."""
         if (self.header is None) != (opcode == Opcode.HEADER):
-            raise ValueError(
-                f"no Header record: the first is of kind {opcode}" if not self.header else "a second Header"
-            )
+            message = f"no Header record: the first is of kind {opcode}" if not self.header else "a second Header"
+            raise ValueError(message)
         if opcode == Opcode.HEADER:
             self.header = parsed(Header, content)
         elif opcode == Opcode.CHUNK:
@@ -250,9 +249,8 @@ class McapReader:
                 self._define(opcode, content)
         for rows in run.rows:
             if rows.channel not in self.channels:
-                raise ValueError(
-                    f"messages of channel {rows.channel}, which no record before them defines: a part is missing"
-                )
+                message = f"messages of channel {rows.channel}, which no record before them defines: a part is missing"
+                raise ValueError(message)
             self.counts[rows.channel] += len(rows.starts)
         yield run
 
@@ -314,7 +312,7 @@ class McapReader:
         hint = f"{COPY_AGAIN}, or set ingest.mcap.allow_truncated=true to use the complete chunks"
         if self.allow_truncated:
             hint = f"{COPY_AGAIN}: {unproven or 'no chunk is complete'}"
-        raise IngestError(facts, self.path, fault="truncated", offset=self.size, hint=hint)
+        raise IngestError(facts, self.path, code="truncated", offset=self.size, hint=hint)
 
     def _check_complete(self) -> None:
         """Compare what was read with the summary; ``ValueError`` if a part is missing."""
@@ -332,9 +330,8 @@ class McapReader:
                 f"the summary says {stated.message_count} messages, the file holds {self.count}: a part is missing"
             )
         if stated.channel_message_counts and Counter(stated.channel_message_counts) != self.counts:
-            raise ValueError(
-                f"the summary says {stated.message_count} messages, which the file does not hold by channel"
-            )
+            message = f"the summary says {stated.message_count} messages, which the file does not hold by channel"
+            raise ValueError(message)
         found = (len(self.chunks), len(self.attachments), len(self.metadata))
         if (stated.chunk_count, stated.attachment_count, stated.metadata_count) != found:
             raise ValueError(
@@ -353,13 +350,13 @@ def check_magic(start: bytes, path: str) -> None:
     if start.startswith(MAGIC):
         return
     if not start:
-        raise IngestError("the file is empty (0 bytes)", path, fault="not_mcap")
+        raise IngestError("the file is empty (0 bytes)", path, code="not_mcap")
     if MAGIC.startswith(start):
-        raise IngestError(f"truncated: the file has only {len(start)} bytes", path, fault="truncated")
+        raise IngestError(f"truncated: the file has only {len(start)} bytes", path, code="truncated")
     what = next((what for known, what in FOREIGN.items() if start.startswith(known) and known not in MAGIC), "")
     if not what and not start.strip(b"\0"):
         what = "zeros: data that a memory card lost"
     if not what:
         what = f"it starts with {start[:8].decode('ascii', 'replace')!r}"
         what += "; a text log needs the suffix .csv" if start.isascii() and b"\0" not in start else ""
-    raise IngestError(f"not an MCAP file: {what}", path, fault="not_mcap", offset=0)
+    raise IngestError(f"not an MCAP file: {what}", path, code="not_mcap", offset=0)

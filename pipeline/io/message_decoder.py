@@ -86,17 +86,14 @@ class ChannelDecoder:
             self.find_layout = ros_layouts(channel, schema)
             self.decode = None if self.find_layout else object_decoder(channel, schema)
         except Exception as error:
-            raise IngestError(
-                f"topic {self.topic}: its message definition cannot be read ({error})", path, fault="unsupported"
-            ) from error
+            message = f"topic {self.topic}: its message definition cannot be read ({error})"
+            raise IngestError(message, path, code="unsupported") from error
         if not self.find_layout and not self.decode:
-            raise IngestError(
+            message = (
                 f"topic {self.topic} is encoded as {channel.message_encoding!r} with "
-                f"{schema.encoding if schema else ''!r} definitions",
-                path,
-                fault="unsupported",
-                hint=SUPPORTED,
+                f"{schema.encoding if schema else ''!r} definitions"
             )
+            raise IngestError(message, path, code="unsupported", hint=SUPPORTED)
 
     def read(self, rows: Rows) -> Batch:
         """Return the columns of messages.
@@ -187,13 +184,11 @@ class ChannelDecoder:
             return work(payload)
         except Exception as error:
             reason = str(error) if isinstance(error, ValueError) else f"{type(error).__name__} {error}".strip()
-            raise IngestError(
+            message = (
                 f"message {self.done + row + 1} on {self.topic} ({rows.place}, {len(payload)} bytes) cannot be read "
-                f"as {self.kind}: {reason}",
-                self.path,
-                fault="bad_message",
-                offset=rows.offset,
-            ) from error
+                f"as {self.kind}: {reason}"
+            )
+            raise IngestError(message, self.path, code="bad_message", offset=rows.offset) from error
 
 
 def ros_layouts(channel: Channel, schema: Schema | None) -> FindLayout | None:

@@ -71,17 +71,14 @@ def _check_whole(table: ChannelTable) -> None:
     for channels in (*TRIADS.values(), ATTITUDE):
         missing = [c for c in channels if c not in table.values]
         if 0 < len(missing) < len(channels):
-            raise IngestError(
-                f"{', '.join(missing)} missing; {', '.join(channels)} come together or not at all",
-                table.path,
-                fault="missing_column",
-            )
+            message = f"{', '.join(missing)} missing; {', '.join(channels)} come together or not at all"
+            raise IngestError(message, table.path, code="missing_column")
 
 
 def _check_times(table: ChannelTable) -> None:
     time = table.time_ns
     if len(time) < 2:
-        raise IngestError(f"{len(time)} data rows; at least 2 are needed", table.path, fault="no_rows")
+        raise IngestError(f"{len(time)} data rows; at least 2 are needed", table.path, code="no_rows")
     back = time[1:] <= time[:-1]
     if back.any():
         row = int(np.argmax(back)) + 1
@@ -96,13 +93,12 @@ def _check_rate(table: ChannelTable, checks: Checks) -> None:
     if abs(ratio - 1.0) <= RATE_TOLERANCE:
         return
     unit = next((f"; the numbers look like {u}" for f, u in _OTHER_UNITS if abs(ratio * f - 1.0) <= RATE_TOLERANCE), "")
-    raise IngestError(
+    message = (
         f"the median interval is {interval_us:g} us, and ingest.checks.rate_hz of {checks.rate_hz:g} Hz asks for "
-        f"{1e6 / checks.rate_hz:g} us{unit}",
-        table.path,
-        fault="wrong_rate",
-        hint="correct ingest.csv.columns.time.unit or ingest.checks.rate_hz",
+        f"{1e6 / checks.rate_hz:g} us{unit}"
     )
+    hint = "correct ingest.csv.columns.time.unit or ingest.checks.rate_hz"
+    raise IngestError(message, table.path, code="wrong_rate", hint=hint)
 
 
 _OTHER_UNITS = (
@@ -129,12 +125,11 @@ def _check_force(table: ChannelTable) -> None:
             hint = f"the numbers look like {unit}"
     if usual > 1500.0:
         hint = "the numbers look like raw counts, which need counts_per_unit"
-    raise IngestError(
+    message = (
         f"median specific force is {usual:.4g} g, and a log of rests and turns has about 1 g (allowed {low} to "
-        f"{high}): {hint}; correct ingest.csv.columns.accel_x.unit (accel_y, accel_z)",
-        table.path,
-        fault="implausible_force",
+        f"{high}): {hint}; correct ingest.csv.columns.accel_x.unit (accel_y, accel_z)"
     )
+    raise IngestError(message, table.path, code="implausible_force")
 
 
 def _check_attitude(table: ChannelTable) -> None:
@@ -144,12 +139,11 @@ def _check_attitude(table: ChannelTable) -> None:
     wrong = np.flatnonzero(np.abs(norm - 1.0) > QUATERNION_TOLERANCE)
     if wrong.size:
         row = int(wrong[0])
-        raise IngestError(
+        message = (
             f"the table's quaternion has the length {norm[row]:.4g} at {table.time_ns[row] / 1e9:.9g} s "
-            f"({wrong.size} such samples); 1 is expected",
-            table.place(row),
-            fault="bad_attitude",
+            f"({wrong.size} such samples); 1 is expected"
         )
+        raise IngestError(message, table.place(row), code="bad_attitude")
 
 
 def _check_turn_rate(table: ChannelTable) -> None:
@@ -174,9 +168,5 @@ def _check_turn_rate(table: ChannelTable) -> None:
         ratio, seen = found
     for factor, what in ((1 / DEGREES, "rad/s that were declared as deg/s"), (DEGREES, "deg/s declared as rad/s")):
         if 0.7 < ratio / factor < 1.4:
-            raise IngestError(
-                f"{seen}: the numbers look like {what}",
-                table.path,
-                fault="implausible_rate",
-                hint="correct ingest.csv.columns.gyro_x.unit (gyro_y, gyro_z)",
-            )
+            hint = "correct ingest.csv.columns.gyro_x.unit (gyro_y, gyro_z)"
+            raise IngestError(f"{seen}: the numbers look like {what}", table.path, code="implausible_rate", hint=hint)

@@ -55,12 +55,9 @@ def flag_gaps(table: ChannelTable, flags: NDArray[np.uint16], checks: Checks) ->
         f"the longest lasts {lengths.max() / 1e9:.6g} s, {lost:.3%} of the time is missing"
     )
     if lost > checks.missing_time:
-        raise IngestError(
-            f"{rows.size} {detail}",
-            table.place(int(rows[np.argmax(lengths)])),
-            fault="missing_time",
-            hint=f"ingest.checks.missing_time allows a share of {checks.missing_time:g}",
-        )
+        message = f"{rows.size} {detail}"
+        hint = f"ingest.checks.missing_time allows a share of {checks.missing_time:g}"
+        raise IngestError(message, table.place(int(rows[np.argmax(lengths)])), code="missing_time", hint=hint)
     return [table.note("N-GAP", rows, detail), *_irregular(table, steps[steps <= limit], usual)]
 
 
@@ -90,13 +87,12 @@ def flag_clipped(table: ChannelTable, sensor: str, full_scale: float, flags: NDA
         size = np.abs(values)
         if largest > FULL_SCALE_MARGIN * full_scale:
             row = int(np.argmax(size > FULL_SCALE_MARGIN * full_scale))
-            raise IngestError(
+            message = (
                 f"{channel} is {values[row]:.6g} {UNIT_NAMES[sensor]} at {table.time_ns[row] / 1e9:.9g} "
                 f"s, beyond {FULL_SCALE_MARGIN} times the full scale of {full_scale:g}; correct "
-                f"ingest.csv.columns.{channel}.unit or sensor.{sensor}.full_scale",
-                table.place(row),
-                fault="beyond_full_scale",
+                f"ingest.csv.columns.{channel}.unit or sensor.{sensor}.full_scale"
             )
+            raise IngestError(message, table.place(row), code="beyond_full_scale")
         rows = np.flatnonzero(_at_rail(size, full_scale, count))
         if rows.size:
             flags[rows] |= CLIPPED
@@ -132,23 +128,20 @@ def flag_stuck(table: ChannelTable, sensor: str, flags: NDArray[np.uint16]) -> l
         share = equal_share(same)
         others = [not s.any() or equal_share(s) <= QUIET for c, s in neighbours.items() if c != channel]
         if same.all() and len(same) >= DEAD_ROWS and others and all(others):
-            raise IngestError(
+            message = (
                 f"{channel} is {table.values[channel][0] + 0.0:.6g} {UNIT_NAMES[sensor]} in all {len(same) + 1} rows, "
-                "while the other axes change",
-                table.path,
-                fault="stuck",
-                hint="is the column right, and the sensor's axis alive?",
+                "while the other axes change"
             )
+            hint = "is the column right, and the sensor's axis alive?"
+            raise IngestError(message, table.path, code="stuck", hint=hint)
         rows = _stuck_rows(same, share)
         rows = rows[(flags[rows] & CLIPPED) == 0]
         if rows.size >= len(same) / 2 and others and all(others):
-            raise IngestError(
+            message = (
                 f"{channel} stays at one value for longer than its noise allows in {rows.size} of "
-                f"{len(same) + 1} rows, while the other axes change",
-                table.place(int(rows[0])),
-                fault="stuck",
-                hint="is the sensor's axis alive?",
+                f"{len(same) + 1} rows, while the other axes change"
             )
+            raise IngestError(message, table.place(int(rows[0])), code="stuck", hint="is the sensor's axis alive?")
         if 0 < rows.size < len(same) / 2:
             flags[rows] |= STUCK
             detail = (

@@ -127,9 +127,8 @@ def _check_complete(
         missing += [f"{name} ({f})" for f in taken if folder / f not in files[name]]
     if missing:
         reason = "" if folder.is_dir() else "; the folder does not exist"
-        raise MissingInputError(
-            f"missing recordings: {'; '.join(missing)}{reason}{_of_one_sensor(procedure, files)}", str(folder)
-        )
+        message = f"missing recordings: {'; '.join(missing)}{reason}{_of_one_sensor(procedure, files)}"
+        raise MissingInputError(message, str(folder))
 
 
 def _of_one_sensor(procedure: Mapping[str, Any], files: Mapping[str, list[Path]]) -> str:
@@ -165,12 +164,9 @@ def to_recording(
     stated = table.source.get("gcsv", {}).get("orientation", "XYZ")
     other = [m for m in maps.values() if m != STRAIGHT]
     if stated != "XYZ" and other:
-        raise IngestError(
-            f"the file states its orientation ({stated}) and sensor.axis_map is [{', '.join(other[0])}]",
-            table.path,
-            fault="gcsv",
-            hint="one of them has to go: write orientation,XYZ in the file, or set sensor.axis_map=[+x,+y,+z]",
-        )
+        message = f"the file states its orientation ({stated}) and sensor.axis_map is [{', '.join(other[0])}]"
+        hint = "one of them has to go: write orientation,XYZ in the file, or set sensor.axis_map=[+x,+y,+z]"
+        raise IngestError(message, table.path, code="gcsv", hint=hint)
     table = to_body_axes(table, maps)
     if entry.get("axis") is None and ATTITUDE[0] in table.values and "table_rate" not in table.values:
         attitude = np.column_stack([table.values[c] for c in ATTITUDE])
@@ -214,12 +210,11 @@ def _check_different(recordings: Sequence[Recording]) -> None:
     for recording in recordings:
         twin = seen.setdefault(recording.source["sha256"], recording)
         if twin is not recording:
-            raise IngestError(
+            message = (
                 f"recordings {twin.name} and {recording.name} are the same file, byte for byte "
-                f"({twin.source['file']}); each needs its own",
-                recording.source["file"],
-                fault="same_file",
+                f"({twin.source['file']}); each needs its own"
             )
+            raise IngestError(message, recording.source["file"], code="same_file")
 
 
 def _compare_clocks(recordings: list[Recording]) -> list[Recording]:

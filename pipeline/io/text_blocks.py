@@ -68,11 +68,8 @@ class TextBlocks:
             block = b"".join((rest, memoryview(chunk)[:end])) if end else b""
             rest = chunk[end:]
             if len(rest) > LONGEST_LINE:
-                raise IngestError(
-                    f"not a text log: no line ends within {LONGEST_LINE} bytes",
-                    f"{self._path}:{self._line}",
-                    fault="foreign",
-                )
+                message = f"not a text log: no line ends within {LONGEST_LINE} bytes"
+                raise IngestError(message, f"{self._path}:{self._line}", code="foreign")
             if block:
                 yield self._lines(block)
         if rest:
@@ -124,17 +121,15 @@ class TextBlocks:
         first = max(kept.find(b"\0"), 0)
         inside = b"\0" in kept
         if inside and data[1::2].count(0) > len(data) // 8 > data[::2].count(0):
-            raise IngestError(f"not a text log but {UTF_16}", self._path, fault="utf16")
+            raise IngestError(f"not a text log but {UTF_16}", self._path, code="utf16")
         if (not kept and position == 0) or (inside and not self._keep_nul):
             count = kept.count(b"\0") if kept else len(data)
             line = self._line + data.count(b"\n", 0, first)
-            raise IngestError(
-                f"{count} NUL bytes, the first at byte {position + first}: data that a memory card lost, or UTF-16 "
-                "text",
-                f"{self._path}:{line}",
-                fault="nul",
-                hint="cut the file before them, or set ingest.csv.bad_rows=drop to leave a gap in their place",
+            message = (
+                f"{count} NUL bytes, the first at byte {position + first}: data that a memory card lost, or UTF-16 text"
             )
+            hint = "cut the file before them, or set ingest.csv.bad_rows=drop to leave a gap in their place"
+            raise IngestError(message, f"{self._path}:{line}", code="nul", hint=hint)
         if len(kept) < len(data):
             line = self._line + kept.count(b"\n")
             detail = "NUL bytes at the end of the file were cut off"
@@ -165,11 +160,10 @@ class TextBlocks:
             data.decode("utf-8")
         except UnicodeDecodeError as error:
             line = self._line + data.count(b"\n", 0, error.start)
-            raise IngestError(
-                f"byte {self._offset + error.start} (0x{data[error.start]:02x}) is not UTF-8; save the file as UTF-8",
-                f"{self._path}:{line}",
-                fault="not_utf8",
-            ) from error
+            message = (
+                f"byte {self._offset + error.start} (0x{data[error.start]:02x}) is not UTF-8; save the file as UTF-8"
+            )
+            raise IngestError(message, f"{self._path}:{line}", code="not_utf8") from error
 
     def _refuse_broken_line(self, data: bytes) -> None:
         r"""Refuse a carriage return inside a line: ``0\r.025`` was one number, and ``0`` is another.
@@ -181,12 +175,9 @@ class TextBlocks:
             left, right = found.group(1), found.group(2)
             if not left.startswith(b"#") and len(DELIMITER.findall(left)) != len(DELIMITER.findall(right)):
                 line = self._line + data.count(b"\n", 0, found.start())
-                raise IngestError(
-                    "a carriage return inside a line: it parts a row, perhaps a number, in two",
-                    f"{self._path}:{line}",
-                    fault="bad_row",
-                    hint="remove the byte 0x0d or the whole line; carriage returns that end lines are read",
-                )
+                message = "a carriage return inside a line: it parts a row, perhaps a number, in two"
+                hint = "remove the byte 0x0d or the whole line; carriage returns that end lines are read"
+                raise IngestError(message, f"{self._path}:{line}", code="bad_row", hint=hint)
 
     def _without_open_line(self, data: bytes) -> bytes:
         end = data.rfind(b"\n") + 1

@@ -85,13 +85,12 @@ def check_plausible(
     strange = np.flatnonzero((time < YEAR_2000) | (time > YEAR_2100)) if absolute else np.flatnonzero(time < 0)
     if strange.size:
         row = int(strange[0])
-        raise IngestError(
+        message = (
             f"message {row + 1} on {topic}: header stamp {time[row] / 1e9:.9g} s is no time since power-on and lies "
-            f"outside the years 2000 to 2100 ({strange.size} such messages)",
-            path,
-            fault="bad_time",
-            hint="correct the logger's clock, or set ingest.mcap.time_source=log_time",
+            f"outside the years 2000 to 2100 ({strange.size} such messages)"
         )
+        hint = "correct the logger's clock, or set ingest.mcap.time_source=log_time"
+        raise IngestError(message, path, code="bad_time", hint=hint)
     if difference_s is None:
         return
     apart = time - log_time
@@ -100,13 +99,12 @@ def check_plausible(
     far = np.flatnonzero(np.abs(apart) > difference_s * SECOND)
     if far.size:
         row = int(far[0])
-        raise IngestError(
+        message = (
             f"message {row + 1} on {topic}: header stamp and the recorder's time are {apart[row] / 1e9:.9g} s apart "
-            f"({far.size} such messages); {difference_s:g} s are allowed",
-            path,
-            fault="bad_time",
-            hint="one of the clocks is wrong; if the log was replayed, set ingest.mcap.clock_difference_s=null",
+            f"({far.size} such messages); {difference_s:g} s are allowed"
         )
+        hint = "one of the clocks is wrong; if the log was replayed, set ingest.mcap.clock_difference_s=null"
+        raise IngestError(message, path, code="bad_time", hint=hint)
 
 
 def in_order(
@@ -138,7 +136,7 @@ def in_order(
             f"message {row + 1} on {topic}: header stamp {time[row] / 1e9:.9g} s after "
             f"{(time[row] + late[row]) / 1e9:.9g} s ({int((steps < 0).sum())} such messages); stamps have to increase",
             path,
-            fault="bad_time",
+            code="bad_time",
             hint=f"a log that was restarted belongs in two files (up to {reorder_s:g} s are put in order: "
             "ingest.mcap.reorder_s)",
         )
@@ -156,13 +154,11 @@ def in_order(
             same &= (column[one] == column[other]) | (equal_nan and np.isnan(column[one]) & np.isnan(column[other]))
         if not same.all():
             row = int(np.argmin(same))
-            raise IngestError(
+            message = (
                 f"message {int(other[row]) + 1} on {topic}: header stamp {time[other[row]] / 1e9:.9g} s as message "
-                f"{int(one[row]) + 1}, with other numbers ({int((~same).sum())} such messages)",
-                path,
-                fault="bad_time",
-                hint="two sensors may send on one topic",
+                f"{int(one[row]) + 1}, with other numbers ({int((~same).sum())} such messages)"
             )
+            raise IngestError(message, path, code="bad_time", hint="two sensors may send on one topic")
         notes.append(Note("N-DUP", int(again.size), 0, 0, f"messages on {topic} that stand there twice were dropped"))
         order = np.delete(order, again)
     return order, notes
@@ -175,25 +171,22 @@ def check_fine(topic: str, time: NDArray[np.int64], path: str) -> None:
     resolution = float(np.spacing(np.abs(time).max() / 1e9)) * 1e9
     interval = float(np.median(np.diff(time)))
     if resolution > COARSEST * interval:
-        raise IngestError(
+        message = (
             f"times on {topic} are floating-point numbers that hold {resolution:.3g} ns, more than {COARSEST:.0%} of "
-            f"the interval of {interval:.3g} ns",
-            path,
-            fault="bad_time",
-            hint="log integer times",
+            f"the interval of {interval:.3g} ns"
         )
+        raise IngestError(message, path, code="bad_time", hint="log integer times")
 
 
 def time_error(time_ns: NDArray[np.int64], place: str, row: int) -> IngestError:
     """Return the refusal of a time that does not increase."""
     steps = np.diff(time_ns)
     repeats = steps[row - 1] == 0
-    what, fault = ("repeats", "duplicate_time") if repeats else ("goes back to", "time_back")
+    what, code = ("repeats", "duplicate_time") if repeats else ("goes back to", "time_back")
     count = int(np.count_nonzero(steps <= 0))
-    return IngestError(
+    message = (
         f"time {what} {time_ns[row] / 1e9:.9g} s after {time_ns[row - 1] / 1e9:.9g} s ({count} such samples); time has "
-        "to increase: a log that was restarted belongs in two files",
-        place,
-        fault=fault,
-        hint="" if repeats else "or set ingest.csv.session=1, 2 .. to read one part of it",
+        "to increase: a log that was restarted belongs in two files"
     )
+    hint = "" if repeats else "or set ingest.csv.session=1, 2 .. to read one part of it"
+    return IngestError(message, place, code=code, hint=hint)

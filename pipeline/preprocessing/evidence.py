@@ -278,6 +278,6 @@ def column(recording: Recording, channel: str, settings: Mapping[str, Any]) -> s
     return str(name) if name is not None else channel
 
 
-def refusal(recording: Recording, fault: str, message: str, hint: str) -> IngestError:
+def refusal(recording: Recording, code: str, message: str, hint: str) -> IngestError:
     """Return the error that names a recording's file."""
-    return IngestError(f"recording {recording.name}: {message}", recording.source.get("file"), fault=fault, hint=hint)
+    return IngestError(f"recording {recording.name}: {message}", recording.source.get("file"), code=code, hint=hint)

@@ -77,7 +77,7 @@ def check_turns(
         + f": in {recording.name} gravity turns as in a turn about body {gravity}, and the gyroscope reads a turn "
         f"about {gyro}; both belong in one right-handed frame",
         recording.source.get("file"),
-        fault="mirrored_axes",
+        code="mirrored_axes",
         hint=_cure(_between(seen), accelerometer, maps),
     )
 
@@ -115,7 +115,7 @@ def check_moves(recording: Recording, maps: Mapping[str, Sequence[str]]) -> None
         f"turns by more than {FAILS_DEG:g} deg otherwise than the angular rates say, and with other axes of the "
         f"gyroscope in {best}; both belong in one right-handed frame",
         recording.source.get("file"),
-        fault="mirrored_axes",
+        code="mirrored_axes",
         hint=_cure(D, None, maps),
     )
 

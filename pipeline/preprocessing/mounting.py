@@ -127,7 +127,7 @@ def _refusal(
     return IngestError(
         first.problem + also,
         first.turn.recording.source.get("file"),
-        fault=first.fault,
+        code=first.code,
         hint=_hint(departures, turns, accelerometer, maps),
     )
 
@@ -225,7 +225,7 @@ class Departure:
     Attributes
     ----------
     turn : Turn
-    fault : str
+    code : str
         Code of the refusal.
     problem : str
     settings : dict of str to str
@@ -233,7 +233,7 @@ class Departure:
     """
 
     turn: Turn
-    fault: str
+    code: str
     problem: str
     settings: dict[str, str]
 
@@ -320,7 +320,7 @@ def _face(turn: Turn, tolerance: Tolerance) -> Departure | None:
             off = at_rest
         if abs(off) <= allowed:
             return None
-    fault = "wrong_sense" if found.sense != stated.sense else "wrong_face" if found.up != stated.up else "wrong_zero"
+    code = "wrong_sense" if found.sense != stated.sense else "wrong_face" if found.up != stated.up else "wrong_zero"
     problem = (
         f"{turn.name} is mounted otherwise than stated: found is {words(found)}; stated is {words(stated)}, to "
         f"{allowed:.2g} deg (procedure.mounting_tolerance_deg)"
@@ -332,7 +332,7 @@ def _face(turn: Turn, tolerance: Tolerance) -> Departure | None:
         settings["sense"] = f"{found.sense}"
     if abs(found.zero_deg - stated.zero_deg) > tolerance.angle_deg:
         settings["zero_deg"] = f"{found.zero_deg:.1f}"
-    return Departure(turn, fault, problem, settings)
+    return Departure(turn, code, problem, settings)
 
 
 def _upright(turn: Turn) -> Departure | None:

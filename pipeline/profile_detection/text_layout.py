@@ -90,7 +90,7 @@ def find_layout(data: bytes, path: str) -> TextLayout:
     rows = [cells for cells in _cells(kept, separator) if len(cells) == len(names)]
     if width < FEWEST_COLUMNS or len(rows) < FEWEST_ROWS:
         first = " / ".join(lines[:3])[:150]
-        raise IngestError(f"no table of numbers was found in it; it starts with {first!r}", path, fault="no_table")
+        raise IngestError(f"no table of numbers was found in it; it starts with {first!r}", path, code="no_table")
     rate_hz, rate_line = _stated_rate(lines[:start])
     return TextLayout(
         path, separator, decimal, skip, names != _numbered(len(names)), comment, names, _numbers(rows, decimal),
