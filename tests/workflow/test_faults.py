@@ -23,8 +23,11 @@ ROOT = Path(__file__).parents[2]
 pytestmark = pytest.mark.workflow
 
 # Found by jobs before anything else: disturbs the report of the first batch before it renames its first file.
+# A shell that starts a job in the background ignores SIGINT for it, and children inherit that: Ctrl-C is set here.
 DISTURB = """
 import os, signal, sys, time
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 def snakemake():
     pid = os.getppid()
