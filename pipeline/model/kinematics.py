@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -59,28 +59,18 @@ def earth_rate(latitude_deg: float, azimuth_deg: float) -> NDArray[np.float64]:
 
 
 def reference_motion(
-    recording: Recording,
-    gravity_g: float = 1.0,
-    earth_rate_level: NDArray[np.float64] | None = None,
-    offset: float | NDArray[np.float64] = 0.0,
+    recording: Recording, gravity_g: float = 1.0, earth_rate_level: NDArray[np.float64] | None = None
 ) -> Motion | None:
     """Return the motion that the table's log gives for a recording, or None where it gives none.
 
     Parameters
     ----------
     recording : Recording
-        With ``table_angle`` and an axis, or with ``table_attitude``.
+        With ``table_angle`` and an axis, or with ``table_attitude``. It keeps the motion, whose arrays are shared.
     gravity_g : float, g
         Local gravity.
     earth_rate_level : (3,) array, deg/s, optional
         Earth's rotation in the level frame; None leaves it out.
-    offset : float or (n,) array, s
-        The motion is evaluated at ``time + offset``.
-
-    Returns
-    -------
-    Motion or None
-        Kept with the recording where the offset is 0: both sensors and every step ask for it. Its arrays are shared.
 
     Raises
     ------
@@ -94,46 +84,22 @@ def reference_motion(
     else:
         return None
     key = (gravity_g, None if earth_rate_level is None else earth_rate_level.tobytes())
-    kept = not np.any(offset)
-    if kept and key in recording.cache:
-        found: Motion = recording.cache[key]
-        return found
-    if recording.samples < 6:
-        raise InputError(
-            f"recording {recording.name} has {recording.samples} samples; at least 6 are needed to follow the table",
-            recording.source.get("file"),
-        )
-    temperature = None if recording.temperature is None else temperature_of(recording)
-    motion = build(recording, gravity_g, earth_rate_level, offset, temperature)
-    motion = _labelled(recording, motion)
-    if kept:
-        recording.cache[key] = motion
-    return motion
-
-
-def _labelled(recording: Recording, motion: Motion) -> Motion:
-    """Return a motion that says, also at another time, which recording and setup it is of."""
-    motion = replace(motion, recording=recording.name, setup=recording.setup)
-    if not recording.setup:
-        return motion
-
-    def later(move: Callable[..., Motion | None] | None) -> Callable[..., Motion | None] | None:
-        return move and partial(_moved, recording, move)
-
-    return replace(motion, at_offset=later(motion.at_offset), at_lag=later(motion.at_lag))
-
-
-def _moved(recording: Recording, move: Callable[..., Motion | None], **how: Any) -> Motion | None:  # noqa: ANN401
-    found = move(**how)
-    return found and _labelled(recording, found)
+    if key not in recording.cache:
+        if recording.samples < 6:
+            raise InputError(
+                f"recording {recording.name} has {recording.samples} samples; at least 6 are needed to follow the "
+                "table",
+                recording.source.get("file"),
+            )
+        temperature = None if recording.temperature is None else temperature_of(recording)
+        logged = partial(replace, temperature=temperature, recording=recording.name, setup=recording.setup)
+        recording.cache[key] = build(recording, gravity_g, earth_rate_level, logged)
+    found: Motion = recording.cache[key]
+    return found
 
 
 def _motion_of_turn(
-    recording: Recording,
-    gravity_g: float,
-    earth: NDArray[np.float64] | None,
-    offset: float | NDArray[np.float64],
-    temperature: NDArray[np.float64] | None,
+    recording: Recording, gravity_g: float, earth: NDArray[np.float64] | None, logged: Callable[[Motion], Motion]
 ) -> Motion:
     assert recording.axis is not None  # noqa: S101
     assert recording.table_angle is not None  # noqa: S101
@@ -142,22 +108,26 @@ def _motion_of_turn(
     log = EncoderTrajectory(time, angle, rate)
     if vague is not None:
         log.valid_samples &= ~vague
-    still = still_samples(time, rate)
     axis = AXES.index(recording.axis)
-    return _turn(log, axis, level_at_zero(axis, recording.up), gravity_g, earth, still, temperature, offset)
+    home, still = level_at_zero(axis, recording.up), still_samples(time, rate)
+
+    def at(before: float | NDArray[np.float64], lag: float = 0.0, offset: float | NDArray[np.float64] = 0.0) -> Motion:
+        offset = before + offset
+        turn = _turn(log, axis, home, gravity_g, offset, lag)
+        if earth is not None:
+            assert turn.level is not None  # noqa: S101
+            turn = replace(turn, angular_rate=turn.angular_rate + np.einsum("i,nij->nj", earth, turn.level))
+        later, lagged = partial(at, offset, lag), partial(at, offset)
+        return logged(replace(turn, still=still, at_offset=later, at_lag=lagged))
+
+    return at(0.0)
 
 
-def _turn(  # noqa: PLR0917  (bound one by one for the motion at an offset)
-    log: EncoderTrajectory,
-    axis: int,
-    home: NDArray[np.float64],
-    gravity_g: float,
-    earth: NDArray[np.float64] | None,
-    still: NDArray[np.bool_],
-    temperature: NDArray[np.float64] | None,
-    offset: float | NDArray[np.float64] = 0.0,
-    lag: float = 0.0,
-) -> Motion:
+def _turn(  # noqa: PLR0917  (the symbols of the module's equations)
+    log: EncoderTrajectory, axis: int, home: NDArray[np.float64], gravity_g: float,
+    offset: float | NDArray[np.float64], lag: float,
+) -> Motion:  # fmt: skip
+    """Return the motion of a turn at ``time + offset``, behind a lag."""
     angle, rate, acceleration = log.angle, log.rate, log.acceleration
     if np.any(offset):
         angle, rate, acceleration = log.at(log.time + offset)
@@ -169,22 +139,17 @@ def _turn(  # noqa: PLR0917  (bound one by one for the motion at an offset)
     force = gravity_g * level[:, 2, :]
     omega, alpha = np.zeros_like(force), np.zeros_like(force)
     omega[:, axis], alpha[:, axis] = rate, acceleration
-    force_rate = -np.radians(rate)[:, None] * (force @ ABOUT[axis].T)
-    if earth is not None:
-        omega = omega + np.einsum("i,nij->nj", earth, level)
     return Motion(
         time=log.time,
         specific_force=force,
         angular_rate=omega,
         angular_acceleration=alpha,
-        specific_force_rate=force_rate,
-        temperature=temperature,
+        specific_force_rate=-np.radians(rate)[:, None] * (force @ ABOUT[axis].T),
+        temperature=None,
         angle=angle,
         rate=rate,
         axis=axis,
-        still=still,
-        at_offset=partial(_turn, log, axis, home, gravity_g, earth, still, temperature),
-        at_lag=partial(_turn, log, axis, home, gravity_g, earth, still, temperature),
+        still=np.zeros(len(log.time), bool),
         level=level,
         reference_valid=log.valid_samples,
     )
@@ -209,43 +174,39 @@ def level_at_zero(axis: int, up: str = "") -> NDArray[np.float64]:
 
 
 def _motion_of_attitude(
-    recording: Recording,
-    gravity_g: float,
-    earth: NDArray[np.float64] | None,
-    offset: float | NDArray[np.float64],
-    temperature: NDArray[np.float64] | None,
+    recording: Recording, gravity_g: float, earth: NDArray[np.float64] | None, logged: Callable[[Motion], Motion]
 ) -> Motion:
     from scipy.interpolate import make_interp_spline  # noqa: PLC0415  (0.3 s, needed by attitude logs alone)
 
     assert recording.table_attitude is not None  # noqa: S101
-    time = recording.time
-    q = continuous(recording.table_attitude)
-    spline = make_interp_spline(time, q, k=5)
-    at = time + offset
-    q = spline(at) if np.any(offset) else q
-    q_rate, q_acceleration = spline(at, 1), spline(at, 2)
-    level = attitude_matrix(q)
-    force = gravity_g * level[:, 2, :]
-    omega = np.degrees(2.0 * conjugate_product(q, q_rate))
-    alpha = np.degrees(2.0 * conjugate_product(q, q_acceleration))
-    rate = np.linalg.norm(omega, axis=1)
-    force_rate = -np.cross(np.radians(omega), force)
-    if earth is not None:
-        omega = omega + np.einsum("i,nij->nj", earth, level)
-    return Motion(
-        time=time,
-        specific_force=force,
-        angular_rate=omega,
-        angular_acceleration=alpha,
-        specific_force_rate=force_rate,
-        temperature=temperature,
-        angle=None,
-        rate=None,
-        axis=None,
-        still=still_samples(time, rate),
-        at_offset=partial(reference_motion, recording, gravity_g, earth),
-        level=level,
-    )
+    time, attitude = recording.time, continuous(recording.table_attitude)
+    spline = make_interp_spline(time, attitude, k=5)
+
+    def at(before: float | NDArray[np.float64], offset: float | NDArray[np.float64] = 0.0) -> Motion:
+        offset = before + offset
+        there = time + offset
+        q = spline(there) if np.any(offset) else attitude
+        level = attitude_matrix(q)
+        force = gravity_g * level[:, 2, :]
+        omega = np.degrees(2.0 * conjugate_product(q, spline(there, 1)))
+        return logged(
+            Motion(
+                time=time,
+                specific_force=force,
+                angular_rate=omega if earth is None else omega + np.einsum("i,nij->nj", earth, level),
+                angular_acceleration=np.degrees(2.0 * conjugate_product(q, spline(there, 2))),
+                specific_force_rate=-np.cross(np.radians(omega), force),
+                temperature=None,
+                angle=None,
+                rate=None,
+                axis=None,
+                still=still_samples(time, np.linalg.norm(omega, axis=1)),
+                at_offset=partial(at, offset),
+                level=level,
+            )
+        )
+
+    return at(0.0)
 
 
 def _rate_of(time: NDArray[np.float64], angle: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:

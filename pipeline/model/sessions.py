@@ -2,9 +2,9 @@
 
     z = z_effect in the recordings of that session, 0 in the others
 
-A procedure names the session of each recording (``setup``); ``<effect>@<setup>`` is the effect there. So recordings of
-several sessions give one estimate of one sensor, together with the errors of each table. Two effects exist in a session
-only; in a single session they are part of the matrix and of the bias:
+A procedure names the session of each recording (``setup``); ``<effect>@<setup>`` is the effect there. Recordings of
+several sessions then give one estimate of a sensor and the errors of each table. Two effects exist in a session only;
+in a single session they are part of the matrix and of the bias:
 
     mounting : z = K (exp([theta]x)^T - 1) u: the unit is rotated by the vector theta, deg, against the other sessions
     bias     : z = db: the bias has changed, as after switching off and on
@@ -32,6 +32,10 @@ if TYPE_CHECKING:
 SEPARATOR = "@"
 STEP_DEG = 1e-3  # of the central difference of a rotation: its error is (step^2 / 6) rad = 5e-11
 EXPERIMENT = "the same turns in another setup"
+AS_THE_BASE = (
+    *("owner", "layout", "sensors", "unseen", "needs", "needs_clock", "needs_motion", "needs_both_directions"),
+    *("meaning", "excitation", "experiment", "source"),
+)
 
 
 class _Mounting(Effect):
@@ -86,22 +90,14 @@ class _Bias(Effect):
 OWN: dict[str, Effect] = {effect.name: effect for effect in (_Mounting(), _Bias())}
 
 
-class InSession(Effect):
-    """An effect in one session, linear in its parameters.
-
-    Parameters
-    ----------
-    name : str
-        ``<base>@<session>``.
-    base : Effect
-    """
+class _InSession(Effect):
+    """An effect in one session, linear in its parameters; ``name`` is ``<base>@<session>``."""
 
     def __init__(self, name: str, base: Effect) -> None:
-        self.name, self.base, self.session = name, base, name.partition(SEPARATOR)[2]
-        self.owner, self.layout, self.sensors, self.unseen = base.owner, base.layout, base.sensors, base.unseen
-        self.needs, self.needs_clock, self.needs_motion = base.needs, base.needs_clock, base.needs_motion
-        self.needs_both_directions, self.meaning = base.needs_both_directions, base.meaning
-        self.excitation, self.experiment, self.source = base.excitation, base.experiment, base.source
+        self.base, self.session = base, name.partition(SEPARATOR)[2]
+        for attribute in AS_THE_BASE:
+            setattr(self, attribute, getattr(base, attribute))
+        self.name = name
 
     def parameters(self, sensor: str) -> tuple[Parameter, ...]:
         """Return those of the effect."""
@@ -131,4 +127,4 @@ def in_session(name: str, base: Effect) -> Effect:
         raise ConfigurationError(
             f"effect {name}: {base.name} cannot be one setup's own, as the fit is not linear in it; name {base.name}"
         )
-    return InSession(name, base)
+    return _InSession(name, base)

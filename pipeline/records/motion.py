@@ -42,10 +42,10 @@ class Motion:
     still : (n,) array of bool
         Samples at which the body rests and has settled.
     at_offset : callable or None
-        ``at_offset(offset=tau)`` is the motion at ``time + tau`` (tau a float or (n,) array, s), from the same
-        interpolated trajectory; None where the trajectory is not known between the samples.
+        ``at_offset(offset=tau)`` is this motion later by tau, s (a float or (n,) array), from its interpolated
+        trajectory; None where the trajectory is not known between the samples.
     at_lag : callable or None
-        ``at_lag(lag=tau, offset=0.0)`` is what a first-order lag of time constant tau, s, leaves of that motion.
+        ``at_lag(lag=tau)`` is what a first-order lag of time constant tau, s, leaves of this motion.
     level : (n, 3, 3) array, or None
         Rows: the level frame's axes x, y, z in the body frame; None where no reference gives the heading.
     direction : (n, 3) array, or None

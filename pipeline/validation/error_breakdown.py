@@ -15,6 +15,7 @@ and effects of timing move the logged rate.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -179,7 +180,11 @@ def _moved_magnitude(samples: Samples, effects: Sequence[FittedEffect]) -> NDArr
         rate, nothing = np.zeros((2, len(time), 3))
         rate[:, 0] = spline(at)
         still = np.zeros(len(time), bool)
-        return Motion(time, nothing, rate, nothing, nothing, None, None, None, None, still, at_offset=motion)
+        later = partial(moved_on, offset)
+        return Motion(time, nothing, rate, nothing, nothing, None, None, None, None, still, at_offset=later)
+
+    def moved_on(before: float | NDArray[np.float64], offset: float | NDArray[np.float64]) -> Motion:
+        return motion(before + offset)
 
     moved = motion()
     for fitted in effects:

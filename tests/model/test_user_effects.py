@@ -27,7 +27,7 @@ from pipeline.model.effects import (
     register_user_effects,
 )
 from pipeline.model.effects.base import Layout, parameter_limits
-from pipeline.model.effects.files import built_in_files, effect_from, load_python_effect, read_effect_file
+from pipeline.model.effects.files import effect_from, load_python_effect, read_effect_file
 from pipeline.model.formula import FUNCTIONS, SIGNALS
 from pipeline.model.kinematics import reference_motion
 from pipeline.records import FittedEffect, Motion, Recording, SensorCalibration
@@ -375,11 +375,3 @@ def test_the_page_on_effects_of_ones_own_holds(tmp_path: Path) -> None:
         read_effect_file(tmp_path / "gear_mesh.yaml")
     assert message is not None
     assert message.group() in caught.value.message
-
-
-@pytest.mark.parametrize("name", built_in_files())
-def test_an_effect_that_ships_passes_the_checks_of_users_files(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    fast = read_effect_file(built_in_files()[name], built_in=True)
-    monkeypatch.setattr("pipeline.model.effects.declaration._shipped", lambda _: None)
-    checked = read_effect_file(built_in_files()[name], built_in=True)
-    assert repr(checked.declared) == repr(fast.declared)  # type: ignore[attr-defined]

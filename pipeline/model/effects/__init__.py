@@ -1,7 +1,6 @@
 """The catalogue of physical effects: every file of ``configs/effect/`` that ships is one.
 
-There is no list to extend: ``catalogue()`` finds the files. Effects of a user's own have the same schema; they are
-registered in the process that uses them.
+``catalogue()`` finds the files. Effects of users have the same schema and are registered in the process that uses them.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ def catalogue() -> dict[str, Effect]:
 
 @contextmanager
 def leaving_out(names: Iterable[str]) -> Iterator[None]:
-    """Take effects out of the catalogue for a while, as unknown effects in studies of the diagnosis."""
+    """Take effects out of the catalogue within a ``with`` block, as unknown effects in studies of the diagnosis."""
     fresh = set(names) - _left_out
     _left_out.update(fresh)
     try:
@@ -47,7 +46,7 @@ def leaving_out(names: Iterable[str]) -> Iterator[None]:
 
 
 def register(effect: Effect) -> None:
-    """Add an effect of the user's own to the catalogue of this process; one of the same name is replaced.
+    """Add a user's effect to the catalogue of this process; it replaces one of the same name.
 
     Raises
     ------

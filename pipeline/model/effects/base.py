@@ -20,14 +20,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.records import SENSORS, Motion
+from pipeline.signal.rests import RATE_AT_REST_DPS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from numpy.typing import NDArray
 
+    Values = NDArray[np.float64]
+
 REFERENCE_TEMPERATURE = 25.0  # degC, that of data sheets
 STANDARD_GRAVITY = 9.80665  # m/s^2, ISO 80000-3
+STEP_DEG = 5e-3  # above an encoder's resolution (1e-3 deg), below a step of a program (0.1 deg)
+TURNING_DPS = 0.25  # above a gyroscope's noise and residual bias, below a slow turn of a table (1 deg/s)
 
 
 class Owner(StrEnum):
@@ -61,11 +66,6 @@ class Effect(abc.ABC):
 
     Attributes
     ----------
-    name : str
-    owner : Owner
-    sensors : tuple of str
-        The sensors to which it applies.
-    layout : Layout
     needs : tuple of str
         What the recording must hold in addition to a motion: ``temperature``, ``angle``, ``rate``, ``level``.
     needs_clock : bool
@@ -114,32 +114,23 @@ class Effect(abc.ABC):
         """Return the parameters for ``sensor``; units in g or deg/s and their products."""
 
     @abc.abstractmethod
-    def regressors(
-        self, sensor: str, motion: Motion, K: NDArray[np.float64], values: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
         """Return the derivatives of the reading in the shape that ``layout`` says.
 
         Parameters
         ----------
-        sensor : str
-        motion : Motion
         K : (3, 3) array
             Inverse of the calibration matrix.
-        values : (p,) array
         """
 
-    def columns(
-        self, sensor: str, motion: Motion, K: NDArray[np.float64], values: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def columns(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
         """Return the derivative of the reading with respect to each parameter, at ``values``: (n, 3, p) array."""
         regressors = self.regressors(sensor, motion, K, values)
         if self.layout == Layout.SHARED:
             return regressors
         return per_axis(regressors) if self.layout == Layout.PER_AXIS else every_axis(regressors)
 
-    def reading(
-        self, sensor: str, motion: Motion, K: NDArray[np.float64], values: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def reading(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
         """Return what the effect adds to the reading: (n, 3) array, g or deg/s.
 
         Linear effects have ``columns @ values``; the others override this with the exact value. The terms are added
@@ -154,16 +145,13 @@ class Effect(abc.ABC):
             added += regressors[:, :, j] * coefficients[..., j]
         return added
 
-    def moved(self, motion: Motion, values: NDArray[np.float64]) -> Motion:
+    def moved(self, motion: Motion, values: Values) -> Motion:
         """Return the motion that acts on the sensor at the time stamps; only effects of timing change it."""
         del values
         return motion
 
-    def slope(self, sensor: str, moved: Motion) -> NDArray[np.float64] | None:
-        """Return the derivative of the truth with respect to the only parameter of an effect of timing: (n, 3) array.
-
-        At the motion that it has led to; None where that does not tell it.
-        """
+    def slope(self, sensor: str, moved: Motion) -> Values | None:
+        """Return du/dp of an effect of timing with one parameter p, from the moved motion alone; None: not so."""
         del sensor, moved
         return None
 
@@ -172,21 +160,21 @@ class Effect(abc.ABC):
         """Whether the effect moves the motion in time."""
         return type(self).moved is not Effect.moved
 
-    def starts(self, sensor: str) -> list[NDArray[np.float64]]:
+    def starts(self, sensor: str) -> list[Values]:
         """Return the values from which a fit starts, several where the reading is not linear in them."""
         return [np.zeros(len(self.parameters(sensor)))]
 
-    def stepped(self, values: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
+    def stepped(self, values: Values, step: Values) -> Values:
         """Return ``values + step``, as far as the parameters may go in one round of a nonlinear fit."""
         return values + step
 
-    def fields(self, sensor: str, values: NDArray[np.float64]) -> set[str]:
+    def fields(self, sensor: str, values: Values) -> set[str]:
         """Return the fields of ``Motion`` that the reading depends on: those that are read while it is computed."""
         seen: set[str] = set()
         self.reading(sensor, _watched(seen), np.eye(3), values)
         return seen | set(self.needs)
 
-    def in_c(self, values: NDArray[np.float64]) -> list[str] | None:
+    def in_c(self, values: Values) -> list[str] | None:
         """Return what is added to each axis as C expressions in the names of ``calibration.h``; None: not in C."""
         del values
         return None
@@ -216,48 +204,47 @@ def _watched(seen: set[str]) -> Motion:
     return Watched(time, *at_rest, direction=vector)
 
 
-def truth(sensor: str, motion: Motion) -> NDArray[np.float64]:
+def truth(sensor: str, motion: Motion) -> Values:
     """Return what an ideal sensor would read: (n, 3) array, specific force in g or angular rate in deg/s."""
     return motion.specific_force if sensor == "accelerometer" else motion.angular_rate
 
 
-def truth_rate(sensor: str, motion: Motion) -> NDArray[np.float64]:
+def truth_rate(sensor: str, motion: Motion) -> Values:
     """Return the time derivative of ``truth``: (n, 3) array, g/s or deg/s^2."""
     return motion.specific_force_rate if sensor == "accelerometer" else motion.angular_acceleration
 
 
-def length(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+def length(vectors: Values) -> Values:
     """Return the length of each vector, its squares added in the order x, y, z: (n,) array."""
     x, y, z = vectors[:, 0], vectors[:, 1], vectors[:, 2]
     return np.asarray(np.sqrt(x * x + y * y + z * z), np.float64)
 
 
-def turning_direction(motion: Motion) -> NDArray[np.float64]:
+def turning_direction(motion: Motion) -> Values:
     """Return the unit vector of the turn that goes on or, at rest, of the last one: (n, 3) array, body frame.
 
-    A turn about a table's axis is seen in its rate and in its angle (a step may lie between two samples); any other
-    is one faster than 0.25 deg/s.
+    A table turns where its rate or its angle changes (a step may lie between two samples), any other body where it
+    turns faster than 0.25 deg/s.
     """
     if motion.direction is not None:
         return motion.direction
     if motion.axis is not None and motion.rate is not None and motion.angle is not None:
         step = np.diff(motion.angle, prepend=motion.angle[0])
-        sign = np.where(
-            np.abs(motion.rate) > 0.02, np.sign(motion.rate), np.where(np.abs(step) > 5e-3, np.sign(step), 0)
-        )
+        stepped = np.where(np.abs(step) > STEP_DEG, np.sign(step), 0)
+        sign = np.where(np.abs(motion.rate) > RATE_AT_REST_DPS, np.sign(motion.rate), stepped)
         now = np.zeros_like(motion.angular_rate)
         now[:, motion.axis] = sign
         turning = sign != 0
     else:
         magnitude = length(motion.angular_rate)
-        turning = magnitude > 0.25
+        turning = magnitude > TURNING_DPS
         now = motion.angular_rate / np.where(turning, magnitude, 1.0)[:, None]
     last = np.maximum.accumulate(np.where(turning, np.arange(len(turning)), -1))
-    held: NDArray[np.float64] = np.where(last[:, None] >= 0, now[last], 0.0)
+    held: Values = np.where(last[:, None] >= 0, now[last], 0.0)
     return held
 
 
-def per_axis(regressors: NDArray[np.float64]) -> NDArray[np.float64]:
+def per_axis(regressors: Values) -> Values:
     """Spread (n, 3, q) regressors, q coefficients an axis, to (n, 3, 3 q) columns.
 
     Parameter order: all of x, then y, then z.
@@ -268,7 +255,7 @@ def per_axis(regressors: NDArray[np.float64]) -> NDArray[np.float64]:
     return out.reshape(n, 3, 3 * q)
 
 
-def every_axis(regressors: NDArray[np.float64]) -> NDArray[np.float64]:
+def every_axis(regressors: Values) -> Values:
     """Spread (n, q) regressors that act on each axis with coefficients of its own to (n, 3, 3 q) columns.
 
     Parameter order: all of x, then y, then z, so that ``values.reshape(3, q) @ regressors[i]`` is what is added.
@@ -286,19 +273,12 @@ def unit_of(sensor: str) -> str:
     return "g" if sensor == "accelerometer" else "deg/s"
 
 
-def parameter_limits(effect: Effect, sensor: str, limits: Mapping[str, float]) -> NDArray[np.float64]:
+def parameter_limits(effect: Effect, sensor: str, limits: Mapping[str, float]) -> Values:
     """Return the limit of each parameter's absolute value: (p,) array, infinite where there is none.
 
-    The limit of an effect counts for each of its parameters. Where they differ in unit, ``<effect>_<parameter>`` (its
-    name, or the part before the axis) goes before it: ``warm_up_time_constant``. An effect in one session has the
-    limits of the effect. Limits in the file of the effect count where the configuration has none of it.
-
-    Parameters
-    ----------
-    effect : Effect
-    sensor : str
-    limits : mapping of str to float
-        ``effects`` of the sensor's configuration.
+    ``limits`` are the ``effects`` of the sensor's configuration; where they do not name the effect, those of its file
+    count. A limit of ``<effect>_<parameter>`` or of ``<effect>_<parameter without its axis>`` precedes that of the
+    effect. An effect in one session has the limits of the effect.
     """
     found, own = [], effect.name.partition("@")[0]
     if own not in limits:

@@ -1,7 +1,7 @@
 """Effects from files: YAML with formulas, and Python where the user names it on the command line.
 
-A YAML file is data, also that of a stranger: it is read within limits, and its formulas are parsed. A Python file is
-code, and is run; nothing but the command line leads to one.
+A YAML file is data: it is read within limits, and its formulas are parsed. A Python file is code and is run; only the
+command line can name one.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import sys
 from dataclasses import replace
 from functools import cache, partial
 from importlib import import_module
-from importlib.abc import ExecutionLoader
+from importlib.abc import InspectLoader
 from importlib.util import decode_source
 from pathlib import Path
 from types import ModuleType
@@ -39,7 +39,7 @@ OF_PYTHON = ("name", "owner", "layout", "meaning", "excitation", "experiment", "
 
 @cache
 def built_in_files() -> dict[str, Path]:
-    """Return the file of each effect that ships, by name; a file of the user's in the same folder is not one."""
+    """Return the file of each effect that ships, by name; a user's file in the same folder is not one."""
     files = sorted(FOLDER.glob("*.yaml"))
     return {f.stem: f for f in files if BUILT_IN.search(f.read_text(encoding="utf-8", errors="replace"))}
 
@@ -50,7 +50,7 @@ def read_effect_files(files: Iterable[Path]) -> dict[str, Effect]:
     Raises
     ------
     ConfigurationError
-        With a line for each file that is not as it should be.
+        With a line for each faulty file.
     """
     found: dict[str, Effect] = {}
     problems = []
@@ -70,7 +70,7 @@ def read_effect_file(file: Path, *, built_in: bool = False) -> Effect:
     Raises
     ------
     ConfigurationError
-        If it is not as it should be, with its line.
+        If it is faulty, with the line.
     """
     text = read_text(file, LARGEST_BYTES, "an effect")
     given = load_yaml(text, str(file), LARGEST_SIZE)
@@ -91,26 +91,10 @@ def effect_from(
     *,
     built_in: bool = False,
 ) -> Effect:
-    """Return the effect that a definition describes (``pipeline.model.effects.declaration``).
-
-    Parameters
-    ----------
-    definition : mapping
-    where : str
-        The file, for messages.
-    lines : callable, optional
-        Returns the keys from the top with their line in the file.
-    built_in : bool
-        Whether it ships with the package.
-
-    Raises
-    ------
-    ConfigurationError
-        If anything in it is not as it should be.
-    """
+    """Return the effect that a definition describes; parameters and errors as of ``read_declaration``."""
     declared = read_declaration(dict(definition), where, lines, built_in=built_in)
     if built_in:
-        if declared.python is None:
+        if not declared.python:
             return FormulaEffect(declared)
         module, _, name = declared.python.partition(".")
         made: Effect = getattr(import_module(f"pipeline.model.effects.{module}"), name)(declared)
@@ -128,7 +112,6 @@ def load_python_effect(path: str | Path, sha256: str | None = None) -> Effect:
 
     Parameters
     ----------
-    path : str or Path
     sha256 : str, optional
         Of the content that is expected.
 
@@ -137,7 +120,7 @@ def load_python_effect(path: str | Path, sha256: str | None = None) -> Effect:
     MissingInputError
         If there is no such file.
     ConfigurationError
-        If it has another content, fails, or holds no effect of the file's name.
+        If its content differs, fails, or holds no effect of the file's name.
     """
     file = Path(path)
     if file.suffix != ".py" or not file.is_file():
@@ -146,52 +129,48 @@ def load_python_effect(path: str | Path, sha256: str | None = None) -> Effect:
     digest = hashlib.sha256(content).hexdigest()
     if sha256 is not None and digest != sha256:
         raise ConfigurationError("the file has changed since the run began; start the run again", str(file))
-    name = f"imu_calibration_user_effect_{file.stem}"
-    module = ModuleType(name)
-    module.__file__ = str(file)
-    sys.modules[name] = module  # dataclasses and pickle look a class up there
+    module = ModuleType(f"imu_calibration_user_effect_{file.stem}")
+    sys.modules[module.__name__] = module  # dataclasses and pickle look a class up there
     try:
-        _ThisContent(file, content).exec_module(module)
+        _ThisContent(content).exec_module(module)
     except PipelineError:
         raise
     except Exception as error:
         raise ConfigurationError(f"cannot be run: {type(error).__name__}: {error}", str(file)) from error
-    return _checked(getattr(module, "EFFECT", None), file, digest)
+    found = getattr(module, "EFFECT", None)
+    problem = _problem_of(found, file.stem)
+    if not isinstance(found, Effect) or problem:
+        raise ConfigurationError(problem, str(file))
+    found.definition = {"python": file.name, "sha256": digest, "owner": str(found.owner)}
+    return found
 
 
-class _ThisContent(ExecutionLoader):
-    """Loads the very bytes that were hashed; no cache of compiled code is read or written."""
+class _ThisContent(InspectLoader):
+    """Loads the very bytes that were hashed; reads and writes no cache of compiled code."""
 
-    def __init__(self, file: Path, content: bytes) -> None:
-        self.file, self.content = file, content
+    def __init__(self, content: bytes) -> None:
+        self.content = content
 
     def get_source(self, fullname: str) -> str:
         del fullname
         return decode_source(self.content)
 
-    def get_filename(self, fullname: str) -> str:
-        del fullname
-        return str(self.file)
 
-
-def _checked(found: Any, file: Path, digest: str) -> Effect:  # noqa: ANN401  (whatever the file calls EFFECT)
+def _problem_of(found: object, name: str) -> str:
+    """Return why the ``EFFECT`` of a Python file cannot be used; empty where it can."""
     if not isinstance(found, Effect):
-        raise ConfigurationError(
+        return (
             "holds no effect: EFFECT = MyEffect() is expected, of a class derived from "
-            "pipeline.model.effects.base.Effect (see docs/effects_of_your_own.md)",
-            str(file),
+            "pipeline.model.effects.base.Effect (see docs/effects_of_your_own.md)"
         )
-    lacking = [name for name in OF_PYTHON if not hasattr(found, name)]
+    lacking = [attribute for attribute in OF_PYTHON if not hasattr(found, attribute)]
     if lacking:
-        raise ConfigurationError(f"its EFFECT lacks {', '.join(lacking)}", str(file))
-    if found.name != file.stem:
-        raise ConfigurationError(
-            f"its EFFECT is called {found.name!r}; give it the file's name, {file.stem}", str(file)
-        )
+        return f"its EFFECT lacks {', '.join(lacking)}"
+    if found.name != name:
+        return f"its EFFECT is called {found.name!r}; give it the file's name, {name}"
     if found.name in built_in_files():
-        raise ConfigurationError(f"a built-in effect is called {found.name}; give yours another name", str(file))
-    found.definition = {"python": file.name, "sha256": digest, "owner": str(found.owner)}
-    return found
+        return f"a built-in effect is called {found.name}; give yours another name"
+    return ""
 
 
 def _lines(text: str) -> dict[tuple[str, ...], int]:

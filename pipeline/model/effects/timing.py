@@ -1,12 +1,13 @@
-"""Effects of timing: the reading is that of the motion at another time, or of a filtered motion.
+"""Effects of time: a bias that settles, and readings that are those of another time or of a filtered motion.
 
+    warm_up:       z = A exp(-t / tau),  t the time since power-on, s; 0 at tau = 0
     time_offset:   reading(t) = model(t + tau)
     clock_rate:    reading(t) = model(t + 1e-6 e t)
     low_pass_lag:  reading(t) = model(u'),  u'(t) = integral_0^inf exp(-s / tau) / tau u(t - s) ds
 
-and z = K (u' - u), with tau in s (an offset is negative where the reading comes late, a time constant is 0 or more), e
-in ppm, u the truth, g or deg/s, u' the truth there, and K the inverse of the calibration matrix. The lag of a turn's
-rate is exact; that of other signals is a Gauss-Laguerre sum, exact where they are polynomials of degree 7 in time.
+In the last three z = K (u' - u), with tau in s (an offset is negative where the reading comes late, a time constant is
+0 or more), e in ppm, u the truth, g or deg/s, u' the truth there, and K the inverse of the calibration matrix. The lag
+of a turn's rate is exact; that of other signals is a Gauss-Laguerre sum, exact for polynomials of degree 7 in time.
 """
 
 from __future__ import annotations
@@ -17,73 +18,88 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.model.effects.base import Layout, truth, truth_rate
+from pipeline.model.effects.base import Layout, every_axis, truth, truth_rate
 from pipeline.model.effects.formula_effect import DeclaredEffect
+from pipeline.model.formula import c_number
 from pipeline.model.kinematics import NODES, WEIGHTS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from numpy.typing import NDArray
 
     from pipeline.records import Motion
 
+    Values = NDArray[np.float64]
+
+STARTS_S = (60.0, 180.0, 500.0, 1500.0)  # of a part of some grams to a box of some kilograms, in steps of three
+SHORTEST_S, LONGEST_S = 1.0, 1e5  # beyond these it is a step at the start, or a drift
+START_LAG_S = 0.005  # above 0, where a lag and a time offset have the same column; below the lag of a 30 Hz filter
 PPM = 1e-6
 STEP_S = 1e-5  # of the central difference: its rounding is 1e-11 of u per second
 
 
-def shifted(motion: Motion, offset: float | NDArray[np.float64]) -> Motion:
-    """Return the motion at ``time + offset``, from the trajectory where it is known between the samples.
+class WarmUp(DeclaredEffect):
+    """Exponential settling of the bias: one amplitude an axis and one time constant."""
 
-    Without a trajectory the truth is extended along its rate.
+    layout = Layout.EVERY_AXIS
+    needs_clock = True
+    nonlinear = ("time_constant",)
 
-    Parameters
-    ----------
-    motion : Motion
-    offset : float or (n,) array, s
+    def starts(self, sensor: str) -> list[Values]:
+        """Return a small grid of time constants."""
+        del sensor
+        return [np.array([0.0, 0.0, 0.0, tau]) for tau in STARTS_S]
+
+    def stepped(self, values: Values, step: Values) -> Values:
+        """Return ``values + step`` with the time constant at most halved or doubled."""
+        new = values + step
+        new[3] = np.clip(new[3], max(values[3] / 2.0, SHORTEST_S), min(values[3] * 2.0, LONGEST_S))
+        return new
+
+    def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
+        """Return ``exp(-t / tau)``."""
+        del sensor, K
+        tau = values[3]
+        decay = np.exp(-motion.time / tau) if tau > 0 else np.zeros_like(motion.time)
+        return np.asarray(decay[:, None])
+
+    def columns(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
+        """Return the columns of A and ``A t / tau^2 exp(-t / tau)``, that of tau."""
+        decay = self.regressors(sensor, motion, K, values)
+        tau = values[3]
+        slope = decay[:, 0] * motion.time / tau**2 if tau > 0 else np.zeros_like(motion.time)
+        return np.concatenate([every_axis(decay), (slope[:, None] * values[:3])[:, :, None]], axis=2)
+
+    def reading(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
+        """Return ``A exp(-t / tau)``."""
+        return self.regressors(sensor, motion, K, values) * values[:3]
+
+    def in_c(self, values: Values) -> list[str]:
+        """Return ``A exp(-t / tau)`` of each axis as C expressions."""
+        decay = f"(imu_real)exp(-m->time / {c_number(values[3])})" if values[3] > 0 else "0"
+        return [f"{c_number(a)} * {decay}" for a in values[:3]]
+
+
+def shifted(motion: Motion, offset: float | Values) -> Motion:
+    """Return the motion at ``time + offset``, s: a float or (n,) array.
+
+    Without a trajectory between the samples the truth is extended along its rate.
     """
     if not np.any(offset):
         return motion
-    if motion.at_offset is None:
-        by = np.broadcast_to(offset, motion.time.shape)[:, None]
-        return replace(
-            motion,
-            specific_force=motion.specific_force + motion.specific_force_rate * by,
-            angular_rate=motion.angular_rate + motion.angular_acceleration * by,
-        )
-    return _at(motion.at_offset, 0.0, motion, offset=offset)
-
-
-def _at(
-    trajectory: Callable[..., Motion | None],
-    before: float | NDArray[np.float64],
-    still_of: Motion,
-    offset: float | NDArray[np.float64],
-) -> Motion:
-    """Return the trajectory at the sum of two offsets, which can be shifted on from there."""
-    total = before + offset
-    there = trajectory(offset=total)
-    assert there is not None  # noqa: S101
+    if motion.at_offset is not None:
+        return _seen_from(motion, motion.at_offset(offset=offset))
+    by = np.broadcast_to(offset, motion.time.shape)[:, None]
     return replace(
-        there,
-        still=still_of.still,
-        direction=still_of.direction,
-        at_offset=partial(_at, trajectory, total, still_of),
-        at_lag=None if there.at_lag is None else partial(_lagged_at, there.at_lag, total, still_of),
+        motion,
+        specific_force=motion.specific_force + motion.specific_force_rate * by,
+        angular_rate=motion.angular_rate + motion.angular_acceleration * by,
     )
 
 
-def _lagged_at(
-    lagged: Callable[..., Motion | None],
-    before: float | NDArray[np.float64],
-    still_of: Motion,
-    lag: float,
-    offset: float | NDArray[np.float64] = 0.0,
-) -> Motion:
-    """Return what a lag shows of a trajectory at the sum of two offsets."""
-    there = lagged(lag=lag, offset=before + offset)
-    assert there is not None  # noqa: S101
-    return replace(there, still=still_of.still, direction=still_of.direction)
+def _seen_from(motion: Motion, moved: Motion | None) -> Motion:
+    """Return a moved motion whose rests and directions are those of the motion as logged."""
+    assert moved is not None  # noqa: S101
+    return replace(moved, still=motion.still, direction=motion.direction)
 
 
 class _Timing(DeclaredEffect):
@@ -92,17 +108,13 @@ class _Timing(DeclaredEffect):
     layout = Layout.SHARED
     needs_motion = True
 
-    def regressors(
-        self, sensor: str, motion: Motion, K: NDArray[np.float64], values: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
         """Return K times the derivative of the truth with respect to the only parameter."""
         slope = self.slope(sensor, self.moved(motion, values))
         assert slope is not None  # noqa: S101
         return np.asarray(slope @ K.T)[:, :, None]
 
-    def reading(
-        self, sensor: str, motion: Motion, K: NDArray[np.float64], values: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def reading(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
         """Return ``K (u' - u)``."""
         change = truth(sensor, self.moved(motion, values)) - truth(sensor, motion)
         return np.asarray(change @ K.T)
@@ -113,11 +125,11 @@ class TimeOffset(_Timing):
 
     nonlinear = ("tau",)
 
-    def slope(self, sensor: str, moved: Motion) -> NDArray[np.float64]:
+    def slope(self, sensor: str, moved: Motion) -> Values:
         """Return ``du/dt``."""
         return truth_rate(sensor, moved)
 
-    def moved(self, motion: Motion, values: NDArray[np.float64]) -> Motion:
+    def moved(self, motion: Motion, values: Values) -> Motion:
         """Return the motion at ``t + tau``."""
         return shifted(motion, values[0])
 
@@ -128,11 +140,11 @@ class ClockRate(_Timing):
     needs_clock = True
     nonlinear = ("e",)
 
-    def slope(self, sensor: str, moved: Motion) -> NDArray[np.float64]:
+    def slope(self, sensor: str, moved: Motion) -> Values:
         """Return ``1e-6 t du/dt``."""
         return PPM * moved.time[:, None] * truth_rate(sensor, moved)
 
-    def moved(self, motion: Motion, values: NDArray[np.float64]) -> Motion:
+    def moved(self, motion: Motion, values: Values) -> Motion:
         """Return the motion at ``t + 1e-6 e t``."""
         return shifted(motion, PPM * values[0] * motion.time)
 
@@ -142,18 +154,16 @@ class LowPassLag(_Timing):
 
     nonlinear = ("tau",)
 
-    def starts(self, sensor: str) -> list[NDArray[np.float64]]:
+    def starts(self, sensor: str) -> list[Values]:
         """Return a short lag: at none, it looks exactly like a time offset."""
         del sensor
-        return [np.array([0.005])]
+        return [np.array([START_LAG_S])]
 
-    def stepped(self, values: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
+    def stepped(self, values: Values, step: Values) -> Values:
         """Return ``values + step``, not below zero."""
         return np.maximum(values + step, 0.0)
 
-    def regressors(
-        self, sensor: str, motion: Motion, K: NDArray[np.float64], values: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
         """Return ``K du'/dtau``: minus the rate of u where there is no lag yet, else a central difference."""
         if values[0] <= STEP_S:
             slope = -truth_rate(sensor, motion)
@@ -162,38 +172,17 @@ class LowPassLag(_Timing):
             slope = (later - sooner) / (2.0 * STEP_S)
         return np.asarray(slope @ K.T)[:, :, None]
 
-    def moved(self, motion: Motion, values: NDArray[np.float64]) -> Motion:
+    def moved(self, motion: Motion, values: Values) -> Motion:
         """Return the motion behind a first-order lag."""
         if values[0] <= 0.0:
             return motion
         if motion.at_lag is not None:
-            shown = motion.at_lag(lag=float(values[0]))
-            assert shown is not None  # noqa: S101
-            return replace(
-                shown,
-                still=motion.still,
-                direction=motion.direction,
-                at_offset=partial(self._moved_at, motion, values),
-            )
+            return _seen_from(motion, motion.at_lag(lag=float(values[0])))
         nodes = [shifted(motion, -values[0] * node) for node in NODES]
+        names = ("specific_force", "angular_rate", "angular_acceleration", "specific_force_rate")
+        means = {name: sum(w * getattr(n, name) for w, n in zip(WEIGHTS, nodes, strict=True)) for name in names}
+        return replace(motion, **means, at_offset=partial(self._moved_at, motion, values))
 
-        def mean(name: str) -> NDArray[np.float64]:
-            total = np.zeros_like(motion.specific_force)
-            for weight, node in zip(WEIGHTS, nodes, strict=True):
-                total += weight * getattr(node, name)
-            return total
-
-        return replace(
-            motion,
-            specific_force=mean("specific_force"),
-            angular_rate=mean("angular_rate"),
-            angular_acceleration=mean("angular_acceleration"),
-            specific_force_rate=mean("specific_force_rate"),
-            at_offset=partial(self._moved_at, motion, values),
-        )
-
-    def _moved_at(
-        self, motion: Motion, values: NDArray[np.float64], offset: float | NDArray[np.float64] = 0.0
-    ) -> Motion:
+    def _moved_at(self, motion: Motion, values: Values, offset: float | Values) -> Motion:
         """Return the motion behind the lag at ``time + offset``."""
         return self.moved(shifted(motion, offset), values)
