@@ -310,15 +310,12 @@ def _check_consistency(declared: Declaration) -> None:
     if not (declared.python or 1 <= len(terms) <= MOST_TERMS):
         raise _WrongError(f"{len(terms)} terms; from 1 to {MOST_TERMS} are expected", "terms")
     for name, term in {**terms, **declared.parameters}.items():
-        key = "terms" if name in terms else "parameters"
+        path = "terms" if name in terms else "parameters", name
         if not TERM.fullmatch(name):
-            raise _WrongError(f"{name!r} is no name of a term; use letters, digits and _, at most 20", key, name)
-        if isinstance(term.unit, dict) and set(term.unit) != set(declared.sensors):
-            raise _WrongError(f"a unit for each of {', '.join(declared.sensors)} is expected", key, name, "unit")
-    for name, term in terms.items():
-        wrong = _wrong_term(declared, name, term)
-        if wrong:
-            raise _WrongError(wrong, "terms", name)
+            raise _WrongError(f"{name!r} is no name of a term; use letters, digits and _, at most 20", *path)
+        _check_sensors(declared, term.unit, "unit", *path, "unit")
+        if wrong := name in terms and _wrong_term(declared, name, term):
+            raise _WrongError(wrong, *path)
     names = [n for term in terms for _, n in declared.coefficients(term)]
     twice = sorted({n for n in names if names.count(n) > 1})
     if twice:
@@ -326,8 +323,13 @@ def _check_consistency(declared: Declaration) -> None:
     if declared.limits and set(declared.limits) != set(terms):
         raise _WrongError(f"a limit for each term is expected ({', '.join(terms)}), or none at all", "limits")
     for name, size in declared.limits.items():
-        if isinstance(size, dict) and set(size) != set(declared.sensors):
-            raise _WrongError(f"a limit for each of {', '.join(declared.sensors)} is expected", "limits", name)
+        _check_sensors(declared, size, "limit", "limits", name)
+
+
+def _check_sensors(declared: Declaration, given: object, what: str, *path: str) -> None:
+    """Refuse a mapping that does not hold a value for each sensor of the effect."""
+    if isinstance(given, dict) and set(given) != set(declared.sensors):
+        raise _WrongError(f"a {what} for each of {', '.join(declared.sensors)} is expected", *path)
 
 
 def _wrong_term(declared: Declaration, name: str, term: Term) -> str:
