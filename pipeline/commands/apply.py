@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.errors import ConfigurationError, InputError
-from pipeline.field_logs.compensate import compensate_log
+from pipeline.field_logs.compensate import LogProfile, compensate_log
 from pipeline.field_logs.output import Progress, require_apart
-from pipeline.field_logs.profile import LogProfile
 from pipeline.model.calibration_file import read_calibration
 from pipeline.model.compensation import SMOOTHING_S, load
 

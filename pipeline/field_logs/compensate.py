@@ -9,15 +9,17 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
-from pipeline.errors import PipelineError
+import numpy as np
+
+from pipeline.errors import ConfigurationError, InputError, PipelineError
 from pipeline.field_logs.log_checks import LogChecks
 from pipeline.field_logs.output import replacing, require_apart
-from pipeline.field_logs.profile import LogProfile
+from pipeline.io.axes import STRAIGHT, axis_matrix, maps_of_log
 from pipeline.model.compensation import SMOOTHING_S
 from pipeline.records import SENSORS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -26,7 +28,62 @@ if TYPE_CHECKING:
 
     Readings = dict[str, NDArray[Any]]
 
+EPOCH_AFTER_S = 1e8  # 3 years: no sensor has been on for longer
 BLOCK_BYTES = 1 << 21  # of a text log: 20,000 rows, whose arrays take some 10 MB
+
+
+def _canonical() -> dict[str, Any]:
+    names = {"time": ("time_s", "s"), "temperature": ("temperature_degc", "degC")}
+    names |= {f"accel_{a}": (f"accel_{a}_g", "g") for a in "xyz"}
+    names |= {f"gyro_{a}": (f"gyro_{a}_dps", "deg/s") for a in "xyz"}
+    return {"csv": {"columns": {channel: {"column": c, "unit": unit} for channel, (c, unit) in names.items()}}}
+
+
+@dataclass(frozen=True)
+class LogProfile:
+    """How the logs of a unit are laid out.
+
+    Attributes
+    ----------
+    ingest : mapping
+        The ingest profile, with the sections ``csv`` and ``mcap``; the canonical one by default.
+    axis_maps : mapping
+        Sensor to the body axis that each of its reading axes points along; straight where it is not named.
+    """
+
+    ingest: Mapping[str, Any] = field(default_factory=_canonical)
+    axis_maps: Mapping[str, Sequence[str]] = field(default_factory=dict)
+
+    @classmethod
+    def of_calibration(cls, document: Mapping[str, Any], file: str) -> LogProfile:
+        """Return the profile with which a unit was calibrated, from ``calibrations/<unit>.json``.
+
+        Raises
+        ------
+        InputError
+            If ``log`` is not what a run writes there.
+        """
+        log = document.get("log")
+        if log is None:
+            return cls()
+        try:
+            maps = maps_of_log({"axis_map": log["axis_map"]})
+            for axis_map in maps.values():
+                axis_matrix(axis_map)
+            found = cls({**log["ingest"]}, maps)
+        except (KeyError, TypeError, ConfigurationError) as error:
+            told = "log is not what a run writes; expected ingest, an object, and axis_map, for example [+x, +y, +z]"
+            raise InputError(f"{told}; got {error}", file) from None
+        return found
+
+    def to_body(self, sensor: str, readings: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return (n, 3) readings of a sensor in the body's axes."""
+        axis_map = tuple(self.axis_maps.get(sensor, STRAIGHT))
+        if axis_map == STRAIGHT:
+            return readings
+        matrix = axis_matrix(axis_map)
+        turned: NDArray[np.float64] = readings[:, np.argmax(np.abs(matrix), axis=1)] * matrix.sum(axis=1)
+        return turned
 
 
 @dataclass
@@ -34,13 +91,12 @@ class Block:
     """Samples of a log.
 
     ``signals``: ``accelerometer`` and ``gyroscope``, (n, 3) arrays in g and deg/s, body axes; ``time``, s, and
-    ``temperature``, degC, (n,) arrays; absent signals are left out. ``file`` returns file and line for a message,
-    ``place`` is the place in a file without lines. ``position``: bytes up to the end of the block. ``content``: what
-    the format needs to write the block.
+    ``temperature``, degC, (n,) arrays; absent signals are left out. ``file`` and, without lines, ``place`` stand in
+    messages. ``position``: bytes up to the end of the block. ``content``: what the format needs to write the block.
     """
 
     signals: dict[str, NDArray[Any]]
-    file: Callable[[], str]
+    file: str
     place: str
     position: int
     content: Any
@@ -137,7 +193,7 @@ def compensate_log(
             try:
                 found = stream.apply(**block.signals)
             except PipelineError as error:
-                raise type(error)(error.message + block.place, block.file()) from None
+                raise type(error)(error.message + block.place, block.file) from None
             readings = {s: getattr(found, s) for s in given}
             checks.add(given, readings, block.signals.get("time"))
             log.write(block, readings, calibrated)

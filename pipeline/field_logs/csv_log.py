@@ -6,7 +6,6 @@ The columns that the profile names as readings are replaced by calibrated ones i
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,10 +13,11 @@ import pyarrow as pa
 from pyarrow import compute as pc
 
 from pipeline.errors import InputError
-from pipeline.field_logs.compensate import Block
-from pipeline.field_logs.profile import EPOCH_AFTER_S
-from pipeline.io.csv_cells import digits, lines_of, read_head, text_blocks
+from pipeline.field_logs.compensate import EPOCH_AFTER_S, Block
+from pipeline.field_logs.log_checks import DECIMALS
+from pipeline.io.csv_layout import Layout, find_faults
 from pipeline.io.ingest_settings import csv_formats
+from pipeline.io.text_log import TextLog
 from pipeline.io.units import COUNTS, TRIADS, UNITS, decode, to_house_unit
 from pipeline.records import SENSORS, Encoding
 
@@ -27,12 +27,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.field_logs.compensate import Readings, Result
+    from pipeline.field_logs.compensate import LogProfile, Readings, Result
     from pipeline.field_logs.log_checks import LogChecks
     from pipeline.field_logs.output import Output
-    from pipeline.field_logs.profile import LogProfile
-    from pipeline.io.csv_cells import Head, TextBlock
     from pipeline.io.ingest_settings import Column
+    from pipeline.io.text_log import Head
 
 SIGNALS = {**TRIADS, "temperature": ("temperature",), "time": ("time",)}
 CANONICAL = {c: f"{c}_{'g' if s == 'accelerometer' else 'dps'}" for s in SENSORS for c in TRIADS[s]}
@@ -55,45 +54,56 @@ class CsvLog:
         self.columns = {c.channel: c for c in self.settings.columns}
         self.places: dict[str, list[int]] = {}  # of the columns of each signal
         self.origin = 0.0
+        self.notes: list[str] = []
 
     def blocks(self, _needs: set[str], checks: LogChecks) -> Iterator[Block]:
         """Yield the samples, and write the lines before them."""
         with self.source.open("rb") as raw:
-            head = read_head(raw, self.settings, self.source)
-            self._find(head.names, f"{self.source}:{len(head.lines) + 1}")
-            self.out.write(head.text(self._new_names(head.names)).encode())
+            log = TextLog(raw, str(self.source), self.settings, keep_open_line=True, block_bytes=self.block_bytes)
             rows = 0
-            for block in text_blocks(raw, head, self.settings, self.block_bytes, self.source):
+            for body, lines in log:
                 if rows == 0:
-                    readings = [block.columns[i] for s in SENSORS for i in self.places.get(s, [])]
+                    self._begin(log.head)
+                cells = self._cells(body, lines)
+                if rows == 0:
+                    readings = [cells[i] for s in SENSORS for i in self.places.get(s, [])]
                     checks.check_decimals(readings, self.settings.decimal)
-                signals = self._signals(block, head, rows)
-                file = partial(self._line, block)
-                yield Block(signals, file, "", raw.tell(), (block, head))
-                rows += block.rows
-
-    def _line(self, block: TextBlock) -> str:
-        return f"{self.source}:{block.line_of(0)}"
+                signals = self._signals(cells, body, lines, rows)
+                yield Block(signals, f"{self.source}:{lines[0]}", "", raw.tell(), (cells, b'"' in body))
+                rows += len(lines)
+            if rows == 0:
+                self._begin(log.head)
+            self.notes = [note.detail for note in log.notes]
 
     def write(self, block: Block, readings: Readings, _changed: set[str]) -> None:
         """Write the block with calibrated numbers in place of the raw ones; missing ones stay as they were written."""
-        text_block: TextBlock
-        head: Head
-        text_block, head = block.content
-        columns = text_block.columns
+        columns, quoted = block.content
         for sensor, values in readings.items():
             for k, i in enumerate(self.places[sensor]):
-                text = digits(values[:, k], self.settings.decimal)
+                text = _digits(values[:, k], self.settings.decimal)
                 missing = ~np.isfinite(values[:, k])
                 if missing.any():
                     written = pa.array(~np.isfinite(block.signals[sensor][:, k]))
                     text = pc.if_else(pa.array(missing), pc.if_else(written, columns[i], ""), text)
                 columns[i] = text
-        self.out.write(lines_of(columns, head.delimiter, quoted=text_block.quoted))
+        self.out.write(_lines_of(columns, self.layout.delimiter, quoted=quoted))
 
     def finish(self, result: Result) -> None:
-        """Name the sensors of a log without rows too."""
+        """Add the notes on the text, and the sensors of a log without rows."""
         result.sensors = [sensor for sensor in SENSORS if sensor in self.places]
+        result.notes += self.notes
+
+    def _begin(self, head: Head | None) -> None:
+        """Find the columns, and write the lines before the rows."""
+        if head is None:
+            message = "the file is empty; expected a header with the names of the columns"
+            raise InputError(message, f"{self.source}:1")
+        self._find(head.names, f"{self.source}:{head.line}")
+        places = [
+            (self.columns[c], i) for s, where in self.places.items() for c, i in zip(SIGNALS[s], where, strict=True)
+        ]
+        self.layout = Layout(str(self.source), head.names, places, head.delimiter, self.settings.decimal)
+        self.out.write(head.text(self._new_names(head.names)).encode())
 
     def _find(self, names: list[str], where: str) -> None:
         """Find the columns of each signal."""
@@ -124,17 +134,44 @@ class CsvLog:
                 new[i] = CANONICAL[channel]
         return new
 
-    def _signals(self, block: TextBlock, head: Head, rows: int) -> dict[str, Any]:
+    def _cells(self, body: bytes, lines: NDArray[np.int64]) -> list[pa.Array]:
+        """Return the cells of a block as columns of text."""
+        try:
+            table = self.layout.parse(body, dict.fromkeys(range(len(self.layout.names)), pa.string()))
+        except pa.ArrowInvalid as error:
+            raise self._refusal(body, lines, str(error)) from None
+        return [column.combine_chunks() for column in table.columns]
+
+    def _refusal(self, body: bytes, lines: NDArray[np.int64], otherwise: str) -> InputError:
+        """Return the error that names the first line of a block with a cell that is no number."""
+        for fault in find_faults(self.layout, body, lines, None):
+            if fault.kind != "not_finite":
+                return InputError(fault.message, f"{self.source}:{fault.line}")
+        return InputError(f"the log is no table of numbers: {otherwise}", f"{self.source}:{lines[0]}")
+
+    def _numbers(self, cells: pa.Array) -> NDArray[np.float64]:
+        """Return a column as numbers, NaN where a cell is empty; ``ArrowInvalid`` where one is no number."""
+        text = cells if self.settings.decimal == "." else pc.replace_substring(cells, self.settings.decimal, ".")
+        try:
+            found = pc.cast(text, pa.float64())
+        except pa.ArrowInvalid:  # blanks, empty cells, or no number
+            text = pc.utf8_trim_whitespace(text)
+            found = pc.cast(pc.if_else(pc.equal(text, ""), pa.scalar(None, pa.string()), text), pa.float64())
+        return np.asarray(found.to_numpy(zero_copy_only=False))
+
+    def _signals(self, cells: list[pa.Array], body: bytes, lines: NDArray[np.int64], rows: int) -> dict[str, Any]:
         """Return the signals of a block in g, deg/s, degC and s, the readings in body axes."""
         out: dict[str, Any] = {}
         for signal, where in self.places.items():
-            numbers = block.numbers(where, self.settings.decimal, head.names, self.source)
-            columns = [self.columns[c] for c in SIGNALS[signal]]
-            for k, column in enumerate(columns):
-                numbers[:, k] = _in_house_unit(column, numbers[:, k])
+            try:
+                numbers = np.column_stack([self._numbers(cells[i]) for i in where])
+            except pa.ArrowInvalid as error:
+                raise self._refusal(body, lines, str(error)) from None
+            for k, channel in enumerate(SIGNALS[signal]):
+                numbers[:, k] = _in_house_unit(self.columns[channel], numbers[:, k])
             out[signal] = self.profile.to_body(signal, numbers) if signal in SENSORS else numbers[:, 0]
         if self.settings.rate_hz is not None:
-            out["time"] = np.arange(rows, rows + block.rows) / self.settings.rate_hz
+            out["time"] = np.arange(rows, rows + len(lines)) / self.settings.rate_hz
         if "time" in out:
             if rows == 0 and out["time"][0] > EPOCH_AFTER_S:
                 self.origin = float(out["time"][0])
@@ -156,3 +193,27 @@ def _in_house_unit(column: Column, numbers: NDArray[np.float64]) -> NDArray[np.f
         multiplier, divisor = UNITS["time"][column.unit]
         return numbers / (NANOSECONDS * divisor / multiplier)
     return to_house_unit(column.channel, numbers, column.unit)
+
+
+def _digits(values: NDArray[np.float64], decimal: str) -> pa.Array:
+    """Return numbers as text, rounded to 1e-12."""
+    text = pc.cast(pa.array(np.round(values, DECIMALS) + 0.0), pa.string())
+    return text if decimal == "." else pc.replace_substring(text, ".", decimal)
+
+
+def _lines_of(columns: list[pa.Array], delimiter: str, *, quoted: bool) -> memoryview:
+    """Return the rows as the lines of a text file; ``quoted``: cells may have to be quoted."""
+    cells = [_quoted(column, delimiter) for column in columns] if quoted else list(columns)
+    cells[-1] = pc.binary_join_element_wise(cells[-1], "\n", "")
+    lines = pc.binary_join_element_wise(*cells, delimiter) if len(cells) > 1 else cells[0]
+    ends = np.frombuffer(lines.buffers()[1], np.int32, len(lines) + 1, 4 * lines.offset)
+    return memoryview(lines.buffers()[2])[ends[0] : ends[-1]]
+
+
+def _quoted(column: pa.Array, delimiter: str) -> pa.Array:
+    """Quote the cells that would not read back as one cell."""
+    special = pc.match_substring_regex(column, f'["{delimiter}\r\n]')
+    if not pc.any(special).as_py():
+        return column
+    doubled = pc.replace_substring(column, '"', '""')
+    return pc.if_else(special, pc.binary_join_element_wise('"', doubled, '"', ""), column)

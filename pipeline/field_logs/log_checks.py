@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.io.csv_cells import DECIMALS
 from pipeline.records import SENSORS
 
 if TYPE_CHECKING:
@@ -31,6 +30,7 @@ if TYPE_CHECKING:
 
     Values = NDArray[np.float64]
 
+DECIMALS = 12  # that ``apply`` writes: far below any sensor's resolution, above the rounding of a double
 WINDOW = 100
 MOST_WINDOWS = 20_000  # 2 million samples, 6 MB: the memory stays bounded
 QUIET, QUIETEST = 2.0, 0.1

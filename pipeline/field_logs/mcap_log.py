@@ -13,9 +13,8 @@ import numpy as np
 from mcap.records import Channel, Metadata, Schema
 
 from pipeline.errors import IngestError, InputError
-from pipeline.field_logs.compensate import Block
+from pipeline.field_logs.compensate import EPOCH_AFTER_S, Block
 from pipeline.field_logs.mcap_messages import new_imu, replaced
-from pipeline.field_logs.profile import EPOCH_AFTER_S
 from pipeline.field_logs.temperatures import Temperatures
 from pipeline.io.mcap_channels import MAPPED, TopicDecoder, kind_of
 from pipeline.io.mcap_copy import McapCopy
@@ -30,10 +29,9 @@ if TYPE_CHECKING:
 
     from mcap.records import McapRecord
 
-    from pipeline.field_logs.compensate import Readings, Result
+    from pipeline.field_logs.compensate import LogProfile, Readings, Result
     from pipeline.field_logs.log_checks import LogChecks
     from pipeline.field_logs.output import Output
-    from pipeline.field_logs.profile import LogProfile
     from pipeline.io.mcap_chunk import Rows
 
 LAST_ID = 0xFFFF  # ids of added definitions count down from here, those of recorders up from 0
@@ -123,9 +121,7 @@ class McapLog:
             warmth = self.temperatures.at(rows.starts, signals["time"], warmth, self.origin_ns)
         if warmth is not None:
             signals["temperature"] = warmth
-        return Block(
-            signals, lambda: str(self.source), f" ({rows.place})", self.reader.position, (rows, time_ns, turned)
-        )
+        return Block(signals, str(self.source), f" ({rows.place})", self.reader.position, (rows, time_ns, turned))
 
     def write(self, block: Block, readings: Readings, changed: set[str]) -> None:
         """Add the calibrated messages of a block after its run."""

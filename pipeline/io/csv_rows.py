@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import IngestError
-from pipeline.io.csv_header import column_notes, fields, find_columns, find_delimiter, single_blanks
-from pipeline.io.csv_parse import Fault, Layout, find_faults, refusal
+from pipeline.io.csv_layout import Fault, Layout, column_notes, find_columns, find_faults, refusal
 from pipeline.io.csv_times import (
     EXACT_BELOW_S,
     LONGEST_S,
@@ -24,8 +23,8 @@ from pipeline.io.csv_times import (
     whole_times,
 )
 from pipeline.io.files import unchanged
-from pipeline.io.ingest_settings import AUTO, COMMENTED, DROP, GAP, WHITESPACE
-from pipeline.io.text_blocks import TextBlocks
+from pipeline.io.ingest_settings import AUTO, DROP, GAP
+from pipeline.io.text_log import TextLog
 from pipeline.records import Note
 
 if TYPE_CHECKING:
@@ -35,9 +34,8 @@ if TYPE_CHECKING:
 
     from pipeline.io.ingest_settings import Checks, CsvFormat
 
-LINES_BELOW = 60  # after a header that lacks columns, searched for one that has them
+LINES_BELOW, SEARCHED_BELOW = 60, 10_000  # lines, bytes after a header without the columns, searched for another
 LINES, EXACT = -1, -2  # in place of a column's index: numbers of the lines, times in ns
-LONGEST_HEAD = 1 << 24  # bytes, before the first row
 MOST_REFUSED = 10_000  # bad lines after which the rest of the file is not searched for more
 
 
@@ -87,19 +85,13 @@ class Rows:
 
 
 def read_rows(path: Path, settings: CsvFormat, checks: Checks) -> Rows:
-    """Return the rows of a file in its own order.
-
-    Raises
-    ------
-    IngestError
-        With ``path:line`` of the line concerned.
-    """
+    """Return the rows of a file in its own order; an ``IngestError`` names the line."""
     with unchanged(path), path.open("rb") as stream:
-        text = TextBlocks(stream, str(path), keep_nul=settings.bad_rows == DROP)
-        reader = _RowReader(str(path), settings, path.stat().st_size)
-        for data, lines in text:
-            reader.add(data, lines)
-        return reader.rows(text, checks)
+        log = TextLog(stream, str(path), settings)
+        reader = _RowReader(log, path.stat().st_size)
+        for body, lines in log:
+            reader.add(body, lines)
+        return reader.rows(checks)
 
 
 class _Columns:
@@ -135,37 +127,35 @@ class _Columns:
 class _RowReader:
     """Numbers of a text log, gathered block by block."""
 
-    def __init__(self, path: str, settings: CsvFormat, size: int) -> None:
-        self.path, self.settings, self.size = path, settings, size
-        self.allowed = {"not_finite"} if settings.nan == GAP else set()
-        if settings.bad_rows == DROP:
+    def __init__(self, log: TextLog, size: int) -> None:
+        self.log, self.path, self.settings, self.size = log, log.path, log.settings, size
+        self.allowed = {"not_finite"} if self.settings.nan == GAP else set()
+        if self.settings.bad_rows == DROP:
             self.allowed |= {"bad_row", "nul", "not_a_number", "decimal_comma"}
-        if settings.session is not None:
+        if self.settings.session is not None:
             self.allowed.add("restarted")
         self.layout: Layout | None = None
         self.notes: list[Note] = []
-        self.head = b""  # what was read before the layout is known
-        self.comments: list[int] = []  # their lines
         self.row_count = 0  # bad ones as well
         self.columns = _Columns()
         self.faults: list[Fault] = []
         self.refused: list[Fault] = []
         self.last_row: tuple[int, str] | None = None
 
-    def add(self, data: bytes, lines: range) -> None:
-        """Take in a block of whole lines with these numbers."""
-        if self.layout is not None:
-            self._add_rows(self.layout, *self._data_lines(data, lines))
-            return
-        self.head += data
-        found = self._find_layout()
-        if found is None and len(self.head) > LONGEST_HEAD:
-            raise self._no_rows()
-        if found is not None:
-            self.layout, self.head = found[0], b""
-            self._add_rows(*found)
+    def add(self, body: bytes, lines: NDArray[np.int64]) -> None:
+        """Add a block of rows with these numbers of lines."""
+        layout = self.layout = self.layout or self._find_layout(body, lines)
+        numbers = layout.numbers(body, len(lines))
+        self.row_count += len(lines)
+        if numbers is None:
+            body, lines, numbers = self._valid_rows(layout, body, lines)
+        else:
+            self.last_row = int(lines[-1]), body[body.rfind(b"\n", 0, -1) + 1 : -1].decode("utf-8", "replace")
+        if numbers:
+            columns = numbers | {LINES: lines} | self._exact_times(layout, body, numbers)
+            self.columns.append(columns, int(1.02 * len(lines) * self.size / len(body)) + 16)
 
-    def rows(self, text: TextBlocks, checks: Checks) -> Rows:
+    def rows(self, checks: Checks) -> Rows:
         """Return all rows, without those that may be dropped.
 
         Raises
@@ -174,114 +164,38 @@ class _RowReader:
             If there are no rows, or lines that may not be dropped, or too many of them.
         """
         if self.layout is None:
-            raise self._no_rows()
+            raise self.log.no_rows()
         notes, repaired = self._drop_faults(self.layout, checks)
-        if not self.columns.rows:
-            raise refusal(self.layout, self.faults)
-        keep: slice | NDArray[np.bool_] = slice(None)
         parted = [f.line for f in self.faults if f.parted_before]
-        if parted:
+        keep: slice | NDArray[np.bool_] = slice(None)
+        if parted and self.columns.rows:
             keep = ~np.isin(self.columns[LINES], parted)
-        lines = self.columns[LINES][keep]
+        lines = self.columns[LINES][keep] if self.columns.rows else np.zeros(0, np.int64)
         if not lines.size:
             raise refusal(self.layout, self.faults)
         restarts = [f.line for f in self.faults if f.kind == "restarted"]
         return Rows(
             layout=self.layout,
-            sha256=text.sha256,
+            sha256=self.log.sha256,
             numbers={index: self.columns[index][keep] for _, index in self.layout.columns},
             lines=lines,
             exact_ns=self.columns[EXACT][keep] if EXACT in self.columns else None,
-            notes=(*text.notes, *self._comment_note(), *self.notes, *notes),
+            notes=(*self.log.notes, *self.notes, *notes),
             repaired=repaired,
             restarts=tuple(np.searchsorted(lines, restarts).tolist()),
         )
 
-    def _data_lines(self, data: bytes, numbers: range) -> tuple[bytes, NDArray[np.int64]]:
-        """Return the lines that are no comments, and their numbers."""
-        lines = np.arange(numbers.start, numbers.stop)
-        comment = self.settings.comment
-        if comment is not None and comment.encode() in data:
-            parts, mark = data.split(b"\n")[:-1], comment.encode()
-            is_comment = np.array([part.lstrip().startswith(mark) for part in parts], bool)
-            self.comments += lines[is_comment].tolist()
-            data = b"".join(part + b"\n" for part, other in zip(parts, is_comment, strict=True) if not other)
-            lines = lines[~is_comment]
-        if self.settings.delimiter == WHITESPACE:
-            data = single_blanks(data)
-        return data, lines
-
-    def _find_layout(self) -> tuple[Layout, bytes, NDArray[np.int64]] | None:
-        """Return the layout and the first rows; None where the header or the first row was not read yet."""
-        settings, start = self.settings, 0
-        for _ in range(settings.skip_lines):
-            start = self.head.find(b"\n", start) + 1
-            if start == 0:
-                return None
-        self.comments = []
-        rest, begin = self.head[start:], settings.skip_lines + 1
-        body, lines = _without_empty_lines(*self._data_lines(rest, range(begin, begin + rest.count(b"\n"))))
-        has_names = settings.header is True
-        if len(lines) < 1 + has_names:
-            return None
-        first = body.partition(b"\n")[0].decode("utf-8")
-        if settings.header == COMMENTED:
-            first = self._last_comment_before(int(lines[0]))
-        delimiter = find_delimiter(settings, first)
-        names = fields(first, delimiter)
-        if not settings.header:
-            names = [f"column {i}" for i in range(len(names))]
-        at = int(lines[0])
-        if has_names:
-            body, lines = body.partition(b"\n")[2], lines[1:]
-        below = body[:10_000].decode("utf-8", "replace").split("\n")[:LINES_BELOW]
-        columns = find_columns(names, settings, f"{self.path}:{at}", dict(zip(lines.tolist(), below, strict=False)))
+    def _find_layout(self, body: bytes, lines: NDArray[np.int64]) -> Layout:
+        """Return which column holds which channel."""
+        head, settings = self.log.head, self.settings
+        assert head is not None  # noqa: S101  (rows follow it)
+        text = body[:SEARCHED_BELOW].decode("utf-8", "replace").split("\n")[:LINES_BELOW]
+        below = dict(zip(lines.tolist(), text, strict=False))
+        columns = find_columns(head.names, settings, f"{self.path}:{head.line}", below)
         if settings.delimiter == AUTO:
-            self.notes.append(Note("N-DELIM", 1, 0, 0, f"the separator is {delimiter!r}, by the header"))
-        self.notes += column_notes(names, columns, at if has_names else 0)
-        return Layout(self.path, names, columns, delimiter, settings.decimal), body, lines
-
-    def _last_comment_before(self, line: int) -> str:
-        """Return the text of the last comment before the data."""
-        above = [number for number in self.comments if number < line]
-        if not above:
-            message = (
-                f"no line that starts with {self.settings.comment!r} stands before the data, where ingest.csv.header "
-                "looks for the column names"
-            )
-            raise IngestError(message, self.path, code="no_header")
-        text = self.head.split(b"\n")[above[-1] - 1].decode("utf-8")
-        text = text.lstrip().removeprefix(self.settings.comment or "")
-        return " ".join(text.split()) if self.settings.delimiter == WHITESPACE else text
-
-    def _comment_note(self) -> list[Note]:
-        if not self.comments:
-            return []
-        detail = f"lines that start with {self.settings.comment!r} are no data"
-        return [Note("N-COMMENT", len(self.comments), self.comments[0], self.comments[-1], detail)]
-
-    def _no_rows(self) -> IngestError:
-        """Return the refusal of a file without rows."""
-        skipped, count = self.settings.skip_lines, self.head.count(b"\n")
-        if count < skipped:
-            message = f"the file ends within the {skipped} lines that ingest.csv.skip_lines skips"
-            return IngestError(message, self.path, code="no_rows")
-        found = f"header on line {skipped + 1}, " if self.settings.header is True and count > skipped else ""
-        return IngestError(f"{found}0 data rows; at least 2 are needed", self.path, code="no_rows")
-
-    def _add_rows(self, layout: Layout, body: bytes, lines: NDArray[np.int64]) -> None:
-        numbers = layout.numbers(body, len(lines)) if len(lines) else {}
-        if numbers is None:
-            body, lines = _without_empty_lines(body, lines)
-            numbers = layout.numbers(body, len(lines)) if len(lines) else {}
-        self.row_count += len(lines)
-        if numbers is None:
-            body, lines, numbers = self._valid_rows(layout, body, lines)
-        elif numbers:
-            self.last_row = int(lines[-1]), body[body.rfind(b"\n", 0, -1) + 1 : -1].decode("utf-8", "replace")
-        if numbers:
-            columns = numbers | {LINES: lines} | self._exact_times(layout, body, numbers)
-            self.columns.append(columns, int(1.02 * len(lines) * self.size / len(body)) + 16)
+            self.notes.append(Note("N-DELIM", 1, 0, 0, f"the separator is {head.delimiter!r}, by the header"))
+        self.notes += column_notes(head.names, columns, head.line if settings.header is True else 0)
+        return Layout(self.path, head.names, columns, head.delimiter, settings.decimal)
 
     def _valid_rows(
         self, layout: Layout, body: bytes, lines: NDArray[np.int64]
@@ -349,13 +263,6 @@ class _RowReader:
                 detail += dropped[0].message
                 notes.append(Note(code, len(dropped), dropped[0].line, dropped[-1].line, detail))
         return notes, len(others)
-
-
-def _without_empty_lines(body: bytes, lines: NDArray[np.int64]) -> tuple[bytes, NDArray[np.int64]]:
-    if b"\n\n" not in body and not body.startswith(b"\n"):
-        return body, lines
-    parts = body.split(b"\n")[:-1]
-    return b"".join(part + b"\n" for part in parts if part), lines[[bool(part) for part in parts]]
 
 
 def _longest_run(faults: list[Fault]) -> int:

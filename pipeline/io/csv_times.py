@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.io.csv_parse import Layout
+    from pipeline.io.csv_layout import Layout
     from pipeline.io.csv_rows import Rows
     from pipeline.io.ingest_settings import Checks, Column, CsvFormat
 

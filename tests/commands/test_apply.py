@@ -11,8 +11,7 @@ import pytest
 
 from pipeline.commands.apply import main
 from pipeline.errors import ConfigurationError, ConvergenceError, InputError, MissingInputError
-from pipeline.field_logs.compensate import compensate_log
-from pipeline.field_logs.profile import LogProfile
+from pipeline.field_logs.compensate import LogProfile, compensate_log
 from pipeline.model.compensation import load
 from pipeline.records import FittedEffect, SensorCalibration
 
@@ -171,14 +170,14 @@ def test_the_log_is_never_overwritten(calibration: Path, log: Path, tmp_path: Pa
 
 def test_a_failed_run_leaves_no_output(calibration: Path, log: Path, tmp_path: Path) -> None:
     log.write_text(log.read_text(encoding="utf-8") + "60.0,1,2,x,ok,1,1,1,25,0,1\n", encoding="utf-8")
-    with pytest.raises(InputError, match=r"log\.csv:502: accel_z_g is 'x'; expected a number"):
+    with pytest.raises(InputError, match=r"log\.csv:502: column accel_z_g .* is 'x'; a finite number is expected"):
         main(["--calibration", str(calibration), str(log), "-o", str(tmp_path / "out.csv")])
     assert sorted(p.name for p in tmp_path.iterdir()) == ["U1.json", "log.csv"]
 
 
 def test_a_row_with_a_missing_cell_is_refused(calibration: Path, log: Path, tmp_path: Path) -> None:
     log.write_text(log.read_text(encoding="utf-8") + "60.0,1,2\n", encoding="utf-8")
-    with pytest.raises(InputError, match="11 columns"):
+    with pytest.raises(InputError, match=r"log\.csv:502: the line has 3 fields where 11 are expected"):
         main(["--calibration", str(calibration), str(log), "-o", str(tmp_path / "out.csv")])
 
 
@@ -188,7 +187,7 @@ def test_a_row_with_a_missing_cell_is_refused(calibration: Path, log: Path, tmp_
         ("t,ax,ay,az", "expected accel_x_g"),
         ("time_s,accel_x_g,accel_y_g,gyro_x_dps", "but not accel_z_g"),
         ("accel_x_g,accel_x_g,accel_y_g,accel_z_g", "more than once"),
-        ("", "empty"),
+        ("", "got 1, 2, 3, 4"),
     ],
 )
 def test_a_header_without_the_sensors_is_refused(calibration: Path, tmp_path: Path, header: str, message: str) -> None:
@@ -209,6 +208,9 @@ def test_a_log_without_rows_gives_a_header(calibration: Path, log: Path, tmp_pat
     log.write_text(HEADER + "\n", encoding="utf-8")
     assert compensate_log(load(calibration), log, tmp_path / "out.csv").samples == 0
     assert (tmp_path / "out.csv").read_text(encoding="utf-8") == HEADER + "\n"
+    log.write_text("\n\n", encoding="utf-8")
+    with pytest.raises(InputError, match="the file is empty"):
+        compensate_log(load(calibration), log, tmp_path / "out.csv")
 
 
 def test_a_missing_log_is_refused(calibration: Path, tmp_path: Path) -> None:
@@ -318,7 +320,7 @@ def test_a_log_of_other_dress_keeps_it(calibration: Path, tmp_path: Path, block_
     bad = text.replace("70,5;", "70,5;x", 1)
     (tmp_path / "log.txt").write_text(bad)
     line = 1 + next(i for i, row in enumerate(bad.splitlines()) if "x" in row and row.startswith("70"))
-    with pytest.raises(InputError, match=rf"log\.txt:{line}: ax is"):
+    with pytest.raises(InputError, match=rf"log\.txt:{line}: column ax .* is"):
         compensate_log(load(calibration), tmp_path / "log.txt", tmp_path / "out.txt", profile, block_bytes=block_bytes)
 
 

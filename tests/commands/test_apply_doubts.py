@@ -161,7 +161,7 @@ def test_what_fails_leaves_the_output_that_was_there(calibration: Path, tmp_path
     log = write(tmp_path / "log.csv", readings()[:50])
     log.write_text(log.read_text() + "60.0,1,2,x,1,1,1\n")
     (tmp_path / "out.csv").write_text("old")
-    with pytest.raises(InputError, match="expected a number"):
+    with pytest.raises(InputError, match="a finite number is expected"):
         main(["--calibration", str(calibration), str(log), "-o", str(tmp_path / "out.csv")])
     assert (tmp_path / "out.csv").read_text() == "old"
     assert sorted(f.name for f in tmp_path.iterdir()) == ["U1.json", "log.csv", "out.csv"]

@@ -17,8 +17,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 from pipeline.commands.apply import main
 from pipeline.errors import InputError
-from pipeline.field_logs.compensate import compensate_log
-from pipeline.field_logs.profile import LogProfile
+from pipeline.field_logs.compensate import LogProfile, compensate_log
 from pipeline.io.ros2_messages import DEFINITIONS, IMU, TEMPERATURE
 from pipeline.model.compensation import load
 from pipeline.records import SENSORS, FittedEffect, SensorCalibration

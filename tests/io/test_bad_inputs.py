@@ -12,8 +12,8 @@ from bad_logs import FILE, TABLE_ANGLE, VALUES, Case, cases
 from sample_logs import SENSOR, procedure
 
 from pipeline.errors import ConfigurationError, InputError, MissingInputError
-from pipeline.io import text_blocks
-from pipeline.io.csv_parse import Layout
+from pipeline.io import text_log
+from pipeline.io.csv_layout import Layout
 from pipeline.io.ingest_settings import check_ingest
 from pipeline.io.parquet import load_recordings, save_recordings
 from pipeline.io.read import read_recordings
@@ -108,7 +108,7 @@ def test_the_size_of_the_blocks_changes_nothing(tmp_path: Path, number: str, mon
     write(tmp_path, case, number)
     results = []
     for size in (1 << 20, 20_011):
-        monkeypatch.setattr(text_blocks, "BLOCK_BYTES", size)
+        monkeypatch.setattr(text_log, "BLOCK_BYTES", size)
         try:
             found = read(tmp_path, case)
             results.append((found.notes, found.time_ns.tolist(), str(found.accelerometer), str(found.gyroscope)))

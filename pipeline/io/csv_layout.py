@@ -1,12 +1,13 @@
-"""Rows of a text log to numbers, and what is wrong with the rows that are none.
+"""The columns of a text log: which holds which channel, its rows as numbers, and what is wrong with a row that is none.
 
-The type of every column is given, none is inferred, and no text stands for a missing value. The fast parser says that a
-block of rows holds a bad cell, but not where: only the lines of such a block are checked one by one.
+Columns are found by their names. No type is inferred, and no text stands for a missing value. The fast parser says that
+a block of rows holds a bad cell, but not where: only the lines of such a block are checked one by one.
 """
 
 from __future__ import annotations
 
 import csv
+import difflib
 import math
 import re
 from dataclasses import dataclass
@@ -17,14 +18,17 @@ import pyarrow as pa
 from pyarrow import csv as arrow_csv
 
 from pipeline.errors import IngestError
+from pipeline.io.units import TRIADS, UNITS, unit_in_brackets
+from pipeline.records import Note
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from pipeline.io.ingest_settings import Column
+    from pipeline.io.ingest_settings import Column, CsvFormat
 
+NUMBER = re.compile(r"\s*[+-]?(\d+[.,]?\d*|[.,]\d+)([eE][+-]?\d+)?\s*")
 LISTED = 5  # lines named in a refusal
 LEAVE_A_GAP = "ingest.csv.bad_rows=drop leaves a gap in place of such rows"
 HINTS = {
@@ -38,6 +42,115 @@ HINTS = {
 END_OF_NUMBER = re.compile(r"[\d.,eE+-]+")
 
 
+def find_columns(names: list[str], settings: CsvFormat, where: str, below: dict[int, str]) -> list[tuple[Column, int]]:
+    """Return the channels that a file holds, each with the index of its column.
+
+    All columns of one sensor may be missing where those of the other are found and fewer than three columns are left
+    over that could hold them under other names: then the log is of one sensor.
+
+    Parameters
+    ----------
+    where : str
+        Place of the header, for refusals.
+    below : dict of int to str
+        The next lines, by their number, searched for a header that was not expected there.
+
+    Raises
+    ------
+    IngestError
+        If a column is missing, a name stands twice, or a name states another unit than the profile.
+    """
+    twice = sorted({n for n in names if n and names.count(n) > 1})
+    if twice:
+        message = f"column name {', '.join(twice)} stands more than once in the header"
+        raise IngestError(message, where, code="duplicate_column")
+    found: list[tuple[Column, int]] = []
+    lacking: list[Column] = []
+    for column in settings.columns:
+        wanted = column.column
+        index = wanted if isinstance(wanted, int) else names.index(wanted) if wanted in names else len(names)
+        if index < len(names):
+            _check_unit(column, names[index], where)
+            found.append((column, index))
+        elif not column.optional:
+            lacking.append(column)
+    absent = _channels_of_absent_sensor(lacking, found, len(names))
+    missing = [str(column.column) for column in lacking if column.channel not in absent]
+    if missing:
+        numbers = bool(settings.header) and all(
+            NUMBER.fullmatch(n) for name in names for n in re.split(r"[;\t| ]+", name)
+        )
+        message = _missing_message(missing, names)
+        hint = _what_to_do(missing, names, settings, below, numbers=numbers)
+        raise IngestError(message, where, code="no_header" if numbers else "missing_column", hint=hint)
+    return found
+
+
+def column_notes(names: list[str], columns: list[tuple[Column, int]], line: int) -> list[Note]:
+    """Return notes on axes in another order than x, y, z and on columns that the profile does not use."""
+    place = {column.channel: index for column, index in columns if isinstance(column.column, str)}
+    turned = [t for t in TRIADS.values() if set(t) <= place.keys() and sorted(t, key=lambda c: place[c]) != list(t)]
+    listed = [names[i] for i in sorted(place[c] for t in turned for c in t)]
+    detail = f"axes stand in the order {', '.join(listed)} and were taken by their names"
+    notes = [Note("N-ORDER", len(listed), line, line, detail)] if turned else []
+    used = {index for _, index in columns}
+    ignored = [n for i, n in enumerate(names) if i not in used]
+    detail = f"columns not used: {', '.join(ignored)}"
+    return notes + ([Note("N-IGNORED", len(ignored), line, line, detail)] if ignored else [])
+
+
+def _channels_of_absent_sensor(missing: list[Column], found: list[tuple[Column, int]], columns: int) -> tuple[str, ...]:
+    """Return the channels of the sensor that a log of the other one does not hold; none where it may hold them."""
+    lacking, known = {c.channel for c in missing}, {c.channel for c, _ in found}
+    absent = [triad for triad in TRIADS.values() if set(triad) <= lacking]
+    other = any(set(triad) <= known for triad in TRIADS.values())
+    return absent[0] if absent and other and columns - len(found) < len(absent[0]) else ()
+
+
+def _check_unit(column: Column, name: str, where: str) -> None:
+    stated = unit_in_brackets(name)
+    if stated is not None and stated != column.unit and stated in UNITS[column.channel]:
+        message = (
+            f"the header says that {name!r} is in {stated}, ingest.csv.columns.{column.channel}.unit says "
+            f"{column.unit}; one of them is wrong"
+        )
+        raise IngestError(message, where, code="unit_contradiction")
+
+
+def _missing_message(missing: list[str], names: list[str]) -> str:
+    near = {m: difflib.get_close_matches(m, names, 1) for m in missing}
+    hints = [f"{m} (nearest: {n[0]})" if n else m for m, n in near.items()]
+    message = f"column {', '.join(hints)} missing; found {', '.join(names)[:300]}"
+    separators = [repr(c) for c in ",;\t| " if c in names[0]] if len(names) == 1 else []
+    if separators:
+        message += f"; is the separator {' or '.join(separators)}? Set ingest.csv.delimiter"
+    return message
+
+
+def _what_to_do(
+    missing: list[str], names: list[str], settings: CsvFormat, below: dict[int, str], *, numbers: bool
+) -> str:
+    """Return the setting with which the columns would be found."""
+    for number, line in below.items():
+        if all(m in line for m in missing):
+            return f"line {number} holds them: set ingest.csv.skip_lines to the lines before"
+    if numbers:
+        return "the first line holds numbers: set ingest.csv.header=false and give columns by index from 0"
+    lines = list(below.values())
+    if lines and len(names) != lines[min(len(lines) - 1, 12)].count(settings.delimiter[:1]) + 1:
+        start = " / ".join(lines[:3])[:150]
+        return f"the next lines are {start!r}; lines before the header are skipped by ingest.csv.skip_lines"
+    advice = "describe the file's columns in ingest.csv.columns"
+    absent = [
+        sensor
+        for sensor, triad in TRIADS.items()
+        if {str(c.column) for c in settings.columns if c.channel in triad} <= set(missing)
+    ]
+    if len(absent) == 1:
+        advice += f"; of a log without {absent[0]}, set {', '.join(TRIADS[absent[0]])} to null there"
+    return advice
+
+
 @dataclass(frozen=True)
 class Layout:
     """The columns of a text log and the channels that they hold, each with the index of its column."""
@@ -49,13 +162,7 @@ class Layout:
     decimal: str
 
     def parse(self, body: bytes, types: Mapping[int, Any]) -> Any:  # noqa: ANN401  (pyarrow has no types)
-        """Return columns of rows as a pyarrow table, named by their index.
-
-        Raises
-        ------
-        pyarrow.ArrowInvalid
-            If a row has another number of fields, or a cell is not of its type.
-        """
+        """Return columns of rows as a pyarrow table, by their index; ``ArrowInvalid`` where a row does not fit."""
         names = [str(i) for i in range(len(self.names))]
         return arrow_csv.read_csv(
             pa.py_buffer(body),
@@ -96,8 +203,8 @@ class Layout:
 class Fault:
     """A line that is no row of numbers.
 
-    ``line`` counts from 1. ``kind`` is a code of ``HINTS``. ``short``: it has too few fields. ``parted_before``: the
-    line is a row, but the next line may hold the end of its last number; that line's number.
+    ``kind`` is a code of ``HINTS``. ``short``: it has too few fields. ``parted_before``: the line is a row, but the
+    next line, of that number, may hold the end of its last number.
     """
 
     line: int
@@ -125,15 +232,7 @@ def refusal(layout: Layout, faults: Sequence[Fault], *, more: bool = False) -> I
 def find_faults(
     layout: Layout, body: bytes, lines: NDArray[np.int64], before: tuple[int, str] | None
 ) -> Iterator[Fault]:
-    """Yield the faults of a block of rows in the order of their lines.
-
-    Parameters
-    ----------
-    lines : (n,) array
-        The number of each line of ``body``.
-    before : (int, str), optional
-        Number and text of the valid row before the block.
-    """
+    """Yield the faults of a block of rows; ``before`` is number and text of the valid row before it."""
     for number, raw in zip(lines.tolist(), body.split(b"\n"), strict=False):
         text = raw.decode("utf-8", "replace")
         fault = _fault(layout, number, text)
