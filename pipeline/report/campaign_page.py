@@ -193,17 +193,16 @@ def _fleet_figure(sensor: str, frame: pd.DataFrame) -> Figure | None:
     words = f"Missing effects: {effects}." if effects else "No effect is named as missing."
     middle = [number(float(np.nanmedian(v))) if np.isfinite(v).any() else "not known" for v in (before, after, floor)]
     finding = f"{sensor.capitalize()}: {_farthest(frame['unit'].tolist(), after / floor, int(known.sum()))}"
-    drawn = chart(
-        f"fleet-{sensor}",
-        finding,
+    caption = f"Error on held-out motion, each unit a dot. {words}"
+    return chart(
+        Figure(f"fleet-{sensor}", finding, caption, tuple(legend)),
         f"Held-out error of {int(known.sum())} units. Median {middle[0]} {unit} before, {middle[1]} after, noise floor "
         f"{middle[2]}. {words}",
         [Panel(layers, f"rms error, {unit}", 200, logarithmic=True)],
         "unit, in the order of units.csv",
         margin=0.03,
-        names="units",
+        units="units",
     )
-    return Figure(drawn, f"Error on held-out motion, each unit a dot. {words}", tuple(legend), finding)
 
 
 def _farthest(units: list[str], ratio: np.ndarray, known: int) -> str:

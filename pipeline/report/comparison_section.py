@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from dataclasses import replace
 from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
@@ -123,15 +124,13 @@ def _figure(compared: list[Compared], comparison: JSON, measure: str, unit: str,
     title = f"{MEASURES[measure]}, {unit}"
     words = ["Mean of each group with its 95 % interval; faint, its units."] * any(len(p.units) > 1 for p in points)
     words += ["Dashed: the error that noise alone gives."] * any(p.floor for p in points)
-    legend: tuple[tuple[str, str], ...] = ()
-    if x is None:
-        drawn = bars(f"{name}-{measure}", title, points, title)
-    else:
-        drawn = curves(f"{name}-{measure}", title, points, title, x_label=x["label"], named=x["named"])
-        series = list(dict.fromkeys(p.series for p in points))
-        legend = tuple((f"c{i % COLOURS}", s) for i, s in enumerate(series)) if len(series) > 1 else ()
     told = finding([c.group for c in compared], measure, comparison["pairs"])
-    return Figure(drawn, " ".join(words), legend, told)
+    figure = Figure(f"{name}-{measure}", told, " ".join(words))
+    if x is None:
+        return bars(figure, points, title)
+    series = list(dict.fromkeys(p.series for p in points))
+    legend = tuple((f"c{i % COLOURS}", s) for i, s in enumerate(series)) if len(series) > 1 else ()
+    return curves(replace(figure, legend=legend), points, title, x["label"], named=x["named"])
 
 
 def _point(c: Compared, measure: str, x: JSON | None) -> Point | None:

@@ -1,4 +1,4 @@
-"""Charts of groups: a row for each value, upright bars in groups, and means along an axis.
+"""Charts of groups: a row for each value, stems in groups, and means along an axis.
 
 The length of a bar on a logarithmic axis has no meaning, only its end has one: so each row shows its number, and levels
 (the noise floor) are lines across all rows. A row with an interval is the mean of several units: a dot with its 95 %
@@ -13,18 +13,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.report.chart import WIDTH, Axis, Dots, Layer, Line, Panel, Samples, chart, svg, text, upright_text
+from pipeline.report.axis import LINEAR_TO, Axis
+from pipeline.report.chart import LETTER, WIDTH, Dots, Figure, Layer, Line, Panel, Samples, chart, text
 from pipeline.report.numbers import number
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from markupsafe import Markup
+    from collections.abc import Mapping, Sequence
 
 ROW, LEFT, RIGHT = 30, 6, 64  # px
-LETTER = 6.0  # px, width of one
+BRACKET = 48  # px, width of a bracket
+LONGEST = 66  # letters of a note that fit into a row
 COLOURS = 6  # of the style sheet: c0 to c5
 DECADE = 8.0  # largest over smallest place from which an axis x is logarithmic: a decade is nearly filled
+LOWEST = -100.0  # value at which a bar on a symlog axis ends
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,8 @@ class Point:
         Place along the axis of ``curves``.
     series : str
         Points of one series are joined in ``curves``.
+    note : str
+        Part of the description, and drawn where there is no value: why there is none.
     """
 
     label: str
@@ -57,41 +60,64 @@ class Point:
     floor: float | None = None
     x: float = 0.0
     series: str = ""
+    note: str = ""
 
 
-def bars(name: str, title: str, rows: Sequence[Point], label: str, *, levels: dict[str, float] | None = None) -> Markup:
-    """Return a chart with a row for each value, on a logarithmic axis.
+def bars(
+    figure: Figure,
+    rows: Sequence[Point],
+    label: str,
+    *,
+    levels: Mapping[str, float] | None = None,
+    kind: str = "log",
+    brackets: Sequence[Mapping[int, str]] = (),
+) -> Figure:
+    """Return a figure with a row for each value.
 
     Parameters
     ----------
-    name, title : str
-        Identifier that is unique on the page, and what the chart is.
+    figure : Figure
+        The texts.
     rows : sequence of Point
     label : str
         Of the values, with unit.
-    levels : dict of str to float, optional
+    levels : mapping of str to float, optional
         Vertical lines by their text; values above 0 are drawn.
+    kind : str
+        Of the axis: "log", or "symlog" with bars from zero.
+    brackets : sequence of mapping
+        Each joins rows: the number of a row to the text beside it.
     """
     levels = {words: value for words, value in (levels or {}).items() if value > 0}
-    values = [v for r in rows for v in (r.value, *(r.interval or ()), *r.units, r.floor) if v is not None and v > 0]
-    values = values + list(levels.values()) or [0.1, 1.0]
+    values = [v for r in rows for v in (r.value, *(r.interval or ()), *r.units, r.floor) if v is not None]
     means = any(r.interval for r in rows)
-    ends = np.array([min(values) / (1.1 if means else 2.0), max(values) * 1.15])
-    axis = Axis.over([ends], LEFT + 20 * means, WIDTH - (26 if means else RIGHT), "log", margin=0.0)
+    if kind == "symlog":
+        ends = [max(min(values, default=0.0), LOWEST), 0.0, max(values, default=0.0), 2.0 * LINEAR_TO]
+    else:
+        positive = [v for v in (*values, *levels.values()) if v > 0] or [0.1, 1.0]
+        ends = [min(positive) / (1.1 if means else 2.0), max(positive) * 1.15]
+    stop = WIDTH - (26 if means else RIGHT) - BRACKET * len(brackets)
+    axis = Axis.over([np.array(ends)], LEFT + 20 * means, stop, kind, margin=0.0)
     top = 16 if levels else 4
     bottom = top + ROW * len(rows)
     ticks = axis.ticks(5)
     out = [f'<path class="grid" d="{"".join(f"M{at:.1f} {top}V{bottom}" for at, _ in ticks)}"/>']
-    out += [_row(row, axis, top + ROW * i) for i, row in enumerate(rows)]
+    out += [_row(row, axis, top + ROW * i) for i, row in enumerate(rows) if row.value is not None]
     for words, value in levels.items():
         at, said = axis.pixels(value), f"{words} {number(value)}"
         half = LETTER / 2 * len(said)
         out.append(f'<path class="level" d="M{at:.1f} {top}V{bottom}"/>')
         out.append(text(min(max(at, LEFT + half), WIDTH - half), top - 4, said, "m"))
+    out += [_row(row, axis, top + ROW * i) for i, row in enumerate(rows) if row.value is None]
+    for k, members in enumerate(brackets):
+        at, heights = stop + RIGHT - 12 + BRACKET * k, {top + ROW * row + 20: said for row, said in members.items()}
+        teeth = "".join(f"M{at - 6} {y}h6" for y in heights)
+        out.append(f'<path class="bracket" d="M{at} {min(heights)}V{max(heights)}{teeth}"/>')
+        out += [text(at + 3, y + 3.5, said) for y, said in heights.items() if said]
     out += [text(max(at, LEFT + 14), bottom + 13, tick, "m") for at, tick in ticks]
     out.append(text((axis.start + axis.stop) / 2, bottom + 27, label, "m"))
     description = _description(rows) + "".join(f"; {words} {number(value)}" for words, value in levels.items())
-    return svg(name, title, f"{label}. {description}", bottom + 34, "".join(out))
+    return figure.drawn(f"{label}. {description}", bottom + 34, "".join(out))
 
 
 def _description(points: Sequence[Point]) -> str:
@@ -99,20 +125,25 @@ def _description(points: Sequence[Point]) -> str:
     said = []
     for p in points:
         interval = f", 95 % interval {number(p.interval[0])} to {number(p.interval[1])}" if p.interval else ""
-        said.append(f"{p.series}{', ' if p.series else ''}{p.label}: {number(p.value)}{interval}")
+        note = f", {p.note}" if p.note else ""
+        said.append(f"{p.series}{', ' if p.series else ''}{p.label}: {number(p.value)}{interval}{note}")
     return "; ".join(said)
 
 
-def _row(row: Point, axis: Axis, top: float) -> str:
+def _row(row: Point, axis: Axis, top: int) -> str:
     """Return the text of a row, and its bar or its mean."""
     said = f"{row.label}: {number(row.value)}" if row.interval else row.label
     out = text(LEFT, top + 11, said, "b")
     if row.value is None:
-        return out + text(LEFT, top + 23, "not known")
+        note = row.note or "not known"
+        short = note if len(note) <= LONGEST else note[: LONGEST - 1].rstrip(" ,;:") + "…"
+        words = text(LEFT, top + 11, said, "off") + text(LEFT, top + 23, short, "off small")
+        return f"<g><title>{escape(note)}</title>{words}</g>"
     end = axis.pixels(row.value)
     if row.interval is None:
-        out += f'<path class="bar c{row.colour}" d="M{LEFT} {top + 15}H{end:.1f}v10H{LEFT}z"/>'
-        return out + text(end + 4, top + 24, number(row.value))
+        zero = axis.pixels(0.0)  # the start of a logarithmic axis
+        out += f'<path class="bar c{row.colour}" d="M{zero:.1f} {top + 15}H{end:.1f}v10H{zero:.1f}z"/>'
+        return out + text(max(zero, end) + 4, top + 24, number(row.value))
     middle, (low, high) = top + 21, row.interval
     out += f"<g><title>{escape(f'{said} ({number(low)} to {number(high)})')}</title>"
     if len(row.units) > 1:
@@ -126,56 +157,39 @@ def _row(row: Point, axis: Axis, top: float) -> str:
     return out
 
 
-def columns(
-    name: str,
-    title: str,
-    groups: dict[str, list[float]],
-    label: str,
-    *,
-    x_label: str,
-    levels: Sequence[float] = (),
-) -> Markup:
-    """Return a chart of upright bars in groups: one colour for each place in a group.
+def stems(
+    figure: Figure, groups: Mapping[str, Sequence[float]], label: str, x_label: str, levels: Sequence[float] = ()
+) -> Figure:
+    """Return a figure with a stem for each value, in groups: one colour for each place in a group.
 
     Parameters
     ----------
-    name, title : str
-    groups : dict of str to list of float
-        Values by the text below their group.
+    figure : Figure
+        The texts.
+    groups : mapping of str to sequence of float
+        As many values in each, by the text below the group.
     label, x_label : str
         Of the values, with unit, and of the groups.
     levels : sequence of float
-        A dash over each group.
+        One for each group, joined by a dashed line.
     """
-    high = max((v for g in [*groups.values(), levels] for v in g), default=1.0) or 1.0
-    left, right, top, bottom = 64, WIDTH - 8, 8, 138
-    y = Axis(0.0, high * 1.05, bottom, top)
-    pitch = (right - left) / max(len(groups), 1)
-    ticks = y.ticks(4)
-    out = [f'<path class="grid" d="{"".join(f"M{left} {at:.1f}H{right}" for at, _ in ticks)}"/>']
-    out += [text(left - 4, at + 3.5, tick, "e") for at, tick in ticks]
-    for i, (below, values) in enumerate(groups.items()):
-        width = 0.8 * pitch / max(len(values), 1)
-        for j, value in enumerate(values):
-            x = left + pitch * (i + 0.1) + j * width
-            path = f"M{x:.1f} {bottom}V{y.pixels(value):.1f}h{width:.1f}V{bottom}z"
-            out.append(f'<path class="bar c{j}" d="{path}"/>')
-        out.append(text(left + pitch * (i + 0.5), bottom + 13, below, "m"))
-    dashes = "".join(f"M{left + pitch * i:.1f} {y.pixels(v):.1f}h{pitch:.1f}" for i, v in enumerate(levels))
-    if dashes:
-        out.append(f'<path class="level" d="{dashes}"/>')
-    out.append(upright_text((top + bottom) / 2, label))
-    out.append(text((left + right) / 2, bottom + 27, x_label, "m"))
+    values = np.array(list(groups.values()), float)
+    at, zero = np.arange(1.0, len(values) + 1.0), np.zeros(len(values))
+    layers: list[Layer] = [Line(at, np.array(levels), 5, "dashed")] if len(levels) else []
+    for j, column in enumerate(values.T):
+        layers.append(Dots(at + 0.8 * ((j + 0.5) / values.shape[1] - 0.5), column, j, zero, column))
     said = "; ".join(f"{below}: {', '.join(number(v, 2) for v in group)}" for below, group in groups.items())
-    return svg(name, title, f"{label}, by {x_label}. {said}", bottom + 34, "".join(out))
+    panel = Panel(layers, label)
+    return chart(figure, f"{label}, by {x_label}. {said}", [panel], x_label, margin=0.03, columns=list(groups))
 
 
-def curves(name: str, title: str, points: Sequence[Point], label: str, *, x_label: str, named: bool) -> Markup:
-    """Return a chart of means with intervals along an axis, a colour for each series.
+def curves(figure: Figure, points: Sequence[Point], label: str, x_label: str, *, named: bool) -> Figure:
+    """Return a figure with means and their intervals along an axis, a colour for each series.
 
     Parameters
     ----------
-    name, title : str
+    figure : Figure
+        The texts.
     points : sequence of Point
         Each with an interval.
     label, x_label : str
@@ -194,9 +208,7 @@ def curves(name: str, title: str, points: Sequence[Point], label: str, *, x_labe
         unit_x, unit_y = np.array(units).reshape(-1, 2).T
         layers += [Samples(unit_x, unit_y, colour % COLOURS), Dots(x, value, colour % COLOURS, low, high)]
     places = [p.x for p in points]
-    wide = min(places) > 0.0 and max(places) > DECADE * min(places)
-    names = [(p.x, p.value or 0.0, p.label) for p in points] if named else None
+    kind = "log" if min(places) > 0.0 and max(places) > DECADE * min(places) else ""
+    names = [(p.x, p.value or 0.0, p.label) for p in points] if named else []
     panel = Panel(layers, label, 230, logarithmic=True, names=names)
-    return chart(
-        name, title, f"{label}. {_description(points)}", [panel], x_label, kind="log" if wide else "", margin=0.03
-    )
+    return chart(figure, f"{label}. {_description(points)}", [panel], x_label, kind=kind, margin=0.03)

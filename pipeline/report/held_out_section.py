@@ -9,21 +9,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.model.effects import effect_of
-from pipeline.model.kinematics import reference_motion
-from pipeline.model.measurement import compensate, linear_truth, sensor_effects
-from pipeline.records import SENSOR_UNITS, SENSORS, SensorCalibration
+from pipeline.records import SENSOR_UNITS, SENSORS, Noise, SensorCalibration
 from pipeline.report.chart import Band, Figure, Layer, Line, Panel, Samples, chart
 from pipeline.report.group_charts import Point, bars
 from pipeline.report.numbers import number, plain
+from pipeline.validation.error_breakdown import with_known_effects
+from pipeline.validation.samples import OTHER, samples_of_motion
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from pipeline.records import Recording
+    from pipeline.report.axis import Values
 
 JSON = dict[str, Any]
 ALIKE = 1.2  # the diagnosis's held-out error may continue the validation's steps where both agree within this factor
+BEFORE_AFTER = (("c3", "before"), ("c2", "after"))
+SILENT = Noise(np.zeros(3), np.zeros(3), 100.0, "none")  # errors are drawn, not weighted
 
 
 def checks(validation: JSON | None) -> list[JSON]:
@@ -79,16 +79,11 @@ def error_steps(sensor: str, held_out: JSON, found: JSON, *, vector: bool) -> Fi
         finding += f", {number(reached / floor)} × the noise floor"
     if added:
         finding += f"; with the missing effects, at {number(added[-1].value)}"
-    drawn = bars(
-        f"{sensor}-staircase-{kind}",
-        f"{sensor}: {finding}",
-        rows + added,
-        f"root mean square error, {unit} (logarithmic)",
-        levels={"noise floor": floor} if floor else {},
-    )
     words = "if it were added" + (" with the suggested shape" if found.get("suggested_effect") else "")
     caption = f"Held-out error of the {kind} after each step; the line is the error that noise alone gives."
-    return Figure(drawn, caption, (("c4", words),) if added else (), finding)
+    figure = Figure(f"{sensor}-staircase-{kind}", finding, caption, (("c4", words),) if added else ())
+    label = f"root mean square error, {unit} (logarithmic)"
+    return bars(figure, rows + added, label, levels={"noise floor": floor or 0.0})
 
 
 def _steps_if_added(found: JSON, reached: float | None) -> list[Point]:
@@ -102,46 +97,49 @@ def _steps_if_added(found: JSON, reached: float | None) -> list[Point]:
     return [Point(f"+ {plain(r['effect'])}, if added", r["held_out_error_after"], 4) for r in chosen]
 
 
-def held_out_figures(sensor: str, part: JSON, held_out: JSON, recordings: list[Recording], table: JSON) -> list[Figure]:
-    """Draw the error of the magnitude over each held-out recording with a reference."""
+def held_out_figures(
+    sensor: str, calibration: JSON, held_out: JSON, recordings: list[Recording], table: JSON
+) -> list[Figure]:
+    """Draw the error of the magnitude over each held-out recording with a reference, as the validation computes it.
+
+    Parameters
+    ----------
+    sensor : str
+    calibration : dict
+        As in its file.
+    held_out : dict
+        The sensor's part of the validation.
+    recordings : list of Recording
+    table : dict
+        The section ``table`` of the unit's configuration.
+    """
+    fits = {s: SensorCalibration.from_json(s, calibration[s]) for s in SENSORS if calibration.get(s)}
     out = []
-    calibration = SensorCalibration.from_json(sensor, part)
     for recording in recordings:
-        reading, rate = recording.reading(sensor), recording.table_rate
-        if recording.role != "validation" or reading is None or (sensor == "gyroscope" and rate is None):
-            continue
-        reference: Any = table.get("gravity_g") or 1.0
-        if rate is not None and sensor == "gyroscope":
-            late = recording.time - float(recording.filter.get("delay_s", 0.0))
-            reference = np.interp(late, recording.time, np.abs(rate))
-        calibrated = _calibrated(calibration, reading, recording, table)
-        raw, after = (np.linalg.norm(v, axis=1) - reference for v in (reading, calibrated))
-        out.append(held_out_over_time(sensor, recording, raw, after, held_out.get("noise_floor")))
+        samples = samples_of_motion(sensor, recording, SILENT, table) if recording.role == "validation" else None
+        if samples is not None:
+            vector, reference, _ = with_known_effects(fits[sensor], samples, fits.get(OTHER[sensor]))
+            raw = np.linalg.norm(samples.reading, axis=1) - samples.magnitude
+            after = np.linalg.norm(vector, axis=1) - reference
+            name, floor = f"{sensor}-held-out-{recording.name}", held_out.get("noise_floor")
+            out.append(held_out_over_time(name, sensor, recording, raw, after, floor=floor))
     return out
 
 
-def _calibrated(
-    calibration: SensorCalibration, reading: NDArray[np.float64], recording: Recording, table: JSON
-) -> NDArray[np.float64]:
-    """Return calibrated readings, with the sensor's own effects where the motion is known."""
-    effects = sensor_effects(calibration)
-    motion = reference_motion(recording, table.get("gravity_g") or 1.0) if effects else None
-    own = [e for e in effects if motion is not None and effect_of(e).available(motion)]
-    return compensate(calibration, reading, motion, own) if motion and own else linear_truth(calibration, reading)
-
-
 def held_out_over_time(
-    sensor: str, recording: Recording, raw: NDArray[np.float64], calibrated: NDArray[np.float64], floor: float | None
+    name: str, sensor: str, recording: Recording, raw: Values, calibrated: Values, *, floor: float | None = None
 ) -> Figure:
     """Draw the error of the magnitude in held-out motion before and after calibration.
 
     Parameters
     ----------
+    name : str
+        Of the figure.
     sensor : str
     recording : Recording
     raw, calibrated : (n,) array, g or deg/s
         Magnitude minus reference.
-    floor : float or None
+    floor : float, optional
         Root mean square error that noise alone gives.
     """
     unit, x = SENSOR_UNITS[sensor], recording.time - recording.time[0]
@@ -150,21 +148,15 @@ def held_out_over_time(
         Panel([Samples(x, raw, 3), Samples(x, calibrated, 2)], f"error, {unit}", 120, {"": 0.0}),
         Panel([Band(-2 * floor, 2 * floor), *after] if floor else after, f"after, {unit}", 80),
     ]
-    rms = [number(float(np.sqrt(np.mean(v**2)))) for v in (raw, calibrated)]
+    rms = [number(float(np.sqrt(np.nanmean(v**2)))) for v in (raw, calibrated)]
     finding = f"In {recording.name} the error goes from {rms[0]} to {rms[1]} {unit}"
-    drawn = chart(
-        f"{sensor}-held-out",
-        f"{sensor}: {finding}",
-        f"Root mean square {rms[0]} {unit} before, {rms[1]} after.",
-        panels,
-        "time, s",
-    )
     what = "specific force minus gravity" if sensor == "accelerometer" else "angular rate minus that of the rate table"
     caption = (
         f"Magnitude of the {what}, before and after calibration, in a recording that no fit used. Below: after "
         "calibration, with a band of ±2 noise floors."
     )
-    return Figure(drawn, caption, (("c3", "before"), ("c2", "after")), finding)
+    figure = Figure(name, finding, caption, BEFORE_AFTER)
+    return chart(figure, f"Root mean square {rms[0]} {unit} before, {rms[1]} after.", panels, "time, s")
 
 
 def attitude_over_time(found: JSON) -> Figure | None:
@@ -193,8 +185,7 @@ def attitude_over_time(found: JSON) -> Figure | None:
         before, now = number(tilt["before"]), number(tilt["after"])
         words += f" Tilt of the fused attitude, rms: {before} deg before, {now} deg after."
         caption += " Below: the vertical of a complementary filter that also uses the accelerometer."
-    drawn = chart("attitude-error", finding, words, panels, "time, s")
-    return Figure(drawn, caption, (("c3", "before"), ("c2", "after")), finding)
+    return chart(Figure("attitude-error", finding, caption, BEFORE_AFTER), words, panels, "time, s")
 
 
 def _attitude_panel(curve: JSON, name: str, label: str) -> Panel:

@@ -1,6 +1,6 @@
-"""The Allan deviation at rest, with that of the noise model and of the data sheet.
+"""Noise at rest: overlapping Allan deviation of each axis beside the noise model and the data sheet.
 
-    sigma^2(tau) = white^2 dt / tau + (2 s^2 T / tau) (1 - (T / (2 tau)) (3 - 4 e^(-tau/T) + e^(-2 tau/T)))
+    sigma^2(tau) = white^2 dt / tau + 2 s^2 T / tau (1 - T / (2 tau) (3 - 4 e^(-tau/T) + e^(-2 tau/T)))
 
 where
 
@@ -24,9 +24,8 @@ from pipeline.signal.allan import allan_deviation
 from pipeline.signal.rests import rests_from_table
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from pipeline.records import Recording
+    from pipeline.report.axis import Values
 
 JSON = dict[str, Any]
 FEWEST = 60  # samples of a rest: two decades of averaging times are drawn
@@ -67,45 +66,46 @@ def allan(
     if found is None:
         return None
     (recording, values), unit = found, SENSOR_UNITS[sensor]
+    noise = noise if noise and noise.get("white") else {}
     tau, deviation = deviations(values, recording.interval)
     sure = tau <= len(values) * recording.interval / SURE
     tau, deviation = tau[sure], deviation[sure]
-    curves = _curves(noise, sheet, recording.interval, tau)
+    models = _models(noise, sheet, recording.interval, tau)
     layers: list[Layer] = [Line(tau, deviation[:, c], c) for c in range(3)]
-    layers += [Line(tau, v, colour, style) for _, v, colour, style in curves]
-    finding = _finding(noise, sheet, recording.interval, unit)
+    layers += [Line(tau, v, colour, style) for _, v, colour, style in models]
     some = [(tau[k], deviation[k].mean()) for k in (0, len(tau) // 2, -1)]
     told = ", ".join(f"{number(float(v))} {unit} at {number(float(t))} s" for t, v in some)
-    drawn = chart(
-        f"{sensor}-allan",
-        f"{sensor}: {finding}",
+    filtered = "" if recording.filter.get("name", "none") == "none" else ", after the filter"
+    rest = f"{recording.name}, {number(len(values) * recording.interval)} s at rest{filtered}."
+    caption = " ".join([rest, *_sentences(noise, wander, unit)])
+    legend = (*AXES_LEGEND, *((f"c{colour}", name) for name, _, colour, _ in models))
+    return chart(
+        Figure(f"{sensor}-allan", _finding(noise, sheet, recording.interval, unit), caption, legend),
         f"Allan deviation, mean of the axes: {told}.",
         [Panel(layers, f"Allan deviation, {unit}", 190, logarithmic=True)],
         "averaging time, s",
         kind="log",
     )
-    filtered = "" if recording.filter.get("name", "none") == "none" else ", after the filter"
-    rest = f"{recording.name}, {number(len(values) * recording.interval)} s at rest{filtered}."
-    legend = (*AXES_LEGEND, *((f"c{colour}", name) for name, _, colour, _ in curves))
-    return Figure(drawn, f"{rest} {_noise_sentences(noise, wander, unit)}", legend, finding)
 
 
-def _longest_rest(sensor: str, recordings: list[Recording]) -> tuple[Recording, NDArray[np.float64]] | None:
+def _longest_rest(sensor: str, recordings: list[Recording]) -> tuple[Recording, Values] | None:
     """Return the recording with the longest rest, a static one if there is one, and the readings in it."""
-    best: tuple[Recording, NDArray[np.float64]] | None = None
-    for recording in sorted(recordings, key=lambda r: r.role != "static"):
-        reading, static = recording.reading(sensor), recording.role == "static"
+    static: list[tuple[Recording, Values]] = []
+    rests: list[tuple[Recording, Values]] = []
+    for recording in recordings:
+        reading = recording.reading(sensor)
         if reading is None or recording.role == "validation" or _uneven(recording):
             continue
-        if best is not None and best[0].role == "static" and not static:
-            break
-        logged = [] if static else [(r.start, r.stop) for r in rests_from_table(recording) if r.accepted]
-        for start, stop in [(0, recording.samples)] if static else logged:
-            values = reading[start:stop]
-            values = values[np.isfinite(values).all(axis=1)]
-            if len(values) >= FEWEST and (best is None or len(values) > len(best[1])):
-                best = recording, values
-    return best
+        if recording.role == "static":
+            static.append((recording, reading))
+        else:
+            rests += [(recording, reading[r.start : r.stop]) for r in rests_from_table(recording) if r.accepted]
+    for found in (static, rests):
+        known = [(recording, values[np.isfinite(values).all(axis=1)]) for recording, values in found]
+        longest = max(known, key=lambda rest: len(rest[1]), default=None)
+        if longest is not None and len(longest[1]) >= FEWEST:
+            return longest
+    return None
 
 
 def _uneven(recording: Recording) -> bool:
@@ -114,7 +114,7 @@ def _uneven(recording: Recording) -> bool:
     return bool(np.sqrt(np.mean((steps[steps <= GAP] - 1.0) ** 2)) > UNEVEN)
 
 
-def deviations(values: NDArray[np.float64], interval: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def deviations(values: Values, interval: float) -> tuple[Values, Values]:
     """Return averaging times and overlapping Allan deviations of (n, 3) readings; long times from means of samples."""
     tau, deviation = allan_deviation(values[:LONGEST], interval, PER_DECADE)
     size = -(-len(values) // LONGEST)
@@ -126,7 +126,7 @@ def deviations(values: NDArray[np.float64], interval: float) -> tuple[NDArray[np
     return np.concatenate([tau[near], late[far]]), np.concatenate([deviation[near], of_means[far]])
 
 
-def expected(white_density: float, wander: float, time: float, tau: NDArray[np.float64]) -> NDArray[np.float64]:
+def expected(white_density: float, wander: float, time: float, tau: Values) -> Values:
     """Return the Allan deviation of white noise and Gauss-Markov wander: (m,) array.
 
     Parameters
@@ -143,12 +143,10 @@ def expected(white_density: float, wander: float, time: float, tau: NDArray[np.f
     return np.asarray(np.sqrt(variance), np.float64)
 
 
-def _curves(
-    noise: JSON | None, sheet: JSON, interval: float, tau: NDArray[np.float64]
-) -> list[tuple[str, NDArray[np.float64], int, str]]:
+def _models(noise: JSON, sheet: JSON, interval: float, tau: Values) -> list[tuple[str, Values, int, str]]:
     """Return name, values, colour and style of the lines of the noise model and of the data sheet."""
-    out: list[tuple[str, NDArray[np.float64], int, str]] = []
-    if noise and noise.get("white"):
+    out: list[tuple[str, Values, int, str]] = []
+    if noise:
         white = _rms(noise["white"]) * np.sqrt(interval)
         wander, time = _rms(noise.get("wander") or [0.0]), float(noise.get("correlation_time_s") or 100.0)
         out.append(("noise model", expected(white, wander, time, tau), 5, "model"))
@@ -165,9 +163,9 @@ def _rms(values: list[float]) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def _finding(noise: JSON | None, sheet: JSON, interval: float, unit: str) -> str:
+def _finding(noise: JSON, sheet: JSON, interval: float, unit: str) -> str:
     """Return the white noise, its ratio to that of the data sheet, and a likely cause of a large ratio."""
-    if not noise or not noise.get("white"):
+    if not noise:
         return "Allan deviation at rest"
     white = _rms(noise["white"])
     head = f"White noise {number(white)} {unit} a sample"
@@ -184,23 +182,23 @@ def _finding(noise: JSON | None, sheet: JSON, interval: float, unit: str) -> str
     return f"{head}, {number(ratio, 2)} × that of the data sheet{cause}"
 
 
-def _noise_sentences(noise: JSON | None, wander: JSON | None, unit: str) -> str:
+def _sentences(noise: JSON, wander: JSON | None, unit: str) -> list[str]:
     """Return white noise and wander, at rest and as the fit needed them."""
-    said = ""
-    if noise and noise.get("white"):
+    said = []
+    if noise:
         source, white = SOURCES.get(str(noise.get("source")), "the recordings"), ", ".join(map(number, noise["white"]))
-        said = f"White noise of a sample, from {source}: {white} {unit} on x, y, z. "
+        said.append(f"White noise of a sample, from {source}: {white} {unit} on x, y, z.")
         if any(noise.get("wander") or []):
             time = number(noise.get("correlation_time_s"))
-            said += f"Bias wander {number(_rms(noise['wander']))} {unit}, correlation time {time} s. "
+            said.append(f"Bias wander {number(_rms(noise['wander']))} {unit}, correlation time {time} s.")
     if not wander or wander.get("standard_deviation") is None:
-        return said.strip()
+        return said
     if not wander.get("ratio"):
-        return f"{said}The fit needs no bias wander."
-    time = number(wander.get("time_s"))
-    said += f"The fit needs a wander of {number(wander['standard_deviation'])} {unit}, correlation time {time} s"
+        return [*said, "The fit needs no bias wander."]
+    needed = f"The fit needs a wander of {number(wander['standard_deviation'])} {unit}, "
+    needed += f"correlation time {number(wander.get('time_s'))} s"
     if wander.get("expected") is not None:
-        said += f", against {number(wander['expected'])} expected"
+        needed += f", against {number(wander['expected'])} expected"
     if wander.get("inflated"):
-        said += ": it is inflated; the noise model may contain a slow effect that is missing in the model"
-    return f"{said}."
+        needed += ": it is inflated; the noise model may contain a slow effect that is missing in the model"
+    return [*said, f"{needed}."]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.records import SENSORS
-from pipeline.report.chart import WIDTH, Axis, Figure, svg, text
+from pipeline.report.chart import Figure, Layer, Line, Panel, chart
 from pipeline.report.numbers import NOTHING, number, plain
 from pipeline.signal.rests import rests_from_table
 
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from pipeline.signal.rests import Rest
 
 JSON = dict[str, Any]
-LEFT, RIGHT, ROW, TOP = 86, 14, 17, 4  # px
+LEFT, LANE, LETTERS = 86, 17, 13  # px of the names, px of a lane, letters of a name
 USES = {"used": 1, "held out": 2, "left out": 0}  # of the rests that a fit found by itself, with their colours
 LOGGED = 4  # colour of rests from a table's log
+NARROWEST = 0.002  # of the axis: a shorter rest is drawn so wide
 STILL = 0.02  # deg/s, below which a table's log is noise of its rate
 MARKS = ("after a gap", "clipped", "stuck", "repaired")  # of samples, by the bits of their flags
-Spans = list[tuple[float, float, int]]
 
 
 def rests_logged(recordings: list[Recording]) -> dict[str, list[Rest]]:
@@ -34,10 +34,7 @@ def rests_logged(recordings: list[Recording]) -> dict[str, list[Rest]]:
 def rest_rows(part: JSON) -> list[JSON]:
     """Return the rests that were found without a table, in order of time: used, held out or left out, and why.
 
-    Parameters
-    ----------
-    part : dict
-        With ``rests``, or with the stages of a fit that tell them in ``details``.
+    ``part`` has them in ``rests``, or in the ``details`` of the stages of a fit.
     """
     found = [part.get("rests") or {}, *(stage.get("details") or {} for stage in part.get("stages") or [])]
     rows = [
@@ -56,7 +53,7 @@ def recording_rows(recordings: list[Recording], rests: dict[str, list[Rest]]) ->
             "name": r.name,
             "role": r.role + (f", {r.axis} axis" if r.axis else ""),
             "samples": r.samples,
-            "duration": number(float(r.time[-1] - r.time[0]) if r.samples else None, 4),
+            "duration": number(_duration(r) if r.samples else None, 4),
             "rate": number(1.0 / r.interval if r.samples > 1 and r.interval > 0 else None, 4),
             "motion": _motion(r, len(rests[r.name])),
             "temperature": _range(r.temperature),
@@ -64,6 +61,10 @@ def recording_rows(recordings: list[Recording], rests: dict[str, list[Rest]]) ->
         }
         for r in recordings
     ]
+
+
+def _duration(recording: Recording) -> float:
+    return float(recording.time[-1] - recording.time[0])
 
 
 def _motion(recording: Recording, rests: int) -> str:
@@ -86,7 +87,7 @@ def _range(values: NDArray[np.float64] | None) -> str:
 
 def _flagged(recording: Recording) -> str:
     """Return how many samples ingest marked, by kind."""
-    if recording.flags is None or not recording.flags.any():
+    if recording.flags is None:
         return ""
     counts = [(int(np.count_nonzero(recording.flags & (1 << bit))), kind) for bit, kind in enumerate(MARKS)]
     return ", ".join(f"{count} {kind}" for count, kind in counts if count)
@@ -100,10 +101,9 @@ def environment(recordings: list[Recording], settings: JSON) -> list[tuple[str, 
     rotation = "not in the model (latitude or azimuth not stated)"
     if latitude is not None and azimuth is not None:
         rotation = f"in the model, latitude {latitude:g}°, azimuth {azimuth:g}°"
-    total = sum(float(r.time[-1] - r.time[0]) for r in recordings if r.samples)
     return [
         ("temperature of the sensor", f"{temperature} °C" if temperature else "not recorded"),
-        ("recorded", f"{number(total, 4)} s"),
+        ("recorded", f"{number(sum(_duration(r) for r in recordings if r.samples), 4)} s"),
         ("local gravity", f"{table.get('gravity_g') or 1.0:.7g} g"),
         ("Earth's rotation", rotation),
         ("filter", plain((settings.get("filter") or {}).get("name", "none"))),
@@ -128,42 +128,35 @@ def segments(recordings: list[Recording], rests: dict[str, list[Rest]], calibrat
         As in its file; ``rests``, or stages in ``details``, hold those that were found without a table.
     """
     drawn = [r for r in recordings if r.samples > 1]
-    cut = len({r.source.get("file") for r in drawn}) == 1 < len(drawn)  # from one file: drawn at their time in it
-    first = min((float(r.time[0]) for r in drawn), default=0.0)
-    lanes = [(r, first if cut else float(r.time[0]), _spans(r, rests[r.name], calibration)) for r in drawn]
-    if not any(spans for *_, spans in lanes):
+    spans = {r.name: _spans(r, rests[r.name], calibration) for r in drawn}
+    if not any(spans.values()):
         return None
-    x = Axis(0.0, max(float(r.time[-1]) - start for r, start, _ in lanes), LEFT, WIDTH - RIGHT)
-    ticks, bottom = x.ticks(6), TOP + ROW * len(lanes)
-    out = [f'<path class="grid" d="{"".join(f"M{at:.1f} {TOP}V{bottom}" for at, _ in ticks)}"/>']
-    out += [_lane(r, start, spans, x, TOP + ROW * i) for i, (r, start, spans) in enumerate(lanes)]
-    out += [text(at, bottom + 13, label, "m") for at, label in ticks]
-    out.append(text((LEFT + WIDTH - RIGHT) / 2, bottom + 27, "time since the start of the recording, s", "m"))
-    count = sum(len(spans) for *_, spans in lanes)
-    finding = f"{count} rest{'s' if count != 1 else ''} in {len(lanes)} recordings"
-    words = "; ".join(f"{r.name}: {len(spans)}" for r, _, spans in lanes)
-    figure = svg("segments", finding, f"Rests of each recording. {words}.", bottom + 34, "".join(out))
-    colours = {colour for *_, spans in lanes for *_, colour in spans}
+    one_file = len({r.source.get("file") for r in drawn}) == 1 < len(drawn)
+    first = min(float(r.time[0]) for r in drawn)
+    begin = {r.name: float(r.time[0]) - first if one_file else 0.0 for r in drawn}
+    narrowest = NARROWEST * max(begin[r.name] + _duration(r) for r in drawn)
+    lanes = drawn[::-1]  # the first at the top
+    layers: list[Layer] = []
+    for y, r in enumerate(lanes, 1):
+        layers.append(Line(np.array([0.0, _duration(r)]) + begin[r.name], np.full(2, float(y)), 3))
+        for colour in sorted({c for *_, c in spans[r.name]}):
+            ends = [(a, max(b, a + narrowest), np.nan) for a, b, c in spans[r.name] if c == colour]
+            x = np.ravel(ends) + begin[r.name]
+            layers.append(Line(x, np.full(len(x), float(y)), colour, "thick"))
+    count, colours = sum(map(len, spans.values())), {c for of in spans.values() for *_, c in of}
+    finding = f"{count} rest{'s' if count != 1 else ''} in {len(drawn)} recordings"
     legend = tuple((f"c{c}", f"rest, {use}") for use, c in USES.items() if c in colours) or ((f"c{LOGGED}", "rest"),)
-    return Figure(figure, "Thick: at rest; thin: in motion.", legend, finding)
+    names = [r.name if len(r.name) <= LETTERS else f"{r.name[: LETTERS - 1]}…" for r in lanes]
+    return chart(
+        Figure("segments", finding, "Thick: at rest; thin: in motion.", legend),
+        f"Rests of each recording. {'; '.join(f'{name}: {len(of)}' for name, of in spans.items())}.",
+        [Panel(layers, "", LANE * len(lanes), limits=(0.5, len(lanes) + 0.5), rows=names)],
+        "time since the start of the recording, s",
+        left=LEFT,
+    )
 
 
-def _lane(recording: Recording, origin: float, spans: Spans, x: Axis, top: float) -> str:
-    """Return the lane of one recording: its name, a line over its time and a block for each rest."""
-    middle, low = top + ROW / 2, top + ROW / 2 - 4
-    begin, end = (x.pixels(float(recording.time[k]) - origin) for k in (0, -1))
-    name = recording.name if len(recording.name) <= 13 else recording.name[:12] + "…"
-    out = text(LEFT - 5, middle + 4, name, "e")
-    out += f'<path class="line c3" d="M{begin:.1f} {middle:g}H{end:.1f}"/>'
-    scale = (x.stop - x.start) / (x.high - x.low)
-    for colour in sorted({s[2] for s in spans}):
-        ends = ((begin + scale * a, max(scale * (b - a), 0.8)) for a, b, c in spans if c == colour)
-        blocks = "".join(f"M{at:.1f} {low:g}h{width:.1f}v8h-{width:.1f}z" for at, width in ends)
-        out += f'<path class="bar c{colour}" d="{blocks}"/>'
-    return out
-
-
-def _spans(recording: Recording, logged: list[Rest], calibration: JSON) -> Spans:
+def _spans(recording: Recording, logged: list[Rest], calibration: JSON) -> list[tuple[float, float, int]]:
     """Return start, end (s since the recording's start) and colour of each rest."""
     start = float(recording.time[0])
     found = {

@@ -25,7 +25,7 @@ from pipeline.model.kinematics import earth_rate, reference_motion
 from pipeline.model.measurement import predicted_reading
 from pipeline.records import AXES, SENSOR_UNITS, SensorCalibration
 from pipeline.report.chart import AXES_LEGEND, Band, Dots, Figure, Layer, Line, Panel, Samples, chart
-from pipeline.report.group_charts import columns
+from pipeline.report.group_charts import stems
 from pipeline.report.numbers import number
 
 if TYPE_CHECKING:
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.records import Motion, Recording
+    from pipeline.report.axis import Values
 
 JSON = dict[str, Any]
 BINS = 36  # of a covariate, and of a turn: 10 deg each
@@ -51,11 +52,11 @@ class Residual:
 
     recording: Recording
     motion: Motion
-    reading: NDArray[np.float64]
-    predicted: NDArray[np.float64]
+    reading: Values
+    predicted: Values
 
     @cached_property
-    def error(self) -> NDArray[np.float64]:
+    def error(self) -> Values:
         """Reading minus prediction: (n, 3) array, g or deg/s."""
         return self.reading - self.predicted
 
@@ -63,14 +64,7 @@ class Residual:
 def residuals(sensor: str, part: JSON, recordings: list[Recording], table: JSON) -> list[Residual]:
     """Return the residuals of the recordings that were made for a sensor and whose motion is known.
 
-    Parameters
-    ----------
-    sensor : str
-    part : dict
-        The sensor's part of the calibration.
-    recordings : list of Recording
-    table : dict
-        The section ``table`` of the unit's configuration.
+    ``part``: the sensor's part of the calibration; ``table``: this section of the unit's configuration.
     """
     calibration = SensorCalibration.from_json(sensor, part)
     latitude, azimuth = table.get("latitude_deg"), table.get("azimuth_deg")
@@ -82,13 +76,12 @@ def residuals(sensor: str, part: JSON, recordings: list[Recording], table: JSON)
             continue
         motion = reference_motion(recording, table.get("gravity_g") or 1.0, earth)
         if motion is not None:
-            out.append(
-                Residual(recording, motion, reading, _filtered(recording, predicted_reading(calibration, motion)))
-            )
+            predicted = _filtered(recording, predicted_reading(calibration, motion))
+            out.append(Residual(recording, motion, reading, predicted))
     return out
 
 
-def _filtered(recording: Recording, predicted: NDArray[np.float64]) -> NDArray[np.float64]:
+def _filtered(recording: Recording, predicted: Values) -> Values:
     """Return a prediction behind the filter of its recording."""
     settings = {k: v for k, v in recording.filter.items() if k not in ("delay_s", "noise_gain")}
     if settings.get("name", "none") == "none":
@@ -97,17 +90,18 @@ def _filtered(recording: Recording, predicted: NDArray[np.float64]) -> NDArray[n
 
     ideal = replace(recording, accelerometer=predicted, gyroscope=None, filter={"name": "none"}, encodings={})
     passed = apply_filter(ideal, settings).accelerometer
-    return predicted if passed is None else passed
+    assert passed is not None  # noqa: S101
+    return passed
 
 
-def white_noise(residual: Residual, noise: JSON | None) -> NDArray[np.float64]:
+def white_noise(residual: Residual, noise: JSON | None) -> Values:
     """Return the standard deviation of a sample's white noise after the filter: (3,) array, g or deg/s.
 
     Without a noise model ``1.4826 median |e[n+1] - e[n]| / sqrt(2)``, which slow errors and outliers do not change.
     """
     if noise and noise.get("white"):
         return float(residual.recording.filter.get("noise_gain", 1.0)) * np.array(noise["white"], float)
-    sigma: NDArray[np.float64] = 1.4826 * np.median(np.abs(np.diff(residual.error, axis=0)), axis=0) / np.sqrt(2.0)
+    sigma: Values = 1.4826 * np.median(np.abs(np.diff(residual.error, axis=0)), axis=0) / np.sqrt(2.0)
     return sigma
 
 
@@ -115,18 +109,18 @@ def white_noise(residual: Residual, noise: JSON | None) -> NDArray[np.float64]:
 class _BinnedMean:
     """Means of a residual in bins of a covariate: centres (m,), means and standard errors (m, 3); NaN in empty bins."""
 
-    centre: NDArray[np.float64]
-    mean: NDArray[np.float64]
-    error: NDArray[np.float64]
+    centre: Values
+    mean: Values
+    error: Values
 
-    def excess(self, wander: NDArray[np.float64]) -> float:
+    def excess(self, wander: Values) -> float:
         """Return the mean square of the means over that of noise and wander (standard deviations), worst axis."""
         filled = np.isfinite(self.mean[:, 0])
         ratio = self.mean[filled] ** 2 / (self.error[filled] ** 2 + wander**2)
         return float(ratio.mean(axis=0).max())
 
 
-def _binned_mean(covariate: NDArray[np.float64], error: NDArray[np.float64]) -> _BinnedMean | None:
+def _binned_mean(covariate: Values, error: Values) -> _BinnedMean | None:
     """Return means of ``error`` (n, 3) in 36 equal bins of the covariate (n,); None where it does not vary."""
     known = np.isfinite(covariate) & np.isfinite(error).all(axis=1)
     if not known.all():
@@ -147,7 +141,7 @@ def _binned_mean(covariate: NDArray[np.float64], error: NDArray[np.float64]) -> 
     return _BinnedMean(centre, mean, scatter / np.sqrt(count)[:, None])
 
 
-COVARIATES: dict[str, Callable[[Residual], NDArray[np.float64] | None]] = {
+COVARIATES: dict[str, Callable[[Residual], Values | None]] = {
     "angle, deg": lambda r: None if r.motion.angle is None else np.mod(r.motion.angle, 360.0),
     "rate, deg/s": lambda r: r.motion.rate,
     "specific force x, g": lambda r: r.motion.specific_force[:, 0],
@@ -158,7 +152,7 @@ COVARIATES: dict[str, Callable[[Residual], NDArray[np.float64] | None]] = {
 }
 
 
-def covariates(found: list[Residual], wander: NDArray[np.float64]) -> dict[str, _BinnedMean]:
+def covariates(found: list[Residual], wander: Values) -> dict[str, _BinnedMean]:
     """Return binned means over all recordings by covariate, the largest excess first.
 
     Of the components of the specific force only the one with the largest excess is returned.
@@ -174,13 +168,13 @@ def covariates(found: list[Residual], wander: NDArray[np.float64]) -> dict[str, 
     return {label: out[label] for label in order if label not in forces[1:]}
 
 
-def _angle_bins(angle: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _angle_bins(angle: Values) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return in which of 36 bins of a turn each of (n,) angles (deg) is, and how many are in each bin."""
     cell = (np.mod(angle, 360.0) * (BINS / 360.0)).astype(np.int64) % BINS
     return cell, np.bincount(cell, minlength=BINS)
 
 
-def harmonics(residual: Residual) -> NDArray[np.float64] | None:
+def harmonics(residual: Residual) -> Values | None:
     """Return the amplitudes of 0 to 12 cycles a turn: (13, 3) array, None where a bin of the turn has no sample.
 
     From means in 36 bins of the angle; the division by ``sinc`` restores what averaging over a bin takes away.
@@ -194,13 +188,11 @@ def harmonics(residual: Residual) -> NDArray[np.float64] | None:
     mean = np.stack([np.bincount(cell, e, BINS) / count for e in residual.error.T], 1)
     amplitude = np.abs(np.fft.rfft(mean, axis=0))[: HARMONICS + 1] * (2.0 / BINS)
     amplitude[0] /= 2.0
-    restored: NDArray[np.float64] = amplitude / np.sinc(np.arange(HARMONICS + 1) / BINS)[:, None]
+    restored: Values = amplitude / np.sinc(np.arange(HARMONICS + 1) / BINS)[:, None]
     return restored
 
 
-def harmonic_noise(
-    residual: Residual, white: NDArray[np.float64], wander: NDArray[np.float64], time: float
-) -> NDArray[np.float64]:
+def harmonic_noise(residual: Residual, white: Values, wander: Values, time: float) -> Values:
     """Return the amplitude that noise alone exceeds once in a thousand, by cycles a turn: (13,) array.
 
     The mean of ``a^2 + b^2`` of a harmonic is ``2 (2 white^2 / n + 2 S(f) / D)`` with the two-sided spectrum of the
@@ -224,20 +216,12 @@ def harmonic_noise(
     of_white = float(white.max()) ** 2 * float(np.mean(1.0 / np.maximum(_angle_bins(motion.angle)[1], 1))) / BINS
     spread = np.sqrt(2.0 * of_white + 2.0 * spectrum / duration)
     spread[0] = np.hypot(np.sqrt(of_white), wander.max())  # a mean, not an amplitude
-    level: NDArray[np.float64] = ONE_IN_A_THOUSAND * spread
+    level: Values = ONE_IN_A_THOUSAND * spread
     return level
 
 
 def residual_figures(sensor: str, found: list[Residual], noise: JSON | None) -> list[Figure]:
-    """Draw binned means of the residual against each covariate (worst first), and its harmonics of the turn.
-
-    Parameters
-    ----------
-    sensor : str
-    found : list of Residual
-    noise : dict or None
-        The noise model: ``white, wander, correlation_time_s``.
-    """
+    """Draw binned means of the residual against each covariate (worst first), and its harmonics of the turn."""
     wander = np.array((noise or {}).get("wander") or [0.0] * 3, float)
     time = float((noise or {}).get("correlation_time_s") or 100.0)
     figures = [_covariate(sensor, label, mean, wander) for label, mean in covariates(found, wander).items()]
@@ -249,7 +233,7 @@ def residual_figures(sensor: str, found: list[Residual], noise: JSON | None) -> 
     return figures
 
 
-def _covariate(sensor: str, label: str, mean: _BinnedMean, wander: NDArray[np.float64]) -> Figure:
+def _covariate(sensor: str, label: str, mean: _BinnedMean, wander: Values) -> Figure:
     """Draw the binned means of each axis with the band of the wander."""
     unit, (name, covariate_unit) = SENSOR_UNITS[sensor], label.split(", ")
     words, excess = name.replace("force ", "force along "), mean.excess(wander)
@@ -264,55 +248,40 @@ def _covariate(sensor: str, label: str, mean: _BinnedMean, wander: NDArray[np.fl
     if excess >= FLAT:
         spread = np.abs(mean.mean) / np.sqrt(mean.error**2 + wander**2)
         row, worst = np.unravel_index(int(np.nanargmax(spread)), spread.shape)
-        at, size = (
-            f"{number(float(mean.centre[row]))} {covariate_unit}",
-            f"{number(float(mean.mean[row, worst]))} {unit}",
+        at, size, sigmas = (float(v) for v in (mean.centre[row], mean.mean[row, worst], spread[row, worst]))
+        finding = (
+            f"Not flat against {words}: {number(size)} {unit} on {AXES[worst]} at {number(at)} {covariate_unit}, "
+            f"{number(sigmas, 2)} σ"
         )
-        sigmas = number(float(spread[row, worst]), 2)
-        finding = f"Not flat against {words}: {size} on {AXES[worst]} at {at}, {sigmas} σ"
-    drawn = chart(
-        f"{sensor}-residual-{name.replace(' ', '-')}",
-        f"{sensor}: {finding}",
+    return chart(
+        Figure(f"{sensor}-residual-{name.replace(' ', '-')}", finding, quiet=excess < FLAT),
         f"Means in bins; on the worst axis their mean square is {number(excess)} times that of noise and wander.",
         panels,
         label,
         kind="angle" if name == "angle" else "",
     )
-    return Figure(drawn, finding=finding, quiet=excess < FLAT)
 
 
-def _harmonics(sensor: str, name: str, amplitudes: NDArray[np.float64], level: NDArray[np.float64]) -> Figure:
+def _harmonics(sensor: str, name: str, amplitudes: Values, level: Values) -> Figure:
     """Draw the amplitudes by cycles a turn, with the level of noise."""
     unit = SENSOR_UNITS[sensor]
     ratio = amplitudes / np.maximum(level[:, None], 1e-300)
     ratio[0] = 0.0  # a bias
     cycles, axis = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
-    loud = ratio.max() > 1.0
+    loud = bool(ratio.max() > 1.0)
     finding = f"{name}: no harmonic of the turn above the noise"
     if loud:
         size, plural = number(float(amplitudes[cycles, axis]), 2), "s" if cycles != 1 else ""
         finding = f"{name}: {cycles} cycle{plural} a turn on {AXES[axis]}, {size} {unit}, above the noise"
+    figure = Figure(f"{sensor}-harmonics-{name}", finding, legend=AXES_LEGEND, quiet=not loud)
     groups = {str(k): row for k, row in enumerate(amplitudes.tolist())}
-    drawn = columns(
-        f"{sensor}-harmonics-{name}",
-        f"{sensor}: {finding}",
-        groups,
-        f"amplitude, {unit}",
-        x_label="cycles a turn",
-        levels=level.tolist(),
-    )
-    return Figure(drawn, legend=AXES_LEGEND, finding=finding, quiet=not loud)
+    return stems(figure, groups, f"amplitude, {unit}", "cycles a turn", level.tolist())
 
 
 def measurement_and_model(sensor: str, residual: Residual, noise: JSON | None) -> Figure:
     """Draw readings and model over a turn, and below them the residual of each axis with the band of +-2 sigma.
 
-    Parameters
-    ----------
-    sensor : str
-    residual : Residual
-    noise : dict or None
-        The noise model; sigma is from the residual's own scatter where it is None.
+    Without a noise model, sigma is from the residual's own scatter.
     """
     unit, motion, name = SENSOR_UNITS[sensor], residual.motion, residual.recording.name
     turns = motion.angle is not None and np.ptp(motion.angle) > 1.0
@@ -333,12 +302,10 @@ def measurement_and_model(sensor: str, residual: Residual, noise: JSON | None) -
     finding += "" if ratio > NOISE else ", so nothing is left"
     caption = f"{100 * outside:.1f} % of the residuals lie outside the band; white noise alone puts 4.6 % there."
     caption += "" if known else " Its σ is taken from the sample-to-sample scatter."
-    drawn = chart(
-        f"{sensor}-{name}",
-        f"{sensor}: measurement and model. {finding}",
+    return chart(
+        Figure(f"{sensor}-{name}", finding, caption, (*AXES_LEGEND, ("c5", "model"))),
         f"Root mean square of the residual: {', '.join(map(number, rms.tolist()))} {unit} on x, y, z.",
         panels,
         "angle of the rate table, deg" if turns else "time, s",
         kind="angle" if turns else "",
     )
-    return Figure(drawn, caption, (*AXES_LEGEND, ("c5", "model")), finding)

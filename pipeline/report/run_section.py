@@ -68,10 +68,9 @@ def _chart(sensor: str, entries: Sequence[JSON]) -> Figure | None:
         change = f"{'falls' if last < first else 'rises'} from {number(first)} to {number(last)}"
     ratio = f", {number(last / floor)} × the noise floor" if floor else ""
     finding = f"{sensor.capitalize()}: in the last run the held-out error {change} {unit}{ratio}"
-    levels = {"noise floor": floor} if floor else {}
-    drawn = bars(f"history-{sensor}", finding, rows, f"rms error, {unit} (logarithmic)", levels=levels)
     caption = "Error on held-out motion after each run that changed the unit, and the effects that it added or removed."
-    return Figure(drawn, caption, (), finding)
+    figure = Figure(f"history-{sensor}", finding, caption)
+    return bars(figure, rows, f"rms error, {unit} (logarithmic)", levels={"noise floor": floor or 0.0})
 
 
 def _row(entry: JSON, part: JSON, sensor: str) -> Point:

@@ -122,7 +122,7 @@ def _sensor(
         "steps": [{**step, "label": step_label(step["name"])} for step in held_out.get("steps", [])],
         "step_figures": [figure for figure in steps if figure],
         "model_figures": [measurement_and_model(sensor, r, noise) for r in traces],
-        "held_out_figures": held_out_figures(sensor, part, held_out, recordings, table),
+        "held_out_figures": held_out_figures(sensor, calibration, held_out, recordings, table),
         "residual_figures": residual_figures(sensor, traces, noise),
         "noise_figure": allan(sensor, recordings, noise, sheet, found.get("wander")),
         "matrix": matrix_rows(part),

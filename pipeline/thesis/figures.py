@@ -13,7 +13,7 @@ import numpy as np
 from pipeline.estimation.correction import apply_correction
 from pipeline.records import SENSOR_UNITS
 from pipeline.report.chart import AXES_LEGEND, Figure, Panel, Samples, chart
-from pipeline.report.group_charts import Point, columns, curves
+from pipeline.report.group_charts import Point, curves, stems
 from pipeline.report.held_out_section import held_out_over_time
 from pipeline.report.numbers import number
 from pipeline.thesis.conclusions import Errors
@@ -23,7 +23,7 @@ from pipeline.thesis.tables import read_printed
 from pipeline.validation.samples import samples_of_motion
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
     from pathlib import Path
 
     import pandas as pd
@@ -43,7 +43,7 @@ FILTERS = {
     "zero-phase": "run both ways, the gain twice",
     "unfiltered": "no filter",
 }
-COLOURS = ("c0", "c1", "c2", "c3")
+PRINTED_AND_OURS = ("printed", "ours, as printed", "ours, errata corrected")
 
 
 def all_figures(
@@ -89,15 +89,14 @@ def _motion(results: Results, device: str, sensor: str, procedure: str) -> Figur
     if recording is None:
         return None
     reading, x = np.asarray(recording.reading(sensor)), recording.time - recording.time[0]
-    svg = chart(
-        f"motion-{device}-{sensor}",
-        f"{DEVICES[device]}, {sensor}: held-out motion",
+    caption = f"{recording.samples} samples that reached the logger, in {number(float(x[-1]))} s; no fit sees them."
+    finding = f"{DEVICES[device]}, {sensor}: the held-out motion"
+    return chart(
+        Figure(f"motion-{device}-{sensor}", finding, caption, AXES_LEGEND),
         f"{recording.samples} samples in {number(float(x[-1]))} s.",
         [Panel([Samples(x, reading)], f"reading, {SENSOR_UNITS[sensor]}", 150)],
         "time, s",
     )
-    caption = f"{recording.samples} samples that reached the logger, in {number(float(x[-1]))} s; no fit sees them."
-    return Figure(svg, caption, AXES_LEGEND, f"{DEVICES[device]}, {sensor}: the held-out motion")
 
 
 def _before_and_after(results: Results, unit: str, sensor: str, noise: Noise) -> Figure | None:
@@ -110,12 +109,11 @@ def _before_and_after(results: Results, unit: str, sensor: str, noise: Noise) ->
         return None
     corrected = apply_correction(results.correction(unit, sensor), samples.reading)
     before, after = (np.linalg.norm(v, axis=1) - samples.magnitude for v in (samples.reading, corrected))
-    drawn = held_out_over_time(sensor, recording, before, after, None)
-    means = [number(float(np.mean(np.abs(e)))) for e in (before, after)]
     name = unit.removesuffix("-printed")
+    drawn = held_out_over_time(f"held-out-{name}", sensor, recording, before, after)
+    means = [number(float(np.mean(np.abs(e)))) for e in (before, after)]
     finding = f"{_in_words(name)}: mean |e| goes from {means[0]} to {means[1]} {SENSOR_UNITS[sensor]}"
-    svg = str(drawn.svg).replace(f"{sensor}-held-out", f"held-out-{name}")
-    return replace(drawn, svg=type(drawn.svg)(svg), finding=finding, caption="Staged, as printed; below, after alone.")
+    return replace(drawn, finding=finding, caption="Staged, as printed; below, after alone.")
 
 
 def _in_words(name: str) -> str:
@@ -132,15 +130,13 @@ def _per_procedure(results: Results, told: dict[tuple[str, str, str], float], de
     for procedure in PROCEDURES[sensor]:
         ours = [results.error(f"{device}-{procedure}-{m}", sensor) or 0.0 for m in ("printed", "staged")]
         groups[_short(procedure)] = [told[device, "acutronic", procedure], *ours]
-    svg = columns(
-        f"procedures-{device}-{sensor}",
-        f"{DEVICES[device]}, {sensor}: held-out error by procedure",
-        groups,
-        f"mean |e| after, {SENSOR_UNITS[sensor]}",
-        x_label=BELOW[sensor],
-    )
-    legend = tuple(zip(COLOURS, ("printed", "ours, as printed", "ours, errata corrected"), strict=False))
-    return Figure(svg, "", legend, f"{DEVICES[device]}, {sensor}: error after calibration by procedure")
+    finding = f"{DEVICES[device]}, {sensor}: error after calibration by procedure"
+    figure = Figure(f"procedures-{device}-{sensor}", finding, legend=_legend(PRINTED_AND_OURS))
+    return stems(figure, groups, f"mean |e| after, {SENSOR_UNITS[sensor]}", BELOW[sensor])
+
+
+def _legend(texts: Iterable[str]) -> tuple[tuple[str, str], ...]:
+    return tuple((f"c{i}", text) for i, text in enumerate(texts))
 
 
 def _short(procedure: str) -> str:
@@ -165,20 +161,14 @@ def _methods(results: Results, printed: Path, sensor: str) -> Figure:
         "gyroscope": ("staged", "Cholesky and LU, forward matrix", "Cholesky and LU, inverted"),
     }[sensor]
     printed_names = ("printed: staged", "printed: least squares" if sensor == "accelerometer" else "printed: Cholesky")
-    svg = columns(
-        f"methods-{sensor}",
-        f"{sensor.capitalize()}: held-out error by method",
-        groups,
-        f"mean |e| after, {SENSOR_UNITS[sensor]}",
-        x_label="device",
-    )
-    legend = tuple((f"c{i}", text) for i, text in enumerate((*printed_names, *names)))
     finding = (
         "Accelerometer: the corrected stages leave little more than least squares"
         if sensor == "accelerometer"
         else "Gyroscope: inverted, Cholesky and LU leave what the stages leave"
     )
-    return Figure(svg, f"From the recordings of {procedure}.", legend, finding)
+    caption, legend = f"From the recordings of {procedure}.", _legend((*printed_names, *names))
+    figure = Figure(f"methods-{sensor}", finding, caption, legend)
+    return stems(figure, groups, f"mean |e| after, {SENSOR_UNITS[sensor]}", "device")
 
 
 def _tables(results: Results, told: dict[tuple[str, str, str], float]) -> Figure:
@@ -192,15 +182,8 @@ def _tables(results: Results, told: dict[tuple[str, str, str], float]) -> Figure
             share = [told["mpu6050-1", table, procedure] / printed_before, *(v / before for v in ours)]
             short = {"accelerometer": "accel.", "gyroscope": "gyro"}[sensor]
             groups[f"{short}{', home' if infix else ''}"] = [100.0 * v for v in share]
-    svg = columns(
-        "tables",
-        "What is left of the error on either table",
-        groups,
-        "after, % of before",
-        x_label="sensor; home: on the home-made table",
-    )
-    legend = tuple(zip(COLOURS, ("printed", "ours, as printed", "ours, errata corrected"), strict=False))
-    return Figure(svg, "MPU6050 (1).", legend, "The home-made table leaves more of the error")
+    figure = Figure("tables", "The home-made table leaves more of the error", "MPU6050 (1).", _legend(PRINTED_AND_OURS))
+    return stems(figure, groups, "after, % of before", "sensor; home: on the home-made table")
 
 
 def _speed(rows: pd.DataFrame) -> Figure:
@@ -212,33 +195,19 @@ def _speed(rows: pd.DataFrame) -> Figure:
             mean = errors.mean(f"mpu6050-2-{procedure}", method)
             rate = float(procedure.split("-")[1].removesuffix("dps"))
             points.append(Point(_short(procedure), mean.value, interval=mean.interval, x=rate, series=name))
-    title = "Error of continuous rotation by rate"
-    svg = curves("speed", title, points, "mean |e| after, g", x_label="rate, deg/s", named=False)
-    legend = tuple((f"c{i}", name) for i, name in enumerate(FILTERS.values()))
     caption = (
         "MPU6050 (2), errata corrected; means over seeds with their 95 % intervals. The filter is on the turns and on "
-    )
-    caption += (
         "the held-out motion, so without one more noise is left there; how an error grows with the rate is its own."
     )
-    return Figure(
-        svg,
-        caption,
-        legend,
-        "With the filter's gain the error grows at 30 deg/s, and more where it runs twice",
-    )
+    finding = "With the filter's gain the error grows at 30 deg/s, and more where it runs twice"
+    figure = Figure("speed", finding, caption, _legend(FILTERS.values()))
+    return curves(figure, points, "mean |e| after, g", "rate, deg/s", named=False)
 
 
 def _scatter(scatter: Sequence[Scatter], quantity: str) -> Figure:
     """Draw the printed scatter beside what picking explains, cause by cause."""
     own = [s for s in scatter if s.quantity == quantity]
     groups = {DEVICES[s.device]: [s.printed, *s.seeds.values()] for s in own}
-    svg = columns(
-        f"scatter-{quantity}",
-        f"Scatter of {quantity}",
-        groups,
-        f"rms deviation of {quantity}",
-        x_label="device",
-    )
-    legend = tuple((f"c{i}", text) for i, text in enumerate(("printed", *CAUSES)))
-    return Figure(svg, "", legend, f"Scatter of {quantity}: printed, and by picking single samples")
+    finding = f"Scatter of {quantity}: printed, and by picking single samples"
+    figure = Figure(f"scatter-{quantity}", finding, legend=_legend(("printed", *CAUSES)))
+    return stems(figure, groups, f"rms deviation of {quantity}", "device")

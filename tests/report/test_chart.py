@@ -7,8 +7,11 @@ import re
 import numpy as np
 import pytest
 
-from pipeline.report.chart import Axis, Band, Dots, Panel, Samples, chart, log_ticks, round_ticks, tick_label
+from pipeline.report.axis import Axis, log_ticks, round_ticks, tick_label
+from pipeline.report.chart import Band, Dots, Figure, Panel, Samples, chart
 from pipeline.report.numbers import measured, number, typeset
+
+FIGURE = Figure("n", "t")
 
 
 def values(ticks: list[tuple[float, str]]) -> list[float]:
@@ -98,7 +101,7 @@ def test_few_samples_are_dots_at_their_values(*, hole: bool) -> None:
     x, block = np.sort(rng.random(100)), rng.standard_normal((100, 3))
     if hole:
         block[7, 1] = np.nan
-    svg = chart("n", "t", "d", [Panel([Samples(x, block)], "y", height=100, limits=(-5.0, 5.0))], "x")
+    svg = chart(FIGURE, "d", [Panel([Samples(x, block)], "y", height=100, limits=(-5.0, 5.0))], "x").svg
     across, up = Axis(x[0], x[-1], 64, 406), Axis(-5.0, 5.0, 108, 8)
     for column, path in zip(block.T, drawn(svg, "dots"), strict=True):
         known = np.isfinite(column)
@@ -109,7 +112,7 @@ def test_few_samples_are_dots_at_their_values(*, hole: bool) -> None:
 def test_many_samples_are_ranges_whose_means_are_a_line(count: int) -> None:
     rng = np.random.default_rng(4)
     x, y = np.arange(count, dtype=float), rng.standard_normal(count)
-    svg = chart("n", "t", "d", [Panel([Samples(x, y, mean=True)], "y", height=100, limits=(-5.0, 5.0))], "x")
+    svg = chart(FIGURE, "d", [Panel([Samples(x, y, mean=True)], "y", height=100, limits=(-5.0, 5.0))], "x").svg
     up = Axis(-5.0, 5.0, 108, 8)
     ((path,), (line,)) = drawn(svg, "strokes"), drawn(svg, "line")
     ranges = [(int(low), int(high)) for low, high in re.findall(r"M\d+ (\d+)V(\d+)", path)]
@@ -122,6 +125,6 @@ def test_many_samples_are_ranges_whose_means_are_a_line(count: int) -> None:
 def test_an_interval_and_a_band_are_drawn_at_their_ends() -> None:
     at = np.array([1.0, 2.0])
     layers = [Band(-0.5, 0.5), Dots(at, at - 1.5, 0, at - 1.6, at - 1.4)]
-    svg = chart("n", "t", "d", [Panel(layers, "y", height=100, limits=(-1.0, 1.0))], "x")
+    svg = chart(FIGURE, "d", [Panel(layers, "y", height=100, limits=(-1.0, 1.0))], "x").svg
     assert drawn(svg, "band") == ["M640 830H4060V330H640z"]
     assert drawn(svg, "strokes") == ["M640 880V780M4060 380V280"]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pipeline.report import campaign_page
-from pipeline.report.chart import Panel, Samples, chart
+from pipeline.report.chart import Figure, Panel, Samples, chart
 from pipeline.report.summary import COLUMNS, summary_row, write_summary
 from pipeline.report.unit_page import render
 
@@ -177,7 +177,7 @@ def test_a_chart_keeps_the_extremes_of_what_it_thins_out() -> None:
     y = np.sin(x / 50)
     with_spike = np.where(x == 54_321, 7.0, y)
     drawn = [
-        chart("n", "title", "words", [Panel([Samples(x, v, 0)], "y", height=100, limits=(-8, 8))], "x")
+        chart(Figure("n", "title"), "words", [Panel([Samples(x, v, 0)], "y", height=100, limits=(-8, 8))], "x").svg
         for v in (y, with_spike)
     ]
     assert max(map(len, drawn)) < 30_000

@@ -11,7 +11,7 @@ import pytest
 from playwright.sync_api import Browser, Page, sync_playwright
 
 from pipeline.report import campaign_page, unit_page
-from pipeline.report.chart import Line, Panel, chart
+from pipeline.report.chart import Figure, Line, Panel, chart
 from pipeline.report.pages import asset
 from pipeline.report.run_section import runs_data
 
@@ -91,7 +91,8 @@ def failures() -> list[dict[str, Any]]:
 def one_chart() -> str:
     """Return a page with the line y = 3 x - 1."""
     x = np.linspace(0.0, 10.0, 11)
-    svg = chart("line", "A line", "It rises.", [Panel([Line(x, 3.0 * x - 1.0, 0)], "height, m")], "way, km")
+    panel = Panel([Line(x, 3.0 * x - 1.0, 0)], "height, m")
+    svg = chart(Figure("line", "A line"), "It rises.", [panel], "way, km").svg
     legend = '<ul class="legend"><li><i class="c0"></i>the line</li></ul>'
     style, script = asset("page.css"), asset("chart.js")
     figure = f"<figure>{svg}<figcaption>{legend}</figcaption></figure>"

@@ -5,13 +5,14 @@ const SVG = "http://www.w3.org/2000/svg", SUBDIVISION = 10;
 const scaleOf = (element) => {
   const [low, high, start, stop, kind, ...label] = element.dataset.scale.split(",");
   const ends = { low: +low, high: +high }, text = label.join(",").trim();
-  return { full: ends, view: { ...ends }, start: +start, stop: +stop, kind, label: text, unit: text.includes(", ") ? text.split(", ").pop() : "" };
+  return { full: ends, view: { ...ends }, start: +start, stop: +stop, kind, label: text, names: element.dataset.ticks?.split("|"), unit: text.includes(", ") ? text.split(", ").pop() : "" };
 };
 const place = (axis, value, range = axis.view) => axis.start + (value - range.low) / (range.high - range.low) * (axis.stop - axis.start);
 const valueAt = (axis, at, range = axis.view) => range.low + (at - axis.start) / (axis.stop - axis.start) * (range.high - range.low);
 const plain = (value, digits = 4) => value === 0 ? "0" : Math.abs(value) >= 1e-4 && Math.abs(value) < 1e6 ? String(+value.toPrecision(digits)) : value.toExponential(Math.min(digits - 1, 2));
 const say = (axis, value, digits) => plain(axis.kind === "log" ? 10 ** value : value, digits).replace("-", "\u2212");
 const told = (axis, value) => { // with the digits that a coordinate of a tenth of a pixel holds
+  if (axis.names) return axis.names[Math.min(Math.max(Math.round(value), 1), axis.names.length) - 1];
   const step = (axis.full.high - axis.full.low) / Math.abs(axis.stop - axis.start) / SUBDIVISION;
   const share = axis.kind === "log" ? Math.LN10 * step : step / Math.abs(value);
   return share >= 1 ? "0" : say(axis, value, Math.min(4, Math.max(1, Math.ceil(-Math.log10(share)))));
@@ -19,6 +20,7 @@ const told = (axis, value) => { // with the digits that a coordinate of a tenth 
 
 function ticksOf(axis, count) {
   const { low, high } = axis.view, out = [];
+  if (axis.names) return axis.names.map((name, i) => [i + 1, name]).filter(([v]) => v >= low && v <= high);
   if (axis.kind === "log" && high - low > 0.7) {
     for (let k = Math.floor(low); k <= high; k++)
       for (const m of high - low > 2 ? [1] : [1, 2, 5]) out.push(k + Math.log10(m));
