@@ -7,18 +7,20 @@ the key, its value and what was expected.
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from pipeline.errors import ConfigurationError, InputError, MissingInputError
 from pipeline.io.files import not_regular
+from pipeline.model.checked import WrongValueError, each, fields, flag, items, mapping, number, one_of, or_none, text
 from pipeline.model.effects import effect_of
 from pipeline.records import SENSOR_UNITS, SENSORS, FittedEffect, SensorCalibration
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from pipeline.model.checked import Check
 
 SCHEMA_VERSION = 1
 # Readings in another unit or range are calibrated by a matrix of that factor: 16 between the ranges of an accelerometer
@@ -27,58 +29,50 @@ LARGEST_FACTOR = 1000.0
 # Two axes 1 deg apart have a condition of 2 / sin(1 deg) = 115; a sensor's axes are 90 deg apart within some degrees.
 LARGEST_CONDITION = 100.0
 
-_Three = Field(min_length=3, max_length=3)
-_Vector = Annotated[list[float], _Three]
+WHAT_TO_DO = "take the file as the run published it, or calibrate the unit anew"
+
+_VECTOR = items(number, 3)
+_EFFECT = fields(
+    {
+        "name": text,
+        "parameters": each(fields({"value": number, "unit": or_none(text)}, ("value",), others=True)),
+        "definition": or_none(mapping),
+    },
+    ("name", "parameters"),
+)
+_COVARIANCE = fields({"parameters": items(text), "values": items(items(number))}, ("parameters", "values"), others=True)
+_STAGE = fields(
+    {
+        "name": text,
+        "parameters": mapping,
+        "residual_rms": or_none(number),
+        "correction": or_none(mapping),
+        "details": mapping,
+    },
+    ("name", "parameters"),
+)
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(strict=True, allow_inf_nan=False)
+def _sensor(unit: str) -> Check:
+    required = {
+        "unit": one_of(unit),
+        "bias": _VECTOR,
+        "matrix": items(_VECTOR, 3),
+        "covariance": _COVARIANCE,
+        "effects": items(_EFFECT),
+        "stages": items(_STAGE),
+        "converged": flag,
+        "degrees_of_freedom": or_none(number),
+    }
+    optional = {"effective_degrees_of_freedom": or_none(items(or_none(number)))}
+    return fields({**required, **optional}, required, others=True)
 
 
-class _Parameter(_Model):
-    value: float
-    unit: str | None = None
-
-
-class _Effect(_Model):
-    model_config = ConfigDict(extra="forbid")
-
-    name: str
-    parameters: dict[str, _Parameter]
-    definition: dict[str, Any] | None = None
-
-
-class _Covariance(_Model):
-    parameters: list[str]
-    values: list[list[float]]
-
-
-class _Stage(_Model):
-    model_config = ConfigDict(extra="forbid")
-
-    name: str
-    parameters: dict[str, Any]
-    residual_rms: float | None = None
-    correction: dict[str, Any] | None = None
-    details: dict[str, Any] = {}
-
-
-class _Sensor(_Model):
-    unit: str
-    bias: _Vector
-    matrix: Annotated[list[_Vector], _Three]
-    covariance: _Covariance
-    effects: list[_Effect]
-    stages: list[_Stage]
-    converged: bool
-    degrees_of_freedom: float | None
-    effective_degrees_of_freedom: list[float | None] | None = None
-
-
-class _Document(_Model):
-    status: Literal["ok"]
-    accelerometer: _Sensor | None
-    gyroscope: _Sensor | None
+_DOCUMENT = fields(
+    {"status": one_of("ok"), **{sensor: or_none(_sensor(unit)) for sensor, unit in SENSOR_UNITS.items()}},
+    ("status", *SENSORS),
+    others=True,
+)
 
 
 def read_calibration(file: Path) -> dict[str, Any]:
@@ -89,8 +83,8 @@ def read_calibration(file: Path) -> dict[str, Any]:
     MissingInputError
         If the file does not exist.
     InputError
-        If it is no file, no JSON, holds a key twice or a number that is not finite, is of another schema version, is
-        the record of a failed unit, holds no calibrated sensor, or a key has not the expected value.
+        If it cannot be read, belongs to another schema version or to a failed unit, holds no calibrated sensor, or a
+        value is not what is expected.
     """
     try:
         if other := not_regular(file):
@@ -101,7 +95,7 @@ def read_calibration(file: Path) -> dict[str, Any]:
     except FileNotFoundError:
         raise MissingInputError("there is no such calibration", str(file)) from None
     except (OSError, RecursionError, ValueError) as error:  # ValueError: no UTF-8, no JSON, or refused below
-        _refuse(file, f"this is no calibration of a unit: {error}")
+        _refuse(file, f"this is no calibration of a unit: {error}; {WHAT_TO_DO}")
     if not isinstance(document, dict) or "status" not in document:
         _refuse(file, "this is no calibration of a unit: it has no status; expected calibrations/<unit>.json")
     version = document.get("schema_version")
@@ -113,23 +107,14 @@ def read_calibration(file: Path) -> dict[str, Any]:
         cause = told.get("message", "unknown") if isinstance(told, dict) else "unknown"
         _refuse(file, f"unit {document.get('unit')} failed and has no calibration; cause: {cause}")
     try:
-        _Document.model_validate(document)
-    except ValidationError as error:
-        _refuse_first(file, dict(error.errors()[0]))
+        _DOCUMENT(document)
+    except WrongValueError as wrong:
+        _refuse(file, f"{wrong}; {WHAT_TO_DO}")
     if all(document[sensor] is None for sensor in SENSORS):
         reasons = document.get("not_calibrated")
         told = "; ".join(map(str, reasons.values())) if isinstance(reasons, dict) and reasons else "not stated"
         _refuse(file, f"accelerometer and gyroscope are null: there is nothing to apply; reason: {told}")
     return document
-
-
-def _refuse_first(file: Path, error: dict[str, Any]) -> NoReturn:
-    """Refuse the first key that is not as declared above."""
-    key = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in error["loc"]).lstrip(".")
-    if error["type"] == "missing":
-        _refuse(file, f"{key} is missing")
-    text = json.dumps(error["input"], default=str)
-    _refuse(file, f"{key} is {text if len(text) <= 80 else f'{text[:77]}...'}; {error['msg']}")
 
 
 def sensor_of(document: dict[str, Any], sensor: str, file: Path) -> SensorCalibration | None:
@@ -138,15 +123,13 @@ def sensor_of(document: dict[str, Any], sensor: str, file: Path) -> SensorCalibr
     Raises
     ------
     InputError
-        If unit, matrix, covariance or an effect is not what it should be.
+        If matrix, covariance or an effect is not what it should be.
     ConfigurationError
         If an effect is not known.
     """
     part = document[sensor]
     if part is None:
         return None
-    if part["unit"] != SENSOR_UNITS[sensor]:
-        _refuse(file, f"{sensor}.unit is {part['unit']!r}; expected {SENSOR_UNITS[sensor]!r}")
     _check_matrix(file, f"{sensor}.matrix", np.array(part["matrix"], float))
     size, rows = len(part["covariance"]["parameters"]), part["covariance"]["values"]
     if [len(row) for row in rows] != [size] * size:

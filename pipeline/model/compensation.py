@@ -18,7 +18,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 import numpy as np
 
 from pipeline.errors import InputError
+from pipeline.model.calibration_file import read_calibration, sensor_of
 from pipeline.model.effects import register
+from pipeline.model.effects.files import load_python_effect
 from pipeline.model.exponential_regression import ExponentialRegression
 from pipeline.model.log_motion import SIGNALS, LogEnd, fields_used, log_motion
 from pipeline.model.measurement import Part, sensor_effects, solve, without_effects
@@ -285,13 +287,8 @@ class Compensation:
 
 def load(path: str | Path, python_effects: Sequence[str | Path] = ()) -> Compensation:
     """Read ``calibrations/<unit>.json``; parameters and errors as of ``pipeline.load_calibration``."""
-    from pipeline.model.calibration_file import read_calibration, sensor_of  # noqa: PLC0415  (stages need no pydantic)
-
-    if python_effects:
-        from pipeline.model.effects.files import load_python_effect  # noqa: PLC0415  (only where there are any)
-
-        for python_file in python_effects:
-            register(load_python_effect(python_file))
+    for python_file in python_effects:
+        register(load_python_effect(python_file))
     file = Path(path)
     document = read_calibration(file)
     accelerometer, gyroscope = (sensor_of(document, sensor, file) for sensor in SENSORS)

@@ -32,9 +32,9 @@ from pipeline.records import AXES, SENSOR_UNITS, FittedEffect
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-MULTIPLE = 4.0
-LOW_COST_BIAS = {"accelerometer": 0.08 / 2.0, "gyroscope": 20.0 / 250.0}  # share of the range
-LOW_COST_SCALE, LOW_COST_CROSS = 0.03, 0.02
+MULTIPLE = 4.0  # see above
+LOW_COST_BIAS = {"accelerometer": 0.08 / 2.0, "gyroscope": 20.0 / 250.0}  # share of the range, see above
+LOW_COST_SCALE, LOW_COST_CROSS = 0.03, 0.02  # see above
 EQUAL_SPREAD = 0.1  # relative spread of the three scale factors that have one cause
 NEAR = 0.03  # relative distance from a factor by which it is recognised, as a low-cost scale factor's limit
 FACTORS = {
@@ -51,7 +51,12 @@ FACTORS = {
     },
 }
 RANGES = [2.0**n for n in range(-6, 7) if n]
+OF_BIAS = "an offset of raw counts that is not taken off, another column, or a damaged axis"
+OF_CROSS_AXIS = "another column or axis map, or a unit that moved on the table between recordings"
+OF_EFFECT = "another effect that looks alike, or an error of the table, its log or the time stamps"
+
 Entry = dict[str, Any]
+Row = tuple[str, float, float, str, float, float, str]  # name, value, uncertainty, unit, limit, floor, likely cause
 
 
 def implausible(sensor: str, part: Mapping[str, Any], sheet: Mapping[str, Any]) -> list[Entry]:
@@ -60,55 +65,48 @@ def implausible(sensor: str, part: Mapping[str, Any], sheet: Mapping[str, Any]) 
     ``part`` is the sensor's part of ``calibrations/<unit>.json``, ``sheet`` its part of the configuration. An entry has
     ``parameter``, ``value``, ``unit``, ``limit`` of the data sheet, ``ratio`` of the two and ``likely_cause``.
     """
+    entries = [
+        {"parameter": name, "value": value, "unit": unit, "limit": limit, "ratio": abs(value) / limit,
+         "likely_cause": cause}
+        for name, value, uncertainty, unit, limit, floor, cause in (
+            *_of_bias_and_matrix(sensor, part, sheet), *_of_effects(sensor, part, sheet["effects"])
+        )
+        if abs(value) - 2.0 * uncertainty > max(MULTIPLE * limit, floor)
+    ]  # fmt: skip
+    return sorted(entries, key=lambda entry: -entry["ratio"])
+
+
+def _of_bias_and_matrix(sensor: str, part: Mapping[str, Any], sheet: Mapping[str, Any]) -> Iterator[Row]:
+    """Yield the rows of biases, scale factors and cross-axis sensitivities."""
     K = np.linalg.inv(np.array(part["matrix"], float))
     squares, axes = np.linalg.eigh(K @ K.T)
     P = (axes * np.sqrt(squares)) @ axes.T
     spread = part["expanded_uncertainty"]
     of_matrix = np.abs(K) @ np.array(spread["matrix"], float) @ np.abs(K)  # dK = -K dM K
-    entries: list[Entry] = []
-
-    def judge(name: str, value: float, uncertainty: float, unit: str, limit: float, floor: float, cause: str) -> None:  # noqa: PLR0917  (a row of a table)
-        if abs(value) - 2.0 * uncertainty > max(MULTIPLE * limit, floor):
-            entry = {"parameter": name, "value": value, "unit": unit, "limit": limit, "ratio": abs(value) / limit}
-            entries.append({**entry, "likely_cause": cause})
-
-    scale = _scale_cause(sensor, np.diag(P))
+    floor, unit = LOW_COST_BIAS[sensor] * sheet["full_scale"], SENSOR_UNITS[sensor]
+    for a, value, uncertainty in zip(AXES, part["bias"], spread["bias"], strict=True):
+        yield f"bias_{a}", float(value), float(uncertainty), unit, sheet["bias"], floor, OF_BIAS
+    scale, limit = _scale_cause(sensor, np.diag(P)), sheet["scale_factor"]
     for i, a in enumerate(AXES):
-        judge(
-            f"bias_{a}", float(part["bias"][i]), float(spread["bias"][i]), SENSOR_UNITS[sensor], sheet["bias"],
-            LOW_COST_BIAS[sensor] * sheet["full_scale"],
-            "an offset of raw counts that is not taken off, another column, or a damaged axis",
-        )  # fmt: skip
-        judge(
-            f"scale_factor_{a}", float(P[i, i] - 1.0), float(of_matrix[i, i]), "1", sheet["scale_factor"],
-            LOW_COST_SCALE, scale,
-        )  # fmt: skip
-        for j in range(i + 1, 3):
-            judge(
-                f"cross_axis_{a}{AXES[j]}", float(P[i, j]), float(of_matrix[i, j]), "1", sheet["cross_axis"],
-                LOW_COST_CROSS, "another column or axis map, or a unit that moved on the table between recordings",
-            )  # fmt: skip
-    for name, value, uncertainty, unit, limit in _of_effects(sensor, part, sheet["effects"]):
-        cause = "another effect that looks alike, or an error of the table, its log or the time stamps"
-        judge(name, value, uncertainty, unit, limit, 0.0, cause)
-    return sorted(entries, key=lambda entry: -entry["ratio"])
+        yield f"scale_factor_{a}", float(P[i, i] - 1.0), float(of_matrix[i, i]), "1", limit, LOW_COST_SCALE, scale
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        name, limit = f"cross_axis_{AXES[i]}{AXES[j]}", sheet["cross_axis"]
+        yield name, float(P[i, j]), float(of_matrix[i, j]), "1", limit, LOW_COST_CROSS, OF_CROSS_AXIS
 
 
-def _of_effects(
-    sensor: str, part: Mapping[str, Any], limits: Mapping[str, float]
-) -> Iterator[tuple[str, float, float, str, float]]:
-    """Yield name, value, expanded uncertainty, unit and limit of the effects' parameters with uncertainty and limit."""
+def _of_effects(sensor: str, part: Mapping[str, Any], limits: Mapping[str, float]) -> Iterator[Row]:
+    """Yield the rows of the effects' parameters that have an uncertainty and a limit."""
     for entry in part["effects"]:
         try:
             effect = effect_of(FittedEffect(entry["name"], entry["parameters"], entry.get("definition")))
         except ConfigurationError:
             continue  # in Python, and not loaded here: its limits are not known
-        for (symbol, p), limit in zip(
-            entry["parameters"].items(), parameter_limits(effect, sensor, limits), strict=True
-        ):
-            uncertainty = p.get("expanded_uncertainty")
-            if np.isfinite(limit) and uncertainty is not None:
-                yield f"{entry['name']}.{symbol}", float(p["value"]), float(uncertainty), p["unit"], float(limit)
+        sizes = parameter_limits(effect, sensor, limits)
+        for (symbol, p), limit in zip(entry["parameters"].items(), sizes, strict=True):
+            spread = p.get("expanded_uncertainty")
+            if np.isfinite(limit) and spread is not None:
+                name, value = f"{entry['name']}.{symbol}", float(p["value"])
+                yield name, value, float(spread), p["unit"], float(limit), 0.0, OF_EFFECT
 
 
 def _scale_cause(sensor: str, factors: np.ndarray) -> str:

@@ -172,7 +172,7 @@ WRONG = {
         ("", None, "name is missing"),
     ],
     "owner: table": [
-        ("owner: bench", 2, "'bench': one of 'sensor', 'recording', 'mounting' or 'table'"),
+        ("owner: bench", 2, "owner: one of 'sensor', 'recording', 'mounting' or 'table' is expected, not"),
         ("owner: sensor", 6, "owner is sensor, but angle is the table's"),
     ],
     "sensors: [gyroscope]": [

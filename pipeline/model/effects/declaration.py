@@ -15,21 +15,21 @@ formula can state names its class (``python: timing.TimeOffset``) and ``paramete
 
 from __future__ import annotations
 
-import difflib
 import re
 from dataclasses import dataclass, field
 from math import inf
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import ConfigurationError
+from pipeline.model.checked import WrongValueError, each, expected, fields, flag, items, one_of, text
 from pipeline.model.effects.base import Owner, Parameter
 from pipeline.model.formula import SIGNALS, Formula, parse
 from pipeline.records import AXES, SENSORS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Callable, Mapping
 
-    Check = Callable[[Any], Any]
+    from pipeline.model.checked import Check
 
 NAME = re.compile(r"[a-z][a-z0-9_]{0,49}")
 TERM = re.compile(r"[A-Za-z](?=.{0,19}$)[A-Za-z0-9_]*\*?[A-Za-z0-9_]*")
@@ -136,60 +136,24 @@ def read_declaration(
     ConfigurationError
         At the first thing that is wrong, with file, line, and what is expected.
     """
+    checks = {**CHECKS, **BUILT_IN_CHECKS} if built_in else CHECKS
     try:
-        declared = Declaration(**_section(given, {**CHECKS, **BUILT_IN_CHECKS} if built_in else CHECKS, REQUIRED))
+        declared = Declaration(**fields(checks, REQUIRED)(given))
         _check_consistency(declared)
-    except _WrongError as wrong:
-        found = lines()
-        line = next((found[wrong.path[:n]] for n in range(len(wrong.path), 0, -1) if wrong.path[:n] in found), None)
-        reason = f"{'.'.join(wrong.path)}: {wrong.reason}" if wrong.path else wrong.reason
-        raise ConfigurationError(reason, f"{where}:{line}" if line else where) from None
+    except WrongValueError as wrong:
+        found, path = lines(), tuple(map(str, wrong.path))
+        line = next((found[path[:n]] for n in range(len(path), 0, -1) if path[:n] in found), None)
+        raise ConfigurationError(str(wrong), f"{where}:{line}" if line else where) from None
     return declared
 
 
-class _WrongError(Exception):
-    """What is wrong, and the keys that lead to it."""
+def _line(longest: int) -> Check:
+    """Return the check of a text on one line; line breaks become spaces."""
 
-    def __init__(self, reason: str, *path: str) -> None:
-        super().__init__(reason)
-        self.reason, self.path = reason, path
-
-
-def _each(items: Iterable[tuple[str, Check, Any]]) -> dict[str, Any]:
-    """Return the checked value of each key."""
-    found = {}
-    for key, check, value in items:
-        try:
-            found[key] = check(value)
-        except _WrongError as wrong:
-            raise _WrongError(wrong.reason, key, *wrong.path) from None
-    return found
-
-
-def _section(given: Any, checks: Mapping[str, Check], required: Iterable[str]) -> dict[str, Any]:  # noqa: ANN401
-    """Return the checked values of a mapping with known keys."""
-    for key in _mapping(given):
-        if key not in checks:
-            close = difflib.get_close_matches(str(key), checks, 1)
-            nearest = f"; nearest: {close[0]}" if close else ""
-            raise _WrongError(f"unknown key{nearest}; valid: {', '.join(checks)}", str(key))
-    for key in required:
-        if key not in given:
-            raise _WrongError(f"{key} is missing")
-    return _each((key, checks[key], value) for key, value in given.items())
-
-
-def _mapping(given: Any) -> dict[Any, Any]:  # noqa: ANN401
-    if not isinstance(given, dict):
-        raise _WrongError(f"a mapping of names is expected, not {given!r:.60}")
-    return given
-
-
-def _text(longest: int) -> Check:
     def check(given: object) -> str:
         text = " ".join(given.split()) if isinstance(given, str) else ""
         if not text or len(text) > longest or not text.isprintable():
-            raise _WrongError(f"a text of 1 to {longest} characters is expected, not {given!r:.60}")
+            raise expected(f"a text of 1 to {longest} characters", given)
         return text
 
     return check
@@ -197,18 +161,8 @@ def _text(longest: int) -> Check:
 
 def _name(given: object) -> str:
     if not isinstance(given, str) or not NAME.fullmatch(given) or given in RESERVED:
-        raise _WrongError(f"{given!r} is no name of an effect; use small letters, digits and _, at most 50")
+        raise WrongValueError(f"{given!r} is no name of an effect; use small letters, digits and _, at most 50")
     return given
-
-
-def _one_of(*known: str) -> Check:
-    def check(given: object) -> str:
-        if given not in known:
-            *first, last = (repr(str(k)) for k in known)
-            raise _WrongError(f"{given!r:.60}: one of {', '.join(first)} or {last} is expected")
-        return known[known.index(str(given))]
-
-    return check
 
 
 def _some_of(known: tuple[str, ...]) -> Check:
@@ -216,38 +170,22 @@ def _some_of(known: tuple[str, ...]) -> Check:
         listed = given if isinstance(given, (list, tuple)) else ()
         found = tuple(v for v in known if v in listed)
         if not found or len(found) != len(listed):
-            raise _WrongError(f"a list of some of {', '.join(known)} is expected, not {given!r:.60}")
+            raise expected(f"a list of some of {', '.join(known)}", given)
         return found
 
     return check
 
 
-def _flag(given: object) -> bool:
-    if not isinstance(given, bool):
-        raise _WrongError(f"true or false is expected, not {given!r:.60}")
-    return given
-
-
-def _names(given: object) -> tuple[str, ...]:
-    if not isinstance(given, (list, tuple)) or not all(isinstance(name, str) for name in given):
-        raise _WrongError(f"a list of names of effects is expected, not {given!r:.60}")
-    return tuple(given)
-
-
 def _by_sensor(check: Check) -> Check:
     """Return the check of a value, or of a mapping of sensors to values."""
-    of_sensors = dict.fromkeys(SENSORS, check)
-    return lambda given: _section(given, of_sensors, ()) if isinstance(given, dict) else check(given)
+    of_sensors = fields(dict.fromkeys(SENSORS, check))
+    return lambda given: of_sensors(given) if isinstance(given, dict) else check(given)
 
 
-def _size(given: Any) -> float:  # noqa: ANN401
-    try:
-        size = -1.0 if isinstance(given, bool) else float(given)
-    except (TypeError, ValueError):
-        size = -1.0
-    if not 0.0 < size < inf:
-        raise _WrongError(f"a number above 0 is expected, not {given!r:.60}")
-    return size
+def _size(given: object) -> float:
+    if isinstance(given, bool) or not isinstance(given, (int, float)) or not 0.0 < given < inf:
+        raise expected("a number above 0", given)
+    return float(given)
 
 
 def _formulas(given: Any) -> dict[str, Formula]:  # noqa: ANN401
@@ -256,51 +194,46 @@ def _formulas(given: Any) -> dict[str, Formula]:  # noqa: ANN401
         return {"": _formula(given)}
     texts = dict(zip(AXES, given, strict=False)) if isinstance(given, list) else given
     if len(given) != len(AXES) or set(texts) != set(AXES):
-        raise _WrongError("one formula, a list of three (x, y, z), or a mapping of x, y and z is expected")
+        raise WrongValueError("one formula, a list of three (x, y, z), or a mapping of x, y and z is expected")
     return {axis: _formula(texts[axis]) for axis in AXES}
 
 
 def _formula(text: object) -> Formula:
     if isinstance(text, bool) or not isinstance(text, (str, int, float)):
-        raise _WrongError(f"a formula is text, not {text!r}")
+        raise WrongValueError(f"a formula is text, not {text!r}")
     try:
         return parse(text if isinstance(text, str) else repr(text))
     except ConfigurationError as error:
-        raise _WrongError(error.message) from None
+        raise WrongValueError(error.message) from None
 
 
 def _term(given: Any) -> Term:  # noqa: ANN401
-    found = _section(given, {"formula": _formulas, **TERM_CHECKS}, ("formula", "unit"))
+    found = fields({"formula": _formulas, **TERM_CHECKS}, ("formula", "unit"))(given)
     return Term(formulas=found.pop("formula"), shared=isinstance(given["formula"], list), **found)
 
 
-def _all_of(check: Check) -> Check:
-    """Return the check of a mapping of any keys to values."""
-    return lambda given: _each((str(key), check, value) for key, value in _mapping(given).items())
-
-
-TEXT = _text(LONGEST_TEXT)
-TERM_CHECKS: dict[str, Check] = {"unit": _by_sensor(_text(LONGEST_UNIT)), "meaning": TEXT}
+TEXT = _line(LONGEST_TEXT)
+TERM_CHECKS: dict[str, Check] = {"unit": _by_sensor(_line(LONGEST_UNIT)), "meaning": TEXT}
 REQUIRED = ("name", "owner", "sensors", "meaning")
 CHECKS: dict[str, Check] = {
     "name": _name,
-    "owner": _one_of(*Owner),
+    "owner": one_of(*Owner),
     "sensors": _some_of(SENSORS),
     "meaning": TEXT,
-    "terms": _all_of(_term),
+    "terms": each(_term),
     "axes": _some_of(AXES),
-    "adds_to": _one_of("reading", "truth"),
-    "limits": _all_of(_by_sensor(_size)),
-    "contains": _names,
-    "needs_both_directions": _flag,
+    "adds_to": one_of("reading", "truth"),
+    "limits": each(_by_sensor(_size)),
+    "contains": lambda given: tuple(items(text)(given)),
+    "needs_both_directions": flag,
     "excitation": TEXT,
     "experiment": TEXT,
     "source": TEXT,
 }
 BUILT_IN_CHECKS: dict[str, Check] = {
-    "built_in": _flag,
+    "built_in": flag,
     "python": TEXT,
-    "parameters": _all_of(lambda given: Term(**_section(given, TERM_CHECKS, ("unit",)))),
+    "parameters": each(lambda given: Term(**fields(TERM_CHECKS, ("unit",))(given))),
 }
 
 
@@ -308,20 +241,20 @@ def _check_consistency(declared: Declaration) -> None:
     """Refuse the first part that contradicts another."""
     terms = declared.terms
     if not (declared.python or 1 <= len(terms) <= MOST_TERMS):
-        raise _WrongError(f"{len(terms)} terms; from 1 to {MOST_TERMS} are expected", "terms")
+        raise WrongValueError(f"{len(terms)} terms; from 1 to {MOST_TERMS} are expected", "terms")
     for name, term in {**terms, **declared.parameters}.items():
         path = "terms" if name in terms else "parameters", name
         if not TERM.fullmatch(name):
-            raise _WrongError(f"{name!r} is no name of a term; use letters, digits and _, at most 20", *path)
+            raise WrongValueError(f"{name!r} is no name of a term; use letters, digits and _, at most 20", *path)
         _check_sensors(declared, term.unit, "unit", *path, "unit")
         if wrong := name in terms and _wrong_term(declared, name, term):
-            raise _WrongError(wrong, *path)
+            raise WrongValueError(wrong, *path)
     names = [n for term in terms for _, n in declared.coefficients(term)]
     twice = sorted({n for n in names if names.count(n) > 1})
     if twice:
-        raise _WrongError(f"two coefficients would be called {twice[0]}; name the terms otherwise", "terms")
+        raise WrongValueError(f"two coefficients would be called {twice[0]}; name the terms otherwise", "terms")
     if declared.limits and set(declared.limits) != set(terms):
-        raise _WrongError(f"a limit for each term is expected ({', '.join(terms)}), or none at all", "limits")
+        raise WrongValueError(f"a limit for each term is expected ({', '.join(terms)}), or none at all", "limits")
     for name, size in declared.limits.items():
         _check_sensors(declared, size, "limit", "limits", name)
 
@@ -329,7 +262,7 @@ def _check_consistency(declared: Declaration) -> None:
 def _check_sensors(declared: Declaration, given: object, what: str, *path: str) -> None:
     """Refuse a mapping that does not hold a value for each sensor of the effect."""
     if isinstance(given, dict) and set(given) != set(declared.sensors):
-        raise _WrongError(f"a {what} for each of {', '.join(declared.sensors)} is expected", *path)
+        raise WrongValueError(f"a {what} for each of {', '.join(declared.sensors)} is expected", *path)
 
 
 def _wrong_term(declared: Declaration, name: str, term: Term) -> str:
