@@ -41,10 +41,15 @@ TELL = """
 import atexit, os, resource, sys
 def _tell():
     used = resource.getrusage(resource.RUSAGE_SELF)
-    words = sys.orig_argv
-    name = words[words.index("pipeline") + 1] if "pipeline" in words else "snakemake"
+    words = sys.argv
+    name = words[1] if words[0].endswith("pipeline/__main__.py") else "snakemake"
     with open(os.environ["FLEET_TOLD"], "a") as stream:
         print(name, used.ru_utime + used.ru_stime, used.ru_maxrss, file=stream)
+    os._exit = leave
+def _leave(code):
+    _tell()
+    leave(code)
+leave, os._exit = os._exit, _leave
 atexit.register(_tell)
 """
 

@@ -43,12 +43,30 @@ def main(argv: list[str] | None = None) -> int:
 
         print(f"imu-calibration {__version__}" if command == "--version" else _help())
         return 0
+    if command == "job-server":  # of a run
+        import socket  # noqa: PLC0415
+
+        from pipeline.stages.job_server import serve  # noqa: PLC0415
+
+        return serve(socket.socket(fileno=int(rest[0])), STAGES, run_command)
     if command not in (*COMMANDS, *STAGES):
         known = ", ".join((*COMMANDS, *STAGES))
         print(f"{PROGRAM}: no command {command!r}; known: {known}", file=sys.stderr)
         return 2
+    if command in STAGES:
+        from pipeline.stages.job_server import run_on_server  # noqa: PLC0415
+
+        code = run_on_server([command, *rest])
+        if code is not None:
+            return code
+    return run_command([command, *rest])
+
+
+def run_command(words: list[str]) -> int:
+    """Run a known command in this process."""
     from pipeline.errors import PipelineError  # noqa: PLC0415
 
+    command, *rest = words
     try:
         if command in COMMANDS or command == "verdict":
             package = "commands" if command in COMMANDS else "stages"

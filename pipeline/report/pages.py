@@ -34,13 +34,23 @@ def _figure(value: object) -> str:
 
 
 @cache
-def template(name: str) -> Template:
-    """Return a template by its file name."""
+def _environment() -> Environment:
     environment = _Pages(loader=FileSystemLoader(FOLDER), autoescape=True, trim_blocks=True, lstrip_blocks=True)
     filters = {"number": number, "measured": measured, "percent": percent, "probability": probability}
     environment.filters.update(filters, typeset=typeset, words=plain, figure=_figure, unit=unit_text)
     environment.globals["asset"] = asset
-    return environment.get_template(name)
+    return environment
+
+
+def template(name: str) -> Template:
+    """Return a template by its file name."""
+    return _environment().get_template(name)
+
+
+def compile_templates() -> None:
+    """Compile all templates, for the processes that are forked from this one."""
+    for file in FOLDER.glob("*.html"):
+        template(file.name)
 
 
 @cache

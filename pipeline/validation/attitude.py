@@ -170,7 +170,13 @@ def drift(time: Array, estimate: Rotation, reference: Rotation, seconds: float) 
 
 def angle_between(p: Rotation, q: Rotation) -> Array:
     """Return the angle of the rotation from one attitude to another: (n,) array, deg."""
-    return np.degrees((p.inv() * q).magnitude())
+    turned = _product(_inverse(p), q.as_quat(scalar_first=True).T)
+    return np.asarray(np.degrees(2.0 * np.arctan2(np.linalg.norm(turned[1:], axis=0), np.abs(turned[0]))))
+
+
+def _inverse(p: Rotation) -> Array:
+    """Return the inverse rotations as quaternions: (4, n) array."""
+    return np.asarray((p.as_quat(scalar_first=True) * [1.0, -1.0, -1.0, -1.0]).T)
 
 
 def _fuse(time: Array, force: Array, alone: Rotation) -> tuple[NDArray[np.int64], Array]:
@@ -179,12 +185,14 @@ def _fuse(time: Array, force: Array, alone: Rotation) -> tuple[NDArray[np.int64]
     Its rates are those of the attitude ``alone`` of the gyroscope between these samples; the first attitude is given.
     """
     import imufusion  # noqa: PLC0415  (only units with a logged attitude pay for it)
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415  (as in integrate)
 
     turns = angle_between(alone[:-1], alone[1:])
     within = min(STEP_S / float(np.median(np.diff(time))), STEP_DEG / max(float(turns.max()), 1e-9))
     at = np.arange(0, len(time), max(1, int(within)))
     intervals = np.diff(time[at])
-    rates = np.degrees((alone[at[:-1]].inv() * alone[at[1:]]).as_rotvec()) / intervals[:, None]
+    turned = _product(_inverse(alone[at[:-1]]), alone[at[1:]].as_quat(scalar_first=True).T)
+    rates = np.degrees(Rotation.from_quat(turned.T, scalar_first=True).as_rotvec()) / intervals[:, None]
     settings = imufusion.AhrsSettings(
         sample_rate=float(1.0 / np.median(intervals)),
         convention=imufusion.CONVENTION_NWU,

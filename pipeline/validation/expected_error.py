@@ -33,6 +33,7 @@ and the variance of white noise has the relative uncertainty ``sqrt(2 / n)`` of 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import combinations_with_replacement
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -279,11 +280,14 @@ def _form(M: Values, held_out: Sequence[LinearizedSamples], uncertain: _Uncertai
         covariances[2, mine, mine] = np.kron(slow, np.diag(uncertain.drift))
         at = mine.stop
     Q = A @ covariances
-    flat, transposed = Q.reshape(3, -1), np.swapaxes(Q, 1, 2).reshape(3, -1)
-    pairs = (Q[:, None] @ Q[None]).reshape(9, -1)
+    transposed = np.swapaxes(Q, 1, 2).reshape(3, -1)
     determined = noise.length / interval if noise.length > 0.0 else REST_SAMPLES
-    first_order, second_order = np.trace(Q, axis1=1, axis2=2), flat @ transposed.T
-    third_order = (pairs @ transposed.T).reshape(3, 3, 3)
+    first_order, second_order = np.trace(Q, axis1=1, axis2=2), Q.reshape(3, -1) @ transposed.T
+    third_order = np.empty((3, 3, 3))
+    for i, j in combinations_with_replacement(range(3), 2):  # the trace of a product is the same in every order
+        last = size if i else q  # the columns of the parameters
+        product = (Q[i, :, :last] @ Q[j, :last]).ravel()
+        third_order[i, j] = third_order[j, i] = transposed @ product
     return _QuadraticForm(white, within, 1.0 / determined, first_order, second_order, third_order)
 
 

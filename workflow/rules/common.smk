@@ -26,6 +26,7 @@ from pipeline.io.files import recording_files
 from pipeline.outcome import outcome
 from pipeline.results_folder import finish_publishing, repetitions
 from pipeline.run_progress import Monitor
+from pipeline.stages.job_server import start_server
 
 try:
     CAMPAIGN = load_campaign(config)
@@ -116,6 +117,8 @@ def begin_run():
         finish_publishing(CAMPAIGN.results)
         for file in WAITING.values():
             file.write()
+        if workflow.local_exec:
+            atexit.register(start_server())
         MONITOR.print_edited(EDITED)
         Path(RESULTS, "configs", "again.json").write_text(json.dumps(AGAIN))
     except PipelineError as error:
