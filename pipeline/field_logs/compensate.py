@@ -43,12 +43,8 @@ def _canonical() -> dict[str, Any]:
 class LogProfile:
     """How the logs of a unit are laid out.
 
-    Attributes
-    ----------
-    ingest : mapping
-        The ingest profile, with the sections ``csv`` and ``mcap``; the canonical one by default.
-    axis_maps : mapping
-        Sensor to the body axis that each of its reading axes points along; straight where it is not named.
+    ``ingest`` is the ingest profile, the canonical one by default. ``axis_maps``: sensor to the body axis that each of
+    its reading axes points along; straight where it is not named.
     """
 
     ingest: Mapping[str, Any] = field(default_factory=_canonical)
@@ -56,13 +52,7 @@ class LogProfile:
 
     @classmethod
     def of_calibration(cls, document: Mapping[str, Any], file: str) -> LogProfile:
-        """Return the profile with which a unit was calibrated, from ``calibrations/<unit>.json``.
-
-        Raises
-        ------
-        InputError
-            If ``log`` is not what a run writes there.
-        """
+        """Return the profile with which a unit was calibrated, from ``calibrations/<unit>.json``."""
         log = document.get("log")
         if log is None:
             return cls()
@@ -106,8 +96,8 @@ class Block:
 class Result:
     """What was compensated with the calibration of ``unit``.
 
-    ``sensors``: those whose readings the log holds. ``topic``: of the calibrated messages in an MCAP log. ``notes``:
-    facts about the output. ``warnings``: what contradicts that this calibration belongs to this log.
+    ``topic``: of the calibrated messages in an MCAP log. ``notes``: facts about the output. ``warnings``: what
+    contradicts that this calibration belongs to this log.
     """
 
     unit: str
@@ -121,10 +111,7 @@ class Result:
 class Log(Protocol):
     """A log of some format and the log that is made of it.
 
-    Attributes
-    ----------
-    smoothing : float, s
-        Of the temperature, as of ``Compensation.stream``; 0 where the format smooths it itself.
+    ``smoothing`` of the temperature, s, is that of ``Compensation.stream``; 0 where the format smooths it itself.
     """
 
     smoothing: float
@@ -154,24 +141,19 @@ def compensate_log(
 
     Parameters
     ----------
-    compensation : Compensation
-    source, target : Path
     profile : LogProfile, optional
-        How the log is laid out; by default the canonical CSV, or the only Imu topic.
+        By default the canonical CSV, or the only Imu topic.
     topic : str, optional
         Of the calibrated messages in an MCAP log; that of the readings and ``_calibrated`` by default.
     smoothing : float, s
         Memory of the line through the temperature's past; 0 takes the temperature as it is.
-    block_bytes : int
-        Size of the blocks in which a text log is read.
     progress : callable, optional
         Called with the samples done and the bytes read.
 
     Raises
     ------
     InputError
-        If the log is damaged, cannot be read as the profile says, or the output would overwrite it; then no output is
-        left.
+        If the log is damaged, cannot be read as the profile says, or would be overwritten; no output is left.
     """
     require_apart(source, target)
     profile = profile or LogProfile()

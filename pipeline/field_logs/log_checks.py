@@ -52,10 +52,7 @@ WHOLE = 10  # different whole numbers that are no chance
 class LogChecks:
     """Statistics of a log, block by block, in bounded memory.
 
-    Attributes
-    ----------
-    compensated : str
-        Evidence that the log was compensated before; else empty.
+    ``compensated``: evidence that the log was compensated before; else empty.
     """
 
     def __init__(self) -> None:

@@ -22,14 +22,7 @@ KINDS = {".mcap": "MCAP", ".csv": "text", ".txt": "text"}
 
 
 def require_apart(source: Path, target: Path) -> None:
-    """Refuse a log that is no file, and an output (``-``: standard output) that cannot be made or would overwrite it.
-
-    Raises
-    ------
-    MissingInputError
-        If there is no such log.
-    InputError
-    """
+    """Refuse a log that is no file, and an output (``-``: stdout) that cannot be made or would overwrite it."""
     if not source.exists():
         raise MissingInputError("there is no such log", str(source))
     mode = source.stat().st_mode
@@ -82,15 +75,10 @@ class Output:
 
 @contextmanager
 def replacing(target: Path) -> Iterator[Output]:
-    """Open a file that takes its name only when it is complete.
+    """Open a file that takes its name only when it is complete; what stood there before is left until then.
 
     A symbolic link stays, and the file to which it points is replaced, with its permissions kept. Standard output,
     pipes and devices are written to as they are.
-
-    Raises
-    ------
-    InputError
-        If the output cannot be written; what stood there before is left.
     """
     descriptor, part = _descriptor(target), None
     file = target if descriptor is not None else target.resolve()

@@ -31,12 +31,7 @@ class Temperatures:
     """Temperatures of a log, run by run; the log is read first up to its first temperature.
 
     ``readings`` is the topic of the readings, ``smoothing`` the memory, s, of the line through the temperature's past;
-    0 takes the last temperature.
-
-    Raises
-    ------
-    IngestError
-        If the log holds no temperature.
+    0 takes the last temperature. A log without temperature is refused.
     """
 
     def __init__(self, settings: McapFormat, path: Path, readings: str | None, smoothing: float) -> None:

@@ -34,13 +34,7 @@ if TYPE_CHECKING:
 
 
 def axis_matrix(axis_map: Sequence[str]) -> NDArray[np.float64]:
-    """Return the (3, 3) signed permutation ``B`` of an axis map, ``body = B @ reading``.
-
-    Raises
-    ------
-    ConfigurationError
-        If the map does not name each body axis once, with its sign.
-    """
+    """Return the (3, 3) signed permutation ``B`` of an axis map, ``body = B @ reading``."""
     entries = [str(a) for a in axis_map]
     if [a for a in entries if a[:1] not in "+-" or a[1:] not in AXES] or sorted(a[1:] for a in entries) != list(AXES):
         raise ConfigurationError(
@@ -54,13 +48,7 @@ def axis_matrix(axis_map: Sequence[str]) -> NDArray[np.float64]:
 
 
 def axis_maps(sensor: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
-    """Return the axis map of each sensor: its own, else that of the unit, else straight.
-
-    Parameters
-    ----------
-    sensor : mapping
-        Section of the unit's configuration.
-    """
+    """Return the axis map of each sensor by the section ``sensor``: its own, else that of the unit, else straight."""
     common = sensor.get("axis_map") or STRAIGHT
     return {s: tuple((sensor.get(s) or {}).get("axis_map") or common) for s in TRIADS}
 
@@ -72,14 +60,9 @@ def maps_of_log(log: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
 
 
 def to_body_axes(table: ChannelTable, maps: Mapping[str, Sequence[str]]) -> ChannelTable:
-    """Turn a table's readings into the body's axes, integers and all.
+    """Rotate readings and their counts into the body's axes, by the axis map of each sensor.
 
     A left-handed map is used as it stands, with a note: no rotation does that, only a sensor with such axes.
-
-    Parameters
-    ----------
-    maps : mapping
-        Axis map of ``accelerometer`` and ``gyroscope``.
     """
     values, encodings, notes = dict(table.values), dict(table.encodings), table.notes
     matrices = {sensor: axis_matrix(maps[sensor]) for sensor in TRIADS}

@@ -20,22 +20,9 @@ if TYPE_CHECKING:
 class ChannelTable:
     """The samples of one file.
 
-    Attributes
-    ----------
-    path : str
-        The file.
-    time_ns : (n,) array of int64, ns
-    values : dict of str to (n,) array
-        Channel (``accel_x`` ... see ``pipeline.io.units``) to values in its house unit.
-    source : dict
-        ``file``, ``sha256``, ``rows``.
-    line_of : callable
-        Row, counted from 0, to the line of the file, counted from 1; 0 where a format has no lines.
-    encodings : dict of str to Encoding
-        Channels that came as integers.
-    notes : tuple of Note
-    flags : (n,) array of uint16, or None
-        As of ``Recording``: what the reader itself marks.
+    ``values`` are in house units, by channel (``pipeline.io.units.CHANNELS``). ``line_of`` maps a row, counted from 0, to
+    the line of the file, counted from 1; 0 where a format has no lines. ``flags`` as of ``Recording``: what the reader
+    itself marks.
     """
 
     path: str

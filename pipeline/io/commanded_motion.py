@@ -42,19 +42,9 @@ FARTHEST = 0.5  # of the rest beside a move
 
 
 def follow_program(table: ChannelTable, program: Sequence[Mapping[str, Any]]) -> ChannelTable:
-    """Return a log with the angle and rate of a table that was commanded so.
+    """Return a log with the angle and rate of a table that was commanded so; the gyroscope must show the moves.
 
-    Parameters
-    ----------
-    table : ChannelTable
-        With a gyroscope, without the table's channels.
-    program : sequence of mapping
-        Rests ``{rest_s}``, turns ``{turn_deg, rate_dps, acceleration_dps2}`` and ``{repeat, steps}``.
-
-    Raises
-    ------
-    IngestError
-        If the gyroscope did not see these moves.
+    ``program`` has rests ``{rest_s}``, turns ``{turn_deg, rate_dps, acceleration_dps2}`` and ``{repeat, steps}``.
     """
     knots = knots_of(program)
     fit = fit_clocks(table, _as_log(table, knots))

@@ -46,19 +46,8 @@ def find_columns(names: list[str], settings: CsvFormat, where: str, below: dict[
     """Return the channels that a file holds, each with the index of its column.
 
     All columns of one sensor may be missing where those of the other are found and fewer than three columns are left
-    over that could hold them under other names: then the log is of one sensor.
-
-    Parameters
-    ----------
-    where : str
-        Place of the header, for refusals.
-    below : dict of int to str
-        The next lines, by their number, searched for a header that was not expected there.
-
-    Raises
-    ------
-    IngestError
-        If a column is missing, a name stands twice, or a name states another unit than the profile.
+    over that could hold them under other names: then the log is of one sensor. ``below`` are the next lines, by their
+    number, searched for a header that was not expected there.
     """
     twice = sorted({n for n in names if n and names.count(n) > 1})
     if twice:
@@ -203,8 +192,8 @@ class Layout:
 class Fault:
     """A line that is no row of numbers.
 
-    ``kind`` is a code of ``HINTS``. ``short``: it has too few fields. ``parted_before``: the line is a row, but the
-    next line, of that number, may hold the end of its last number.
+    ``kind`` is a code of ``HINTS``. ``parted_before``: the line is a row, but the next line, of that number, may hold the
+    end of its last number.
     """
 
     line: int

@@ -32,13 +32,7 @@ TABLE_TIME = "table_time"
 
 
 def read_csv(paths: Sequence[Path], formats: Sequence[CsvFormat], checks: Checks | None = None) -> ChannelTable:
-    """Return the channels of a text log, or of the files of one recording.
-
-    Raises
-    ------
-    IngestError
-        With ``path:line`` of the line concerned.
-    """
+    """Return the channels of a text log, or of the files of one recording."""
     tables = [read_one(path, layout, checks or Checks()) for path, layout in zip(paths, formats, strict=True)]
     same = [t for t, layout in zip(tables, formats, strict=True) if not layout.own_clock]
     others = [t for t, layout in zip(tables, formats, strict=True) if layout.own_clock]

@@ -45,15 +45,12 @@ class Rows:
 
     Attributes
     ----------
-    layout : Layout
-    sha256 : str
     numbers : dict of int to (n,) array
         The columns in use, by index.
     lines : (n,) array of int64
         The line of each row, counted from 1.
     exact_ns : (n,) array of int64, ns, or None
         Times from their decimal digits, where doubles are too coarse.
-    notes : tuple of Note
     repaired : int
         Rows that were dropped, which count against ``repaired_rows``.
     restarts : tuple of int
@@ -156,13 +153,7 @@ class _RowReader:
             self.columns.append(columns, int(1.02 * len(lines) * self.size / len(body)) + 16)
 
     def rows(self, checks: Checks) -> Rows:
-        """Return all rows, without those that may be dropped.
-
-        Raises
-        ------
-        IngestError
-            If there are no rows, or lines that may not be dropped, or too many of them.
-        """
+        """Return all rows, without those that may be dropped."""
         if self.layout is None:
             raise self.log.no_rows()
         notes, repaired = self._drop_faults(self.layout, checks)

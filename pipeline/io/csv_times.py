@@ -77,13 +77,7 @@ def whole_times(values: NDArray[np.float64], unit: str, tick_ns: Fraction | None
 
 
 def times_of(rows: Rows, settings: CsvFormat) -> NDArray[np.int64]:
-    """Return the time of each row, ns.
-
-    Raises
-    ------
-    IngestError
-        If a time is out of range, or the times have lost their digits.
-    """
+    """Return the time of each row, ns; refuse times out of range, or that have lost their digits."""
     if settings.rate_hz is not None:
         return np.asarray(np.rint(np.arange(len(rows.lines)) * (1e9 / settings.rate_hz)).astype(np.int64))
     column, index = next((c, i) for c, i in rows.layout.columns if c.channel == "time")
@@ -124,11 +118,8 @@ def in_order(
 ) -> tuple[Rows, NDArray[np.int64]]:
     """Return rows in the order of their times, each time once, and these times.
 
-    Raises
-    ------
-    IngestError
-        If a time goes back otherwise than by an overflow or by displaced rows, if two rows of one time differ, or if
-        more would have to be repaired than ``checks`` allows.
+    A time that goes back otherwise than by an overflow or by displaced rows is refused, as are two rows of one time that
+    differ, and more repairs than ``checks`` allows.
     """
     clock = time_column(rows.layout)
     tick_ns = float(settings.tick_ns or UNITS["time"][clock[0].unit if clock else "s"][0])

@@ -35,16 +35,10 @@ HEADER = (
 
 
 def write_canonical_csv(path: Path, recording: Recording, decimals: Mapping[str, int] | None = None) -> None:
-    """Write a recording as canonical CSV; channels that it does not hold are left out.
+    """Write a recording as canonical CSV; the file is replaced at once, never half written.
 
-    Readings are written along the body axes: they are read back with the axis map [+x, +y, +z].
-
-    Parameters
-    ----------
-    path : Path
-        Replaced at once, never half written.
-    decimals : mapping of str to int, optional
-        Header name (``accel_x_g`` ...) to digits after the point; a column that is not named keeps every bit.
+    Readings are written along the body axes. ``decimals``: header name (``accel_x_g`` ...) to digits after the point; a
+    column that is not named keeps every bit.
     """
     decimals = decimals or {}
     columns = _columns(recording)

@@ -69,14 +69,10 @@ LARGEST_SHARE = 0.1  # of the pieces
 def leave_out_disturbances(
     recording: Recording, note: Callable[[str, NDArray[np.intp], str], Note], largest_share: float
 ) -> Recording:
-    """Return a recording without its disturbed samples, each event noted.
+    """Return a recording without its disturbed samples, each event noted by ``note``, that of its ``ChannelTable``.
 
-    Parameters
-    ----------
-    note : callable
-        ``ChannelTable.note`` of its file.
-    largest_share : float
-        Of the samples. Where more would have to go, all are kept, and that is noted: it is how the bench behaves.
+    Where more than ``largest_share`` of the samples would have to go, all are kept, and that is noted: it is how the
+    bench behaves.
     """
     silent = recording.accelerometer is None and recording.gyroscope is None
     if silent or largest_share == 0 or recording.samples < 4 * FEWEST_AROUND:
@@ -272,15 +268,7 @@ class _Motion:
 
 
 def leave_out_shaken_rests(recording: Recording, note: Callable[[str, Index, str], Note]) -> Recording:
-    """Return a recording without the pieces of its rests that were shaken, noted as ``N-SHAKEN``.
-
-    Parameters
-    ----------
-    recording : Recording
-        Others than those that log a table's rate or angle are returned as they are.
-    note : callable
-        ``ChannelTable.note`` of its file.
-    """
+    """Return a recording of a table without the pieces of its rests that were shaken, noted as ``N-SHAKEN``."""
     pieces = _pieces(recording)
     if len(pieces) < FEWEST_PIECES:
         return recording

@@ -40,18 +40,16 @@ SAME_SIGN = 0.9  # correlation of the logged rate with the slope of the angle
 
 @dataclass(frozen=True)
 class Signals:
-    """Signals of a table's motion that sensors respond to, on a regular grid of the table's own time.
+    """Signals of a table's motion that sensors respond to, on a regular grid of the table's own time from its first sample.
 
     Attributes
     ----------
-    step : float, s
-        Of the grid, which begins at the log's first sample.
+    step, interval : float, s
+        Of the grid; median of the log's own.
     rates : (n, m) array, deg/s
         Signals that angular rates follow.
     directions : (n, p) array
         Signals that specific forces follow; p is 0 where the log does not determine them.
-    interval : float, s
-        Median of the log's own.
     magnitude : bool
         Whether only the magnitude of the rate is known.
     """
@@ -192,13 +190,7 @@ def _merged(  # noqa: PLR0917  (parts of one table)
 
 
 def signals_of(log: ChannelTable) -> Signals:
-    """Return the signals of a table's motion that sensors respond to.
-
-    Raises
-    ------
-    IngestError
-        If the log holds neither rate, angle nor attitude.
-    """
+    """Return the signals of a table's motion that sensors respond to; refuse a log without rate, angle and attitude."""
     own = seconds_of(log)
     found = interpolators(log)
     step = max(FINEST_OF_ATTITUDE_S if ATTITUDE[0] in found else FINEST_S, own[-1] / MOST_POINTS)

@@ -58,13 +58,7 @@ class FieldPath:
 
 
 def place_of(path: FieldPath, layout: MessageLayout) -> tuple[int, str] | None:
-    """Return the byte and the type of a number in a layout; None if it belongs to an empty list.
-
-    Raises
-    ------
-    ValueError
-        If the message has no such number.
-    """
+    """Return the byte and the type of a number in a layout; None if it belongs to an empty list."""
     place: Place | None = layout.places.get(path.base)
     if place is None:
         raise ValueError(f"it has no number {path.base}; it has {', '.join(layout.places)}")

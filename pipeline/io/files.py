@@ -57,20 +57,9 @@ FOREIGN = {
 
 
 def recording_files(procedure: Mapping[str, Any], ingest: Mapping[str, Any], folder: Path) -> dict[str, list[Path]]:
-    """Return the existing files of each recording of a procedure.
+    """Return the existing files of each recording of a procedure, in its order.
 
-    Parameters
-    ----------
-    procedure, ingest : mapping
-        Sections of the unit's configuration.
-    folder : Path
-        Where the unit's recordings lie.
-
-    Returns
-    -------
-    dict of str to list of Path
-        In the order of the procedure; a recording without any file is absent, one with some of its parts missing has
-        those that exist.
+    A recording without any file is absent, one with some of its parts missing has those that exist.
     """
     found = {}
     for name, candidates in candidate_files(procedure, ingest).items():
@@ -83,18 +72,7 @@ def recording_files(procedure: Mapping[str, Any], ingest: Mapping[str, Any], fol
 
 
 def candidate_files(procedure: Mapping[str, Any], ingest: Mapping[str, Any]) -> dict[str, list[list[str]]]:
-    """Return which files each recording may lie in, most wanted first.
-
-    Returns
-    -------
-    dict of str to list of list of str
-        Recording to alternatives, each the names of all files that make up the recording.
-
-    Raises
-    ------
-    ConfigurationError
-        If the profile's parts do not say which recording they belong to.
-    """
+    """Return which files each recording may lie in: alternatives, most wanted first, each with the names of all its files."""
     recordings: Mapping[str, Mapping[str, Any]] = procedure["recordings"]
     parts: Sequence[Mapping[str, Any]] = (ingest.get("csv") or {}).get("parts") or ()
     owner = _owner_of_parts(recordings, parts)
@@ -137,13 +115,7 @@ def wrong_name(name: str) -> str:
 
 
 def not_regular(path: Path) -> str:
-    """Return why a path cannot be read as a file, empty for a regular file or a link to one.
-
-    Raises
-    ------
-    OSError
-        If the path does not exist, or a folder above it cannot be searched.
-    """
+    """Return why a path cannot be read as a file, empty for a regular file or a link to one; ``OSError`` if there is none."""
     try:
         kind = stat.S_IFMT(path.stat().st_mode)
     except FileNotFoundError:
@@ -156,13 +128,7 @@ def not_regular(path: Path) -> str:
 
 
 def read_text(path: Path, largest: int, what: str) -> str:
-    """Return the text of a UTF-8 file of at most ``largest`` bytes; ``what`` it holds is named in refusals.
-
-    Raises
-    ------
-    ConfigurationError
-        If it is no regular file, cannot be read, is not UTF-8, or is larger.
-    """
+    """Return the text of a UTF-8 file of at most ``largest`` bytes; ``what`` it holds is named in refusals."""
     try:
         other = not_regular(path)
         if other:

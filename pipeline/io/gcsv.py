@@ -47,13 +47,7 @@ EXTRA = {
 
 
 def read_gcsv(path: Path, checks: Checks) -> ChannelTable:
-    """Return the channels of a ``.gcsv`` file in the axes of its orientation; raw counts stay integers.
-
-    Raises
-    ------
-    IngestError
-        If the head is not that of such a file, or as for any text log.
-    """
+    """Return the channels of a ``.gcsv`` file in the axes of its orientation; raw counts stay integers."""
     names, facts, line = _read_head(path)
     table = read_one(path, _format(names, facts, line, path), checks)
     table = to_body_axes(table, dict.fromkeys(TRIADS, _orientation(facts, path)))

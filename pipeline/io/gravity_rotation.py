@@ -49,12 +49,8 @@ FITS_DEG, FAILS_DEG = 15.0, 30.0  # the next possible unit misses by tens of deg
 class Move:
     """A move between two rests.
 
-    Attributes
-    ----------
-    turns : (64, 3) array
-        Integral of the angular rate over parts of the move, unit of the gyroscope times s.
-    before, after : (3,) array
-        Direction of the specific force at rest.
+    ``turns``: integral of the angular rate over parts of the move, (64, 3), unit of the gyroscope times s. ``before`` and
+    ``after``: direction of the specific force at rest.
     """
 
     turns: NDArray[np.float64]
@@ -68,14 +64,7 @@ class Move:
 
 
 def rests_of(force: NDArray[np.float64], interval_s: float) -> list[tuple[int, int]]:
-    """Return the samples, start and stop, of stretches of at least half a second in which the sensor rests.
-
-    Parameters
-    ----------
-    force : (n, 3) array
-        Specific force in any unit.
-    interval_s : float, s
-    """
+    """Return start and stop of stretches of at least half a second in which the sensor rests, by (n, 3) forces in any unit."""
     width = max(SHORTEST_BLOCK, round(BLOCK_S / interval_s))
     count = len(force) // width
     if count < 4:
@@ -98,14 +87,7 @@ def _keeps_its_direction(means: NDArray[np.float64]) -> bool:
 
 
 def moves_of(force: NDArray[np.float64], rate: NDArray[np.float64], time_s: NDArray[np.float64]) -> list[Move]:
-    """Return the moves between rests in which gravity turned by more than 20 degrees.
-
-    Parameters
-    ----------
-    force, rate : (n, 3) array
-        In any unit.
-    time_s : (n,) array, s
-    """
+    """Return the moves between rests in which gravity turned by more than 20 degrees, by (n, 3) readings in any unit."""
     steps = np.diff(time_s, append=2 * time_s[-1] - time_s[-2])
     rests = rests_of(force, float(np.median(steps)))
     found: list[Move] = []
@@ -133,10 +115,7 @@ def misfit_deg(moves: Sequence[Move], scales: Sequence[float]) -> NDArray[np.flo
 def misfits_deg(moves: Sequence[Move], scales: Sequence[float]) -> NDArray[np.float64]:
     """Return the angle between the gravity that each scale predicts after a move and the one that was read.
 
-    Parameters
-    ----------
-    scales : sequence of float
-        Candidates of ``s``, deg/s in one unit of the gyroscope.
+    ``scales`` are candidates of ``s``, deg/s in one unit of the gyroscope.
     """
     factors = np.radians(np.asarray(scales, float))[None, :, None]
     direction = np.repeat(np.stack([m.before for m in moves])[:, None, :], len(scales), axis=1)

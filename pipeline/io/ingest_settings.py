@@ -168,13 +168,7 @@ S = TypeVar("S", bound=Section)
 
 
 def validated(model: type[S], section: Mapping[str, Any], where: str, **context: object) -> S:
-    """Return a section as its model.
-
-    Raises
-    ------
-    ConfigurationError
-        Naming the key below ``where``, its value and what is allowed.
-    """
+    """Return a section as its model; a refusal names the key below ``where``, its value and what is allowed."""
     refuse_unknown(where, section, tuple(model.model_fields))
     try:
         return model.model_validate(dict(section), context=context)
@@ -205,13 +199,7 @@ def checks_of(ingest: Mapping[str, Any]) -> Checks:
 
 
 def csv_formats(ingest: Mapping[str, Any]) -> list[CsvFormat]:
-    """Return the layout of each text file of a recording: one, or one for each of the profile's ``parts``.
-
-    Raises
-    ------
-    ConfigurationError
-        Naming the key, its value and what is allowed.
-    """
+    """Return the layout of each text file of a recording: one, or one for each of the profile's ``parts``."""
     csv: Mapping[str, Any] = ingest.get("csv") or {}
     own = tuple(k for k in CsvFormat.model_fields if k != "own_clock")
     refuse_unknown("ingest.csv", csv, (*own, "parts"))
@@ -273,13 +261,7 @@ def _check_channels(formats: Iterable[CsvFormat]) -> None:
 
 
 def check_ingest(ingest: Mapping[str, Any], procedure: Mapping[str, Any] | None = None) -> None:
-    """Refuse an ingest profile that no file could be read with, or whose parts do not suit the procedure.
-
-    Raises
-    ------
-    ConfigurationError
-        Naming the key, its value and what is allowed.
-    """
+    """Refuse an ingest profile that no file could be read with, or whose parts do not suit the procedure."""
     from pipeline.io.mcap_settings import mcap_format  # noqa: PLC0415  (it uses the checks of this module)
 
     mcap_format(ingest)

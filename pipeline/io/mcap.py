@@ -36,13 +36,7 @@ if TYPE_CHECKING:
 
 
 def read_mcap(path: Path, settings: McapFormat) -> ChannelTable:
-    """Read a log.
-
-    Raises
-    ------
-    IngestError
-        If the file is damaged or incomplete, has no or several Imu topics, or its times cannot be.
-    """
+    """Read a log; refuse one that is damaged, incomplete, without Imu topic or with several, or with impossible times."""
     with unchanged(path), path.open("rb") as stream:
         return read_stream(stream, str(path), settings)
 
@@ -88,13 +82,7 @@ class _Topic:
             self.values.setdefault(name, []).append(column)
 
     def series(self, settings: McapFormat, notes: list[Note]) -> _Series:
-        """Return all messages in the order of their times.
-
-        Raises
-        ------
-        IngestError
-            If a message could not be decoded, or the times cannot be.
-        """
+        """Return all messages in the order of their times."""
         if self.error is not None:
             raise self.error
         topic, path, decoders = self.decoder.topic, self.decoder.path, self.decoder.decoders.values()

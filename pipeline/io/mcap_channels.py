@@ -55,15 +55,7 @@ def topic_of(kind: str, settings: McapFormat) -> str | None:
 
 
 class TopicDecoder:
-    """Decoder of one topic; ``path`` names the file in messages.
-
-    Attributes
-    ----------
-    encodings : dict of str to Encoding
-        Channels that are sent as counts.
-    count : int
-        Messages so far.
-    """
+    """Decoder of one topic; ``encodings`` are those of channels that are sent as counts, ``count`` the messages so far."""
 
     def __init__(self, topic: str, kind: str, settings: McapFormat, path: str) -> None:
         self.topic, self.kind, self.path = topic, kind, path
@@ -82,13 +74,7 @@ class TopicDecoder:
         self._absent: dict[str, bool] = {}  # columns, by the first message
 
     def read(self, rows: Rows, reader: McapReader) -> Batch:
-        """Return time and channels of some messages; channels that are absent are left out.
-
-        Raises
-        ------
-        IngestError
-            If a message is not what its definition says, or a channel is absent in some messages only.
-        """
+        """Return time and channels of some messages; channels that are absent are left out."""
         recorded = rows.heads["log_time"]
         if (recorded > LARGEST_NS).any():
             number = self.count + int(np.argmax(recorded > LARGEST_NS)) + 1

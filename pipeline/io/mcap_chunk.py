@@ -45,19 +45,16 @@ class Rows:
 
     Attributes
     ----------
-    channel : int
     data : (m,) array of uint8
         All records of the run.
     heads : (n,) structured array
-        Opcode, length, channel, sequence and times of each message.
+        ``HEAD`` of each message.
     starts, sizes : (n,) arrays of int64
         Where the payload of each message begins in ``data``, and its bytes.
     stride : int
         Distance of the starts where it is the same for all, else 0.
-    place : str
-        The run, for messages: ``chunk 3``.
-    offset : int
-        Byte of the file at which the run begins.
+    place, offset : str, int
+        The run, for messages: ``chunk 3``; byte of the file at which it begins.
     """
 
     channel: int
@@ -88,10 +85,8 @@ class Run:
 
     Attributes
     ----------
-    offset : int
-        Byte of the file at which the chunk, or the first message outside chunks, begins.
-    name : str
-        For messages: ``chunk 3``.
+    offset, name : int, str
+        Byte of the file at which the chunk, or the first message outside chunks, begins; its name for messages.
     data : bytes
         The chunk's records, or the messages.
     loose : bool
@@ -116,10 +111,7 @@ class Run:
 def unpack(content: bytes, expected: int, compression: str) -> bytes | memoryview:
     """Return the records of a chunk, ``expected`` bytes by its head; compression is empty, ``zstd`` or ``lz4``.
 
-    Raises
-    ------
-    ValueError
-        If the size is too large for any log, before memory is allocated, or not what the chunk holds.
+    A size too large for any log is refused before memory is allocated.
     """
     if expected > min(LARGEST_CHUNK, max(ALWAYS_ALLOWED, LARGEST_EXPANSION * len(content))):
         raise ValueError(f"a chunk claims to hold {expected} bytes, packed into {len(content)}: damaged, or no log")
@@ -146,13 +138,7 @@ def unpack(content: bytes, expected: int, compression: str) -> bytes | memoryvie
 
 
 def split(run: Run) -> tuple[list[tuple[int, memoryview]], list[Rows]]:
-    """Return the other records (opcode, content) of a run, and its messages: one ``Rows`` for each channel.
-
-    Raises
-    ------
-    ValueError
-        If the records do not fill the run.
-    """
+    """Return the other records (opcode, content) of a run, and its messages; ``ValueError`` if records do not fill the run."""
     data = np.frombuffer(run.data, np.uint8)
     first, others = _leading(run.data)
     if first == len(data):

@@ -56,23 +56,15 @@ class McapReader:
 
     Parameters
     ----------
-    stream : binary file
-        At its beginning.
     path : str
         For messages.
     allow_truncated : bool
         Whether the complete chunks of a file without end are read.
 
-    Raises
-    ------
-    IngestError
-        If the file is not an MCAP file.
-
     Attributes
     ----------
-    schemas, channels : dict of int to Schema, Channel
-    counts : Counter
-        Channel to number of messages.
+    schemas, channels, counts
+        By number; ``counts`` are those of messages.
     chunks : list of int
         Byte at which each chunk begins.
     position : int
@@ -124,13 +116,7 @@ class McapReader:
             yield from run.rows
 
     def runs(self) -> Iterator[Run]:
-        """Yield the data section in runs: records, and the messages of one chunk or between chunks.
-
-        Raises
-        ------
-        IngestError
-            If a byte is damaged or missing; no other exception.
-        """
+        """Yield the data section, run by run; damage, and a part that is missing, raise ``IngestError``."""
         try:
             self._take(len(MAGIC))
             try:
@@ -341,12 +327,7 @@ class McapReader:
 
 
 def check_magic(start: bytes, path: str) -> None:
-    """Refuse a file that does not begin as an MCAP file does, and name what it is.
-
-    Raises
-    ------
-    IngestError
-    """
+    """Refuse a file that does not begin as an MCAP file does, and name what it is."""
     if start.startswith(MAGIC):
         return
     if not start:

@@ -40,10 +40,7 @@ class _Content(ReadDataStream):
 def parsed(kind: Any, content: bytes | memoryview) -> Any:  # noqa: ANN401  (a class of the library, its record)
     """Return the record in a content, which may be longer: later versions of the format append to it.
 
-    Raises
-    ------
-    ValueError
-        If the content is too short, a text is not UTF-8, or the lengths in it contradict each other.
+    ``ValueError``: it is too short, a text is not UTF-8, or the lengths in it contradict each other.
     """
     record = kind.read(_Content(BytesIO(content)))
     if kind is not Chunk and not bytes(content).startswith(bytes_of([record])[RECORD_HEAD:]):

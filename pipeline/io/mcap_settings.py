@@ -60,13 +60,7 @@ class McapFormat(Section):
 
 
 def mcap_format(ingest: Mapping[str, Any]) -> McapFormat:
-    """Return how an MCAP file is read.
-
-    Raises
-    ------
-    ConfigurationError
-        Naming the key, its value and what is allowed.
-    """
+    """Return how an MCAP file is read."""
     section = dict(ingest.get("mcap") or {})
     topics = section.pop("topics", None) or {}
     settings = validated(McapFormat, section, "ingest.mcap")

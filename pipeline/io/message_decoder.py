@@ -65,13 +65,7 @@ class Batch:
 
 
 class ChannelDecoder:
-    """Decoder of one channel; ``path`` names the file in messages.
-
-    Raises
-    ------
-    IngestError
-        If the channel's encoding is not supported or its definition cannot be read.
-    """
+    """Decoder of one channel; ``path`` names the file in messages. An encoding that is not supported is refused."""
 
     def __init__(self, channel: Channel, schema: Schema | None, wanted: Wanted, path: str) -> None:
         self.topic, self.wanted, self.path = channel.topic, wanted, path
@@ -96,13 +90,7 @@ class ChannelDecoder:
             raise IngestError(message, path, code="unsupported", hint=SUPPORTED)
 
     def read(self, rows: Rows) -> Batch:
-        """Return the columns of messages.
-
-        Raises
-        ------
-        IngestError
-            Naming the first message that is not what its definition says.
-        """
+        """Return the columns of messages; a refusal names the first message that is not what its definition says."""
         layout = self._common_layout(rows)
         if layout is not None:
             batch = self._in_message(0, rows, lambda _payload: self._columns(rows, layout))
@@ -192,13 +180,7 @@ class ChannelDecoder:
 
 
 def ros_layouts(channel: Channel, schema: Schema | None) -> FindLayout | None:
-    """Return the function that finds the layout of a channel's ROS messages; None for other encodings.
-
-    Raises
-    ------
-    ValueError
-        If the definition cannot be read.
-    """
+    """Return the function that finds the layout of a channel's ROS messages; None for other encodings."""
     if schema is None or (channel.message_encoding, schema.encoding) not in ROS_TIMES:
         return None
     times, cdr = ROS_TIMES[channel.message_encoding, schema.encoding], channel.message_encoding == "cdr"

@@ -90,13 +90,7 @@ def short_name(name: str) -> str:
 
 
 def parse_definition(name: str, text: str, given: Definitions) -> Definitions:
-    """Return the definitions in the text of the message type ``name``, and those ``given`` that it may leave out.
-
-    Raises
-    ------
-    ValueError
-        Naming the line that is no field, or the type that is not defined.
-    """
+    """Return the definitions in the text of the message type ``name``, and those ``given`` that it may leave out."""
     sections = _SECTION.split(text)
     bodies = {short_name(name): sections[0]}
     for section in sections[1:]:
@@ -156,15 +150,8 @@ class Place:
 class MessageLayout:
     """The layout of one message.
 
-    Attributes
-    ----------
-    sample : bytes
-    places : dict of str to Place
-        By path, such as ``linear_acceleration.x``.
-    texts : dict of str to str or list of str
-        The sample's texts, by path.
-    fixed : list of (start, end)
-        Bytes that another message of this layout has in common with the sample.
+    ``places`` of the numbers and ``texts`` are by path, such as ``linear_acceleration.x``. ``fixed``: spans of bytes that
+    another message of this layout has in common with the sample.
     """
 
     sample: bytes
@@ -208,10 +195,7 @@ def _words(start: int, end: int) -> Iterator[tuple[int, int]]:
 def find_layout(root: str, definitions: Definitions, sample: bytes, *, cdr: bool) -> MessageLayout:
     """Return the layout of one message of the type ``root``: CDR of either byte order, or ROS 1.
 
-    Raises
-    ------
-    ValueError
-        If the message does not have exactly the bytes that its definition needs.
+    ``ValueError``: the message does not have exactly the bytes that its definition needs.
     """
     finder = _LayoutFinder(definitions, sample, cdr=cdr)
     finder.message(root, "", 0)

@@ -93,12 +93,8 @@ def _array(values: NDArray[Any]) -> pa.Array:
 def load_recordings(path: Path) -> list[Recording]:
     """Read the recordings of a unit, each bit as it was saved.
 
-    The times are read at once, every other channel when it is used first: a stage decodes what it needs, once.
-
-    Raises
-    ------
-    InputError
-        If the file does not exist, is damaged or of a schema that is not known; here, or when a channel is used first.
+    The times are read at once, every other channel when it is used first: a stage decodes what it needs, once. Damage
+    raises ``InputError``, here or then.
     """
     stored = _StoredColumns(path)
     recordings: list[Recording] = []

@@ -40,15 +40,7 @@ def examine(
 ) -> tuple[NDArray[np.uint16] | None, list[Note]]:
     """Return quality flags (None where none is set) and notes; refuse what cannot be valid.
 
-    Parameters
-    ----------
-    sensor : mapping
-        Section of the unit's configuration; its full scales may be absent.
-
-    Raises
-    ------
-    IngestError
-        With a code of ``docs/bad_inputs.md``.
+    ``sensor`` is the section of the unit's configuration; its full scales may be absent.
     """
     checks = checks or Checks()
     _check_whole(table)

@@ -39,7 +39,7 @@ EPOCH_AFTER_NS = 100_000_000 * 1_000_000_000  # 3 years: no sensor has been on f
 def read_recordings(
     procedure: Mapping[str, Any], ingest: Mapping[str, Any], sensor: Mapping[str, Any], folder: Path
 ) -> list[Recording]:
-    """Read all recordings of a unit.
+    """Read all recordings of a unit, in the order of the procedure; optional ones that do not exist are left out.
 
     Parameters
     ----------
@@ -48,19 +48,12 @@ def read_recordings(
     folder : Path
         Where the unit's recordings lie.
 
-    Returns
-    -------
-    list of Recording
-        In the order of the procedure; optional ones that do not exist are left out.
-
     Raises
     ------
     MissingInputError
         If files that are not optional do not exist; one error names all.
     InputError
         If a file cannot be used; ``file`` holds its path, and line where there is one.
-    ConfigurationError
-        If the ingest profile or the axis map is no such thing.
     """
     files = recording_files(procedure, ingest, folder)
     wanted = candidate_files(procedure, ingest)
@@ -143,16 +136,10 @@ def _of_one_sensor(procedure: Mapping[str, Any], files: Mapping[str, list[Path]]
 def to_recording(
     name: str, entry: Mapping[str, Any], table: ChannelTable, sensor: Mapping[str, Any], checks: Checks
 ) -> Recording:
-    """Return a table's samples as a recording in body axes, examined and marked.
+    """Return a table's samples as a recording in body axes, examined and marked; the channels are taken out of the table.
 
-    Parameters
-    ----------
-    entry : mapping
-        What the procedure says of the recording: ``role``, ``axis``, and its ``program`` where the table logs nothing.
-    table : ChannelTable
-        Its channels are taken out of it.
-    sensor : mapping
-        Section of the unit's configuration.
+    ``entry`` is what the procedure says of the recording: ``role``, ``axis``, and ``program`` where the table logs
+    nothing. ``sensor`` is the section of the unit's configuration.
     """
     if entry.get("program") and not set(TABLE_CHANNELS) & table.values.keys():
         from pipeline.io.commanded_motion import follow_program  # noqa: PLC0415  (few tables need it)

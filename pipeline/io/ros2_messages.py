@@ -126,13 +126,7 @@ class _Message:
 
 
 def write_mcap(path: Path, recording: Recording) -> None:
-    """Write a recording as ROS 2 messages; the file is replaced at once, never half written.
-
-    Raises
-    ------
-    InputError
-        If a time is negative or later than a stamp can hold.
-    """
+    """Write a recording as ROS 2 messages; the file is replaced at once, never half written."""
     time = recording.time_ns
     if len(time) and not (time.min() >= 0 and time.max() < 2**31 * NANOSECONDS):
         raise InputError("times of a ROS 2 stamp lie between 0 and 2^31 s", str(path))

@@ -64,21 +64,8 @@ class Head:
 class TextLog:
     """The rows of a text log, block by block, each block with the numbers of its lines, counted from 1.
 
-    Parameters
-    ----------
-    stream : binary stream
-        At the beginning of the file.
-    keep_open_line : bool
-        Whether a last line without a newline is a row; else it is dropped with a note, as it may be cut.
-    block_bytes : int, optional
-        ``BLOCK_BYTES`` by default.
-
-    Attributes
-    ----------
-    head : Head or None
-        None until the header, or the first row of a log without one, was read.
-    comments, lines : list of int, int
-        Lines that are comments, and number of lines so far.
+    ``keep_open_line``: a last line without a newline is a row; else it is dropped with a note, as it may be cut. ``head``
+    is None until the header, or the first row of a log without one, was read. ``lines`` were read so far.
     """
 
     def __init__(
@@ -107,13 +94,7 @@ class TextLog:
         return notes
 
     def __iter__(self) -> Iterator[tuple[bytes, NDArray[np.int64]]]:
-        """Yield the rows, each with a newline after it; a block has at least one.
-
-        Raises
-        ------
-        IngestError
-            If the file is of another kind, holds NUL bytes, is no UTF-8 text, or its head is not as the profile says.
-        """
+        """Yield the rows, each with a newline after it; a block has at least one."""
         before = b""
         for block, numbers in self._blocks:
             self.lines, data = numbers.stop - 1, block

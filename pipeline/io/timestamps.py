@@ -72,14 +72,9 @@ def of_number(values: NDArray[Any], unit: str) -> NDArray[np.int64]:
 def check_plausible(
     topic: str, time: NDArray[np.int64], log_time: NDArray[np.int64], difference_s: float | None, path: str
 ) -> None:
-    """Refuse stamps that no clock gave.
+    """Refuse stamps ``time`` that no clock gave; ``log_time`` are the recorder's.
 
-    Parameters
-    ----------
-    time, log_time : (n,) array of int64, ns
-        Of the headers, and of the recorder.
-    difference_s : float or None
-        How far both may be apart, beyond a constant where the stamps do not count from 1970; None: any.
+    ``difference_s``: how far both may be apart, beyond a constant where the stamps do not count from 1970; None: any.
     """
     absolute = bool((np.abs(time) > SINCE_1970).any())
     strange = np.flatnonzero((time < YEAR_2000) | (time > YEAR_2100)) if absolute else np.flatnonzero(time < 0)
@@ -112,18 +107,8 @@ def in_order(
 ) -> tuple[NDArray[np.intp] | None, list[Note]]:
     """Return the order in which times increase, without messages that stand there twice; None where all is in order.
 
-    Parameters
-    ----------
-    time : (n,) array of int64, ns
-    columns : sequence of (n,) array
-        All that is read of the messages, for comparison.
-    reorder_s : float
-        How late a message may stand in the file, after later ones.
-
-    Raises
-    ------
-    IngestError
-        If messages stand later than that, or two with one stamp differ.
+    ``columns`` are all that is read of the messages, for comparison: two messages of one stamp that differ are refused.
+    So are messages that stand more than ``reorder_s`` after later ones.
     """
     steps = np.diff(time)
     if (steps > 0).all():

@@ -78,13 +78,7 @@ def read_yaml(path: Path, largest: int = LARGEST_SIZE) -> Any:  # noqa: ANN401  
 
 
 def load_yaml(text: str, where: str, largest: int = LARGEST_SIZE) -> Any:  # noqa: ANN401
-    """Return what a YAML text holds.
-
-    Raises
-    ------
-    ConfigurationError
-        As ``read_yaml``.
-    """
+    """Return what a YAML text holds; refusals as of ``read_yaml``."""
     try:
         _check_size(yaml.parse(text, Loader=_Loader), where, largest)
         return yaml.load(text, _Loader)  # noqa: S506  (a safe loader)

@@ -24,10 +24,7 @@ LONGEST_LIST = 4  # elements listed of an array
 def topic_lines(path: Path, *, fields: bool) -> list[tuple[str, str]]:
     """Return what an MCAP file holds, as pairs of label and text; nothing where it cannot be walked through.
 
-    Parameters
-    ----------
-    fields : bool
-        Whether the fields of messages of types that ingest does not know are listed.
+    ``fields``: whether the fields of messages of types that ingest does not know are listed.
     """
     first: dict[int, bytes] = {}
     try:

@@ -47,20 +47,9 @@ WORD = re.compile(r"[A-Za-z_][\w.-]*(/[\w^]+)?")
 class Proposal:
     """A proposed profile.
 
-    Attributes
-    ----------
-    files : list of str
-        Of a recording in parts, the file of each part.
-    layouts : list of TextLayout
-        Of its parts, one where there are none.
-    csv : dict
-        The ``csv`` section without columns.
-    columns : list of dict
-        Of each part: channel to its entry; ``???`` stands for what has to be filled in.
-    evidence : dict of str to str
-        By key of ``csv``, ``time``, sensor or channel.
-    remarks : list of str
-        What has to be decided, or is odd.
+    ``files``: of a recording in parts, the file of each. ``csv``: the section without columns. ``columns``: of each part,
+    channel to its entry; ``???`` stands for what has to be filled in. ``evidence``: by key of ``csv``, ``time``, sensor
+    or channel. ``remarks``: what has to be decided, or is odd.
     """
 
     files: list[str]

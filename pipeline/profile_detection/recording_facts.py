@@ -33,13 +33,7 @@ Line = tuple[str, str]
 
 
 def facts(recording: Recording, sensor: Mapping[str, Any] | None = None) -> list[Line]:
-    """Return what a recording holds, as pairs of label and text.
-
-    Parameters
-    ----------
-    sensor : mapping, optional
-        Section of a configuration, for the full scales.
-    """
+    """Return what a recording holds, as pairs of label and text; ``sensor`` has the full scales."""
     rests = _rests(recording)
     lines = [("time", _time(recording))]
     for name in SENSORS:

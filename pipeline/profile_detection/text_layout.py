@@ -35,26 +35,9 @@ RATE_KEY = re.compile(r"(fs|odr|(sampl\w*[ _]?)?(rate|freq\w*))\b", re.IGNORECAS
 class TextLayout:
     """The layout of a text log.
 
-    Attributes
-    ----------
-    delimiter, decimal : str
-        A blank stands for any run of blanks and tabs.
-    skip_lines : int
-        Lines before the header, or before the data.
-    header : bool
-        Whether a line of names stands before the data.
-    comment : str or None
-        Start of the lines before the data.
-    names : list of str
-        Of all columns.
-    numbers : dict of int to (n,) array
-        The columns that hold finite numbers only.
-    rate_hz : float or None
-        Sampling rate that a line before the data states.
-    rate_line : str
-        That line.
-    odd_rows : int
-        Rows with another number of fields.
+    ``delimiter``: a blank stands for any run of blanks and tabs. ``skip_lines``: before the header, or before the data.
+    ``comment``: start of the lines before the data. ``numbers``: the columns that hold finite numbers only. ``rate_hz``:
+    sampling rate that the line ``rate_line`` before the data states. ``odd_rows``: with another number of fields.
     """
 
     path: str
@@ -75,13 +58,7 @@ class TextLayout:
 
 
 def find_layout(data: bytes, path: str) -> TextLayout:
-    """Return the layout with the most columns of numbers.
-
-    Raises
-    ------
-    IngestError
-        If no part of the text is a table of numbers.
-    """
+    """Return the layout of a text; refuse one of which no part is a table of numbers."""
     lines = data.decode("utf-8", "replace").splitlines()
     tried = [_try(lines[:LINES_TRIED], separator, decimal) for separator in SEPARATORS for decimal in NUMBER]
     width, start, separator, decimal = max(tried, key=lambda t: (t[0], -t[1]))

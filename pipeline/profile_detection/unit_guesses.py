@@ -46,16 +46,8 @@ FEWEST_RESTS_FOR_A_SPHERE = 9  # twice the four unknowns, and one
 class Guess:
     """What may be said of a column.
 
-    Attributes
-    ----------
-    entry : dict
-        Of a profile; ``???`` stands for what has to be filled in.
-    evidence : str
-        What speaks for it.
-    second_s : float or None
-        Length of a time's unit in s.
-    centre : (3,) array
-        Of the sphere on which rests lie, zeros where it is not known: offset and bias.
+    ``entry`` of a profile; ``???`` stands for what has to be filled in. ``second_s``: length of a time's unit in s.
+    ``centre``: (3,), of the sphere on which rests lie, offset and bias; zeros where it is not known.
     """
 
     entry: dict[str, Any]
@@ -96,13 +88,7 @@ def time_unit(values: NDArray[np.float64], stated: str | None, why: str) -> Gues
 
 
 def force_unit(force: NDArray[np.float64], interval_s: float) -> Guess:
-    """Return the unit of a specific force.
-
-    Parameters
-    ----------
-    force : (n, 3) array
-    interval_s : float, s
-    """
+    """Return the unit of an (n, 3) specific force."""
     rests = rests_of(force, interval_s)
     means = np.array([force[a:b].mean(axis=0) for a, b in rests or [(0, len(force))]])
     size = float(np.median(np.linalg.norm(means, axis=1)))
@@ -147,18 +133,10 @@ def sphere(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
 
 
 def rate_unit(rate: NDArray[np.float64], moves: Sequence[Move], why_none: str, *, timed: bool) -> Guess:
-    """Return the unit of angular rates.
+    """Return the unit of (n, 3) angular rates by the ``moves`` between rests in which gravity turns (``why_none``).
 
-    Parameters
-    ----------
-    rate : (n, 3) array
-    moves : sequence of Move
-        Between rests, in which gravity turns.
-    why_none : str
-        Why there are none.
-    timed : bool
-        Whether the time is known; else its unit is a hundredth of an interval, and only the product of scale and
-        sampling rate can be told.
+    Where the time is not known (``timed``), its unit is a hundredth of an interval, and only the product of scale and
+    sampling rate can be told.
     """
     largest = float(np.abs(rate - np.median(rate, axis=0)).max())
     if whole(rate):
@@ -173,13 +151,7 @@ def rate_unit(rate: NDArray[np.float64], moves: Sequence[Move], why_none: str, *
 
 
 def rate_unit_by_table(rate: NDArray[np.float64], table_rate: NDArray[np.float64]) -> Guess | None:
-    """Return the unit of angular rates by the table's rate in the same rows; None where they do not follow it.
-
-    Parameters
-    ----------
-    rate : (n, 3) array
-    table_rate : (n,) array, deg/s
-    """
+    """Return the unit of (n, 3) angular rates by the table's, deg/s, in the same rows; None where they do not follow it."""
     table = table_rate - table_rate.mean()
     power = float(table @ table)
     if power < len(table):  # 1 deg/s rms: below, noise and bias wander tell more than the table

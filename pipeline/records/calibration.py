@@ -24,7 +24,6 @@ class StageResult:
 
     Attributes
     ----------
-    name : str
     parameters : dict
         Name to ``{"value", "unit", "standard_uncertainty"}``; the uncertainty may be None.
     residual_rms : float or None
@@ -45,16 +44,10 @@ class StageResult:
 
 @dataclass(frozen=True)
 class FittedEffect:
-    """A fitted effect: its name and parameters.
+    """A fitted effect; ``parameters`` map names to ``{"value", "unit", "expanded_uncertainty"}``.
 
-    Attributes
-    ----------
-    name : str
-    parameters : dict
-        Name to ``{"value", "unit", "expanded_uncertainty"}``.
-    definition : dict or None
-        Content of the file of a user's effect, so that the calibration can be applied without that file; None for a
-        built-in effect.
+    ``definition`` is the content of the file of a user's effect, so that the calibration can be applied without it; None
+    for a built-in effect.
     """
 
     name: str
@@ -73,22 +66,17 @@ class SensorCalibration:
 
     Attributes
     ----------
-    sensor : str
-        ``accelerometer`` or ``gyroscope``.
     bias : (3,) array, g or deg/s
     matrix : (3, 3) array, dimensionless
-    stages : tuple of StageResult
-    effects : tuple of FittedEffect
     covariance : (12, 12) array or None
         Of (bias_x..z, matrix_xx, matrix_xy .. matrix_zz), then each effect's parameters (then larger than 12). It
         includes every line of the uncertainty budget.
     degrees_of_freedom : float
         The smallest of the parameters.
-    converged : bool
     freedom : (p,) array or None
         Effective degrees of freedom of each parameter; None: ``degrees_of_freedom`` for all.
     budget : dict or None
-        The uncertainty budget as published; see ``pipeline.estimation.uncertainty_budget``.
+        As published; see ``pipeline.estimation.uncertainty_budget``.
     convergence : dict or None
         Evidence that the estimate is a minimum: ``cosine``, the largest between the residual and a column of the
         Jacobian; ``condition`` and ``rank`` of its scaled columns; ``parameters``, their number.
@@ -181,22 +169,18 @@ class Contribution:
 
     Attributes
     ----------
-    source : str
     kind : str
         ``A`` (from the scatter of these recordings) or ``B`` (from any other knowledge).
     distribution : str
         Assumed distribution of the input.
     covariance : (p, p) array
-        Of the parameters, from this source only.
-    degrees_of_freedom : (p,) array
+        Of the parameters, from this source only; ``degrees_of_freedom`` is (p,).
     input_uncertainty : float or None
         Standard uncertainty of the input; None where the source is not a single quantity.
-    input_unit : str
     independent : int
         How many independent quantities of this uncertainty the input stands for (stops of a table, axes).
     parts : dict of str to (p,) array
         Standard uncertainties that the contribution consists of, where they are known separately.
-    remark : str
     """
 
     source: str

@@ -23,40 +23,33 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Motion:
-    """The true motion, from a table's log (without noise) or from calibrated signals.
+    """The true motion, from a table's log (without noise) or from calibrated signals, in the body frame.
 
     Attributes
     ----------
     time : (n,) array, s since power-on
-    specific_force : (n, 3) array, g, body frame
-    angular_rate : (n, 3) array, deg/s, body frame
-    angular_acceleration : (n, 3) array, deg/s^2, body frame
-    specific_force_rate : (n, 3) array, g/s, body frame
+    specific_force, angular_rate, angular_acceleration : (n, 3) arrays, g, deg/s, deg/s^2
+    specific_force_rate : (n, 3) array, g/s
         Time derivative of ``specific_force`` as the body sees it (for gravity alone ``-omega x f``, omega in rad/s).
     temperature : (n,) array, degC, or None
         Smoothed over 30 s: sensor noise in a regressor would bias what is fitted to it.
-    angle, rate : (n,) array, deg and deg/s, or None
-        About the turn axis, where there is one.
-    axis : int or None
-        Index of the turn axis in the body frame.
+    angle, rate, axis : (n,) arrays, deg and deg/s, and index of the turn axis, or None
     still : (n,) array of bool
         Samples at which the body rests and has settled.
     at_offset : callable or None
-        ``at_offset(offset=tau)`` is this motion later by tau, s (a float or (n,) array), from its interpolated
-        trajectory; None where the trajectory is not known between the samples.
+        ``at_offset(offset=tau)`` is the motion at ``time + tau`` (tau a float or (n,) array, s), from the same
+        interpolated trajectory; None where the trajectory is not known between the samples.
     at_lag : callable or None
-        ``at_lag(lag=tau)`` is what a first-order lag of time constant tau, s, leaves of this motion.
+        ``at_lag(lag=tau, offset=0.0)`` is what a first-order lag of time constant tau, s, leaves of that motion.
     level : (n, 3, 3) array, or None
         Rows: the level frame's axes x, y, z in the body frame; None where no reference gives the heading.
     direction : (n, 3) array, or None
-        Unit vector in the body frame of the turn that goes on or, at rest, of the last one; zeros before the first.
-        None: not computed yet (``pipeline.model.effects.base.turning_direction`` computes it from the rates).
+        Unit vector of the turn that goes on or, at rest, of the last one; zeros before the first. None: not computed yet
+        (``pipeline.model.effects.base.turning_direction``).
     reference_valid : (n,) array of bool, or None
         Samples around which the table's log is dense enough to interpolate the trajectory.
-    recording : str
-        Name of the recording, for messages; empty where there is none.
-    setup : str
-        Its table, mounting or session; empty where there is one alone.
+    recording, setup : str
+        Name of the recording; its table, mounting or session; empty where there is one alone.
     """
 
     time: NDArray[np.float64]
@@ -130,14 +123,7 @@ def level_in_body(q: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def rate_of_attitude(time: NDArray[np.float64], attitude: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the magnitude of the angular rate: (n,) array, deg/s.
-
-    Parameters
-    ----------
-    time : (n,) array, s
-        n at least 6, increasing.
-    attitude : (n, 4) array
-    """
+    """Return the magnitude of the angular rate, (n,), deg/s, of an (n, 4) attitude at n >= 6 increasing times, s."""
     from scipy.interpolate import make_interp_spline  # noqa: PLC0415  (0.3 s, needed by attitude logs only)
 
     rate = make_interp_spline(time, continuous(attitude), k=5)(time, 1)

@@ -21,20 +21,11 @@ MEDIAN_STEP = 0.9539  # median of |w[n+1] - w[n]| of white noise with standard d
 
 @dataclass(frozen=True)
 class Noise:
-    """White noise of a sample and Gauss-Markov bias wander, per axis.
+    """White noise of a sample (before any filter) and Gauss-Markov bias wander: (3,) standard deviations, sensor's unit.
 
-    Attributes
-    ----------
-    white : (3,) array, unit of the sensor
-        Standard deviation of one raw sample, before any filter.
-    wander : (3,) array, unit of the sensor
-        Stationary standard deviation of the bias wander; 0 where none was seen.
-    correlation_time : float, s
-    source : str
-        ``static`` (a long rest), ``rests`` (rests in the recordings), ``residual`` (of a fit) or ``data_sheet``.
-    length : float, s
-        Duration of the static rest that it was estimated from, else 0. The relative uncertainty of the wander is about
-        ``sqrt(correlation_time / length)``.
+    ``source``: ``static`` (a long rest), ``rests`` (in the recordings), ``residual`` (of a fit) or ``data_sheet``.
+    ``length``, s, is that of the static rest, else 0; the relative uncertainty of the wander is about
+    ``sqrt(correlation_time / length)``.
     """
 
     white: NDArray[np.float64]
@@ -56,13 +47,6 @@ class Noise:
 def noise_of_steps(step: NDArray[np.float64], axis: int = 0, *, keepdims: bool = False) -> NDArray[np.float64]:
     """Return the standard deviation of white noise, ``median |x[n+1] - x[n]| / 0.9539``, along an axis.
 
-    Slow signals and outliers hardly change it.
-
-    Parameters
-    ----------
-    step : array
-        Absolute differences of successive samples, ``|x[n+1] - x[n]|``.
-    axis, keepdims
-        As of ``numpy.median``.
+    ``step`` are the absolute differences of successive samples. Slow signals and outliers hardly change the result.
     """
     return np.asarray(np.median(step, axis, keepdims=keepdims) / MEDIAN_STEP)

@@ -25,18 +25,8 @@ CLIPPED_OR_STUCK = 0b110  # bits 1 and 2 of ``Recording.flags``
 class Note:
     """A machine-readable remark on an input: what was found or repaired, how often and where.
 
-    Attributes
-    ----------
-    code : str
-        ``N-...`` code, for example ``N-GAP``.
-    count : int
-        How often it was found.
-    first, last : int
-        First and last line of the file concerned, counted from 1; 0 where lines do not apply.
-    detail : str
-        One sentence.
-    start_s, end_s : float or None, s
-        Times of the first and the last sample concerned, in the clock of the file; None where none is.
+    ``first`` and ``last`` line of the file concerned count from 1; 0 where lines do not apply. ``start_s`` and ``end_s``
+    are the times of the first and the last sample concerned, in the clock of the file.
     """
 
     code: str
@@ -73,24 +63,18 @@ class Recording:
     axis : str or None
         Body axis that the table turns about (``x``, ``y``, ``z``), None where there is no single axis.
     time_ns : (n,) array of int64, ns since power-on
-    accelerometer : (n, 3) array, g, or None
-    gyroscope : (n, 3) array, deg/s, or None
-    temperature : (n,) array, degC, or None
-    table_angle : (n,) array, deg, or None
-        About the turn axis; not wrapped.
-    table_rate : (n,) array, deg/s, or None
-        About the turn axis; in held-out motion the magnitude of the table's rate.
+    accelerometer, gyroscope : (n, 3) arrays, g and deg/s, or None
+    temperature, table_angle, table_rate : (n,) arrays, degC, deg, deg/s, or None
+        Angle and rate are about the turn axis, the angle not wrapped; in held-out motion the magnitude of the rate.
     table_attitude : (n, 4) array, or None
         Unit quaternion (w, x, y, z), body to level with z up.
     flags : (n,) array of uint16, or None
         Bit 0: a gap before this sample. Bit 1: clipped. Bit 2: stuck. Bit 3: repaired.
     source : dict
         ``file``, ``sha256``, ``rows`` of the input.
-    notes : tuple of Note
-        What ingest found or repaired.
     filter : dict
-        Name and settings of the filter that was applied, and ``delay_s``, the delay of its output in s
-        (0 where it is zero-phase), and ``noise_gain``, the factor on the standard deviation of white noise.
+        Name and settings of the filter that was applied; ``delay_s`` of its output (0 where it is zero-phase), and
+        ``noise_gain``, the factor on the standard deviation of white noise.
     encodings : dict of str to Encoding
         Columns that came as integers.
     setup : str
