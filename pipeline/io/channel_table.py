@@ -20,9 +20,8 @@ if TYPE_CHECKING:
 class ChannelTable:
     """The samples of one file.
 
-    ``values`` are in house units, by channel (``pipeline.io.units.CHANNELS``). ``line_of`` maps a row, counted from 0, to
-    the line of the file, counted from 1; 0 where a format has no lines. ``flags`` as of ``Recording``: what the reader
-    itself marks.
+    ``values`` are in house units, by channel (``pipeline.io.units.CHANNELS``). ``line_of`` maps a row, counted from 0,
+    to the line of the file, counted from 1; 0 where a format has no lines. ``flags``: what the reader itself marks.
     """
 
     path: str
