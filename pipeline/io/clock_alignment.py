@@ -94,7 +94,8 @@ class SensorSignals:
 def fit_clocks(sensor: ChannelTable, log: ChannelTable) -> ClockFit:
     """Return offset and drift of the table's clock, both times counted from the first sample of each log.
 
-    Refused are a sensor without gyroscope, and logs that do not show the same motion, or show it at several times alike.
+    Refused are a sensor without gyroscope, and logs that do not show the same motion, or show it at several times
+    alike.
     """
     if "gyro_x" not in sensor.values:
         raise IngestError("a table's log with its own clock needs a gyroscope to be aligned", log.path, code="no_sync")

@@ -192,8 +192,8 @@ class Layout:
 class Fault:
     """A line that is no row of numbers.
 
-    ``kind`` is a code of ``HINTS``. ``parted_before``: the line is a row, but the next line, of that number, may hold the
-    end of its last number.
+    ``kind`` is a code of ``HINTS``. ``parted_before``: the line is a row, but the next line, of that number, may hold
+    the end of its last number.
     """
 
     line: int

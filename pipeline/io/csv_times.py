@@ -118,8 +118,8 @@ def in_order(
 ) -> tuple[Rows, NDArray[np.int64]]:
     """Return rows in the order of their times, each time once, and these times.
 
-    A time that goes back otherwise than by an overflow or by displaced rows is refused, as are two rows of one time that
-    differ, and more repairs than ``checks`` allows.
+    A time that goes back otherwise than by an overflow or by displaced rows is refused, as are two rows of one time
+    that differ, and more repairs than ``checks`` allows.
     """
     clock = time_column(rows.layout)
     tick_ns = float(settings.tick_ns or UNITS["time"][clock[0].unit if clock else "s"][0])

@@ -40,7 +40,7 @@ SAME_SIGN = 0.9  # correlation of the logged rate with the slope of the angle
 
 @dataclass(frozen=True)
 class Signals:
-    """Signals of a table's motion that sensors respond to, on a regular grid of the table's own time from its first sample.
+    """Signals of a table's motion that sensors respond to, on a regular grid of the log's time from its first sample.
 
     Attributes
     ----------

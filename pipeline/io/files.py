@@ -72,7 +72,7 @@ def recording_files(procedure: Mapping[str, Any], ingest: Mapping[str, Any], fol
 
 
 def candidate_files(procedure: Mapping[str, Any], ingest: Mapping[str, Any]) -> dict[str, list[list[str]]]:
-    """Return which files each recording may lie in: alternatives, most wanted first, each with the names of all its files."""
+    """Return which files each recording may lie in: alternatives, most wanted first, each with all its files."""
     recordings: Mapping[str, Mapping[str, Any]] = procedure["recordings"]
     parts: Sequence[Mapping[str, Any]] = (ingest.get("csv") or {}).get("parts") or ()
     owner = _owner_of_parts(recordings, parts)
@@ -115,7 +115,7 @@ def wrong_name(name: str) -> str:
 
 
 def not_regular(path: Path) -> str:
-    """Return why a path cannot be read as a file, empty for a regular file or a link to one; ``OSError`` if there is none."""
+    """Return why a path cannot be read as a file, empty for a regular file or a link to one; ``OSError``: it is none."""
     try:
         kind = stat.S_IFMT(path.stat().st_mode)
     except FileNotFoundError:

@@ -49,8 +49,8 @@ FITS_DEG, FAILS_DEG = 15.0, 30.0  # the next possible unit misses by tens of deg
 class Move:
     """A move between two rests.
 
-    ``turns``: integral of the angular rate over parts of the move, (64, 3), unit of the gyroscope times s. ``before`` and
-    ``after``: direction of the specific force at rest.
+    ``turns``: integral of the angular rate over parts of the move, (64, 3), unit of the gyroscope times s. ``before``
+    and ``after``: direction of the specific force at rest.
     """
 
     turns: NDArray[np.float64]
@@ -64,7 +64,7 @@ class Move:
 
 
 def rests_of(force: NDArray[np.float64], interval_s: float) -> list[tuple[int, int]]:
-    """Return start and stop of stretches of at least half a second in which the sensor rests, by (n, 3) forces in any unit."""
+    """Return start and stop of stretches of at least half a second at rest, by (n, 3) forces in any unit."""
     width = max(SHORTEST_BLOCK, round(BLOCK_S / interval_s))
     count = len(force) // width
     if count < 4:
@@ -87,7 +87,7 @@ def _keeps_its_direction(means: NDArray[np.float64]) -> bool:
 
 
 def moves_of(force: NDArray[np.float64], rate: NDArray[np.float64], time_s: NDArray[np.float64]) -> list[Move]:
-    """Return the moves between rests in which gravity turned by more than 20 degrees, by (n, 3) readings in any unit."""
+    """Return the moves between rests in which gravity turned by more than 20 degrees; (n, 3) readings in any unit."""
     steps = np.diff(time_s, append=2 * time_s[-1] - time_s[-2])
     rests = rests_of(force, float(np.median(steps)))
     found: list[Move] = []

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 
 def read_mcap(path: Path, settings: McapFormat) -> ChannelTable:
-    """Read a log; refuse one that is damaged, incomplete, without Imu topic or with several, or with impossible times."""
+    """Read a log; refuse a damaged or incomplete one, no Imu topic or several, and impossible times."""
     with unchanged(path), path.open("rb") as stream:
         return read_stream(stream, str(path), settings)
 

@@ -55,7 +55,7 @@ def topic_of(kind: str, settings: McapFormat) -> str | None:
 
 
 class TopicDecoder:
-    """Decoder of one topic; ``encodings`` are those of channels that are sent as counts, ``count`` the messages so far."""
+    """Decoder of one topic; ``encodings`` are those of channels sent as counts, ``count`` the messages so far."""
 
     def __init__(self, topic: str, kind: str, settings: McapFormat, path: str) -> None:
         self.topic, self.kind, self.path = topic, kind, path

@@ -138,7 +138,7 @@ def unpack(content: bytes, expected: int, compression: str) -> bytes | memoryvie
 
 
 def split(run: Run) -> tuple[list[tuple[int, memoryview]], list[Rows]]:
-    """Return the other records (opcode, content) of a run, and its messages; ``ValueError`` if records do not fill the run."""
+    """Return the other records (opcode, content) of a run, and its messages; ``ValueError``: records do not fill it."""
     data = np.frombuffer(run.data, np.uint8)
     first, others = _leading(run.data)
     if first == len(data):

@@ -150,8 +150,8 @@ class Place:
 class MessageLayout:
     """The layout of one message.
 
-    ``places`` of the numbers and ``texts`` are by path, such as ``linear_acceleration.x``. ``fixed``: spans of bytes that
-    another message of this layout has in common with the sample.
+    ``places`` of the numbers and ``texts`` are by path, such as ``linear_acceleration.x``. ``fixed``: spans of bytes
+    that another message of this layout has in common with the sample.
     """
 
     sample: bytes

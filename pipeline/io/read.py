@@ -136,7 +136,7 @@ def _of_one_sensor(procedure: Mapping[str, Any], files: Mapping[str, list[Path]]
 def to_recording(
     name: str, entry: Mapping[str, Any], table: ChannelTable, sensor: Mapping[str, Any], checks: Checks
 ) -> Recording:
-    """Return a table's samples as a recording in body axes, examined and marked; the channels are taken out of the table.
+    """Return a table's samples as a recording in body axes, examined and marked; its channels are taken out of it.
 
     ``entry`` is what the procedure says of the recording: ``role``, ``axis``, and ``program`` where the table logs
     nothing. ``sensor`` is the section of the unit's configuration.

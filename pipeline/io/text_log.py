@@ -64,8 +64,8 @@ class Head:
 class TextLog:
     """The rows of a text log, block by block, each block with the numbers of its lines, counted from 1.
 
-    ``keep_open_line``: a last line without a newline is a row; else it is dropped with a note, as it may be cut. ``head``
-    is None until the header, or the first row of a log without one, was read. ``lines`` were read so far.
+    ``keep_open_line``: a last line without a newline is a row; else it is dropped with a note, as it may be cut.
+    ``head`` is None until the header, or the first row of a log without one, was read. ``lines`` were read so far.
     """
 
     def __init__(

@@ -49,9 +49,9 @@ UNIT_ENDINGS = (
 class Columns:
     """The index of the column that may hold each channel of a log.
 
-    ``counter`` counts samples. ``arrival``: a time that scatters beside a counter without a gap, which then is the time.
-    ``triads``: sensor to its x, y, z. ``others``: temperature, table_angle ... ``steady``: time, or the counter of
-    samples, never falls back.
+    ``counter`` counts samples. ``arrival``: a time that scatters beside a counter without a gap, which then is the
+    time. ``triads``: sensor to its x, y, z. ``others``: temperature, table_angle ... ``steady``: time, or the counter
+    of samples, never falls back.
     """
 
     layout: TextLayout

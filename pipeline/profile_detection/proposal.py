@@ -47,9 +47,9 @@ WORD = re.compile(r"[A-Za-z_][\w.-]*(/[\w^]+)?")
 class Proposal:
     """A proposed profile.
 
-    ``files``: of a recording in parts, the file of each. ``csv``: the section without columns. ``columns``: of each part,
-    channel to its entry; ``???`` stands for what has to be filled in. ``evidence``: by key of ``csv``, ``time``, sensor
-    or channel. ``remarks``: what has to be decided, or is odd.
+    ``files``: of a recording in parts, the file of each. ``csv``: the section without columns. ``columns``: of each
+    part, channel to its entry; ``???`` stands for what has to be filled in. ``evidence``: by key of ``csv``, ``time``,
+    sensor or channel. ``remarks``: what has to be decided, or is odd.
     """
 
     files: list[str]

@@ -36,8 +36,9 @@ class TextLayout:
     """The layout of a text log.
 
     ``delimiter``: a blank stands for any run of blanks and tabs. ``skip_lines``: before the header, or before the data.
-    ``comment``: start of the lines before the data. ``numbers``: the columns that hold finite numbers only. ``rate_hz``:
-    sampling rate that the line ``rate_line`` before the data states. ``odd_rows``: with another number of fields.
+    ``comment``: start of the lines before the data. ``numbers``: the columns that hold finite numbers only.
+    ``rate_hz``: sampling rate that the line ``rate_line`` before the data states. ``odd_rows``: with another number of
+    fields.
     """
 
     path: str

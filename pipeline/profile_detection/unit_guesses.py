@@ -151,7 +151,7 @@ def rate_unit(rate: NDArray[np.float64], moves: Sequence[Move], why_none: str, *
 
 
 def rate_unit_by_table(rate: NDArray[np.float64], table_rate: NDArray[np.float64]) -> Guess | None:
-    """Return the unit of (n, 3) angular rates by the table's, deg/s, in the same rows; None where they do not follow it."""
+    """Return the unit of (n, 3) angular rates by the table's, deg/s, in the same rows; None: they do not follow it."""
     table = table_rate - table_rate.mean()
     power = float(table @ table)
     if power < len(table):  # 1 deg/s rms: below, noise and bias wander tell more than the table

@@ -46,8 +46,8 @@ class StageResult:
 class FittedEffect:
     """A fitted effect; ``parameters`` map names to ``{"value", "unit", "expanded_uncertainty"}``.
 
-    ``definition`` is the content of the file of a user's effect, so that the calibration can be applied without it; None
-    for a built-in effect.
+    ``definition`` is the content of the file of a user's effect, so that the calibration can be applied without it;
+    None for a built-in effect.
     """
 
     name: str

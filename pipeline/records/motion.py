@@ -44,8 +44,8 @@ class Motion:
     level : (n, 3, 3) array, or None
         Rows: the level frame's axes x, y, z in the body frame; None where no reference gives the heading.
     direction : (n, 3) array, or None
-        Unit vector of the turn that goes on or, at rest, of the last one; zeros before the first. None: not computed yet
-        (``pipeline.model.effects.base.turning_direction``).
+        Unit vector of the turn that goes on or, at rest, of the last one; zeros before the first. None: not computed
+        yet (``pipeline.model.effects.base.turning_direction``).
     reference_valid : (n,) array of bool, or None
         Samples around which the table's log is dense enough to interpolate the trajectory.
     recording, setup : str

@@ -21,7 +21,7 @@ MEDIAN_STEP = 0.9539  # median of |w[n+1] - w[n]| of white noise with standard d
 
 @dataclass(frozen=True)
 class Noise:
-    """White noise of a sample (before any filter) and Gauss-Markov bias wander: (3,) standard deviations, sensor's unit.
+    """White noise of a sample (before any filter) and Gauss-Markov bias wander: (3,) standard deviations.
 
     ``source``: ``static`` (a long rest), ``rests`` (in the recordings), ``residual`` (of a fit) or ``data_sheet``.
     ``length``, s, is that of the static rest, else 0; the relative uncertainty of the wander is about

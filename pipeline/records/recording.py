@@ -25,8 +25,8 @@ CLIPPED_OR_STUCK = 0b110  # bits 1 and 2 of ``Recording.flags``
 class Note:
     """A machine-readable remark on an input: what was found or repaired, how often and where.
 
-    ``first`` and ``last`` line of the file concerned count from 1; 0 where lines do not apply. ``start_s`` and ``end_s``
-    are the times of the first and the last sample concerned, in the clock of the file.
+    ``first`` and ``last`` line of the file concerned count from 1; 0 where lines do not apply. ``start_s`` and
+    ``end_s`` are the times of the first and the last sample concerned, in the clock of the file.
     """
 
     code: str
