@@ -115,7 +115,7 @@ def wrong_name(name: str) -> str:
 
 
 def not_regular(path: Path) -> str:
-    """Return why a path cannot be read as a file, empty for a regular file or a link to one; ``OSError``: it is none."""
+    """Return why a path cannot be read as a file; empty for a regular file or a link to one. ``OSError``: none."""
     try:
         kind = stat.S_IFMT(path.stat().st_mode)
     except FileNotFoundError:
