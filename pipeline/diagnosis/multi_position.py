@@ -1,14 +1,19 @@
-"""Which physical effect is missing from a calibration by rests and moves, where no table logged the motion.
+"""What the selection finds in rests and moves by hand, where no table logged the motion.
 
-The selection is ``pipeline.estimation.multi_position.selection``; here it becomes the document that
-``pipeline.diagnosis.diagnose`` makes of a table's recordings. The residual of the rests is compared with white noise
-and the expected bias instability. Nobody states how firmly a unit rests by hand, so that a scatter of the rests beyond
-that is reported, but is by itself no sign of a missing effect.
+The residual of the rests is compared with white noise and the expected bias instability. Nobody states how firmly a
+unit rests by hand, so that a scatter of the rests beyond that is reported, but alone is no sign of a missing effect.
 
 Twenty rests are too few to keep every third from a selection. So the selection uses all of them, and cross-validation
 judges it: of ``FOLDS`` models each leaves out every third rest with the move before it. ``held_out_error`` of a ranking
 is that of the selected effects, fitted without those rests; ``cross_validation`` repeats the selection without them.
 The published calibration keeps its own every third rest out and uses nothing of this.
+
+The residual is tested for a dependence on a covariate by curves with coefficients of their own in every axis:
+
+    time, temperature : powers 1 to d over their span, d = 2 and 3
+    specific_force    : Chebyshev polynomials of degree 4 and 5 of the axis' own component; the catalogue has the lower
+
+A covariate is named where one of its tests has delta BIC > 10 and m p < 1e-3, m the number of all tests.
 """
 
 from __future__ import annotations
@@ -18,99 +23,153 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.diagnosis.residual_trends import added_variable, dependences
-from pipeline.diagnosis.unobservable_effects import hidden_effects, next_experiment, not_enough_data
-from pipeline.diagnosis.verdict import evidence_of, judged
-from pipeline.errors import CannotCalibrateError, PipelineError
+from pipeline.diagnosis import functional_forms as forms
+from pipeline.diagnosis.findings import Findings
+from pipeline.diagnosis.observability import MORE, not_observable_by_hand
+from pipeline.diagnosis.residual_dependence import GATE_P
+from pipeline.diagnosis.residual_plots import added_variable_of_rests
+from pipeline.diagnosis.words import listed, plain
+from pipeline.errors import CannotCalibrateError, NotObservableError, PipelineError
 from pipeline.estimation.accelerometer import nonlinear_least_squares
+from pipeline.estimation.design import Term
 from pipeline.estimation.multi_position.fit import fit
 from pipeline.estimation.multi_position.likelihood import NoiseHypothesis, project_out
-from pipeline.estimation.multi_position.result import AUTO, calibration_of, model_of
+from pipeline.estimation.multi_position.result import calibration_of, model_of
 from pipeline.estimation.multi_position.selection import FAR, select
-from pipeline.estimation.selection import ALIKE, EVIDENCE, GATE_BIC, INFLATED
-from pipeline.model.effects import effect
+from pipeline.estimation.selection import GATE_BIC
+from pipeline.model.effects import catalogue, effect
+from pipeline.model.effects.files import effect_from
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
     from pipeline.estimation.multi_position.fit import Fit
     from pipeline.estimation.multi_position.model import Model, State
-    from pipeline.estimation.multi_position.selection import Scored, Selection
-    from pipeline.estimation.ranking import Score
+    from pipeline.estimation.multi_position.selection import Selection
     from pipeline.records import Noise, Recording, SensorCalibration
 
+NEEDED = MORE
 FAR_ABOVE = 10.0  # times the noise: no unit that somebody sets down or holds rests so badly
 FOLDS = 3
 SPARE = 2  # equations beyond the parameters, from which on a fold is judged
+LEAST_SPAN = 1.0  # s or degC: of a covariate
+FORCE = ("8 * u ** 4 - 8 * u ** 2 + 1", "16 * u ** 5 - 20 * u ** 3 + 5 * u")  # Chebyshev polynomials of u in g
+WORTH = 0.25  # share of the residual's mean square, of what could be its cause
+MOST_NAMED = 3
+FIRM = 2.0  # times the noise, above which the scatter of the rests is worth a word
 
 
-def diagnose_multi_position(
+def findings(
     calibration: SensorCalibration,
     recordings: Sequence[Recording],
     noise: Noise | None,
     settings: Mapping[str, Any],
-    accelerometer: SensorCalibration | None = None,
+    configured: list[str],
     *,
-    validation: Mapping[str, Any] | None = None,
-) -> dict[str, Any]:
-    """Return a sensor's part of ``diagnoses/<unit>.json``.
+    accelerometer: SensorCalibration | None,
+) -> Findings:
+    """Return what the selection finds in rests and moves by hand.
 
-    Parameters
-    ----------
-    calibration : SensorCalibration
-    recordings : sequence of Recording
-        All of the unit.
-    noise : Noise or None
-    settings : mapping
-        Sections ``sensor``, ``table``, ``procedure`` and ``effects``.
-    accelerometer : SensorCalibration, optional
-        For the gyroscope, which needs the direction of gravity; without it, it is calibrated again.
-    validation : mapping, optional
-        The sensor's part of ``validations/<unit>.json``; without it, a free fit stands for the
-        calibration.
-
-    Returns
-    -------
-    dict
-        As of ``pipeline.diagnosis.diagnose.diagnose``, and ``cross_validation``.
+    Raises
+    ------
+    NotObservableError
+        If there are no rests, or they do not determine bias and matrix.
     """
-    sensor = calibration.sensor
-    wanted = settings["effects"][sensor]
-    configured = [] if wanted == AUTO else list(wanted)
-    try:
-        every = {**settings, "procedure": {**settings["procedure"], "holdout_every": 0}}
-        if sensor == "accelerometer":
-            known = _with_all_rests(calibration, recordings, noise, every)
-            model = model_of(recordings, known, noise, every)
-        else:
-            felt = accelerometer and _with_all_rests(accelerometer, recordings, None, every)
-            model = model_of(recordings, calibration, noise, every, felt)
-        why = "" if model else f"no recording holds a rest with readings of the {sensor}"
-    except CannotCalibrateError as lack:
-        model, why = None, lack.message
-    if model is None:
-        nothing = not_enough_data(sensor, configured, why)
-        return judged(nothing, evidence_of(nothing, sensor, recordings, noise, settings, validation))
-    sheet = settings["sensor"][sensor]
+    sensor, sheet = calibration.sensor, settings["sensor"][calibration.sensor]
+    model = _model_of_all_rests(calibration, recordings, noise, settings, accelerometer)
     selection = select(model, calibration, configured, noise, sheet)
     expected = _without_creep(noise, sheet)
-    document = _document(selection, configured, expected)
-    document["cross_validation"] = _nested(selection, calibration, configured, noise, sheet)
-    names = selection.names
-    found = evidence_of(
-        document,
+    hidden, unknown = not_observable_by_hand(selection, configured), dependences(selection)
+    chi = [_chi(selection, fit, expected) for fit in selection.fits]
+    over, left_over = (_over_noise(selection, selection.fits[k], expected) for k in (0, -1))
+    verdict = "missing_effect" if selection.names else "nothing_missing"
+    if (unknown and not selection.names) or left_over > FAR_ABOVE:
+        verdict = "unexplained"
+    likely = project_out(model.equations(selection.fits[-1].state), selection.hypotheses).scores()
+    best = selection.hypotheses[int(np.argmax(likely))]
+    signal = selection.first.signal
+
+    def advice(verdict: str) -> str:
+        if verdict == "not_enough_data":
+            return MORE
+        if left_over > FIRM or verdict == "unexplained":
+            return _of_scatter(_suspects(selection, hidden), left_over)
+        warmth = catalogue()["bias_temperature"]
+        return f"to make bias temperature observable: record {warmth.excitation}" if warmth.name in hidden else ""
+
+    return Findings(
         sensor,
-        recordings,
-        noise,
-        settings,
-        validation,
+        selection.names,
+        verdict,
+        selection.steps,
+        selection.first.scores,
+        selection.fits[-1].state.terms,
+        selection.fits[-1].covariance,
+        selection.limits,
+        lambda name: _shares(selection, name),
+        chi,
+        lambda name: float(signal[name] @ signal[name]) if name in signal else 0.0,
+        max(chi[0] - (len(selection.fits[0].residual) - selection.fits[0].rank), chi[0] - chi[-1]),
+        _held_out_errors(selection) if selection.names else [None],
+        hidden,
+        unknown,
+        over,
+        left_over,
+        [(h.ratio, h.time, float(score)) for h, score in zip(selection.hypotheses, likely, strict=True)],
+        float(np.sqrt(np.mean(model.white**2))),
+        None if expected is None else float(np.sqrt(np.mean(expected.wander**2))),
+        advice,
+        full=(lambda: calibration_of(model, selection.fits[-1], calibration, settings)) if selection.names else None,
         other=accelerometer if sensor == "gyroscope" else None,
-        full=(lambda: calibration_of(model, selection.fits[-1], calibration, settings)) if names else None,
+        on_table=False,
+        scatter={"scatter_over_noise": float(best.scatter[0])},
+        more={
+            "pictures": {
+                "added_variable": added_variable_of_rests(selection) if selection.names else None,
+                "unexplained": [],
+            },
+            "cross_validation": _nested(selection, lambda part: select(part, calibration, configured, noise, sheet)),
+        },
     )
-    left = _over_noise(selection, selection.fits[-1], expected)
-    return judged(document, replace(found, left_over_noise=left, on_table=False))
+
+
+def _model_of_all_rests(
+    calibration: SensorCalibration,
+    recordings: Sequence[Recording],
+    noise: Noise | None,
+    settings: Mapping[str, Any],
+    accelerometer: SensorCalibration | None,
+) -> Model:
+    """Return the model with no rest held out.
+
+    The accelerometer is calibrated by all rests, which shows those that contradict the others; it is taken as it is
+    where it has effects, or where all rests do not determine it.
+    """
+
+    def with_all_rests(found: SensorCalibration, noise: Noise | None) -> SensorCalibration:
+        known = {"noise": {"accelerometer": noise}} if noise is not None else {}
+        if found.effects:
+            return found
+        try:
+            return nonlinear_least_squares.fit(recordings, None, {**every, **known})
+        except PipelineError:
+            return found
+
+    every = {**settings, "procedure": {**settings["procedure"], "holdout_every": 0}}
+    sensor = calibration.sensor
+    try:
+        if sensor == "accelerometer":
+            model = model_of(recordings, with_all_rests(calibration, noise), noise, every)
+        else:
+            felt = accelerometer and with_all_rests(accelerometer, None)
+            model = model_of(recordings, calibration, noise, every, felt)
+    except CannotCalibrateError as lack:
+        raise NotObservableError(lack.message) from lack
+    if model is None:
+        raise NotObservableError(f"no recording holds a rest with readings of the {sensor}")
+    return model
 
 
 def _without_creep(noise: Noise | None, sheet: Mapping[str, Any]) -> Noise | None:
@@ -124,96 +183,15 @@ def _without_creep(noise: Noise | None, sheet: Mapping[str, Any]) -> Noise | Non
     return replace(noise, wander=wander, correlation_time=float(sheet.get("wander_time_s") or noise.correlation_time))
 
 
-def _document(selection: Selection, configured: list[str], noise: Noise | None) -> dict[str, Any]:
-    sensor, selected = selection.model.sensor, selection.names
-    hidden = hidden_effects(selection, configured)
-    unknown = dependences(selection)
-    held = _held_out_errors(selection) if selected else [None]
-    seen = [s for s in selection.first.scores.values() if s.name not in selected and s.name not in hidden]
-    order = [*selected, *(s.name for s in sorted(seen, key=lambda s: -s.delta_bic))]
-    chi = [_chi(selection, fit, noise) for fit in selection.fits]
-    ranking = [_entry(selection, name, held, chi) for name in order]
-    verdict = "missing_effect" if selected else "nothing_missing" if ranking else "not_enough_data"
-    over = _over_noise(selection, selection.fits[0], noise)
-    left = _over_noise(selection, selection.fits[-1], noise)
-    if (unknown and not selected) or left > FAR_ABOVE:
-        verdict = "unexplained"
-    return {
-        "verdict": verdict,
-        "residual_over_noise": over,
-        "selected": list(selected),
-        "ranking": ranking,
-        "not_observable": [{"effect": name, "reason": reason} for name, reason in hidden.items()],
-        "unexplained": unknown,
-        "suggested_effect": None,
-        "next_experiment": next_experiment(selection, verdict, ranking, hidden, unknown=unknown, over_noise=left),
-        "override": f"effects.{sensor}=[{','.join([*configured, *selected])}]" if selected else "",
-        "configured": configured,
-        "wander": _wander(selection, noise),
-        "pictures": {"added_variable": added_variable(selection), "unexplained": []},
-        "method_errors": [],
-    }
-
-
-def _entry(selection: Selection, name: str, held: Sequence[float | None], chi: Sequence[float]) -> dict[str, Any]:
-    """Return one line of the ranking."""
-    score = selection.steps.get(name) or selection.first.scores[name]
-    before = after = None
-    scored, drop = selection.first, 0.0
-    if name in selection.names:
-        step = selection.names.index(name)
-        before, after = held[step], held[step + 1]
-        scored, drop = selection.own[name], chi[step] - chi[step + 1]
-    elif name in scored.signal:
-        drop = float(scored.signal[name] @ scored.signal[name])
-    return {
-        "effect": name,
-        "delta_bic": score.delta_bic,
-        "p_value": score.p_value,
-        "parameters": _parameters(selection, score),
-        "explained_share": _share(drop, chi, len(selection.fits[0].residual) - selection.fits[0].rank),
-        "held_out_error_before": before,
-        "held_out_error_after": after,
-        "look_alikes": _look_alikes(scored, score) if score.delta_bic > GATE_BIC else [],
-        "plausible": score.plausible,
-    }
-
-
-def _share(drop: float, chi: Sequence[float], spare: int) -> float:
-    excess = max(chi[0] - spare, chi[0] - chi[-1], drop)
-    return float(np.clip(drop / excess, 0.0, 1.0)) if excess > 0 else 0.0
-
-
-def _parameters(selection: Selection, score: Score) -> dict[str, dict[str, Any]]:
-    """Return the estimates: of the fit of all selected effects, or of the effect alone."""
-    values, uncertainty = score.values, score.uncertainty
-    found = selection.fits[-1]
-    at = selection.model.directions.shape[1]
-    for term in found.state.terms:
-        own = slice(at, at + len(term.values))
-        if term.effect.name == score.name and score.name in selection.names:
-            values, uncertainty = term.values, np.sqrt(np.clip(np.diag(found.covariance)[own], 0.0, None))
-        at = own.stop
-    described = effect(score.name).parameters(selection.model.sensor)
-    return {
-        p.name: {"value": float(v), "unit": p.unit, "standard_uncertainty": float(u) if u > 0 else None}
-        for p, v, u in zip(described, values, uncertainty, strict=True)
-    }
-
-
-def _look_alikes(scored: Scored, score: Score) -> list[dict[str, Any]]:
-    """Return the effects that reproduce most of an effect's fitted signal."""
-    signal = scored.signal.get(score.name)
-    power = 0.0 if signal is None else float(signal @ signal)
-    if signal is None or power == 0.0:
-        return []
-    shares = {
-        name: float(np.sum((shown.T @ signal) ** 2)) / power
-        for name, shown in scored.shown.items()
-        if name != score.name
-    }
-    alike = sorted(((share, name) for name, share in shares.items() if share > ALIKE), reverse=True)
-    return [{"effect": name, "share": min(share, 1.0)} for share, name in alike]
+def _shares(selection: Selection, name: str) -> dict[str, float]:
+    """Return the share of an effect's fitted signal that each other effect reproduces."""
+    scored = selection.own[name] if name in selection.names else selection.first
+    signal = scored.signal.get(name)
+    if signal is None or not signal.any():
+        return {}
+    power = float(signal @ signal)
+    others = {other: shown for other, shown in scored.shown.items() if other != name}
+    return {other: min(float(np.sum((shown.T @ signal) ** 2)) / power, 1.0) for other, shown in others.items()}
 
 
 def _expected(selection: Selection, noise: Noise | None) -> NoiseHypothesis:
@@ -234,49 +212,10 @@ def _chi(selection: Selection, fit: Fit, noise: Noise | None) -> float:
 
 def _over_noise(selection: Selection, fit: Fit, noise: Noise | None) -> float:
     """Return the rms residual of the rests, of a fit, over that of noise alone."""
-    equations = selection.model.equations(fit.state)
-    at_rest = equations.rows(selection.model.rests_equations)
+    at_rest = selection.model.equations(fit.state).rows(selection.model.rests_equations)
     found = project_out(at_rest, [_expected(selection, noise)])
     spare = max(len(at_rest.residual) - float(np.sum(found.basis[0] ** 2)), 1.0)
     return float(np.sqrt(np.sum(found.residual**2) / spare))
-
-
-def _wander(selection: Selection, noise: Noise | None) -> dict[str, Any]:
-    """Return the wander and the scatter of the rests under which the whole model explains the readings best."""
-    found = project_out(selection.model.equations(selection.fits[-1].state), selection.hypotheses)
-    scores = found.scores()
-    best = selection.hypotheses[int(np.argmax(scores))]
-    white = float(np.sqrt(np.mean(selection.model.white**2)))
-    expected = None if noise is None else float(np.sqrt(np.mean(noise.wander**2)))
-    inflated = False
-    if expected is not None:
-        most = INFLATED * expected / white
-        believed = [score for score, n in zip(scores, selection.hypotheses, strict=True) if n.ratio <= most]
-        inflated = best.ratio > most and (not believed or bool(scores.max() - max(believed) > EVIDENCE))
-    return {
-        "ratio": float(best.ratio),
-        "time_s": float(best.time) if best.ratio else None,
-        "standard_deviation": float(best.ratio * white),
-        "expected": expected,
-        "inflated": bool(inflated),
-        "scatter_over_noise": float(best.scatter[0]),
-    }
-
-
-def _with_all_rests(
-    accelerometer: SensorCalibration, recordings: Sequence[Recording], noise: Noise | None, settings: Mapping[str, Any]
-) -> SensorCalibration:
-    """Return the accelerometer's calibration by all rests, which shows those that contradict the others.
-
-    It is returned as it is where it has effects, or where all rests do not determine it.
-    """
-    known = {"noise": {"accelerometer": noise}} if noise is not None else {}
-    if accelerometer.effects:
-        return accelerometer
-    try:
-        return nonlinear_least_squares.fit(recordings, None, {**settings, **known})
-    except PipelineError:
-        return accelerometer
 
 
 def _held_out_errors(selection: Selection) -> list[float | None]:
@@ -298,17 +237,11 @@ def _held_out_errors(selection: Selection) -> list[float | None]:
     return errors
 
 
-def _nested(
-    selection: Selection, start: SensorCalibration, configured: Sequence[str], noise: Noise | None,
-    sheet: Mapping[str, Any],
-) -> dict[str, Any] | None:  # fmt: skip
+def _nested(selection: Selection, again: Callable[[Model], Selection]) -> dict[str, Any] | None:
     """Return the errors of the whole procedure, selection included, on rests that it does not see.
 
-    Returns
-    -------
-    dict or None
-        ``folds``, ``error_before, error_after`` (rms, g or deg/s), and ``named``: the number of folds that selected
-        each effect. None where nothing was selected, or a recording for validation judges.
+    ``folds``, ``error_before, error_after`` (rms, g or deg/s), and ``named``: the number of folds that selected each
+    effect. None where nothing was selected, or a recording for validation judges.
     """
     model = selection.model
     if not selection.names or model.held_out_error(selection.fits[0].state) is not None:
@@ -316,7 +249,7 @@ def _nested(
     named: dict[str, int] = {}
     squares = np.zeros(2)
     for part, held in _folds(model):
-        found = select(part, start, configured, noise, sheet)
+        found = again(part)
         for name in found.names:
             named[name] = named.get(name, 0) + 1
         squares += held * np.array([_squared(part, found.fits[k].state) for k in (0, -1)])
@@ -333,5 +266,79 @@ def _folds(model: Model) -> Iterator[tuple[Model, int]]:
 
 
 def _squared(model: Model, state: State) -> float:
-    error = model.held_out_error(state)
-    return 0.0 if error is None else error**2
+    return (model.held_out_error(state) or 0.0) ** 2
+
+
+def dependences(selection: Selection) -> list[dict[str, Any]]:
+    """Return the covariates on which the residual still depends, each with its p-value, the likeliest first."""
+    from scipy.special import chdtrc  # noqa: PLC0415  (0.1 s that only a diagnosis pays)
+
+    model = selection.model
+    tests = _curves_of(selection)
+    terms = [_curves(covariate, formulas, model.sensor) for covariate, formulas in tests]
+    equations = model.equations(selection.fits[-1].state, terms)
+    found = project_out(equations, selection.hypotheses)
+    before, at = found.of_model()
+    named: dict[str, tuple[float, float]] = {}
+    for j, (covariate, _) in enumerate(tests):
+        count = found.count(j, at)
+        factor = found.correction(j, at, count, equations.scatter) if count else 0.0
+        gain = factor * max(2.0 * (found.with_candidate(j)[0] - before), 0.0)
+        delta = gain - count * float(np.log(len(equations.residual)))
+        p = float(chdtrc(max(count, 1), gain))
+        if delta > GATE_BIC and p * len(tests) < GATE_P and delta > named.get(covariate, (0.0, 1.0))[0]:
+            named[covariate] = (delta, p)
+    ordered = sorted(named.items(), key=lambda item: -item[1][0])
+    return [{"covariate": name, "p_value": p} for name, (_, p) in ordered]
+
+
+def _curves_of(selection: Selection) -> list[tuple[str, Sequence[str]]]:
+    """Return the tests: a covariate and the formulas of its curves."""
+    rests = selection.model.rests
+    tests: list[tuple[str, Sequence[str]]] = []
+    for covariate, values in (("time", rests.time), ("temperature", rests.temperature)):
+        known = rests.clock_shared if covariate == "time" else not np.isnan(values).any()
+        if known and np.ptp(values) > LEAST_SPAN:
+            powers = forms.powers(forms.Span(covariate, np.sort(values)), covariate)
+            tests += [(covariate, powers[:degree]) for degree in (2, 3)]
+    return [*tests, ("specific_force", FORCE)] if selection.model.sensor == "accelerometer" else tests
+
+
+def _curves(covariate: str, formulas: Sequence[str], sensor: str) -> Term:
+    """Return curves with coefficients of their own in every axis, as an effect of size 0."""
+    terms = {f"c{k}": {"formula": text, "unit": "1"} for k, text in enumerate(formulas)}
+    known = {"name": f"curves_of_{covariate}", "owner": "recording", "sensors": [sensor], "meaning": "Curves."}
+    return Term(effect_from({**known, "terms": terms}, "a test of the residual"), np.zeros(3 * len(formulas)))
+
+
+def _suspects(selection: Selection, hidden: Mapping[str, str]) -> list[str]:
+    """Return the effects that these recordings cannot tell, and that could be what the residual holds.
+
+    Such an effect shows in the equations, and at its limits it brings at least the share ``WORTH`` of the mean square
+    that is left; or it goes with the temperature, which was not recorded or did not change enough.
+    """
+    first, n = selection.first, len(selection.fits[0].residual)
+
+    def could(name: str) -> bool:
+        if "temperature" in catalogue()[name].needs:
+            return bool(np.isnan(selection.model.rests.temperature).any()) or name in first.scores
+        return name in first.scores and first.visible[name] >= first.spare[name] * n * float(np.log1p(WORTH))
+
+    def brings(name: str) -> float:
+        return -first.scores[name].delta_bic if name in first.scores else float("inf")
+
+    return sorted((name for name in hidden if could(name)), key=brings)
+
+
+def _of_scatter(names: Sequence[str], over_noise: float) -> str:
+    """Return what to record where the rests scatter more than the noise, and nothing that can be seen explains it."""
+    many = f"the rests scatter {over_noise:.2g} times the noise"
+    if not names:
+        return f"set the unit down firmly for each rest: {many} and follow nothing that is recorded"
+    alike = listed([plain(name) for name in names[:MOST_NAMED]], "or")
+    warm = any("temperature" in catalogue()[name].needs for name in names)
+    beside = ", with the temperature of the sensor beside them" if warm else ""
+    return (
+        f"{MORE}{beside}: {many}, and an unsteady hand explains that no better than {alike}, which "
+        "these rests do not tell"
+    )

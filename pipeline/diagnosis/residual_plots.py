@@ -4,15 +4,12 @@ Added-variable plot of one coefficient gamma of an effect, on the axis c,
 
     x~ = x - X delta,    delta = (X^T C^-1 X)^-1 X^T C^-1 x,    y~ = gamma x~ + r - w
 
-where
-
-    x : the effect's column, X all other columns of the model (``pipeline.diagnosis.residual_regression``)
+    x : the effect's column, X all other columns of the model;  C : white noise plus bias wander
     r : residual of the fit;  w : the bias wander that it implies, ``E[w | r] = wander covariance C^-1 r``
-    C : white noise plus bias wander
 
-So y~ is the part of the reading that neither the other columns nor the wander explain (Frisch, Waugh and Lovell), and
-the least-squares line through (x~, y~) has the slope gamma: ``x~^T C^-1 r = 0`` is the normal equation, and
-``C^-1 r`` is the weight times ``r - w``.
+So y~ is the part of the reading that neither the other columns nor the wander explain, and the least-squares line
+through (x~, y~) has the slope gamma: ``x~^T C^-1 r = 0`` is the normal equation. Of rests by hand, x and r are whitened
+by the most likely noise, and a point is a rest; both are shown times the median white error of a rest.
 
 The plot of what is unexplained is the residual r against the covariate on which it depends. Where a functional form g
 is suggested, r is that of a fit with g beside the base, and g is added to it again: the points scatter about the curve.
@@ -29,9 +26,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.diagnosis.functional_forms import columns_of, signals_of
-from pipeline.diagnosis.residual_regression import FittedModel
 from pipeline.estimation.design import BASE
 from pipeline.estimation.gauss_markov import Products, Setting
+from pipeline.estimation.generalized_least_squares import design_at
+from pipeline.estimation.multi_position.fit import solve
 from pipeline.model.effects.base import Layout, truth, unit_of
 from pipeline.model.formula import parse
 
@@ -42,6 +40,7 @@ if TYPE_CHECKING:
 
     from pipeline.estimation.design import Term
     from pipeline.estimation.gauss_markov import Blocks
+    from pipeline.estimation.multi_position import selection as by_hand
     from pipeline.estimation.selection import Selection
     from pipeline.records import Noise
 
@@ -50,31 +49,27 @@ if TYPE_CHECKING:
 
 OWN = 4  # columns of the base on each axis
 RANK = 1e-11  # of singular values: columns that are the same to rounding
+RANK_OF_RESTS = 1e-8  # the same of the whitened columns themselves
 BINS = 40  # points that a plot shows apart
 DIGITS = 5  # more than a plot shows
 CURVE = 60  # points of a suggested form
 LEAST_SHARE = 0.01  # of the information on a coefficient that the axes share, for an axis to be shown
+AT_REST = 0.9  # share of a column's power that rests must have, for a point a rest to show it
 MOST = 3  # plots of what is unexplained
 SIGNALS = {"rate": "speed", "specific_force": "u"}  # against which a covariate is drawn where no form names a signal
 
 
 def plots(
-    selection: Selection,
-    unexplained: Sequence[Mapping[str, Any]],
-    noise: Noise | None,
-    reported: Selection | None = None,
+    selection: Selection, unexplained: Sequence[Mapping[str, Any]], noise: Noise | None, reported: Selection
 ) -> JSON:
     """Return the points of a diagnosis's plots, few enough to be kept in its document.
 
     Parameters
     ----------
-    selection : Selection
-        To which ``unexplained`` belongs.
     unexplained : sequence of mapping
-        Entries of the diagnosis: ``covariate``, and ``axes, formulas, coefficients`` of the suggested form.
-    noise : Noise or None
-    reported : Selection, optional
-        The one that the diagnosis reports, where it is another: with the suggested form in its base.
+        Entries of the diagnosis, of ``selection``: ``covariate``, and ``axes, formulas, coefficients`` of the form.
+    reported : Selection
+        The one that the diagnosis reports: with the suggested form in its base where there is one.
 
     Returns
     -------
@@ -84,30 +79,26 @@ def plots(
         the slope, with ``unit, value, standard_uncertainty``; those of the unexplained, where a form is suggested,
         ``curve_x, curve``.
     """
-    reported = reported or selection
     shown = [entry for entry in unexplained if not entry.get("explained_by")][:MOST]
-    found: JSON = {"added_variable": None, "unexplained": []}
-    if reported.names:
-        found["added_variable"] = _added_variable(_Columns(reported), reported)
-    if shown:
-        regression = _Columns(selection)
-        found["unexplained"] = [_unexplained(regression, selection, entry, noise) for entry in shown]
-    return found
+    regression = _Columns(selection) if shown else None
+    return {
+        "added_variable": _added_variable(_Columns(reported), reported) if reported.names else None,
+        "unexplained": [_unexplained(regression, selection, entry, noise) for entry in shown if regression],
+    }
 
 
 def _added_variable(regression: _Columns, selection: Selection) -> JSON:
     """Return the added-variable plot of the first selected effect: its clearest coefficient on each axis."""
     sensor, fit = selection.observations.sensor, selection.fit
-    sizes = [len(term.values) for term in fit.terms]
-    order = [term.effect.name for term in fit.terms].index(selection.names[0])
-    term, at = fit.terms[order], sum(sizes[:order])
-    uncertainty = np.sqrt(np.clip(np.diag(fit.covariance)[BASE + at :][: sizes[order]], 1e-300, None))
-    described = term.effect.parameters(sensor)
+    term, own = _first_selected(fit.terms, selection.names[0], BASE)
+    uncertainty = np.sqrt(np.clip(np.diag(fit.covariance)[own], 1e-300, None))
     white = regression.residual - regression.wander(fit.setting)
     sigma = regression.white_noise(white)
-    products = regression.all_products(selection.start.scale, fit.setting)
-    chosen = _clearest(regression, term, at, np.abs(term.values) / uncertainty, sensor)
-    left_of = [regression.left_of_column(c, at + j, products) for c, j in chosen]
+    products = regression.design.products([fit.setting])[0][0][:-1, :-1]
+    columns = [regression.columns[c][:, own.start - BASE + OWN :] for c in range(3)]
+    clearest = _clearest(term, sensor, np.abs(term.values) / uncertainty)
+    chosen = [(c, j) for c, j in enumerate(clearest) if j is not None and np.any(columns[c][:, j])]
+    left_of = [regression.left_of_column(c, own.start + j, products) for c, j in chosen]
     information = np.array(
         [regression.weight @ x**2 / sigma[c] ** 2 for (c, _), x in zip(chosen, left_of, strict=True)]
     )
@@ -115,31 +106,72 @@ def _added_variable(regression: _Columns, selection: Selection) -> JSON:
     for (c, j), left, share in zip(chosen, left_of, information / information.sum(), strict=True):
         if term.effect.layout == Layout.SHARED and share < LEAST_SHARE:
             continue
-        value, bins = float(term.values[j]), Bins.of(left, regression.weight)
-        coefficient = {"parameter": described[j].name, "unit": described[j].unit, "value": value}
-        panels.append(
-            {"axis": "xyz"[c], **coefficient, "standard_uncertainty": float(uncertainty[j])}
-            | bins.document(value * left + white[:, c], sigma[c] ** 2 / bins.weight)
-        )
+        bins = Bins.of(left, regression.weight)
+        points = bins.document(term.values[j] * left + white[:, c], sigma[c] ** 2 / bins.weight)
+        panels.append({"axis": "xyz"[c], **_coefficient(term, sensor, j, uncertainty[j]), **points})
     return {"effect": selection.names[0], "unit": unit_of(sensor), "panels": panels}
 
 
-def _clearest(regression: _Columns, term: Term, at: int, clear: Values, sensor: str) -> list[tuple[int, int]]:
-    """Return axes, and which coefficient to show on each: the clearest one, of one unit and linear where there is."""
+def added_variable_of_rests(selection: by_hand.Selection) -> JSON | None:
+    """Return the same of rests by hand, a point a rest; None where the first effect shows mostly in the moves."""
+    model, found = selection.model, selection.fits[-1]
+    term, own = _first_selected(found.state.terms, selection.names[0], model.directions.shape[1])
+    equations = model.equations(found.state)
+    columns = equations.columns
+    white, _ = equations.whitened(found.noise, np.column_stack([columns, equations.residual]))
+    scale = solve(equations, found.noise, *np.zeros((2, columns.shape[1]))).scale
+    rests = slice(0, model.rests_equations)
+    size = float(np.median(equations.error[rests]))
+    uncertainty = np.sqrt(np.diag(found.covariance))[own]
+    panels = []
+    for c, j in enumerate(_clearest(term, model.sensor, np.abs(term.values) / uncertainty)):
+        if j is None or (c and term.effect.layout == Layout.SHARED):
+            continue
+        others, column = np.delete(white[:, :-1], own.start + j, axis=1), white[:, own.start + j]
+        norm = np.linalg.norm(others, axis=0)
+        others = others / np.where(norm > 0.0, norm, 1.0)
+        left = column - others @ np.linalg.lstsq(others, column, rcond=RANK_OF_RESTS)[0]
+        if np.sum(left[rests] ** 2) < AT_REST * np.sum(left**2):
+            return None
+        points = (term.values[j] * left + white[:, -1])[rests] * size
+        shown = np.argsort(left[rests], kind="stable")
+        panels.append(
+            {
+                "axis": "xyz"[c],
+                **_coefficient(term, model.sensor, j, uncertainty[j]),
+                "x": (left[rests] * size)[shown].tolist(),
+                "mean": points[shown].tolist(),
+                "standard_error": [size * float(np.sqrt(scale))] * len(shown),
+            }
+        )
+    return {"effect": selection.names[0], "unit": unit_of(model.sensor), "panels": panels}
+
+
+def _first_selected(terms: Sequence[Term], name: str, base: int) -> tuple[Term, slice]:
+    """Return the term of an effect, and where its parameters lie after so many of the base."""
+    order = [term.effect.name for term in terms].index(name)
+    at = base + sum(len(term.values) for term in terms[:order])
+    return terms[order], slice(at, at + len(terms[order].values))
+
+
+def _coefficient(term: Term, sensor: str, j: int, uncertainty: float) -> JSON:
+    described = term.effect.parameters(sensor)[j]
+    known = {"parameter": described.name, "unit": described.unit, "value": float(term.values[j])}
+    return known | {"standard_uncertainty": float(uncertainty)}
+
+
+def _clearest(term: Term, sensor: str, clear: Values) -> list[int | None]:
+    """Return which coefficient to show on each axis: the clearest, of one unit, and linear where there is one."""
     described = term.effect.parameters(sensor)
     linear = np.array([p.name not in term.effect.nonlinear for p in described])
     clear = np.where(linear | (not linear.any()), clear, -1.0)
-    unit = described[int(np.argmax(clear))].unit
-    clear = np.where([p.unit == unit for p in described], clear, -1.0)
+    best = int(np.argmax(clear))
     if term.effect.layout == Layout.SHARED:
-        clear[np.arange(len(clear)) != int(np.argmax(clear))] = -1.0
-    found = []
-    for c in range(3):
-        columns = regression.columns[c][:, OWN + at : OWN + at + len(clear)]
-        seen = np.where(np.any(columns != 0.0, axis=0), clear, -1.0)
-        if seen.max() >= 0.0:
-            found.append((c, int(np.argmax(seen))))
-    return found
+        return [best] * 3
+    clear = np.where([p.unit == described[best].unit for p in described], clear, -1.0)
+    of_axis = np.flatnonzero(linear).reshape(3, -1)
+    found = [int(own[np.argmax(clear[own])]) for own in of_axis]
+    return [j if clear[j] >= 0.0 else None for j in found]
 
 
 def _unexplained(regression: _Columns, selection: Selection, entry: Mapping[str, Any], noise: Noise | None) -> JSON:
@@ -147,15 +179,15 @@ def _unexplained(regression: _Columns, selection: Selection, entry: Mapping[str,
     signal, given = _signal_and_shape(selection, entry)
     setting, values = _expected(noise), _values(selection, signal)
     sigma = regression.white_noise(regression.residual - regression.wander(selection.fit.setting))
-    bins = Bins.of(values[:, 0], regression.weight)
-    wander = _wander_of_means(bins, regression, noise)
     panels = []
     for c, (shape, coefficients) in enumerate(given):
-        if c > 0 and signal == "u":
-            bins = Bins.of(values[:, c], regression.weight)
-            wander = _wander_of_means(bins, regression, noise)
+        bins = Bins.of(values[:, c], regression.weight)
         residual = regression.left_of(c, regression.residual[:, c] - shape, setting) + shape
-        panels.append({"axis": "xyz"[c]} | bins.document(residual, sigma[c] ** 2 / bins.weight + wander[c]))
+        variance = sigma[c] ** 2 / bins.weight
+        if noise is not None and noise.wander[c] > 0.0:
+            blocks = selection.observations.blocks
+            variance += noise.wander[c] ** 2 * bins.bias_of_means(blocks, noise.correlation_time)
+        panels.append({"axis": "xyz"[c]} | bins.document(residual, variance))
         if coefficients is not None:
             panels[-1] |= _curve(entry["formulas"], coefficients, signal, values[:, c])
     unit = unit_of(selection.observations.sensor)
@@ -169,14 +201,6 @@ def _expected(noise: Noise | None) -> Setting:
     return Setting(float(np.sqrt(np.mean((noise.wander / noise.white) ** 2))), noise.correlation_time)
 
 
-def _wander_of_means(bins: Bins, regression: _Columns, noise: Noise | None) -> Values:
-    """Return the variance of binned means by the expected bias wander: (3, b) array."""
-    if noise is None or not np.any(noise.wander > 0):
-        return np.zeros((3, len(bins.weight)))
-    unit = bins.bias_of_means(regression.observations.blocks, noise.correlation_time)
-    return np.outer(noise.wander**2, unit)
-
-
 def _signal_and_shape(
     selection: Selection, entry: Mapping[str, Any]
 ) -> tuple[str, list[tuple[Values, Sequence[float] | None]]]:
@@ -185,7 +209,7 @@ def _signal_and_shape(
     named = sorted({name for text in formulas for name in parse(text).signals})
     signal = named[0] if named else SIGNALS.get(entry["covariate"], entry["covariate"])
     given: list[tuple[Values, Sequence[float] | None]] = [(np.zeros(len(observations.weight)), None)] * 3
-    if len(named) != 1 or "coefficients" not in entry:
+    if len(named) != 1:
         return signal, given
     of = columns_of(formulas, observations.sensor)
     columns = np.concatenate([of(part.motion) for part in observations.parts])
@@ -217,47 +241,37 @@ def _curve(formulas: Sequence[str], coefficients: Sequence[float], signal: str, 
 
 
 class _Columns:
-    """The columns and the residual of a selection's fit, with their products."""
+    """The columns of each axis and the residual of a selection's fit, with their products."""
 
     def __init__(self, selection: Selection) -> None:
-        model, observations = FittedModel.of(selection), selection.observations
-        self.columns = [model.columns(c) for c in range(3)]
-        self.residual = model.residual
-        self.observations, self.weight = observations, observations.weight
-
-    def _of(self, columns: Values) -> Products:
-        return Products(self.observations.blocks, self.weight, columns)
-
-    def all_products(self, scale: Values, setting: Setting) -> Values:
-        """Return the products of all parameters' columns: 12 of the base, then those of the effects."""
-        count = BASE + self.columns[0].shape[1] - OWN
-        total = np.zeros((count, count))
-        for c in range(3):
-            index = _places(c, count)
-            total[np.ix_(index, index)] += self._of(self.columns[c]).products([setting])[0][0] / scale[c] ** 2
-        return total
+        self.observations, self.weight = selection.observations, selection.observations.weight
+        self.design = design_at(self.observations, selection.fit)
+        of_axis = [self.design.of_axis(c) for c in range(3)]
+        self.columns = [found[:, :-1] for found in of_axis]
+        self.residual = np.stack([found[:, -1] for found in of_axis], axis=1)
 
     def wander(self, setting: Setting) -> Values:
         """Return the bias wander that the residual implies under a noise: (n, 3) array."""
-        return self._of(self.residual).bias(setting)
+        return Products(self.observations.blocks, self.weight, self.residual).bias(setting)
 
     def white_noise(self, white: Values) -> Values:
         """Return the standard deviation of a sample on each axis, of a residual without its wander: (3,) array."""
         squares = np.einsum("i,ij->j", self.weight, white**2) + self.observations.scatter
         return np.asarray(np.sqrt(squares / self.observations.samples), np.float64)
 
-    def left_of_column(self, c: int, j: int, products: Values) -> Values:
-        """Return x~ on axis c of effect parameter j, from ``all_products``: (n,) array."""
-        count, own = len(products), BASE + j
-        others = np.arange(count) != own
-        delta = np.zeros(count)
+    def left_of_column(self, c: int, own: int, products: Values) -> Values:
+        """Return x~ on axis c of a parameter, from the products of all parameters' columns: (n,) array."""
+        places = self.design.places(c)[1][:-1]
+        others = np.arange(len(products)) != own
+        delta = np.zeros(len(products))
         delta[others] = _solved(products[np.ix_(others, others)], products[others, own])
-        left: Values = self.columns[c][:, OWN + j] - self.columns[c] @ delta[_places(c, count)]
+        left: Values = self.columns[c][:, own - BASE + OWN] - self.columns[c] @ delta[places]
         return left
 
     def left_of(self, c: int, values: Values, setting: Setting) -> Values:
         """Return what base and effects, free on this axis, leave of values of (n,): (n,) array."""
-        products = self._of(np.column_stack([self.columns[c], values])).products([setting])[0][0]
+        columns = np.column_stack([self.columns[c], values])
+        products = Products(self.observations.blocks, self.weight, columns).products([setting])[0][0]
         left: Values = values - self.columns[c] @ _solved(products[:-1, :-1], products[:-1, -1])
         return left
 
@@ -267,11 +281,6 @@ def _solved(gram: Values, cross: Values) -> Values:
     size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
     found: Values = np.linalg.lstsq(gram / np.outer(size, size), cross / size, rcond=RANK)[0] / size
     return found
-
-
-def _places(c: int, count: int) -> NDArray[np.intp]:
-    """Return to which parameters the columns of an axis belong."""
-    return np.concatenate([[c], 3 + 3 * c + np.arange(3), np.arange(BASE, count)])
 
 
 @dataclass(frozen=True)
@@ -285,24 +294,15 @@ class Bins:
 
     @classmethod
     def of(cls, values: Values, weight: Values) -> Bins:
-        """Return the bins of a covariate.
-
-        Parameters
-        ----------
-        values : (n,) array
-            Not finite where it is not known.
-        weight : (n,) array
-        """
+        """Return the bins of a covariate, (n,) values that are not finite where it is not known."""
         known = np.isfinite(values)
         low, high = (float(values[known].min()), float(values[known].max())) if known.any() else (0.0, 0.0)
         place = np.full(len(values), BINS)
         place[known] = np.minimum((values[known] - low) * (BINS / max(high - low, 1e-300)), BINS - 1)
-        total: Values = np.bincount(place, weight, BINS + 1).astype(float)
-        filled = np.flatnonzero(total[:BINS] > 0)
-        number = np.full(BINS + 1, len(filled))
-        number[filled] = np.arange(len(filled))
-        sums: Values = np.bincount(place, weight * np.where(known, values, 0.0), BINS + 1).astype(float)
-        return cls(number[place], weight, total[filled], sums[filled] / total[filled])
+        filled, cell = np.unique(np.append(place, BINS), return_inverse=True)
+        total: Values = np.bincount(cell[:-1], weight, len(filled))[:-1].astype(float)
+        first = cls(cell[:-1], weight, total, np.zeros(0))
+        return cls(first.cell, weight, total, first.mean(np.where(known, values, 0.0)))
 
     def mean(self, values: Values) -> Values:
         """Return the weighted means of (n,) values: (b,) array."""
@@ -313,13 +313,7 @@ class Bins:
     def bias_of_means(self, blocks: Blocks, time: float) -> Values:
         """Return the variance that a Gauss-Markov bias of unit variance gives the means: (b,) array.
 
-        ``a^T B a``, with a the shares of a bin in the blocks and B the covariance of the bias.
-
-        Parameters
-        ----------
-        blocks : Blocks
-        time : float, s
-            Its correlation time.
+        ``a^T B a``, with a the shares of a bin in the blocks and B the covariance of the bias of that correlation time.
         """
         bins, count = len(self.weight), len(blocks.first)
         index = self.cell * count + blocks.label(len(self.cell))

@@ -3,24 +3,15 @@
     y_c = X_c beta_c + Z gamma_c + noise,    drop(W, c) = b^T (W^T G W)^-1 b,    b = W^T Z^T M C^-1 y_c
     G = Z^T M C^-1 Z,    M = 1 - C^-1 X_c (X_c^T C^-1 X_c)^-1 X_c^T
 
-where
-
-    X_c  : (n, 4 + p) columns of the model on axis c: 1, what K acts on, and every parameter of every effect
-    Z    : (n, q) further columns, such as curves in a covariate
+    X_c  : columns of the model on axis c: 1, what K acts on, and every parameter of every effect
+    Z    : (n, q) further columns, such as curves in a covariate;  W : (q, r), combinations of them: a functional form
     C    : white noise plus bias wander, ``pipeline.estimation.gauss_markov``
-    W    : (q, r) weights: which combinations of the columns make up a functional form
     drop : by how much they lower the whitened sum of squares
 
-so that any number of forms is judged from products formed once. The coefficients of effects that the axes share are
-left free on each axis: that decouples the axes, and never lets a form explain more than it does.
-
-Products of columns are differences of larger numbers. Their rounding errors are at most ``u sqrt(n) |a| |a'|`` (Higham
-and Mary 2019, doi:10.1137/18M1226312, n rows, |a| the norm of a column under white noise), so a column z from which
-others are taken with coefficients x leaves a sum of squares that is known to
-
-    e^2 = u sqrt(n) (|z| + sum |x_k| |a_k|)^2
-
-A column that leaves less than this cannot be distinguished from the others: it explains nothing.
+The coefficients of effects that the axes share are left free on each axis: that decouples the axes, and never lets a
+form explain more than it does. Rounding errors of products are at most ``u sqrt(n) |a| |a'|`` (Higham and Mary 2019,
+doi:10.1137/18M1226312), so a column z from which others are taken with coefficients x leaves a sum of squares that is
+known to ``e^2 = u sqrt(n) (|z| + sum |x_k| |a_k|)^2``; a column that leaves less explains nothing.
 """
 
 from __future__ import annotations
@@ -30,17 +21,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.estimation.design import Term, motions_of
+from pipeline.estimation.design import felt
 from pipeline.estimation.gauss_markov import WHITE, Products
+from pipeline.estimation.generalized_least_squares import design_at
 from pipeline.estimation.ranking import projection
-from pipeline.model.effects.base import Layout, truth
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
     from numpy.typing import NDArray
 
-    from pipeline.estimation.observations import Part
     from pipeline.estimation.selection import Selection
     from pipeline.records import Motion
 
@@ -49,46 +39,6 @@ if TYPE_CHECKING:
 
 NEW = 1e-3  # share of a column's norm that base and effects leave, below which it is theirs (EXCITED of the ranking)
 ROUNDING = float(np.finfo(np.float64).eps) / 2.0  # u
-
-
-@dataclass(frozen=True)
-class FittedModel:
-    """The columns and the residual of a selection's fit, at all rows."""
-
-    base: Values  # (n, 4): 1, and what K acts on: the truth and the effects that the axes share
-    effects: Values  # (n, 3, p): derivatives by every parameter of every effect, on each axis
-    residual: Values  # (n, 3), unit of the sensor
-    motions: list[Motion]  # of each part, after all effects of timing
-
-    @classmethod
-    def of(cls, selection: Selection) -> FittedModel:
-        """Return the model at the values of a selection's fit."""
-        terms = [Term(t.effect, t.values, full=True) for t in selection.fit.terms]
-        pieces = [_of_part(selection, part, terms) for part in selection.observations.parts]
-        base, effects, residual = (np.concatenate([piece[k] for piece in pieces]) for k in range(3))
-        return cls(base, effects, residual, [piece[3] for piece in pieces])
-
-    def columns(self, c: int) -> Values:
-        """Return the columns of one axis: (n, 4 + p) array."""
-        return np.concatenate([self.base, self.effects[:, c]], axis=1)
-
-
-def _of_part(selection: Selection, part: Part, terms: Sequence[Term]) -> tuple[Values, Values, Values, Motion]:
-    """Return base, effects and residual of one recording, and its motion after all effects of timing."""
-    sensor, fit = selection.observations.sensor, selection.fit
-    *motions, moved = motions_of(part, terms)
-    u = truth(sensor, moved)
-    residual = part.reading - fit.bias - u @ fit.K.T
-    columns = [np.zeros((len(u), 3, 0))]
-    for term, motion in zip(terms, motions, strict=True):
-        columns.append(term.regressors(sensor, motion, fit.K, moved))
-        if term.effect.moves:
-            continue
-        added = term.effect.reading(sensor, motion, fit.K, term.values)
-        residual = residual - added
-        if term.effect.layout == Layout.SHARED:
-            u = u + np.linalg.solve(fit.K, added.T).T
-    return np.column_stack([np.ones(len(u)), u]), np.concatenate(columns, axis=2), residual, moved
 
 
 @dataclass(frozen=True)
@@ -115,43 +65,41 @@ class ProjectedCurves:
     """
 
     def __init__(self, selection: Selection, curves: Curves, explained: Curves | None = None) -> None:
-        observations, model = selection.observations, FittedModel.of(selection)
+        observations, design = selection.observations, design_at(selection.observations, selection.fit)
         self.scale = selection.start.scale
         self.samples = 3.0 * observations.samples
         self.within = float(np.sum(observations.scatter / self.scale**2))
-        groups = [model.base, model.effects, *(_at_rows(f, model) for f in (explained, curves) if f is not None)]
-        A = np.concatenate([*(g.reshape(len(g), -1) for g in groups), model.residual], axis=1)
-        starts = np.cumsum([0, *(g[0].size for g in groups)])
-        of_axis = [
-            [
-                start + (c * g.shape[2] if g.ndim == 3 else 0) + np.arange(g.shape[-1])
-                for g, start in zip(groups, starts, strict=False)
-            ]
-            for c in range(3)
-        ]
-        known, own = [np.concatenate(places[:-1]) for places in of_axis], [places[-1] for places in of_axis]
-        self.size = np.sqrt(np.einsum("i,ij,ij->j", observations.weight, A, A))[own[0]]
+        motions = [felt(part, selection.fit.terms) for part in observations.parts]
+        columns, places = [design.columns.columns], [[design.places(c)[0]] for c in range(3)]
+        for further in filter(None, (explained, curves)):
+            values = np.concatenate([further(motion) for motion in motions])
+            first, apart = sum(c.shape[1] for c in columns), values.shape[2] if values.ndim == 3 else 0
+            for c in range(3):
+                places[c].append(first + c * apart + np.arange(values.shape[-1]))
+            columns.append(values.reshape(len(values), -1))
+        A, weight = np.concatenate(columns, axis=1), observations.weight
+        self.size = np.sqrt(np.einsum("i,ij,ij->j", weight, A, A))[places[0][-1]]
         settings = list(selection.settings)
-        stacked, logarithms = Products(observations.blocks, observations.weight, A).products([WHITE, *settings])
+        stacked, logarithms = Products(observations.blocks, weight, A).products([WHITE, *settings])
         self.penalty = 1.5 * logarithms[1:] - np.array([setting.prior for setting in settings])
-        self._project(stacked, known, own)
+        self._project(stacked, places)
 
-    def _project(self, products: Values, known: Sequence[NDArray[np.intp]], own: Sequence[NDArray[np.intp]]) -> None:
+    def _project(self, products: Values, places: Sequence[Sequence[NDArray[np.intp]]]) -> None:
         """Project base and effects out of curves and residual: products inner, cross and left, by noise and axis."""
-        q = len(own[0])
+        q = len(places[0][-1])
         white = np.sqrt(np.maximum(np.einsum("ii->i", products[0]), 0.0))
         unit = (ROUNDING * np.sqrt(self.samples / 3.0)) ** 0.5
         inner, cross, left, error = [], [], [], []
-        for c in range(3):
-            k = len(known[c])
-            index = np.concatenate([known[c], own[c], [products.shape[1] - 3 + c]])
+        for model, *explained, own in places:
+            known = np.concatenate([model[:-1], *explained])
+            k, index = len(known), np.concatenate([known, own, model[-1:]])
             among = products[:, index[:, None], index]
             taken = projection(among, np.arange(k))[:, :, k:]
             rest = among[:, k:, k:] - among[:, :k, k:].transpose(0, 2, 1) @ taken
             inner.append(rest[:, :q, :q])
             cross.append(rest[:, :q, q])
             left.append(rest[:, q, q])
-            error.append(unit * (white[own[c]] + white[known[c]] @ np.abs(taken[:, :, :q])))
+            error.append(unit * (white[own] + white[known] @ np.abs(taken[:, :, :q])))
         over = self.scale[None, :] ** -2
         self.white: Values = np.mean([axis[0] for axis in inner], axis=0)
         self.inner: Values = np.stack(inner, axis=1)[1:] * over[:, :, None, None]
@@ -177,13 +125,7 @@ class ProjectedCurves:
         return kept
 
     def drops(self, weights: Values) -> Values:
-        """Return what single columns explain under each noise, on each axis: (t, 3, m) array.
-
-        Parameters
-        ----------
-        weights : (q, m) array
-            Each column one form.
-        """
+        """Return what forms, the columns of (q, m) weights, explain under each noise on each axis: (t, 3, m) array."""
         inner = np.einsum("qm,tcqm->tcm", weights, self.inner @ weights)
         cross = self.cross @ weights
         left = np.einsum("qm,qm->m", weights, self.white @ weights)
@@ -214,14 +156,7 @@ class ProjectedCurves:
         return explained, independent
 
     def gains(self, drops: Values, parameters: int | NDArray[np.intp]) -> Values:
-        """Return delta BIC of forms on all three axes: (m,) array.
-
-        Parameters
-        ----------
-        drops : (t, 3, m) array
-        parameters : int or (m,) array
-            k.
-        """
+        """Return delta BIC of forms on all three axes, from their (t, 3, m) drops and numbers of parameters: (m,)."""
         rss = self.left.sum(axis=1)[:, None] - drops.sum(axis=1)
         best = self._log_likelihood(rss).max(axis=0)
         found: Values = 2.0 * (best - self.before) - parameters * float(np.log(self.samples))
@@ -230,13 +165,7 @@ class ProjectedCurves:
     def gain(self, drop: Values, columns: int, scanned: int = 0) -> Gain:
         """Return what one form explains, on the axes that it improves.
 
-        Parameters
-        ----------
-        drop : (t, 3) array
-        columns : int
-            Coefficients on each axis.
-        scanned : int
-            Nonlinear parameters, such as the place of a step.
+        Its (t, 3) ``drop`` is that of so many columns on each axis; ``scanned`` counts parameters such as a place.
         """
         from scipy.special import chdtrc  # noqa: PLC0415  (0.1 s that only a diagnosis pays)
 
@@ -262,8 +191,3 @@ class ProjectedCurves:
         known = np.where(both, inner, np.eye(len(index)))
         found: Values = np.linalg.solve(known, (cross * independent)[..., None])[..., 0]
         return found
-
-
-def _at_rows(curves: Curves, model: FittedModel) -> Values:
-    """Return curves at all rows."""
-    return np.concatenate([curves(motion) for motion in model.motions])

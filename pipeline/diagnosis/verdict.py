@@ -30,6 +30,7 @@ from pipeline.validation.heldout import last_error
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
+    from pipeline.diagnosis.findings import Findings
     from pipeline.records import Noise, Recording, SensorCalibration
 
 IN_DOUBT = "N-REFERENCE"
@@ -153,17 +154,15 @@ def doubts_of(sensor: str, recordings: Sequence[Recording]) -> list[str]:
     return [f"{r.name}: {note.detail}" for r in own for note in r.notes if note.code == IN_DOUBT]
 
 
-def evidence_of(  # noqa: PLR0917  (what a diagnosis is made of)
+def evidence_of(
     document: Mapping[str, Any],
     sensor: str,
     recordings: Sequence[Recording],
     noise: Noise | None,
     settings: Mapping[str, Any],
-    validation: Mapping[str, Any] | None,
     *,
-    other: SensorCalibration | None = None,
-    free: Callable[[], SensorCalibration] | None = None,
-    full: Callable[[], SensorCalibration] | None = None,
+    validation: Mapping[str, Any] | None,
+    found: Findings | None = None,
 ) -> Evidence:
     """Return what decides; the held-out error of further fits only where that of the calibration is above its interval.
 
@@ -171,26 +170,21 @@ def evidence_of(  # noqa: PLR0917  (what a diagnosis is made of)
     ----------
     document : mapping
         The diagnosis of the selection alone.
-    sensor : str
-    recordings : sequence of Recording
-    noise : Noise or None
     settings : mapping
         Sections ``table``, ``sensor``, ``procedure`` and ``method``.
     validation : mapping or None
         The sensor's part of ``validations/<unit>.json``; without it, the free fit stands for the calibration.
-    other : SensorCalibration, optional
-        Of the other sensor.
-    free, full : callable, optional
-        Return the calibrations of a free fit, without and with what was selected.
+    found : Findings or None
+        None where the recordings show no effect.
     """
     method = settings.get("method") or {}
-    filtered = any(r.filter["name"] != "none" for r in recordings if r.role == "validation")
+    free, full = (found.free, found.full) if found else (None, None)
 
     def error_of(fit: Callable[[], SensorCalibration] | None, *, smoothed: bool) -> HeldOut | None:
-        if fit is None or noise is None:
+        if fit is None or noise is None or found is None:
             return None
-        found = last_error(fit(), recordings, noise, settings, other=other, smoothed=smoothed)
-        return None if found is None else HeldOut(found[0], *found[1])
+        error = last_error(fit(), recordings, noise, settings, other=found.other, smoothed=smoothed)
+        return None if error is None else HeldOut(error[0], *error[1])
 
     accepted = ((settings.get("sensor") or {}).get(sensor) or {}).get("accept_implausible")
     implausible = [
@@ -203,17 +197,19 @@ def evidence_of(  # noqa: PLR0917  (what a diagnosis is made of)
         str(document["verdict"]),
         tuple(document["selected"]),
         document["residual_over_noise"],
+        found.left_over_noise if found else None,
         published=published,
         free=error_of(free, smoothed=True) if contradicted else None,
         full=error_of(full, smoothed=True) if contradicted else None,
         doubts=doubts_of(sensor, recordings),
-        approximations=[error["name"] for error in document.get("method_errors") or () if error["name"] in COMPARED],
+        approximations=[error["name"] for error in document["method_errors"] if error["name"] in COMPARED],
         unknown=[entry["covariate"] for entry in document["unexplained"] if not entry.get("explained_by")],
         implausible=() if accepted else implausible,
         held_out=document.get("held_out"),
         method=str(method.get(sensor) or ""),
         as_printed=bool(method.get("as_printed")),
-        filtered=filtered,
+        filtered=any(r.filter["name"] != "none" for r in recordings if r.role == "validation"),
+        on_table=found is None or found.on_table,
     )
 
 

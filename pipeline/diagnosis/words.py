@@ -10,6 +10,8 @@ from pipeline.model.effects.base import unit_of
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from pipeline.diagnosis.findings import Findings
+
 STAYS = 1.15  # times the noise floor: two standard deviations of the rms of 100 samples, 1 / sqrt(200) each
 UNKNOWN = {
     "temperature": "repeat the sequence at two steady temperatures, and while it heats and cools",
@@ -22,6 +24,12 @@ FAR_OFF = (
     "check the table against its log first (steps, backlash, rate, vibration) and the mounting: the residual is far "
     "above the noise and does not depend on any recorded quantity"
 )
+BY_HAND = {  # experiments where that of the effect asks for a table
+    "g_sensitivity": "repeat the rests on another day and facing another way: Earth's rotation turns with the heading, "
+    "the sensitivity stays with the unit",
+    "g_squared_sensitivity": "record more rests in which two axes are inclined alike, and some with one axis upright",
+    "cross_axis_nonlinearity": "record more rests in which all three axes are inclined, such as body diagonals up",
+}
 VERDICTS = {
     "nothing_missing": "Nothing that these recordings can show is missing in the model of the {sensor}.",
     "missing_effect": "The model of the {sensor} misses {effects}.",
@@ -166,58 +174,24 @@ def _hidden(part: Mapping[str, Any]) -> str:
     return f"Not observable: {each}."
 
 
-def next_experiment(
-    verdict: str,
-    ranking: Sequence[Mapping[str, Any]],
-    selected: Sequence[str],
-    hidden: Mapping[str, str],
-    unknown: Sequence[Mapping[str, Any]],
-    *,
-    one_way: bool,
-) -> str:
-    """Return the experiment that would show most, as one sentence.
-
-    Parameters
-    ----------
-    verdict : str
-    ranking, unknown : sequence of mapping
-        Entries ``ranking`` and ``unexplained`` of the diagnosis.
-    selected : sequence of str
-    hidden : mapping
-        Effect that is not observable to the reason.
-    one_way : bool
-        Whether the turns about no axis go in both directions.
-    """
+def next_experiment(verdict: str, ranking: Sequence[Mapping[str, Any]], found: Findings) -> str:
+    """Return the experiment that would show most, as one sentence."""
     if verdict == "unexplained":
-        return of_unknown(unknown)
-    if selected:
-        return _of_selected({entry["effect"]: entry for entry in ranking}, selected)
-    if one_way:
-        return "make every turn in the other direction too: five effects are observable only in both directions"
-    shown = next((name for name in ("bias_temperature", "lever_arm", "time_offset") if name in hidden), None)
-    if shown:
-        return f"to make {plain(shown)} observable: record {catalogue()[shown].excitation}"
-    return "none is needed: nothing that these recordings can show is missing"
+        return of_unknown(found.unknown) if found.unknown else found.advice(verdict)
+    if not found.selected:
+        return found.advice(verdict) or "none is needed: nothing that these recordings can show is missing"
+    entries = {entry["effect"]: entry for entry in ranking}
+    name = next((n for n in found.selected if entries[n]["look_alikes"]), found.selected[0])
+    experiment = catalogue()[name].experiment
+    if not found.on_table:
+        experiment = BY_HAND.get(name, experiment)
+    others = listed([plain(a["effect"]) for a in entries[name]["look_alikes"][:2]], "or")
+    return f"to {f'distinguish {plain(name)} from {others}' if others else f'confirm {plain(name)}'}: {experiment}"
 
 
 def of_unknown(unknown: Sequence[Mapping[str, Any]]) -> str:
-    """Return the experiment that would show on which quantity the residual depends.
-
-    Parameters
-    ----------
-    unknown : sequence of mapping
-        Entries of ``unexplained``.
-    """
+    """Return the experiment that would show on which quantity the residual depends, from entries ``unexplained``."""
     if not unknown:
         return FAR_OFF
     covariate = str(unknown[0]["covariate"])
     return f"to find other quantities than {plain(covariate)} on which the residual depends: {UNKNOWN[covariate]}"
-
-
-def _of_selected(entries: Mapping[str, Mapping[str, Any]], selected: Sequence[str]) -> str:
-    for name in selected:
-        alike = entries[name]["look_alikes"]
-        if alike:
-            others = listed([plain(a["effect"]) for a in alike[:2]], "or")
-            return f"to distinguish {plain(name)} from {others}: {catalogue()[name].experiment}"
-    return f"to confirm {plain(selected[0])}: {catalogue()[selected[0]].experiment}"

@@ -250,6 +250,14 @@ class Design:
                 for c in range(3):
                     A[:, places[c]] = regressors[:, c]
 
+    def of_axis(self, c: int) -> NDArray[np.float64]:
+        """Return the columns of one axis, the readings last: (n, q + 1) array."""
+        return self.columns.columns[:, self._local[c]]
+
+    def places(self, c: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Return where the columns of one axis lie, and to which parameters they belong, the readings last."""
+        return self._local[c], self._total[c]
+
     def products(self, settings: Sequence[Setting]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return all products of parameters' columns and, last, the readings, (g, p + 1, p + 1); and log det C, (g,).
 

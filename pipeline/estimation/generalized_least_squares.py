@@ -174,6 +174,11 @@ def _at(
     return Design(observations, terms, K, scale, target=residual, base=base)
 
 
+def design_at(observations: Observations, fit: Fit) -> Design:
+    """Return the derivative of a fitted model, and its residual in place of the readings."""
+    return _at(observations, fit.terms, fit.bias, fit.K, np.maximum(fit.scale, 1e-300))
+
+
 def _residual(
     observations: Observations, terms: Sequence[Term], bias: NDArray[np.float64], K: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -403,7 +408,7 @@ def calibration_of(  # noqa: PLR0917  (what a fit with effects is)
     if settings is None:
         return combined(found, [scatter_contribution(covariance, fit.degrees_of_freedom)], {})
     names = [term.effect.name for term in fit.terms]
-    design = _at(observations, fit.terms, fit.bias, fit.K, np.maximum(fit.scale, 1e-300))
+    design = design_at(observations, fit)
     first = design.linear_map(fit.setting)
     prior = static_or_sheet(noise, (settings.get("sensor") or {}).get(sensor) or {})
     errors = _residual_noise(design, observations, prior.grid(float(np.sqrt(np.mean(design.scale**2)))))

@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.diagnosis.observability import not_observable
-from pipeline.diagnosis.unobservable_effects import hidden_effects
+from pipeline.diagnosis.observability import at_its_limit, not_observable, not_observable_by_hand
 from pipeline.errors import NotObservableError
 from pipeline.estimation.multi_position.rests import is_multi_position
 from pipeline.estimation.observations import observe
@@ -117,7 +116,7 @@ def _expectation(sensor: str, simulated: SimulatedProcedure) -> tuple[Expectatio
 
         selected = select_in_rehearsal(sensor, simulated)
         hand = ExpectedSelection(selected, noise)
-        return hand, hidden_effects(selected, [])
+        return hand, not_observable_by_hand(selected, [])
     selection = unselected(observe(sensor, simulated.recordings, simulated.table), [], noise, sheet)
     return Expectation(selection, noise), not_observable(selection, [])
 
@@ -145,10 +144,8 @@ def _finite(value: float) -> float | None:
 
 def _faint(sensor: str, found: Detection) -> str:
     this = effect(found.effect)
-    unit = this.parameters(sensor)[0].unit
-    limit = f"{found.unit_sizes[0]:.2g}{'' if unit == '1' else ' ' + unit}"
     times = f", {found.found:.2g} times that would show" if np.isfinite(found.found) else ""
-    return f"even at its limit of {limit} it would be below the noise{times}; it needs {this.excitation}"
+    return f"{at_its_limit(this, sensor, found.unit_sizes[0])} be below the noise{times}; it needs {this.excitation}"
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,188 @@
+"""What the selection finds in turns on a table.
+
+Held-out errors of the selection's own fits are the rms length of ``matrix (reading - model)`` where the attitude is
+logged, else the rms error of the magnitude, against the noise floor of ``pipeline.validation.heldout``.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.diagnosis.findings import Findings
+from pipeline.diagnosis.functional_form_search import select_with_form, suggested_effect, unexplained
+from pipeline.diagnosis.method_errors import method_errors
+from pipeline.diagnosis.observability import not_observable, one_way
+from pipeline.diagnosis.residual_plots import plots
+from pipeline.diagnosis.verdict import verdict_of_selection
+from pipeline.diagnosis.words import FAR_OFF, plain
+from pipeline.estimation.design import Start
+from pipeline.estimation.generalized_least_squares import calibration_of, fit_terms
+from pipeline.estimation.observations import observe
+from pipeline.estimation.selection import FAR_ABOVE, select
+from pipeline.model.effects import catalogue
+from pipeline.records import Noise
+from pipeline.validation.error_breakdown import with_known_effects
+from pipeline.validation.heldout import noise_floors
+from pipeline.validation.samples import samples_of_motion
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.estimation.generalized_least_squares import Fit
+    from pipeline.estimation.selection import Selection
+    from pipeline.records import Recording, SensorCalibration
+
+NEEDED = "record turns about all three axes on a table whose angle and rate are logged"
+CLOSE = 1.1  # mean square of a residual over that of noise, under which there is no excess to share
+WORTH_RECORDING = ("bias_temperature", "lever_arm", "time_offset")  # where they are hidden, the first is proposed
+
+
+def findings(
+    calibration: SensorCalibration,
+    recordings: Sequence[Recording],
+    noise: Noise | None,
+    settings: Mapping[str, Any],
+    configured: list[str],
+    *,
+    accelerometer: SensorCalibration | None,
+) -> Findings:
+    """Return what the selection finds in turns on a table.
+
+    Raises
+    ------
+    NotObservableError
+        If the recordings do not determine bias and matrix.
+    """
+    del accelerometer
+    sensor, sheet = calibration.sensor, settings["sensor"][calibration.sensor]
+    observations = observe(sensor, recordings, settings["table"])
+    plain_selection = select(observations, configured, noise, sheet, calibration)
+    unknown = unexplained(plain_selection)
+    selection = select_with_form(plain_selection, unknown, configured, noise, sheet)
+    fits = _fits(selection)
+    held, floor = _held_out(selection, fits, recordings, noise, settings["table"])
+    held_out = None
+    if held is not None and noise is not None:
+        held_out = {"error_before": held[0], "error_after": held[-1], "floor": floor}
+    hidden = not_observable(selection, configured)
+    left = [fit.residual_rms**2 for fit in fits]
+    noise_square = None if noise is None else float(np.mean(noise.white**2 + noise.wander**2))
+    least = left[-1] if noise_square is None else noise_square
+    within = not selection.names and left[0] < CLOSE * least
+    excess = left[0] if within else max(left[0] - least, left[0] - left[-1])
+    share = float(np.clip((left[0] - left[-1]) / excess, 0.0, 1.0)) if excess > 0.0 else 0.0
+    explained = selection.first.explained([])
+    first_scale = float(np.mean(selection.start.scale**2) / selection.first.samples)
+    scores = selection.ranking.log_likelihoods(selection.chosen())
+    settings_of = selection.ranking.settings
+    suggested = None if selection is plain_selection else suggested_effect(unknown, sensor, catalogue())
+
+    def advice(verdict: str) -> str:
+        if verdict == "unexplained":
+            return FAR_OFF
+        if one_way(observations):
+            return "make every turn in the other direction too: five effects are observable only in both directions"
+        shown = next((name for name in WORTH_RECORDING if name in hidden), None)
+        return f"to make {plain(shown)} observable: record {catalogue()[shown].excitation}" if shown else ""
+
+    def calibrated(fit: Fit) -> SensorCalibration:
+        return calibration_of(sensor, fit, plain_selection.observations, None, settings)
+
+    return Findings(
+        sensor,
+        selection.names,
+        verdict_of_selection(
+            selection.names,
+            unknown,
+            share,
+            2.0 * (selection.fit.log_likelihood - selection.base.log_likelihood),
+            above_noise=noise_square is not None and left[-1] > FAR_ABOVE**2 * noise_square,
+            held_out=held_out,
+        ),
+        selection.steps,
+        selection.alone,
+        selection.fit.terms,
+        selection.fit.covariance,
+        selection.limits,
+        lambda name: _shares(selection, name),
+        left,
+        lambda name: first_scale * float(max((explained[j] for j in selection.first.indices(name)), default=0.0)),
+        excess,
+        held or [None] * len(fits),
+        hidden,
+        unknown,
+        _over_noise(plain_selection.base, recordings, noise),
+        _over_noise(plain_selection.fit, recordings, noise),
+        [(s.ratio, s.time, float(score)) for s, score in zip(settings_of[1:], scores[1:], strict=True)],
+        float(np.sqrt(np.mean(selection.start.scale**2))),
+        None if noise is None else float(np.sqrt(np.mean(noise.wander**2))),
+        advice,
+        free=lambda: calibrated(plain_selection.base),
+        full=(lambda: calibrated(plain_selection.fit)) if plain_selection.names else None,
+        more={
+            "held_out": held_out,
+            "suggested_effect": suggested,
+            "pictures": plots(plain_selection, unknown, noise, selection),
+            "method_errors": method_errors(calibration, selection, recordings, settings),
+        },
+    )
+
+
+def _fits(selection: Selection) -> list[Fit]:
+    """Return the fits of the base and with each further selected effect."""
+    fits = [selection.base]
+    fitted = {term.effect.name: term for term in selection.fit.terms}
+    for count in range(1, len(selection.names)):
+        terms = [*selection.base.terms, *(fitted[name] for name in selection.names[:count])]
+        start = Start(selection.fit.bias, selection.fit.K, selection.start.scale)
+        fits.append(fit_terms(selection.observations, terms, start, selection.settings))
+    return [*fits, selection.fit] if selection.names else fits
+
+
+def _held_out(
+    selection: Selection,
+    fits: Sequence[Fit],
+    recordings: Sequence[Recording],
+    noise: Noise | None,
+    table: Mapping[str, Any],
+) -> tuple[list[float] | None, float]:
+    """Return the held-out errors of some fits, and the noise floor of the last; None where nothing is held out.
+
+    An error is the rms length of the vector's error where the attitude is known, else the rms error of the magnitude.
+    """
+    sensor, known = selection.observations.sensor, noise or Noise(np.zeros(3), np.zeros(3), 1.0, "none")
+    held = [r for r in recordings if r.role == "validation"] if selection.names else []
+    samples = [s for r in held if (s := samples_of_motion(sensor, r, known, table, smoothed=True)) is not None]
+    samples = [s for s in samples if s.known.any()]
+    if not samples:
+        return None, 0.0
+    calibrations = [calibration_of(sensor, fit, selection.observations, None) for fit in fits]
+    errors = []
+    for calibration in calibrations:
+        squares = []
+        for each in samples:
+            vector, magnitude, true = with_known_effects(calibration, each, None)
+            off = np.linalg.norm(vector, axis=1) - magnitude if true is None else np.linalg.norm(vector - true, axis=1)
+            squares.append(off[each.known] ** 2)
+        errors.append(float(np.sqrt(np.nanmean(np.concatenate(squares)))))
+    floor, vector_floor = noise_floors(calibrations[-1], samples)
+    return errors, floor if vector_floor is None else vector_floor
+
+
+def _shares(selection: Selection, name: str) -> dict[str, float]:
+    """Return the share of an effect's fitted signal that each other effect reproduces."""
+    if name in selection.names:
+        held = selection.chosen()
+        return selection.ranking.shares(selection.ranking.indices(name)[0], held, selection.ranking.of_model(held)[1])
+    return selection.first.shares(selection.first.indices(name)[0], [], selection.alone[name].setting)
+
+
+def _over_noise(fit: Fit, recordings: Sequence[Recording], noise: Noise | None) -> float | None:
+    """Return the rms residual of a fit over that of noise alone."""
+    if noise is None:
+        return None
+    gain = max(float(r.filter.get("noise_gain", 1.0)) for r in recordings)
+    floor = float(np.sqrt(np.mean((gain * noise.white) ** 2 + noise.wander**2)))
+    return float(fit.residual_rms / floor) if floor > 0 else None
