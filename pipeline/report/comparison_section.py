@@ -2,23 +2,35 @@
 
 The groups are those that the configuration resolves (``pipeline.config.comparisons``). Errors are compared on held-out
 motion, and where the recordings are simulated also against their truth, without the noise of the held-out samples.
+The noise sigma of N held-out samples makes their rms error e uncertain by
+
+    u(e)^2 = sigma^2 (2 e^2 - sigma^2) / (2 N e^2),
+
+since the mean of (d_k + n_k)^2 has the variance (4 mean(d^2) sigma^2 + 2 sigma^4) / N, with mean(d^2) = e^2 - sigma^2.
+How far another recording would differ is not in it. The error against the truth is
+
+    e^2 = a^2 |M K - 1|_F^2 / 3 + |M (b - b_hat)|^2
+
+with the calibration M, b_hat, the truth K, b of ``reading = b + K truth`` and the rms motion a (g or deg/s).
 """
 
 from __future__ import annotations
 
 import math
-from collections import Counter
 from dataclasses import replace
 from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pandas as pd
 
-from pipeline.records import SENSOR_UNITS
+from pipeline.records import SENSOR_UNITS, SENSORS
 from pipeline.report.chart import Figure
 from pipeline.report.comparison import LEVEL, Compared, Group, compare, difference, finding, mean_of
 from pipeline.report.group_charts import COLOURS, Point, bars, curves
-from pipeline.report.numbers import MINUS, NOTHING, measured, number, plain, probability
+from pipeline.report.held_out_section import first_and_last_step
+from pipeline.report.numbers import measured, number
+from pipeline.report.parameters import fitted_parameters
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -31,6 +43,67 @@ FIGURES = (
 )  # fmt: skip
 
 
+def unit_figures(
+    calibration: JSON, validation: JSON | None, diagnosis: JSON | None, truth: JSON | None = None
+) -> list[JSON]:
+    """Return what is compared of a unit, a dict for each calibrated sensor.
+
+    Parameters
+    ----------
+    calibration, validation, diagnosis : dict or None
+        As in their files.
+    truth : dict, optional
+        ``truth/<unit>.json`` of the recordings, where they are simulated.
+
+    Returns
+    -------
+    list of dict
+        ``unit, sensor``; rms errors ``before``, ``after`` and ``truth`` (against the truth) with the standard
+        uncertainty ``u_<name>`` (g or deg/s); ``noise_floor``; ``table_time``, the length of the recordings of the
+        fit (s); ``verdict``; ``parameters``: name to Parameter.
+    """
+    rows = []
+    for sensor in SENSORS:
+        part, held_out = calibration.get(sensor), (validation or {}).get(sensor)
+        if part and held_out:
+            before, after = (step.get("rms_error") for step in first_and_last_step(held_out))
+            inputs = [i for i in calibration.get("inputs") or [] if i.get("role") in (sensor, "rests")]
+            rows.append({
+                "unit": calibration["unit"],
+                "sensor": sensor,
+                "before": before,
+                "u_before": _noise_of_error(before, held_out),
+                "after": after,
+                "u_after": _noise_of_error(after, held_out),
+                "truth": _against_truth(part, held_out, (truth or {}).get(sensor)),
+                "u_truth": None,
+                "noise_floor": held_out.get("noise_floor"),
+                "table_time": sum(i.get("duration_s") or 0.0 for i in inputs) or None,
+                "verdict": ((diagnosis or {}).get(sensor) or {}).get("verdict") or "",
+                "parameters": {p.words: p for p in fitted_parameters(part)},
+            })  # fmt: skip
+    return rows
+
+
+def _noise_of_error(error: float | None, held_out: JSON) -> float | None:
+    """Return the standard uncertainty of a held-out error by the noise of its samples."""
+    floor, samples = held_out.get("noise_floor"), held_out.get("samples")
+    if not error or not floor or not samples:
+        return None
+    noise = min(floor, error) ** 2
+    return math.sqrt(noise * (2.0 * error**2 - noise) / (2.0 * samples)) / error
+
+
+def _against_truth(part: JSON, held_out: JSON, truth: JSON | None) -> float | None:
+    size = held_out.get("reference_rms")
+    if truth is None or size is None:
+        return None
+    matrix = np.array(part["matrix"], float)
+    left = matrix @ np.linalg.inv(np.array(truth["matrix"], float)) - np.eye(3)
+    bias = matrix @ (np.array(truth["bias"], float) - np.array(part["bias"], float))
+    return float(np.sqrt(size**2 * np.sum(left**2) / 3.0 + np.sum(bias**2)))
+
+
 def section(comparison: JSON, figures: Sequence[JSON], name: str) -> JSON:
     """Return what the page shows of a comparison.
 
@@ -39,93 +112,55 @@ def section(comparison: JSON, figures: Sequence[JSON], name: str) -> JSON:
     comparison : dict
         As ``pipeline.config.comparisons`` resolves it.
     figures : sequence of dict
-        Of ``comparison.unit_figures``, of all units; failed units have none.
+        Of ``unit_figures``, of all units; failed units have none.
     name : str
         Identifier that is unique on the page.
     """
-    frame, sensors = pd.DataFrame(list(figures), columns=list(FIGURES)).set_index("unit"), []
+    frame = pd.DataFrame(list(figures), columns=list(FIGURES)).set_index("unit")
+    against, pairs, sensors = comparison["against"], comparison["pairs"], []
     for sensor in comparison["sensors"]:
-        known = frame[frame["sensor"] == sensor]
+        known, unit = frame[frame["sensor"] == sensor], SENSOR_UNITS[sensor]
         groups = [
             Group(
                 g["name"],
                 g["series"],
                 g["label"],
                 len(g["units"]),
-                known.reindex([u for u in g["units"] if u in known.index]),
+                known.loc[[u for u in g["units"] if u in known.index]],
             )
             for g in comparison["groups"]
         ]
-        compared = {m: c for m in MEASURES if (c := compare(groups, m, comparison["against"], comparison["pairs"]))}
-        if compared:
-            sensors.append({
-                "sensor": sensor,
-                "unit": SENSOR_UNITS[sensor],
-                "measures": [
-                    {
-                        "name": m,
-                        "title": MEASURES[m],
-                        "figure": _figure(c, comparison, m, SENSOR_UNITS[sensor], f"{name}-{sensor}"),
-                        "rows": [_row(one, m) for one in c],
-                    }
-                    for m, c in compared.items()
-                ],
-                "parameters": _parameters(groups, comparison["against"], comparison["pairs"]),
-            })  # fmt: skip
+        compared = {m: c for m in MEASURES if (c := compare(groups, m, against, pairs))}
+        measures = [
+            {
+                "name": m,
+                "title": MEASURES[m],
+                "figure": _figure(c, comparison, m, f"{MEASURES[m]}, {unit}", f"{name}-{sensor}-{m}"),
+                "rows": c,
+            }
+            for m, c in compared.items()
+        ]
+        if measures:
+            parameters = _parameters(groups, against, pairs)
+            sensors.append({"sensor": sensor, "unit": unit, "measures": measures, "parameters": parameters})
     return {
         "title": comparison["title"],
-        "against": comparison["against"],
-        "paired": comparison["pairs"] is not None,
+        "against": against,
+        "paired": pairs is not None,
         "sensors": sensors,
         "groups": [(g["name"], g["units"]) for g in comparison["groups"]],
         "single": all(len(g["units"]) == 1 for g in comparison["groups"]),
     }
 
 
-def _row(c: Compared, measure: str) -> JSON:
-    """Return the line of a group in the table of a measure, as text."""
-    count, (low, high), held_out = len(c.group.figures), c.interval, measure == "after"
-    before, floor = c.group.mean("before"), c.group.mean("noise_floor") if held_out else None
-    verdicts = Counter(plain(v) for v in c.group.figures["verdict"] if v)
-    row = {
-        "name": c.group.name,
-        "count": f"{count}" + (f" of {c.group.asked}" if count < c.group.asked else ""),
-        "before": number(before),
-        "value": number(c.mean),
-        "interval": f"{number(low)} to {number(high)}" if low < high else NOTHING,
-        "floor": number(floor),
-        "ratio": number(c.mean / floor if floor else None),
-        "time": number(c.group.mean("table_time")),
-        "verdicts": [f"{n} {v}" for v, n in verdicts.items()],
-        "result": c.result,
-    }
-    if c.difference is None:
-        return row | dict.fromkeys(("difference", "interval_of_difference", "significance", "p"), "")
-    low, high = c.difference.interval
-    return row | {
-        "difference": _percent(c.difference.value),
-        "interval_of_difference": f"{_percent(low)} to {_percent(high)}" if low < high else NOTHING,
-        "significance": number(c.difference.significance, 2),
-        "p": probability(c.p_value),
-    }
-
-
-def _percent(logarithm: float) -> str:
-    """Return a ratio, given by its logarithm, as a change in percent, or where it is more than twofold as a factor."""
-    if logarithm > math.log(2.0):
-        return f"× {number(math.exp(logarithm))}"
-    return f"{100.0 * math.expm1(logarithm):+.1f} %".replace("-", MINUS)
-
-
-def _figure(compared: list[Compared], comparison: JSON, measure: str, unit: str, name: str) -> Figure:
+def _figure(compared: list[Compared], comparison: JSON, measure: str, title: str, name: str) -> Figure:
     """Draw a measure: along the axis that the comparison names, or in rows."""
     x = comparison["x"]
     points = [p for c in compared if (p := _point(c, measure, x)) is not None]
-    title = f"{MEASURES[measure]}, {unit}"
     words = ["Mean of each group with its 95 % interval; faint, its units."] * any(len(p.units) > 1 for p in points)
     words += ["Dashed: the error that noise alone gives."] * any(p.floor for p in points)
     told = finding([c.group for c in compared], measure, comparison["pairs"])
-    figure = Figure(f"{name}-{measure}", told, " ".join(words))
+    figure = Figure(name, told, " ".join(words))
     if x is None:
         return bars(figure, points, title)
     series = list(dict.fromkeys(p.series for p in points))
@@ -159,16 +194,15 @@ def _parameters(groups: Sequence[Group], against: str, pairs: Mapping[str, str] 
     for group in groups:
         cells = []
         for name in names:
-            own, other = group.parameter(name), reference.parameter(name)
-            mean = mean_of(own["value"], own["u"])
-            change = difference(own, other, pairs) if group is not reference and len(own) and len(other) else None
-            value = NOTHING
-            if mean is not None:
-                U = mean.expanded_uncertainty
-                value = measured(mean.value, U) if U else number(mean.value)
-            significance = number(change.significance, 2) if change else ""
-            p_value = change.p_value if change else None
-            beyond = p_value is not None and p_value < LEVEL
-            cells.append({"value": value, "significance": significance, "beyond": beyond})
+            own = group.parameter(name)
+            mean, change = mean_of(own["value"], own["u"]), difference(own, reference.parameter(name), pairs)
+            U = mean.expanded_uncertainty
+            if group is reference:
+                change = replace(change, standard_uncertainty=math.nan)
+            cells.append({
+                "value": measured(mean.value, U) if U > 0.0 else number(mean.value),
+                "significance": "" if math.isnan(change.significance) else number(change.significance, 2),
+                "beyond": change.p_value < LEVEL,
+            })  # fmt: skip
         rows.append({"name": group.name, "cells": cells})
     return {"names": names, "rows": rows}

@@ -43,6 +43,13 @@ def percent(share: object) -> str:
     return f"{number(100.0 * share, 2)} %" if isinstance(share, int | float) else NOTHING
 
 
+def percent_change(logarithm: float) -> str:
+    """Return a ratio, given by its logarithm, as a change in percent, or where it is more than twofold as a factor."""
+    if logarithm > math.log(2.0):
+        return f"× {number(math.exp(logarithm))}"
+    return f"{100.0 * math.expm1(logarithm):+.1f} %".replace("-", MINUS)
+
+
 def probability(value: object) -> str:
     """Return a p-value; tiny ones as a bound."""
     if not isinstance(value, int | float):

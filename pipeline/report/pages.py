@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from jinja2 import Environment, FileSystemLoader, Template
 from markupsafe import Markup
 
-from pipeline.report.numbers import measured, number, percent, plain, probability, typeset, unit_text
+from pipeline.report.numbers import measured, number, percent, percent_change, plain, probability, typeset, unit_text
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -36,8 +36,8 @@ def _figure(value: object) -> str:
 @cache
 def _environment() -> Environment:
     environment = _Pages(loader=FileSystemLoader(FOLDER), autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    filters = {"number": number, "measured": measured, "percent": percent, "probability": probability}
-    environment.filters.update(filters, typeset=typeset, words=plain, figure=_figure, unit=unit_text)
+    numbers = (number, measured, percent, percent_change, probability, typeset)
+    environment.filters |= {f.__name__: f for f in numbers} | {"words": plain, "figure": _figure, "unit": unit_text}
     environment.globals["asset"] = asset
     return environment
 

@@ -16,8 +16,7 @@ from pipeline.errors import PipelineError
 from pipeline.files import flushed_together, read_json, write_atomically, write_json
 from pipeline.history import of_units, record, unit_state
 from pipeline.report.campaign_page import render
-from pipeline.report.comparison import unit_figures
-from pipeline.report.comparison_section import section
+from pipeline.report.comparison_section import section, unit_figures
 from pipeline.report.fleet import fleet_statistics, unit_parameters, write_parameters
 from pipeline.report.pages import failure_page
 from pipeline.report.run_section import runs_data, times_of, with_history

@@ -118,9 +118,7 @@ class Errors:
 
 
 def _mean(values: Iterable[float]) -> Estimate:
-    found = mean_of(list(values))
-    assert found is not None  # noqa: S101  (every key holds a row)
-    return found
+    return mean_of(list(values))
 
 
 def _compared(what: str, first: pd.Series[float], second: pd.Series[float], smallest: float) -> Line:
