@@ -9,6 +9,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from whole_run import run_campaign, run_jobs
 
 from pipeline import results_folder
 from pipeline.config import load_campaign, settings_file
@@ -18,33 +19,6 @@ from pipeline.stages import report as report_stage
 
 STAGES = ("ingest", "filter", "fit", "calibration", "validate", "diagnose", "export", "report", "gather")
 FOLDERS = ("calibrations", "validations", "diagnoses", "reports", "certificates", "exports")
-
-
-def run_stages(campaign: Campaign) -> None:
-    """Run each stage in this process, as the rules do."""
-    (name,) = campaign.batches
-    folder = campaign.results / "batches" / name
-    units = campaign.batches[name]
-    fits = {sensor: f"fit/{sensor}/{stages[-1]}" for sensor, stages in campaign.chains[name].items()}
-
-    def stage(module: str, output: str, inputs: dict[str, str], *more: str, sensor: str = "") -> None:
-        part = settings_file(campaign, module if module != "fit" else "fit-x", units, sensor).write()
-        given = [word for i, of in inputs.items() for word in (f"--{i}", str(folder / of))]
-        arguments = ["--config", part, *given, *more, "--output", str(folder / output)]
-        assert batch.main(module, arguments) == 0
-
-    stage("ingest", "ingest", {})
-    stage("filter", "filter", {"ingest": "ingest"})
-    for sensor, output in fits.items():
-        more = ("--sensor", sensor, "--stage", output.rpartition("/")[2], "--previous=")
-        stage("fit", output, {"filter": "filter"}, *more, sensor=sensor)
-    stage("validate", "validate", {"filter": "filter", **fits})
-    stage("diagnose", "diagnose", {"filter": "filter", **fits, "validate": "validate"})
-    stage("calibration", "calibration", {"ingest": "ingest", **fits, "validate": "validate"})
-    stage("export", "export", {"calibration": "calibration", "validate": "validate"})
-    done = ("calibration", "validate", "diagnose", "export")
-    stage("report", "report", {"filter": "filter", **{s: s for s in done}})
-    stage("gather", "../gathered.json", {})
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +53,7 @@ def published(tmp_path_factory: pytest.TempPathFactory, simulated: Path) -> tupl
         patch.setattr(batch, "_run_unit", faulty)
         patch.setattr(gather, "_read_unit", faulty_gather)
         patch.setattr(report_stage, "render", faulty_render)
-        run_stages(campaign)
+        assert run_jobs(campaign) == 1
     return campaign, campaign.results
 
 
@@ -173,6 +147,26 @@ def test_the_published_files_are_those_of_one_run_wherever_it_is_stopped(
         assert not (results / results_folder.COMPLETE).exists()
     assert contents(results) == new
     assert stop > len(results_folder.PUBLISHED)
+
+
+def keep_the_first_rest(file: Path) -> None:
+    file.write_text("\n".join(file.read_text().splitlines()[:8]) + "\n")
+
+
+def test_other_failures_are_named_too(tmp_path: Path, simulated: Path) -> None:
+    for unit in ("good", "incomplete", "short"):
+        shutil.copytree(simulated, tmp_path / "bench" / "raw" / unit)
+    (tmp_path / "bench" / "units.csv").write_text("unit\ngood\nincomplete\nshort\n")
+    (tmp_path / "bench" / "raw" / "incomplete" / "accel_z.csv").unlink()
+    for file in (tmp_path / "bench" / "raw" / "short").glob("accel_*.csv"):
+        keep_the_first_rest(file)
+    campaign, code = run_campaign(tmp_path / "bench")
+    assert code == 1
+    failures = json.loads((campaign.results / "failures.json").read_text())
+    assert [(f["unit"], f["code"]) for f in failures] == [("incomplete", "missing_file"), ("short", "not_observable")]
+    assert "accel_z" in failures[0]["message"]
+    assert "accelerometer" in failures[1]["message"]
+    assert json.loads((campaign.results / "calibrations" / "good.json").read_text())["status"] == "ok"
 
 
 def test_what_a_killed_gather_leaves_is_the_old_set(published: tuple[Campaign, Path]) -> None:

@@ -11,9 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from whole_run import run_campaign
 
-from pipeline.io.parquet import load_recordings
+from pipeline.config import load_campaign
+from pipeline.errors import ConfigurationError
 from pipeline.io.ros2_messages import write_mcap
+from pipeline.records import Recording
 
 from .conftest import ROOT, Bench
 
@@ -39,6 +42,14 @@ def without(source: Path, target: Path, sensor: str) -> None:
     target.write_text("".join(",".join(row[i] for i in kept) + "\n" for row in rows))
 
 
+def as_mcap(source: Path, target: Path) -> None:
+    """Write the same readings as MCAP, with the gyroscope marked as absent by the covariance -1."""
+    rows = np.genfromtxt(source, delimiter=",", names=True)
+    time = np.rint(rows["time_s"] * 1e9).astype(np.int64)
+    force = np.column_stack([rows[f"accel_{axis}_g"] for axis in "xyz"])
+    write_mcap(target, Recording("recording", "rests", None, time, force, None, rows["temperature_degc"]))
+
+
 def simulate(directory: Path, *options: str) -> Path:
     command = [sys.executable, "-m", "pipeline", "simulate", str(directory), "--sensor", "mpu6050", "--quiet", *options]
     subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
@@ -57,18 +68,11 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> Bench:
     without(hand / "recording.csv", campaign / "raw" / "csv" / "recording.csv", "gyro")
     for name in ("gyro_x", "gyro_y", "gyro_z", "validation"):  # no recording of the accelerometer's turns at all
         without(table / f"{name}.csv", campaign / "raw" / "table" / f"{name}.csv", "accel")
-    (campaign / "units.csv").write_text("".join(r for r in UNITS.splitlines(keepends=True) if not r.startswith("mcap")))
-    bench = Bench(directory, campaign)
-    assert bench.snakemake().code == 0
-    # the same readings as MCAP, its gyroscope marked as absent by the covariance -1
-    folder = campaign / "raw" / "mcap"
-    folder.mkdir()
-    (recording,) = load_recordings(next((bench.results / "batches").glob("*/ingest/csv.parquet")))
-    write_mcap(folder / "recording.mcap", recording)
+    (campaign / "raw" / "mcap").mkdir()
+    as_mcap(campaign / "raw" / "csv" / "recording.csv", campaign / "raw" / "mcap" / "recording.mcap")
     (campaign / "units.csv").write_text(UNITS)
-    run = bench.snakemake()
-    assert run.code == 0, run.output
-    return bench
+    assert run_campaign(campaign)[1] == 0
+    return Bench(directory, campaign)
 
 
 def document(bench: Bench, kind: str, unit: str) -> dict[str, Any]:
@@ -115,6 +119,6 @@ def test_a_log_of_one_sensor_is_compensated(done: Bench) -> None:
 
 
 def test_a_method_without_any_sensor_is_refused(done: Bench) -> None:
-    run = done.snakemake("overrides=[method.accelerometer=null, method.gyroscope=null]", dry=True)
-    assert run.code != 0
-    assert "nothing is left to calibrate" in run.output
+    overrides = ["method.accelerometer=null", "method.gyroscope=null"]
+    with pytest.raises(ConfigurationError, match="nothing is left to calibrate"):
+        load_campaign({"campaign": str(done.campaign), "overrides": overrides})

@@ -1,4 +1,4 @@
-"""Recordings that others have published, calibrated by the real Snakefile, against what is known of their sensors."""
+"""Recordings that others have published, calibrated by every stage, against what is known of their sensors."""
 
 import json
 from pathlib import Path
@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from whole_run import run_campaign
 
 from .conftest import ROOT, Bench
 
@@ -31,11 +32,9 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> Bench:
     directory = tmp_path_factory.mktemp("published")
     (directory / "published").mkdir()
     (directory / "published" / "units.csv").write_text(SHEET)
-    bench = Bench(directory, directory / "published")
-    gravity = ", ".join(f"{unit}: [table.gravity_g={GRAVITY}]" for unit in ("xsens", "xsens-all", "xsens-moves"))
-    run = bench.snakemake(f"unit_overrides={{{gravity}}}")
-    assert run.code == 0, run.output
-    return bench
+    gravity = {unit: [f"table.gravity_g={GRAVITY}"] for unit in ("xsens", "xsens-all", "xsens-moves")}
+    assert run_campaign(directory / "published", unit_overrides=gravity)[1] == 0
+    return Bench(directory, directory / "published")
 
 
 def document(bench: Bench, kind: str, unit: str) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from whole_run import run_campaign
 
 from pipeline.io.parquet import load_recordings
 
@@ -36,17 +37,16 @@ WINDOWS = ", ".join(
 
 
 @pytest.fixture(scope="module")
-def done(tmp_path_factory: pytest.TempPathFactory) -> tuple[Bench, str]:
+def done(tmp_path_factory: pytest.TempPathFactory) -> Bench:
     directory = tmp_path_factory.mktemp("layouts")
     campaign = directory / "layouts"
     campaign.mkdir()
     (campaign / "simulation.yaml").write_text(DESCRIPTION)
     command = [sys.executable, "-m", "pipeline", "simulate", str(campaign)]
     subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
-    bench = Bench(directory, campaign)
     override = f"procedure.recordings.recording.windows=[{WINDOWS}]"
-    run = bench.snakemake(f"unit_overrides={{windows: [{json.dumps(override)}]}}")
-    return bench, run.output
+    assert run_campaign(campaign, unit_overrides={"windows": [override]})[1] == 0
+    return Bench(directory, campaign)
 
 
 def result(bench: Bench, kind: str, unit: str) -> dict[str, Any]:
@@ -55,11 +55,10 @@ def result(bench: Bench, kind: str, unit: str) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("unit", ["rows", "file", "program", "one", "one_file"])
-def test_each_layout_gives_the_truth_within_its_uncertainty(done: tuple[Bench, str], unit: str) -> None:
-    bench, output = done
-    found = result(bench, "calibrations", unit)
-    assert found["status"] == "ok", output
-    truth = json.loads((bench.campaign / "truth" / f"{unit}.json").read_text())
+def test_each_layout_gives_the_truth_within_its_uncertainty(done: Bench, unit: str) -> None:
+    found = result(done, "calibrations", unit)
+    assert found["status"] == "ok"
+    truth = json.loads((done.campaign / "truth" / f"{unit}.json").read_text())
     for sensor in ("accelerometer", "gyroscope"):
         for key in ("bias", "matrix"):
             off = np.array(found[sensor][key]) - truth[sensor][key]
@@ -67,34 +66,31 @@ def test_each_layout_gives_the_truth_within_its_uncertainty(done: tuple[Bench, s
 
 
 @pytest.mark.parametrize("unit", ["file", "program"])
-def test_a_twin_differs_by_little_of_its_uncertainty(done: tuple[Bench, str], unit: str) -> None:
-    bench, _ = done
-    twin, found = result(bench, "calibrations", "rows"), result(bench, "calibrations", unit)
+def test_a_twin_differs_by_little_of_its_uncertainty(done: Bench, unit: str) -> None:
+    twin, found = result(done, "calibrations", "rows"), result(done, "calibrations", unit)
     for sensor in ("accelerometer", "gyroscope"):
         for key in ("bias", "matrix"):
             off = np.array(found[sensor][key]) - twin[sensor][key]
             assert float(np.abs(off / twin[sensor]["expanded_uncertainty"][key]).max()) < 0.5
-        held_out = [result(bench, "validations", u)[sensor]["steps"][-1]["rms_error"] for u in ("rows", unit)]
+        held_out = [result(done, "validations", u)[sensor]["steps"][-1]["rms_error"] for u in ("rows", unit)]
         assert held_out[1] == pytest.approx(held_out[0], rel=0.05)
 
 
-def test_the_page_tells_clock_program_and_segments(done: tuple[Bench, str]) -> None:
-    bench, _ = done
+def test_the_page_tells_clock_program_and_segments(done: Bench) -> None:
     for unit, told in (
         ("file", "the table&#39;s clock is"),
         ("program", "the table is followed from its program"),
         ("one", "24 steps about x at"),
         ("windows", "accelerometer about x, from 0.00 to 49"),
     ):
-        assert told in (bench.results / "reports" / f"{unit}.html").read_text(), unit
+        assert told in (done.results / "reports" / f"{unit}.html").read_text(), unit
 
 
-def test_windows_in_the_configuration_take_the_place_of_what_is_found(done: tuple[Bench, str]) -> None:
-    bench, _ = done
-    ingested = next(bench.results.glob("batches/*/ingest/windows.parquet"))
+def test_windows_in_the_configuration_take_the_place_of_what_is_found(done: Bench) -> None:
+    ingested = next(done.results.glob("batches/*/ingest/windows.parquet"))
     found = {r.name: float(r.time[-1] - r.time[0]) for r in load_recordings(ingested)}
     spans = {
         f"{s}_{axis}": b - a for axis, at in TIMES.items() for s, (a, b) in zip(("accel", "gyro"), at, strict=True)
     }
     assert found == pytest.approx(spans, abs=0.25)  # two samples
-    assert result(bench, "calibrations", "windows")["status"] == "ok"
+    assert result(done, "calibrations", "windows")["status"] == "ok"

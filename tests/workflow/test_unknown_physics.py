@@ -1,4 +1,4 @@
-"""Physics that no effect knows, through the real Snakefile: a file is suggested and, copied, leaves noise alone."""
+"""Physics that no effect knows, through every stage: a file is suggested and, copied, leaves noise alone."""
 
 import csv
 import json
@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from whole_run import run_campaign
 
-from .conftest import Bench, Run
+from .conftest import Bench
 
 pytestmark = pytest.mark.workflow
 
@@ -53,10 +54,8 @@ def bench(tmp_path_factory: pytest.TempPathFactory, simulated: Path) -> Bench:
 
 
 @pytest.fixture(scope="module")
-def first(bench: Bench) -> Run:
-    run = bench.snakemake()
-    assert run.code == 0, run.output
-    return run
+def first(bench: Bench) -> None:
+    assert run_campaign(bench.campaign)[1] == 0
 
 
 @pytest.mark.usefixtures("first")
@@ -79,8 +78,7 @@ def test_the_file_copied_as_it_is_told_runs_and_leaves_noise_alone(bench: Bench)
     effects = bench.campaign / "effects"
     effects.mkdir()
     shutil.copyfile(bench.results / "diagnoses" / FILE, effects / "unknown_angle.yaml")
-    run = bench.snakemake("overrides=effects.gyroscope=[unknown_angle]")
-    assert run.code == 0, run.output
+    assert run_campaign(bench.campaign, overrides="effects.gyroscope=[unknown_angle]")[1] == 0
     part = diagnosis(bench, "buzzing")["gyroscope"]
     assert (part["verdict"], part["selected"], part["unexplained"]) == ("nothing_missing", [], [])
     assert part["residual_over_noise"] < 1.1 < before
