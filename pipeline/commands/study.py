@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 from pipeline.errors import ConfigurationError
 from pipeline.study.cases import FAMILIES
-from pipeline.study.figures import all_figures, in_the_catalogue, joined, mean_excess_gone
 from pipeline.study.page import page
 from pipeline.study.run import RESULTS, TRUTH, read_lines, run_study
+from pipeline.study.scores import all_figures, cases_of, in_the_catalogue, mean_excess_gone
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -48,7 +48,7 @@ def main(argv: Sequence[str]) -> int:
     run_study(
         arguments.directory, families, arguments.n, arguments.seed, processes=arguments.processes, progress=_progress
     )
-    cases = joined(read_lines(arguments.directory / TRUTH), read_lines(arguments.directory / RESULTS))
+    cases = cases_of(read_lines(arguments.directory / TRUTH), read_lines(arguments.directory / RESULTS))
     for figure in all_figures(cases):
         low, high = figure.interval
         print(

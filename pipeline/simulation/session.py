@@ -105,7 +105,7 @@ class Session:
                 table_rate=log.get("table_rate"),
                 table_attitude=log.get("table_attitude"),
             )
-            out.append(whole.select(_received(len(times[k]), self.lost, rng["link"])) if self.lost else whole)
+            out.append(whole.select(received(len(times[k]), self.lost, rng["link"])) if self.lost else whole)
         return out
 
     def _times(self) -> list[NDArray[np.int64]]:
@@ -172,7 +172,7 @@ def _log(plan: Planned, bench: Bench, time: NDArray[np.float64]) -> dict[str, ND
     return {"table_rate": np.zeros(len(time))} if plan.role == "static" else {}
 
 
-def _received(count: int, lost: float, rng: np.random.Generator) -> NDArray[np.bool_]:
+def received(count: int, lost: float, rng: np.random.Generator) -> NDArray[np.bool_]:
     """Return which samples the radio link delivers; the first and the last always."""
     kept = rng.random(count) >= lost
     kept[[0, -1]] = True

@@ -49,16 +49,18 @@ from pipeline.simulation.session import Streams
 from pipeline.study.cases import COURSES, OF_TEMPERATURE
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
     from pipeline.records import Recording
     from pipeline.study.cases import Case
 
-INTERVAL_S = 0.12
+    Values = NDArray[np.float64]
+
+INTERVAL_S = 0.12  # the default of ``UnitDescription``
 PERFECT = {"angle_accuracy_deg": 0.0, "rate_error": (0.0, 0.0, 0.0), "direction_deg": [[0.0, 0.0]] * 3}
-OF_WHITE = ("ar_06", "ar_09")
+OF_WHITE = {"ar_06": 0.6, "ar_09": 0.9}  # coefficient of the autoregression
 AMPLITUDE = {
     "gear_mesh": {"accelerometer": 2e-3, "gyroscope": 0.03},
     "temperature_step": {"accelerometer": 4e-3, "gyroscope": 0.06},
@@ -66,8 +68,7 @@ AMPLITUDE = {
     "exponential": {"accelerometer": 3e-3, "gyroscope": 0.6},
     "band": {"accelerometer": 2e-3, "gyroscope": 0.05},
 }
-USED = ("accelerometer", "gyroscope")
-GAUSS_MARKOV = ("normal", "wander")
+GAUSS_MARKOV = ("normal", "wander")  # families of noise for which lambda is known
 
 
 def recordings_of(case: Case) -> list[Recording]:
@@ -102,12 +103,12 @@ def recordings_of(case: Case) -> list[Recording]:
     if case.noise == "cold":
         recordings = [replace(r, temperature=None) for r in recordings]
     if case.noise == "coarse":
-        recordings = [replace(r, temperature=np.round(2.0 * _temperature(r)) / 2.0) for r in recordings]
+        recordings = [replace(r, temperature=np.round(2.0 * np.asarray(r.temperature)) / 2.0) for r in recordings]
     return recordings
 
 
 def _at_rest(recording: Recording) -> Recording:
-    """Return the samples at which a table stands still; of motion held out, all."""
+    """Return the samples at which a table stands still; of held-out motion, all."""
     if recording.table_angle is None or recording.table_rate is None:
         return recording
     return recording.select((recording.table_rate == 0.0) & (np.diff(recording.table_angle, prepend=0.0) == 0.0))
@@ -116,12 +117,12 @@ def _at_rest(recording: Recording) -> Recording:
 def _with_noise(
     recordings: list[Recording], sensor: str, noise: str, sheet: dict[str, Any], rng: np.random.Generator
 ) -> list[Recording]:
-    white = sheet["noise_density"] * np.sqrt(0.5 / INTERVAL_S)
+    """Add noise of a family other than the simulator's to one sensor, over all recordings of the unit."""
     first = min(float(r.time[0]) for r in recordings)
     last = max(float(r.time[-1]) for r in recordings)
     count = int((last - first) / INTERVAL_S) + 2
     if noise in OF_WHITE:
-        added = white * _autoregression(count, float(noise[-1]) / 10.0, rng)
+        added = _white(sheet) * _autoregression(count, OF_WHITE[noise], rng)
     elif noise == "random_walk":
         step = sheet["bias_wander"] * np.sqrt(INTERVAL_S / sheet["wander_time_s"])
         added = np.cumsum(step * rng.standard_normal((count, 3)), axis=0)
@@ -129,23 +130,24 @@ def _with_noise(
         added = 3.0 * sheet["bias_wander"] * _one_over_f(count, rng)
     else:
         return recordings
-    out = []
-    for recording in recordings:
-        at = np.rint((recording.time - first) / INTERVAL_S).astype(int)
-        out.append(_added(recording, sensor, added[at]))
-    return out
+    return [_added(r, sensor, added[np.rint((r.time - first) / INTERVAL_S).astype(int)]) for r in recordings]
 
 
-def _autoregression(count: int, coefficient: float, rng: np.random.Generator) -> NDArray[np.float64]:
+def _white(sheet: Mapping[str, Any]) -> float:
+    """Return the standard deviation of one sample's white noise."""
+    return float(sheet["noise_density"] * np.sqrt(0.5 / INTERVAL_S))
+
+
+def _autoregression(count: int, coefficient: float, rng: np.random.Generator) -> Values:
     from scipy.signal import lfilter  # noqa: PLC0415  (0.3 s, as in the simulator)
 
     drive = np.sqrt(1.0 - coefficient**2) * rng.standard_normal((count, 3))
     drive[0] = rng.standard_normal(3)
-    found: NDArray[np.float64] = lfilter([1.0], [1.0, -coefficient], drive, axis=0)
+    found: Values = lfilter([1.0], [1.0, -coefficient], drive, axis=0)
     return found
 
 
-def _one_over_f(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+def _one_over_f(count: int, rng: np.random.Generator) -> Values:
     """Return noise with a spectrum of power 1/f and variance 1: (n, 3) array."""
     frequency = np.fft.rfftfreq(count)
     shape = np.zeros(len(frequency))
@@ -156,6 +158,7 @@ def _one_over_f(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
 
 
 def _with_shape(recordings: list[Recording], case: Case) -> list[Recording]:
+    """Add physics in another functional form than the catalogue's."""
     if case.shape in OF_TEMPERATURE:
         room = random_environment(Streams(case.seed, case.number)["room"])
         room = room if case.room_degc is None else replace(room, drift=case.room_degc)
@@ -168,8 +171,8 @@ def _with_shape(recordings: list[Recording], case: Case) -> list[Recording]:
     return [_added(r, case.sensor, signal[:, None] * size) for r, signal in zip(recordings, signals, strict=True)]
 
 
-def _of_temperature(shape: str, x: NDArray[np.float64]) -> NDArray[np.float64]:
-    curves: dict[str, NDArray[np.float64]] = {
+def _of_temperature(shape: str, x: Values) -> Values:
+    curves: dict[str, Values] = {
         "temperature_step": 0.5 + 0.5 * np.tanh((x - 0.5) / 0.04),
         "saturation": np.tanh(4.0 * x),
         "exponential": np.expm1(3.0 * x) / np.expm1(3.0),
@@ -177,7 +180,7 @@ def _of_temperature(shape: str, x: NDArray[np.float64]) -> NDArray[np.float64]:
     return curves[shape]
 
 
-def _of_motion(shape: str, recording: Recording) -> NDArray[np.float64]:
+def _of_motion(shape: str, recording: Recording) -> Values:
     if shape == "gear_mesh" and recording.table_angle is not None and recording.role != "static":
         return np.asarray(np.cos(np.radians(5.0 * recording.table_angle)), np.float64)
     motion = reference_motion(recording, 1.0)
@@ -187,61 +190,46 @@ def _of_motion(shape: str, recording: Recording) -> NDArray[np.float64]:
     return np.zeros(recording.samples)
 
 
-def _temperature(recording: Recording) -> NDArray[np.float64]:
-    assert recording.temperature is not None  # noqa: S101  (the simulator logs it)
-    return recording.temperature
-
-
-def _added(recording: Recording, sensor: str, values: NDArray[np.float64]) -> Recording:
-    reading = recording.reading(sensor)
-    assert reading is not None  # noqa: S101  (the simulator reads both sensors)
-    if sensor == "accelerometer":
-        return replace(recording, accelerometer=reading + values)
-    return replace(recording, gyroscope=reading + values)
+def _added(recording: Recording, sensor: str, values: Values) -> Recording:
+    added: dict[str, Any] = {sensor: np.asarray(recording.reading(sensor)) + values}
+    return replace(recording, **added)
 
 
 def signals_left(case: Case) -> dict[str, float]:
-    """Return lambda of each hidden effect; nothing where the noise is of another family.
-
-    Parameters
-    ----------
-    case : Case
-    """
+    """Return lambda of each hidden effect; nothing where the noise is of another family."""
     if not case.hidden or case.noise not in GAUSS_MARKOV:
         return {}
-    recordings = _used(recordings_of(case))
-    signals = {}
+    recordings = _used(case)
+    signals = []
     for name in case.hidden:
         rest = {other: values for other, values in case.hidden.items() if other != name}
-        signals[name] = _readings(recordings, case) - _readings(_used(recordings_of(replace(case, hidden=rest))), case)
+        signals.append(_readings(recordings, case.sensor) - _readings(_used(replace(case, hidden=rest)), case.sensor))
     sheet = read_config("sensor", case.model)[case.sensor]
+    gravity = read_config("table", "acutronic")["gravity_g"]
+    motions = [motion for r in recordings if (motion := reference_motion(r, gravity)) is not None]
     time = np.concatenate([r.time for r in recordings])
-    white = sheet["noise_density"] * np.sqrt(0.5 / INTERVAL_S)
-    columns = np.column_stack([np.ones(len(time)), _truth(recordings, case), *signals.values()])
+    base = np.concatenate([truth(case.sensor, motion) for motion in motions])
+    columns = np.column_stack([np.ones(len(time)), base, *signals])
     size = np.maximum(np.abs(columns).max(axis=0), 1e-300)
-    whitened = size * whiten(columns / size, time, white, case.wander * sheet["bias_wander"], sheet["wander_time_s"])
+    white, wander = _white(sheet), case.wander * sheet["bias_wander"]
+    whitened = size * whiten(columns / size, time, white, wander, sheet["wander_time_s"])
     rounding = 3 * len(time) / (6.0 * sheet["counts_per_unit"] ** 2 * white**2)
     return {
         name: max(0.0, float(sum(_left(whitened, 4 + 3 * j, axis) for axis in range(3))) - rounding)
-        for j, name in enumerate(signals)
+        for j, name in enumerate(case.hidden)
     }
 
 
-def _used(recordings: Sequence[Recording]) -> list[Recording]:
-    return sorted((r for r in recordings if r.role in USED), key=lambda r: int(r.time_ns[0]))
+def _used(case: Case) -> list[Recording]:
+    """Return the recordings that a fit uses, in the order of time."""
+    return sorted((r for r in recordings_of(case) if r.role in SENSORS), key=lambda r: int(r.time_ns[0]))
 
 
-def _readings(recordings: Sequence[Recording], case: Case) -> NDArray[np.float64]:
-    return np.concatenate([r.accelerometer if case.sensor == "accelerometer" else r.gyroscope for r in recordings])
+def _readings(recordings: Sequence[Recording], sensor: str) -> Values:
+    return np.concatenate([np.asarray(r.reading(sensor)) for r in recordings])
 
 
-def _truth(recordings: Sequence[Recording], case: Case) -> NDArray[np.float64]:
-    gravity = read_config("table", "acutronic")["gravity_g"]
-    motions = [motion for r in recordings if (motion := reference_motion(r, gravity)) is not None]
-    return np.concatenate([truth(case.sensor, motion) for motion in motions])
-
-
-def _left(whitened: NDArray[np.float64], at: int, axis: int) -> float:
+def _left(whitened: Values, at: int, axis: int) -> float:
     """Return the square of an effect's whitened signal on one axis that base and other effects leave."""
     signal = whitened[:, at + axis]
     others = [k for k in range(4 + axis, whitened.shape[1], 3) if k != at + axis]
@@ -252,9 +240,7 @@ def _left(whitened: NDArray[np.float64], at: int, axis: int) -> float:
     return float(rest @ rest)
 
 
-def whiten(
-    columns: NDArray[np.float64], time: NDArray[np.float64], white: float, wander: float, correlation_time: float
-) -> NDArray[np.float64]:
+def whiten(columns: Values, time: Values, white: float, wander: float, correlation_time: float) -> Values:
     """Return columns after the filter that makes white noise plus a Gauss-Markov wander white, of variance 1.
 
     Parameters

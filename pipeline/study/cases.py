@@ -22,7 +22,7 @@ register map knows.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -62,25 +62,20 @@ CYCLE_DEGC = 4.0
 
 @dataclass(frozen=True)
 class Case:
-    """One unit of a study, its truth.
+    """One unit of a study: its truth.
 
     Attributes
     ----------
-    family : str
-    number, seed : int
-    model, sensor, procedure : str
-        Sensor model, the sensor in which something is hidden, and how it is recorded.
+    sensor : str
+        The one in which something is hidden.
     hidden : dict of str to list of float
         Effects and their parameters.
     wander : float
         Bias wander over that of the data sheet.
-    noise : str
     left_out : tuple of str
         Effects that the catalogue is left without.
-    shape : str
-        Of physics that is not in the catalogue; empty for none.
-    amplitude : tuple of float
-        Of that physics on each axis, over ``pipeline.study.bench.AMPLITUDE``.
+    shape, amplitude : str and tuple of float
+        Physics that is not in the catalogue (empty: none), and its size on each axis over ``bench.AMPLITUDE``.
     room_degc : float or None
         Swing of the room's temperature, where it is not the usual one.
     method : str
@@ -118,14 +113,7 @@ class Case:
 
 
 def draw(family: str, number: int, seed: int) -> Case:
-    """Draw one case.
-
-    Parameters
-    ----------
-    family : str
-    number, seed : int
-        They determine it, with the family.
-    """
+    """Draw the case that family, number and seed determine."""
     rng = np.random.default_rng([seed, FAMILIES.index(family), number])
     kind, _, detail = family.partition("_")
     model = "stim300" if kind in ("single", "null") and rng.random() < STIM_SHARE else "mpu6050"
@@ -143,20 +131,14 @@ def draw(family: str, number: int, seed: int) -> Case:
         return _unseen(number, seed, rng)
     if kind == "staged":
         procedure = "stop_and_go"  # the method needs rests, and turns in both directions
-    wander = 5.0 if detail == "wander" else 1.0
     names = _names(kind, model, sensor, procedure, rng)
     hidden = {name: drawn(model, sensor, name, rng, FACTOR.get(family, 1.0)) for name in names}
     if kind == "one":
         hidden = {name: _on_one_axis(sensor, name, values, rng) for name, values in hidden.items()}
-    return Case(
-        family,
-        number,
-        seed,
-        model,
-        sensor,
-        procedure,
-        {name: values.tolist() for name, values in hidden.items()},
-        wander,
+    return replace(
+        Case(family, number, seed, model, sensor, procedure),
+        hidden={name: values.tolist() for name, values in hidden.items()},
+        wander=5.0 if detail == "wander" else 1.0,
         noise=family if family in ("lost", "coarse", "cold") else "normal",
         left_out=tuple(names) if kind == "removed" else (),
         method=STAGED if kind == "staged" else REFERENCE,

@@ -3,19 +3,28 @@
 from __future__ import annotations
 
 from collections import Counter
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
+import pandas as pd
+
 from pipeline.model.effects import effect
-from pipeline.study import figures
 from pipeline.study.cases import FAINT, SIZES
-from pipeline.study.figures import families, first_is_right, mean_excess_gone, named, warned, wilson
+from pipeline.study.scores import (
+    Z,
+    all_figures,
+    first_is_right,
+    in_the_catalogue,
+    mean_excess_gone,
+    named,
+    warned,
+    wilson,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
 JSON = dict[str, Any]
-Pair = tuple[JSON, JSON]
+Rows = list[list[Any]]
 LISTED = 40
 OF_SIZE = ("single", "small", "tiny")
 BOUNDS = (0.0, 30.0, 60.0, 100.0, 200.0, 500.0, float("inf"))
@@ -46,178 +55,163 @@ then a substitute, whose worth is the share of the held-out excess that it takes
 DATA_SHEET = "Median of the size drawn; one number is for all parameters. A warm-up's time constant is 90 to 400 s."
 
 
-def page(cases: Sequence[Pair], command: str) -> str:
-    """Return the page.
-
-    Parameters
-    ----------
-    cases : sequence of (dict, dict)
-        Truth and result of each case.
-    command : str
-        That makes the page again.
-    """
-    code = " and ".join(sorted({f"`{said['code']}`" for _, said in cases if "code" in said})) or "unknown"
+def page(cases: Sequence[JSON], command: str) -> str:
+    """Return the page; ``command`` makes it again."""
+    code = " and ".join(sorted({f"`{case['code']}`" for case in cases if "code" in case})) or "unknown"
+    said = table_of(cases)
+    faults = [[case["key"], case["error"]] for case in cases if "error" in case]
     parts = [
         HEAD.format(command=command, code=code),
-        table(["figure", "n", "share", "95 % interval", "goal"], _figures(cases)),
-        _section("Detection by size", SIZE_TEXT, ["sensor", "effect", "x1", "x0.3", "x0.1"], _sizes(cases)),
+        _table(["figure", "n", "share", "95 % interval", "goal"], _figures(cases)),
+        _section("Detection by size", SIZE_TEXT, ["sensor", "effect", "x1", "x0.3", "x0.1"], found_at(said)),
         _section("Detection by signal", SIGNAL_TEXT, ["lambda", "n", "selected", "95 % interval"], by_signal(cases)),
-        _section("Called something else", "", ["sensor", "hidden", "said", "cases"], _confusions(cases)),
-        _section("Taken out of the catalogue", "", ["sensor", "hidden", "said", "warning", "cases"], _instead(cases)),
+        _section("Called something else", "", ["sensor", "hidden", "said", "cases"], confusions(said)),
+        _section("Taken out of the catalogue", "", ["sensor", "hidden", "said", "warning", "cases"], instead(said)),
         _section("Physics in another form than the catalogue's", SHAPE_TEXT, SHAPE_HEAD, of_shapes(cases)),
         _section("Cases that miss a goal", MISS_TEXT, ["case", "unit", "hidden", "said"], _misses(cases)),
-        _section("Faults", "", ["case", "error"], [[t["key"], s["error"]] for t, s in cases if "error" in s]),
+        _section("Faults", "", ["case", "error"], faults),
         _section("What data-sheet size is", DATA_SHEET, ["model", "sensor", "effect", "size", "unit"], _data_sheet()),
     ]
     return "\n".join(part for part in parts if part)
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a Markdown table."""
+def _table(head: Sequence[str], rows: Rows) -> str:
     lines = [head, ["---"] * len(head), *rows]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+    return "".join(f"| {' | '.join(map(str, line))} |\n" for line in lines)
 
 
-def _section(title: str, text: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def _section(title: str, text: str, head: Sequence[str], rows: Rows) -> str:
     if not rows:
         return ""
-    return "\n".join([f"## {title}\n", *([f"{text}\n"] if text else []), table(head, rows)])
+    return "\n".join([f"## {title}\n", *([f"{text}\n"] if text else []), _table(head, rows)])
 
 
-def _figures(cases: Sequence[Pair]) -> list[list[str]]:
-    rows = []
-    for figure in figures.all_figures(cases):
-        low, high = figure.interval
-        value = f"{100 * figure.hits / figure.total:.1f} %"
-        rows.append([figure.name, str(figure.total), value, f"{100 * low:.1f} to {100 * high:.1f} %", figure.goal])
-    mean = figures.mean_excess_gone(figures.in_the_catalogue(cases))
+def _figures(cases: Sequence[JSON]) -> Rows:
+    rows = [[f.name, f.total, _percent(f.hits / f.total), _between(*f.interval), f.goal] for f in all_figures(cases)]
+    mean = mean_excess_gone(in_the_catalogue(cases))
     if mean.total > 1:
-        low, high = mean.value - figures.Z * mean.error, mean.value + figures.Z * mean.error
+        interval = _between(mean.value - Z * mean.error, mean.value + Z * mean.error)
         name = "held-out excess over the noise floor that is gone with what was selected, mean"
-        rows.append(
-            [name, str(mean.total), f"{100 * mean.value:.1f} %", f"{100 * low:.1f} to {100 * high:.1f} %", ">= 98 %"]
-        )
+        rows.append([name, mean.total, _percent(mean.value), interval, ">= 98 %"])
     return rows
 
 
-def _sizes(cases: Sequence[Pair]) -> list[list[str]]:
-    rows = []
-    for (sensor, name), row in found_at(cases).items():
-        cells = [f"{row[size][0]} of {row[size][1]}" if size in row else "" for size in OF_SIZE]
-        rows.append([sensor, f"`{name}`", *cells])
-    return rows
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f} %"
 
 
-def _confusions(cases: Sequence[Pair]) -> list[list[str]]:
-    found = sorted(confusions(cases).items(), key=lambda item: (-item[1], item[0]))
-    return [[sensor, f"`{name}`", said, str(number)] for (sensor, name, said), number in found]
+def _between(low: float, high: float) -> str:
+    return f"{100 * low:.1f} to {100 * high:.1f} %"
 
 
-def _instead(cases: Sequence[Pair]) -> list[list[str]]:
-    found = sorted(instead(cases).items())
-    return [
-        [sensor, f"`{name}`", said, "yes" if warned else "no", str(number)]
-        for (sensor, name, said, warned), number in found
+def table_of(cases: Iterable[JSON]) -> pd.DataFrame:
+    """Return a row for each diagnosis of a unit with one hidden effect, or with effects left out of the catalogue."""
+    rows = [
+        {
+            "family": case["family"],
+            "model": case["model"],
+            "sensor": case["sensor"],
+            "hidden": (case["left_out"] or list(case["hidden"]))[0],
+            "said": _said(case),
+            "left_out": bool(case["left_out"]),
+            "alone": case["selected"] == list(case["hidden"]),
+            "first": first_is_right(case),
+            "warned": "yes" if warned(case) else "no",
+        }
+        for case in cases
+        if "error" not in case and (case["left_out"] or len(case["hidden"]) == 1)
     ]
+    columns = ["family", "model", "sensor", "hidden", "said", "left_out", "alone", "first", "warned"]
+    return pd.DataFrame(rows, columns=columns).astype({"left_out": bool, "alone": bool})
 
 
-def _misses(cases: Sequence[Pair]) -> list[list[str]]:
-    by_key = {figures.key_of(pair): pair for pair in cases}
-    keys = [key for figure in figures.all_figures(cases) if figure.goal for key in figure.misses]
+def _said(case: JSON) -> str:
+    return " + ".join(case["selected"]) or "nothing"
+
+
+def found_at(said: pd.DataFrame) -> Rows:
+    """Return for each sensor and effect in how many of how many cases of each size it was selected first."""
+    own = said[said["family"].isin(OF_SIZE) & (said["model"] == "mpu6050")]
+    rows: dict[tuple[str, str], dict[str, str]] = {}
+    for (sensor, name, size), first in own.groupby(["sensor", "hidden", "family"])["first"]:
+        row = rows.setdefault((sensor, name), dict.fromkeys(OF_SIZE, ""))
+        row[size] = f"{first.sum()} of {len(first)}"
+    return [[sensor, f"`{name}`", *row.values()] for (sensor, name), row in rows.items()]
+
+
+def confusions(said: pd.DataFrame) -> Rows:
+    """Return how often one hidden effect was called something else, the most frequent first."""
+    own = said[~said["left_out"] & (said["family"] != "unseen") & ~said["alone"]]
+    counts = own.groupby(["sensor", "hidden", "said"]).size().sort_values(ascending=False, kind="stable")
+    return [[sensor, f"`{name}`", other, count] for (sensor, name, other), count in counts.items()]
+
+
+def instead(said: pd.DataFrame) -> Rows:
+    """Return what was said of effects that the catalogue was left without, and whether with a warning."""
+    counts = said[said["left_out"]].groupby(["sensor", "hidden", "said", "warned"]).size()
+    return [[sensor, f"`{name}`", *rest, count] for (sensor, name, *rest), count in counts.items()]
+
+
+def by_signal(cases: Iterable[JSON]) -> Rows:
+    """Return how many effects were selected, of how many, by the signal that each leaves beside the others."""
+    found = pd.DataFrame(
+        [
+            (left, any(named(case, name, selected) for selected in case["selected"]))
+            for case in cases
+            if "error" not in case and not case["left_out"] and case["family"] != "unseen"
+            for name, left in (case.get("signal_left") or {}).items()
+        ],
+        columns=["left", "selected"],
+    )
+    rows = []
+    for bin_, hits in found.groupby(pd.cut(found["left"], BOUNDS, right=False), observed=True)["selected"]:
+        low, high = bin_.left, bin_.right
+        text = f"{low:g} to {high:g}" if high < BOUNDS[-1] else f"{low:g} and more"
+        least, most = wilson(int(hits.sum()), len(hits))
+        rows.append([text, len(hits), f"{100 * hits.mean():.0f} %", f"{100 * least:.0f} to {100 * most:.0f} %"])
+    return rows
+
+
+def of_shapes(cases: Sequence[JSON]) -> Rows:
+    """Return a row for each form of unknown physics: what was said of it, and what that does to held-out motion."""
+    rows = []
+    for family in sorted({case["family"] for case in cases if case["shape"]}):
+        own = [case for case in cases if case["family"] == family and "error" not in case]
+        if not own:
+            continue
+        unexplained = sum(case["verdict"] == "unexplained" for case in own)
+        with_warning = sum(case["verdict"] != "unexplained" and warned(case) for case in own)
+        silent = sum(bool(case["selected"]) and not warned(case) for case in own)
+        name, count = Counter(map(_said, own)).most_common(1)[0]
+        mean = mean_excess_gone(own)
+        gone = f"{100 * mean.value:.0f} % (n = {mean.total})" if mean.total > 1 else ""
+        counts = [len(own), unexplained, with_warning, silent, len(own) - unexplained - with_warning - silent]
+        rows.append([family.replace("_", " "), *counts, f"{name} ({count})", gone])
+    return rows
+
+
+def _misses(cases: Sequence[JSON]) -> Rows:
+    by_key = {key: case for case in cases for key in (case["key"], f"{case['key']} {case['sensor']}")}
+    keys = [key for figure in all_figures(cases) if figure.goal for key in figure.misses]
     rows = []
     for key in keys[:LISTED]:
-        truth, said = by_key[key]
-        left = truth.get("signal_left") or {}
-        hidden = " + ".join(f"{n} ({left[n]:.0f})" if n in left else n for n in truth["hidden"]) or "nothing"
-        unit = f"{truth['model']} {truth['sensor']} {truth['procedure']}"
-        rows.append([key, unit, hidden, said.get("error") or (" + ".join(said["selected"]) or said["verdict"])])
+        case = by_key[key]
+        left = case.get("signal_left") or {}
+        hidden = " + ".join(f"{n} ({left[n]:.0f})" if n in left else n for n in case["hidden"]) or "nothing"
+        unit = f"{case['model']} {case['sensor']} {case['procedure']}"
+        rows.append([key, unit, hidden, case.get("error") or (" + ".join(case["selected"]) or case["verdict"])])
     more = len(keys) - len(rows)
     return [*rows, *([[f"and {more} more", "", "", ""]] if more else [])]
 
 
-def _data_sheet() -> list[list[str]]:
+def _data_sheet() -> Rows:
     rows = []
     for model, sensors in SIZES.items():
         for sensor, sizes in sensors.items():
             for name, size in sizes.items():
-                parameters = effect(name).parameters(sensor)
                 values = size if isinstance(size, tuple) else (size,)
-                units = dict.fromkeys(p.unit for p in parameters)
                 text = ", ".join(dict.fromkeys(f"{value:.3g}" for value in values))
+                units = ", ".join(dict.fromkeys(p.unit for p in effect(name).parameters(sensor)))
                 faint = " (hides in the noise)" if name in FAINT[model][sensor] else ""
-                rows.append([model, sensor, f"`{name}`{faint}", text, ", ".join(units)])
+                rows.append([model, sensor, f"`{name}`{faint}", text, units])
     return rows
-
-
-def confusions(cases: Iterable[Pair]) -> Counter[tuple[str, str, str]]:
-    """Return how often one hidden effect was called something else: (sensor, hidden, said) to the number."""
-    found: Counter[tuple[str, str, str]] = Counter()
-    for truth, said in cases:
-        if "error" in said or len(truth["hidden"]) != 1 or truth["left_out"] or truth["family"] == "unseen":
-            continue
-        name = next(iter(truth["hidden"]))
-        if said["selected"] != [name]:
-            found[truth["sensor"], name, _names(said)] += 1
-    return found
-
-
-def instead(cases: Iterable[Pair]) -> Counter[tuple[str, str, str, bool]]:
-    """Return what was said of effects that the catalogue was left without: (sensor, hidden, said, warned)."""
-    found: Counter[tuple[str, str, str, bool]] = Counter()
-    for truth, said in cases:
-        if truth["left_out"] and "error" not in said:
-            found[truth["sensor"], truth["left_out"][0], _names(said), warned(said)] += 1
-    return found
-
-
-def found_at(cases: Iterable[Pair]) -> dict[tuple[str, str], dict[str, tuple[int, int]]]:
-    """Return for each sensor and effect in how many of how many cases of each size it was selected first."""
-    table: dict[tuple[str, str], dict[str, tuple[int, int]]] = {}
-    for truth, said in cases:
-        if truth["family"] not in OF_SIZE or truth["model"] != "mpu6050" or "error" in said:
-            continue
-        row = table.setdefault((truth["sensor"], next(iter(truth["hidden"]))), {})
-        hits, total = row.get(truth["family"], (0, 0))
-        row[truth["family"]] = (hits + first_is_right(truth, said), total + 1)
-    return dict(sorted(table.items()))
-
-
-def by_signal(cases: Iterable[Pair]) -> list[list[str]]:
-    """Return how many effects were selected, of how many, by the signal that each leaves beside the others."""
-    found = [
-        (left, any(named(name, said, selected) for selected in said["selected"]))
-        for truth, said in cases
-        if "error" not in said and not truth["left_out"] and truth["family"] != "unseen"
-        for name, left in (truth.get("signal_left") or {}).items()
-    ]
-    rows = []
-    for low, high in pairwise(BOUNDS):
-        within = [hit for left, hit in found if low <= left < high]
-        if within:
-            least, most = wilson(sum(within), len(within))
-            text = f"{low:g} to {high:g}" if high < BOUNDS[-1] else f"{low:g} and more"
-            value = f"{100 * sum(within) / len(within):.0f} %"
-            rows.append([text, str(len(within)), value, f"{100 * least:.0f} to {100 * most:.0f} %"])
-    return rows
-
-
-def of_shapes(cases: Iterable[Pair]) -> list[list[str]]:
-    """Return a row for each form of unknown physics: what was said of it, and what that does to held-out motion."""
-    rows = []
-    for family, pairs in families(cases).items():
-        said = [s for t, s in pairs if t["shape"] and "error" not in s]
-        if not said:
-            continue
-        unexplained = sum(s["verdict"] == "unexplained" for s in said)
-        with_warning = sum(s["verdict"] != "unexplained" and warned(s) for s in said)
-        silent = sum(bool(s["selected"]) and not warned(s) for s in said)
-        names, number = Counter(_names(s) for s in said).most_common(1)[0]
-        mean = mean_excess_gone(pairs)
-        gone = f"{100 * mean.value:.0f} % (n = {mean.total})" if mean.total > 1 else ""
-        counts = [len(said), unexplained, with_warning, silent, len(said) - unexplained - with_warning - silent]
-        rows.append([family.replace("_", " "), *map(str, counts), f"{names} ({number})", gone])
-    return rows
-
-
-def _names(said: JSON) -> str:
-    return " + ".join(said["selected"]) or "nothing"

@@ -37,12 +37,12 @@ from pipeline.validation.heldout import validate
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from pipeline.records import Noise, Recording, SensorCalibration
+    from pipeline.records import Recording, SensorCalibration
     from pipeline.study.cases import Case
 
 TRUTH, RESULTS = "truth.jsonl", "results.jsonl"
 JSON = dict[str, Any]
-Planned = tuple[str, int, int]
+_Planned = tuple[str, int, int]
 HELD_OUT = ("single", "pairs", "triples", "one_axis", "shape", "cycle")
 
 
@@ -55,19 +55,9 @@ def run_study(
     processes: int,
     progress: Callable[[int, int], None],
 ) -> None:
-    """Run what is not there yet.
+    """Run the first ``count`` cases of each family that have no result in ``directory``.
 
-    Parameters
-    ----------
-    directory : Path
-        Made if need be.
-    families : sequence of str
-    count : int
-        Cases of each family.
-    seed : int
-    processes : int
-    progress : callable
-        Told how many of how many are done.
+    ``progress`` gets how many of how many are done.
 
     Raises
     ------
@@ -75,10 +65,15 @@ def run_study(
         If the directory holds cases of another seed.
     """
     directory.mkdir(parents=True, exist_ok=True)
-    _refuse_another_seed(directory / TRUTH, seed)
+    others = {line["seed"] for line in read_lines(directory / TRUTH)} - {seed}
+    if others:
+        raise ConfigurationError(
+            f"holds cases of seed {min(others)}, not {seed}; choose another directory, or that seed",
+            str(directory / TRUTH),
+        )
     done = {line["key"] for line in read_lines(directory / RESULTS)}
     code = code_digest("pipeline.study.run")
-    planned: list[Planned] = [(family, number, seed) for number in range(count) for family in families]
+    planned: list[_Planned] = [(family, number, seed) for number in range(count) for family in families]
     planned = [item for item in planned if draw(*item).key not in done]
     with (
         (directory / TRUTH).open("a", encoding="utf-8") as truth,
@@ -92,25 +87,17 @@ def run_study(
             progress(number, len(planned))
 
 
-def _refuse_another_seed(truth: Path, seed: int) -> None:
-    found = {line["seed"] for line in read_lines(truth)} - {seed}
-    if found:
-        raise ConfigurationError(
-            f"holds cases of seed {min(found)}, not {seed}; choose another directory, or that seed", str(truth)
-        )
-
-
-def _judged(planned: Sequence[Planned], processes: int) -> Iterator[tuple[JSON, list[JSON]]]:
+def _judged(planned: Sequence[_Planned], processes: int) -> Iterator[tuple[JSON, list[JSON]]]:
     if processes == 1:
-        yield from map(judged, planned)
+        yield from map(_judged_or_fault, planned)
         return
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ.setdefault(name, "1")  # a process is one core
     with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
-        yield from pool.map(judged, planned, chunksize=4)
+        yield from pool.map(_judged_or_fault, planned, chunksize=4)
 
 
-def judged(planned: Planned) -> tuple[JSON, list[JSON]]:
+def _judged_or_fault(planned: _Planned) -> tuple[JSON, list[JSON]]:
     """Return the truth of a case and what was said of it; a fault is a result, not the end of the study."""
     case = draw(*planned)
     hidden = {**case.to_json(), "signal_left": signals_left(case)}
@@ -128,23 +115,17 @@ def read_lines(path: Path) -> list[JSON]:
 
 
 def judge(case: Case) -> list[JSON]:
-    """Return what is said of a case: one entry, or one for each sensor where nothing is hidden.
-
-    Parameters
-    ----------
-    case : Case
-    """
+    """Return what is said of a case: one entry, or one for each sensor where nothing is hidden."""
     recordings = recordings_of(case)
-    sensors = SENSORS if case.kind == "null" else (case.sensor,)
     out = []
-    for sensor in sensors:
+    for sensor in SENSORS if case.kind == "null" else (case.sensor,):
         began = time.process_time()
         said = say(recordings, case.model, sensor, case.left_out, case.method)
         said |= {"key": case.key, "sensor": sensor, "cpu_s": time.process_time() - began}
         if case.left_out:
-            said["whole"] = say(recordings, case.model, sensor, (), case.method)
+            said["whole"] = say(recordings, case.model, sensor, method=case.method)
         if case.kind in HELD_OUT:
-            said["held_out"] = held_out(recordings, case.model, sensor, said["selected"], case.method)
+            said["held_out"] = _held_out(recordings, case.model, sensor, said["selected"], case.method)
         out.append(said)
     return out
 
@@ -154,14 +135,7 @@ def say(
 ) -> JSON:
     """Return the diagnosis of recordings, as far as a study judges it.
 
-    Parameters
-    ----------
-    recordings : list of Recording
-    model, sensor : str
-    left_out : sequence of str
-        Effects that the catalogue is left without.
-    method : str
-        By which the base is calibrated.
+    The catalogue is left without the effects ``left_out``; the base is calibrated by ``method``.
     """
     settings = settings_of(model, method)
     noise = estimate_noise(sensor, recordings, settings["sensor"][sensor])
@@ -169,19 +143,19 @@ def say(
     with leaving_out(left_out):
         document = diagnose(calibration, recordings, noise, settings)
     entries = {entry["effect"]: entry for entry in document["ranking"]}
+    selected = [entries[name] for name in document["selected"]]
     return {
         "verdict": document["verdict"],
         "selected": document["selected"],
-        "plausible": all(entries[name]["plausible"] for name in document["selected"]),
+        "plausible": all(entry["plausible"] for entry in selected),
         "inflated": bool((document["wander"] or {}).get("inflated")),
         "look_alikes": {
-            name: {alike["effect"]: alike["share"] for alike in entries[name]["look_alikes"]}
-            for name in document["selected"]
+            entry["effect"]: {alike["effect"]: alike["share"] for alike in entry["look_alikes"]} for entry in selected
         },
         "not_observable": [entry["effect"] for entry in document["not_observable"]],
         "unexplained": [entry["covariate"] for entry in document["unexplained"]],
         "residual_over_noise": document["residual_over_noise"],
-        "delta_bic": [entries[name]["delta_bic"] for name in document["selected"]],
+        "delta_bic": [entry["delta_bic"] for entry in selected],
     }
 
 
@@ -194,9 +168,7 @@ def calibrated(recordings: list[Recording], sensor: str, settings: JSON) -> Sens
     return found
 
 
-def held_out(
-    recordings: list[Recording], model: str, sensor: str, names: Sequence[str], method: str = REFERENCE
-) -> JSON:
+def _held_out(recordings: list[Recording], model: str, sensor: str, names: Sequence[str], method: str) -> JSON:
     """Return the held-out error before and after the effects are added, and the floor.
 
     The vector error where the attitude is logged, else that of the magnitude.
@@ -204,21 +176,20 @@ def held_out(
     settings = settings_of(model, method)
     noise = estimate_noise(sensor, recordings, settings["sensor"][sensor])
     plain = calibrated(recordings, sensor, settings)
-    adding = {**settings, "effects": {**settings["effects"], sensor: list(names)}}
-    before, floor = _error(plain, recordings, noise, settings)
-    full = fit_effects(sensor, recordings, plain, adding)
-    after = _error(full, recordings, noise, adding)[0] if names else before
+
+    def error(calibration: SensorCalibration, settings: JSON) -> tuple[float, float]:
+        found = validate(calibration, recordings, noise, settings)
+        last = found["steps"][-1]
+        if last["vector_rms_error"] is not None and found["vector_noise_floor"] is not None:
+            return last["vector_rms_error"], found["vector_noise_floor"]
+        return last["rms_error"], found["noise_floor"]
+
+    before, floor = error(plain, settings)
+    after = before
+    if names:
+        adding = {**settings, "effects": {**settings["effects"], sensor: list(names)}}
+        after, _ = error(fit_effects(sensor, recordings, plain, adding), adding)
     return {"before": before, "after": after, "floor": floor}
-
-
-def _error(
-    calibration: SensorCalibration, recordings: list[Recording], noise: Noise, settings: JSON
-) -> tuple[float, float]:
-    found = validate(calibration, recordings, noise, settings)
-    last = found["steps"][-1]
-    if last["vector_rms_error"] is not None and found["vector_noise_floor"] is not None:
-        return last["vector_rms_error"], found["vector_noise_floor"]
-    return last["rms_error"], found["noise_floor"]
 
 
 @cache

@@ -7,27 +7,26 @@ that lies within 1 % of the error itself is no difference, whatever its sign.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from pipeline.report.comparison import mean_of
 from pipeline.report.numbers import number
 from pipeline.thesis.results import CONTINUOUS, DEVICES, RATES, STOPS, in_words
-from pipeline.thesis.seeds import INTERVAL_S, TIME_CONSTANT_S
+from pipeline.thesis.seeds import CAUSES, INTERVAL_S, LOST, TIME_CONSTANT_S
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     import pandas as pd
 
     from pipeline.report.comparison import Estimate
 
-LOST = 2  # index in recorded.CAUSES: what the campaign has
 CONFIRMED, REFUTED, NONE, OPEN = "confirmed", "refuted", "no difference", "not decided"
-KINDS = {CONFIRMED: "good", REFUTED: "bad", NONE: "warn", OPEN: "warn"}
+KINDS = {CONFIRMED: "good", REFUTED: "bad", NONE: "warn", OPEN: "warn"}  # CSS classes
 SMALLEST = 0.01  # of the error: differences within it are none
+ALIKE = 0.05  # of the error: by how much rates that are called alike may differ
 WHY_SPEED = (
     "A delay turns all angles of a turn alike: it moves neither the 90 deg between two extremes nor their height. So "
     "the stages do not feel it, as long as they leave out the rests at the ends of a turn, which are not late: fitted "
@@ -38,8 +37,7 @@ WHY_SPEED = (
 READINGS = {"printed": "as printed", "staged": "errata corrected"}
 
 
-@dataclass(frozen=True)
-class Line:
+class Line(NamedTuple):
     """One comparison: what is compared, the two means, the difference with its interval, and the verdict."""
 
     what: str
@@ -49,26 +47,15 @@ class Line:
     verdict: str
 
 
-@dataclass(frozen=True)
-class Conclusion:
-    """A conclusion of the thesis.
+class Conclusion(NamedTuple):
+    """A conclusion of the thesis (``says``), its comparisons, why they come out so (``remark``), what is compared.
 
-    Attributes
-    ----------
-    says : str
-        What the thesis says.
-    unit : str
-        ``deg/s``, or ``mg``: of the accelerometer, whose errors are in g.
-    lines : list of Line
-    remark : str
-        Why, where that is known.
-    compared : str
-        What the figures are.
+    ``unit`` is deg/s, or mg for the accelerometer, whose errors are in g.
     """
 
     says: str
     unit: str
-    lines: list[Line] = field(default_factory=list)
+    lines: list[Line]
     remark: str = ""
     compared: str = "Mean |e| after"
 
@@ -76,10 +63,12 @@ class Conclusion:
     def verdict(self) -> str:
         """Return the verdict that all lines share, else the counts of each."""
         counts = {v: sum(line.verdict == v for line in self.lines) for v in KINDS}
-        held = [v for v, n in counts.items() if n]
-        if len(held) == 1:
-            return held[0]
-        return ", ".join(f"{v} in {n} of {len(self.lines)}" for v, n in counts.items() if n)
+        counts = {v: n for v, n in counts.items() if n}
+        return (
+            ", ".join(f"{v} in {n} of {len(self.lines)}" for v, n in counts.items())
+            if len(counts) > 1
+            else next(iter(counts))
+        )
 
     @property
     def kind(self) -> str:
@@ -88,79 +77,97 @@ class Conclusion:
 
 
 class Errors:
-    """Held-out errors of the study by set, method and seed."""
+    """Held-out errors of the study by set of recordings, method and seed."""
 
     def __init__(self, rows: pd.DataFrame) -> None:
-        judged = rows[(rows["cause"] == LOST) & rows["error"].notna()]
+        judged = rows[(rows["cause"] == CAUSES.index(LOST)) & rows["error"].notna()]
         self._errors = judged.set_index(["set", "method", "seed"])["error"].sort_index()
 
     def mean(self, name: str, method: str) -> Estimate:
         """Return the mean over seeds."""
-        return _mean(self._errors[name, method])
+        return mean_of(self._errors[name, method])
 
     def line(self, what: str, smaller: tuple[str, str], larger: tuple[str, str]) -> Line:
-        """Return the comparison of what the thesis says has the smaller and the larger error."""
+        """Compare two (set, method), of which the thesis says that the first has the smaller error."""
         first = self._errors[smaller]
-        return _compared(what, first, self._errors[larger], SMALLEST * _mean(first).value)
+        return _compared(what, first, self._errors[larger], SMALLEST * mean_of(first).value)
+
+    def lines(self, what: str, smaller: str, larger: str, methods: Mapping[str, str] = READINGS) -> list[Line]:
+        """Compare two procedures on each device by each method."""
+        return [
+            self.line(f"{name}, {reading}: {what}", (f"{device}-{smaller}", method), (f"{device}-{larger}", method))
+            for method, reading in methods.items()
+            for device, name in DEVICES.items()
+        ]
 
     def growth(self, what: str, device: str, smaller: str, larger: str) -> Line:
-        """Return the comparison of how two methods' errors grow from continuous 1 to 30 deg/s."""
+        """Compare how two methods' errors grow from continuous 1 to 30 deg/s."""
         grown = []
         for method in (smaller, larger):
             slow, fast = (self._errors[f"{device}-continuous-{rate}dps", method] for rate in (1, 30))
             grown.append((fast - slow).dropna())
         fastest = self._errors[f"{device}-continuous-30dps", larger]
-        return _compared(what, grown[0], grown[1], SMALLEST * _mean(fastest).value)
+        return _compared(what, grown[0], grown[1], SMALLEST * mean_of(fastest).value)
 
-    def extreme(self, names: Sequence[str], method: str, *, largest: bool) -> str:
-        """Return the set with the smallest or the largest mean."""
-        return sorted(names, key=lambda n: self.mean(n, method).value)[-1 if largest else 0]
-
-
-def _mean(values: Iterable[float]) -> Estimate:
-    return mean_of(list(values))
+    def ordered(self, device: str, procedures: Iterable[str], method: str) -> list[str]:
+        """Return a device's sets of recordings, the smallest mean error first."""
+        return sorted((f"{device}-{p}" for p in procedures), key=lambda name: self.mean(name, method).value)
 
 
 def _compared(what: str, first: pd.Series[float], second: pd.Series[float], smallest: float) -> Line:
-    """Compare what has the smaller with what has the larger value, seed by seed."""
-    difference = _mean((second - first).dropna())
+    """Compare the smaller value of each seed with the larger one."""
+    difference = mean_of((second - first).dropna())
     low, high = difference.interval
     verdict = CONFIRMED if low > 0.0 else REFUTED if high < 0.0 else OPEN
     if max(abs(low), abs(high)) < smallest:
         verdict = NONE
-    return Line(what, _mean(first), _mean(second), difference, verdict)
+    return Line(what, mean_of(first), mean_of(second), difference, verdict)
 
 
 def conclusions(rows: pd.DataFrame) -> list[Conclusion]:
-    """Return the verdicts on what the thesis concludes.
-
-    Parameters
-    ----------
-    rows : DataFrame
-        Of the study over seeds.
-    """
+    """Return the verdicts on what the thesis concludes, from the rows of the study over seeds."""
     errors = Errors(rows)
+    with_unfiltered = {**READINGS, "unfiltered": "errata corrected, no filter"}
+    matrices = {"cholesky-printed": "forward matrix, as printed", "cholesky": "inverted"}
     return [
         _best_procedure(errors),
-        _equal_duration(errors),
-        _speed(errors),
+        Conclusion(
+            "At equal duration continuous 1 deg/s beats stop 1 s",
+            "mg",
+            errors.lines("continuous 1 deg/s against stop 1 s", "continuous-1dps", "stop-1s"),
+        ),
+        Conclusion(
+            "Continuous rotation gets worse as the rate grows; 30 deg/s is worst",
+            "mg",
+            errors.lines("continuous 1 deg/s against 30 deg/s", "continuous-1dps", "continuous-30dps", with_unfiltered),
+            "As printed on the MPU6050, fewer samples at 30 deg/s lie less far above the peaks: that outweighs the "
+            "filter.",
+        ),
         _filter(errors),
         _gyroscope_rates(errors),
         _best_rate(errors),
         _staged_against_least_squares(errors),
-        _staged_against_cholesky(errors),
-        _tables(errors, "mg", (("stop-1s", "printed"), ("stop-1s", "staged"))),
-        _tables(errors, "deg/s", (("gyro-60dps", "staged"),)),
+        Conclusion(
+            "The staged method beats Cholesky and LU (table 5.26)",
+            "deg/s",
+            [
+                errors.line(f"{name}, {reading}", (f"{device}-gyro-20dps", "staged"), (f"{device}-gyro-20dps", method))
+                for method, reading in matrices.items()
+                for device, name in DEVICES.items()
+            ],
+            "The printed advantage is the inversion that was left out (erratum 4).",
+        ),
+        _tables(errors, "accelerometer", "mg", (("stop-1s", "printed"), ("stop-1s", "staged"))),
+        _tables(errors, "gyroscope", "deg/s", (("gyro-60dps", "staged"),)),
     ]
 
 
 def _best_procedure(errors: Errors) -> Conclusion:
-    """Stop 10 s against the best of the others."""
+    """Compare stop 10 s with the best of the others."""
     lines = []
     for method, reading in READINGS.items():
         for device, name in DEVICES.items():
-            others = [f"{device}-{p}" for p in (*STOPS[:2], *CONTINUOUS)]
-            rival = errors.extreme(others, method, largest=False)
+            rival = errors.ordered(device, (*STOPS[:2], *CONTINUOUS), method)[0]
             what = f"{name}, {reading}: stop 10 s against the best other, {in_words(rival.removeprefix(device + '-'))}"
             lines.append(errors.line(what, (f"{device}-stop-10s", method), (rival, method)))
     return Conclusion(
@@ -172,37 +179,6 @@ def _best_procedure(errors: Errors) -> Conclusion:
         "procedure does worst. With fitted sinusoids what is left is the noise of the held-out motion, alike for all "
         "procedures up to 10 deg/s on the MPU6050. On the STIM300, whose noise is low, 10 deg/s gains a tenth: what "
         "the filter takes of the turn makes up for what it takes of the held-out motion.",
-    )
-
-
-def _equal_duration(errors: Errors) -> Conclusion:
-    lines = [
-        errors.line(
-            f"{name}, {reading}: continuous 1 deg/s against stop 1 s",
-            (f"{device}-continuous-1dps", method),
-            (f"{device}-stop-1s", method),
-        )
-        for method, reading in READINGS.items()
-        for device, name in DEVICES.items()
-    ]
-    return Conclusion("At equal duration continuous 1 deg/s beats stop 1 s", "mg", lines)
-
-
-def _speed(errors: Errors) -> Conclusion:
-    lines = [
-        errors.line(
-            f"{name}, {reading}: continuous 1 deg/s against 30 deg/s",
-            (f"{device}-continuous-1dps", method),
-            (f"{device}-continuous-30dps", method),
-        )
-        for method, reading in (*READINGS.items(), ("unfiltered", "errata corrected, no filter"))
-        for device, name in DEVICES.items()
-    ]
-    return Conclusion(
-        "Continuous rotation gets worse as the rate grows; 30 deg/s is worst",
-        "mg",
-        lines,
-        "As printed on the MPU6050, fewer samples at 30 deg/s lie less far above the peaks: that outweighs the filter.",
     )
 
 
@@ -236,25 +212,17 @@ def _gyroscope_rates(errors: Errors) -> Conclusion:
     """Judge whether the worst rate is within 5 % of the best."""
     lines = []
     for device, name in DEVICES.items():
-        names = [f"{device}-{rate}" for rate in RATES]
-        best, worst = (errors.extreme(names, "staged", largest=largest) for largest in (False, True))
+        best, *_, worst = errors.ordered(device, RATES, "staged")
         line = errors.line(f"{name}: {_rate(best)} against {_rate(worst)}", (best, "staged"), (worst, "staged"))
-        alike = line.difference.interval[1] < 0.05 * line.first.value
-        apart = line.difference.interval[0] > 0.05 * line.first.value
-        verdict = CONFIRMED if alike else REFUTED if apart else OPEN
-        lines.append(Line(line.what, line.first, line.second, line.difference, verdict))
-    return Conclusion(
-        "The gyroscope's rates are all alike (here: the best and the worst within 5 %)",
-        "deg/s",
-        lines,
-    )
+        (low, high), least = line.difference.interval, ALIKE * line.first.value
+        lines.append(line._replace(verdict=CONFIRMED if high < least else REFUTED if low > least else OPEN))
+    return Conclusion("The gyroscope's rates are all alike (here: the best and the worst within 5 %)", "deg/s", lines)
 
 
 def _best_rate(errors: Errors) -> Conclusion:
     lines = []
     for device, name in DEVICES.items():
-        others = [f"{device}-{rate}" for rate in RATES if rate != "gyro-100dps"]
-        rival = errors.extreme(others, "staged", largest=False)
+        rival = errors.ordered(device, [rate for rate in RATES if rate != "gyro-100dps"], "staged")[0]
         what = f"{name}: 100 deg/s against the best other, {_rate(rival)}"
         lines.append(errors.line(what, (f"{device}-gyro-100dps", "staged"), (rival, "staged")))
     return Conclusion("100 deg/s is the best rate by a hair", "deg/s", lines)
@@ -270,21 +238,7 @@ def _staged_against_least_squares(errors: Errors) -> Conclusion:
     return Conclusion("The staged method beats nonlinear least squares (table 5.24)", "mg", lines)
 
 
-def _staged_against_cholesky(errors: Errors) -> Conclusion:
-    lines = [
-        errors.line(f"{name}, {reading}", (f"{device}-gyro-20dps", "staged"), (f"{device}-gyro-20dps", method))
-        for method, reading in (("cholesky-printed", "forward matrix, as printed"), ("cholesky", "inverted"))
-        for device, name in DEVICES.items()
-    ]
-    return Conclusion(
-        "The staged method beats Cholesky and LU (table 5.26)",
-        "deg/s",
-        lines,
-        "The printed advantage is the inversion that was left out (erratum 4).",
-    )
-
-
-def _tables(errors: Errors, unit: str, sets: Sequence[tuple[str, str]]) -> Conclusion:
+def _tables(errors: Errors, sensor: str, unit: str, sets: Sequence[tuple[str, str]]) -> Conclusion:
     lines = [
         errors.line(
             f"{in_words(procedure)}, {READINGS[method]}: precise against home-made",
@@ -293,7 +247,6 @@ def _tables(errors: Errors, unit: str, sets: Sequence[tuple[str, str]]) -> Concl
         )
         for procedure, method in sets
     ]
-    sensor = "accelerometer" if unit == "mg" else "gyroscope"
     return Conclusion(f"The home-made table calibrates the {sensor} worse than the precise one", unit, lines)
 
 

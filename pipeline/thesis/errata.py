@@ -2,32 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from pipeline.report.numbers import MINUS, number
 from pipeline.thesis.conclusions import Errors, gain_of_filter
-from pipeline.thesis.results import DEVICES
+from pipeline.thesis.results import DEVICES, matrix_of, read_printed, values
 from pipeline.thesis.seeds import TIME_CONSTANT_S
-from pipeline.thesis.tables import read_printed
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     import pandas as pd
-    from numpy.typing import NDArray
 
     from pipeline.thesis.results import Results
 
-BANGKOK = 9.783  # m/s^2
-STANDARD = 9.80665  # m/s^2
-DIRECTIONS = 200_000
+BANGKOK = 9.783  # m/s^2, WGS 84 normal gravity at 13.7 deg N
+STANDARD = 9.80665  # m/s^2, standard gravity (CGPM 1901)
 
 
-@dataclass(frozen=True)
-class Erratum:
+class Erratum(NamedTuple):
     """What is printed, what is meant or done here, and the evidence."""
 
     printed: str
@@ -36,22 +31,16 @@ class Erratum:
 
 
 def errata(printed: Path, results: Results, rows: pd.DataFrame) -> list[Erratum]:
-    """Return the errata with their evidence.
-
-    Parameters
-    ----------
-    printed : Path
-    results : Results
-    rows : DataFrame
-        Of the study over seeds.
-    """
+    """Return the errata with their evidence; ``rows``: of the study over seeds."""
+    parameters = read_printed(printed, "accel_parameters")
+    errors = read_printed(printed, "errors")
     return [
         _scale_factor(),
         _twice_subtracted(results),
         _order_of_matrix(results),
-        _forward_matrix(printed),
-        _misprints(printed),
-        _percentages(printed),
+        _forward_matrix(read_printed(printed, "method_comparison")),
+        _misprints(parameters),
+        _percentages(errors),
         _cosines(results),
         Erratum(
             "Gravity is 1 g.",
@@ -60,11 +49,11 @@ def errata(printed: Path, results: Results, rows: pd.DataFrame) -> list[Erratum]
             f"would be {number(100 * (1 - BANGKOK / STANDARD), 2)} % smaller on every axis.",
         ),
         _delay(rows),
-        _reference_axis(printed),
+        _reference_axis(parameters),
         _side(results),
-        _anisotropy(printed, results),
-        _bias_in_misalignment(printed, results),
-        _bias_of_mark2(printed, results),
+        _anisotropy(errors, results),
+        _bias_in_misalignment(parameters, results),
+        _bias_of_mark2(parameters, results),
     ]
 
 
@@ -107,22 +96,16 @@ def _order_of_matrix(results: Results) -> Erratum:
     )
 
 
-def _forward_matrix(printed: Path) -> Erratum:
-    rows = [r for t in read_printed(printed / "method_comparison.csv").values() for r in t]
-    worst, parts = {}, []
-    rows = [r for r in rows if r["sensor"] == "gyroscope"]
-    for device in sorted({r["device"] for r in rows}):
-        staged, other = (
-            _matrix(next(r for r in rows if r["device"] == device and r["method"] == m))
-            for m in ("staged", "cholesky_lu")
-        )
+def _forward_matrix(rows: pd.DataFrame) -> Erratum:
+    parts = []
+    for device, own in rows[rows["sensor"] == "gyroscope"].groupby("device"):
+        matrices = {row["method"]: matrix_of(row, "R") for row in own.to_dict("records")}
+        staged, other = matrices["staged"], matrices["cholesky_lu"]
         if staged[2, 2] > 1.9:  # misprint, see erratum 5
             staged[2, 2], staged[1, 2] = 1.007, -0.009
-        worst[device] = float(np.abs(np.linalg.solve(staged, np.eye(3)) - other).max())
+        worst = float(np.abs(np.linalg.solve(staged, np.eye(3)) - other).max())
         apart = float(np.abs(staged - other).max())
-        parts.append(
-            f"{DEVICES[device.lower()]} {number(worst[device], 1)} (from the presented matrix: {number(apart, 2)})"
-        )
+        parts.append(f"{DEVICES[device]} {number(worst, 1)} (from the presented matrix: {number(apart, 2)})")
     return Erratum(
         "Tables 5.25 and 5.26: Cholesky and LU's forward matrix is applied as if it were the correction",
         "Its inverse is the correction; then both methods agree (see the comparison of methods).",
@@ -132,13 +115,9 @@ def _forward_matrix(printed: Path) -> Erratum:
     )
 
 
-def _matrix(row: dict[str, str]) -> NDArray[np.float64]:
-    return np.array([[float(row[f"R{i}{j}"]) for j in (1, 2, 3)] for i in (1, 2, 3)])
-
-
-def _misprints(printed: Path) -> Erratum:
-    rows = read_printed(printed / "accel_parameters.csv")["5.1"][0]
-    product = [float(rows[f"O_{a}"]) * float(rows[f"M_{a}"]) * float(rows[f"S_{a}"]) for a in "xyz"]
+def _misprints(parameters: pd.DataFrame) -> Erratum:
+    row = parameters.iloc[0]
+    product = values(row, "O_{}") * values(row, "M_{}") * values(row, "S_{}")
     return Erratum(
         "Misprints: 1.998 and -0.005 in table 5.25 (MPU6050 (2)); 0.994 and 0.949 in table 5.23 (MPU6050 (1)); "
         "73.609 in "
@@ -151,14 +130,13 @@ def _misprints(printed: Path) -> Erratum:
     )
 
 
-def _percentages(printed: Path) -> Erratum:
-    rows = [r for t in read_printed(printed / "errors.csv").values() for r in t]
-    odd = [r for r in rows if r["metric"] == "max_error" and float(r["before"]) * float(r["after"]) < 0]
-    values = ", ".join(r["change_percent"] for r in odd)
+def _percentages(errors: pd.DataFrame) -> Erratum:
+    odd = errors[(errors["metric"] == "max_error") & (errors["before"] * errors["after"] < 0)]
+    percentages = ", ".join(map(str, odd["change_percent"]))
     return Erratum(
         "Percentages of the largest error where its sign changes (table 5.20)",
         "They mean nothing.",
-        f"{len(odd)} cells: {values} %, all of them errors that became larger than they were on that side.",
+        f"{len(odd)} cells: {percentages} %, all of them errors that became larger than they were on that side.",
     )
 
 
@@ -196,25 +174,23 @@ def _delay(rows: pd.DataFrame) -> Erratum:
     )
 
 
-def _reference_axis(printed: Path) -> Erratum:
-    rows = [r for t in read_printed(printed / "accel_parameters.csv").values() for r in t]
-    ones = sum(float(r["O_x"]) == 1.0 for r in rows)
-    differ = sum(r["O_y"] != r["O_z"] for r in rows)
+def _reference_axis(parameters: pd.DataFrame) -> Erratum:
+    ones = (parameters["O_x"] == 1.0).sum()
+    differ = (parameters["O_y"] != parameters["O_z"]).sum()
     return Erratum(
         "(3.26): O = diag(cos β cos γ, cos α cos γ, cos α cos β)",
         "O = diag(1, cos γ, cos α cos β), with x the reference axis, as the text says",
-        f"O_x is 1.000 in {ones} of {len(rows)} rows, which forces β = γ = 0 and so O_y = O_z; they differ in "
+        f"O_x is 1.000 in {ones} of {len(parameters)} rows, which forces β = γ = 0 and so O_y = O_z; they differ in "
         f"{differ}.",
     )
 
 
-def _bias_in_misalignment(printed: Path, results: Results) -> Erratum:
+def _bias_in_misalignment(parameters: pd.DataFrame, results: Results) -> Erratum:
     parts = []
     for device, name in DEVICES.items():
-        rows = [r for t in read_printed(printed / "accel_parameters.csv").values() for r in t]
-        own = [r for r in rows if r["device"].lower() == device and r["rate_table"] == "acutronic"]
-        bias = np.median([[float(r[f"b_{a}_g"]) for a in "xyz"] for r in own], axis=0)
-        told = {f"{float(r['M_x']):.3f}" for r in own}
+        own = parameters[(parameters["device"] == device) & (parameters["rate_table"] == "acutronic")]
+        bias = own[["b_x_g", "b_y_g", "b_z_g"]].median()
+        told = {f"{m:.3f}" for m in own["M_x"]}
         ours = results.parameter(f"{device}-stop-1s-printed", "accelerometer", "misalignment", "M_P_x")
         parts.append(
             f"{name}: {number(float(np.prod(np.sqrt(1.0 - bias**2))), 4)} from the printed biases alone, "
@@ -227,12 +203,12 @@ def _bias_in_misalignment(printed: Path, results: Results) -> Erratum:
     )
 
 
-def _bias_of_mark2(printed: Path, results: Results) -> Erratum:
-    row = read_printed(printed / "accel_parameters.csv")["5.7"][0]
+def _bias_of_mark2(parameters: pd.DataFrame, results: Results) -> Erratum:
+    row = parameters[parameters["table"] == "5.7"].iloc[0].to_dict()
     unit = "mpu6050-1-mark2-stop-1s"
-    told, meant = (results.with_printed(unit, "accelerometer", {**row, "b_y_g": b}) for b in (row["b_y_g"], "-0.014"))
+    told, meant = (results.with_printed(unit, "accelerometer", {**row, "b_y_g": b}) for b in (row["b_y_g"], -0.014))
     return Erratum(
-        f"Table 5.7: b of y is {MINUS}{abs(float(row['b_y_g'])):.3f} g on the home-made table",
+        f"Table 5.7: b of y is {MINUS}{abs(row['b_y_g']):.3f} g on the home-made table",
         f"{MINUS}0.014 g, as in tables 5.1 and 5.2 ({MINUS}0.013, {MINUS}0.014)",
         f"On our held-out motion the printed parameters leave a mean |e| of {number(told)} g, with {MINUS}0.014 g they "
         f"leave {number(meant)} g; printed is 0.032 g (table 5.14).",
@@ -249,15 +225,11 @@ def _side(results: Results) -> Erratum:
     )
 
 
-def _anisotropy(printed: Path, results: Results) -> Erratum:
-    rng = np.random.default_rng(12)
-    directions = rng.standard_normal((DIRECTIONS, 3))
-    directions /= np.linalg.norm(directions, axis=1)[:, None]
-    bias = np.array([-3.837, 0.003, 0.255])
-    isotropic = float(np.mean(np.abs(directions @ bias)))
-    before = [r for t in read_printed(printed / "errors.csv").values() for r in t if r["sensor"] == "gyroscope"]
+def _anisotropy(errors: pd.DataFrame, results: Results) -> Erratum:
+    isotropic = float(np.linalg.norm([-3.837, 0.003, 0.255])) / 2.0  # mean of |u . b| over all directions u
     ours = {d: results.error(f"{d}-gyro-20dps-printed", "gyroscope", "raw") for d in DEVICES}
-    told = {r["device"].lower(): float(r["before"]) for r in before if r["metric"] == "mean_abs_error"}
+    own = errors[(errors["sensor"] == "gyroscope") & (errors["metric"] == "mean_abs_error")]
+    told = own.drop_duplicates("device", keep="last").set_index("device")["before"]
     parts = [f"{name} {number(ours[d])} against {number(told[d])} printed" for d, name in DEVICES.items()]
     return Erratum(
         "The gyroscope's held-out motion is called random",

@@ -17,9 +17,8 @@ from pipeline.report.group_charts import Point, curves, stems
 from pipeline.report.held_out_section import held_out_over_time
 from pipeline.report.numbers import number
 from pipeline.thesis.conclusions import Errors
-from pipeline.thesis.results import CONTINUOUS, DEVICES, RATES, STOPS, in_words, procedure_of
+from pipeline.thesis.results import CONTINUOUS, DEVICES, RATES, SILENT, STOPS, in_words, read_printed
 from pipeline.thesis.seeds import CAUSES, device_of
-from pipeline.thesis.tables import read_printed
 from pipeline.validation.samples import samples_of_motion
 
 if TYPE_CHECKING:
@@ -28,8 +27,6 @@ if TYPE_CHECKING:
 
     import pandas as pd
 
-    from pipeline.records import Noise
-    from pipeline.thesis.agreement import Scatter
     from pipeline.thesis.results import Results
 
 PROCEDURES = {"accelerometer": (*STOPS, *CONTINUOUS), "gyroscope": RATES}
@@ -43,51 +40,33 @@ FILTERS = {
     "zero-phase": "run both ways, the gain twice",
     "unfiltered": "no filter",
 }
-PRINTED_AND_OURS = ("printed", "ours, as printed", "ours, errata corrected")
+OURS = ("printed", "ours, as printed", "ours, errata corrected")
 
 
-def all_figures(
-    printed: Path, results: Results, rows: pd.DataFrame, scatter: Sequence[Scatter], noise: Noise
-) -> list[Figure]:
-    """Return the figures in the order of the thesis's groups, numbered on the page.
-
-    Parameters
-    ----------
-    printed : Path
-    results : Results
-    rows : DataFrame
-        Of the study over seeds.
-    scatter : sequence of Scatter
-    noise : Noise
-        That samples of held-out motion are given; it does not matter for what is drawn.
-    """
-    told = _printed_errors(printed)
+def all_figures(printed: Path, results: Results, rows: pd.DataFrame, scatter: pd.DataFrame) -> list[Figure]:
+    """Return the figures in the order of the thesis's groups; ``rows``: of the study over seeds."""
+    errors = read_printed(printed, "errors")
+    told = errors[errors["metric"] == "mean_abs_error"].set_index("set")["after"]
+    methods = read_printed(printed, "method_comparison").set_index(["sensor", "device", "method"])["mean_error_after"]
     out: list[Figure | None] = []
     for sensor, shown in (("accelerometer", ("stop-10s", "continuous-1dps")), ("gyroscope", ("gyro-100dps",))):
         for device in DEVICES:
             out.append(_motion(results, device, sensor, shown[0]))
-            out += [_before_and_after(results, f"{device}-{p}-printed", sensor, noise) for p in shown]
+            out += [_before_and_after(results, f"{device}-{p}", sensor) for p in shown]
             out.append(_per_procedure(results, told, device, sensor))
         own = "stop-1s" if sensor == "accelerometer" else "gyro-60dps"
-        out.append(_before_and_after(results, f"mpu6050-1-mark2-{own}-printed", sensor, noise))
-        out.append(_methods(results, printed, sensor))
-    out.append(_tables(results, told))
-    out.append(_speed(rows))
-    out += [_scatter(scatter, quantity) for quantity in ("O", "S")]
+        out.append(_before_and_after(results, f"mpu6050-1-mark2-{own}", sensor))
+        out.append(_methods(results, methods[sensor], sensor))
+    out += [_tables(results, told), _speed(rows), _scatter(scatter, "O"), _scatter(scatter, "S")]
     return [figure for figure in out if figure is not None]
-
-
-def _printed_errors(printed: Path) -> dict[tuple[str, str, str], float]:
-    """Return the printed mean |e| after, by device, table and procedure."""
-    rows = [r for t in read_printed(printed / "errors.csv").values() for r in t if r["metric"] == "mean_abs_error"]
-    return {(r["device"].lower(), r["rate_table"], procedure_of(r)): float(r["after"]) for r in rows}
 
 
 def _motion(results: Results, device: str, sensor: str, procedure: str) -> Figure | None:
     """Draw what the sensor read in the held-out motion."""
-    recording = next((r for r in results.recordings(f"{device}-{procedure}-printed") if r.role == "validation"), None)
-    if recording is None:
+    held_out = results.recordings(f"{device}-{procedure}-printed", "validation")
+    if not held_out:
         return None
+    recording = held_out[0]
     reading, x = np.asarray(recording.reading(sensor)), recording.time - recording.time[0]
     caption = f"{recording.samples} samples that reached the logger, in {number(float(x[-1]))} s; no fit sees them."
     finding = f"{DEVICES[device]}, {sensor}: the held-out motion"
@@ -99,18 +78,15 @@ def _motion(results: Results, device: str, sensor: str, procedure: str) -> Figur
     )
 
 
-def _before_and_after(results: Results, unit: str, sensor: str, noise: Noise) -> Figure | None:
+def _before_and_after(results: Results, name: str, sensor: str) -> Figure | None:
     """Draw e before and after calibration over the held-out motion."""
-    recording = next((r for r in results.recordings(unit) if r.role == "validation"), None)
-    if recording is None:
-        return None
-    samples = samples_of_motion(sensor, recording, noise, {"gravity_g": 1.0})
+    held_out = results.recordings(f"{name}-printed", "validation")
+    samples = samples_of_motion(sensor, held_out[0], SILENT, {"gravity_g": 1.0}) if held_out else None
     if samples is None:
         return None
-    corrected = apply_correction(results.correction(unit, sensor), samples.reading)
+    corrected = apply_correction(results.correction(f"{name}-printed", sensor), samples.reading)
     before, after = (np.linalg.norm(v, axis=1) - samples.magnitude for v in (samples.reading, corrected))
-    name = unit.removesuffix("-printed")
-    drawn = held_out_over_time(f"held-out-{name}", sensor, recording, before, after)
+    drawn = held_out_over_time(f"held-out-{name}", sensor, held_out[0], before, after)
     means = [number(float(np.mean(np.abs(e)))) for e in (before, after)]
     finding = f"{_in_words(name)}: mean |e| goes from {means[0]} to {means[1]} {SENSOR_UNITS[sensor]}"
     return replace(drawn, finding=finding, caption="Staged, as printed; below, after alone.")
@@ -118,25 +94,29 @@ def _before_and_after(results: Results, unit: str, sensor: str, noise: Noise) ->
 
 def _in_words(name: str) -> str:
     device = device_of(name)
-    table, procedure = "", name.removeprefix(f"{device}-")
-    if procedure.startswith("mark2-"):
-        table, procedure = ", home-made table", procedure.removeprefix("mark2-")
-    return f"{DEVICES[device]}{table}, {in_words(procedure)}"
-
-
-def _per_procedure(results: Results, told: dict[tuple[str, str, str], float], device: str, sensor: str) -> Figure:
-    """Draw the error after calibration by procedure: printed, and ours in both readings."""
-    groups = {}
-    for procedure in PROCEDURES[sensor]:
-        ours = [results.error(f"{device}-{procedure}-{m}", sensor) or 0.0 for m in ("printed", "staged")]
-        groups[_short(procedure)] = [told[device, "acutronic", procedure], *ours]
-    finding = f"{DEVICES[device]}, {sensor}: error after calibration by procedure"
-    figure = Figure(f"procedures-{device}-{sensor}", finding, legend=_legend(PRINTED_AND_OURS))
-    return stems(figure, groups, f"mean |e| after, {SENSOR_UNITS[sensor]}", BELOW[sensor])
+    procedure = name.removeprefix(f"{device}-")
+    table = ", home-made table" if procedure.startswith("mark2-") else ""
+    return f"{DEVICES[device]}{table}, {in_words(procedure.removeprefix('mark2-'))}"
 
 
 def _legend(texts: Iterable[str]) -> tuple[tuple[str, str], ...]:
     return tuple((f"c{i}", text) for i, text in enumerate(texts))
+
+
+def _after(results: Results, name: str, sensor: str, methods: Sequence[str]) -> list[float]:
+    """Return the mean |e| after calibration by each method; 0 where a unit failed."""
+    return [results.error(f"{name}-{method}", sensor) or 0.0 for method in methods]
+
+
+def _per_procedure(results: Results, told: pd.Series[float], device: str, sensor: str) -> Figure:
+    """Draw the error after calibration by procedure: printed, and ours in both readings."""
+    groups = {}
+    for procedure in PROCEDURES[sensor]:
+        name = f"{device}-{procedure}"
+        groups[_short(procedure)] = [told[name], *_after(results, name, sensor, ("printed", "staged"))]
+    finding = f"{DEVICES[device]}, {sensor}: error after calibration by procedure"
+    figure = Figure(f"procedures-{device}-{sensor}", finding, legend=_legend(OURS))
+    return stems(figure, groups, f"mean |e| after, {SENSOR_UNITS[sensor]}", BELOW[sensor])
 
 
 def _short(procedure: str) -> str:
@@ -144,45 +124,40 @@ def _short(procedure: str) -> str:
     return value.removesuffix("dps") if value.endswith("dps") else f"{value[:-1]} s"
 
 
-def _methods(results: Results, printed: Path, sensor: str) -> Figure:
+def _methods(results: Results, told: pd.Series[float], sensor: str) -> Figure:
     """Draw the change of the error by the methods of tables 5.24 and 5.26."""
-    rows = [r for t in read_printed(printed / "method_comparison.csv").values() for r in t if r["sensor"] == sensor]
-    told = {(r["device"].lower(), r["method"] == "staged"): float(r["mean_error_after"]) for r in rows}
-    other = {"accelerometer": ("stop-1s", ("printed", "staged", "least-squares")),
-             "gyroscope": ("gyro-20dps", ("staged", "cholesky-printed", "cholesky"))}  # fmt: skip
-    procedure, methods = other[sensor]
+    if sensor == "accelerometer":
+        procedure, other, methods = "stop-1s", "nonlinear_least_squares", ("printed", "staged", "least-squares")
+        legend = ("printed: staged", "printed: least squares", "staged, as printed", "staged, errata corrected",
+                  "least squares")  # fmt: skip
+        finding = "Accelerometer: the corrected stages leave little more than least squares"
+    else:
+        procedure, other, methods = "gyro-20dps", "cholesky_lu", ("staged", "cholesky-printed", "cholesky")
+        legend = ("printed: staged", "printed: Cholesky", "staged", "Cholesky and LU, forward matrix",
+                  "Cholesky and LU, inverted")  # fmt: skip
+        finding = "Gyroscope: inverted, Cholesky and LU leave what the stages leave"
     groups = {
-        name: [told[device, True], told[device, False]]
-        + [results.error(f"{device}-{procedure}-{m}", sensor) or 0.0 for m in methods]
+        name: [told[device, m] for m in ("staged", other)] + _after(results, f"{device}-{procedure}", sensor, methods)
         for device, name in DEVICES.items()
     }
-    names = {
-        "accelerometer": ("staged, as printed", "staged, errata corrected", "least squares"),
-        "gyroscope": ("staged", "Cholesky and LU, forward matrix", "Cholesky and LU, inverted"),
-    }[sensor]
-    printed_names = ("printed: staged", "printed: least squares" if sensor == "accelerometer" else "printed: Cholesky")
-    finding = (
-        "Accelerometer: the corrected stages leave little more than least squares"
-        if sensor == "accelerometer"
-        else "Gyroscope: inverted, Cholesky and LU leave what the stages leave"
-    )
-    caption, legend = f"From the recordings of {procedure}.", _legend((*printed_names, *names))
-    figure = Figure(f"methods-{sensor}", finding, caption, legend)
+    figure = Figure(f"methods-{sensor}", finding, f"From the recordings of {procedure}.", _legend(legend))
     return stems(figure, groups, f"mean |e| after, {SENSOR_UNITS[sensor]}", "device")
 
 
-def _tables(results: Results, told: dict[tuple[str, str, str], float]) -> Figure:
+def _tables(results: Results, told: pd.Series[float]) -> Figure:
     """Draw the error after calibration on both tables, as a share of that before."""
     groups = {}
-    for sensor, procedure in (("accelerometer", "stop-1s"), ("gyroscope", "gyro-60dps")):
+    for sensor, procedure, printed_before in (
+        ("accelerometer", "stop-1s", 0.069),
+        ("gyroscope", "gyro-60dps", 1.724),
+    ):
         before = results.error(f"mpu6050-1-{procedure}-printed", sensor, "raw") or 1.0
-        printed_before = {"accelerometer": 0.069, "gyroscope": 1.724}[sensor]
-        for table, infix in (("acutronic", ""), ("mark2", "mark2-")):
-            ours = [results.error(f"mpu6050-1-{infix}{procedure}-{m}", sensor) or 0.0 for m in ("printed", "staged")]
-            share = [told["mpu6050-1", table, procedure] / printed_before, *(v / before for v in ours)]
-            short = {"accelerometer": "accel.", "gyroscope": "gyro"}[sensor]
-            groups[f"{short}{', home' if infix else ''}"] = [100.0 * v for v in share]
-    figure = Figure("tables", "The home-made table leaves more of the error", "MPU6050 (1).", _legend(PRINTED_AND_OURS))
+        short = {"accelerometer": "accel.", "gyroscope": "gyro"}[sensor]
+        for table, infix in (("", ""), (", home", "mark2-")):
+            name = f"mpu6050-1-{infix}{procedure}"
+            ours = [v / before for v in _after(results, name, sensor, ("printed", "staged"))]
+            groups[f"{short}{table}"] = [100.0 * v for v in (told[name] / printed_before, *ours)]
+    figure = Figure("tables", "The home-made table leaves more of the error", "MPU6050 (1).", _legend(OURS))
     return stems(figure, groups, "after, % of before", "sensor; home: on the home-made table")
 
 
@@ -193,8 +168,8 @@ def _speed(rows: pd.DataFrame) -> Figure:
     for method, name in FILTERS.items():
         for procedure in CONTINUOUS:
             mean = errors.mean(f"mpu6050-2-{procedure}", method)
-            rate = float(procedure.split("-")[1].removesuffix("dps"))
-            points.append(Point(_short(procedure), mean.value, interval=mean.interval, x=rate, series=name))
+            rate = _short(procedure)
+            points.append(Point(rate, mean.value, interval=mean.interval, x=float(rate), series=name))
     caption = (
         "MPU6050 (2), errata corrected; means over seeds with their 95 % intervals. The filter is on the turns and on "
         "the held-out motion, so without one more noise is left there; how an error grows with the rate is its own."
@@ -204,10 +179,10 @@ def _speed(rows: pd.DataFrame) -> Figure:
     return curves(figure, points, "mean |e| after, g", "rate, deg/s", named=False)
 
 
-def _scatter(scatter: Sequence[Scatter], quantity: str) -> Figure:
-    """Draw the printed scatter beside what picking explains, cause by cause."""
-    own = [s for s in scatter if s.quantity == quantity]
-    groups = {DEVICES[s.device]: [s.printed, *s.seeds.values()] for s in own}
+def _scatter(scatter: pd.DataFrame, quantity: str) -> Figure:
+    """Draw the printed scatter and what picking explains, cause by cause."""
+    own = scatter[scatter["quantity"] == quantity].set_index("device")[["printed", *CAUSES]]
+    groups = {DEVICES[str(device)]: list(row) for device, row in own.iterrows()}
     finding = f"Scatter of {quantity}: printed, and by picking single samples"
-    figure = Figure(f"scatter-{quantity}", finding, legend=_legend(("printed", *CAUSES)))
+    figure = Figure(f"scatter-{quantity}", finding, legend=_legend(own.columns))
     return stems(figure, groups, f"rms deviation of {quantity}", "device")

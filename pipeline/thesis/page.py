@@ -7,38 +7,27 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
+import pandas as pd
 
-from pipeline.records import Noise
-from pipeline.report.numbers import MINUS, NOTHING, number, percent
+from pipeline.report.numbers import MINUS, NOTHING, number
 from pipeline.report.pages import template
 from pipeline.thesis.agreement import agreements, scatters
 from pipeline.thesis.conclusions import KINDS, conclusions
 from pipeline.thesis.errata import errata
 from pipeline.thesis.figures import all_figures
-from pipeline.thesis.method_tables import method_tables, paper_tables
 from pipeline.thesis.results import DEVICES, Results
-from pipeline.thesis.seeds import CAUSES, LOST, read_rows
-from pipeline.thesis.tables import error_tables, parameter_tables
+from pipeline.thesis.seeds import CAUSES, LOST
+from pipeline.thesis.tables import all_tables
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
     from pathlib import Path
 
     from pipeline.report.comparison import Estimate
     from pipeline.thesis.conclusions import Conclusion
-    from pipeline.thesis.tables import Cell, Table
 
 JSON = dict[str, Any]
-
-
-def all_tables(printed: Path, results: Results) -> list[Table]:
-    """Return tables 5.1 to 5.26, then those of the paper."""
-    tables = parameter_tables(printed, results) + error_tables(printed, results) + method_tables(printed, results)
-    return sorted(tables, key=lambda t: int(t.number.split(".")[1])) + paper_tables(printed, results)
 
 
 def render(campaign: Path, folder: Path) -> str:
@@ -52,86 +41,67 @@ def render(campaign: Path, folder: Path) -> str:
         Results of a run of it.
     """
     printed, results = campaign / "printed", Results(folder)
-    rows = read_rows(campaign / "seeds.csv")
+    rows = pd.read_csv(campaign / "seeds.csv")
     scatter = scatters(printed, rows)
-    silent = Noise(np.zeros(3), np.zeros(3), 100.0, "none")
-    tables = [_table(t) for t in all_tables(printed, results)]
+    cells = all_tables(printed, results)
+    cells["key"] = [
+        key_of(c["table"], c["block"], c["row"], c["column"]) if c["large"] else "" for c in cells.to_dict("records")
+    ]
     page: str = template("thesis.html").render(
-        tables=tables,
-        figures=all_figures(printed, results, rows, scatter, silent),
+        tables=[_table(number, own) for number, own in cells.groupby("table", sort=False)],
+        figures=all_figures(printed, results, rows, scatter),
         errata=errata(printed, results, rows),
         conclusions=[_conclusion(c) for c in conclusions(rows)],
-        agreements=[
-            {
-                "what": a.what,
-                "method": a.method,
-                "bound": number(a.bound),
-                "largest": number(a.largest),
-                "within": f"{a.within} of {a.differences.size}",
-                "kind": "good" if a.within == a.differences.size else "warn",
-            }
-            for a in agreements(printed, results)
-        ],
-        explanations=sorted((e for e in EXPLANATIONS if any(e.key in t["keys"] for t in tables)), key=lambda e: e.key),
+        agreements=agreements(printed, results).to_dict("records"),
+        explanations=sorted(e for e in EXPLANATIONS if e.key in set(cells["key"])),
         scatter=[
             {
-                "device": DEVICES[s.device],
-                "quantity": s.quantity,
-                "printed": number(s.printed, 2),
-                "causes": [number(v, 2) for v in s.seeds.values()],
-                "unexplained": number(s.unexplained, 2),
-                "share": percent(min(1.0, (s.seeds[LOST] / s.printed) ** 2)),
+                "device": DEVICES[row["device"]],
+                "quantity": row["quantity"],
+                "printed": row["printed"],
+                "causes": [row[cause] for cause in CAUSES],
+                "unexplained": row["unexplained"],
+                "share": min(1.0, (row[LOST] / row["printed"]) ** 2),
             }
-            for s in scatter
+            for row in scatter.to_dict("records")
         ],
         causes=CAUSES,
         seeds=rows["seed"].nunique(),
-        cells=sum(t["cells"] for t in tables),
-        large=sum(t["large"] for t in tables),
+        cells=len(cells),
+        large=cells["large"].sum(),
     )
     return page
 
 
-def _table(table: Table) -> JSON:
-    blocks, keys = [], set()
-    for block in table.blocks:
-        rows = []
-        for row in block.rows:
-            cells = []
-            for cell, column in zip(row.cells, table.columns, strict=True):
-                key = key_of(table.number, block.title, row.label, column) if cell.large else ""
-                keys.add(key)
-                cells.append(_cell(cell, key))
-            rows.append({"label": row.label, "cells": cells})
-        blocks.append({"title": block.title, "rows": rows})
-    count = sum(len(row.cells) for block in table.blocks for row in block.rows)
+def _table(number: str, cells: pd.DataFrame) -> JSON:
+    blocks = [
+        {
+            "title": title,
+            "rows": [
+                {"label": label, "cells": [_cell(cell) for cell in row.to_dict("records")]}
+                for label, row in block.groupby("row", sort=False)
+            ],
+        }
+        for title, block in cells.groupby("block", sort=False)
+    ]
     return {
-        "id": table.number.replace(".", "-").replace(" ", "-"),
-        "number": table.number,
-        "title": table.title,
-        "columns": table.columns,
+        "id": number.replace(".", "-").replace(" ", "-"),
+        "number": number,
+        "title": cells["title"].iloc[0],
+        "columns": list(cells["column"].unique()),
         "blocks": blocks,
-        "keys": keys - {""},
-        "cells": count,
-        "large": table.large,
     }
 
 
-def _cell(cell: Cell, key: str) -> JSON:
-    digits = cell.digits
-
-    def text(value: float | None, *, sign: bool = False) -> str:
-        if value is None:
+def _cell(cell: JSON) -> JSON:
+    def text(value: float, sign: str = "") -> str:
+        if math.isnan(value):
             return NOTHING
-        rounded = f"{value:{'+' if sign else ''}.{digits}f}"
+        rounded = f"{value:{sign}.{cell['digits']}f}"
         return rounded.lstrip("+-") if float(rounded) == 0.0 else rounded.replace("-", MINUS)
 
-    return {
-        "printed": text(cell.printed),
-        "ours": text(cell.ours),
-        "difference": text(cell.difference, sign=True),
-        "key": key,
-    }
+    texts = {"printed": text(cell["printed"]), "ours": text(cell["ours"]), "difference": text(cell["difference"], "+")}
+    return {**texts, "key": cell["key"]}
 
 
 def _conclusion(conclusion: Conclusion) -> JSON:
@@ -169,29 +139,8 @@ def _difference(estimate: Estimate, scale: float) -> dict[str, str]:
     return {"difference": text(estimate.value), "interval": f"{text(low)} to {text(high)}"}
 
 
-def unexplained(tables: Sequence[Table]) -> list[str]:
-    """Return the cells whose difference is large and has no explanation."""
-    return [
-        f"table {t.number}, {block.title}, {row.label}, {column}"
-        for t in tables
-        for block in t.blocks
-        for row in block.rows
-        for cell, column in zip(row.cells, t.columns, strict=True)
-        if cell.large and not key_of(t.number, block.title, row.label, column)
-    ]
-
-
-@dataclass(frozen=True)
-class Explanation:
-    """One reason.
-
-    Attributes
-    ----------
-    key : str
-    text : str
-    where : str
-        Regular expression of ``table|block|row|column``.
-    """
+class Explanation(NamedTuple):
+    """A reason for large differences; ``where``: regular expression of ``table|block|row|column`` of the cells."""
 
     key: str
     text: str
@@ -200,7 +149,7 @@ class Explanation:
 
 ACCELEROMETER = r"^5\.(8|9|10|11|12|13|24)\|"
 GYROSCOPE = r"^5\.(19|20|21|22|26)\|"
-EXPLANATIONS = (
+EXPLANATIONS = (  # the first that holds for a cell
     Explanation(
         "a",
         "The printed matrix of Cholesky and LU is the forward one (erratum 4); here stands its inverse, the "

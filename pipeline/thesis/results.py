@@ -1,4 +1,4 @@
-"""What a run of the campaign found, by device, procedure and method."""
+"""What was printed, and what a run of the campaign found, by device, procedure and method."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 
 from pipeline.io.parquet import load_recordings
 from pipeline.records import Noise
@@ -22,22 +23,47 @@ if TYPE_CHECKING:
     from pipeline.records import Recording
 
 JSON = dict[str, Any]
+AXES = "xyz"
 DEVICES = {"mpu6050-1": "MPU6050 (1)", "mpu6050-2": "MPU6050 (2)", "stim300": "STIM300"}
 TABLES = {"acutronic": "precise table", "mark2": "home-made table"}
 STOPS = ("stop-1s", "stop-5s", "stop-10s")
 CONTINUOUS = tuple(f"continuous-{rate}dps" for rate in ("0.5", "1", "5", "10", "30"))
 RATES = tuple(f"gyro-{rate}dps" for rate in (20, 60, 80, 100, 200))
+SILENT = Noise(np.zeros(3), np.zeros(3), 100.0, "none")  # for mean errors, which do not depend on it
+
+
+def read_printed(folder: Path, name: str) -> pd.DataFrame:
+    """Read a file of printed figures, a row a line of a printed table.
+
+    Devices are named as in the campaign; ``procedure`` and ``set`` name the recordings of a row.
+    """
+    rows = pd.read_csv(folder / f"{name}.csv", dtype={"table": str, "error_table": str})
+    if "device" in rows:
+        rows["device"] = rows["device"].str.lower()
+    if "rate_table" in rows:
+        rows["procedure"] = [_procedure(row) for row in rows.to_dict("records")]
+        rows["set"] = (
+            rows["device"] + rows["rate_table"].map({"acutronic": "-", "mark2": "-mark2-"}) + rows["procedure"]
+        )
+    return rows
+
+
+def _procedure(row: Mapping[str, Any]) -> str:
+    if row.get("dwell_s", np.nan) > 0.0:
+        return f"stop-{row['dwell_s']:g}s"
+    kind = "gyro" if "M11" in row or row.get("procedure") == "gyro_rate" else "continuous"
+    return f"{kind}-{row['speed_dps']:g}dps"
+
+
+def in_words(procedure: str) -> str:
+    """Return a procedure in words."""
+    kind, _, value = procedure.partition("-")
+    return f"{kind} {value.removesuffix('dps')} deg/s" if value.endswith("dps") else f"{kind} {value[:-1]} s"
 
 
 @dataclass(frozen=True)
 class Results:
-    """The results of one run.
-
-    Attributes
-    ----------
-    folder : Path
-        ``results/thesis``.
-    """
+    """The results of one run, in ``folder``. A unit is named ``<set of recordings>-<method>``."""
 
     folder: Path
 
@@ -47,7 +73,7 @@ class Results:
         return part
 
     def parameter(self, unit: str, sensor: str, stage: str, name: str) -> float | None:
-        """Return what a stage found, or None."""
+        """Return a parameter that a stage estimated, or None."""
         for found in (self.fit(unit, sensor) or {}).get("stages", ()):
             if found["name"] == stage and name in found["parameters"]:
                 return float(found["parameters"][name]["value"])
@@ -61,64 +87,49 @@ class Results:
     def step(self, unit: str, sensor: str, name: str) -> JSON:
         """Return a step of a unit's held-out errors: ``raw``, or ``last`` for the last stage's."""
         steps = (_read(self.folder / "validations" / f"{unit}.json").get(sensor) or {}).get("steps", ())
-        stages = [s for s in steps if s["name"].startswith("stage:")]
-        if name == "last":
-            return stages[-1] if stages else {}
-        return next((s for s in steps if s["name"] == name), {})
+        found = [s for s in steps if (s["name"].startswith("stage:") if name == "last" else s["name"] == name)]
+        return found[-1] if found else {}
 
     def error(self, unit: str, sensor: str, name: str = "last") -> float | None:
         """Return the mean |e| of a step."""
         value: float | None = self.step(unit, sensor, name).get("mean_abs_error")
         return value
 
-    def recordings(self, unit: str) -> list[Recording]:
-        """Return a unit's recordings behind its filter; none where it failed."""
+    def recordings(self, unit: str, role: str) -> list[Recording]:
+        """Return the filtered recordings of a role; none where the unit failed."""
         files = list(self.folder.glob(f"batches/*/filter/{unit}.parquet"))
-        return load_recordings(files[0]) if files else []
+        return [r for r in load_recordings(files[0]) if r.role == role] if files else []
 
-    def with_printed(self, name: str, sensor: str, parameters: Mapping[str, str]) -> float | None:
+    def with_printed(self, name: str, sensor: str, parameters: Mapping[str, float]) -> float | None:
         """Return the mean |e| that printed parameters leave on the held-out motion of a set of recordings.
 
         ``S (O M a - b)`` for the accelerometer (eq. 3.2), ``(g - b) M S`` for the gyroscope (3.45).
         """
-        held_out = next((r for r in self.recordings(f"{name}-printed") if r.role == "validation"), None)
-        if held_out is None:
+        held_out = self.recordings(f"{name}-printed", "validation")
+        if not held_out:
             return None
-        silent = Noise(np.zeros(3), np.zeros(3), 100.0, "none")
-        samples = samples_of_motion(sensor, held_out, silent, {"gravity_g": 1.0})
+        samples = samples_of_motion(sensor, held_out[0], SILENT, {"gravity_g": 1.0})
         assert samples is not None  # noqa: S101  (the table logs its rate)
-
-        def vector(pattern: str) -> NDArray[np.float64]:
-            return np.array([float(parameters[pattern.format(axis)]) for axis in "xyz"])
-
         if sensor == "accelerometer":
-            corrected = vector("S_{}") * (vector("O_{}") * vector("M_{}") * samples.reading - vector("b_{}_g"))
+            O, M, S, b = (values(parameters, pattern) for pattern in ("O_{}", "M_{}", "S_{}", "b_{}_g"))
+            corrected = S * (O * M * samples.reading - b)
         else:
-            matrix = np.array([[float(parameters[f"M{i}{j}"]) for j in (1, 2, 3)] for i in (1, 2, 3)])
-            corrected = (samples.reading - vector("b_{}_dps")) @ matrix * vector("S_{}")
+            matrix, S, b = matrix_of(parameters, "M"), values(parameters, "S_{}"), values(parameters, "b_{}_dps")
+            corrected = (samples.reading - b) @ matrix * S
         return float(np.mean(np.abs(np.linalg.norm(corrected, axis=1) - samples.magnitude)))
+
+
+def values(row: Mapping[str, float], pattern: str) -> NDArray[np.float64]:
+    """Return the printed values of x, y and z, whose columns ``pattern`` names: (3,) array."""
+    return np.array([row[pattern.format(axis)] for axis in AXES])
+
+
+def matrix_of(row: Mapping[str, float], letter: str) -> NDArray[np.float64]:
+    """Return a printed matrix, of the columns ``M11`` to ``M33``: (3, 3) array."""
+    return np.array([[row[f"{letter}{i}{j}"] for j in (1, 2, 3)] for i in (1, 2, 3)])
 
 
 @cache
 def _read(path: Path) -> JSON:
     found: JSON = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     return found
-
-
-def procedure_of(row: Mapping[str, str]) -> str:
-    """Return the procedure of a row of a printed table, as the campaign's units name it."""
-    if row.get("dwell_s"):
-        return f"stop-{float(row['dwell_s']):g}s"
-    kind = "gyro" if "M11" in row or row.get("procedure") == "gyro_rate" else "continuous"
-    return f"{kind}-{float(row['speed_dps']):g}dps"
-
-
-def set_of(device: str, table: str, procedure: str) -> str:
-    """Return the name of a set of recordings."""
-    return f"{device.lower()}-{'mark2-' if table == 'mark2' else ''}{procedure}"
-
-
-def in_words(procedure: str) -> str:
-    """Return a procedure as a reader says it."""
-    kind, _, value = procedure.partition("-")
-    return f"{kind} {value.removesuffix('dps')} deg/s" if value.endswith("dps") else f"{kind} {value[:-1]} s"

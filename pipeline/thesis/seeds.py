@@ -2,9 +2,9 @@
 
     error = mean |e_n| of the held-out motion (Sudsanguan 2019, eqs 5.1 to 5.4), with the noise of the same seed
 
-Beside it stand, for the accelerometer as printed, what the stages found: O of y and z, M, b, and S (mean of both
-sides). "zero-phase" runs the RC filter both ways, so its gain works twice; "same-gain" runs one with a shorter time
-constant tau both ways, so that the gain is that of the causal filter and the delay none:
+For the accelerometer as printed, a row also holds what the stages found: O of y and z, M, b, and S (mean of both
+sides). "zero-phase" runs the RC filter forwards and backwards, so its gain works twice; "same-gain" does so with a
+shorter time constant tau', so that the gain is that of the causal filter without its delay:
 
     |H|^2 = 1 - tau (dt + tau) omega^2,   2 tau' (dt + tau') = tau (dt + tau)      for small omega
 
@@ -42,11 +42,13 @@ from pipeline.estimation.gyroscope import staged as gyroscope
 from pipeline.estimation.gyroscope.integrated_turns import turns_of
 from pipeline.estimation.turns import parts_of
 from pipeline.model.measurement import linear_truth
-from pipeline.records import SENSORS, Noise
+from pipeline.records import SENSORS
 from pipeline.signal.filters import apply_filter
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import read_config, read_description
 from pipeline.simulation.sensor import SimulatedSensor, bias_wander
+from pipeline.simulation.session import received
+from pipeline.thesis.results import AXES, DEVICES, SILENT
 from pipeline.validation.samples import samples_of_motion
 
 if TYPE_CHECKING:
@@ -55,10 +57,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.records import Recording
-
-    Correct = Callable[[NDArray[np.float64]], NDArray[np.float64]]
     from pipeline.estimation.turns import Part
+    from pipeline.records import Recording
     from pipeline.simulation.description import Description, UnitDescription
 
 FOUND = ("O_y", "O_z", "M", "b_x", "b_y", "b_z", "S_x", "S_y", "S_z")
@@ -77,188 +77,8 @@ Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Drawn:
-    """The turns of one seed and the held-out motion of its device, with the same filter on both.
-
-    Attributes
-    ----------
-    own : Set
-    seed : int
-    held_out : Recording
-    cause : str
-    filter : str
-    """
-
-    own: Set
-    seed: int
-    held_out: Recording
-    cause: str = LOST
-    filter: str = "rc_low_pass"
-
-    def filtered(self, recording: Recording) -> Recording:
-        """Return a recording behind the filter."""
-        if self.filter == "none":
-            return recording
-        time_constant = SAME_GAIN_S if self.filter == "same-gain" else TIME_CONSTANT_S
-        wanted = {**read_config("filter", "rc_low_pass"), "time_constant_s": float(time_constant)}
-        return apply_filter(recording, {**wanted, "zero_phase": self.filter != "rc_low_pass"})
-
-    def accelerometer_error(self, correct: Correct) -> float:
-        """Return the mean |e| of the held-out motion, corrected."""
-        reading = self.filtered(self.held_out).accelerometer
-        return float(np.mean(np.abs(np.linalg.norm(correct(np.asarray(reading)), axis=1) - 1.0)))
-
-    def staged_accelerometer(self, *, as_printed: bool, judge: bool = True) -> Row:
-        """Return what the stages find, and the error that they leave."""
-        turns = self._turns(as_printed=as_printed)
-        extremes = (
-            extremes_of_samples(turns)
-            if as_printed
-            else extremes_of_sinusoids([[s.coefficients for s in fits] for fits in sinusoids_of(turns)])
-        )
-        row: Row = {}
-        chain = staged.Corrected()
-        for name in staged.STAGES:
-            chain = staged.follow(extremes, [name], 1.0, as_printed=as_printed, start=chain)
-            values = {k: v for k, (v, _) in chain.values.items()}  # noqa: PD011  (no DataFrame)
-            for axis in "xyz":
-                if name == "bias":
-                    row[f"b_{axis}"] = values[f"b_{axis}"]
-                elif name in ("orthogonality", "scale_factor"):
-                    letter = "O" if name == "orthogonality" else "S"
-                    row[f"{letter}_{axis}"] = (values[f"{letter}_P_{axis}"] + values[f"{letter}_N_{axis}"]) / 2.0
-            if name == "misalignment":  # the same on all axes
-                row["M"] = (values["M_P_x"] + values["M_N_x"]) / 2.0
-        if judge:
-            row["error"] = self.accelerometer_error(partial(apply_correction, {"steps": chain.steps}))
-        return row
-
-    def least_squares_accelerometer(self) -> Row:
-        """Return the error that nonlinear least squares leaves."""
-        turns = [self.filtered(r) for r in self.own.recordings(self.seed, self.cause)]
-        fitted = nonlinear_least_squares.fit(turns, None, self._settings())
-        return {"error": self.accelerometer_error(partial(linear_truth, fitted))}
-
-    def gyroscope(self) -> Iterator[tuple[str, Row]]:
-        """Yield method and error of the staged method, and of Cholesky and LU as printed and inverted."""
-        turns = [self.filtered(r) for r in self.own.recordings(self.seed, self.cause)]
-        table = self._settings()["table"]
-        parts = parts_of(turns, "gyroscope", table, "the study")
-        samples = response.samples_of(parts, turns)
-        theta = response.weights_of(samples.rate, as_printed=False) @ samples.reading
-        chain = gyroscope.follow(
-            response.Response(theta[0], theta[1:], samples.speed), list(gyroscope.STAGES), as_printed=False
-        )
-        integrated = turns_of(parts)
-        U, Y = integrated.integral(integrated.rate), integrated.integral(integrated.reading - theta[0])
-        forward = np.linalg.lstsq(U, Y, rcond=None)[0].T
-        matrices = {
-            "staged": chain.contract()[1],
-            "cholesky-printed": forward,
-            "cholesky": np.linalg.solve(forward, np.eye(3)),
-        }
-        silent = Noise(np.zeros(3), np.zeros(3), 100.0, "none")
-        motion = samples_of_motion("gyroscope", self.filtered(self.held_out), silent, table)
-        assert motion is not None  # noqa: S101  (the table logs its rate)
-        for method, matrix in matrices.items():
-            error = np.linalg.norm((motion.reading - theta[0]) @ matrix.T, axis=1) - motion.magnitude
-            yield method, {"error": float(np.mean(np.abs(error)))}
-
-    def _turns(self, *, as_printed: bool) -> list[Turn]:
-        """Return what the staged method sees of the turns; their motion is the same for every seed."""
-        turns = []
-        drawn = self.own.drawn(self.seed, self.cause)
-        for part, (recording, kept) in zip(self.own.parts, drawn, strict=True):
-            filtered = self.filtered(recording.select(kept))
-            late = replace(part, recording=replace(part.recording, filter=filtered.filter))
-            used = samples_of(late, as_printed=as_printed)
-            reading = np.asarray(filtered.accelerometer)[used[kept]]
-            turns.append(Turn(np.asarray(part.motion.angle)[kept & used], reading, [], []))
-        return turns
-
-    def _settings(self) -> dict[str, Any]:
-        unit = self.own.unit
-        table, sensor = read_config("table", unit.table), read_config("sensor", unit.sensor)
-        return {"table": table, "sensor": sensor, "procedure": {"holdout_every": 0}, "method": {"as_printed": False}}
-
-
-def study(campaign: Path, sets: Sequence[str], seeds: Sequence[int]) -> Iterator[Row]:
-    """Yield the rows of some sets of recordings.
-
-    Parameters
-    ----------
-    campaign : Path
-        With ``simulation.yaml``.
-    sets : sequence of str
-        Names in it.
-    seeds : sequence of int
-    """
-    description = read_description(campaign / "simulation.yaml")
-    for name in sets:
-        own = Set.named(description, name)
-        held_out = Set.named(description, f"{device_of(name)}-held-out-{own.sensor}")
-        for seed in seeds:
-            held_out_of_seed = held_out.recordings(seed)[0]
-            for cause, method, row in _rows(Drawn(own, seed, held_out_of_seed)):
-                yield {"set": name, "seed": seed, "cause": CAUSES.index(cause), "method": method, **row}
-
-
-def _rows(drawn: Drawn) -> Iterator[tuple[str, str, Row]]:
-    """Yield cause, method and row of one seed."""
-    name = drawn.own.unit.unit
-    if drawn.own.sensor == "gyroscope":
-        for method, row in drawn.gyroscope():
-            yield LOST, method, row
-        return
-    yield LOST, "printed", drawn.staged_accelerometer(as_printed=True)
-    yield LOST, "staged", _error_alone(drawn.staged_accelerometer(as_printed=False))
-    if drawn.own.unit.table == "acutronic":
-        for cause in (c for c in CAUSES if c != LOST):
-            yield cause, "printed", replace(drawn, cause=cause).staged_accelerometer(as_printed=True, judge=False)
-    if "-continuous-" in name:
-        for method, chosen in (("zero-phase", "zero-phase"), ("same-gain", "same-gain"), ("unfiltered", "none")):
-            yield LOST, method, _error_alone(replace(drawn, filter=chosen).staged_accelerometer(as_printed=False))
-    if name.endswith("-stop-1s") or name == "stim300-continuous-0.5dps":
-        yield LOST, "least-squares", drawn.least_squares_accelerometer()
-
-
-def _error_alone(row: Row) -> Row:
-    return {"error": row["error"]}
-
-
-def device_of(name: str) -> str:
-    """Return the device of a set of recordings."""
-    return next(d for d in ("mpu6050-1", "mpu6050-2", "stim300") if name.startswith(d))
-
-
-def sets_of(campaign: Path) -> list[str]:
-    """Return the sets of recordings that calibrate a device of the thesis."""
-    names = [u.unit for u in read_description(campaign / "simulation.yaml").units]
-    return [n for n in names if "-held-out-" not in n and not n.startswith("gy-521")]
-
-
-def write_rows(path: Path, rows: Sequence[Row]) -> None:
-    """Write rows as CSV, with five digits."""
-    pd.DataFrame(rows, columns=COLUMNS).to_csv(path, index=False, float_format="%.5g", lineterminator="\n")
-
-
-def read_rows(path: Path) -> pd.DataFrame:
-    """Read rows back; a value that is not there is NaN."""
-    return pd.read_csv(path)
-
-
-@dataclass(frozen=True)
 class Set:
-    """One set of recordings of ``simulation.yaml``.
-
-    Attributes
-    ----------
-    unit : UnitDescription
-    number : int
-        In the description.
-    campaign_seed : int
-        Of the campaign: the motions are those of its recordings.
-    """
+    """One set of recordings of ``simulation.yaml``: its number there, and the seed of the campaign's motions."""
 
     unit: UnitDescription
     number: int
@@ -274,13 +94,6 @@ class Set:
     def sensor(self) -> str:
         """The sensor that the recordings are made for; the other one's readings are left out."""
         return "gyroscope" if "-gyro" in self.unit.unit else "accelerometer"
-
-    @property
-    def sheet(self) -> dict[str, Any]:
-        """The sensor's data sheet, with the noise of its whole bandwidth."""
-        sheet: dict[str, Any] = read_config("sensor", self.unit.sensor)[self.sensor]
-        given = getattr(self.unit, self.sensor)
-        return {**sheet, **{key: given[key] for key in ("noise_density",) if key in given}}
 
     @cached_property
     def still(self) -> list[Recording]:
@@ -298,23 +111,30 @@ class Set:
         """The recordings without noise or loss, with the table's motion."""
         return parts_of(self.still, "accelerometer", read_config("table", self.unit.table), "the study")
 
-    def recordings(self, seed: int, cause: str = LOST) -> list[Recording]:
-        """Return the recordings of one seed, disturbed by a cause and those before it in ``CAUSES``."""
-        return [recording.select(kept) for recording, kept in self.drawn(seed, cause)]
-
     def drawn(self, seed: int, cause: str = LOST) -> list[tuple[Recording, NDArray[np.bool_]]]:
-        """Return the recordings of one seed, whole, and which of their samples arrive."""
+        """Return the recordings of one seed, whole, and which of their samples arrive.
+
+        They are disturbed by ``cause`` and those before it in ``CAUSES``.
+        """
         exact = self.still if self.unit.table == "acutronic" else _exact(self.unit, seed, self.number)
         if cause == SHAKEN:
             exact = self.shaken
+        sheet = read_config("sensor", self.unit.sensor)[self.sensor]
+        given = getattr(self.unit, self.sensor)
+        if cause != SHEET and "noise_density" in given:
+            sheet = {**sheet, "noise_density": given["noise_density"]}  # of the whole bandwidth
+        lost = self.unit.lost if cause in (LOST, SHAKEN) else 0.0
         link, noise = (np.random.default_rng([seed, self.number, k]) for k in (0, 1 + SENSORS.index(self.sensor)))
-        sheet = read_config("sensor", self.unit.sensor)[self.sensor] if cause == SHEET else self.sheet
+        simulated = SimulatedSensor(self.sensor, sheet, np.zeros(3), np.eye(3))
+        wander = bias_wander([r.time for r in exact], sheet["wander_time_s"], noise)
         out = []
-        for recording, reading in zip(exact, _noisy(self.sensor, sheet, exact, noise), strict=True):
-            kept = link.random(recording.samples) >= (self.unit.lost if cause in (LOST, SHAKEN) else 0.0)
-            kept[[0, -1]] = True
+        for recording, slow in zip(exact, wander, strict=True):
+            white = simulated.white(recording.interval) * noise.standard_normal(slow.shape)
+            reading = simulated.quantised(
+                np.asarray(recording.reading(self.sensor)) + white + sheet["bias_wander"] * slow
+            )
             own: dict[str, Any] = {s: reading if s == self.sensor else None for s in SENSORS}
-            out.append((replace(recording, **own), kept))
+            out.append((replace(recording, **own), received(recording.samples, lost, link)))
         return out
 
 
@@ -326,16 +146,147 @@ def _exact(unit: UnitDescription, seed: int, number: int) -> list[Recording]:
     return [replace(r, temperature=None) for r in simulate_unit(without, seed, number)[0]]
 
 
-def _noisy(
-    sensor: str, sheet: dict[str, Any], exact: list[Recording], rng: np.random.Generator
-) -> list[NDArray[np.float64]]:
-    """Return the readings of a sensor in each recording, with white noise and bias wander, in whole counts."""
-    simulated = SimulatedSensor(sensor, sheet, np.zeros(3), np.eye(3))
-    wander = bias_wander([r.time for r in exact], sheet["wander_time_s"], rng)
-    out = []
-    for recording, slow in zip(exact, wander, strict=True):
-        reading = recording.reading(sensor)
-        assert reading is not None  # noqa: S101  (simulated sets hold both sensors)
-        white = simulated.white(recording.interval) * rng.standard_normal(reading.shape)
-        out.append(simulated.quantised(reading + white + sheet["bias_wander"] * slow))
-    return out
+@dataclass(frozen=True)
+class Drawn:
+    """The turns of one seed and the held-out motion of its device, with the same filter on both."""
+
+    own: Set
+    seed: int
+    held_out: Recording
+    cause: str = LOST
+    filter: str = "rc_low_pass"
+
+    def filtered(self, recording: Recording) -> Recording:
+        """Return a recording behind the filter."""
+        if self.filter == "unfiltered":
+            return recording
+        time_constant = SAME_GAIN_S if self.filter == "same-gain" else TIME_CONSTANT_S
+        wanted = {**read_config("filter", "rc_low_pass"), "time_constant_s": float(time_constant)}
+        return apply_filter(recording, {**wanted, "zero_phase": self.filter != "rc_low_pass"})
+
+    def turns(self) -> list[Recording]:
+        """Return the filtered turns."""
+        return [self.filtered(recording.select(kept)) for recording, kept in self.own.drawn(self.seed, self.cause)]
+
+    def staged_accelerometer(self, *, as_printed: bool, judge: bool = True) -> Row:
+        """Return what the stages find, and the error that they leave."""
+        turns = self._seen(as_printed=as_printed)
+        extremes = (
+            extremes_of_samples(turns)
+            if as_printed
+            else extremes_of_sinusoids([[s.coefficients for s in fits] for fits in sinusoids_of(turns)])
+        )
+        found: dict[str, float] = {}
+        chain = staged.Corrected()
+        for name in staged.STAGES:
+            chain = staged.follow(extremes, [name], 1.0, as_printed=as_printed, start=chain)
+            found |= {k: v for k, (v, _) in chain.values.items()}  # noqa: PD011  (no DataFrame)
+        row = {f"b_{a}": found[f"b_{a}"] for a in AXES}
+        row |= {f"{q}_{a}": (found[f"{q}_P_{a}"] + found[f"{q}_N_{a}"]) / 2.0 for q in "OS" for a in AXES}
+        row["M"] = (found["M_P_x"] + found["M_N_x"]) / 2.0  # the same on all axes
+        if judge:
+            row["error"] = self._accelerometer_error(partial(apply_correction, {"steps": chain.steps}))
+        return row
+
+    def least_squares_accelerometer(self) -> Row:
+        """Return the error that nonlinear least squares leaves."""
+        table, sensor = (read_config(group, getattr(self.own.unit, group)) for group in ("table", "sensor"))
+        settings = {
+            "table": table,
+            "sensor": sensor,
+            "procedure": {"holdout_every": 0},
+            "method": {"as_printed": False},
+        }
+        fitted = nonlinear_least_squares.fit(self.turns(), None, settings)
+        return {"error": self._accelerometer_error(partial(linear_truth, fitted))}
+
+    def _accelerometer_error(self, correct: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> float:
+        """Return the mean |e| of the held-out motion, corrected."""
+        reading = self.filtered(self.held_out).accelerometer
+        return float(np.mean(np.abs(np.linalg.norm(correct(np.asarray(reading)), axis=1) - 1.0)))
+
+    def _seen(self, *, as_printed: bool) -> list[Turn]:
+        """Return what the staged method sees of the turns; their motion is the same for every seed."""
+        turns = []
+        drawn = self.own.drawn(self.seed, self.cause)
+        for part, (recording, kept) in zip(self.own.parts, drawn, strict=True):
+            filtered = self.filtered(recording.select(kept))
+            late = replace(part, recording=replace(part.recording, filter=filtered.filter))
+            used = samples_of(late, as_printed=as_printed)
+            reading = np.asarray(filtered.accelerometer)[used[kept]]
+            turns.append(Turn(np.asarray(part.motion.angle)[kept & used], reading, [], []))
+        return turns
+
+    def gyroscope(self) -> Iterator[tuple[str, Row]]:
+        """Yield method and error of the staged method, and of Cholesky and LU as printed and inverted."""
+        turns, table = self.turns(), read_config("table", self.own.unit.table)
+        parts = parts_of(turns, "gyroscope", table, "the study")
+        samples = response.samples_of(parts, turns)
+        theta = response.weights_of(samples.rate, as_printed=False) @ samples.reading
+        chain = gyroscope.follow(
+            response.Response(theta[0], theta[1:], samples.speed), list(gyroscope.STAGES), as_printed=False
+        )
+        integrated = turns_of(parts)
+        U, Y = integrated.integral(integrated.rate), integrated.integral(integrated.reading - theta[0])
+        forward = np.linalg.lstsq(U, Y, rcond=None)[0].T
+        matrices = {
+            "staged": chain.contract()[1],
+            "cholesky-printed": forward,
+            "cholesky": np.linalg.solve(forward, np.eye(3)),
+        }
+        motion = samples_of_motion("gyroscope", self.filtered(self.held_out), SILENT, table)
+        assert motion is not None  # noqa: S101  (the table logs its rate)
+        for method, matrix in matrices.items():
+            error = np.linalg.norm((motion.reading - theta[0]) @ matrix.T, axis=1) - motion.magnitude
+            yield method, {"error": float(np.mean(np.abs(error)))}
+
+
+def study(campaign: Path, sets: Sequence[str], seeds: Sequence[int]) -> Iterator[Row]:
+    """Yield the rows of some sets of recordings of the campaign's ``simulation.yaml``."""
+    description = read_description(campaign / "simulation.yaml")
+    for name in sets:
+        own = Set.named(description, name)
+        held_out = Set.named(description, f"{device_of(name)}-held-out-{own.sensor}")
+        for seed in seeds:
+            recording, kept = held_out.drawn(seed)[0]
+            for cause, method, row in _rows(Drawn(own, seed, recording.select(kept))):
+                yield {"set": name, "seed": seed, "cause": CAUSES.index(cause), "method": method, **row}
+
+
+def _rows(drawn: Drawn) -> Iterator[tuple[str, str, Row]]:
+    """Yield cause, method and row of one seed."""
+    name = drawn.own.unit.unit
+    if drawn.own.sensor == "gyroscope":
+        for method, row in drawn.gyroscope():
+            yield LOST, method, row
+        return
+    yield LOST, "printed", drawn.staged_accelerometer(as_printed=True)
+    yield LOST, "staged", _error_alone(drawn.staged_accelerometer(as_printed=False))
+    if drawn.own.unit.table == "acutronic":
+        for cause in (c for c in CAUSES if c != LOST):
+            yield cause, "printed", replace(drawn, cause=cause).staged_accelerometer(as_printed=True, judge=False)
+    if "-continuous-" in name:
+        for method in ("zero-phase", "same-gain", "unfiltered"):
+            yield LOST, method, _error_alone(replace(drawn, filter=method).staged_accelerometer(as_printed=False))
+    if name.endswith("-stop-1s") or name == "stim300-continuous-0.5dps":
+        yield LOST, "least-squares", drawn.least_squares_accelerometer()
+
+
+def _error_alone(row: Row) -> Row:
+    return {"error": row["error"]}
+
+
+def device_of(name: str) -> str:
+    """Return the device of a set of recordings."""
+    return next(d for d in DEVICES if name.startswith(d))
+
+
+def sets_of(campaign: Path) -> list[str]:
+    """Return the sets of recordings that calibrate a device of the thesis."""
+    names = [u.unit for u in read_description(campaign / "simulation.yaml").units]
+    return [n for n in names if "-held-out-" not in n and not n.startswith("gy-521")]
+
+
+def write_rows(path: Path, rows: Sequence[Row]) -> None:
+    """Write rows as CSV, with five digits."""
+    pd.DataFrame(rows, columns=COLUMNS).to_csv(path, index=False, float_format="%.5g", lineterminator="\n")

@@ -1,23 +1,34 @@
-"""The printed tables of the thesis, each cell beside what the campaign found."""
+"""The tables of the thesis and of the conference paper: each printed value with the campaign's.
+
+All tables are one DataFrame with a row a cell: ``table`` (as printed; of the paper ``paper 1`` and so on), ``title``,
+``block`` (how ours was found), ``row``, ``column``, ``printed``, ``ours`` (NaN where a unit failed), ``digits``
+(decimals that were printed), ``difference``, and whether it is ``large``: beyond ``LARGE`` of the printed value, and
+beyond its rounding.
+"""
 
 from __future__ import annotations
 
-import csv
-from dataclasses import dataclass, field
-from functools import partial
 from typing import TYPE_CHECKING
 
-from pipeline.thesis.results import DEVICES, TABLES, in_words, procedure_of, set_of
+import numpy as np
+import pandas as pd
+from scipy.integrate import cumulative_trapezoid
+
+from pipeline.signal.rests import find_rests
+from pipeline.thesis.results import AXES, DEVICES, TABLES, in_words, read_printed, values
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
 
-    from pipeline.thesis.results import Results
+    from numpy.typing import NDArray
 
-Printed = list[dict[str, str]]
-AXES = "xyz"
-LARGE = 0.25  # of the printed value, from which a difference is explained
+    from pipeline.records import Recording
+    from pipeline.thesis.results import JSON, Results
+
+    Cells = Iterator[JSON]
+
+LARGE = 0.25  # of the printed value, from which the page explains a difference
 ACCELEROMETER = {
     "as printed: the largest and smallest samples": "printed",
     "errata corrected: fitted sinusoids": "staged",
@@ -30,135 +41,67 @@ METRICS = {
     "min_error": "smallest e",
 }
 APPLIED = "by the printed parameters, applied to our held-out motion"
-STEPS = {"before": "raw", "after": "last"}
 STAGES = {"O": "orthogonality", "M": "misalignment", "b": "bias", "S": "scale_factor"}
+# Of the comparison of methods: what its two methods are, by reading of the thesis.
+READINGS = {
+    "accelerometer": {
+        "by the staged method as printed": {"staged": "printed", "nonlinear_least_squares": "least-squares"},
+        "by the staged method with its errata corrected": {
+            "staged": "staged",
+            "nonlinear_least_squares": "least-squares",
+        },
+    },
+    "gyroscope": {
+        "as printed: Cholesky and LU's forward matrix applied as if it were the correction": {
+            "staged": "staged",
+            "cholesky_lu": "cholesky-printed",
+        },
+        "inverted: Cholesky and LU's matrix as it is meant": {"staged": "staged", "cholesky_lu": "cholesky"},
+    },
+}
+SHORT = {"staged": "staged", "nonlinear_least_squares": "least squares", "cholesky_lu": "Cholesky and LU"}
+PAPER = "gy-521"
+SEGMENT_DEG = 45.0  # the paper turns in steps of 45 deg
 
 
-@dataclass(frozen=True)
-class Cell:
-    """A printed value and ours; ``digits`` are the decimals that were printed."""
-
-    printed: float | None
-    ours: float | None
-    digits: int = 3
-
-    @property
-    def difference(self) -> float | None:
-        """Ours less the printed value."""
-        return None if self.printed is None or self.ours is None else self.ours - self.printed
-
-    @property
-    def large(self) -> bool:
-        """Whether the difference is beyond ``LARGE`` of the printed value, and beyond its rounding."""
-        if self.difference is None or self.printed is None:
-            return False
-        return abs(self.difference) > max(LARGE * abs(self.printed), 1.0001 * 10.0**-self.digits)
+def all_tables(printed: Path, results: Results) -> pd.DataFrame:
+    """Return the cells of tables 5.1 to 5.26, then of those of the paper."""
+    cells = [
+        *_parameter_tables(printed, results),
+        *_error_tables(printed, results),
+        *_method_tables(printed, results),
+    ]
+    cells.sort(key=lambda cell: int(cell["table"].partition(".")[2]))
+    return with_differences(pd.DataFrame([*cells, *_paper_tables(printed, results)]).astype({"ours": float}))
 
 
-@dataclass(frozen=True)
-class Row:
-    """One quantity in every column of a table."""
-
-    label: str
-    cells: list[Cell]
-
-
-@dataclass(frozen=True)
-class Block:
-    """The rows of one method."""
-
-    title: str
-    rows: list[Row]
+def with_differences(cells: pd.DataFrame) -> pd.DataFrame:
+    """Return cells with ``difference`` and ``large``."""
+    difference = cells["ours"] - cells["printed"]
+    least = np.maximum(LARGE * cells["printed"].abs(), 1.0001 * 10.0 ** -cells["digits"])
+    return cells.assign(difference=difference, large=difference.abs() > least)
 
 
-@dataclass(frozen=True)
-class Table:
-    """A printed table.
-
-    Attributes
-    ----------
-    number : str
-        As printed; those of the paper ``paper 1`` and so on.
-    title : str
-    columns : list of str
-    blocks : list of Block
-    notes : list of str
-        Keys of the explanations that its large differences have.
-    """
-
-    number: str
-    title: str
-    columns: list[str]
-    blocks: list[Block]
-    notes: list[str] = field(default_factory=list)
-
-    @property
-    def large(self) -> int:
-        """Number of cells with a large difference."""
-        return sum(cell.large for block in self.blocks for row in block.rows for cell in row.cells)
-
-
-def read_printed(path: Path) -> dict[str, Printed]:
-    """Return the rows of a file of printed figures by the table that they stand in."""
-    tables: dict[str, Printed] = {}
-    with path.open(encoding="utf-8", newline="") as stream:
-        for row in csv.DictReader(stream):
-            tables.setdefault(row["table"], []).append(row)
-    return tables
-
-
-def parameter_tables(printed: Path, results: Results) -> list[Table]:
-    """Return tables 5.1 to 5.7 and 5.15 to 5.18."""
-    tables = []
-    for number, rows in read_printed(printed / "accel_parameters.csv").items():
-        blocks = [
-            Block(title, _accelerometer_rows(rows, partial(_accelerometer_value, results, method)))
-            for title, method in ACCELEROMETER.items()
-        ]
-        tables.append(Table(number, _title("Accelerometer: parameters", rows), _columns(rows), blocks))
-    for number, rows in read_printed(printed / "gyro_parameters.csv").items():
-        blocks = [
-            Block(title, _gyroscope_rows(rows, partial(_gyroscope_value, results, method)))
-            for title, method in GYROSCOPE.items()
-        ]
-        tables.append(Table(number, _title("Gyroscope: parameters", rows), _columns(rows), blocks))
-    return tables
-
-
-def error_tables(printed: Path, results: Results) -> list[Table]:
-    """Return tables 5.8 to 5.14 and 5.19 to 5.22."""
-    tables = []
-    parameters = {
-        key_of_row(row): row
-        for name in ("accel_parameters.csv", "gyro_parameters.csv")
-        for rows in read_printed(printed / name).values()
-        for row in rows
-    }
-    for number, rows in read_printed(printed / "errors.csv").items():
-        sensor, unit = rows[0]["sensor"], rows[0]["unit"]
-        by_procedure: dict[str, dict[str, dict[str, str]]] = {}
-        for row in rows:
-            by_procedure.setdefault(procedure_of(row), {})[row["metric"]] = row
-        blocks = []
-        for title, method in (ACCELEROMETER if sensor == "accelerometer" else GYROSCOPE).items():
-            units = [f"{_set(rows[0], procedure)}-{method}" for procedure in by_procedure]
-            blocks.append(Block(title, _error_rows(list(by_procedure.values()), units, sensor, unit, results)))
-        by_metric = [row["mean_abs_error"] for row in by_procedure.values()]
-        applied = [results.with_printed(_set(r, procedure_of(r)), sensor, parameters[key_of_row(r)]) for r in by_metric]
-        blocks.append(Block(APPLIED, [_applied_row(by_metric, applied, unit)]))
-        columns = [in_words(p) for p in by_procedure]
-        tables.append(Table(number, _title(f"{sensor.capitalize()}: held-out error", rows), columns, blocks))
-    return tables
-
-
-def key_of_row(row: Mapping[str, str]) -> tuple[str, str, str]:
-    """Return device, table and procedure of a printed row."""
-    return row["device"], row["rate_table"], procedure_of(row)
-
-
-def _applied_row(rows: Sequence[dict[str, str]], ours: Sequence[float | None], unit: str) -> Row:
-    cells = [Cell(float(row["after"]), value) for row, value in zip(rows, ours, strict=True)]
-    return Row(f"mean |e|, {unit}: after", cells)
+def _cells(
+    place: tuple[str, str, str, str],
+    columns: Iterable[str],
+    printed: Iterable[float],
+    ours: Iterable[float | None],
+    digits: int = 3,
+) -> Cells:
+    """Yield the cells of one row; ``place``: table, title, block and row."""
+    table, title, block, row = place
+    for column, told, own in zip(columns, printed, ours, strict=True):
+        yield {
+            "table": table,
+            "title": title,
+            "block": block,
+            "row": row,
+            "column": column,
+            "printed": float(told),
+            "ours": own,
+            "digits": digits,
+        }
 
 
 def change(before: float | None, after: float | None) -> float | None:
@@ -166,64 +109,193 @@ def change(before: float | None, after: float | None) -> float | None:
     return None if not before or after is None else 100.0 * (before - after) / before
 
 
-def _title(what: str, rows: Printed) -> str:
-    return f"{what} of {DEVICES[rows[0]['device'].lower()]}, {TABLES[rows[0]['rate_table']]}"
+def _title(what: str, rows: pd.DataFrame) -> str:
+    return f"{what} of {DEVICES[rows['device'].iloc[0]]}, {TABLES[rows['rate_table'].iloc[0]]}"
 
 
-def _columns(rows: Printed) -> list[str]:
-    return [in_words(procedure_of(row)) for row in rows]
+def _parameter_tables(printed: Path, results: Results) -> Cells:
+    """Yield the cells of tables 5.1 to 5.7 and 5.15 to 5.18."""
+    for sensor, name, methods, quantities in (
+        ("accelerometer", "accel_parameters", ACCELEROMETER, _ACCELEROMETER_ROWS),
+        ("gyroscope", "gyro_parameters", GYROSCOPE, _GYROSCOPE_ROWS),
+    ):
+        for table, rows in read_printed(printed, name).groupby("table", sort=False):
+            title = _title(f"{sensor.capitalize()}: parameters", rows)
+            columns = [in_words(p) for p in rows["procedure"]]
+            for block, method in methods.items():
+                for label, column, stage, names in quantities:
+                    ours = [_mean_parameter(results, f"{s}-{method}", sensor, stage, names) for s in rows["set"]]
+                    yield from _cells((table, title, block, label), columns, rows[column], ours)
 
 
-def _set(row: Mapping[str, str], procedure: str) -> str:
-    return set_of(row["device"], row["rate_table"], procedure)
+# Label, column of the file, stage and names of the parameters whose mean is meant: of a factor, both sides.
+_ACCELEROMETER_ROWS = [
+    (f"{q}{a}{', g' if q == 'b' else ''}", f"{q}_{a}{'_g' if q == 'b' else ''}", stage,
+     [f"b_{a}"] if q == "b" else [f"{q}_P_{a}", f"{q}_N_{a}"])
+    for q, stage in STAGES.items()
+    for a in AXES
+]  # fmt: skip
+_GYROSCOPE_ROWS = [
+    *((f"b{a}, deg/s", f"b_{a}_dps", "bias", [f"b_{a}"]) for a in AXES),
+    *((f"M{i}{j}", f"M{i}{j}", "orthogonality_and_misalignment", [f"M_{i}{j}"]) for i in (1, 2, 3) for j in (1, 2, 3)),
+    *((f"S{a}", f"S_{a}", "scale_factor", [f"S_{a}"]) for a in AXES),
+]
 
 
-def _accelerometer_rows(rows: Printed, ours: Callable[[dict[str, str], str, str], float | None]) -> list[Row]:
-    out = []
-    for quantity in STAGES:
-        unit = "_g" if quantity == "b" else ""
-        for axis in AXES:
-            cells = [Cell(float(r[f"{quantity}_{axis}{unit}"]), ours(r, quantity, axis)) for r in rows]
-            out.append(Row(f"{quantity}{axis}{', g' if unit else ''}", cells))
-    return out
+def _mean_parameter(results: Results, unit: str, sensor: str, stage: str, names: Sequence[str]) -> float | None:
+    found = [results.parameter(unit, sensor, stage, name) for name in names]
+    return None if None in found else sum(v for v in found if v is not None) / len(found)
 
 
-def _accelerometer_value(results: Results, method: str, row: dict[str, str], quantity: str, axis: str) -> float | None:
-    """Return what a stage found; of a factor that differs between the sides, the mean of both."""
-    unit = f"{_set(row, procedure_of(row))}-{method}"
-    names = [f"b_{axis}"] if quantity == "b" else [f"{quantity}_{side}_{axis}" for side in "PN"]
-    values = [results.parameter(unit, "accelerometer", STAGES[quantity], name) for name in names]
-    return sum(v for v in values if v is not None) / len(values) if None not in values else None
+def _error_tables(printed: Path, results: Results) -> Cells:
+    """Yield the cells of tables 5.8 to 5.14 and 5.19 to 5.22."""
+    parameters = {
+        row["set"]: row
+        for name in ("accel_parameters", "gyro_parameters")
+        for row in read_printed(printed, name).to_dict("records")
+    }
+    for table, rows in read_printed(printed, "errors").groupby("table", sort=False):
+        sensor, unit = rows["sensor"].iloc[0], rows["unit"].iloc[0]
+        title = _title(f"{sensor.capitalize()}: held-out error", rows)
+        by_metric = {metric: rows[rows["metric"] == metric] for metric in METRICS}
+        sets = by_metric["mean_abs_error"]["set"]
+        columns = [in_words(p) for p in by_metric["mean_abs_error"]["procedure"]]
+        for block, method in (ACCELEROMETER if sensor == "accelerometer" else GYROSCOPE).items():
+            for metric, label in METRICS.items():
+                ours: dict[str, list[float | None]] = {
+                    when: [results.step(f"{s}-{method}", sensor, step).get(metric) for s in sets]
+                    for when, step in (("before", "raw"), ("after", "last"))
+                }
+                ours["change_percent"] = [change(*pair) for pair in zip(ours["before"], ours["after"], strict=True)]
+                for column, found in ours.items():
+                    row = f"{label}: change, %" if column == "change_percent" else f"{label}, {unit}: {column}"
+                    yield from _cells((table, title, block, row), columns, by_metric[metric][column], found)
+        applied = [results.with_printed(s, sensor, parameters[s]) for s in sets]
+        place = (table, title, APPLIED, f"mean |e|, {unit}: after")
+        yield from _cells(place, columns, by_metric["mean_abs_error"]["after"], applied)
 
 
-def _gyroscope_rows(rows: Printed, ours: Callable[[dict[str, str], str, str], float | None]) -> list[Row]:
-    names = [("bias", f"b_{a}", f"b_{a}_dps", f"b{a}, deg/s") for a in AXES]
-    names += [
-        ("orthogonality_and_misalignment", f"M_{i}{j}", f"M{i}{j}", f"M{i}{j}")
-        for i in range(1, 4)
-        for j in range(1, 4)
-    ]
-    names += [("scale_factor", f"S_{a}", f"S_{a}", f"S{a}") for a in AXES]
-    return [
-        Row(label, [Cell(float(r[column]), ours(r, stage, name)) for r in rows]) for stage, name, column, label in names
-    ]
+def _method_tables(printed: Path, results: Results) -> Cells:
+    """Yield the cells of tables 5.23 to 5.26."""
+    for table, rows in read_printed(printed, "method_comparison").groupby("table", sort=False):
+        sensor, unit = rows["sensor"].iloc[0], rows["bias_unit"].iloc[0]
+        columns = [f"{DEVICES[d]}, {SHORT[m]}" for d, m in zip(rows["device"], rows["method"], strict=True)]
+        by_parameters, by_errors = (
+            f"{sensor.capitalize()}: {what} by two methods" for what in ("parameters", "held-out error")
+        )
+        for block, methods in READINGS[sensor].items():
+            pairs = [(device, methods[m]) for device, m in zip(rows["device"], rows["method"], strict=True)]
+            own = "stop-1s" if sensor == "accelerometer" else "gyro-20dps"
+            fits = [results.fit(f"{device}-{own}-{method}", sensor) for device, method in pairs]
+            for i, j in ((i, j) for i in range(3) for j in range(3) if i == j or sensor == "gyroscope"):
+                # readings are row vectors in the thesis: its matrix is the transpose of ours
+                ours = [None if fit is None else fit["matrix"][j][i] for fit in fits]
+                row = f"R{i + 1}{j + 1}"
+                yield from _cells((table, by_parameters, block, row), columns, rows[row], ours)
+            for k, axis in enumerate(AXES):
+                ours = [None if fit is None else fit["bias"][k] for fit in fits]
+                yield from _cells((table, by_parameters, block, f"b{axis}, {unit}"), columns, rows[f"b_{axis}"], ours)
+            # the STIM300's errors are those of continuous 0.5 deg/s (erratum 5)
+            stim = "continuous-0.5dps" if sensor == "accelerometer" else own
+            units = [f"{device}-{stim if device == 'stim300' else own}-{method}" for device, method in pairs]
+            before = [results.error(u, sensor, "raw") for u in units]
+            after = [results.error(u, sensor) for u in units]
+            for row, column, ours in (
+                (f"mean |e|, {unit}: before", "mean_error_before", before),
+                (f"mean |e|, {unit}: after", "mean_error_after", after),
+                ("mean |e|: change, %", "change_percent", [change(*p) for p in zip(before, after, strict=True)]),
+            ):
+                place = (rows["error_table"].iloc[0], by_errors, block, row)
+                yield from _cells(place, columns, rows[column], ours)
 
 
-def _gyroscope_value(results: Results, method: str, row: dict[str, str], stage: str, name: str) -> float | None:
-    return results.parameter(f"{_set(row, procedure_of(row))}-{method}", "gyroscope", stage, name)
+def _paper_tables(printed: Path, results: Results) -> Cells:
+    """Yield the cells of tables 1 to 4 of the conference paper."""
+    made = "GY-521, 24 orientations"
+    by_table = dict(iter(read_printed(printed, "conference_paper").groupby("table")))
+    positions = read_printed(printed, "conference_paper_six_positions")
+    for table, title, found in (
+        ("paper 1", f"{made}: nonlinear least squares", _paper_1(by_table["1"], results)),
+        ("paper 2", f"{made}, judged in six positions", _paper_2(positions, results)),
+        ("paper 3", "GY-521, gyroscope: Cholesky and LU", _paper_3(by_table["3"], results)),
+    ):
+        for row, told, ours, digits in found:
+            yield from _cells((table, title, "", row), ["GY-521"], [told], [ours], digits)
+    title = "GY-521, gyroscope: error of the integrated angle, row i in the turn about axis i"
+    for row, errors, own in _paper_4(by_table["4"], results):
+        yield from _cells(("paper 4", title, "", row), AXES, errors, own, 4)
 
 
-def _error_rows(
-    columns: Sequence[dict[str, dict[str, str]]], units: Sequence[str], sensor: str, unit: str, results: Results
-) -> list[Row]:
-    out = []
-    for metric, label in METRICS.items():
-        found = [[results.step(u, sensor, step).get(metric) for step in STEPS.values()] for u in units]
-        for k, when in enumerate(STEPS):
-            cells = [Cell(float(c[metric][when]), ours[k]) for c, ours in zip(columns, found, strict=True)]
-            out.append(Row(f"{label}, {unit}: {when}", cells))
-        changes = [
-            Cell(float(c[metric]["change_percent"]), change(*ours)) for c, ours in zip(columns, found, strict=True)
-        ]
-        out.append(Row(f"{label}: change, %", changes))
-    return out
+def _paper_1(rows: pd.DataFrame, results: Results) -> Iterator[tuple[str, float, float | None, int]]:
+    unit, method = f"{PAPER}-orientations", "nonlinear_least_squares"
+    names = {
+        "scale_factor_diagonal_S_a": [(f"S{a}", f"scale_factor_{a}", 1.0) for a in AXES],
+        "non_orthogonality_alpha": [
+            (f"α{p}, deg", f"misalignment_{p}", float(np.degrees(1.0))) for p in ("yx", "zx", "zy")
+        ],
+        "bias": [(f"b{a}, g", f"bias_{a}", 1.0) for a in AXES],
+    }
+    for row in rows.to_dict("records"):
+        for axis, (label, name, factor) in zip(AXES, names.get(row["quantity"], ()), strict=False):
+            found = results.parameter(unit, "accelerometer", method, name)
+            yield label, row[axis], None if found is None else factor * found, 4
+        if row["quantity"].startswith("rmse"):
+            when = row["quantity"].removeprefix("rmse_")
+            step = results.step(unit, "accelerometer", "raw" if when == "before" else "last")
+            yield f"RMSE {when}, g", row["x"], step.get("rms_error"), 6
+
+
+def _paper_2(positions: pd.DataFrame, results: Results) -> Iterator[tuple[str, float, float | None, int]]:
+    """Yield the mean reading of the axis that points up or down, before and after the 24 orientations' calibration."""
+    means = _rest_means(results.recordings(f"{PAPER}-six-positions", "rests"))
+    fit = results.fit(f"{PAPER}-orientations", "accelerometer")
+    for row in positions.to_dict("records"):
+        ideal = values(row, "{}_ideal_g")
+        before = after = None
+        if fit is not None and len(means):
+            reading = means[np.argmax(means @ ideal)]
+            before = float(reading @ np.abs(ideal))
+            after = float((np.array(fit["matrix"]) @ (reading - fit["bias"])) @ np.abs(ideal))
+        yield f"{row['axis']} up: before, g", row["mean_before_g"], before, 3
+        yield f"{row['axis']} up: after, g", row["mean_after_g"], after, 3
+
+
+def _rest_means(recordings: list[Recording]) -> NDArray[np.float64]:
+    rests = [(r, rest) for r in recordings for rest in find_rests(r)]
+    return np.array([np.asarray(r.accelerometer)[rest.start : rest.stop].mean(axis=0) for r, rest in rests])
+
+
+def _paper_3(rows: pd.DataFrame, results: Results) -> Iterator[tuple[str, float, float | None, int]]:
+    for row in rows.to_dict("records"):
+        names = {
+            "scale_factor_diagonal_S_g": [f"S_{a}" for a in AXES],
+            "non_orthogonality_alpha_xy_xz_yz": ["T_yx", "T_zx", "T_zy"],
+            "alignment_M_g": [f"M_{AXES[int(np.nan_to_num(row['row'], nan=1.0)) - 1]}{a}" for a in AXES],
+        }[row["quantity"]]
+        for axis, name in zip(AXES, names, strict=True):
+            ours = results.parameter(f"{PAPER}-gyro-20dps", "gyroscope", "cholesky_lu", name)
+            yield name.replace("_", ""), row[axis], ours, 4
+
+
+def _paper_4(rows: pd.DataFrame, results: Results) -> Iterator[tuple[str, NDArray[np.float64], Sequence[float | None]]]:
+    fit = results.fit(f"{PAPER}-gyro-20dps", "gyroscope")
+    turns = {r.axis: r for r in results.recordings(f"{PAPER}-gyro-20dps", "gyroscope")}
+    for row in rows.to_dict("records"):
+        about, when = AXES[int(row["row"]) - 1], row["quantity"].rpartition("_")[2]
+        ours: list[float | None] = [None] * 3
+        if fit is not None and about in turns:
+            matrix = np.array(fit["matrix"]) if when == "after" else np.eye(3)
+            ours = _angle_errors(turns[about], np.array(fit["bias"]), matrix).tolist()
+        yield f"about {about}: {when}, deg", values(row, "{}"), ours
+
+
+def _angle_errors(recording: Recording, bias: NDArray[np.float64], matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the rms error of the angle integrated over each 45 deg of a turn: (3,) array, deg."""
+    error = (np.asarray(recording.gyroscope) - bias) @ matrix.T
+    error[:, AXES.index(str(recording.axis))] -= np.asarray(recording.table_rate)
+    angle = cumulative_trapezoid(error, recording.time, axis=0, initial=0)
+    turned = np.asarray(recording.table_angle)
+    edges = np.arange(turned[0], turned[-1] + 1e-6, SEGMENT_DEG)
+    at = np.searchsorted(turned, np.maximum(edges, turned[0] + 1e-9))
+    at[0] = np.flatnonzero(turned > turned[0] + 1e-9)[0] - 1
+    return np.asarray(np.sqrt(np.mean(np.diff(angle[np.minimum(at, len(turned) - 1)], axis=0) ** 2, axis=0)))

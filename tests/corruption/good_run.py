@@ -27,8 +27,8 @@ from pipeline.preprocessing.checks import check_recordings
 from pipeline.records import SENSORS
 from pipeline.study.bench import recordings_of
 from pipeline.study.cases import FAMILIES, Case, draw
-from pipeline.study.figures import wilson
 from pipeline.study.run import settings_of
+from pipeline.study.scores import wilson
 from pipeline.validation.heldout import validate
 
 DOUBTS = ("reference_in_doubt", "floor_in_doubt")

@@ -15,8 +15,8 @@ from pipeline.model.effects import catalogue
 from pipeline.records import SENSORS
 from pipeline.study.bench import recordings_of
 from pipeline.study.cases import FAMILIES, SIZES, Case, draw
-from pipeline.study.figures import exact, first_is_right, not_seen
 from pipeline.study.run import judge, read_lines, say
+from pipeline.study.scores import exact, first_is_right, not_seen
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -88,13 +88,13 @@ def test_correlated_noise_has_its_correlation(noise: str, slope: float) -> None:
 @pytest.mark.parametrize("number", range(6))
 def test_what_is_hidden_alone_is_named_first(number: int) -> None:
     case = draw("single", number, SEED)
-    assert first_is_right(case.to_json(), say(recordings_of(case), case.model, case.sensor))
+    assert first_is_right(case.to_json() | say(recordings_of(case), case.model, case.sensor))
 
 
 @pytest.mark.parametrize("number", range(2))
 def test_two_hidden_effects_are_found_and_no_third(number: int) -> None:
     case = draw("pairs", number, SEED)
-    assert exact(case.to_json(), say(recordings_of(case), case.model, case.sensor))
+    assert exact(case.to_json() | say(recordings_of(case), case.model, case.sensor))
 
 
 @pytest.mark.parametrize("family", ["null_normal", "null_wander", "null_random_walk"])
@@ -105,7 +105,7 @@ def test_nothing_is_found_where_nothing_is_hidden(family: str) -> None:
 @pytest.mark.parametrize("number", range(2))
 def test_what_cannot_be_seen_is_said_to_be_so(number: int) -> None:
     case = draw("unseen", number, SEED)
-    assert not_seen(case.to_json(), judge(case)[0])
+    assert not_seen(case.to_json() | judge(case)[0])
 
 
 def test_an_effect_that_nobody_knows_of_is_not_named() -> None:
@@ -142,7 +142,7 @@ def test_a_larger_study_reaches_its_goals(family: str, least: float, tmp_path: P
     truths = {line["key"]: line for line in read_lines(tmp_path / "truth.jsonl")}
     judges = {"single": first_is_right, "pairs": exact}
     found = [
-        judges.get(family, lambda _, said: not said["selected"])(truths[said["key"]], said)
+        judges.get(family, lambda case: not case["selected"])(truths[said["key"]] | said)
         for said in read_lines(tmp_path / "results.jsonl")
     ]
     assert len(found) >= 60

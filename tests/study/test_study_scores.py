@@ -5,21 +5,19 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from scipy.stats import binomtest
 
-from pipeline.study.figures import (
+from pipeline.study.page import by_signal, confusions, found_at, instead, of_shapes, page, table_of
+from pipeline.study.scores import (
     all_figures,
+    cases_of,
     exact,
     excess_gone,
     first_is_right,
     hard_to_replace,
     in_the_catalogue,
-    joined,
     mean_excess_gone,
     not_silent,
-    wilson,
 )
-from pipeline.study.page import by_signal, confusions, found_at, instead, of_shapes, page
 
 
 def said(*selected: str, key: str = "single-00000", **more: Any) -> dict[str, Any]:
@@ -32,41 +30,35 @@ def truth(*hidden: str, key: str = "single-00000", **more: Any) -> dict[str, Any
     return {"key": key, "family": key.partition("-")[0], "hidden": {name: [1.0] for name in hidden}, **case, **more}
 
 
-@pytest.mark.parametrize(("hits", "total"), [(0, 300), (3, 300), (294, 300), (300, 300), (7, 9)])
-def test_intervals_are_those_of_another_implementation(hits: int, total: int) -> None:
-    other = binomtest(hits, total).proportion_ci(0.95, method="wilson")
-    assert wilson(hits, total) == pytest.approx((other.low, other.high), abs=2e-5)
-
-
 def test_a_look_alike_counts_only_where_its_share_is_declared_over_95_percent() -> None:
     for share, right in ((0.96, True), (0.94, False)):
         alike = {"time_offset": {"low_pass_lag": share}}
-        assert first_is_right(truth("low_pass_lag"), said("time_offset", look_alikes=alike)) is right
+        assert first_is_right(truth("low_pass_lag") | said("time_offset", look_alikes=alike)) is right
 
 
 def test_an_exact_set_has_nothing_more_and_nothing_less() -> None:
-    assert exact(truth("a", "b"), said("b", "a"))
-    assert not exact(truth("a", "b"), said("a"))
-    assert not exact(truth("a"), said("a", "b"))
-    assert exact(truth("a", "b"), said("c", "b", look_alikes={"c": {"a": 0.99}}))
-    assert not exact(truth("a", "b"), said("b", look_alikes={"b": {"a": 0.99}}))
+    assert exact(truth("a", "b") | said("b", "a"))
+    assert not exact(truth("a", "b") | said("a"))
+    assert not exact(truth("a") | said("a", "b"))
+    assert exact(truth("a", "b") | said("c", "b", look_alikes={"c": {"a": 0.99}}))
+    assert not exact(truth("a", "b") | said("b", look_alikes={"b": {"a": 0.99}}))
 
 
 def test_another_effect_is_silent_unless_a_warning_is_said() -> None:
-    assert not not_silent(truth(), said("b"))
+    assert not not_silent(truth() | said("b"))
     for warning in ({"verdict": "unexplained"}, {"plausible": False}, {"inflated": True}):
-        assert not_silent(truth(), said("b", **warning))
-    assert not_silent(truth(), said())
+        assert not_silent(truth() | said("b", **warning))
+    assert not_silent(truth() | said())
 
 
 def test_what_another_effect_replaces_is_no_test_of_a_warning() -> None:
     case = truth("a", key="removed-00000", left_out=["a"])
     for share, counts in ((0.96, False), (0.94, True)):
         whole = said("a", look_alikes={"a": {"b": share}})
-        assert hard_to_replace(case, said("b", whole=whole)) is counts
-        figures = all_figures([(case, said("b", key=case["key"], whole=whole))])
+        assert hard_to_replace(case | said("b", whole=whole)) is counts
+        figures = all_figures([case | said("b", key=case["key"], whole=whole)])
         assert [(f.hits, f.total) for f in figures] == ([(0, 1)] if counts else [])
-    assert not hard_to_replace(case, said("b", whole=said("b")))
+    assert not hard_to_replace(case | said("b", whole=said("b")))
 
 
 def test_excess_is_counted_above_five_percent_of_the_floor() -> None:
@@ -76,50 +68,52 @@ def test_excess_is_counted_above_five_percent_of_the_floor() -> None:
 
 def test_a_unit_in_which_nothing_is_selected_counts_with_all_of_its_excess() -> None:
     held = [{"before": 2.0, "after": after, "floor": 1.0} for after in (1.0, 2.0)]
-    pairs = [(truth("a"), said(held_out=entry)) for entry in held]
-    pairs.append((truth(key="shape_band-00000", shape="band"), said(held_out=held[1])))
-    mean = mean_excess_gone(in_the_catalogue(pairs))
+    cases = [truth("a") | said(held_out=entry) for entry in held]
+    cases.append(truth(key="shape_band-00000", shape="band") | said(held_out=held[1]))
+    mean = mean_excess_gone(in_the_catalogue(cases))
     assert (mean.value, mean.least, mean.total) == (0.5, 0.0, 2)
     assert mean.error == pytest.approx(0.5)
 
 
 def test_a_fault_is_a_miss() -> None:
     lines = [{"key": "single-00000", "error": "ValueError: x"}]
-    figure = all_figures(joined([truth("a")], lines))[0]
+    figure = all_figures(cases_of([truth("a")], lines))[0]
     assert (figure.hits, figure.total, figure.misses) == (0, 1, ("single-00000",))
 
 
 def test_both_sensors_of_a_unit_count_where_nothing_is_hidden() -> None:
     case = truth(key="null_white-00003")
     lines = [said(key=case["key"]), said("a", key=case["key"], sensor="accelerometer")]
-    (figure,) = all_figures(joined([case], lines))
+    (figure,) = all_figures(cases_of([case], lines))
     assert (figure.hits, figure.total, figure.misses) == (1, 2, ("null_white-00003 accelerometer",))
 
 
 def test_tables_count_what_was_said() -> None:
-    pairs = [
-        (truth("a"), said("b")),
-        (truth("a"), said("a")),
-        (truth("a", key="tiny-00000"), said()),
-        (truth("a", key="removed-00000", left_out=["a"]), said("c", plausible=False)),
-    ]
-    assert confusions(pairs) == {("gyroscope", "a", "b"): 1, ("gyroscope", "a", "nothing"): 1}
-    assert instead(pairs) == {("gyroscope", "a", "c", True): 1}
-    assert found_at(pairs) == {("gyroscope", "a"): {"single": (1, 2), "tiny": (0, 1)}}
+    table = table_of(
+        [
+            truth("a") | said("b"),
+            truth("a") | said("a"),
+            truth("a", key="tiny-00000") | said(),
+            truth("a", key="removed-00000", left_out=["a"]) | said("c", plausible=False),
+        ]
+    )
+    assert confusions(table) == [["gyroscope", "`a`", "b", 1], ["gyroscope", "`a`", "nothing", 1]]
+    assert instead(table) == [["gyroscope", "`a`", "c", "yes", 1]]
+    assert found_at(table) == [["gyroscope", "`a`", "1 of 2", "", "0 of 1"]]
 
 
 def test_units_in_which_every_effect_stands_out_are_counted_by_themselves() -> None:
     lefts = [({"a": 500.0, "b": 99.0}, ["a"]), ({"a": 500.0, "b": 100.0}, ["b", "a"])]
     keys = ["pairs-00000", "pairs-00001"]
-    pairs = [
-        (truth("a", "b", key=key, signal_left=left), said(*selected, key=key))
+    cases = [
+        truth("a", "b", key=key, signal_left=left) | said(*selected, key=key)
         for key, (left, selected) in zip(keys, lefts, strict=True)
     ]
-    assert [(f.hits, f.total) for f in all_figures(pairs)] == [(1, 2), (1, 1)]
-    assert by_signal(pairs) == [
-        ["60 to 100", "1", "0 %", "0 to 79 %"],
-        ["100 to 200", "1", "100 %", "21 to 100 %"],
-        ["500 and more", "2", "100 %", "34 to 100 %"],
+    assert [(f.hits, f.total) for f in all_figures(cases)] == [(1, 2), (1, 1)]
+    assert by_signal(cases) == [
+        ["60 to 100", 1, "0 %", "0 to 79 %"],
+        ["100 to 200", 1, "100 %", "21 to 100 %"],
+        ["500 and more", 2, "100 %", "34 to 100 %"],
     ]
 
 
@@ -127,13 +121,13 @@ def test_a_form_of_unknown_physics_is_unexplained_warned_of_silently_replaced_or
     held = {"before": 2.0, "after": 1.2, "floor": 1.0}
     ways = [said(verdict="unexplained"), said("a", inflated=True), said("a"), said("a"), said()]
     case = truth(key="shape_band-00000", shape="band")
-    (row,) = of_shapes([(case, {**way, "held_out": held}) for way in ways])
-    assert row == ["shape band", "5", "1", "1", "2", "1", "a (3)", "80 % (n = 5)"]
+    (row,) = of_shapes([case | way | {"held_out": held} for way in ways])
+    assert row == ["shape band", 5, 1, 1, 2, 1, "a (3)", "80 % (n = 5)"]
 
 
 def test_the_page_has_the_figures_the_code_and_the_cases_that_miss() -> None:
-    pairs = [(truth("g_sensitivity"), said("b", code="0123"))]
-    text = page(pairs, "python -m pipeline study DIR")
+    cases = [truth("g_sensitivity") | said("b", code="0123")]
+    text = page(cases, "python -m pipeline study DIR")
     assert "| one effect at its data sheet's size: named first | 1 | 0.0 % | 0.0 to 79.3 % | >= 98 % |" in text
     assert "code being `0123`." in text
     assert "| single-00000 | mpu6050 gyroscope one_way | g_sensitivity | b |" in text
