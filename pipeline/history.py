@@ -47,9 +47,8 @@ class Change:
 
     def words(self, sensor: str | None = None) -> list[str]:
         """Return the change as a list of texts, of the effects of one sensor or of both."""
-        sensors = SENSORS if sensor is None else (sensor,)
         told = []
-        for s in sensors:
+        for s in SENSORS if sensor is None else (sensor,):
             name = f"{s}." if sensor is None else ""
             told += [f"+ {name}{effect}" for effect in self.added[s]]
             told += [f"\N{MINUS SIGN} {name}{effect}" for effect in self.removed[s]]
@@ -83,13 +82,7 @@ def unit_state(
 
 
 def read_history(results: Path) -> list[JSON]:
-    """Return the entries of a campaign's results, the oldest first.
-
-    Raises
-    ------
-    InputError
-        If a file of it is not what a run wrote.
-    """
+    """Return the entries of a campaign's results, the oldest first; ``InputError`` where a file is no such entry."""
     entries = []
     for file in sorted((results / FOLDER).glob("[0-9]*.json")):
         try:
@@ -106,18 +99,7 @@ def read_history(results: Path) -> list[JSON]:
 def record(results: Path, units: Mapping[str, JSON], settings: Mapping[str, Any]) -> list[JSON]:
     """Append the states of the units (name to state) that differ from the last ones; return all entries.
 
-    Parameters
-    ----------
-    results : Path
-        Of the campaign.
-    units : mapping of str to dict
-    settings : mapping
-        Of the run.
-
-    Raises
-    ------
-    InputError
-        If the history cannot be read.
+    ``results`` are those of the campaign, ``settings`` those of the run. Raises ``InputError`` as ``read_history``.
     """
     entries = read_history(results)
     before = {unit: states[-1][1] for unit, states in of_units(entries).items()}
@@ -147,8 +129,11 @@ def difference(before: JSON, after: JSON) -> Change:
     """Return what differs in the configuration and the recordings of a unit."""
     fitted = [{s: (state.get(s) or {}).get("effects") or [] for s in SENSORS} for state in (before, after)]
     calibrated = [state.get("status") == "ok" for state in (before, after)]
-    added = {s: [e for e in fitted[1][s] if e not in fitted[0][s]] for s in SENSORS}
-    removed = {s: [e for e in fitted[0][s] if e not in fitted[1][s]] if all(calibrated) else [] for s in SENSORS}
+    added, removed = (
+        {s: [e for e in one[s] if e not in other[s]] for s in SENSORS} for one, other in (fitted[::-1], fitted)
+    )
+    if not all(calibrated):
+        removed = {s: [] for s in SENSORS}
     old, new = (state.get("overrides") or {} for state in (before, after))
     keys = [k for k in dict.fromkeys([*old, *new]) if old.get(k) != new.get(k) and not k.startswith("effects")]
     settings = [f"{k}: {old.get(k, 'default')} \N{RIGHTWARDS ARROW} {new.get(k, 'default')}" for k in keys]
@@ -166,12 +151,13 @@ def difference(before: JSON, after: JSON) -> Change:
     return Change(added, removed, settings, other)
 
 
-def dropped(entries: Sequence[JSON]) -> list[tuple[str, str, str, int]]:
-    """Return which effects the last run no longer has: unit, sensor, effect, and the run before that had it."""
-    found, states = [], of_units(entries)
-    for unit in entries[-1]["units"] if entries else []:
+def dropped(entries: Sequence[JSON]) -> dict[tuple[str, int], list[str]]:
+    """Return the effects (``sensor.effect``) that the last run no longer has, by unit and the run that had them."""
+    found, states = {}, of_units(entries)
+    for unit in entries[-1]["units"]:
         if len(states[unit]) > 1:
             (run, before), (_, after) = states[unit][-2:]
             removed = difference(before, after).removed
-            found += [(unit, sensor, effect, run) for sensor in SENSORS for effect in removed[sensor]]
+            if effects := [f"{sensor}.{effect}" for sensor in SENSORS for effect in removed[sensor]]:
+                found[unit, run] = effects
     return found

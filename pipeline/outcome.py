@@ -21,10 +21,15 @@ if TYPE_CHECKING:
 
 JSON = dict[str, Any]
 UNITS = {"accelerometer": "g", "gyroscope": "deg/s"}
-ORDER = (
-    "missing_effect", "reference_in_doubt", "unexplained", "floor_in_doubt", "left_by_method", "not_enough_data",
-    "nothing_missing",
-)  # fmt: skip
+VERDICTS = {
+    "missing_effect": "warn",
+    "reference_in_doubt": "warn",
+    "unexplained": "warn",
+    "floor_in_doubt": "warn",
+    "left_by_method": "warn",
+    "not_enough_data": "",
+    "nothing_missing": "good",
+}  # what can be added first, then what is in doubt, in the order in which verdicts apply; with the pages' CSS class
 NAMED = 5  # units that a line names, and lines of one kind
 SMALLEST_CHANGE = 0.02  # relative change of an error that is reported
 PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_.=/+-]*")  # texts that YAML reads as they stand, within brackets too
@@ -51,15 +56,10 @@ def read_summary(results: Path) -> list[dict[str, str]]:
 def findings_of(rows: Sequence[Mapping[str, Any]]) -> list[Finding]:
     """Return the verdicts in rows as of ``summary.csv``."""
     return [
-        Finding(
-            row["unit"],
-            sensor,
-            row[f"{sensor}_verdict"],
-            [n for n in (row[f"{sensor}_selected"] or "").split(";") if n],
-        )
+        Finding(row["unit"], sensor, verdict, list(filter(None, (row[f"{sensor}_selected"] or "").split(";"))))
         for row in rows
         for sensor in SENSORS
-        if row.get(f"{sensor}_verdict")
+        if (verdict := row.get(f"{sensor}_verdict"))
     ]
 
 
@@ -67,22 +67,25 @@ def verdict_groups(findings: Sequence[Finding]) -> list[tuple[str, list[str]]]:
     """Return units by the effect that they miss, and by each other verdict but ``nothing_missing``."""
     groups: dict[tuple[int, str], list[str]] = {}
     for unit, sensor, verdict, selected in findings:
-        told = (
-            [f"{effect} missing" for effect in selected] if verdict == "missing_effect" else [verdict.replace("_", " ")]
-        )
+        missing = [f"{effect} missing" for effect in selected]
+        told = missing if verdict == "missing_effect" else [verdict.replace("_", " ")]
         for what in told if verdict != "nothing_missing" else []:
             groups.setdefault((place(verdict), f"{sensor}, {what}"), []).append(unit)
     return [(what, units) for (_, what), units in sorted(groups.items())]
 
 
 def place(verdict: str | None) -> int:
-    """Return the place of a verdict: what can be added, then what is in doubt, in the order in which verdicts apply."""
-    return ORDER.index(verdict) if verdict in ORDER else len(ORDER)
+    """Return the place of a verdict in ``VERDICTS``; one that is not there comes last."""
+    return [*VERDICTS, verdict].index(verdict)
 
 
 def verdict_lines(findings: Sequence[Finding]) -> list[str]:
     """Return ``verdict_groups`` as lines."""
-    return [f"{what}: {_named(units)}" for what, units in verdict_groups(findings)]
+    lines = []
+    for what, units in verdict_groups(findings):
+        more = f" and {len(units) - NAMED} more" if len(units) > NAMED else ""
+        lines.append(f"{what}: {', '.join(units[:NAMED])}{more}")
+    return lines
 
 
 def commands_of(
@@ -90,17 +93,8 @@ def commands_of(
 ) -> JSON:
     """Return the commands that add what a diagnosis selected: ``add`` for every run, ``once`` for one; else nothing.
 
-    ``verb`` is what they are for: to add what is missing, or to try what does not explain all.
-
-    Parameters
-    ----------
-    part : mapping
-        The sensor's part of ``diagnoses/<unit>.json``.
-    sensor, unit : str
-    settings : mapping
-        Of the run.
-    results : str
-        Folder of the results of all campaigns.
+    ``verb`` is what they are for: to add what is missing, or to try what does not explain all. ``part`` is the sensor's
+    part of ``diagnoses/<unit>.json``, ``settings`` are those of the run, ``results`` holds those of all campaigns.
     """
     if not part.get("override"):
         return {}
@@ -116,16 +110,7 @@ def commands_of(
 def next_commands(
     findings: Sequence[Finding], settings: Mapping[str, Any], results: str = RESULTS
 ) -> list[tuple[str, str]]:
-    """Return the commands to continue with, each behind what it is for.
-
-    Parameters
-    ----------
-    findings : sequence of Finding
-    settings : mapping
-        Of the run.
-    results : str
-        Folder of the results of all campaigns.
-    """
+    """Return the commands to continue with, each behind what it is for."""
     missing: dict[str, list[str]] = {}
     for unit, sensor, verdict, selected in findings:
         if verdict == "missing_effect":
@@ -135,9 +120,11 @@ def next_commands(
         ((unit, effects),) = missing.items()
         lines.append(("to add what is missing", add_command(settings, unit, effects, results)))
     elif missing:
-        lines.append(("to add to each unit its missing effects", add_missing_command(settings, results)))
+        command = _command("add", settings, ["--missing"], results)
+        lines.append(("to add to each unit its missing effects", command))
     if any(f.verdict != "nothing_missing" for f in findings):
-        lines.append(("for the evidence", explain_command(settings, results)))
+        campaign = str(settings.get("campaign", "demo")).rstrip("/")
+        lines.append(("for the evidence", _command("explain", {"campaign": campaign}, [], results)))
     return lines
 
 
@@ -153,16 +140,27 @@ def outcome(results: Path, settings: Mapping[str, Any], *, of_this_run: bool) ->
     of_this_run : bool
         Whether the last entry of the history is of this run.
     """
-    rows = read_summary(results)
+    rows, folder = read_summary(results), str(results.parent)
     calibrated = sum(row["status"] == "ok" for row in rows)
     failed = f", failed: {len(rows) - calibrated}" if calibrated < len(rows) else ""
     findings = findings_of(rows)
     lines = [f"units calibrated: {calibrated}{failed}; look at {results}/index.html", *verdict_lines(findings)]
     entries = read_history(results) if of_this_run else []
     if entries:
-        lines += [*_changes(entries), *_dropped(entries, settings, str(results.parent))]
-    lines += [f"{what}: {command}" for what, command in next_commands(findings, settings, str(results.parent))]
+        lines += _first(_changes(entries), "sensors that changed")
+        no_longer = [
+            f"{unit}: this run no longer has {', '.join(effects)}, which run {run} had; "
+            f"to have it in every run: {add_command(settings, unit, effects, folder)}"
+            for (unit, run), effects in dropped(entries).items()
+        ]
+        lines += _first(no_longer, "units that no longer have an effect")
+    lines += [f"{what}: {command}" for what, command in next_commands(findings, settings, folder)]
     return "\n".join(lines) + "\n"
+
+
+def _first(lines: Sequence[str], of: str) -> list[str]:
+    more = len(lines) - NAMED
+    return [*lines[:NAMED], *([f"and {more} more {of}"] * (more > 0))]
 
 
 def _changes(entries: Sequence[JSON]) -> list[str]:
@@ -170,45 +168,21 @@ def _changes(entries: Sequence[JSON]) -> list[str]:
     states = of_units(entries)
     found: list[tuple[float, str]] = []
     for unit in entries[-1]["units"]:
-        if len(states[unit]) < 2 or not states[unit][-2][1]:
-            continue
-        before, after = (state for _, state in states[unit][-2:])
+        before, after = [{}, *(state for _, state in states[unit])][-2:]
         change = difference(before, after)
         for sensor in SENSORS:
-            parts = [state.get(sensor) or {} for state in (before, after)]
-            errors = [float(part.get("error") or 0.0) for part in parts]
-            words = ", ".join(change.words(sensor)).replace("\N{MINUS SIGN}", "-").replace("\N{RIGHTWARDS ARROW}", "->")
+            errors = [float((state.get(sensor) or {}).get("error") or 0.0) for state in (before, after)]
             if not all(errors):
                 continue
             factor = abs(math.log(errors[1] / errors[0]))
             if factor < SMALLEST_CHANGE and not change.added[sensor] and not change.removed[sensor]:
                 continue
-            floor = parts[1].get("floor")
+            words = ", ".join(change.words(sensor)).replace("\N{MINUS SIGN}", "-").replace("\N{RIGHTWARDS ARROW}", "->")
+            floor = after[sensor].get("floor")
             ratio = f", {errors[1] / floor:.3g} times the noise floor" if floor else ""
             told = f"held-out error {errors[0]:.3g} -> {errors[1]:.3g} {UNITS[sensor]}{ratio}"
             found.append((factor, f"{unit}, {sensor}: {words}; {told}"))
-    lines = [line for _, line in sorted(found, key=lambda f: -f[0])]
-    more = len(lines) - NAMED
-    return [*lines[:NAMED], *([f"and {more} more sensors that changed"] * (more > 0))]
-
-
-def _dropped(entries: Sequence[JSON], settings: Mapping[str, Any], results: str) -> list[str]:
-    """Return a line for each unit whose effects an earlier run had and this one has not."""
-    by_unit: dict[tuple[str, int], list[str]] = {}
-    for unit, sensor, effect, run in dropped(entries):
-        by_unit.setdefault((unit, run), []).append(f"{sensor}.{effect}")
-    lines = [
-        f"{unit}: this run no longer has {', '.join(effects)}, which run {run} had; "
-        f"to have it in every run: {add_command(settings, unit, effects, results)}"
-        for (unit, run), effects in by_unit.items()
-    ]
-    more = len(lines) - NAMED
-    return [*lines[:NAMED], *([f"and {more} more units that no longer have an effect"] * (more > 0))]
-
-
-def _named(units: Sequence[str]) -> str:
-    more = f" and {len(units) - NAMED} more" if len(units) > NAMED else ""
-    return ", ".join(units[:NAMED]) + more
+    return [line for _, line in sorted(found, key=lambda f: -f[0])]
 
 
 def run_command(settings: Mapping[str, Any]) -> str:
@@ -220,48 +194,26 @@ def run_command(settings: Mapping[str, Any]) -> str:
         As given by ``--config``: ``campaign``, ``overrides``, ``unit_overrides``, ``results`` ...
     """
     if INSTALLED:
-        return _pipeline("run", settings, [], str(settings.get("results") or RESULTS))
-    words = [shlex.quote(f"{key}={_flow(value, top=True)}") for key, value in settings.items() if value]
-    return " ".join(["snakemake", "--cores 2", *(["--config"] * bool(words)), *words])
+        return _command("run", settings, [], str(settings.get("results") or RESULTS))
+    return shlex.join(["snakemake", "--cores", "2", *_config(settings)])
 
 
 def add_command(settings: Mapping[str, Any], unit: str, effects: Sequence[str], results: str = RESULTS) -> str:
-    """Return the command that adds effects to a unit's own settings and runs the campaign.
+    """Return the command that adds effects (``sensor.effect``) to a unit's own settings and runs the campaign.
 
     Effects that ``unit_overrides`` gave the unit for one run are added with them, or the override would be stronger.
-
-    Parameters
-    ----------
-    settings : mapping
-        Of the run, as of ``run_command``.
-    unit : str
-    effects : sequence of str
-        ``sensor.effect``.
-    results : str
-        Folder of the results of all campaigns.
     """
-    of_units = dict(settings.get("unit_overrides") or {})
+    overrides = dict(settings.get("unit_overrides") or {})
     others, given = [], []
-    for override in of_units.pop(unit, []):
+    for override in overrides.pop(unit, []):
         found = EFFECTS.fullmatch(override)
         if found:
             given += [f"{found[1]}.{name.strip()}" for name in found[2].split(",") if name.strip()]
         else:
             others.append(override)
-    rest = {k: v for k, v in settings.items() if k != "unit_overrides"}
-    of_units |= {unit: others} if others else {}
-    rest |= {"unit_overrides": of_units} if of_units else {}
-    return _pipeline("add", rest, [unit, *dict.fromkeys([*given, *effects])], results)
-
-
-def add_missing_command(settings: Mapping[str, Any], results: str = RESULTS) -> str:
-    """Return the command that adds to each unit the effects that its diagnosis found to be missing."""
-    return _pipeline("add", settings, ["--missing"], results)
-
-
-def explain_command(settings: Mapping[str, Any], results: str = RESULTS) -> str:
-    """Return the command that prints the diagnoses of a campaign."""
-    return _pipeline("explain", {"campaign": settings.get("campaign", "demo")}, [], results)
+    overrides |= {unit: others} if others else {}
+    rest = {**settings, "unit_overrides": overrides}
+    return _command("add", rest, [unit, *dict.fromkeys([*given, *effects])], results)
 
 
 def once_command(settings: Mapping[str, Any], unit: str, override: str, results: str = RESULTS) -> str:
@@ -274,14 +226,17 @@ def once_command(settings: Mapping[str, Any], unit: str, override: str, results:
     return run_command(given | ({"results": results} if results != RESULTS else {}))
 
 
-def _pipeline(command: str, settings: Mapping[str, Any], words: Sequence[str], results: str) -> str:
-    rest = dict(settings)
-    campaign = str(rest.pop("campaign", "demo"))
+def _command(command: str, settings: Mapping[str, Any], words: Sequence[str], results: str) -> str:
+    """Return a command of this package on the campaign of a run."""
     program = ["imu-calibration"] if INSTALLED else ["python", "-m", "pipeline"]
-    parts = [*program, command, campaign.rstrip("/") if command == "explain" else campaign, *words]
-    parts += ["--results", results] * (results != RESULTS)
-    given = [f"{key}={_flow(value, top=True)}" for key, value in rest.items() if value and key != "results"]
-    return shlex.join([*parts, *(["--config"] * bool(given)), *given])
+    folder = ["--results", results] if results != RESULTS else []
+    rest = {key: value for key, value in settings.items() if key not in ("campaign", "results")}
+    return shlex.join([*program, command, str(settings.get("campaign", "demo")), *words, *folder, *_config(rest)])
+
+
+def _config(settings: Mapping[str, Any]) -> list[str]:
+    given = [f"{key}={_flow(value, top=True)}" for key, value in settings.items() if value]
+    return ["--config", *given] if given else []
 
 
 def _flow(value: Any, *, top: bool = False) -> str:  # noqa: ANN401  (what a command line may hold)

@@ -59,7 +59,7 @@ def test_a_run_that_drops_an_effect_is_told_with_what_it_cost_and_how_to_keep_it
     results = tmp_path / "bench"
     for units in (state([], 0.12), state(["g_sensitivity"], 0.011), state([], 0.12)):
         entries = record(results, {"U1": units}, SETTINGS)
-    assert dropped(entries) == [("U1", "gyroscope", "g_sensitivity", 2)]
+    assert dropped(entries) == {("U1", 2): ["gyroscope.g_sensitivity"]}
     columns = "unit,status,accelerometer_verdict,accelerometer_selected,gyroscope_verdict,gyroscope_selected"
     (results / "summary.csv").write_text(f"{columns}\nU1,ok,,,missing_effect,g_sensitivity\nU2,failed,,,,\n")
     add = f"python -m pipeline add bench U1 gyroscope.g_sensitivity --results {tmp_path}"

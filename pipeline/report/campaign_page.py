@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from pipeline.outcome import findings_of, next_commands, verdict_groups
+from pipeline.outcome import VERDICTS, findings_of, next_commands, verdict_groups
 from pipeline.records import SENSOR_UNITS, SENSORS
 from pipeline.report.chart import Dots, Figure, Layer, Panel, chart
 from pipeline.report.numbers import number, plain
@@ -24,15 +24,6 @@ FAR = 3.0  # error over noise floor from which a unit is marked
 NAMED = 3  # units that the finding of a chart names
 FEWEST_UNITS, FAR_SHOWN = 3, 30  # units, below which a distribution says nothing; units far from the others
 MOST_LOTS = 60  # of which medians are shown lot by lot
-VERDICTS = {
-    "nothing_missing": "good",
-    "missing_effect": "warn",
-    "unexplained": "warn",
-    "not_enough_data": "",
-    "left_by_method": "warn",
-    "reference_in_doubt": "warn",
-    "floor_in_doubt": "warn",
-}  # with the class of their colour
 
 
 def render(

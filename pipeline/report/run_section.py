@@ -106,12 +106,9 @@ def runs_data(entries: Sequence[JSON], settings: JSON) -> JSON | None:
         if len(shown := _states_after(states, [e["run"] for e in kept])) > 1
     ]
     runs = [[e["run"], f"run {e['run']}, {times[e['run']]}: {_count(e)}"] for e in kept]
-    lost: dict[tuple[str, int], list[str]] = {}
-    for unit, sensor, effect, run in dropped(entries):
-        lost.setdefault((unit, run), []).append(f"{sensor}.{effect}")
     gone = [
         {"unit": unit, "run": run, "effects": effects, "add": add_command(settings, unit, effects)}
-        for (unit, run), effects in lost.items()
+        for (unit, run), effects in dropped(entries).items()
     ]
     return {"runs": runs, "units": units, "dropped": gone, "number": entries[-1]["run"]}
 

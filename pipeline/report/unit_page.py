@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.files import json_text
 from pipeline.model.plausible import sentences
-from pipeline.outcome import commands_of, place, run_command
+from pipeline.outcome import VERDICTS, commands_of, place, run_command
 from pipeline.records import SENSOR_UNITS, SENSORS
 from pipeline.report.diagnosis_section import evidence_figures, ranking_rows
 from pipeline.report.held_out_section import (
@@ -31,15 +31,6 @@ if TYPE_CHECKING:
     from pipeline.records import Recording
 
 JSON = dict[str, Any]
-VERDICTS = {
-    "nothing_missing": "Nothing significant is missing from the model.",
-    "missing_effect": "A physical effect is missing from the model.",
-    "unexplained": "The residual exceeds noise, and no plausible effect of the catalogue explains it.",
-    "not_enough_data": "The recordings cannot show whether an effect is missing.",
-    "left_by_method": "The model explains the sensor; approximations of method or filter cause errors above noise.",
-    "reference_in_doubt": "The reference is in doubt: recordings contradict each other.",
-    "floor_in_doubt": "The noise estimate is in doubt: it may be too large and hide an effect.",
-}
 
 
 def render(
@@ -135,7 +126,7 @@ def _sensor(
         "ranking": ranking_rows(found),
         "evidence_figures": evidence_figures(sensor, found),
         "implausible": sentences(sensor, part),
-        "verdict": VERDICTS.get(found.get("verdict", ""), "There is no diagnosis."),
+        "kind": VERDICTS.get(found.get("verdict", ""), ""),
         "commands": commands_of(found, sensor, str(calibration.get("unit")), settings.get("run") or {}),
     }
 
