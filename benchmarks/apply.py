@@ -128,9 +128,9 @@ def mcap_unchanged(log: Path, out: Path, _calibration: Path) -> int:
     from mcap.opcode import Opcode  # noqa: PLC0415
     from mcap.records import Chunk  # noqa: PLC0415
 
+    from pipeline.io.mcap_chunk import RECORD_HEAD, bytes_of, parsed  # noqa: PLC0415
     from pipeline.io.mcap_copy import McapCopy  # noqa: PLC0415
     from pipeline.io.mcap_reader import McapReader  # noqa: PLC0415
-    from pipeline.io.mcap_records import RECORD_HEAD, bytes_of, parsed  # noqa: PLC0415
 
     with log.open("rb") as stream, out.open("wb") as target:
         reader, copy = McapReader(stream, str(log)), McapCopy(target)

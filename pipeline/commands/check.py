@@ -21,18 +21,17 @@ from pipeline.io.files import FILE, candidate_files
 from pipeline.io.ingest_settings import checks_of
 from pipeline.io.read import read_table, to_recording
 from pipeline.preprocessing.checks import check_recordings
-from pipeline.profile_detection.mcap_topics import topic_lines
+from pipeline.profile_detection.columns import find_layout
 from pipeline.profile_detection.proposal import as_yaml, propose
-from pipeline.profile_detection.recording_facts import as_text, facts
-from pipeline.profile_detection.text_layout import find_layout
+from pipeline.profile_detection.recording_facts import as_text, facts, topic_lines
 from pipeline.profile_detection.unit_guesses import UNKNOWN
 from pipeline.signal.segments import cut
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from pipeline.profile_detection.columns import TextLayout
     from pipeline.profile_detection.proposal import Proposal
-    from pipeline.profile_detection.text_layout import TextLayout
     from pipeline.records import Recording
 
 DEFAULT_PROFILE = "canonical_csv"

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.io.axes import STRAIGHT, maps_of_log
+from pipeline.io.channel_table import STRAIGHT, maps_of_log
 from pipeline.model.effects import owner_of
 from pipeline.model.effects.base import REFERENCE_TEMPERATURE, STANDARD_GRAVITY, Owner
 from pipeline.model.plausible import sentences

@@ -14,7 +14,7 @@ import numpy as np
 from pipeline.errors import ConfigurationError, InputError, PipelineError
 from pipeline.field_logs.log_checks import LogChecks
 from pipeline.field_logs.output import replacing, require_apart
-from pipeline.io.axes import STRAIGHT, axis_matrix, maps_of_log
+from pipeline.io.channel_table import STRAIGHT, axis_matrix, maps_of_log
 from pipeline.model.compensation import SMOOTHING_S
 from pipeline.records import SENSORS
 

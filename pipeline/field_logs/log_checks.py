@@ -5,10 +5,9 @@
     error : ||a| - 1 g| or |w| of a rest's mean reading, before and after compensation
 
 The right calibration brings rests nearer to 1 g and to zero rate. If it does not, the log was compensated already,
-belongs to another unit or sensor, or is read with other axes or units; or the sensor has changed.
-
-Between two rests gravity turns in the body by at most the integral of |w| (minus its value at rest). A gyroscope that
-integrates to less than half of the turn is not read in deg/s.
+belongs to another unit or sensor, or is read with other axes or units; or the sensor has changed. Between two rests
+gravity turns in the body by at most the integral of |w| (minus its value at rest): a gyroscope that integrates to less
+than half of the turn is not read in deg/s.
 
 ``apply`` writes numbers rounded to 12 decimals without trailing zeros: 9 of 10 cells have 12 decimals. Sensors give
 fewer digits, programs that write doubles give more.

@@ -1,17 +1,10 @@
 """The clock of a table's log, aligned with the sensor's by the motion in both logs.
 
-    tau = t + d + k (t - t_m)
-
+    tau  = t + d + k (t - t_m)
     w(t) = A r(tau) + a + noise,   f(t) = B u(tau) + b + noise
 
-where
-
-    t, tau     : the sensor's and the table's clock, s
-    t_m        : middle of the samples that determine the offset, which makes offset and drift uncorrelated
-    d, k       : offset and drift of the table's clock, s and 1
-    w, f       : angular rate and specific force read by the sensor
-    r, u       : the corresponding signals of the table's log (``pipeline.io.encoder_log``)
-    A, B, a, b : scales, axes and biases, not used further
+with the sensor's and the table's clock t and tau, s; offset d and drift k of the table's clock, uncorrelated at t_m;
+readings w and f, and the signals r and u of the table's log that they follow (``pipeline.io.encoder_log``).
 
 ``d`` is first found by correlation on a grid. Steps of a table repeat, the directions of gravity at them do not: of the
 offsets with similar correlation, the one with the smallest residual of the whole model is taken. The table is assumed
@@ -19,13 +12,12 @@ at rest before and after its log; where no offset fits so, only what both logs c
 refined by Gauss-Newton, with A, B, a, b eliminated by projection.
 
 The residuals are not white: they are largest where the rate changes, and there the offset is determined. So the
-covariance is estimated from the scatter between blocks of some seconds (a sandwich estimate),
+covariance is a sandwich estimate from the scatter between blocks,
 
     C = H^-1 (sum_b s_b s_b') H^-1,   H = J'J,   s_b = J_b' e_b
 
-with J the projected derivatives and e the residuals, enlarged for the effective number of blocks. The larger estimate
-of blocks of 1 s and of 4 s is used, as slow errors are correlated between neighbouring blocks. It is never below that
-of white noise, nor below 0.5 % of the table's interval, the error of the interpolation.
+with the projected derivatives J and the residuals e, enlarged for the effective number of blocks; the larger one of
+blocks of 1 s and 4 s, at least that of white noise and 0.5 % of the table's interval, the error of the interpolation.
 """
 
 from __future__ import annotations

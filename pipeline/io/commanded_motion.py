@@ -2,17 +2,12 @@
 
     A(t) = P(tau),   r(t) = P'(tau),   tau = m_j + (1 + k) (t - t_j) + d_j       near move j
 
-where
-
-    P   : commanded angle by the program's own time, deg: rests, and turns with trapezoidal rate
-    m_j : middle of move j by the program, s
-    t_j : the sensor's time there by offset and drift of the whole program (``pipeline.io.clock_alignment``), s
-    d_j : deviation of the move from that, s
-    k   : drift of the program's clock during moves, 1; pauses between moves would look like a drift
+with the commanded angle P, deg, by the program's time; the middle m_j of move j, which is at the sensor's time t_j by
+offset and drift of the whole program (``pipeline.io.clock_alignment``); and the move's deviation d_j from that, s. The
+drift k during moves is separate, as pauses between moves would look like a drift.
 
 ``d_j`` and ``k`` are fitted to the readings w = a P'(tau) + b of the gyroscope about the move, so a table that pauses
-between moves is followed from rest to rest. Angles and rates are the commanded ones: lost steps of the motors are not
-observable here and belong to the table's stated accuracy.
+between moves is followed from rest to rest. Lost steps of the motors are not observable and belong to its accuracy.
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
 """The times of a text log's rows: integer nanoseconds, increasing.
 
-    time = round(t * 10^9), from the decimal digits themselves where doubles are too coarse
-
-A double of t seconds is finer than half a nanosecond up to t = 10^6 s; Unix time, 1.7*10^9 s, is larger.
+    time = round(t * 10^9), from the decimal digits themselves where doubles are too coarse (beyond 10^6 s)
 
 A counter that overflows starts again at 0: a time that falls from within 2.5 intervals of M to within 2.5 intervals of
 0 continues at M, where M is 2^32 us or ms, or 2^16, 2^24 or 2^32 of the column's unit. Rows displaced by at most five

@@ -1,21 +1,20 @@
 """Samples that neither noise nor the table's motion explains: bus glitches, shocks, and disturbed rests.
 
-**Disturbances.** First what the log explains is removed from each channel by least squares: from a specific force a
-constant and gravity in the body (by attitude, or cosine and sine of the angle), from an angular rate a constant and the
-table's rate. A sample is disturbed where the residual x departs from the median m of the samples around it by
+**Disturbances.** What the log explains is removed from each channel by least squares: from a specific force a constant
+and gravity in the body (by attitude, or cosine and sine of the angle), from an angular rate a constant and the table's
+rate. A sample is disturbed where the residual x departs from the median m of the samples around it by
 
     |x - m| > 10 s + 1.5 L
 
-where s is the larger of the noise of neighbours (``median |x[n+1] - x[n]| / 0.9539``) and of the scatter about m
-(``1.4826 median |x - m|``; at rest that of most rests), and L is the largest change by a delay, a clock error or a
-lever arm within half a second: for a gyroscope the variation of the table's rate; for an accelerometer g times the
-angle turned in 0.2 s, and the acceleration at a lever arm of 0.1 m. So effects that shift a reading in time are no
-disturbances. The samples around are those of the same rest, up to 2 s on either side, or half a second of motion.
-Without a table's log, the gyroscope gives the motion, and only rests are searched; of a static recording all of it.
+where s is the larger of the noise of neighbours and of the scatter about m (at rest that of most rests), and L is the
+largest change by a delay, a clock error or a lever arm within half a second: for a gyroscope the variation of the
+table's rate; for an accelerometer g times the angle turned in 0.2 s, and the acceleration at a lever arm of 0.1 m. So
+effects that shift a reading in time are no disturbances. The samples around are those of the same rest, up to 2 s on
+either side, or half a second of motion. Without a table's log, the gyroscope gives the motion, and only rests are
+searched; of a static recording all of it.
 
-**Disturbed rests.** Someone leant on the table, or shook it, during a part of a dwell. A rest by the table's log,
-without its first and last 0.3 s, in which a late or early sensor reads the move, is cut into pieces of at most 2 s. A
-piece is left out as a whole where
+**Disturbed rests.** A rest by the table's log, without its first and last 0.3 s, in which a late or early sensor reads
+the move, is cut into pieces of at most 2 s. A piece is left out as a whole where
 
     chi^2 = sum over its n samples and the 3 axes of (x - m)^2 / s^2 > 4 nu  and  > nu + 6 sqrt(2 nu) + 18
 

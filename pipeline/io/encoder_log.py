@@ -3,9 +3,9 @@
     rate r and angle A of the turn     the gyroscope reads along r, the accelerometer along (cos A, sin A)
     attitude q                         the gyroscope reads along omega, the accelerometer along R(q)^T e_z
 
-Between two samples the angle is the cubic through angle and rate at both ends, exact for constant acceleration. The
-rate is linear; it bends once where the slopes on both sides of the interval require it. The attitude is the quintic
-spline of its components.
+Between two samples the angle is the cubic through angle and rate at both ends, exact for constant acceleration; the
+rate is linear and bends once where the slopes on both sides require it; the attitude is the quintic spline of its
+components.
 """
 
 from __future__ import annotations

@@ -1,10 +1,9 @@
 """Files of users: which ones hold a unit's recordings, what their names may be, and safe access to them.
 
 A procedure names a recording's file without suffix; the first kind of file that exists is taken, ``.csv`` before
-``.gcsv`` before ``.mcap``. A name with a suffix is taken as it is. Where the ingest profile says that a recording comes
-in several ``parts`` (files of one logger, joined on time), these stand in place of the ``.csv``.
-
-Only regular files are opened: opening a FIFO would wait forever, and a device may never end.
+``.gcsv`` before ``.mcap``. A name with a suffix is taken as it is. Where the ingest profile has ``parts`` (files of one
+logger, joined on time), these stand in place of the ``.csv``. Only regular files are opened: opening a FIFO would wait
+forever.
 
 Only the standard library is imported here: the Snakefile asks for the files of thousands of units while it is parsed.
 """

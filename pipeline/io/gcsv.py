@@ -23,7 +23,7 @@ from fractions import Fraction
 from typing import TYPE_CHECKING
 
 from pipeline.errors import IngestError
-from pipeline.io.axes import to_body_axes
+from pipeline.io.channel_table import to_body_axes
 from pipeline.io.csv_read import read_one
 from pipeline.io.files import refuse_foreign, unchanged
 from pipeline.io.ingest_settings import Column, CsvFormat

@@ -1,17 +1,12 @@
 """The unit of the angular rates, from the rotation of gravity between rests.
 
-In the sensor's axes the direction of gravity rotates against the angular rate:
+In the sensor's axes,
 
     du/dt = -(s w) x u
 
-where
-
-    u : direction of the specific force, measured at rest before and after a move
-    w : reading of the gyroscope, minus its mean in the rests on both sides
-    s : deg/s per unit of the gyroscope, the unknown
-
-The right s rotates u from rest to rest with the smallest residual angle. The next possible unit (57.3 times, or another
-range of the sensor) misses by tens of degrees.
+with the direction u of the specific force, measured at rest before and after a move; the reading w of the gyroscope,
+minus its mean in these rests; and the unknown s, deg/s per unit of the gyroscope. The right s rotates u from rest to
+rest; the next possible unit (57.3 times, or another range of the sensor) misses by tens of degrees.
 """
 
 from __future__ import annotations

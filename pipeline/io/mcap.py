@@ -15,9 +15,9 @@ import numpy as np
 from pipeline.errors import IngestError
 from pipeline.io.channel_table import ChannelTable
 from pipeline.io.files import unchanged
+from pipeline.io.ingest_settings import HEADER, OWN
 from pipeline.io.mcap_channels import MAPPED, TopicDecoder, kind_of, topic_of
 from pipeline.io.mcap_reader import McapReader
-from pipeline.io.mcap_settings import HEADER, OWN
 from pipeline.io.ros2_messages import IMU, JOINT_STATE, QUATERNION_STAMPED, TEMPERATURE
 from pipeline.io.timestamps import check_fine, check_plausible, in_order
 from pipeline.io.units import ACCELEROMETER, GYROSCOPE, TABLE_CHANNELS
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from pipeline.io.ingest_settings import McapFormat
     from pipeline.io.mcap_chunk import Rows
-    from pipeline.io.mcap_settings import McapFormat
 
     Columns = dict[str, NDArray[Any]]
 

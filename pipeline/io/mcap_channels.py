@@ -16,7 +16,7 @@ import numpy as np
 
 from pipeline.errors import IngestError
 from pipeline.io.field_path import ONLY, FieldPath
-from pipeline.io.mcap_settings import HEADER, TIME, MappedField
+from pipeline.io.ingest_settings import HEADER, TIME, MappedField
 from pipeline.io.message_decoder import Batch, ChannelDecoder, Wanted
 from pipeline.io.message_layout import short_name
 from pipeline.io.ros2_messages import IMU, JOINT_STATE, QUATERNION_STAMPED, TEMPERATURE
@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     from mcap.records import Schema
     from numpy.typing import NDArray
 
+    from pipeline.io.ingest_settings import McapFormat
     from pipeline.io.mcap_chunk import Rows
     from pipeline.io.mcap_reader import McapReader
-    from pipeline.io.mcap_settings import McapFormat
 
 MAPPED = "mapped"  # the kind of a topic whose fields the profile names; other kinds are ROS types
 KINDS = {short_name(kind): kind for kind in (IMU, TEMPERATURE, JOINT_STATE, QUATERNION_STAMPED)}

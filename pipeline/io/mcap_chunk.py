@@ -1,29 +1,39 @@
-"""Chunks of an MCAP file: unpacked, and cut into messages.
+"""Records of an MCAP file by the official library, and chunks unpacked and cut into messages.
 
 A run of records (a chunk, or the messages between chunks) is cut by following the lengths from record to record:
 
     start_0 = 0,   start_{i+1} = start_i + 9 + length_i,   and the last record ends where the run ends
 
-Three ways give the same starts. If all records have one length, the starts are an arithmetic series; if the file has an
-index, they are its offsets; else the lengths are followed one by one. For the first two, numpy compares all starts at
-once with the rule above, so that a wrong index has no effect.
+If all records have one length, the starts are an arithmetic series; if the file has an index, they are its offsets;
+else the lengths are followed one by one. numpy compares the first two with the rule, so that a wrong index has no
+effect.
+
+The library returns short data where a length is too large, ignores contradicting lengths, does not compare the checksum
+of attachments, and reads an index entry by entry. Here such records are refused, and an index is an array.
 """
 
 from __future__ import annotations
 
 import struct
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from io import BytesIO
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.opcode import Opcode
+from mcap.records import Attachment, Chunk
 from numpy.lib.stride_tricks import sliding_window_view
 
-from pipeline.io.mcap_records import RECORD_HEAD
-
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from mcap.records import McapRecord
     from numpy.typing import NDArray
 
+MAGIC = b"\x89MCAP0\r\n"
+RECORD_HEAD = 9  # bytes of opcode and length
+INDEX_ENTRY = 16  # bytes of a time and an offset
 LARGEST_CHUNK = 1 << 30  # bytes; recorders write about 1 MiB
 LARGEST_EXPANSION = 1000
 ALWAYS_ALLOWED = 1 << 24  # bytes; a small chunk of equal bytes packs better than any log
@@ -220,3 +230,55 @@ def _by_channel(run: Run, data: NDArray[np.uint8], starts: NDArray[np.int64]) ->
         sizes = heads["length"][own].astype(np.int64) - MESSAGE_HEAD
         rows.append(Rows(channel, data, heads[own], starts[own] + HEAD.itemsize, sizes, 0, run.name, run.offset))
     return rows
+
+
+class _Content(ReadDataStream):
+    """The content of a record; the library's own stream returns less than asked for at its end."""
+
+    def read(self, length: int) -> bytes:
+        data = self._stream.read(length)
+        if len(data) < length:
+            raise ValueError(f"{length} bytes are claimed where {len(data)} are left")
+        self._count += length
+        return data
+
+
+def parsed(kind: Any, content: bytes | memoryview) -> Any:  # noqa: ANN401  (a class of the library, its record)
+    """Return the record in a content, which may be longer: later versions of the format append to it.
+
+    ``ValueError``: it is too short, a text is not UTF-8, or the lengths in it contradict each other.
+    """
+    record = kind.read(_Content(BytesIO(content)))
+    if kind is not Chunk and not bytes(content).startswith(bytes_of([record])[RECORD_HEAD:]):
+        raise ValueError(f"the lengths within a {kind.__name__} record contradict each other")
+    return record
+
+
+def attachment(content: bytes) -> Attachment:
+    """Return an attachment; ``ValueError`` if its checksum is neither right nor 0 (not computed)."""
+    record: Attachment = Attachment.read(_Content(BytesIO(content)))
+    written = bytes_of([record])[RECORD_HEAD:]  # with the right checksum, in its last four bytes
+    body, crc = content[: len(written) - 4], content[len(written) - 4 : len(written)]
+    if body != written[:-4] or crc not in {bytes(4), written[-4:]}:
+        raise ValueError(f"the checksum of attachment {record.name!r} is wrong")
+    return record
+
+
+def bytes_of(records: Iterable[McapRecord]) -> bytes:
+    """Return records as they stand in a file."""
+    builder = RecordBuilder()
+    for record in records:
+        record.write(builder)
+    return bytes(builder.end())  # type: ignore[no-untyped-call]
+
+
+def message_index(content: bytes) -> tuple[int, NDArray[np.int64]]:
+    """Return a channel and the offsets of its messages in the chunk before; ``ValueError`` if it is not an index."""
+    number, size = struct.unpack_from("<HI", content)
+    body = content[6 : 6 + size]
+    if len(body) < size or size % INDEX_ENTRY:
+        raise ValueError("an index of messages is no list of times and offsets")
+    offsets = np.frombuffer(body, "<u8").reshape(-1, 2)[:, 1]
+    if (offsets > np.iinfo(np.int64).max).any():
+        raise ValueError("an index of messages has an offset beyond 63 bits")
+    return number, offsets.astype(np.int64)

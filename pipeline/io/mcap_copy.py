@@ -26,8 +26,7 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from pipeline.io.mcap_chunk import HEAD
-from pipeline.io.mcap_records import MAGIC, RECORD_HEAD, attachment, bytes_of, parsed
+from pipeline.io.mcap_chunk import HEAD, MAGIC, RECORD_HEAD, attachment, bytes_of, parsed
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

@@ -3,12 +3,10 @@
     file   = magic | data section | summary | magic
     record = opcode (1 byte) | length (8 bytes) | content (length bytes)
 
-Checked are the checksums of each chunk, each attachment, the data section and the summary; that records fill their
-chunks; and that the summary's counts of messages, chunks, attachments and metadata are those found. A checksum of 0
-means that the recorder computed none. No length is used before it is compared with the bytes that are left.
-
-Messages are returned chunk by chunk: memory is bounded by the largest chunk. A file is known to be complete only when
-the iteration has ended without an error.
+Checked are the checksums of each chunk, each attachment, the data section and the summary (0: the recorder computed
+none); that records fill their chunks; and that the summary's counts are those found. No length is used before it is
+compared with the bytes that are left. Messages are returned chunk by chunk, so memory is bounded by the largest chunk.
+A file is known to be complete only when the iteration has ended without an error.
 """
 
 from __future__ import annotations
@@ -25,8 +23,7 @@ from mcap.records import Attachment, Channel, Chunk, ChunkIndex, DataEnd, Footer
 
 from pipeline.errors import IngestError
 from pipeline.io.files import FOREIGN
-from pipeline.io.mcap_chunk import Run, split, unpack
-from pipeline.io.mcap_records import MAGIC, RECORD_HEAD, attachment, message_index, parsed
+from pipeline.io.mcap_chunk import MAGIC, RECORD_HEAD, Run, attachment, message_index, parsed, split, unpack
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

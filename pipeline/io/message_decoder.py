@@ -1,9 +1,7 @@
 """Messages of one channel to columns of numbers.
 
-    cdr  with ros2msg definitions  (ROS 2)      columns of a whole chunk at once, as views on its bytes
-    ros1 with ros1msg definitions  (ROS 1)      likewise
-    protobuf                                    message by message, official decoder
-    json                                        message by message
+    cdr with ros2msg definitions, ros1 with ros1msg   columns of a whole chunk at once, as views on its bytes
+    protobuf, json                                    message by message
 
 Where the ROS messages of a chunk differ in layout (a text or a list changes its length), the layout of each message is
 found by itself. The official ROS decoders are not used: that of ROS 1 runs Python code that it writes from the

@@ -8,9 +8,8 @@ which is not sent); ``#`` begins a comment. ``type[3]`` is an array, ``type[]`` 
                  a text is a 4-byte length with its closing zero
     ROS 1      : no alignment, no encapsulation, no closing zero
 
-Only texts and sequences move the numbers after them, and each sends its length first. A layout is found by following
-the definition through one message: the places of its numbers, and the bytes that fix them (the encapsulation, every
-length, every text). Another message of the same size that agrees in those bytes has its numbers in the same places.
+Only texts and sequences move the numbers after them, and each sends its length first. So another message of the same
+size that agrees in the encapsulation, every length and every text has its numbers in the same places.
 """
 
 from __future__ import annotations

@@ -1,15 +1,10 @@
 """Recordings to Parquet and back, one file a unit, its recordings one after the other.
 
 Columns that came as counts stay integers, ``value = (count - offset) * scale`` on loading; those that would not come
-back to the last bit are stored as doubles. Page checksums guard the data. A CRC-32 of each recording's columns and one
-of the metadata guard what page checksums do not cover (lengths, offsets, types, scales). Writing the same recordings
-again gives the same bytes.
-
-    +------------+---------------------------------------------------------------------------------+
-    | time_ns    | int64                                                                           |
-    | accel_x .. | double or int32/int64 counts; null in the rows of recordings without it         |
-    | flags      | uint16                                                                          |
-    +------------+---------------------------------------------------------------------------------+
+back to the last bit are stored as doubles. ``time_ns`` is int64, ``flags`` uint16; a channel is null in the rows of
+recordings without it. Page checksums guard the data. A CRC-32 of each recording's columns and one of the metadata guard
+what page checksums do not cover (lengths, offsets, types, scales). Writing the same recordings again gives the same
+bytes.
 """
 
 from __future__ import annotations

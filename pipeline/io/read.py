@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import IngestError, MissingInputError
-from pipeline.io.axes import STRAIGHT, axis_maps, to_body_axes
+from pipeline.io.channel_table import STRAIGHT, axis_maps, to_body_axes
 from pipeline.io.disturbances import leave_out_disturbances, leave_out_shaken_rests
 from pipeline.io.encoder_log import unwrapped
 from pipeline.io.files import candidate_files, recording_files
 from pipeline.io.ingest_settings import checks_of
-from pipeline.io.plausibility import examine
+from pipeline.io.quality_flags import examine
 from pipeline.io.units import ATTITUDE, TABLE_CHANNELS, TRIADS
 from pipeline.records import Note, Recording, rate_of_attitude
 
@@ -88,8 +88,8 @@ def table_reader(ingest: Mapping[str, Any]) -> Callable[[Sequence[Path]], Channe
 
     def read(paths: Sequence[Path]) -> ChannelTable:
         if paths[0].suffix == ".mcap":
+            from pipeline.io.ingest_settings import mcap_format  # noqa: PLC0415
             from pipeline.io.mcap import read_mcap  # noqa: PLC0415  (the decoder costs what a text log need not pay)
-            from pipeline.io.mcap_settings import mcap_format  # noqa: PLC0415
 
             return read_mcap(paths[0], mcap_format(ingest))
         if paths[0].suffix == ".gcsv":

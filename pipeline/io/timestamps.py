@@ -1,7 +1,5 @@
 """Timestamps of messages as integer nanoseconds, and the checks of their values and order.
 
-    t [ns] = seconds * 10^9 + nanoseconds,   0 <= nanoseconds < 10^9
-
 A double resolves a time since 1970 to 238 ns only. So no timestamp passes through one, unless the log itself stores it
 as one; then whole seconds and fraction are converted separately, which loses nothing more.
 """

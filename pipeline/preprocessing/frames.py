@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.errors import IngestError
-from pipeline.io.axes import axis_matrix
+from pipeline.io.channel_table import axis_matrix
 from pipeline.io.gravity_rotation import FAILS_DEG, FEWEST_MOVES, MOST_SAMPLES, misfits_deg, moves_of
 from pipeline.preprocessing.bench import nearest_axis, off_axis_deg, signed_axis
 from pipeline.records import AXES

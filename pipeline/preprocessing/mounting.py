@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import IngestError
-from pipeline.io.axes import axis_maps, axis_matrix
+from pipeline.io.channel_table import axis_maps, axis_matrix
 from pipeline.model.kinematics import UP_AT_ZERO
 from pipeline.preprocessing.bench import (
     ACROSS,

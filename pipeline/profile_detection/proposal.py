@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.io.gravity_rotation import Move
-    from pipeline.profile_detection.text_layout import TextLayout
+    from pipeline.profile_detection.columns import TextLayout
 
 UNITS_OF = {"accelerometer": ("g", "mg", "m/s^2"), "gyroscope": ("deg/s", "rad/s")}
 Entries = dict[str, dict[str, Any]]

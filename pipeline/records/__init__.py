@@ -19,8 +19,7 @@ from pipeline.records.motion import (
     motion_at_rest,
     rate_of_attitude,
 )
-from pipeline.records.noise import Noise, noise_of_steps
-from pipeline.records.recording import AXES, SENSORS, Encoding, Note, Recording
+from pipeline.records.recording import AXES, SENSORS, Encoding, Noise, Note, Recording, noise_of_steps
 
 __all__ = [
     "AXES",

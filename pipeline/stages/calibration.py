@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline import __version__
 from pipeline.errors import CannotCalibrateError
 from pipeline.files import read_json, write_json
-from pipeline.io.axes import axis_maps
+from pipeline.io.channel_table import axis_maps
 from pipeline.io.parquet import load_recordings
 from pipeline.model.plausible import implausible
 from pipeline.records import SENSORS

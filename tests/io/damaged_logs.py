@@ -14,9 +14,9 @@ from mcap.writer import CompressionType, Writer
 from sample_logs import make_recording
 
 from pipeline.errors import IngestError
+from pipeline.io.ingest_settings import McapFormat
 from pipeline.io.mcap import read_stream
 from pipeline.io.mcap_reader import McapReader
-from pipeline.io.mcap_settings import McapFormat
 from pipeline.io.ros2_messages import write_mcap
 
 if TYPE_CHECKING:

@@ -16,8 +16,8 @@ from mcap_ros2.decoder import DecoderFactory as Ros2Factory
 from ros_messages import FIRST_NS, INNER, NAME, NUMPY, STEP_NS, RandomField, RandomLog
 from rosbags.typesys import Stores, get_typestore
 
+from pipeline.io.ingest_settings import mcap_format
 from pipeline.io.mcap import read_mcap
-from pipeline.io.mcap_settings import mcap_format
 
 if TYPE_CHECKING:
     from pathlib import Path

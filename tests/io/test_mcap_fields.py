@@ -14,8 +14,8 @@ from rosbags.typesys import Stores, get_typestore
 from sample_logs import SENSOR, procedure, profile
 
 from pipeline.errors import ConfigurationError, IngestError
+from pipeline.io.ingest_settings import mcap_format
 from pipeline.io.mcap import read_mcap
-from pipeline.io.mcap_settings import mcap_format
 from pipeline.io.read import read_recordings
 from pipeline.io.ros2_messages import DEFINITIONS, IMU
 

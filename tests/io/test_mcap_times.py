@@ -12,8 +12,8 @@ import pytest
 from mcap.writer import Writer
 
 from pipeline.errors import IngestError
+from pipeline.io.ingest_settings import mcap_format
 from pipeline.io.mcap import read_mcap
-from pipeline.io.mcap_settings import mcap_format
 from pipeline.io.timestamps import of_number
 
 if TYPE_CHECKING:

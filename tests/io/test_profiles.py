@@ -12,8 +12,7 @@ from sample_logs import procedure, profile
 from pipeline.config.compose import Composer
 from pipeline.errors import ConfigurationError
 from pipeline.io.files import candidate_files
-from pipeline.io.ingest_settings import check_ingest, csv_formats
-from pipeline.io.mcap_settings import mcap_format
+from pipeline.io.ingest_settings import check_ingest, csv_formats, mcap_format
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -14,8 +14,8 @@ from pipeline.config.compose import Composer
 from pipeline.errors import IngestError
 from pipeline.io.csv_read import read_csv
 from pipeline.io.ingest_settings import Checks, csv_formats
+from pipeline.profile_detection.columns import find_layout
 from pipeline.profile_detection.proposal import Proposal, as_yaml, propose
-from pipeline.profile_detection.text_layout import find_layout
 
 REFERENCE = Path(__file__).parents[3] / "shared" / "data"
 
