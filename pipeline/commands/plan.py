@@ -14,7 +14,7 @@ from pipeline.model.effects import register
 from pipeline.model.effects.files import read_effect_files
 from pipeline.planning.changes import best_changes
 from pipeline.planning.plan import plan_of
-from pipeline.planning.plan_text import helps_most, in_words, side_by_side
+from pipeline.planning.plan_text import helps_most, plan_text, side_by_side
 from pipeline.simulation.description import UnitDescription, read_description
 from pipeline.simulation.options import add_recording_options, described
 
@@ -50,7 +50,7 @@ def main(argv: Sequence[str]) -> int:
         print(json.dumps({**document, **more}, indent=1))
         return 0
     helps = helps_most(gains)
-    lines = in_words(document) if second is None else side_by_side(document, second)
+    lines = plan_text(document) if second is None else side_by_side(document, second)
     print("\n".join([*lines, *(["", *helps] if helps else [])]))
     return 0
 

@@ -60,10 +60,6 @@ class FittedForm:
 def unexplained(selection: Selection) -> list[dict[str, Any]]:
     """Return the covariates on which the residual still depends, each with its form, the best first.
 
-    Parameters
-    ----------
-    selection : Selection
-
     Returns
     -------
     list of dict
@@ -257,7 +253,6 @@ def suggested_effect(
     ----------
     unknown : sequence of mapping
         What ``unexplained`` returned.
-    sensor : str
     taken : collection of str
         Names of existing effects.
     """
@@ -285,7 +280,6 @@ def effect_file(definition: Mapping[str, Any], unit: str) -> str:
 
     Parameters
     ----------
-    definition : mapping
     unit : str
         The unit that showed it.
     """
@@ -314,11 +308,8 @@ def select_with_form(
 
     Parameters
     ----------
-    selection : Selection
     unknown : sequence of mapping
         What ``unexplained`` returned of it; where that is empty, nothing changes.
-    configured : sequence of str
-    noise : Noise or None
     sheet : mapping
         As for ``selection.select``.
     """

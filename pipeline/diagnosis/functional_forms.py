@@ -211,12 +211,10 @@ def in_words(form: Form, sizes: Values, axes: Sequence[int], sensor: str) -> str
 
     Parameters
     ----------
-    form : Form
     sizes : (3,) array
         Amplitude, height or whole change on each axis, unit of the sensor.
     axes : sequence of int
         On which the form acts.
-    sensor : str
     """
     figures, unit = form.figures, UNITS.get(form.signal, "")
     size = _sizes(form, sizes, axes, sensor)

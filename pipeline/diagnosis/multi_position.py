@@ -158,17 +158,32 @@ def _model_of_all_rests(
             return found
 
     every = {**settings, "procedure": {**settings["procedure"], "holdout_every": 0}}
-    sensor = calibration.sensor
+    if calibration.sensor == "accelerometer":
+        return require_model(recordings, with_all_rests(calibration, noise), noise, every)
+    felt = accelerometer and with_all_rests(accelerometer, None)
+    return require_model(recordings, calibration, noise, every, felt)
+
+
+def require_model(
+    recordings: Sequence[Recording],
+    calibration: SensorCalibration,
+    noise: Noise | None,
+    settings: Mapping[str, Any],
+    accelerometer: SensorCalibration | None = None,
+) -> Model:
+    """Return the model of rests and moves; see ``pipeline.estimation.multi_position.result.model_of``.
+
+    Raises
+    ------
+    NotObservableError
+        If there are no rests, or they do not determine bias and matrix.
+    """
     try:
-        if sensor == "accelerometer":
-            model = model_of(recordings, with_all_rests(calibration, noise), noise, every)
-        else:
-            felt = accelerometer and with_all_rests(accelerometer, None)
-            model = model_of(recordings, calibration, noise, every, felt)
+        model = model_of(recordings, calibration, noise, settings, accelerometer)
     except CannotCalibrateError as lack:
         raise NotObservableError(lack.message) from lack
     if model is None:
-        raise NotObservableError(f"no recording holds a rest with readings of the {sensor}")
+        raise NotObservableError(f"no recording holds a rest with readings of the {calibration.sensor}")
     return model
 
 

@@ -59,7 +59,6 @@ def dependences(selection: Selection, explained: Curves | None = None) -> list[t
 
     Parameters
     ----------
-    selection : Selection
     explained : callable, optional
         Motion to (n, m) further curves that count as explained.
     """

@@ -214,12 +214,7 @@ def evidence_of(
 
 
 def decide(e: Evidence) -> tuple[str, str]:
-    """Return the verdict and its reason as one or two sentences; empty where the selection is the reason.
-
-    Parameters
-    ----------
-    e : Evidence
-    """
+    """Return the verdict and its reason as one or two sentences; empty where the selection is the reason."""
     if e.doubts:
         return "reference_in_doubt", f"A check of the recordings contradicts the reference: {'; '.join(e.doubts)}."
     if e.published and e.published.above:
@@ -341,7 +336,6 @@ def judged(document: dict[str, Any], e: Evidence) -> dict[str, Any]:
     ----------
     document : dict
         Of the selection alone.
-    e : Evidence
     """
     verdict, reason = decide(e)
     step = _next_step(verdict, e)

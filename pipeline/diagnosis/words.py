@@ -48,7 +48,6 @@ def in_words(part: Mapping[str, Any] | None, sensor: str) -> list[str]:
     ----------
     part : mapping or None
         The sensor's part of ``diagnoses/<unit>.json``; None where the sensor was not calibrated.
-    sensor : str
     """
     if part is None:
         return [f"The {sensor} was not calibrated, so there is nothing to diagnose."]

@@ -137,7 +137,6 @@ def best_changes(unit: UnitDescription, before: Document) -> list[Gain]:
 
     Parameters
     ----------
-    unit : UnitDescription
     before : dict
         Its plan.
     """

@@ -17,23 +17,25 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.diagnosis.multi_position import require_model
 from pipeline.diagnosis.observability import at_its_limit, not_observable, not_observable_by_hand
 from pipeline.errors import NotObservableError
+from pipeline.estimation.accelerometer import nonlinear_least_squares
+from pipeline.estimation.multi_position import selection as by_hand
 from pipeline.estimation.multi_position.rests import is_multi_position
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import unselected
 from pipeline.model.effects import effect
 from pipeline.model.effects.base import unit_of
-from pipeline.planning.detection_limits import Expectation
-from pipeline.records import SENSORS, Noise, Recording
+from pipeline.planning.detection_limits import RestLimits, TurntableLimits
+from pipeline.records import SENSORS, Noise, Recording, SensorCalibration
 from pipeline.simulation.campaign import course_of, simulate_unit
 from pipeline.simulation.description import read_config
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.planning.detection_limits import Detection
-    from pipeline.planning.multi_position import ExpectedSelection
+    from pipeline.planning.detection_limits import Detection, DetectionLimits
     from pipeline.simulation.description import UnitDescription
     from pipeline.simulation.trajectory import Planned
 
@@ -69,17 +71,13 @@ def plan_of(unit: UnitDescription, extra: Sequence[Planned] = (), *, half_only: 
         "sensor": unit.sensor,
         "table": unit.table,
         "procedure": unit.procedure,
-        "course": {name: _plain(value) for name, value in asdict(course_of(unit)).items()},
+        "course": {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(course_of(unit)).items()},
         "at_a_table": simulated.table["motion"] != "none",
         "minutes": simulated.minutes,
         "samples": sum(r.samples for r in simulated.recordings),
         "warnings": _warnings(simulated),
         **{sensor: of_sensor(sensor, simulated, half_only=half_only) for sensor in SENSORS},
     }
-
-
-def _plain(value: Any) -> Any:  # noqa: ANN401  (a setting)
-    return list(value) if isinstance(value, tuple) else value
 
 
 def of_sensor(sensor: str, simulated: SimulatedProcedure, *, half_only: bool = False) -> Document:
@@ -93,13 +91,13 @@ def of_sensor(sensor: str, simulated: SimulatedProcedure, *, half_only: bool = F
         "reason": None,
     }
     try:
-        expectation, hidden = _expectation(sensor, simulated)
+        limits, hidden = _limits(sensor, simulated)
     except NotObservableError as error:
         return {**document, "reason": error.message}
-    for name in sorted(set(expectation.names) - set(hidden)):
-        found = expectation.detection(name, half_only=half_only)
+    for name in sorted(set(limits.names) - set(hidden)):
+        found = limits.detection(name, half_only=half_only)
         assert found is not None  # noqa: S101  (what the motion does not excite is hidden)
-        limited = bool(np.isfinite(expectation.limits[name]).any())
+        limited = bool(np.isfinite(limits.limits[name]).any())
         if limited and found.found > 1.0:
             hidden[name] = _faint(sensor, found)
         else:
@@ -108,17 +106,32 @@ def of_sensor(sensor: str, simulated: SimulatedProcedure, *, half_only: bool = F
     return document
 
 
-def _expectation(sensor: str, simulated: SimulatedProcedure) -> tuple[Expectation | ExpectedSelection, dict[str, str]]:
+def _limits(sensor: str, simulated: SimulatedProcedure) -> tuple[DetectionLimits, dict[str, str]]:
     """Return what a selection is expected to find, and the effects that it cannot find, each with the reason."""
     noise, sheet = simulated.noise[sensor], simulated.sheets[sensor]
     if is_multi_position(sensor, simulated.recordings):
-        from pipeline.planning.multi_position import ExpectedSelection, select_in_rehearsal  # noqa: PLC0415  (by hand alone)
-
-        selected = select_in_rehearsal(sensor, simulated)
-        hand = ExpectedSelection(selected, noise)
-        return hand, not_observable_by_hand(selected, [])
+        selected = select_by_hand(sensor, simulated)
+        return RestLimits(selected, noise), not_observable_by_hand(selected, [])
     selection = unselected(observe(sensor, simulated.recordings, simulated.table), [], noise, sheet)
-    return Expectation(selection, noise), not_observable(selection, [])
+    return TurntableLimits(selection, noise), not_observable(selection, [])
+
+
+def select_by_hand(sensor: str, simulated: SimulatedProcedure) -> by_hand.Selection:
+    """Return what the selection makes of a simulated procedure by hand.
+
+    Raises
+    ------
+    NotObservableError
+        If bias and matrix cannot be determined, or there are no rests.
+    """
+    sections = {"sensor": simulated.sheets, "table": simulated.table, "procedure": simulated.procedure}
+    settings: dict[str, Any] = {**sections, "effects": {"accelerometer": [], "gyroscope": []}}
+    start = nonlinear_least_squares.fit(simulated.recordings, None, settings)
+    other = None
+    if sensor == "gyroscope":
+        start, other = SensorCalibration(sensor), start
+    model = require_model(simulated.recordings, start, simulated.noise[sensor], settings, other)
+    return by_hand.select(model, start, [], simulated.noise[sensor], simulated.sheets[sensor])
 
 
 def _entry(sensor: str, found: Detection, *, limited: bool) -> Document:
@@ -165,7 +178,6 @@ def simulate_procedure(unit: UnitDescription, extra: Sequence[Planned] = ()) -> 
 
     Parameters
     ----------
-    unit : UnitDescription
     extra : sequence of Planned
         Further recordings after those of the procedure.
 

@@ -16,7 +16,7 @@ CLEARLY_SMALLER = 99.5  # per cent
 TOP = 3  # changes that are printed
 
 
-def in_words(document: Mapping[str, Any]) -> list[str]:
+def plan_text(document: Mapping[str, Any]) -> list[str]:
     """Return a plan as lines.
 
     Parameters

@@ -69,7 +69,6 @@ def attitude(
 
     Parameters
     ----------
-    accelerometer, gyroscope : SensorCalibration or None
     recordings : sequence of Recording
         Of the unit; looked at is the first of role ``validation`` that logs the table's attitude.
 
@@ -127,7 +126,6 @@ def integrate(time: Array, rate: Array, start: Rotation) -> Rotation:
     ----------
     time : (n,) array, s
     rate : (n, 3) array, deg/s
-    start : Rotation
     """
     from scipy.spatial.transform import Rotation  # noqa: PLC0415  (0.2 s that only units with a logged attitude pay)
 
@@ -158,7 +156,6 @@ def drift(time: Array, estimate: Rotation, reference: Rotation, seconds: float) 
     time : (n,) array, s
     estimate, reference : Rotation
         n each.
-    seconds : float
     """
     last = int(np.searchsorted(time, time[-1] - seconds + 1e-6, "right")) - 1
     start = np.unique(np.linspace(0, max(last, 0), STARTS).astype(int))
@@ -250,8 +247,6 @@ def gravity_direction(
 
     Parameters
     ----------
-    accelerometer, gyroscope : SensorCalibration or None
-    recordings : sequence of Recording
     noise : Noise or None
         Of the gyroscope.
     settings : mapping

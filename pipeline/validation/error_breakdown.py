@@ -49,8 +49,6 @@ def error_breakdown(
 
     Parameters
     ----------
-    calibration : SensorCalibration
-    samples : sequence of Samples
     other : SensorCalibration or None
         Of the other sensor, for effects that need its signal.
     """
@@ -76,14 +74,7 @@ def error_breakdown(
 
 
 def last_step(calibration: SensorCalibration, samples: Samples, other: SensorCalibration | None) -> Corrected | None:
-    """Return calibrated readings, magnitude and vector of the reference with all effects; None where one is left out.
-
-    Parameters
-    ----------
-    calibration : SensorCalibration
-    samples : Samples
-    other : SensorCalibration or None
-    """
+    """Return calibrated readings, magnitude and vector of the reference with all effects; None if one is left out."""
     if any(_lack(calibration, fitted, samples) for fitted in calibration.effects):
         return None
     return _with_effects(calibration, calibration.effects, other, samples)

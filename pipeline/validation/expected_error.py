@@ -92,8 +92,6 @@ def linearized(
 
     Parameters
     ----------
-    calibration : SensorCalibration
-    samples : Samples
     truth : (n, 3) array
         Of the reference.
     other : SensorCalibration or None
@@ -162,8 +160,6 @@ def expected_rms_error(
     ----------
     calibration : SensorCalibration
         With its covariance; without one, its parameters count as exact.
-    held_out : sequence of LinearizedSamples
-    noise : Noise
     settings : mapping
         Sections ``table`` (``rate_accuracy``) and ``sensor`` (``bias_wander``, ``wander_time_s``, ``counts_per_unit``).
     fitted_s : float, s

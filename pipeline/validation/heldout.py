@@ -58,10 +58,8 @@ def validate(
 
     Parameters
     ----------
-    calibration : SensorCalibration
     recordings : sequence of Recording
         All of the unit, filtered as for the fit.
-    noise : Noise
     settings : mapping
         Sections ``table``, ``procedure``, ``limits`` and, for the expected error, ``sensor``.
     other : SensorCalibration, optional
@@ -181,13 +179,7 @@ def last_error(
 
 
 def noise_floors(calibration: SensorCalibration, samples: Sequence[Samples]) -> tuple[float, float | None]:
-    """Return the rms error, and where an attitude is known the vector rms error, that noise alone would give.
-
-    Parameters
-    ----------
-    calibration : SensorCalibration
-    samples : sequence of Samples
-    """
+    """Return the rms error, and where an attitude is known the vector rms error, that noise alone would give."""
     squares = [
         squared_norm_errors(_truth(calibration, s)[s.known], calibration.matrix, s.variance[s.known]) for s in samples
     ]

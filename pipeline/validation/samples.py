@@ -73,9 +73,6 @@ def samples_of_motion(
 
     Parameters
     ----------
-    sensor : str
-    recording : Recording
-    noise : Noise
     table : mapping
         ``gravity_g``, ``latitude_deg``, ``azimuth_deg``.
     smoothed : bool
@@ -124,14 +121,6 @@ def samples_of_rests(
 
     Of a gyroscope they are less the rate at which the unit creeps, as far as the accelerometer shows it; what it does
     not show counts as noise of the rest (``pipeline.signal.creep``).
-
-    Parameters
-    ----------
-    sensor : str
-    recording : Recording
-    rests : sequence of Rest
-    noise : Noise
-    table : mapping
     """
     reading, counts = rest_means(recording, rests, sensor)
     rests = [rest for rest, count in zip(rests, counts, strict=False) if count]

@@ -8,8 +8,7 @@ import numpy as np
 
 from pipeline.estimation.selection import GATE_BIC
 from pipeline.planning.changes import changes
-from pipeline.planning.multi_position import select_in_rehearsal
-from pipeline.planning.plan import ROOM, of_sensor, simulate_procedure
+from pipeline.planning.plan import ROOM, of_sensor, select_by_hand, simulate_procedure
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription
 
@@ -28,7 +27,7 @@ def test_half_of_the_units_are_found_within_a_factor_of_the_planned_size_by_hand
             signs = np.random.default_rng([number, 7]).choice([-1.0, 1.0], len(sizes))
             hidden = {"accelerometer.quadratic_nonlinearity": (factor * sizes * signs).tolist()}
             recordings, _ = simulate_unit(replace(POSITIONS, effects=hidden), 2, number)
-            selection = select_in_rehearsal("accelerometer", replace(rehearsal, recordings=recordings))
+            selection = select_by_hand("accelerometer", replace(rehearsal, recordings=recordings))
             found[factor] += selection.first.scores["quadratic_nonlinearity"].delta_bic > GATE_BIC
     assert found[FACTOR] >= MOST, found
     assert found[1.0 / FACTOR] <= UNITS - MOST, found
