@@ -11,11 +11,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from pipeline.model.compensation import OF_THE_PAST, OF_THE_ROOM, SMOOTHING_S
-from pipeline.model.effects import effect_of, owner_of
-from pipeline.model.effects.base import REFERENCE_TEMPERATURE, Owner
+from pipeline.model.compensation import OF_THE_PAST, SMOOTHING_S, Steps, circular
+from pipeline.model.effects import effect_of
+from pipeline.model.effects.base import REFERENCE_TEMPERATURE
 from pipeline.model.formula import c_number
 from pipeline.model.log_motion import SIGNALS
+from pipeline.model.measurement import sensor_effects
 from pipeline.records import SENSORS
 
 if TYPE_CHECKING:
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from pipeline.records import FittedEffect, SensorCalibration
 
 ROUNDS = 12  # of the fixed point: each gains about two digits, and 1e-13 is asked for
-ACROSS = {"accelerometer": {"specific_force"}, "gyroscope": {"angular_rate", "angular_acceleration", "direction"}}
 IN_C = set(SIGNALS) - {"specific_force_rate"}
 
 
@@ -38,8 +38,6 @@ class SensorPlan:
     steady: list[str] = field(default_factory=list)
     moving: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
-    fields: set[str] = field(default_factory=set)
-    depends_on: set[str] = field(default_factory=set)
     with_time: list[str] = field(default_factory=list)
 
 
@@ -65,62 +63,54 @@ class Plan:
 
 def plan_of(sensors: Mapping[str, ExportedSensor]) -> Plan:
     """Return the plan of a header for the calibrated sensors."""
-    plans = {s: _sensor_plan(sensors[s].calibration if s in sensors else None) for s in SENSORS}
-    busy = {s for s, plan in plans.items() if plan.moving}
-    in_turn = {
-        s
-        for s in busy
-        if s in plans[s].depends_on or plans[s].depends_on & {o for o in busy if s in plans[o].depends_on}
-    }
-    fields = set().union(*(plan.fields for plan in plans.values()))
-    past = bool(fields & OF_THE_PAST)
+    plans, steps = {}, {}
+    for sensor in SENSORS:
+        calibration = sensors[sensor].calibration if sensor in sensors else None
+        plans[sensor], steps[sensor] = _sensor_plan(sensor, calibration)
+    in_turn = circular(steps)
+    used = set().union(*(step.used for step in steps.values()))
+    past = bool(used & OF_THE_PAST)
     return Plan(
         sensors=plans,
         in_turn=in_turn,
         past=past,
-        temperature="temperature" in fields,
+        temperature="temperature" in used,
         with_time=sorted({name for plan in plans.values() for name in plan.with_time}),
         rounds=ROUNDS if in_turn else 1,
         ends=ROUNDS if in_turn and past else 1,
     )
 
 
-def _sensor_plan(calibration: SensorCalibration | None) -> SensorPlan:
+def _sensor_plan(sensor: str, calibration: SensorCalibration | None) -> tuple[SensorPlan, Steps]:
     """Return bias, matrix and effects of a sensor; one that is not calibrated passes through."""
     if calibration is None:
-        return SensorPlan(["(imu_real)0.0"] * 3, [[c_number(float(i == j)) for j in range(3)] for i in range(3)])
+        unchanged = [[c_number(float(i == j)) for j in range(3)] for i in range(3)]
+        return SensorPlan([c_number(0.0)] * 3, unchanged), Steps.of(sensor, ())
     matrix = [[c_number(x) for x in row] for row in calibration.matrix.tolist()]
     plan = SensorPlan([c_number(b) for b in calibration.bias.tolist()], matrix)
-    for fitted in calibration.effects:
-        if owner_of(fitted) == Owner.SENSOR:
-            _add(plan, calibration.sensor, fitted)
-    return plan
+    known = []
+    for fitted in sensor_effects(calibration):
+        if why := _not_in_c(sensor, fitted):
+            plan.left_out.append(f"{fitted.name} ({why})")
+        else:
+            known.append(fitted)
+    steps = Steps.of(sensor, known)
+    for effects, lines in ((steps.steady, plan.steady), (steps.moving, plan.moving)):
+        for fitted in effects:
+            with_time = bool(steps.fields[fitted.name] & ({"time"} | OF_THE_PAST))
+            condition = "if (!m->alone) " if with_time else ""
+            plan.with_time += [fitted.name] if with_time else []
+            terms = effect_of(fitted).in_c(fitted.values) or ()
+            lines += [f"{condition}r[{i}] -= {term}; /* {fitted.name} */" for i, term in enumerate(terms)]
+    return plan, steps
 
 
-def _add(plan: SensorPlan, sensor: str, fitted: FittedEffect) -> None:
-    """Add the assignments of an effect, or the reason why there are none."""
+def _not_in_c(sensor: str, fitted: FittedEffect) -> str:
+    """Return why the header leaves an effect out; empty where it does not."""
     if fitted.definition and "python" in fitted.definition:
-        why = "it is in Python; python -m pipeline apply --python-effect takes it off"
-        plan.left_out.append(f"{fitted.name} ({why})")
-        return
+        return "it is in Python; python -m pipeline apply --python-effect takes it off"
     effect = effect_of(fitted)
-    terms, fields = effect.in_c(fitted.values), effect.fields(sensor, fitted.values)
-    if terms is None:
-        plan.left_out.append(f"{fitted.name} (its equation has no form in C; python -m pipeline apply takes it off)")
-        return
-    if fields - IN_C:
-        plan.left_out.append(
-            f"{fitted.name} (it needs {', '.join(sorted(fields - IN_C))}, which this header does not know)"
-        )
-        return
-    alone = not fields & ({"time"} | OF_THE_PAST)
-    condition = "" if alone else "if (!m->alone) "
-    lines = [f"{condition}r[{i}] -= {term}; /* {fitted.name} */" for i, term in enumerate(terms)]
-    plan.fields |= fields
-    if fields - OF_THE_ROOM:
-        plan.moving += lines
-        plan.depends_on |= {s for s, own in ACROSS.items() if own & fields}
-    else:
-        plan.steady += lines
-    if not alone:
-        plan.with_time.append(fitted.name)
+    if effect.in_c(fitted.values) is None:
+        return "its equation has no form in C; python -m pipeline apply takes it off"
+    unknown = sorted(effect.fields(sensor, fitted.values) - IN_C)
+    return f"it needs {', '.join(unknown)}, which this header does not know" if unknown else ""

@@ -11,7 +11,7 @@ iteration. The effects of a sensor that depend on the other sensor's truth alone
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
@@ -32,9 +32,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.model.measurement import Truths
-    from pipeline.records import Motion, SensorCalibration
+    from pipeline.records import FittedEffect, Motion, SensorCalibration
 
-SMOOTHING_S = 3.0
+SMOOTHING_S = 3.0  # thirty samples of a thermometer that is read ten times a second
 BLOCK = 8192  # samples that are computed at once: their arrays stay in the processor's cache
 OF_THE_ROOM = {"time", "temperature"}  # fields of a motion that do not depend on the readings
 OF_THE_PAST = {"specific_force_rate", "angular_acceleration", "direction"}
@@ -48,56 +48,51 @@ class Compensated(NamedTuple):
 
 
 @dataclass(frozen=True)
-class _Steps:
-    """What is subtracted from the readings of one sensor.
+class Steps:
+    """The effects of one sensor by what they depend on, for Python and for ``calibration.h``.
 
     Attributes
     ----------
-    steady : Part
-        The effects that depend on the time and the temperature alone.
-    moving : Part
+    steady : list of FittedEffect
+        Those that depend on the time and the temperature alone.
+    moving : list of FittedEffect
         Those that depend on the truth.
-    used : set of str
-        Fields of a motion that the effects use.
-    looks_at : set of str
-        Sensors on whose truths the moving ones depend.
-    signals : dict of str to set of str
-        Effect to the signals that it needs.
+    fields : dict of str to set of str
+        Effect to the fields of a motion that it reads.
     """
 
-    steady: Part
-    moving: Part
-    used: set[str]
-    looks_at: set[str]
-    signals: dict[str, set[str]]
+    steady: list[FittedEffect]
+    moving: list[FittedEffect]
+    fields: dict[str, set[str]]
 
     @classmethod
-    def of(cls, calibration: SensorCalibration) -> Self:
-        """Return the steps of a calibration."""
-        effects = sensor_effects(calibration)
-        fields = {e.name: fields_used(calibration.sensor, [e]) for e in effects}
-        signals = {name: set().union(*(SIGNALS[f] for f in used)) for name, used in fields.items()}
+    def of(cls, sensor: str, effects: Sequence[FittedEffect]) -> Self:
+        """Return the steps of some effects of a sensor."""
+        fields = {e.name: fields_used(sensor, [e]) for e in effects}
         moving = [e for e in effects if fields[e.name] - OF_THE_ROOM]
-        return cls(
-            steady=Part.of(calibration, [e for e in effects if e not in moving]),
-            moving=Part.of(calibration, moving),
-            used=set().union(*fields.values()),
-            looks_at=set().union(*(signals[e.name] for e in moving)) & set(SENSORS),
-            signals=signals,
-        )
+        return cls([e for e in effects if e not in moving], moving, fields)
+
+    @property
+    def used(self) -> set[str]:
+        """All fields that the effects read."""
+        return set().union(*self.fields.values())
+
+    def needs(self, effect: str) -> set[str]:
+        """Return the signals of a log that an effect needs."""
+        return set().union(*(SIGNALS[field] for field in self.fields[effect]))
 
 
-def _circular(steps: Mapping[str, _Steps]) -> set[str]:
+def circular(steps: Mapping[str, Steps]) -> set[str]:
     """Return the sensors whose effects depend on what they change, directly or through the other sensor."""
-    looks_at = {s: step.looks_at & {o for o in steps if steps[o].moving.effects} for s, step in steps.items()}
+    moving = {s for s, step in steps.items() if step.moving}
+    looks_at = {s: set().union(*(steps[s].needs(e.name) for e in steps[s].moving)) & moving for s in moving}
     return {s for s, seen in looks_at.items() if any(other == s or s in looks_at[other] for other in seen)}
 
 
-@dataclass
 class CompensationStream:
     """Compensation of one log, block by block.
 
-    Attributes
+    Parameters
     ----------
     unit : str
     calibrations : dict of str to SensorCalibration
@@ -106,23 +101,19 @@ class CompensationStream:
         Memory of the temperature's smoothing (``pipeline.model.exponential_regression``); 0: none.
     """
 
-    unit: str
-    calibrations: dict[str, SensorCalibration]
-    smoothing: float
-    steps: dict[str, _Steps] = field(init=False)
-    _line: ExponentialRegression = field(init=False)
-    _ends: list[LogEnd] = field(init=False)  # of the last block, one for each iteration
-
-    def __post_init__(self) -> None:
-        """Prepare the steps, and a memory of the past."""
-        self.steps = {s: _Steps.of(c) for s, c in self.calibrations.items()}
-        self._line = ExponentialRegression(self.smoothing or 1.0)
-        self._ends = [LogEnd()]
+    def __init__(self, unit: str, calibrations: dict[str, SensorCalibration], smoothing: float) -> None:
+        self.unit, self.smoothing = unit, smoothing
+        self.steps = {s: Steps.of(s, sensor_effects(c)) for s, c in calibrations.items()}
+        self._steady = {s: Part.of(c, self.steps[s].steady) for s, c in calibrations.items()}
+        self._moving = {s: Part.of(c, self.steps[s].moving) for s, c in calibrations.items()}
+        self._linear = {s: Part.of(c, ()) for s, c in calibrations.items()}
+        self._line = ExponentialRegression(smoothing or 1.0)
+        self._ends = [LogEnd()]  # of the last block, one for each iteration
 
     @property
     def needs(self) -> set[str]:
         """Signals that the effects need: ``accelerometer``, ``gyroscope``, ``temperature``, ``time``."""
-        return set().union(*(need for step in self.steps.values() for need in step.signals.values()))
+        return set().union(*(step.needs(effect) for step in self.steps.values() for effect in step.fields))
 
     def apply(
         self,
@@ -135,25 +126,24 @@ class CompensationStream:
         given = {"accelerometer": accelerometer, "gyroscope": gyroscope, "temperature": temperature, "time": time}
         arrays, single = _checked(given)
         self._require(arrays)
-        n = len(next(iter(arrays.values())))
-        if n <= BLOCK:
-            found = self._block(_by_axis(arrays)) if n else arrays
-        else:
-            found = {s: np.empty((n, 3)) if s in self.steps else arrays[s] for s in SENSORS if s in arrays}
-            for start in range(0, n, BLOCK):
-                cut = _by_axis({name: a[start : start + BLOCK] for name, a in arrays.items()})
-                for s, truth in self._block(cut).items():
-                    if s in self.steps:
-                        found[s][start : start + BLOCK] = truth
-        kept = {s: np.ascontiguousarray(found[s]) if s in self.steps else arrays[s] for s in SENSORS if s in arrays}
-        shaped = {s: value[0] if single else value for s, value in kept.items()}
+        sensors = [s for s in SENSORS if s in arrays]
+        n = len(arrays[sensors[0]])
+        found = {s: np.empty((n, 3)) if s in self.steps else arrays[s] for s in sensors}
+        for start in range(0, n, BLOCK):
+            block = slice(start, start + BLOCK)
+            # as doubles, axis by axis in memory: so they are processed
+            cut = {name: np.asarray(a[block], np.float64, order="F") for name, a in arrays.items()}
+            for s, truth in self._block(cut).items():
+                if s in self.steps:
+                    found[s][block] = truth
+        shaped = {s: value[0] if single else value for s, value in found.items()}
         return Compensated(shaped.get("accelerometer"), shaped.get("gyroscope"))
 
     def _block(self, arrays: Mapping[str, NDArray[np.float64]]) -> Truths:
         """Return the truths of some samples."""
         readings = {s: arrays[s] for s in SENSORS if s in arrays}
         steps = {s: self.steps[s] for s in readings if s in self.steps}
-        used = set().union(*(p.used for p in steps.values()))
+        used = set().union(*(step.used for step in steps.values()))
         nothing = np.zeros_like(next(iter(readings.values()))) if used else np.zeros((0, 3))
         clock, warmth = arrays.get("time", nothing[:, 0]), arrays.get("temperature")
         if warmth is not None and "time" in arrays and "temperature" in used and self.smoothing > 0:
@@ -164,20 +154,19 @@ class CompensationStream:
             end = self._ends[min(number, len(self._ends) - 1)]
             return log_motion(clock, specific_force=force, angular_rate=rate, temperature=warmth, used=used, end=end)
 
-        if any(step.steady.effects for step in steps.values()):
+        if any(step.steady for step in steps.values()):
             room = log_motion(
                 clock, specific_force=nothing, angular_rate=nothing, temperature=warmth, used=set(), end=LogEnd()
             )
-            readings |= {s: step.steady.take_off(readings[s], room) for s, step in steps.items()}
+            readings |= {s: self._steady[s].take_off(readings[s], room) for s in steps}
         return self._solved(steps, readings, true_motion, used & OF_THE_PAST)
 
     def _solved(
-        self, steps: dict[str, _Steps], readings: Truths, true_motion: Callable[[Truths, int], Motion], past: set[str]
+        self, steps: dict[str, Steps], readings: Truths, true_motion: Callable[[Truths, int], Motion], past: set[str]
     ) -> Truths:
         """Subtract the effects that depend on the truth, and keep the end of the block in each iteration."""
-        parts = {s: step.moving for s, step in steps.items()}
-        circular = _circular(steps)
-        once = {s: part for s, part in parts.items() if part.effects and s not in circular}
+        turns = circular(steps)
+        once = {s: self._moving[s] for s, step in steps.items() if step.moving and s not in turns}
         ends: list[LogEnd] = []
 
         def noted(truths: Truths, number: int) -> Motion:
@@ -186,12 +175,12 @@ class CompensationStream:
                 ends.append(self._ends[min(number, len(self._ends) - 1)].after(motion, past))
             return motion
 
-        truths = solve({s: p if s in circular else p.without() for s, p in parts.items()}, readings, noted)
+        truths = solve({s: self._moving[s] if s in turns else self._linear[s] for s in steps}, readings, noted)
         settled = len(ends)
-        for number in range(settled, max(settled + 1, len(self._ends)) if circular and past else settled):
+        for number in range(settled, max(settled + 1, len(self._ends)) if turns and past else settled):
             noted(truths, number)
         if once:
-            motion = true_motion(truths, len(self._ends)) if circular else noted(truths, 0)
+            motion = true_motion(truths, len(self._ends)) if turns else noted(truths, 0)
             truths |= without_effects(once, readings, motion)
         self._ends = ends or self._ends
         return truths
@@ -199,18 +188,13 @@ class CompensationStream:
     def _require(self, arrays: Mapping[str, Any]) -> None:
         """Refuse a log that lacks what an effect needs."""
         for sensor in set(self.steps) & set(arrays):
-            for name, signals in self.steps[sensor].signals.items():
-                missing = sorted(signals - set(arrays))
+            for effect in self.steps[sensor].fields:
+                missing = sorted(self.steps[sensor].needs(effect) - set(arrays))
                 if missing:
                     raise InputError(
-                        f"the {sensor} of unit {self.unit} was calibrated with the effect {name}, "
+                        f"the {sensor} of unit {self.unit} was calibrated with the effect {effect}, "
                         f"which needs {' and '.join(missing)}: give that too, or calibrate without the effect"
                     )
-
-
-def _by_axis(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[np.float64]]:
-    """Return signals as doubles, axis by axis in memory, as they are processed."""
-    return {name: np.asarray(array, np.float64, order="F") for name, array in arrays.items()}
 
 
 def _checked(given: dict[str, Any]) -> tuple[dict[str, NDArray[Any]], bool]:

@@ -14,8 +14,6 @@ blocks and a whole log give the same numbers to the last bit.
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, field
-from math import floor
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,18 +29,13 @@ FARTHEST = 50.0  # memories that time may go back: exp(50) of the sums is still 
 DEGENERATE = 1e-15  # determinant over its scale, below which a double holds no slope
 
 
-@dataclass
 class ExponentialRegression:
-    """Exponential regression of a temperature log.
+    """Exponential regression of a temperature log with a memory in s."""
 
-    Attributes
-    ----------
-    memory : float, s
-    """
-
-    memory: float
-    _stretch: float = field(default=float("nan"), init=False)
-    _sums: tuple[float, ...] = field(default=(0.0,) * 5, init=False)
+    def __init__(self, memory: float) -> None:
+        self.memory = memory
+        self._stretch = float("nan")
+        self._sums = np.zeros(5)
 
     def apply(self, time: NDArray[np.float64], temperature: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the line at each sample: (n,) array, degC; a row without a temperature (NaN) is given the line's.
@@ -52,13 +45,10 @@ class ExponentialRegression:
         InputError
             If time goes back by more than the line can bear.
         """
-        if len(time) == 1:
-            return np.array([self._next(float(time[0]), float(temperature[0]))])
         stretch = np.floor(time / (STRETCH * self.memory))
         cuts = np.flatnonzero(stretch[1:] != stretch[:-1]) + 1
-        edges = [0, *cuts.tolist(), len(time)]
         out = np.empty(len(time))
-        for start, end in itertools.pairwise(edges):
+        for start, end in itertools.pairwise([0, *cuts.tolist(), len(time)]):
             self._move(float(stretch[start]), float(time[start]))
             out[start:end] = self._along(time[start:end], temperature[start:end])
         return out
@@ -67,63 +57,28 @@ class ExponentialRegression:
         """Carry the sums over to the start of another stretch."""
         step = (stretch - self._stretch) * (STRETCH * self.memory)
         self._stretch = stretch
-        if step == 0.0 or step != step or not self._sums[0]:  # noqa: PLR0124  (NaN: nothing is known yet)
+        if not abs(step) > 0.0 or not self._sums[0]:  # NaN: nothing is known yet
             return
         if step < -FARTHEST * self.memory:
             raise InputError(f"time goes back by {-step:.6g} s or so to {time:.6f} s; sort the log, or cut it there")
         s0, s1, s2, r0, r1 = self._sums
-        fade = float(np.exp(-step / self.memory))
         moved = (s0, s1 - step * s0, s2 - 2.0 * step * s1 + step * step * s0, r0, r1 - step * r0)
-        self._sums = tuple(fade * s for s in moved)
-
-    def _next(self, time: float, temperature: float) -> float:
-        """Return the line at one sample: what ``_along`` does, without the cost of arrays."""
-        self._move(float(floor(time / (STRETCH * self.memory))), time)
-        at = time - self._stretch * (STRETCH * self.memory)
-        s0, s1, s2, r0, r1 = self._sums
-        if temperature == temperature:  # noqa: PLR0124  (not NaN)
-            weight, above = float(np.exp(at / self.memory)), temperature - REFERENCE_TEMPERATURE
-            leaned = weight * at
-            s0, s1, s2 = s0 + weight, s1 + leaned, s2 + leaned * at
-            r0, r1 = r0 + weight * above, r1 + leaned * above
-            self._sums = (s0, s1, s2, r0, r1)
-        if not s0 > 0.0:
-            return float("nan")
-        here1, here2 = s1 - at * s0, s2 - 2.0 * at * s1 + at * at * s0
-        determinant = s0 * here2 - here1 * here1
-        if determinant > DEGENERATE * s0 * s0 * self.memory * self.memory:
-            return (here2 * r0 - here1 * (r1 - at * r0)) / determinant + REFERENCE_TEMPERATURE
-        return r0 / s0 + REFERENCE_TEMPERATURE
+        self._sums = np.exp(-step / self.memory) * np.array(moved)
 
     def _along(self, time: NDArray[np.float64], temperature: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the line within a stretch."""
+        """Return the line within a stretch; of one known sample, its temperature."""
         at = time - self._stretch * (STRETCH * self.memory)
-        above = temperature - REFERENCE_TEMPERATURE
-        missing = np.isnan(above)
-        weight = np.exp(at / self.memory)
-        if missing.any():
-            weight[missing] = 0.0
-            above[missing] = 0.0
-        terms = np.empty((5, len(at) + 1))
-        terms[:, 0] = self._sums
-        terms[0, 1:] = weight
-        np.multiply(weight, at, out=terms[1, 1:])
-        np.multiply(terms[1, 1:], at, out=terms[2, 1:])
-        np.multiply(weight, above, out=terms[3, 1:])
-        np.multiply(terms[1, 1:], above, out=terms[4, 1:])
-        sums = np.add.accumulate(terms, axis=1)[:, 1:]
-        self._sums = tuple(sums[:, -1].tolist())
-        return _line_at(sums, at, self.memory)
-
-
-def _line_at(sums: NDArray[np.float64], at: NDArray[np.float64], memory: float) -> NDArray[np.float64]:
-    """Return the value at ``at`` of the lines with these sums; of one known sample, its temperature."""
-    s0, s1, s2, r0, r1 = sums
-    here1 = s1 - at * s0
-    here2 = s2 - 2.0 * at * s1 + at * at * s0
-    determinant = s0 * here2 - here1 * here1
-    sloping = determinant > DEGENERATE * s0 * s0 * memory * memory
-    value = np.divide(r0, s0, out=np.full(len(at), np.nan), where=s0 > 0)
-    line = here2 * r0 - here1 * (r1 - at * r0)
-    np.divide(line, determinant, out=value, where=sloping)
-    return np.asarray(value + REFERENCE_TEMPERATURE, np.float64)
+        missing = np.isnan(temperature)
+        above = np.where(missing, 0.0, temperature - REFERENCE_TEMPERATURE)
+        weight = np.where(missing, 0.0, np.exp(at / self.memory))
+        leaned = weight * at
+        terms = np.array([weight, leaned, leaned * at, weight * above, leaned * above])
+        sums = np.add.accumulate(np.column_stack([self._sums, terms]), axis=1)[:, 1:]
+        self._sums = sums[:, -1]
+        s0, s1, s2, r0, r1 = sums
+        first, second = s1 - at * s0, s2 - 2.0 * at * s1 + at * at * s0
+        determinant = s0 * second - first * first
+        sloping = determinant > DEGENERATE * s0 * s0 * self.memory * self.memory
+        value = np.divide(r0, s0, out=np.full(len(at), np.nan), where=s0 > 0)
+        np.divide(second * r0 - first * (r1 - at * r0), determinant, out=value, where=sloping)
+        return np.asarray(value + REFERENCE_TEMPERATURE, np.float64)

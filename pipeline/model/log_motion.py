@@ -68,19 +68,9 @@ def log_motion(
     used: set[str],
     end: LogEnd,
 ) -> Motion:
-    """Return the motion of a block.
+    """Return the motion of a block; ``temperature`` is smoothed, ``end`` is of the block before.
 
-    Parameters
-    ----------
-    time : (n,) array, s
-    specific_force : (n, 3) array, g
-    angular_rate : (n, 3) array, deg/s
-    temperature : (n,) array, degC, or None
-        Smoothed.
-    used : set of str
-        Fields of ``Motion`` that are needed; of the others only those that cost nothing are filled.
-    end : LogEnd
-        Of the block before.
+    Of the fields that are not ``used``, only those that cost nothing are filled.
     """
     zeros = np.zeros_like(specific_force)
     rate = _difference(time, specific_force, end.force) if "specific_force_rate" in used else zeros

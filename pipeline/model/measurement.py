@@ -38,16 +38,7 @@ OUT_OF_REACH = 1e12  # g or deg/s: far beyond any reading, the fixed point runs 
 
 @dataclass(frozen=True)
 class Part:
-    """What is taken off the readings of one sensor.
-
-    Attributes
-    ----------
-    calibration : SensorCalibration
-    effects : tuple of (Effect, (p,) array)
-        With their parameters.
-    K : (3, 3) array
-        Inverse of the calibration matrix.
-    """
+    """Effects with their values that are taken off the readings of a sensor, and K, the inverse of its matrix."""
 
     calibration: SensorCalibration
     effects: tuple[tuple[Effect, NDArray[np.float64]], ...]
@@ -58,10 +49,6 @@ class Part:
         """Return the part that takes off the given effects of a calibration."""
         return cls(calibration, tuple((effect_of(e), e.values) for e in effects), inverse_of(calibration))
 
-    def without(self) -> Part:
-        """Return the part that takes off no effect."""
-        return replace(self, effects=())
-
     def take_off(self, reading: NDArray[np.float64], motion: Motion) -> NDArray[np.float64]:
         """Return readings without what the effects add at a motion: (n, 3) array, g or deg/s."""
         for effect, values in self.effects:
@@ -70,34 +57,15 @@ class Part:
 
 
 def predicted_reading(calibration: SensorCalibration, motion: Motion) -> NDArray[np.float64]:
-    """Return ``bias + K @ truth + sum of effects``: (n, 3) array, g or deg/s.
-
-    Parameters
-    ----------
-    calibration : SensorCalibration
-    motion : Motion
-    """
+    """Return ``bias + K @ truth + sum of effects``: (n, 3) array, g or deg/s; motion by the reference's clock."""
     K = inverse_of(calibration)
-    motion = sensed_motion(calibration, motion)
+    for fitted in calibration.effects:
+        motion = effect_of(fitted).moved(motion, fitted.values)
     reading = calibration.bias + truth(calibration.sensor, motion) @ K.T
     for fitted in calibration.effects:
         if not effect_of(fitted).moves:
             reading = reading + effect_of(fitted).reading(calibration.sensor, motion, K, fitted.values)
     return reading
-
-
-def sensed_motion(calibration: SensorCalibration, motion: Motion) -> Motion:
-    """Return the motion that the sensor shows at its time stamps: after the fitted effects of timing.
-
-    Parameters
-    ----------
-    calibration : SensorCalibration
-    motion : Motion
-        By the clock of the reference.
-    """
-    for fitted in calibration.effects:
-        motion = effect_of(fitted).moved(motion, fitted.values)
-    return motion
 
 
 def compensate(
@@ -106,36 +74,18 @@ def compensate(
     motion: Motion,
     effects: Sequence[FittedEffect] | None = None,
 ) -> NDArray[np.float64]:
-    """Return the truth by a sensor's readings; the rest of the motion is known.
+    """Return the truth by (n, 3) readings; the rest of the motion is known.
 
-    Parameters
-    ----------
-    calibration : SensorCalibration
-    reading : (n, 3) array, g or deg/s
-    motion : Motion
-        Its truth of this sensor is not used: it is solved for.
-    effects : sequence of FittedEffect, optional
-        Those to take off; by default all of the calibration that belong to the sensor.
-
-    Returns
-    -------
-    (n, 3) array, same unit
-
-    Raises
-    ------
-    ConvergenceError
-        If a reading is so far out of range that the equation has no solution.
+    ``effects`` are taken off, by default all of the calibration that belong to the sensor. Errors as of ``solve``.
     """
-    chosen = sensor_effects(calibration) if effects is None else effects
+    sensor = calibration.sensor
+    own = "specific_force" if sensor == "accelerometer" else "angular_rate"
 
     def motion_at(truths: Truths, _number: int) -> Motion:
-        own = truths[calibration.sensor]
-        if calibration.sensor == "accelerometer":
-            return replace(motion, specific_force=own)
-        return replace(motion, angular_rate=own)
+        return replace(motion, **{own: truths[sensor]})  # type: ignore[arg-type]
 
-    sensor = calibration.sensor
-    return solve({sensor: Part.of(calibration, chosen)}, {sensor: reading}, motion_at)[sensor]
+    part = Part.of(calibration, sensor_effects(calibration) if effects is None else effects)
+    return solve({sensor: part}, {sensor: reading}, motion_at)[sensor]
 
 
 def sensor_effects(calibration: SensorCalibration) -> list[FittedEffect]:
@@ -143,26 +93,22 @@ def sensor_effects(calibration: SensorCalibration) -> list[FittedEffect]:
     return [fitted for fitted in calibration.effects if owner_of(fitted) == Owner.SENSOR]
 
 
-def solve(
-    parts: Mapping[str, Part],
-    readings: Truths,
-    motion_at: Callable[[Truths, int], Motion],
-) -> Truths:
+def solve(parts: Mapping[str, Part], readings: Truths, motion_at: Callable[[Truths, int], Motion]) -> Truths:
     """Solve the measurement equation of one or both sensors.
 
     Parameters
     ----------
     parts : mapping
-        Sensor to what is to be taken off; the readings of a sensor without are taken for the truth.
+        By sensor; the readings of a sensor without are the truth.
     readings : dict
-        Sensor to (n, 3) array, g or deg/s.
+        By sensor, (n, 3) array, g or deg/s.
     motion_at : callable
-        The motion that given truths make, in a round counted from 0.
+        Returns the motion that given truths make, in a round counted from 0.
 
     Returns
     -------
     dict
-        Sensor to (n, 3) array of its truth.
+        By sensor, (n, 3) array of its truth.
 
     Raises
     ------
@@ -199,9 +145,6 @@ def linear_truth(calibration: SensorCalibration, reading: NDArray[np.float64]) -
     Each row's terms are added in their order, so that no rounding depends on how many samples there are.
     """
     rest = reading - calibration.bias
-    if len(rest) == 1:  # without the cost of arrays
-        x, y, z = rest[0].tolist()
-        return np.array([[(a * x + b * y) + c * z for a, b, c in calibration.matrix.tolist()]])
     x, y, z = rest.T
     truth = np.empty_like(rest)
     for c, (along_x, along_y, along_z) in enumerate(calibration.matrix.tolist()):
