@@ -63,6 +63,6 @@ def run_jobs(campaign: Campaign) -> int:
 
 def run_campaign(directory: Path, **settings: Any) -> tuple[Campaign, int]:
     """Run the campaign in a directory, its results beside it; return it and the exit code of the run."""
-    results = settings.pop("results", directory.parent / "results")
+    results = settings.pop("results", directory.absolute().parent / "results")
     campaign = load_campaign({"campaign": str(directory), "results": str(results), **settings})
     return campaign, run_jobs(campaign)

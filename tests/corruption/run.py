@@ -12,7 +12,9 @@ import shutil
 import subprocess
 import sys
 from collections import Counter
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -26,6 +28,9 @@ from unit_copy import TIME, Copy, NotApplicableError, write
 from pipeline.config import load_campaign
 from pipeline.errors import PipelineError
 
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
 ROOT = Path(__file__).parents[2]
 LATEST_S = 2.0**63 / 1e9
 COLUMNS = ("unit", "sensor", "table", "procedure", "method", "filter", "overrides")
@@ -38,7 +43,7 @@ def main() -> int:
     out = Path(options.out).resolve()
     shutil.rmtree(out, ignore_errors=True)
     copies = drawn(options)
-    judgements = run(copies, out, options.cores)
+    judgements = run(copies, out, partial(by_snakemake, cores=options.cores))
     text = report(judgements, options.seed)
     (out / "table.txt").write_text(text, encoding="utf-8")
     sys.stdout.write(text)
@@ -102,8 +107,19 @@ def _writable(copy: Copy) -> Copy:
     return copy
 
 
-def run(copies: list[Copy], out: Path, cores: int = 1) -> list[Judgement]:
-    """Write the campaign, calibrate it by the real command, and judge every unit."""
+def by_snakemake(campaign: Path, results: Path, cores: int = 1) -> None:
+    """Calibrate a campaign by the real command."""
+    settings = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+    command = [Path(sys.executable).with_name("snakemake"), "--cores", cores, "--quiet", "all"]
+    command += ["--config", f"campaign={campaign}", f"results={results}"]
+    with (results.parent / "run.log").open("w", encoding="utf-8") as log:
+        subprocess.run(
+            [str(c) for c in command], cwd=ROOT, env={**os.environ, **settings}, stdout=log, stderr=log, check=False
+        )
+
+
+def run(copies: list[Copy], out: Path, calibrate: Callable[[Path, Path], object] = by_snakemake) -> list[Judgement]:
+    """Write the campaign, calibrate it, and judge every unit."""
     campaign = out / "corrupted"
     judgements, rows, kept = [], [], []
     for copy in copies:
@@ -118,21 +134,7 @@ def run(copies: list[Copy], out: Path, cores: int = 1) -> list[Judgement]:
         rows.append(row)
         kept.append(copy)
     sheet(campaign, rows)
-    settings = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
-    command = [
-        Path(sys.executable).with_name("snakemake"),
-        "--cores",
-        cores,
-        "--quiet",
-        "all",
-        "--config",
-        f"campaign={campaign}",
-        f"results={out / 'results'}",
-    ]
-    with (out / "run.log").open("w", encoding="utf-8") as log:
-        subprocess.run(
-            [str(c) for c in command], cwd=ROOT, env={**os.environ, **settings}, stdout=log, stderr=log, check=False
-        )
+    calibrate(campaign, out / "results")
     for copy in kept:
         judgements += judge(copy, out / "results" / "corrupted")
     return judgements

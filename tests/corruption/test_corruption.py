@@ -9,6 +9,7 @@ import pytest
 from all_ways import single_ways
 from judged import RIGHT, SILENT
 from run import drawn, run
+from whole_run import run_campaign
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -24,10 +25,9 @@ def _options(**given: object) -> Namespace:
     return Namespace(**{"units": 0, "start": 0, "seed": 1, "good": 0, "only": [], "kind": "", **given})
 
 
-@pytest.mark.workflow
 def test_a_tenth_of_the_ways_leaves_no_silent_error_and_good_units_right(tmp_path: Path) -> None:
     copies = drawn(_options(units=len(single_ways()), only=TENTH)) + drawn(_options(good=2))
-    judgements = run(copies, tmp_path, cores=2)
+    judgements = run(copies, tmp_path, lambda campaign, results: run_campaign(campaign, results=results))
     assert len({j.kind for j in judgements}) == len(TENTH) + 1
     assert [j.line for j in judgements if j.outcome == SILENT] == []
     assert {j.outcome for j in judgements if j.unit.startswith("good")} == {RIGHT}

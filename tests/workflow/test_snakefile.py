@@ -8,12 +8,13 @@ import shutil
 import subprocess
 import sys
 import zipfile
-from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from .conftest import ROOT, Bench
+from .conftest import ROOT, Bench, Run
 from .schemas import validator, violations
 
 pytestmark = pytest.mark.workflow
@@ -23,6 +24,8 @@ A1,S1,L1,2026-01-02,,,red
 A2,S2,L1,2026-01-03,,effects.gyroscope=[g_sensitivity],
 B1,S1,L1,2026-01-02,staged,filter=rc_low_pass,blue
 """
+REFERENCE, STAGED = "reference_least_squares-0001", "staged-0001"
+END = {"gather", "verdict", "all"}
 
 
 def lay_out(directory: Path, sheet: str, simulated: Path, units: list[str]) -> Bench:
@@ -37,12 +40,66 @@ def summary(bench: Bench) -> list[dict[str, str]]:
     return list(csv.DictReader((bench.results / "summary.csv").read_text().splitlines()))
 
 
+@dataclass(frozen=True)
+class Mended:
+    """Runs of a campaign with one bad unit: as it is, once more, and when its recording is replaced by a good one."""
+
+    bench: Bench
+    first: Run
+    rows: list[dict[str, str]]  # of the first run, as what follows
+    failed: dict[str, Any]
+    page: str
+    unlike_schema: list[str]
+    again: Run
+    mended: Run
+
+
 @pytest.fixture(scope="module")
-def bench(tmp_path_factory: pytest.TempPathFactory, simulated: Path) -> Bench:
-    made = lay_out(tmp_path_factory.mktemp("bench"), SHEET, simulated, ["A1", "A2", "B1"])
-    run = made.snakemake()
-    assert run.code == 0, run.output
-    return made
+def runs(tmp_path_factory: pytest.TempPathFactory, simulated: Path) -> Mended:
+    bench = lay_out(tmp_path_factory.mktemp("bench"), SHEET, simulated, ["A1", "A2", "B1"])
+    bad = bench.campaign / "raw" / "A1" / "gyro_y.csv"
+    lines = bad.read_text().splitlines()
+    cells = lines[40].split(",")
+    lines[40] = ",".join([*cells[:2], "broken", *cells[3:]])
+    bad.write_text("\n".join(lines) + "\n")
+    first = bench.snakemake()
+    rows, unlike_schema = summary(bench), violations(bench.results)
+    failed = json.loads((bench.results / "calibrations" / "A1.json").read_text())
+    page = (bench.results / "index.html").read_text()
+    assert (bench.results / "reports" / "A1.html").is_file()
+    again = bench.snakemake()
+    shutil.copy(simulated / "gyro_y.csv", bad)
+    return Mended(bench, first, rows, failed, page, unlike_schema, again, bench.snakemake())
+
+
+@pytest.fixture(scope="module")
+def bench(runs: Mended) -> Bench:
+    assert runs.mended.code == 0, runs.mended.output
+    return runs.bench
+
+
+def test_one_bad_unit_leaves_the_others_calibrated_and_is_named_at_the_end(runs: Mended) -> None:
+    assert runs.first.code != 0
+    assert [(r["unit"], r["status"]) for r in runs.rows] == [("A1", "failed"), ("A2", "ok"), ("B1", "ok")]
+    assert runs.unlike_schema == []
+    assert runs.failed["status"] == "failed"
+    assert runs.failed["error"]["file"].endswith("gyro_y.csv:41")
+    assert "broken" in runs.failed["error"]["message"]
+    assert "A1" in runs.page
+    last = runs.first.output.strip().splitlines()[-3:]
+    assert any("A1: " in line and "gyro_y.csv:41" in line and "broken" in line for line in last), last
+
+
+def test_a_second_run_with_a_bad_unit_names_it_again_and_computes_nothing(runs: Mended) -> None:
+    assert runs.again.code != 0
+    assert runs.again.jobs == {"verdict"}
+    assert any("A1: " in line and "gyro_y.csv:41" in line for line in runs.again.output.strip().splitlines()[-3:])
+
+
+def test_a_mended_unit_reruns_its_batch_only(runs: Mended) -> None:
+    assert runs.mended.code == 0
+    assert any(REFERENCE in job for job in runs.mended.jobs)
+    assert not [job for job in runs.mended.jobs if STAGED in job]
 
 
 def test_every_file_of_a_unit_is_published_under_its_stable_path(bench: Bench) -> None:
@@ -98,33 +155,19 @@ def test_an_unchanged_second_run_does_nothing(bench: Bench) -> None:
     assert "Nothing to be done" in run.output
 
 
-REFERENCE, STAGED = "reference_least_squares-0001", "staged-0001"
-END = {"gather", "verdict", "all"}
+def after(batch: str) -> set[str]:
+    return {f"{stage}/{batch}" for stage in ("validate", "diagnose", "calibration", "export", "report")}
 
 
-def after(stage: str, batch: str) -> set[str]:
-    order = ["validate", "diagnose", "calibration", "export", "report"]
-    return {f"{s}/{batch}" for s in order if stage == "all" or s in stage.split()}
-
-
-@pytest.mark.parametrize(
-    ("config", "expected"),
-    [
-        ("overrides=limits.gyroscope.bias=20", after("all", REFERENCE)
-            | after("all", STAGED)),
-        ("unit_overrides={A1: [limits.gyroscope.bias=20]}", after("all", REFERENCE)),
-        ("unit_overrides={B1: [filter.zero_phase=true]}", {f"filter/{STAGED}"}
-            | {f"fit/{STAGED}/accelerometer/{s}" for s in ("orthogonality", "misalignment", "bias", "scale_factor")}
-            | {f"fit/{STAGED}/gyroscope/{s}" for s in ("bias", "orthogonality_and_misalignment", "scale_factor")}
-            | after("all", STAGED)),
-        ('unit_overrides={A2: ["effects.gyroscope=[bias_temperature]"]}',
-            {f"fit/{REFERENCE}/gyroscope/effects"} | after("all", REFERENCE)),
-        ("unit_overrides={A1: [sensor.gyroscope.effects.quadratic_nonlinearity=2e-4]}",
-            {f"fit/{REFERENCE}/gyroscope/effects"} | after("all", REFERENCE)),
-    ],
-)  # fmt: skip
-def test_changing_a_setting_reruns_the_stages_that_read_it(bench: Bench, config: str, expected: set[str]) -> None:
-    assert bench.snakemake(config, dry=True).jobs == expected | END
+def test_changing_settings_reruns_the_stages_that_read_them(bench: Bench) -> None:
+    change = '{A2: ["effects.gyroscope=[bias_temperature]"], B1: [filter.zero_phase=true]}'
+    chains = {
+        "accelerometer": ("orthogonality", "misalignment", "bias", "scale_factor"),
+        "gyroscope": ("bias", "orthogonality_and_misalignment", "scale_factor"),
+    }
+    fits = {f"fit/{STAGED}/{sensor}/{stage}" for sensor, chain in chains.items() for stage in chain}
+    rerun = {f"fit/{REFERENCE}/gyroscope/effects", f"filter/{STAGED}"} | fits | after(REFERENCE) | after(STAGED)
+    assert bench.snakemake(f"unit_overrides={change}", dry=True).jobs == rerun | END
 
 
 def test_a_refused_configuration_stops_the_run_before_any_job_with_one_message(bench: Bench) -> None:
@@ -136,120 +179,9 @@ def test_a_refused_configuration_stops_the_run_before_any_job_with_one_message(b
     assert "Traceback" not in run.output
 
 
-SIX = "overrides=batch_size=6"
-
-
-@pytest.fixture(scope="module")
-def ten(tmp_path_factory: pytest.TempPathFactory, simulated: Path) -> Bench:
-    names = [f"U{i}" for i in range(10)]
-    made = lay_out(tmp_path_factory.mktemp("ten"), "unit\n" + "\n".join(names) + "\n", simulated, names)
-    lines = (made.campaign / "raw" / "U3" / "gyro_y.csv").read_text().splitlines()
-    cells = lines[40].split(",")
-    lines[40] = ",".join([*cells[:2], "broken", *cells[3:]])
-    (made.campaign / "raw" / "U3" / "gyro_y.csv").write_text("\n".join(lines) + "\n")
-    return made
-
-
-def test_one_bad_unit_leaves_nine_calibrated_and_is_named_at_the_end(ten: Bench) -> None:
-    run = ten.snakemake(SIX)
-    assert run.code != 0
-    rows = summary(ten)
-    assert [r["unit"] for r in rows if r["status"] == "ok"] == [f"U{i}" for i in range(10) if i != 3]
-    failed = json.loads((ten.results / "calibrations" / "U3.json").read_text())
-    assert failed["status"] == "failed"
-    assert violations(ten.results) == []
-    assert failed["error"]["file"].endswith("gyro_y.csv:41")
-    assert "broken" in failed["error"]["message"]
-    assert "U3" in (ten.results / "index.html").read_text()
-    assert (ten.results / "reports" / "U3.html").is_file()
-    last = run.output.strip().splitlines()[-3:]
-    assert any("U3: " in line and "gyro_y.csv:41" in line and "broken" in line for line in last), last
-
-    again = ten.snakemake(SIX)
-    assert again.code != 0
-    assert again.jobs == {"verdict"}
-    assert any("U3: " in line and "gyro_y.csv:41" in line for line in again.output.strip().splitlines()[-3:])
-
-
-def test_a_mended_unit_reruns_its_batch_only(ten: Bench, simulated: Path) -> None:
-    ten.snakemake(SIX)
-    shutil.copy(simulated / "gyro_y.csv", ten.campaign / "raw" / "U3" / "gyro_y.csv")
-    run = ten.snakemake(SIX)
-    assert run.code == 0
-    assert not [job for job in run.jobs if "-0002" in job]
-    assert "Nothing to be done" in ten.snakemake(SIX).output
-
-
-def test_a_change_to_one_unit_concerns_its_batch_and_new_units_the_last(ten: Bench, simulated: Path) -> None:
-    shutil.copy(simulated / "gyro_y.csv", ten.campaign / "raw" / "U3" / "gyro_y.csv")
-    ten.snakemake(SIX)
-    sheet, device = ten.campaign / "units.csv", ten.campaign / "devices" / "U7.yaml"
-    text = sheet.read_text()
-
-    def batches() -> set[str]:
-        jobs = ten.snakemake(SIX, dry=True).jobs
-        return {found.group(1) for job in jobs if (found := re.search(r"-(\d{4})", job))}
-
-    sheet.write_text(re.sub("$", ",", text.strip(), flags=re.MULTILINE).replace("unit,", "unit,overrides")
-        .replace("U2,", "U2,limits.gyroscope.bias=9"))  # fmt: skip
-    assert batches() == {"0001"}
-    sheet.write_text(text)
-    device.parent.mkdir()
-    device.write_text("overrides: [limits.gyroscope.bias=9]")
-    assert batches() == {"0002"}
-    device.unlink()
-    sheet.write_text(text + "".join(f"V{i}\n" for i in range(10)))
-    assert batches() == {"0002", "0003", "0004"}
-    sheet.write_text(text)
-
-
-def keep_the_first_rest(file: Path) -> None:
-    file.write_text("\n".join(file.read_text().splitlines()[:8]) + "\n")
-
-
-@pytest.mark.parametrize(
-    ("harm", "code", "cause"),
-    [
-        (lambda raw: (raw / "accel_z.csv").unlink(), "missing_file", "accel_z"),
-        (lambda raw: [keep_the_first_rest(f) for f in raw.glob("accel_*.csv")], "not_observable", "accelerometer"),
-    ],
-    ids=["missing file", "unobservable fit"],
-)
-def test_other_failures_are_named_too(
-    tmp_path: Path, simulated: Path, harm: Callable[[Path], object], code: str, cause: str
-) -> None:
-    bench = lay_out(tmp_path, "unit\nG1\nG2\n", simulated, ["G1", "G2"])
-    harm(bench.campaign / "raw" / "G2")
-    run = bench.snakemake()
-    assert run.code != 0
-    failures = json.loads((bench.results / "failures.json").read_text())
-    assert [(f["unit"], f["code"]) for f in failures] == [("G2", code)]
-    assert cause in failures[0]["message"]
-    assert json.loads((bench.results / "calibrations" / "G1.json").read_text())["status"] == "ok"
-
-
-def test_a_dry_run_writes_nothing(tmp_path: Path) -> None:
-    (tmp_path / "bench-7").mkdir()
-    bench = lay_out(tmp_path, "unit\nG1\n", tmp_path, [])
-    assert len(bench.snakemake(dry=True).jobs) > 9
-    assert not bench.results.exists()
-
-
-def test_jobs_find_what_the_users_own_python_path_holds(
-    tmp_path: Path, simulated: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bench = lay_out(tmp_path, "unit\nG1\n", simulated, ["G1"])
-    (tmp_path / "own").mkdir()
-    (tmp_path / "own" / "sitecustomize.py").write_text("import sys\nprint('own path', file=sys.stderr)\n")
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "own"))
-    bench.snakemake("--until", "ingest")
-    (log,) = bench.results.glob("logs/*/ingest.log")
-    assert "own path" in log.read_text()
-
-
 def test_campaign_results_and_environment_may_lie_anywhere(tmp_path: Path, simulated: Path) -> None:
     name = "it's {mine}, all"
-    bench = lay_out(tmp_path / "a b,{c}", "unit,procedure\nA1,own\n", simulated, ["A1"])
+    bench = lay_out(tmp_path / "a b,{c}", "unit,procedure,overrides\nA1,own,method.gyroscope=null\n", simulated, ["A1"])
     campaign = bench.campaign.rename(bench.directory / name)
     own = campaign / "configs" / "procedure" / "own.yaml"
     own.parent.mkdir(parents=True)
@@ -258,7 +190,9 @@ def test_campaign_results_and_environment_may_lie_anywhere(tmp_path: Path, simul
     python.parent.mkdir()
     python.write_text(f'#!/bin/sh\nexec {sys.executable} "$@"\n')
     python.chmod(0o755)
-    (bench.directory / "sitecustomize.py").write_text(f"import sys\nsys.executable = {str(python)!r}\n")
+    (bench.directory / "sitecustomize.py").write_text(
+        f"import sys\nsys.executable = {str(python)!r}\nprint('own path', file=sys.stderr)\n"
+    )
     command = [sys.executable, "-m", "snakemake", "--cores", "2", "-s", str(ROOT / "Snakefile"), "--config"]
     command += [f"campaign={name}/", "results=r {batch}, 's"]
     environment = os.environ | {"PYTHONPATH": str(bench.directory), "PYTHONWARNINGS": ""}
@@ -269,3 +203,5 @@ def test_campaign_results_and_environment_may_lie_anywhere(tmp_path: Path, simul
     results = bench.directory / "r {batch}, 's" / name
     assert json.loads((results / "calibrations" / "A1.json").read_text())["status"] == "ok"
     assert f"r {{batch}}, 's/{name}/index.html" in done.stderr
+    (log,) = results.glob("logs/*/ingest.log")
+    assert "own path" in log.read_text()  # jobs find what the user's own PYTHONPATH holds

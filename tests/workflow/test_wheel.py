@@ -68,4 +68,5 @@ def test_the_installed_command_plans_a_run_of_the_shipped_demo(installed: Path, 
     assert run("--version").split()[1] == metadata.name.split("-")[1].removesuffix(".dist")
     planned = run("run", "demo", "filter=rc_low_pass", "--results", "elsewhere", "--", "--dry-run")
     assert "elsewhere/demo/batches" in planned
+    assert not (tmp_path / "elsewhere").exists()  # a dry run writes nothing
     assert "imu-calibration run bench" in run("new", "bench")

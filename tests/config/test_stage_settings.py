@@ -1,0 +1,94 @@
+"""Which jobs a changed setting concerns: those whose settings file has another name."""
+
+import re
+from pathlib import Path
+
+import pytest
+from whole_run import settings_of_jobs
+
+from pipeline.config import load_campaign
+
+SHEET = """unit,method,overrides
+A1,,
+A2,,effects.gyroscope=[g_sensitivity]
+B1,staged,filter=rc_low_pass
+"""
+REFERENCE, STAGED = "reference_least_squares-0001", "staged-0001"
+
+
+def changed(directory: Path, **settings: object) -> set[str]:
+    """Return the jobs whose settings differ from those of the sheet alone."""
+    given = {"campaign": str(directory)}
+    before, after = (settings_of_jobs(load_campaign(given | more)) for more in ({}, settings))
+    return {job for job, file in after.items() if file.path != before[job].path}
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Path:
+    (tmp_path / "units.csv").write_text(SHEET)
+    return tmp_path
+
+
+def of(batch: str, *stages: str) -> set[str]:
+    return {f"{stage}/{batch}" for stage in stages}
+
+
+# A job whose input is made again runs too: here are those that read the setting itself.
+@pytest.mark.parametrize(
+    ("unit", "override", "expected"),
+    [
+        ("A1", "limits.gyroscope.bias=20", of(REFERENCE, "validate", "calibration", "report")),
+        (
+            "B1",
+            "filter.zero_phase=true",
+            of(STAGED, "filter", "calibration", "report"),
+        ),
+        (
+            "A2",
+            "effects.gyroscope=[bias_temperature]",
+            of(REFERENCE, "diagnose", "calibration", "report") | {f"fit/{REFERENCE}/gyroscope/effects"},
+        ),
+        (
+            "A1",
+            "sensor.gyroscope.effects.quadratic_nonlinearity=2e-4",
+            of(REFERENCE, "validate", "diagnose", "calibration", "export", "report")
+            | {f"fit/{REFERENCE}/gyroscope/effects"},
+        ),
+    ],
+)
+def test_a_setting_of_a_unit_concerns_the_jobs_of_its_batch_that_read_it(
+    bench: Path, unit: str, override: str, expected: set[str]
+) -> None:
+    assert changed(bench, unit_overrides={unit: [override]}) == expected | {"gather"}
+
+
+def test_a_setting_of_the_run_concerns_every_batch(bench: Path) -> None:
+    stages = ("validate", "calibration", "report")
+    assert changed(bench, overrides="limits.gyroscope.bias=20") == of(REFERENCE, *stages) | of(STAGED, *stages) | {
+        "gather"
+    }
+
+
+def test_a_change_of_sheet_or_device_concerns_the_batch_of_the_unit(tmp_path: Path) -> None:
+    sheet, device = tmp_path / "units.csv", tmp_path / "devices" / "U7.yaml"
+    plain = "unit,overrides\n" + "".join(f"U{i},\n" for i in range(10))
+
+    def settings() -> dict[str, Path]:
+        found = settings_of_jobs(load_campaign({"campaign": str(tmp_path), "overrides": "batch_size=6"}))
+        return {job: file.path for job, file in found.items()}
+
+    def batches() -> set[str]:
+        jobs = {job for job, path in settings().items() if before.get(job) != path}
+        return {found[1] for job in jobs if (found := re.search(r"-(\d{4})", job))}
+
+    sheet.write_text(plain)
+    before = settings()
+    sheet.write_text(plain.replace("U2,", "U2,limits.gyroscope.bias=9"))
+    assert batches() == {"0001"}
+    sheet.write_text(plain)
+    device.parent.mkdir()
+    device.write_text("overrides: [limits.gyroscope.bias=9]")
+    assert batches() == {"0002"}
+    device.unlink()
+    sheet.write_text(plain + "".join(f"V{i},\n" for i in range(10)))
+    assert batches() == {"0002", "0003", "0004"}
