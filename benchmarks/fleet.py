@@ -2,16 +2,16 @@
 
 A campaign of simulated units (10,000 samples each in eight recordings) goes through ``snakemake --cores 2`` with every
 stage, diagnosis and page. CPU seconds are those of Snakemake and all its jobs, user and system; the memory is that of
-the largest process. In the same run stands the floor, which is what no tool can save: one process reads the same files
-with pyarrow and solves one linear least squares problem for each sensor of each unit. How fast the machine is at the
-moment, by a loop of five million additions, stands beside it: CPU seconds of a shared machine vary twofold.
+the largest process. The floor is what no tool can save: one process reads the same files with pyarrow and solves one
+linear least squares problem for each sensor of each unit. CPU seconds of a shared machine vary twofold, so the floor is
+measured before, during and after the run, and so is a loop of five million additions.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
-import resource
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -19,6 +19,7 @@ import time
 from collections import defaultdict
 from pathlib import Path
 
+PAUSE_S = 15.0  # between two measurements of the floor
 ROOT = Path(__file__).resolve().parents[1]
 FLOOR = """
 import sys, time
@@ -65,31 +66,49 @@ def main() -> int:
         subprocess.run([sys.executable, "-m", "pipeline", *made], cwd=folder, check=True, stderr=subprocess.DEVNULL)
         rows = sum(file.read_bytes().count(b"\n") - 1 for file in Path(folder, "fleet/raw").rglob("*.csv"))
         print(f"{arguments.units} units, {rows / arguments.units:.0f} samples each", flush=True)
-        speed = _speed()
-        floor = subprocess.run(
-            [sys.executable, "-c", FLOOR, "fleet/raw"], cwd=folder, check=True, capture_output=True, text=True
+        found, floors, speeds = _run(folder, arguments.cores)
+        least = statistics.median(floors)
+        print(f"load average {os.getloadavg()[0]:.1f}; five million additions: {_range(speeds)} s")
+        print(
+            f"floor: {1000 * least / arguments.units:.1f} ms a unit, median of {len(floors)} runs of {_range(floors)} s"
         )
-        least = float(floor.stdout) / arguments.units
-        found = _run(folder, arguments.cores) / arguments.units
-        print(f"floor: {1000 * least:.1f} ms a unit; ratio to it: {found / least:.1f}")
-        print(f"five million additions: {speed:.2f} s before, {_speed():.2f} s after")
+        print(f"ratio to the floor: {found / least:.1f}")
     return 0
 
 
-def _run(folder: str, cores: int) -> float:
+def _range(seconds: list[float]) -> str:
+    return f"{min(seconds):.2f} to {max(seconds):.2f}"
+
+
+def _floor(folder: str) -> float:
+    done = subprocess.run(
+        [sys.executable, "-c", FLOOR, "fleet/raw"], cwd=folder, check=True, capture_output=True, text=True
+    )
+    return float(done.stdout)
+
+
+def _run(folder: str, cores: int) -> tuple[float, list[float], list[float]]:
+    """Return the CPU seconds of the run, of each floor and of each loop of additions."""
     told = Path(folder, "told")
     Path(folder, "sitecustomize.py").write_text(TELL, encoding="utf-8")
     paths = [folder, *filter(None, [os.environ.get("PYTHONPATH")])]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths), "FLEET_TOLD": str(told)}
     environment.pop("PYTHONDONTWRITEBYTECODE", None)  # an installed package is not compiled at each start
     command = [sys.executable, "-m", "snakemake", "-s", str(ROOT / "Snakefile"), "--cores", str(cores)]
-    before, start = _cpu(), time.perf_counter()
-    done = subprocess.run(  # noqa: PLW1510  (its own words are shown below)
-        [*command, "--config", "campaign=fleet"], cwd=folder, env=environment, capture_output=True, text=True
-    )
-    if done.returncode:
-        raise SystemExit(done.stderr[-4000:])
-    used, wall = _cpu() - before, time.perf_counter() - start
+    floors, speeds, start = [_floor(folder)], [_speed()], time.perf_counter()
+    with Path(folder, "log").open("w", encoding="utf-8") as log:
+        run = subprocess.Popen(
+            [*command, "--config", "campaign=fleet"], cwd=folder, env=environment, stdout=log, stderr=log
+        )
+        process = 0
+        while not process:
+            time.sleep(PAUSE_S)
+            process, failed, spent_by_run = os.wait4(run.pid, os.WNOHANG)
+            floors.append(_floor(folder))
+            speeds.append(_speed())
+    if failed:
+        raise SystemExit(Path(folder, "log").read_text(encoding="utf-8")[-4000:])
+    used, wall = spent_by_run.ru_utime + spent_by_run.ru_stime, time.perf_counter() - start
     spent: dict[str, float] = defaultdict(float)
     jobs: dict[str, int] = defaultdict(int)
     largest = 0.0
@@ -103,12 +122,7 @@ def _run(folder: str, cores: int) -> float:
         print(f"{name:12s} {jobs[name]:4d} processes {1000 * seconds / units:7.1f} ms a unit")
     print(f"all stages, {units} pages: {1000 * used / units:.0f} ms CPU a unit, {used:.0f} s in all")
     print(f"{wall:.0f} s on {cores} cores; {largest:.0f} MB in the largest process")
-    return used
-
-
-def _cpu() -> float:
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
+    return used, floors, speeds
 
 
 def _speed() -> float:

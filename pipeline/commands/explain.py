@@ -53,13 +53,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def find(campaign: str, units: Sequence[str], results: Path) -> Selection:
-    """Return the diagnoses and failures of the units.
-
-    Raises
-    ------
-    MissingInputError
-        If there are none.
-    """
+    """Return the diagnoses and failures of the units; raises ``MissingInputError`` if there are none."""
     given = Path(campaign)
     if given.is_file():
         return _selection({given.stem: given}, {}, given.parent.parent)

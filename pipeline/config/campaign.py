@@ -50,7 +50,6 @@ class Campaign:
     ----------
     name : str
         Last part of its directory; its results are in ``<results>/<name>``.
-    directory, results : Path
     units : dict of str to UnitRow
         In the order of ``units.csv``.
     batches : dict of str to list of str
@@ -107,18 +106,13 @@ class Campaign:
 
 
 def load_campaign(settings: Mapping[str, Any]) -> Campaign:
-    """Load and check a campaign.
+    """Load and check a campaign; raises ``ConfigurationError`` with one message for everything that is wrong.
 
     Parameters
     ----------
     settings : mapping
         What ``snakemake --config`` gave: ``campaign``, ``results``, ``overrides``, ``unit_overrides``,
         ``python_effects``.
-
-    Raises
-    ------
-    ConfigurationError
-        With one message for everything that is wrong.
     """
     valid = ("campaign", "results", "overrides", "unit_overrides", PYTHON)
     unknown = sorted(set(settings) - set(valid))

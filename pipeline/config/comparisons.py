@@ -42,6 +42,8 @@ FORM = "a list of units, or a mapping with units, groups or by"
 def resolve_comparisons(entries: Sequence[Any], units: Mapping[str, UnitRow], file: str) -> list[JSON]:
     """Return the comparisons with their units.
 
+    Raises ``ConfigurationError`` with one message for everything that is wrong.
+
     Parameters
     ----------
     entries : sequence
@@ -57,11 +59,6 @@ def resolve_comparisons(entries: Sequence[Any], units: Mapping[str, UnitRow], fi
         ``title``; ``groups``, each ``name, series, label, units``; ``sensors``; ``against``; ``pairs`` (unit to what
         it shares with its pair, or None) and ``x`` (``label``; ``values`` by unit, None for the table time; ``named``:
         the points' names are drawn beside them), or None.
-
-    Raises
-    ------
-    ConfigurationError
-        With one message for everything that is wrong.
     """
     columns = {name: unit.row | {g: unit.config[g]["name"] for g in GROUPS} for name, unit in units.items()}
     out, problems = [], []

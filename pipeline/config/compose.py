@@ -50,17 +50,14 @@ OF_A_SETUP = ("mounting", "bias")  # effects that exist as one setup's own alone
 class Composer:
     """Composes configurations for the units of one campaign.
 
+    Raises ``ConfigurationError`` if an effect of the user's own is not as it should be.
+
     Parameters
     ----------
     campaign : Path
         The campaign's directory; its ``configs/<group>/*.yaml`` are options too, its ``effects/*.yaml`` effects.
     python_effects : sequence of str
         Python files with effects that the command line names.
-
-    Raises
-    ------
-    ConfigurationError
-        If an effect of the user's own is not as it should be.
     """
 
     def __init__(self, campaign: Path, python_effects: Sequence[str] = ()) -> None:
@@ -81,18 +78,12 @@ class Composer:
         self._valid_ingest: set[str] = set()
 
     def unit(self, name: str, layers: Sequence[str]) -> dict[str, Any]:
-        """Return the checked configuration of a unit.
+        """Return the checked configuration of a unit; raises ``Problem`` one line for each thing that is wrong.
 
         Parameters
         ----------
-        name : str
         layers : sequence of str
             Hydra overrides, weakest first.
-
-        Raises
-        ------
-        Problem
-            One line for each thing that is wrong.
         """
         groups, values = self.split(layers)
         key = repr((sorted(groups.items()), values))
@@ -106,9 +97,7 @@ class Composer:
     def split(self, layers: Sequence[str]) -> tuple[dict[str, str], list[tuple[str, Any]]]:
         """Return the choice of each group that is chosen, and the values in the order of the layers.
 
-        Raises
-        ------
-        Problem
+        Raises ``Problem``.
         """
         groups: dict[str, str] = {}
         values: list[tuple[str, Any]] = []

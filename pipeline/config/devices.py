@@ -37,13 +37,7 @@ class Edit(NamedTuple):
 
 
 def sensor_and_effect(text: str) -> tuple[str, str]:
-    """Split ``SENSOR.EFFECT``.
-
-    Raises
-    ------
-    ConfigurationError
-        If it has another form, or names no sensor.
-    """
+    """Split ``SENSOR.EFFECT``; raises ``ConfigurationError`` if it has another form, or names no sensor."""
     sensor, dot, effect = text.partition(".")
     if not dot or not effect:
         raise ConfigurationError(f"{text!r}: SENSOR.EFFECT is expected, for example gyroscope.g_sensitivity")
@@ -57,21 +51,17 @@ def edit_effects(
 ) -> Edit:
     """Return the unit's device file with effects added or removed.
 
+    Raises ``ConfigurationError`` if the unit or an effect is unknown, a stronger layer sets the effects, or the file
+    cannot be edited.
+
     Parameters
     ----------
-    unit : str
     effects : sequence of (str, str)
         Sensor and effect.
     layers : Layers
         Of the campaign, with what the command line gives.
-    composer : Composer
     remove : bool
         Whether the effects are removed.
-
-    Raises
-    ------
-    ConfigurationError
-        If the unit or an effect is unknown, a stronger layer sets the effects, or the file cannot be edited.
     """
     file = _file(unit, layers, composer.campaign)
     text = file.read_bytes().decode() if file.is_file() else ""  # line ends as they are
@@ -121,20 +111,16 @@ def _file(unit: str, layers: Layers, directory: Path) -> Path:
 def set_override(text: str, key: str, override: str | None, file: str) -> str:
     """Return a device file with the override of a key replaced, added, or (None) removed; all else stays as it is.
 
+    Raises ``ConfigurationError`` if the file has a form that cannot be edited in place.
+
     Parameters
     ----------
     text : str
         Of the file; may be empty.
-    key : str
     override : str or None
         ``key=value``.
     file : str
         For the message.
-
-    Raises
-    ------
-    ConfigurationError
-        If the file has a form that cannot be edited in place.
     """
     wanted = _changed([(entry, entry) for entry in _overrides(text)], key, override, override)
     edited = _edited(text, key, override)

@@ -91,7 +91,6 @@ class Layers:
 
     Attributes
     ----------
-    sheet : Sheet
     campaign : CampaignFile
         Its ``overrides`` without those of the run.
     of_run : list of str
@@ -137,20 +136,16 @@ class Layers:
 def load_layers(directory: Path, settings: Mapping[str, Any], sheet: Sheet, sensors: Iterable[str]) -> Layers:
     """Read the overrides of a campaign and of the command line.
 
+    Raises ``ConfigurationError`` naming the file and the key.
+
     Parameters
     ----------
     directory : Path
         Of the campaign.
     settings : mapping
         Of ``--config``: ``overrides`` and ``unit_overrides``.
-    sheet : Sheet
     sensors : iterable of str
         Names of the sensor configs.
-
-    Raises
-    ------
-    ConfigurationError
-        Naming the file and the key.
     """
     path = directory / "campaign.yaml"
     file = _read(path, CampaignFile) if os.path.lexists(path) else CampaignFile()

@@ -51,10 +51,7 @@ def parse(text: str) -> tuple[str, Any]:
 
     A plain number, which is what differs from unit to unit, is read without Hydra's parser: that costs 0.6 ms each.
 
-    Raises
-    ------
-    Problem
-        If it is no override, a sweep or a deletion.
+    Raises ``Problem`` if it is no override, a sweep or a deletion.
     """
     number = NUMBER.fullmatch(text)
     if number:
@@ -117,10 +114,7 @@ def default_of_run(name: str) -> Any:  # noqa: ANN401  (a setting's type is its 
 def check_references(value: Any, where: str | None = None) -> None:  # noqa: ANN401  (any YAML value)
     """Refuse ``${...}`` that is more than the name of a setting, anywhere below a value.
 
-    Raises
-    ------
-    ConfigurationError
-        Naming the text.
+    Raises ``ConfigurationError`` naming the text.
     """
     if isinstance(value, dict):
         for key, below in value.items():
@@ -136,10 +130,8 @@ def check_references(value: Any, where: str | None = None) -> None:  # noqa: ANN
 def with_references(node: Any, root: dict[str, Any]) -> Any:  # noqa: ANN401  (dict, list or value)
     """Return a copy of a node in which each reference is replaced by what it names in the tree ``root``.
 
-    Raises
-    ------
-    ConfigurationError
-        If a reference names no setting, a group of settings, or a setting that is a reference too.
+    Raises ``ConfigurationError`` if a reference names no setting, a group of settings, or a setting that is a reference
+    too.
     """
     if isinstance(node, dict):
         return {key: with_references(below, root) for key, below in node.items()}

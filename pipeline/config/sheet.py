@@ -41,13 +41,7 @@ class Sheet:
 def read_sheet(path: Path) -> Sheet:
     """Read ``units.csv``; refuses bad names, duplicates and ragged rows, all in one message.
 
-    Parameters
-    ----------
-    path : Path
-
-    Raises
-    ------
-    ConfigurationError
+    Raises ``ConfigurationError``.
     """
     columns, rows = _table(path)
     if PYTHON in columns:

@@ -131,10 +131,8 @@ def settings_file(
 
     Parameters
     ----------
-    campaign : Campaign
     stage : str
         Key of ``READS``; other names are stages of a fit.
-    units : sequence of str
     sensor : str
         The sensor of a stage of a fit.
     again : int

@@ -30,7 +30,6 @@ class UserEffects:
 
     Attributes
     ----------
-    effects : dict of str to Effect
     python : dict of str to dict
         Of those in Python, by name: ``path`` and ``sha256``.
     """
@@ -57,10 +56,7 @@ class UserEffects:
 def load_user_effects(campaign: Path, configs: Iterable[Path], python: Sequence[str]) -> UserEffects:
     """Read ``<campaign>/effects``, ``<configs>/effect`` and the Python files that the command line names.
 
-    Raises
-    ------
-    ConfigurationError
-        With a line for each file that is not as it should be.
+    Raises ``ConfigurationError`` with a line for each file that is not as it should be.
     """
     found: dict[str, Effect] = {}
     places: dict[str, str] = {}

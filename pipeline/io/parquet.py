@@ -56,8 +56,7 @@ def save_recordings(path: Path, recordings: Sequence[Recording]) -> None:
     with parquet.ParquetWriter(
         temporary,
         schema,
-        compression="zstd",
-        compression_level=3,
+        compression="lz4",
         use_dictionary=False,
         column_encoding={n: PAGE_ENCODINGS[types[n].kind] for n in names},
         write_statistics=False,

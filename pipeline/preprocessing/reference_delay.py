@@ -79,7 +79,8 @@ def delay_of(
         step, one, two = _thinned(first, other, recording)
         furthest = min(max(int(np.ceil(min(allowed, FURTHEST_S) / step)), FURTHEST), len(one) // 4)
         windows = np.lib.stride_tricks.sliding_window_view(two, len(two) - 2 * furthest)
-        squares = np.var(windows - one[furthest : len(one) - furthest], axis=1)
+        apart = windows - one[furthest : len(one) - furthest]
+        squares = np.einsum("ij,ij->i", apart, apart) / apart.shape[1] - apart.mean(axis=1) ** 2
         power = min(float(np.var(one)), float(np.var(two)))
         if float(squares.min()) >= BETTER * power:
             continue  # nothing moves, or they are not alike at any delay

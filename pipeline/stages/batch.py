@@ -47,7 +47,6 @@ class Job:
 
     Attributes
     ----------
-    stage : str
     units : dict of str to dict
         Unit to its settings.
     run : dict

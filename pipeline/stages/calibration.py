@@ -28,13 +28,7 @@ LIBRARIES = ("numpy", "scipy", "pyarrow", "mcap")
 
 
 def process_unit(job: Job, unit: str, settings: dict[str, Any]) -> None:
-    """Write the calibration document of a unit.
-
-    Raises
-    ------
-    CannotCalibrateError
-        If no sensor is calibrated.
-    """
+    """Write the calibration document of a unit; raises ``CannotCalibrateError`` if no sensor is calibrated."""
     fits = {sensor: read_json(job.inputs[sensor] / f"{unit}.json") for sensor in SENSORS}
     validation = read_json(job.inputs["validate"] / f"{unit}.json")
     reasons = {s: f["not_calibrated"] for s, f in fits.items() if "not_calibrated" in f}

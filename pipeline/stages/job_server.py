@@ -87,7 +87,7 @@ def _prepare(stages: Sequence[str]) -> None:
     for stage in stages:
         if stage != "gather":  # runs once, and imports pandas
             import_module(f"pipeline.stages.{stage}")
-    for module in ("scipy.interpolate", "scipy.optimize", "scipy.signal", "scipy.spatial.transform", "imufusion"):
+    for module in ("scipy.interpolate", "scipy.spatial.transform", "imufusion"):
         import_module(module)  # stages import them where they need them
 
     from pipeline.exports import formats  # noqa: PLC0415

@@ -42,10 +42,7 @@ def require_noises(
 ) -> dict[str, Noise]:
     """Read the noise of each calibrated sensor.
 
-    Raises
-    ------
-    ConfigurationError
-        If nothing determines it; ``estimate_noise`` names what is missing.
+    Raises ``ConfigurationError`` if nothing determines it; ``estimate_noise`` names what is missing.
     """
     found = load_noises(folder, unit)
     return {s: found[s] or estimate_noise(s, recordings, sheets[s]) for s, fit in fits.items() if fit is not None}
