@@ -17,7 +17,6 @@ from pipeline.outcome import run_command
 from pipeline.records import SENSORS
 from pipeline.report.held_out_section import first_and_last_step
 from pipeline.report.pages import template
-from pipeline.report.parameter_section import monte_carlo_of
 from pipeline.report.parameters import fitted_parameters
 
 if TYPE_CHECKING:
@@ -230,10 +229,7 @@ def certificate_page(unit: str, report: JSON) -> str:
     sheet = f"{core['title']} {core['uniqueIdentifier'] or unit}"
     if report["stamp"]:
         sheet += " \N{MIDDLE DOT} NOT A CALIBRATION CERTIFICATE"
-    runs = {
-        r["name"]: monte_carlo_of({"uncertainty_budget": r["uncertaintyBudget"]}) for r in report["measurementResults"]
-    }
-    page: str = template("certificate.html").render(unit=unit, report=report, sheet=_css_text(sheet), monte_carlo=runs)
+    page: str = template("certificate.html").render(unit=unit, report=report, sheet=_css_text(sheet))
     return page
 
 

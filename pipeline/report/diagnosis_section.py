@@ -17,7 +17,6 @@ from pipeline.report.axis import LINEAR_TO
 from pipeline.report.chart import Dots, Figure, Layer, Line, Panel, chart
 from pipeline.report.group_charts import Point, bars
 from pipeline.report.numbers import MINUS, measured, number, percent, plain, unit_text
-from pipeline.report.parameter_section import parameter_texts
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -54,7 +53,6 @@ def ranking_rows(found: JSON) -> list[JSON]:
     return [
         {
             **r,
-            "parameter_texts": parameter_texts(r.get("parameters")),
             "selected": r["effect"] in selected,
             "supported": r["effect"] in selected or _evidence(r) > 0.0,
         }

@@ -12,6 +12,7 @@ from jinja2 import Environment, FileSystemLoader, Template
 from markupsafe import Markup
 
 from pipeline.report.numbers import measured, number, percent, percent_change, plain, probability, typeset, unit_text
+from pipeline.report.parameters import convergence_of, monte_carlo_of, parameter_texts, stage_details
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -37,7 +38,15 @@ def _figure(value: object) -> str:
 def _environment() -> Environment:
     environment = _Pages(loader=FileSystemLoader(FOLDER), autoescape=True, trim_blocks=True, lstrip_blocks=True)
     numbers = (number, measured, percent, percent_change, probability, typeset)
-    environment.filters |= {f.__name__: f for f in numbers} | {"words": plain, "figure": _figure, "unit": unit_text}
+    environment.filters |= {f.__name__: f for f in numbers} | {
+        "words": plain,
+        "figure": _figure,
+        "unit": unit_text,
+        "parameter_texts": parameter_texts,
+        "details": stage_details,
+        "monte_carlo": monte_carlo_of,
+        "convergence": convergence_of,
+    }
     environment.globals["asset"] = asset
     return environment
 

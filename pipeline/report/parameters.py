@@ -1,4 +1,4 @@
-"""The fitted parameters of a sensor, each with its expanded uncertainty and coverage factor.
+"""The fitted parameters of a sensor with their uncertainties, and what pages say of the fit.
 
 The calibration file holds the matrix M of ``truth = M (reading - bias - effects)``. A data sheet states scale factor
 errors and cross-axis sensitivities, which are elements of ``K = M^-1`` in ``reading = bias + K truth + effects``:
@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pipeline.records import AXES
-from pipeline.report.numbers import plain
+from pipeline.report.numbers import measured, number, plain, unit_text
 
 JSON = dict[str, Any]
 NO_UNCERTAINTY: JSON = {"bias": [None] * 3, "matrix": [[None] * 3] * 3}
@@ -43,18 +43,10 @@ class Parameter(NamedTuple):
 
 
 def fitted_parameters(part: JSON) -> list[Parameter]:
-    """Return bias, matrix and effects in the order of the covariance's rows.
+    """Return bias, matrix and effects of a sensor's part of a calibration, in the order of the covariance's rows.
 
-    Parameters
-    ----------
-    part : dict
-        The sensor's part of ``calibrations/<unit>.json``.
-
-    Returns
-    -------
-    list of Parameter
-        ``bias_x``, ``matrix_xy`` (row, column) and ``<effect>.<parameter>``. Each has its own coverage factor: the
-        effective degrees of freedom differ between parameters.
+    ``bias_x``, ``matrix_xy`` (row, column) and ``<effect>.<parameter>``. Each has its own coverage factor,
+    as the effective degrees of freedom differ between parameters.
     """
     U = part.get("expanded_uncertainty") or NO_UNCERTAINTY
     k = part.get("coverage_factor") or NO_UNCERTAINTY
@@ -76,18 +68,10 @@ def fitted_parameters(part: JSON) -> list[Parameter]:
 
 
 def reading_errors(part: JSON) -> list[Parameter]:
-    """Return the elements of K that a data sheet states: ``scale_factor_error_x``, ``cross_axis_xy``.
+    """Return the elements of K that a data sheet states, of a sensor's part of a calibration.
 
-    Parameters
-    ----------
-    part : dict
-        The sensor's part of ``calibrations/<unit>.json``.
-
-    Returns
-    -------
-    list of Parameter
-        ``scale_factor_error_x`` is ``K_xx - 1``; ``cross_axis_xy`` is what axis x reads of a truth along y. Each has
-        the coverage factor of the same element of the matrix.
+    ``scale_factor_error_x`` is ``K_xx - 1``; ``cross_axis_xy`` is what axis x reads of a truth along y. Each has the
+    coverage factor of the same element of the matrix.
     """
     K = np.linalg.inv(np.array(part["matrix"], float))
     k = (part.get("coverage_factor") or NO_UNCERTAINTY)["matrix"]
@@ -104,3 +88,81 @@ def reading_errors(part: JSON) -> list[Parameter]:
     return scale + [
         element(f"cross_axis_{a}{b}", K[i, j], i, j) for i, a in enumerate(AXES) for j, b in enumerate(AXES) if i != j
     ]
+
+
+def parameter_rows(part: JSON, sheet: JSON) -> list[JSON]:
+    """Return bias, scale factor errors, cross-axis terms and effects: ``p``, ``name`` and ``limit`` (or None).
+
+    ``part``: the sensor's part of the calibration; ``sheet``: its section of the configuration with the limits.
+    """
+    fitted, effects = fitted_parameters(part), sheet.get("effects") or {}
+    found = [(p, p.words.capitalize(), sheet.get("bias")) for p in fitted[:3]]
+    for p in reading_errors(part):
+        kind, _, axes = p.name.rpartition("_")
+        if kind == "cross_axis":
+            found.append((p, f"{axes[0]} reads of {axes[1]}", sheet.get("cross_axis")))
+        else:
+            found.append((p, f"Scale factor error {axes}", sheet.get("scale_factor")))
+    found += [(p, p.words, effects.get(p.name.partition(".")[0])) for p in fitted[12:]]
+    bounds = (limit if isinstance(limit, int | float) and limit > 0 else None for *_, limit in found)
+    return [{"p": p, "name": name, "limit": bound} for (p, name, _), bound in zip(found, bounds, strict=True)]
+
+
+def stage_details(stage: JSON) -> list[str]:
+    """Return the details of a stage of the fit that are one value each, in words."""
+    details = {k: v for k, v in (stage.get("details") or {}).items() if isinstance(v, int | float | str | bool)}
+    return [f"{plain(k)}: {number(v, 4) if isinstance(v, float) else v}" for k, v in details.items()]
+
+
+def parameter_texts(parameters: JSON | None) -> list[str]:
+    """Return ``name = value ± uncertainty unit`` of a stage or an effect.
+
+    Where only a standard uncertainty is stated, twice its value is shown, which covers about 95 %.
+    """
+    texts = []
+    for name, given in (parameters or {}).items():
+        p = given if isinstance(given, dict) else {"value": given}
+        standard = p.get("standard_uncertainty")
+        expanded = p.get("expanded_uncertainty", 2.0 * standard if standard else None)
+        texts.append(f"{name} = {measured(p.get('value'), expanded)} {unit_text(p.get('unit'))}".rstrip())
+    return texts
+
+
+def monte_carlo_of(budget: JSON) -> JSON | None:
+    """Return what the page shows of the Monte Carlo run beside the uncertainty budget; None where there is none.
+
+    ``finding``: a sentence; ``rows``: the index of each uncertain parameter.
+    """
+    run = budget.get("monte_carlo")
+    if not run:
+        return None
+    if not run["trials"]:
+        return {"finding": f"No Monte Carlo run: {run['reason']}.", "rows": []}
+    rows = [j for j, U in enumerate(run["expanded_uncertainty"]) if U > 0.0]
+    validated = sum(run["validated"][j] for j in rows)
+    digit = "second" if run["digits"] == 2 else "first"
+    finding = (
+        f"Monte Carlo, {run['trials']:,} trials: the interval of {validated} of {len(rows)} parameters agrees with the "
+        f"budget's to half a unit of the {digit} digit of u."
+    )
+    if validated < len(rows):
+        finding += " Where it does not, use the Monte Carlo interval."
+    return {"finding": finding, "rows": rows}
+
+
+def convergence_of(part: JSON) -> str:
+    """Return one sentence on whether the fit is at a minimum, with the evidence; empty where nothing is known."""
+    shown = part.get("convergence")
+    if not shown:
+        return ""
+    condition = f"condition {number(shown['condition'])}" if shown.get("condition") else "condition not finite"
+    rank = f"{condition} in scaled columns, {shown['rank']} of {shown['parameters']} determined"
+    if shown.get("closed_form"):
+        return f"A closed formula, without iteration; {rank}."
+    cosine = f"largest cosine of the residual and a column of the Jacobian {number(shown['cosine'], 2)}"
+    if part.get("converged", True):
+        return f"The fit converged: {cosine}; {rank}."
+    return (
+        f"The fit did not converge: {cosine}, {rank}. Its values are where it stopped; do not use them. Record more, "
+        "or fit fewer effects."
+    )

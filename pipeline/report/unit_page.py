@@ -23,7 +23,7 @@ from pipeline.report.held_out_section import (
 )
 from pipeline.report.noise_section import allan
 from pipeline.report.pages import template
-from pipeline.report.parameter_section import convergence_of, matrix_rows, monte_carlo_of, parameter_rows, stage_rows
+from pipeline.report.parameters import fitted_parameters, parameter_rows
 from pipeline.report.recording_section import environment, recording_rows, rest_rows, rests_logged, segments
 from pipeline.report.residual_section import measurement_and_model, residual_figures, residuals
 
@@ -55,27 +55,25 @@ def render(
     words : dict of str to list of str, optional
         The diagnosis of each sensor in sentences.
     """
-    attitude = (validation or {}).get("attitude") or {}
-    moves = (validation or {}).get("gravity_direction") or {}
+    validation, diagnosis, words = validation or {}, diagnosis or {}, words or {}
+    attitude, moves = validation.get("attitude") or {}, validation.get("gravity_direction") or {}
     ok, rests = calibration.get("status") == "ok", rests_logged(recordings)
-    sensors = [
-        _sensor(
-            s,
-            calibration,
-            (validation or {}).get(s) or {},
-            (diagnosis or {}).get(s) or {},
-            recordings=recordings,
-            settings=settings,
-        )
-        | {"words": (words or {}).get(s) or []}
-        for s in SENSORS
-    ]
+    sensors = []
+    for sensor in SENSORS if ok else ():
+        shown = {"name": sensor, "unit": SENSOR_UNITS[sensor], "part": calibration.get(sensor)}
+        if shown["part"] is None:
+            shown["reason"] = calibration.get("not_calibrated", {}).get(sensor, "the procedure does not calibrate it")
+        else:
+            held_out, found = validation.get(sensor) or {}, diagnosis.get(sensor) or {}
+            shown |= _sensor(sensor, calibration, held_out, found, recordings=recordings, settings=settings)
+            shown["words"] = words.get(sensor) or []
+        sensors.append(shown)
     page: str = template("unit.html").render(
         calibration=calibration,
         ok=ok,
         passed=passes(calibration, validation),
         checks=checks(validation),
-        sensors=sorted(sensors, key=_order) if ok else [],
+        sensors=sorted(sensors, key=_order),
         attitude=attitude if attitude.get("curve") else None,
         attitude_figure=attitude_over_time(attitude),
         moves=moves if moves.get("moves") else None,
@@ -93,19 +91,12 @@ def render(
 def _sensor(
     sensor: str, calibration: JSON, held_out: JSON, found: JSON, *, recordings: list[Recording], settings: JSON
 ) -> JSON:
-    """Return what the template shows of one sensor, from its parts of validation and diagnosis."""
-    part, unit = calibration.get(sensor), SENSOR_UNITS[sensor]
-    if part is None:
-        reason = (calibration.get("not_calibrated") or {}).get(sensor) or "the procedure does not calibrate it"
-        return {"name": sensor, "unit": unit, "part": None, "reason": reason}
-    sheet, table = (settings.get("sensor") or {}).get(sensor) or {}, settings.get("table") or {}
+    """Return what the template shows of a calibrated sensor, from its parts of validation and diagnosis."""
+    part, sheet, table = calibration[sensor], (settings.get("sensor") or {}).get(sensor) or {}, settings["table"]
     noise, traces = found.get("noise") or held_out.get("noise"), residuals(sensor, part, recordings, table)
     first, last = first_and_last_step(held_out)
     steps = [error_steps(sensor, held_out, found, vector=vector) for vector in (False, True)]
     return {
-        "name": sensor,
-        "unit": unit,
-        "part": part,
         "held_out": held_out,
         "before": first.get("rms_error"),
         "after": last.get("rms_error"),
@@ -116,11 +107,8 @@ def _sensor(
         "held_out_figures": held_out_figures(sensor, calibration, held_out, recordings, table),
         "residual_figures": residual_figures(sensor, traces, noise),
         "noise_figure": allan(sensor, recordings, noise, sheet, found.get("wander")),
-        "matrix": matrix_rows(part),
+        "matrix": fitted_parameters(part)[3:12],
         "parameters": parameter_rows(part, sheet),
-        "monte_carlo": monte_carlo_of(part),
-        "convergence": convergence_of(part),
-        "stages": stage_rows(part),
         "rests": rest_rows(part),
         "diagnosis": found,
         "ranking": ranking_rows(found),

@@ -14,7 +14,7 @@ from pipeline.estimation.engine import Posterior
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.monte_carlo import beside_trials, quadratic_results, through
 from pipeline.records import SensorCalibration
-from pipeline.report.parameter_section import monte_carlo_of
+from pipeline.report.parameters import monte_carlo_of
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, read_config
 from tests.hand_session import hand_held
@@ -104,7 +104,7 @@ def test_methods_by_hand_and_on_a_table_run_it_beside_their_budget() -> None:
         known = U > 0.0
         ratio = (half[known] / U[known]) / np.median(half[known] / U[known])
         assert np.abs(np.log(ratio)).max() < 0.5
-        page = monte_carlo_of(calibration.to_json())
+        page = monte_carlo_of(calibration.to_json()["uncertainty_budget"])
         assert page is not None
         assert page["rows"] == np.flatnonzero(known).tolist()
 

@@ -11,7 +11,7 @@ import pytest
 from pipeline.estimation.least_squares import certified
 from pipeline.estimation.uncertainty_budget import combined, scatter_contribution, type_b
 from pipeline.records import SensorCalibration
-from pipeline.report.parameter_section import convergence_of
+from pipeline.report.parameters import convergence_of
 from pipeline.report.unit_page import render
 
 from .test_pages import Text
