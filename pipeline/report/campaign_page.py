@@ -63,28 +63,20 @@ def render(
     findings = findings_of(rows)
     frame = pd.DataFrame(rows).reindex(columns=list(dict.fromkeys([*COLUMNS, *(k for row in rows for k in row)])))
     judged = [row.get("pass") for row in rows]
+    serials = frame[frame["serial"].fillna("") != ""].groupby("serial", sort=False)
     text: str = template("campaign.html").render(
         campaign=campaign,
         rows=rows,
         failures=failures,
         twins=twins,
-        implausible=[
-            (row["unit"], s, names.replace(";", ", "))
-            for row in rows
-            for s in SENSORS
-            if (names := row.get(f"{s}_implausible"))
-        ],
+        implausible=[(r["unit"], s, names) for r in rows for s in SENSORS if (names := r.get(f"{s}_implausible"))],
         ok=sum(row["status"] == "ok" for row in rows),
         passed=judged.count(True),
         not_passed=judged.count(False),
         judged=any(row.get("pass") is not None for row in rows if row["status"] == "ok"),
-        fleet=[m for s in SENSORS if (m := _medians(s, "all units", frame))],
+        fleet=_medians("all units", frame),
         lots=_lots(frame),
-        groups=[
-            (f"Serial {serial}", [rows[i] for i in same.index])
-            for serial, same in frame[frame["serial"].fillna("") != ""].groupby("serial", sort=False)
-            if len(same) > 1
-        ],
+        groups=[(f"Serial {n}", [rows[i] for i in same.index]) for n, same in serials if len(same) > 1],
         figures=[f for sensor in SENSORS if (f := _fleet_figure(sensor, frame))],
         statistics=statistics if statistics and len(rows) >= FEWEST_UNITS else None,
         far_shown=FAR_SHOWN,
@@ -100,7 +92,7 @@ def render(
         sections=comparisons,
         verdicts=VERDICTS,
         sensors=SENSORS,
-        kept=sorted({key for row in rows for key in row} - set(COLUMNS)),
+        kept=sorted(set(frame) - set(COLUMNS)),
         beside=page,
     )
     return text
@@ -115,31 +107,27 @@ def _causes(failures: list[JSON]) -> list[tuple[str, list[str]]]:
     return sorted(causes.items(), key=lambda c: -len(c[1]))
 
 
-def _medians(sensor: str, name: str, frame: pd.DataFrame) -> JSON | None:
-    """Return the medians of the errors, the verdicts and the missing effects of some units."""
-    known = frame[frame[f"{sensor}_error_after"].notna()]
-    if known.empty:
-        return None
-    figures = ("error_before", "error_after", "noise_floor")
-    before, after, floor = (pd.to_numeric(known[f"{sensor}_{column}"]).median() for column in figures)
-    verdicts = Counter(known[f"{sensor}_verdict"])
-    return {
-        "sensor": sensor,
-        "name": name,
-        "unit": SENSOR_UNITS[sensor],
-        "count": len(known),
-        "before": number(float(before)),
-        "after": number(float(after)),
-        "floor": number(float(floor)),
-        "verdicts": {plain(v): verdicts[v] for v in VERDICTS if verdicts[v]},
-        "missing": sorted(_selected(sensor, known).items(), key=lambda c: (-c[1], c[0])),
-    }
+def _medians(name: str, frame: pd.DataFrame) -> list[JSON]:
+    """Return for each sensor the medians of the errors, the verdicts and the missing effects of some units."""
+    found = []
+    for sensor in SENSORS:
+        known = frame[frame[f"{sensor}_error_after"].notna()]
+        figures = {
+            figure: float(pd.to_numeric(known[f"{sensor}_{column}"]).median())
+            for figure, column in (("before", "error_before"), ("after", "error_after"), ("floor", "noise_floor"))
+        }
+        verdicts = Counter(known[f"{sensor}_verdict"])
+        about = {"sensor": sensor, "name": name, "unit": SENSOR_UNITS[sensor], "count": len(known)}
+        counts = {verdict: verdicts[verdict] for verdict in VERDICTS if verdicts[verdict]}
+        if len(known):
+            found.append(about | figures | {"verdicts": counts, "missing": _missing(sensor, known)})
+    return found
 
 
-def _selected(sensor: str, frame: pd.DataFrame) -> Counter[str]:
-    """Return in how many units each effect is missing."""
-    names = (name for names in frame[f"{sensor}_selected"].dropna() for name in str(names).split(";"))
-    return Counter(plain(name) for name in names if name)
+def _missing(sensor: str, frame: pd.DataFrame) -> list[tuple[str, int]]:
+    """Return in how many units each effect is missing, the most frequent first."""
+    names = Counter(name for names in frame[f"{sensor}_selected"].dropna() for name in names.split(";") if name)
+    return sorted(((plain(name), count) for name, count in names.items()), key=lambda c: (-c[1], c[0]))
 
 
 def _lots(frame: pd.DataFrame) -> list[JSON]:
@@ -147,7 +135,8 @@ def _lots(frame: pd.DataFrame) -> list[JSON]:
     lots = {lot: of for lot, of in frame.groupby("lot", sort=False) if lot}
     if not 1 < len(lots) <= MOST_LOTS:
         return []
-    return [m for s in SENSORS for lot, of in lots.items() if (m := _medians(s, f"lot {lot}", of))]
+    found = [medians for lot, of in lots.items() for medians in _medians(f"lot {lot}", of)]
+    return sorted(found, key=lambda medians: SENSORS.index(medians["sensor"]))
 
 
 def _fleet_values(rows: list[JSON]) -> JSON:
@@ -167,7 +156,8 @@ def _fleet_figure(sensor: str, frame: pd.DataFrame) -> Figure | None:
     errors = (pd.to_numeric(frame[f"{sensor}_{name}"]) for name in ("error_before", "error_after", "noise_floor"))
     before, after, floor = (v.where(v > 0).to_numpy(float) for v in errors)
     known = np.isfinite(after)
-    if known.sum() < FEWEST_UNITS:
+    count = int(known.sum())
+    if count < FEWEST_UNITS:
         return None
     complete = known & (frame[f"{sensor}_verdict"] == "nothing_missing").to_numpy(bool)
     layers: list[Layer] = [Dots(order, before, 3), Dots(order, floor, 4)]
@@ -179,15 +169,14 @@ def _fleet_figure(sensor: str, frame: pd.DataFrame) -> Figure | None:
         if chosen.any():
             layers.append(Dots(order[chosen], after[chosen], colour))
             legend.append((f"c{colour}", name))
-    missing = _selected(sensor, frame).most_common()
-    effects = ", ".join(f"{name} ({count} unit{'s' if count != 1 else ''})" for name, count in missing)
+    effects = ", ".join(f"{name} ({n} unit{'s' if n != 1 else ''})" for name, n in _missing(sensor, frame))
     words = f"Missing effects: {effects}." if effects else "No effect is named as missing."
     middle = [number(float(np.nanmedian(v))) if np.isfinite(v).any() else "not known" for v in (before, after, floor)]
-    finding = f"{sensor.capitalize()}: {_farthest(frame['unit'].tolist(), after / floor, int(known.sum()))}"
+    finding = f"{sensor.capitalize()}: {_farthest(frame['unit'].tolist(), after / floor, count)}"
     caption = f"Error on held-out motion, each unit a dot. {words}"
     return chart(
         Figure(f"fleet-{sensor}", finding, caption, tuple(legend)),
-        f"Held-out error of {int(known.sum())} units. Median {middle[0]} {unit} before, {middle[1]} after, noise floor "
+        f"Held-out error of {count} units. Median {middle[0]} {unit} before, {middle[1]} after, noise floor "
         f"{middle[2]}. {words}",
         [Panel(layers, f"rms error, {unit}", 200, logarithmic=True)],
         "unit, in the order of units.csv",

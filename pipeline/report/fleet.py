@@ -17,8 +17,8 @@ References
 
 from __future__ import annotations
 
+import io
 import math
-import os
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,6 +26,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from pipeline.files import write_atomically
 from pipeline.records import SENSORS
 from pipeline.report.parameters import Parameter, fitted_parameters
 
@@ -53,19 +54,9 @@ def unit_parameters(calibration: JSON) -> dict[str, Parameter]:
 
 
 def fleet_statistics(rows: Sequence[JSON], fitted: Mapping[str, Mapping[str, Parameter]]) -> JSON:
-    """Return the statistics of a fleet, ``fleet.json``.
+    """Return the statistics of a fleet, ``fleet.json``: a list of dicts for each of ``STATISTICS``, and ``missing``.
 
-    Parameters
-    ----------
-    rows : sequence of dict
-        One a unit, as of ``summary.summary_row``.
-    fitted : mapping
-        Unit to its parameters, as of ``unit_parameters``; units that failed have none.
-
-    Returns
-    -------
-    dict
-        ``distributions``, ``far``, ``drift``, ``lots``, ``repeatability``: lists of dicts; ``missing``: sentences.
+    ``rows``: one a unit, as of ``summary_row``; ``fitted``: unit to its parameters, none of those that failed.
     """
     sheet = pd.DataFrame(rows, columns=["unit", "lot", "date", "serial", *SIBLINGS]).set_index("unit").replace("", None)
     out: JSON = {key: [] for key in STATISTICS}
@@ -92,17 +83,12 @@ def _spread(values: pd.DataFrame) -> pd.Series:
 
 
 def _distributions(values: pd.DataFrame, _: pd.DataFrame) -> Iterable[tuple[str, JSON]]:
-    low, middle, high = values.quantile([0.05, 0.5, 0.95]).to_numpy()
-    frame = pd.DataFrame({
-        "median": middle,
-        "robust_standard_deviation": _spread(values),
-        "quantile_05": low,
-        "quantile_95": high,
-        "smallest": values.min(),
-        "largest": values.max(),
-    })  # fmt: skip
-    for name, count, row in zip(frame.index, values.count(), frame.to_dict("records"), strict=True):
-        yield name, {"units": int(count), **row}
+    spread = _spread(values)
+    for name, v in values.items():
+        low, middle, high = v.quantile([0.05, 0.5, 0.95]).tolist()
+        found = {"units": int(v.count()), "median": middle, "robust_standard_deviation": float(spread[name])}
+        ends = {"smallest": float(v.min()), "largest": float(v.max())}
+        yield str(name), found | {"quantile_05": low, "quantile_95": high} | ends
 
 
 def _far(values: pd.DataFrame, siblings: pd.DataFrame) -> Iterable[tuple[str, JSON]]:
@@ -201,12 +187,6 @@ def write_parameters(path: Path, rows: Sequence[JSON], fitted: Mapping[str, Mapp
     """Write ``parameters.parquet``: a row a unit with everything of ``summary.csv`` and every fitted parameter.
 
     Columns of a parameter: ``<name>`` and ``<name>_expanded_uncertainty``, with the unit in the column's metadata.
-
-    Parameters
-    ----------
-    path : Path
-    rows, fitted
-        As of ``fleet_statistics``.
     """
     arrays, fields = [], []
     for column in dict.fromkeys(key for row in rows for key in row):
@@ -221,6 +201,6 @@ def write_parameters(path: Path, rows: Sequence[JSON], fitted: Mapping[str, Mapp
         for suffix, of in (("", "value"), ("_expanded_uncertainty", "expanded_uncertainty")):
             arrays.append(pa.array([getattr(p, of) if p else None for p in found], pa.float64()))
             fields.append(pa.field(name + suffix, pa.float64(), metadata={"unit": unit}))
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    pq.write_table(pa.Table.from_arrays(arrays, schema=pa.schema(fields)), temporary, compression="zstd")
-    temporary.replace(path)
+    buffer = io.BytesIO()
+    pq.write_table(pa.Table.from_arrays(arrays, schema=pa.schema(fields)), buffer, compression="zstd")
+    write_atomically(path, buffer.getvalue())

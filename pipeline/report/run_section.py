@@ -30,14 +30,7 @@ NEAR_FLOOR = 1.5  # of the noise floor, up to which a bar is green
 def with_history(page: str, states: Sequence[tuple[int, JSON]], times: Mapping[int, str]) -> str:
     """Return a unit's page with the section on its runs.
 
-    Parameters
-    ----------
-    page : str
-        As of ``unit_page.render``.
-    states : sequence of (int, dict)
-        Number of each run that changed the unit, and the unit's state after it.
-    times : mapping of int to str
-        When each run was.
+    ``states``: number of each run that changed the unit, and the unit's state after it; ``times``: when each run was.
     """
     entries: list[JSON] = []
     before: JSON = {}
@@ -88,15 +81,7 @@ def times_of(entries: Sequence[JSON]) -> dict[int, str]:
 
 
 def runs_data(entries: Sequence[JSON], settings: JSON) -> JSON | None:
-    """Return what the campaign's page needs to compare any two runs; None while there is one run.
-
-    Parameters
-    ----------
-    entries : sequence of dict
-        As of ``history.read_history``.
-    settings : dict
-        Of the run.
-    """
+    """Return what the campaign's page needs to compare any two runs; None while there is one run."""
     if len(entries) < 2:
         return None
     kept, times = _kept(entries), times_of(entries)

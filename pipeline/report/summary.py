@@ -18,15 +18,8 @@ if TYPE_CHECKING:
 JSON = dict[str, Any]
 UNIT_COLUMNS = ("unit", "serial", "lot", "date", "status", "error", "sensor", "method")
 SENSOR_COLUMNS = (
-    "error_before",
-    "error_after",
-    "mean_abs_before",
-    "mean_abs_after",
-    "noise_floor",
-    "verdict",
-    "selected",
-    "reason",
-)
+    "error_before", "error_after", "mean_abs_before", "mean_abs_after", "noise_floor", "verdict", "selected", "reason",
+)  # fmt: skip
 IMPLAUSIBLE = tuple(f"{s}_implausible" for s in SENSORS)
 COLUMNS = (*UNIT_COLUMNS, *(f"{s}_{c}" for s in SENSORS for c in SENSOR_COLUMNS), "pass", *IMPLAUSIBLE)
 SHEET_COLUMNS = ("table", "procedure", "ingest", "filter", "certificate", "overrides")  # of units.csv; not repeated
@@ -37,13 +30,7 @@ def summary_row(
 ) -> JSON:
     """Return a unit's row: a dict from column to value, None where there is none.
 
-    Parameters
-    ----------
-    unit : str
-    calibration, validation, diagnosis : dict
-        As in their files; the last two may be None.
-    sheet_row : dict of str to str
-        The unit's row of ``units.csv``.
+    ``calibration, validation, diagnosis``: as in their files; ``sheet_row``: the unit's row of ``units.csv``.
     """
     error = calibration.get("error") or {}
     file = f"{error['file']}: " if error.get("file") else ""
@@ -60,16 +47,9 @@ def summary_row(
         held_out, found = (validation or {}).get(sensor) or {}, (diagnosis or {}).get(sensor) or {}
         raw, final = first_and_last_step(held_out)
         selected = found.get("selected") if found.get("verdict") == "missing_effect" else None
-        values = (
-            raw.get("rms_error"),
-            final.get("rms_error"),
-            raw.get("mean_abs_error"),
-            final.get("mean_abs_error"),
-            held_out.get("noise_floor"),
-            found.get("verdict"),
-            ";".join(selected or []) or None,
-            found.get("reason") or None,
-        )
+        errors = [step.get(error) for error in ("rms_error", "mean_abs_error") for step in (raw, final)]
+        texts = [found.get("verdict"), ";".join(selected or []) or None, found.get("reason") or None]
+        values = [*errors, held_out.get("noise_floor"), *texts]
         row |= {f"{sensor}_{column}": value for column, value in zip(SENSOR_COLUMNS, values, strict=True)}
         implausible = (calibration.get(sensor) or {}).get("implausible") or []
         row[f"{sensor}_implausible"] = ";".join(e["parameter"] for e in implausible) or None
@@ -80,14 +60,7 @@ def summary_row(
 
 
 def write_summary(path: Path, rows: list[JSON]) -> None:
-    """Write ``summary.csv``; own columns may differ from unit to unit.
-
-    Parameters
-    ----------
-    path : Path
-    rows : list of dict
-        As of ``summary_row``.
-    """
+    """Write ``summary.csv`` from rows of ``summary_row``; own columns may differ from unit to unit."""
     import pandas as pd  # noqa: PLC0415  (0.4 s, and summary_row is used without it)
 
     columns = list(dict.fromkeys([*COLUMNS, *(key for row in rows for key in row)]))
