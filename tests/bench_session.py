@@ -154,7 +154,7 @@ def _recording(  # noqa: PLR0917  (one of everything that a recording is made of
         for name, values in hidden.items():
             if name not in ALTERATIONS:
                 readings[sensor] += effect(name).reading(sensor, motion, K[sensor], values)
-    pose = item.trajectory.commanded(time - start)
+    pose = item.trajectory.pose(time - start)
     attitude = None
     if item.axis is None:
         attitude = item.trajectory.quaternion(time - start) if hasattr(item.trajectory, "quaternion") else None

@@ -15,8 +15,7 @@ from pipeline.model.effects.files import read_effect_files
 from pipeline.planning.changes import best_changes
 from pipeline.planning.plan import plan_of
 from pipeline.planning.plan_text import helps_most, plan_text, side_by_side
-from pipeline.simulation.description import UnitDescription, read_description
-from pipeline.simulation.options import add_recording_options, described
+from pipeline.simulation.description import UnitDescription, add_recording_options, described, read_description
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

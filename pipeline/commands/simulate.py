@@ -13,8 +13,13 @@ from pipeline.model.effects import register
 from pipeline.model.effects.files import read_effect_files
 from pipeline.outcome import run_command
 from pipeline.simulation.campaign import write_campaign
-from pipeline.simulation.description import FORMATS, description_from, read_description
-from pipeline.simulation.options import add_recording_options, described
+from pipeline.simulation.description import (
+    FORMATS,
+    add_recording_options,
+    described,
+    description_from,
+    read_description,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -15,8 +15,7 @@ from pipeline.model.effects import effect
 from pipeline.model.effects.base import Owner
 from pipeline.planning.plan import plan_of
 from pipeline.records import SENSORS
-from pipeline.simulation.campaign import course_of
-from pipeline.simulation.description import read_config
+from pipeline.simulation.description import course_of, read_config
 from pipeline.simulation.procedures import TABLE_PROCEDURES, plan
 from pipeline.simulation.trajectory import Gimbals, Planned, random_gimbals
 

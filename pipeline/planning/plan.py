@@ -29,8 +29,8 @@ from pipeline.model.effects import effect
 from pipeline.model.effects.base import unit_of
 from pipeline.planning.detection_limits import RestLimits, TurntableLimits
 from pipeline.records import SENSORS, Noise, Recording, SensorCalibration
-from pipeline.simulation.campaign import course_of, simulate_unit
-from pipeline.simulation.description import read_config
+from pipeline.simulation.campaign import simulate_unit
+from pipeline.simulation.description import course_of, read_config
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

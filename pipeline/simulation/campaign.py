@@ -16,27 +16,23 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import yaml
 
 from pipeline.errors import ConfigurationError
 from pipeline.io.csv_write import write_canonical_csv
 from pipeline.records import AXES, SENSORS
-from pipeline.simulation.description import read_config
+from pipeline.simulation.description import course_of, read_config
 from pipeline.simulation.draw import drawn_effects, drawn_sensors, inline_effects
-from pipeline.simulation.one_session import joined
-from pipeline.simulation.procedures import ONE_RECORDING, TABLE_PROCEDURES, Course, fit_to_samples, plan
+from pipeline.simulation.procedures import ONE_RECORDING, plan
 from pipeline.simulation.sensor import random_environment
 from pipeline.simulation.session import (
     ANGLE_DECIMALS,
     QUATERNION_DECIMALS,
     TEMPERATURE_DECIMALS,
     Bench,
-    Session,
     Streams,
-    hidden,
+    record,
 )
-from pipeline.simulation.table_logs import as_program, clock_of, own_log, table_log_of
-from pipeline.simulation.trajectory import Turn
+from pipeline.simulation.table_logs import columns_of, programs_of, with_table_log
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -52,10 +48,6 @@ if TYPE_CHECKING:
 
 COLUMNS = ("unit", "serial", "lot", "date", "sensor", "table", "procedure", "method", "ingest", "filter", "overrides")
 CAMPAIGN = "# Hydra overrides for all units of this campaign.\noverrides: []\n"
-# By hand, rests are longer and moves faster than on a table, and there is no held-out motion with a reference.
-BY_HAND = Course(dwell_s=4.0, step_rate_dps=60.0, acceleration_dps2=200.0, validation_s=0.0)
-FILE, PROGRAM = "file", "program"
-INGEST = "table_log"
 
 
 def write_campaign(
@@ -65,20 +57,18 @@ def write_campaign(
     *,
     sheet_only: bool = False,
 ) -> None:
-    """Simulate every unit of a description and write the campaign.
+    """Simulate every unit of a description and write the campaign; files of the same names are replaced.
 
     Parameters
     ----------
     description : Description
     directory : Path
-        Made if it does not exist; files of the same names are replaced.
     progress : callable
-        Told of each unit that is done.
+        Gets a line for each unit that is done.
     sheet_only : bool
         Write ``units.csv`` without recordings and truth: for a campaign whose run makes them.
     """
-    programs = programs_of(description.units, [course_of(u) for u in description.units])
-    for name, text in programs.items():
+    for name, text in programs_of(description.units).items():
         path = directory / "configs" / "procedure" / f"{name}.yaml"
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8")
@@ -90,15 +80,15 @@ def write_campaign(
         folder = directory / "raw" / unit.unit
         folder.mkdir(parents=True, exist_ok=True)
         for recording in recordings:
-            write_recording(folder, recording, unit.format, sheet)
+            _write_recording(folder, recording, unit.format, sheet)
         _write_json(directory / "truth" / f"{unit.unit}.json", {**truth, "unit": unit.unit})
         progress(f"{unit.unit}: {sum(r.samples for r in recordings)} samples in {len(recordings)} recordings")
-    (directory / "units.csv").write_text(_table(sheet_rows(description)), encoding="utf-8")
+    (directory / "units.csv").write_text(_table(_sheet_rows(description)), encoding="utf-8")
     if not (directory / "campaign.yaml").exists():
         (directory / "campaign.yaml").write_text(CAMPAIGN, encoding="utf-8")
 
 
-def sheet_rows(description: Description) -> list[dict[str, Any]]:
+def _sheet_rows(description: Description) -> list[dict[str, Any]]:
     """Return the rows of ``units.csv``: of the units, of their variants, then the further ones."""
     rows = [
         {"unit": unit.unit, "sensor": unit.sensor, "table": unit.table, "procedure": unit.procedure}
@@ -122,14 +112,8 @@ def simulate_unit(
 ) -> tuple[list[Recording], dict[str, Any]]:
     """Return the recordings of one unit and the truth behind them.
 
-    Parameters
-    ----------
-    unit : UnitDescription
-    seed : int
-    number : int
-        Of the unit in its campaign; with the seed it determines every random number.
-    extra : sequence of Planned
-        Further recordings after those of the procedure.
+    The seed and the unit's number in its campaign determine every random number. ``extra``: further recordings after
+    those of the procedure.
     """
     streams = Streams(seed, number)
     sheets = read_config("sensor", unit.sensor)
@@ -151,14 +135,14 @@ def simulate_unit(
     environment = random_environment(streams["room"], ramp=ramp, ramp_period=total / 1.5)
     environment = replace(environment, **unit.temperature)
     pause = unit.interval_s if unit.procedure == ONE_RECORDING else course.pause_s
-    session = Session(planned, benches, hidden(effects), environment, unit.interval_s, pause, unit.lost)
     truth = {
         "seed": [seed, number],
         **{name: getattr(unit, name) for name in ("sensor", "table", "procedure", "interval_s", "lost")},
         **{s: _truth(sensors[s], effects[s], unit.interval_s) for s in SENSORS},
         "imperfections": {k: np.asarray(v).tolist() for k, v in bench.imperfections.items()},
     }
-    recordings, clock = with_table_log(unit, planned, session.recordings(streams), streams["link"])
+    made = record(planned, benches, effects, environment=environment, unit=unit, pause=pause, streams=streams)
+    recordings, clock = with_table_log(unit, planned, made, streams["link"])
     return recordings, truth | ({"table_clock": clock} if clock else {})
 
 
@@ -173,7 +157,7 @@ def _wanted(unit: UnitDescription, planned: list[Planned]) -> list[Planned]:
     return [p for p in planned if not unit.recordings or p.name in unit.recordings]
 
 
-def write_recording(folder: Path, recording: Recording, kind: str, sheets: dict[str, Any]) -> None:
+def _write_recording(folder: Path, recording: Recording, kind: str, sheets: dict[str, Any]) -> None:
     """Write one recording as ``<name>.csv`` or ``<name>.mcap``, in the axes of the unit's body."""
     if kind == "mcap":
         from pipeline.io.ros2_messages import write_mcap  # noqa: PLC0415  (needs the mcap library)
@@ -190,16 +174,6 @@ def write_recording(folder: Path, recording: Recording, kind: str, sheets: dict[
 
 def _digits(sheet: dict[str, Any]) -> int:
     return int(np.ceil(np.log10(sheet["counts_per_unit"]))) + 1
-
-
-def course_of(unit: UnitDescription) -> Course:
-    """Return how the unit's procedure is run: as described, and fitted to its number of samples."""
-    base = Course() if unit.procedure in TABLE_PROCEDURES else BY_HAND
-    wanted: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in unit.course.items()}
-    course = replace(base, **wanted)
-    if unit.samples is None:
-        return course
-    return fit_to_samples(unit.procedure, course, unit.samples, unit.interval_s, keep_step="step_deg" in unit.course)
 
 
 def _imperfections(table: dict[str, Any], given: dict[str, Any], rng: np.random.Generator) -> dict[str, Any]:
@@ -268,88 +242,3 @@ def _table(rows: list[dict[str, Any]]) -> str:
 def _write_json(path: Path, content: dict[str, Any]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-
-
-NO_TABLE: dict[str, Any] = {"table_angle": None, "table_rate": None, "table_attitude": None}
-
-
-def with_table_log(
-    unit: UnitDescription, planned: Sequence[Planned], recordings: list[Recording], rng: np.random.Generator
-) -> tuple[list[Recording], dict[str, float] | None]:
-    """Return recordings as they are laid out, and the clock of a table's log of its own.
-
-    Logs of their own follow the recordings, each named after the one that it belongs to.
-    """
-    log = table_log_of(unit.table_log)
-    starts = [float(r.time[0]) for r in recordings]
-    if unit.procedure == ONE_RECORDING:
-        groups = [(joined(recordings, planned, wrapped=log.wrapped), planned, starts)]
-    else:
-        groups = [(r, [p], [s]) for r, p, s in zip(recordings, planned, starts, strict=True)]
-    whole = [_wrapped(r) if log.wrapped else r for r, _, _ in groups]
-    if log.kind == FILE:
-        clock = clock_of(log, rng)
-        logs = [own_log(f"{r.name}_table", p, s, log, clock) for r, p, s in groups]
-        truth = {"offset_s": clock.offset_s, "drift_ppm": 1e6 * clock.drift}
-        return [*(replace(r, **NO_TABLE) for r in whole), *logs], truth
-    if log.kind == PROGRAM:
-        return [replace(r, **NO_TABLE) if r.axis is not None else r for r in whole], None
-    return whole, None
-
-
-def _wrapped(recording: Recording) -> Recording:
-    angle = recording.table_angle
-    return recording if angle is None else replace(recording, table_angle=np.mod(angle, 360.0))
-
-
-def columns_of(unit: UnitDescription) -> dict[str, str]:
-    """Return the columns of ``units.csv`` that the layout asks for."""
-    kind = table_log_of(unit.table_log).kind
-    if kind == FILE:
-        return {"ingest": INGEST}
-    return {"procedure": _commanded(unit)} if kind == PROGRAM else {}
-
-
-def _commanded(unit: UnitDescription) -> str:
-    return f"{unit.procedure}_commanded"
-
-
-def programs_of(units: Sequence[UnitDescription], courses: Sequence[Course]) -> dict[str, str]:
-    """Return the procedures of tables that log nothing, each with its program: name to YAML.
-
-    Parameters
-    ----------
-    units : sequence of UnitDescription
-    courses : sequence of Course
-        Of each unit.
-
-    Raises
-    ------
-    ConfigurationError
-        If units of one procedure follow different programs.
-    """
-    found: dict[str, str] = {}
-    for unit, course in zip(units, courses, strict=True):
-        if table_log_of(unit.table_log).kind == PROGRAM:
-            text = _procedure_text(unit.procedure, course)
-            if found.setdefault(_commanded(unit), text) != text:
-                raise ConfigurationError(
-                    f"unit {unit.unit}: its table follows another program than those of the units before; simulate it "
-                    "as a campaign of its own"
-                )
-    return found
-
-
-def _procedure_text(name: str, course: Course) -> str:
-    procedure = read_config("procedure", name)
-    programs = {
-        p.name: as_program(p.trajectory.program)
-        for p in plan(name, course, np.random.default_rng(0))
-        if isinstance(p.trajectory, Turn)
-    }
-    entries: dict[str, Any] = {
-        recording: {**entry, **({"program": programs[recording]} if recording in programs else {})}
-        for recording, entry in procedure["recordings"].items()
-    }
-    comment = "# The table has no encoders: its program in place of its log. Written by python -m pipeline simulate.\n"
-    return comment + yaml.safe_dump({**procedure, "recordings": entries}, sort_keys=False, width=120)

@@ -19,7 +19,7 @@ What a unit leaves out is drawn at random from the sensor's data sheet. The keys
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -27,14 +27,47 @@ from pipeline.errors import ConfigurationError, MissingInputError
 from pipeline.files import CONFIGS
 from pipeline.io.files import wrong_name
 from pipeline.io.yaml_file import read_yaml
-from pipeline.simulation.procedures import ONE_RECORDING, TABLE_PROCEDURES, Course
-from pipeline.simulation.table_logs import table_log_of
+from pipeline.simulation.procedures import ONE_RECORDING, TABLE_PROCEDURES, Course, fit_to_samples
 
 if TYPE_CHECKING:
+    import argparse
+    from collections.abc import Mapping
     from pathlib import Path
 
 FORMATS = ("csv", "mcap")
-UNITS_OF_A_LOT = 25
+KINDS = ("rows", "file", "program")
+_, FILE, PROGRAM = KINDS
+UNITS_OF_A_LOT = 25  # of a described count of units: a round number
+# By hand, rests are longer and moves faster than on a table, and there is no held-out motion with a reference.
+BY_HAND = Course(dwell_s=4.0, step_rate_dps=60.0, acceleration_dps2=200.0, validation_s=0.0)
+RECORDED = ("sensor", "table", "procedure", "samples", "interval_s", "lost")
+
+
+@dataclass(frozen=True)
+class TableLog:
+    """How the table is logged.
+
+    Attributes
+    ----------
+    kind : str
+        ``rows``: in the sensor's rows; ``file``: in a file of its own; ``program``: not at all.
+    interval_s : float
+        Of a file.
+    offset_s, drift_ppm : float or None
+        Of the file's clock; None: drawn at random, 0 to 100 s and of 50 ppm.
+    wrapped : bool
+        Whether the encoder starts again at 360 deg.
+    """
+
+    kind: str = "rows"
+    interval_s: float = 0.01
+    offset_s: float | None = None
+    drift_ppm: float | None = None
+    wrapped: bool = False
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise ConfigurationError(f"table_log.kind is {self.kind!r}; it is {', '.join(KINDS)}")
 
 
 @dataclass(frozen=True)
@@ -43,34 +76,26 @@ class UnitDescription:
 
     Attributes
     ----------
-    unit : str
     count : int
         Units of this description; above 1, ``unit`` is a prefix.
-    sensor, table, procedure : str
-        Names of configurations.
     columns : dict
         Further columns of ``units.csv``: serial, lot, date, method, overrides ...
     course : dict
         How the procedure is run: attributes of ``procedures.Course``.
     samples : int or None
         About how many rows the unit's recordings have together.
-    interval_s : float
-        Sampling interval.
     lost : float
         Share of the samples that the radio link loses.
-    format : str
-        ``csv`` or ``mcap``.
     accelerometer, gyroscope : dict
         ``bias`` (g or deg/s), ``matrix``, or in its place ``scale_factor`` (of the correction),
         ``non_orthogonality_deg`` (yx, zx, zy) and ``mounting_deg`` (turns about x, then y, then z); and
         ``noise_density``, ``bias_wander``, ``wander_time_s`` in place of the data sheet's.
     effects : dict
         ``sensor.effect``, or ``effect`` alone for both sensors, to null (a typical size, at random), a number (that
-        size, with random signs) or the list of the parameters' values; or to a formula of its own
-        (``inline_effects``).
+        size, with random signs), the list of the parameters' values, or a formula of its own (``inline_effects``).
     imperfections : dict
-        What the table does otherwise than commanded; see ``table_errors.random_errors``, and ``tilt_deg`` (2,). What is
-        left out follows from the accuracies of the table's configuration.
+        What the table does otherwise than commanded: ``tilt_deg`` (2,) and the settings of
+        ``rate_table.random_errors``. What is left out follows from the accuracies of the table's configuration.
     held_out : dict
         Where the held-out motion and the long rest are recorded elsewhere: ``table``, ``imperfections``,
         ``accelerometer``, ``gyroscope``.
@@ -83,7 +108,7 @@ class UnitDescription:
     motion : int or None
         Number of the random motion: units of the same number and course move alike. None: each has a motion of its own.
     table_log : dict
-        How the table is logged: attributes of ``table_logs.TableLog``.
+        Attributes of ``TableLog``.
     """
 
     unit: str
@@ -119,18 +144,34 @@ class UnitDescription:
         if not self.interval_s > 0.0:
             raise ConfigurationError(f"unit {self.unit}: interval_s is {self.interval_s}; it must be above 0")
         _refuse_unknown(self.course, {f.name for f in fields(Course)}, f"unit {self.unit}: course")
-        log = table_log_of(self.table_log).kind
+        _refuse_unknown(self.table_log, {f.name for f in fields(TableLog)}, "table_log")
+        log = self.log.kind
         if log != "rows" and self.format != "csv":
             raise ConfigurationError(f"unit {self.unit}: a table_log of its own is written in csv only")
         if log != "rows" and self.procedure not in TABLE_PROCEDURES:
             raise ConfigurationError(f"unit {self.unit}: procedure {self.procedure} has no table to log")
-        if log == "program" and self.procedure == ONE_RECORDING:
+        if log == PROGRAM and self.procedure == ONE_RECORDING:
             raise ConfigurationError(f"unit {self.unit}: procedure {ONE_RECORDING} has moves that no program describes")
+
+    @property
+    def log(self) -> TableLog:
+        """How the table is logged."""
+        return TableLog(**self.table_log)
+
+
+def course_of(unit: UnitDescription) -> Course:
+    """Return how the unit's procedure is run: as described, and fitted to its number of samples."""
+    base = Course() if unit.procedure in TABLE_PROCEDURES else BY_HAND
+    wanted: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in unit.course.items()}
+    course = replace(base, **wanted)
+    if unit.samples is None:
+        return course
+    return fit_to_samples(unit.procedure, course, unit.samples, unit.interval_s, keep_step="step_deg" in unit.course)
 
 
 @dataclass(frozen=True)
 class Description:
-    """A campaign to be simulated: its seed, units, variants of them, and further rows of ``units.csv``."""
+    """A campaign to be simulated; ``rows`` are further ones of ``units.csv``."""
 
     seed: int
     units: tuple[UnitDescription, ...]
@@ -148,8 +189,7 @@ def read_description(path: Path) -> Description:
     ConfigurationError
         If it holds what is not known.
     """
-    data = read_mapping(path)
-    return description_from(data, str(path))
+    return description_from(_read_mapping(path), str(path))
 
 
 def description_from(data: dict[str, Any], origin: str) -> Description:
@@ -174,7 +214,7 @@ def description_from(data: dict[str, Any], origin: str) -> Description:
     return Description(int(data.get("seed", 0)), tuple(units), tuple(data.get("rows") or ()), variants)
 
 
-def read_mapping(path: Path) -> dict[str, Any]:
+def _read_mapping(path: Path) -> dict[str, Any]:
     """Read a YAML file that holds a mapping."""
     if not os.path.lexists(path):
         raise MissingInputError("this file does not exist", str(path))
@@ -197,7 +237,7 @@ def read_config(group: str, name: str) -> dict[str, Any]:
     if not path.is_file():
         known = ", ".join(sorted(p.stem for p in path.parent.glob("*.yaml")))
         raise ConfigurationError(f"no {group} is called {name!r}; known: {known}")
-    return read_mapping(path)
+    return _read_mapping(path)
 
 
 def _counted(entry: dict[str, Any]) -> list[UnitDescription]:
@@ -217,3 +257,44 @@ def _refuse_unknown(data: dict[str, Any], known: set[str], origin: str) -> None:
     unknown = sorted(set(data) - known)
     if unknown:
         raise ConfigurationError(f"{origin}: {', '.join(unknown)} is not known; known: {', '.join(sorted(known))}")
+
+
+def add_recording_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of what is recorded and how, to a parser with ``argument_default=argparse.SUPPRESS``.
+
+    ``simulate`` and ``plan`` share them, so that a planned procedure can be simulated with the same options.
+    """
+    add = parser.add_argument
+    add("--sensor", metavar="NAME", help="configs/sensor (mpu6050)")
+    add("--table", metavar="NAME", help="configs/table (acutronic; hand for procedures without a table)")
+    add("--procedure", metavar="NAME", help="configs/procedure (three_axis_turns)")
+    add("--samples", type=int, metavar="N", help="about so many rows a unit: dwells, rests, held-out motion follow")
+    add("--interval", dest="interval_s", type=float, metavar="S", help="sampling interval in s (0.12)")
+    add("--table-log", choices=KINDS, help="where the table is logged: in the sensor's rows (the default), in a file "
+        "with a clock of its own, or not at all: then its program is known")  # fmt: skip
+    add("--lost", type=float, metavar="SHARE", help="share of the samples that the radio link loses (0)")
+    add = parser.add_argument_group("how the procedure is run").add_argument
+    add("--dwell", dest="dwell_s", type=float, metavar="S", help="rest at each stop (1; without a table 4)")
+    add("--step", dest="step_deg", type=float, metavar="DEG", help="of stop-and-go (5)")
+    add("--accelerometer-rate", dest="accelerometer_rates_dps", type=float, nargs="+", metavar="DPS",
+        help="continuous turns for the accelerometer in place of stop-and-go")  # fmt: skip
+    add("--rate", "--rates", dest="rates_dps", type=float, nargs="+", metavar="DPS", help="gyroscope turns (60)")
+    add("--both-directions", action="store_true", help="make each turn backwards too")
+    add("--turns", type=int, metavar="N", help="whole turns at each rate (1)")
+    add("--positions", type=int, metavar="N", help="rests of multi_position (40)")
+    add("--validation", dest="validation_s", type=float, metavar="S", help="length of held-out motion (120; 0: none)")
+    add("--validation-rate", dest="validation_rate_dps", type=float, metavar="DPS", help="largest rate in it (40)")
+    add("--static", dest="static_s", type=float, metavar="S", help="length of the long rest (120; 0: none)")
+    add("--pause", dest="pause_s", type=float, metavar="S", help="between recordings (30)")
+    add("--thermal-ramp", dest="thermal_ramp_degc", type=float, metavar="DEGC",
+        help="of thermal_ramp: up and down (15)")  # fmt: skip
+
+
+def described(arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the keys of a unit of ``simulation.yaml`` that the parsed options give; other options are ignored."""
+    procedure = arguments.get("procedure", "three_axis_turns")
+    unit: dict[str, Any] = {"table": "acutronic" if procedure in TABLE_PROCEDURES else "hand"}
+    unit |= {name: arguments[name] for name in RECORDED if name in arguments}
+    unit |= {"table_log": {"kind": arguments["table_log"]}} if "table_log" in arguments else {}
+    course = {f.name: arguments[f.name] for f in fields(Course) if f.name in arguments}
+    return {**unit, "course": course} if course else unit

@@ -62,19 +62,12 @@ def drawn_sensors(
     given: Mapping[str, Mapping[str, Any]],
     effects: Mapping[str, dict[str, NDArray[np.float64]]],
     rng: np.random.Generator,
-    kinds: Mapping[str, Effect] | None = None,
+    kinds: dict[str, Effect],
 ) -> dict[str, SimulatedSensor]:
     """Return accelerometer and gyroscope of a unit.
 
-    Parameters
-    ----------
-    sheets, given : mapping
-        Sensor to its section of the configuration, and to what is described of it.
-    effects : mapping
-        Sensor to its effects' values.
-    rng : Generator
-    kinds : mapping, optional
-        Effects that are not in the catalogue, by name.
+    Each argument but ``rng`` and ``kinds`` (effects that are not in the catalogue, by name) is by sensor: its section
+    of the configuration, what is described of it, and the values of its effects.
     """
     mounting = rng.uniform(-1.0, 1.0, 3)
     out = {}
@@ -85,10 +78,10 @@ def drawn_sensors(
             raise ConfigurationError(f"{sensor}: {', '.join(unknown)} is not known; known: {known}")
         sheet = {**sheets[sensor], **{key: given[sensor][key] for key in NOISE_KEYS & set(given[sensor])}}
         own = {name: values for name, values in effects[sensor].items() if name not in ALTERATIONS}
-        bias = _limited(sheet["bias"], 3, rng)
+        drawn = _limited(sheet["bias"], 3, rng)
+        bias = np.array(given[sensor].get("bias", drawn), float)
         matrix = _matrix(sheet, given[sensor], mounting, rng)
-        bias = np.array(given[sensor].get("bias", bias), float)
-        out[sensor] = SimulatedSensor(sensor, sheet, bias, matrix, own, dict(kinds or {}))
+        out[sensor] = SimulatedSensor(sensor, sheet, bias, matrix, own, kinds)
     return out
 
 
@@ -96,18 +89,11 @@ def drawn_effects(
     specification: Mapping[str, Any],
     sheets: Mapping[str, Mapping[str, Any]],
     rng: np.random.Generator,
-    kinds: Mapping[str, Effect] | None = None,
+    kinds: dict[str, Effect],
 ) -> dict[str, dict[str, NDArray[np.float64]]]:
     """Return the values of the parameters of each effect, per sensor.
 
-    Parameters
-    ----------
-    specification : mapping
-        ``sensor.effect``, or ``effect`` for both sensors, to None (typical, at random), a size or the values.
-    sheets : mapping
-    rng : Generator
-    kinds : mapping, optional
-        Effects that are not in the catalogue, by name.
+    ``specification``: ``effects`` of a description, as ``inline_effects`` returns it with ``kinds``.
 
     Raises
     ------
@@ -117,7 +103,7 @@ def drawn_effects(
     out: dict[str, dict[str, NDArray[np.float64]]] = {sensor: {} for sensor in SENSORS}
     for key, value in specification.items():
         sensor, _, name = str(key).rpartition(".")
-        kind = (kinds or {}).get(name) or effect(name)
+        kind = kinds.get(name) or effect(name)
         if sensor not in (*kind.sensors, ""):
             raise ConfigurationError(f"effect {key}: {name} applies to the {' and '.join(kind.sensors)}")
         for each in kind.sensors if sensor == "" else (sensor,):
@@ -126,13 +112,6 @@ def drawn_effects(
             else:
                 out[each][name] = _values(kind, each, value, sheets[each]["effects"], rng)
     return out
-
-
-def rotation(mounting_deg: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return ``R_m = R_z R_y R_x``: (3, 3) array."""
-    x, y, z = (rotation_about(axis, np.array([a]))[0] for axis, a in zip(np.eye(3), mounting_deg, strict=True))
-    product: NDArray[np.float64] = z @ y @ x
-    return product
 
 
 def _matrix(
@@ -147,8 +126,9 @@ def _matrix(
     scale = np.array(given.get("scale_factor", scale), float)
     lower = np.eye(3)
     lower[[1, 2, 2], [0, 0, 1]] = np.radians(np.array(given.get("non_orthogonality_deg", skew), float))
-    turned = rotation(np.array(given.get("mounting_deg", mounting), float))
-    matrix: NDArray[np.float64] = turned.T @ lower @ np.diag(scale)
+    angles = np.array(given.get("mounting_deg", mounting), float)
+    x, y, z = (rotation_about(axis, np.array([a]))[0] for axis, a in zip(np.eye(3), angles, strict=True))
+    matrix: NDArray[np.float64] = (z @ y @ x).T @ lower @ np.diag(scale)
     return matrix
 
 
@@ -187,17 +167,7 @@ def _values(
 
 
 def inline_effects(specification: Mapping[str, Any]) -> tuple[dict[str, Effect], dict[str, Any]]:
-    """Return the effects that are defined where they are hidden, and what is hidden with their values alone.
-
-    Parameters
-    ----------
-    specification : mapping
-        ``effects`` of a unit's description.
-
-    Returns
-    -------
-    effects : dict of str to Effect
-    specification : dict
+    """Return the effects that a unit's ``effects`` define by formulas, and the same with their values alone.
 
     Raises
     ------

@@ -17,9 +17,11 @@ import numpy as np
 
 from pipeline.errors import ConfigurationError
 from pipeline.records import AXES
-from pipeline.simulation.one_session import with_transits
 from pipeline.simulation.rate_table import ProgramBuilder
 from pipeline.simulation.trajectory import (
+    COMES_UP_S,
+    Eased,
+    Gimbals,
     Moves,
     Planned,
     Turn,
@@ -32,12 +34,15 @@ from pipeline.simulation.trajectory import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
 
 ONE_RECORDING = "one_recording"
+TRANSIT = "transit"  # name and role of a move between recordings
+TRANSIT_RATE_DPS = 20.0  # as between stops
+LEAST_ANGLE_DEG = 1e-6  # below it nothing moves: rounding
 TABLE_PROCEDURES = ("three_axis_turns", "thermal_ramp", ONE_RECORDING)
 ABOVE_ZERO = (
     "step_deg", "dwell_s", "accelerometer_rates_dps", "rates_dps", "turns", "acceleration_dps2", "step_rate_dps",
@@ -53,18 +58,14 @@ class Course:
 
     Attributes
     ----------
-    step_deg : float
-        Of stop-and-go.
-    dwell_s : float
-        Rest at each stop, orientation or position.
+    step_deg, dwell_s : float
+        Of stop-and-go; the dwell is also the rest in each orientation or position.
     accelerometer_rates_dps : tuple of float
         Continuous turns in place of stop-and-go; empty for stop-and-go.
-    rates_dps : tuple of float
-        Of the gyroscope's turns.
+    rates_dps, turns : tuple of float and int
+        Rates of the gyroscope's turns, and whole turns at each.
     both_directions : bool
         Each turn of the gyroscope (and each continuous one of the accelerometer) is also made backwards.
-    turns : int
-        Whole turns at each rate.
     warm_up_rest_s, rest_s : float
         Rest before the first turn of a recording for the gyroscope, and after each.
     acceleration_dps2, step_rate_dps : float
@@ -115,13 +116,7 @@ class Course:
 def plan(procedure: str, course: Course, rng: np.random.Generator, hand_accuracy: float = 0.0) -> list[Planned]:
     """Return the recordings of a procedure, in the order in which they are made.
 
-    Parameters
-    ----------
-    procedure : str
-    course : Course
-    rng : Generator
-    hand_accuracy : float, deg
-        Standard deviation with which an attitude is set where there is no table.
+    Without a table, attitudes are set with the standard deviation ``hand_accuracy``, deg.
 
     Raises
     ------
@@ -130,9 +125,7 @@ def plan(procedure: str, course: Course, rng: np.random.Generator, hand_accuracy
     """
     if procedure in TABLE_PROCEDURES:
         planned = _turns(course) + _heldout(course, rng)
-        return (
-            with_transits(planned, course.pause_s, course.acceleration_dps2) if procedure == ONE_RECORDING else planned
-        )
+        return _with_transits(planned, course) if procedure == ONE_RECORDING else planned
     attitudes: dict[str, Callable[[], NDArray[np.float64]]] = {
         "orientations_24": orientations_24,
         "six_positions": six_positions,
@@ -153,14 +146,7 @@ def plan(procedure: str, course: Course, rng: np.random.Generator, hand_accuracy
 def fit_to_samples(procedure: str, course: Course, samples: int, interval: float, *, keep_step: bool) -> Course:
     """Return the course with dwells, rests and held-out motion of a length that gives about ``samples`` rows a unit.
 
-    Parameters
-    ----------
-    procedure : str
-    course : Course
-    samples : int
-    interval : float, s
-    keep_step : bool
-        Whether the step of stop-and-go was asked for; else a larger one may be taken for a short recording.
+    Unless ``keep_step``, a larger step of stop-and-go may be taken for a short recording. ``interval``: s.
 
     Raises
     ------
@@ -201,20 +187,20 @@ def _turns(course: Course) -> list[Planned]:
 def _accelerometer(axis: int, course: Course) -> Turn:
     builder = ProgramBuilder(course.acceleration_dps2)
     if course.accelerometer_rates_dps:
-        builder.rest(course.rest_s)
-        for rate in course.accelerometer_rates_dps:
-            for sign in (1.0, -1.0)[: 1 + course.both_directions]:
-                builder.turn_with_plateau(sign * 360.0 * course.turns, rate).rest(course.rest_s)
-    else:
-        builder.rest(course.dwell_s)
-        for _ in range(round(360.0 / course.step_deg)):
-            builder.turn(course.step_deg, course.step_rate_dps).rest(course.dwell_s)
+        return _continuous(axis, course, builder.rest(course.rest_s), course.accelerometer_rates_dps)
+    builder.rest(course.dwell_s)
+    for _ in range(round(360.0 / course.step_deg)):
+        builder.turn(course.step_deg, course.step_rate_dps).rest(course.dwell_s)
     return Turn(axis, builder.build())
 
 
 def _gyroscope(axis: int, course: Course) -> Turn:
     builder = ProgramBuilder(course.acceleration_dps2).rest(course.warm_up_rest_s)
-    for rate in course.rates_dps:
+    return _continuous(axis, course, builder, course.rates_dps)
+
+
+def _continuous(axis: int, course: Course, builder: ProgramBuilder, rates: Sequence[float]) -> Turn:
+    for rate in rates:
         for sign in (1.0, -1.0)[: 1 + course.both_directions]:
             builder.turn_with_plateau(sign * 360.0 * course.turns, rate).rest(course.rest_s)
     return Turn(axis, builder.build())
@@ -246,3 +232,32 @@ def _rests(attitudes: NDArray[np.float64], course: Course, rng: np.random.Genera
         builder.turn(angle, course.step_rate_dps).rest(course.dwell_s)
         axes.append(axis)
     return Moves(builder.build(), np.array(axes), attitudes[0])
+
+
+def _with_transits(planned: Sequence[Planned], course: Course) -> list[Planned]:
+    """Return recordings with what lies between them: half a pause, the move to where the next begins, half a pause.
+
+    Held-out motion begins and ends at rest here, where a file of its own begins and ends within it.
+    """
+    planned = [replace(p, trajectory=_eased(p.trajectory)) if isinstance(p.trajectory, Gimbals) else p for p in planned]
+    out = [planned[0]]
+    for one, two in pairwise(planned):
+        before, after = (_level(p, t) for p, t in ((one, one.trajectory.duration), (two, 0.0)))
+        axis, angle = axis_and_angle(before.T @ after)
+        builder = ProgramBuilder(course.acceleration_dps2).rest(course.pause_s / 2)
+        if angle > LEAST_ANGLE_DEG:
+            builder.turn(angle, TRANSIT_RATE_DPS).rest(course.pause_s / 2)
+        out += [Planned(TRANSIT, TRANSIT, None, Moves(builder.build(), axis[None], before)), two]
+    return out
+
+
+def _eased(motion: Gimbals) -> Eased:
+    """Return held-out motion that begins and ends at rest; it is longer by that."""
+    duration = max(motion.duration, COMES_UP_S) + COMES_UP_S
+    return Eased(motion.drift, motion.amplitude, motion.frequency, motion.phase, duration)
+
+
+def _level(plan: Planned, time: float) -> NDArray[np.float64]:
+    """Return the attitude at a time in s of a recording: (3, 3) array."""
+    level: NDArray[np.float64] = plan.trajectory.pose(np.array([time])).level[0]
+    return level

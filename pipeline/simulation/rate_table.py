@@ -40,7 +40,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
+
+    Values = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -60,24 +64,17 @@ class Program:
     duration : float, s
     """
 
-    knots: NDArray[np.float64]
-    angle: NDArray[np.float64]
-    rate: NDArray[np.float64]
-    acceleration: NDArray[np.float64]
+    knots: Values
+    angle: Values
+    rate: Values
+    acceleration: Values
     move: NDArray[np.int64]
-    stops: NDArray[np.float64]
+    stops: Values
     duration: float
 
-    def segment(self, time: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the segment that each time falls into: (n,) array."""
-        found = np.searchsorted(self.knots, time, side="right") - 1
-        return np.clip(found, 0, None).astype(np.int64)
-
-    def at(
-        self, time: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    def at(self, time: Values) -> tuple[Values, Values, Values, NDArray[np.int64]]:
         """Return angle (deg), rate (deg/s), acceleration (deg/s^2) and number of the move at any times: (n,) arrays."""
-        k = self.segment(time)
+        k = np.clip(np.searchsorted(self.knots, time, side="right") - 1, 0, None)
         s = np.clip(time - self.knots[k], 0.0, None)
         acceleration = self.acceleration[k]
         rate = self.rate[k] + acceleration * s
@@ -85,21 +82,13 @@ class Program:
 
 
 class ProgramBuilder:
-    """Puts rests and turns one after the other.
+    """Puts rests and turns one after the other; ``acceleration``: of every ramp, deg/s^2."""
 
-    Parameters
-    ----------
-    acceleration : float, deg/s^2
-        Of every ramp.
-    angle : float, deg
-        At the start.
-    """
-
-    def __init__(self, acceleration: float, angle: float = 0.0) -> None:
+    def __init__(self, acceleration: float) -> None:
         self._acceleration = acceleration
-        self._time, self._angle = 0.0, angle
-        self._stops = [angle]
-        self._rows: list[tuple[float, float, float, float, int]] = [(0.0, angle, 0.0, 0.0, -1)]
+        self._time, self._angle = 0.0, 0.0
+        self._stops = [0.0]
+        self._rows: list[tuple[float, float, float, float, int]] = [(0.0, 0.0, 0.0, 0.0, -1)]
 
     def rest(self, seconds: float) -> ProgramBuilder:
         """Stay for a time in s."""
@@ -150,44 +139,42 @@ class TurnErrors:
     stops : (moves + 1,) array or None, deg
         Angle error ``D_k - C_k`` of each stop of the program.
     backlash : float, deg
-        The table lags behind by it, in the direction of the last move.
+        By which the table lags behind, in the direction of the last move.
     direction : (2,) array, rad
         Components of d along the two axes that follow the turn axis cyclically.
     vibration : float, deg
         Amplitude V.
     shaking : float, g
-        Amplitude of the specific force that the vibration adds along each body axis, 120 deg apart in phase.
+        Amplitude of the specific force of the vibration along each body axis, 120 deg apart in phase.
     vibration_frequency : float, Hz
     """
 
-    encoder: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
-    ripple: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
-    stops: NDArray[np.float64] | None = None
+    encoder: Values = field(default_factory=lambda: np.zeros(2))
+    ripple: Values = field(default_factory=lambda: np.zeros(2))
+    stops: Values | None = None
     backlash: float = 0.0
-    direction: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
+    direction: Values = field(default_factory=lambda: np.zeros(2))
     vibration: float = 0.0
     shaking: float = 0.0
     vibration_frequency: float = 0.0
 
-    def turn_axis(self, axis: int) -> NDArray[np.float64]:
+    def turn_axis(self, axis: int) -> Values:
         """Return the true turn axis: (3,) unit vector, body frame."""
         u = np.zeros(3)
         u[[axis, (axis + 1) % 3, (axis + 2) % 3]] = 1.0, *self.direction
-        unit: NDArray[np.float64] = u / np.linalg.norm(u)
+        unit: Values = u / np.linalg.norm(u)
         return unit
 
-    def force(self, program: Program, time: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    def force(self, program: Program, time: Values) -> Values | None:
         """Return the specific force of the shaking plate: (n, 3) array, g, or None where it is quiet."""
         if not self.shaking:
             return None
         phase = 2.0 * np.pi * (self.vibration_frequency * time[:, None] + np.arange(3) / 3.0)
         moving = program.at(time)[1] != 0.0
-        shaken: NDArray[np.float64] = self.shaking * moving[:, None] * np.sin(phase)
+        shaken: Values = self.shaking * moving[:, None] * np.sin(phase)
         return shaken
 
-    def motion(
-        self, program: Program, time: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def motion(self, program: Program, time: Values) -> tuple[Values, Values, Values]:
         """Return the true angle (deg), rate (deg/s) and acceleration (deg/s^2): (n,) arrays."""
         phi, rate, acceleration, move = program.at(time)
         base, slope = self._stops(program, phi, move)
@@ -202,9 +189,7 @@ class TurnErrors:
             true_acceleration = true_acceleration - swing * w**2 * np.sin(w * time)
         return angle, true_rate, true_acceleration
 
-    def _stops(
-        self, program: Program, phi: NDArray[np.float64], move: NDArray[np.int64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _stops(self, program: Program, phi: Values, move: NDArray[np.int64]) -> tuple[Values, Values]:
         """Return the angle between its stops, and its slope in the commanded angle."""
         if (self.stops is None and not self.backlash) or len(program.stops) < 2:
             return phi, np.ones_like(phi)
@@ -215,9 +200,7 @@ class TurnErrors:
         lag = np.where(move >= 0, -self.backlash * np.sign(commanded[k]), 0.0)
         return program.stops[k] + error[k] + (phi - program.stops[k]) * slope + lag, slope
 
-    def _harmonics(
-        self, phi: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def _harmonics(self, phi: Values) -> tuple[Values, Values, Values]:
         """Return h (deg) and its first (deg/deg) and second (1/deg) derivative."""
         sine, cosine = np.sin(np.radians(phi)), np.cos(np.radians(phi))
         (A, B), (a, b) = self.encoder, self.ripple
@@ -227,52 +210,29 @@ class TurnErrors:
         return value, first, second
 
 
-def stop_errors(
-    program: Program,
-    rng: np.random.Generator,
-    angle_accuracy: float = 0.0,
-    rate_error: float = 0.0,
-    step: float = 0.0,
-) -> NDArray[np.float64]:
-    """Return the angle errors of the stops of a program: (moves + 1,) array, deg.
+def random_errors(program: Program, rng: np.random.Generator, settings: Mapping[str, Any], axis: int) -> TurnErrors:
+    """Return the errors of one recording on a table; those that ``settings`` leave out are zero.
 
     Parameters
     ----------
     program : Program
     rng : Generator
-    angle_accuracy : float, deg
-        Standard deviation of each stop, independent.
-    rate_error : float, relative
-        Every move falls short (negative) or goes too far by this share of it.
-    step : float, deg
-        Step of the motor; 0 for none.
-    """
-    travelled = np.concatenate([[0.0], np.cumsum(np.diff(program.stops) * rate_error)])
-    error: NDArray[np.float64] = travelled + angle_accuracy * rng.standard_normal(len(program.stops))
-    if step > 0.0:
-        error = np.round((program.stops + error) / step) * step - program.stops
-    return error
-
-
-def random_errors(program: Program, rng: np.random.Generator, settings: dict[str, Any], axis: int) -> TurnErrors:
-    """Return the errors of one recording on a table.
-
-    Parameters
-    ----------
-    program : Program
-    rng : Generator
-    settings : dict
-        ``angle_accuracy_deg``, ``rate_error`` (3,), ``step_deg``, ``ripple`` (relative amplitude),
-        ``direction_deg`` (3, 2), ``vibration_deg``, ``shaking_g``, ``vibration_hz``; what is missing is 0.
+    settings : mapping
+        ``angle_accuracy_deg`` (standard deviation of each stop), ``rate_error`` (3,) (share by which every move falls
+        short, negative, or goes too far), ``step_deg`` (of the motor), ``ripple`` (relative amplitude),
+        ``direction_deg`` (3, 2), ``vibration_deg``, ``shaking_g``, ``vibration_hz``.
     axis : int
     """
     phase = rng.uniform(0.0, 2.0 * np.pi)
-    rate_error = settings.get("rate_error", (0.0, 0.0, 0.0))[axis]
+    travelled = np.cumsum(np.diff(program.stops) * settings.get("rate_error", np.zeros(3))[axis])
+    scatter = settings.get("angle_accuracy_deg", 0.0) * rng.standard_normal(len(program.stops))
+    stops = np.concatenate([[0.0], travelled]) + scatter
+    step = settings.get("step_deg", 0.0)
+    if step > 0.0:
+        stops = np.round((program.stops + stops) / step) * step - program.stops
     return TurnErrors(
         ripple=settings.get("ripple", 0.0) * np.array([np.cos(phase), np.sin(phase)]),
-        stops=stop_errors(
-            program, rng, settings.get("angle_accuracy_deg", 0.0), rate_error, settings.get("step_deg", 0.0)
-        ),
+        stops=stops,
         direction=np.radians(np.asarray(settings.get("direction_deg", np.zeros((3, 2))), float)[axis]),
         vibration=settings.get("vibration_deg", 0.0),
         shaking=settings.get("shaking_g", 0.0),

@@ -2,28 +2,24 @@
 
     f = g up + [omega x (omega x r) + alpha x r] / 9.80665 + shaking,   omega_sensed = omega + level^T Omega_earth
 
-at the time that the sensor's clock really shows,
+at the true time of the sensor's clock, ``t' = t + tau + epsilon t``, where
 
-    t' = t + tau + epsilon t
-
-where
-
-up     : (3,) the true vertical in the body frame; in the table's own level frame it is tilted
-r      : (3,) position of the accelerometer from the turn axes, m, body frame
-tau    : time offset, s: the reading at t shows the motion at t + tau
+up      : (3,) the true vertical in the body frame; in the table's own level frame it is tilted
+r       : (3,) position of the accelerometer from the turn axes, m, body frame
+tau     : time offset, s: the reading at t shows the motion at t + tau
 epsilon : relative error of the sensor's clock
 
 A lag is a first-order low pass of the true motion, ``y(t) = integral_0^inf exp(-s) u(t - lag s) ds``, by Gauss'
 rule on short panels: the corners of a ramp lie anywhere in the past, and no smooth rule would follow them.
 
 Effects of place, mounting, table and timing use exact geometry instead of the linear columns that the estimation uses.
-Each of their functions takes a scene and the effect's parameters, and returns the scene with that effect.
+Each function of ``ALTERATIONS`` takes a scene and the effect's parameters, and returns the scene with that effect.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -36,34 +32,21 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.simulation.trajectory import Pose
+    from pipeline.simulation.trajectory import Gimbals, Moves, Pose
 
-STANDARD_GRAVITY = 9.80665
-# Edges of the panels in s: beyond 20 time constants nothing is left.
+    Values = NDArray[np.float64]
+
+STANDARD_GRAVITY = 9.80665  # m/s^2, CGPM 1901
+# Edges of the panels in time constants: exp(-20) is 2e-9.
 PANELS = np.concatenate([np.linspace(0.0, 2.0, 21), np.linspace(2.25, 6.0, 16), np.linspace(7.0, 20.0, 14)])
-
-
-class Trajectory(Protocol):
-    """Anything that knows its pose at any time."""
-
-    @property
-    def duration(self) -> float:
-        """Length in s."""
-
-    def true(self, time: NDArray[np.float64]) -> Pose:
-        """Return the true pose."""
-
-    def commanded(self, time: NDArray[np.float64]) -> Pose:
-        """Return the pose that the log shows."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What one sensor feels in one recording.
+    """The motion of one sensor in one recording.
 
     Attributes
     ----------
-    trajectory : Trajectory
     start : float, s
         Time since power-on at which the trajectory begins.
     axis : int or None
@@ -71,50 +54,47 @@ class Scene:
     gravity : float, g
     up : (3,) array
         The true vertical in the table's level frame, unit vector.
-    earth : (3,) array or None, deg/s
+    earth : (3,) array, deg/s
         Earth's rotation in the level frame.
     lever_arm : (3,) array, m
-    offset : float, s
-    clock : float
-        epsilon above.
-    lag : float, s
+    offset, clock, lag : float, s, 1, s
+        tau and epsilon above, and the time constant of the lag.
     """
 
-    trajectory: Trajectory
+    trajectory: Turn | Moves | Gimbals
     start: float = 0.0
     axis: int | None = None
     gravity: float = 1.0
-    up: NDArray[np.float64] = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
-    earth: NDArray[np.float64] | None = None
-    lever_arm: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    up: Values = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    earth: Values | None = None
+    lever_arm: Values = field(default_factory=lambda: np.zeros(3))
     offset: float = 0.0
     clock: float = 0.0
     lag: float = 0.0
 
-    def motion(self, time: NDArray[np.float64], temperature: NDArray[np.float64] | None = None) -> Motion:
+    def motion(self, time: Values, temperature: Values | None = None) -> Motion:
         """Return the motion that the sensor shows at times of the log: s since power-on, (n,) array."""
         shown = time + self.offset + self.clock * time
-        felt = self._felt(shown, temperature)
+        motion = self._without_lag(shown, temperature)
         if self.lag > 0.0:
-            nodes, weights = lag_rule()
-            past = [self._felt(shown - self.lag * node, None) for node in nodes]
+            nodes, weights = _lag_rule()
+            past = [self._without_lag(shown - self.lag * node, None) for node in nodes]
             names = ("specific_force", "angular_rate", "angular_acceleration", "specific_force_rate")
-            felt = replace(
-                felt,
+            motion = replace(
+                motion,
                 **{name: sum(w * getattr(p, name) for w, p in zip(weights, past, strict=True)) for name in names},
             )
-        return replace(felt, time=time, at_offset=lambda offset=0.0: self.motion(time + offset, temperature))
+        return replace(motion, time=time, at_offset=lambda offset=0.0: self.motion(time + offset, temperature))
 
-    def _felt(self, time: NDArray[np.float64], temperature: NDArray[np.float64] | None) -> Motion:
-        pose = self.trajectory.true(time - self.start)
+    def _without_lag(self, time: Values, temperature: Values | None) -> Motion:
+        pose = self.trajectory.pose(time - self.start)
         gravity = self.gravity * (self.up @ pose.level)
         force = gravity
         if np.any(self.lever_arm):
-            force = force + lever_arm_force(pose, self.lever_arm)
+            force = force + _lever_arm_force(pose, self.lever_arm)
         if pose.force is not None:
             force = force + pose.force
         omega = pose.omega if self.earth is None else pose.omega + self.earth @ pose.level
-        rate = np.linalg.norm(pose.omega, axis=1)
         return Motion(
             time=time,
             specific_force=force,
@@ -125,13 +105,13 @@ class Scene:
             angle=pose.angle,
             rate=pose.rate,
             axis=self.axis,
-            still=still_samples(time, rate),
+            still=still_samples(time, np.linalg.norm(pose.omega, axis=1)),
             level=pose.level,
             direction=pose.direction,
         )
 
 
-def lag_rule() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _lag_rule() -> tuple[Values, Values]:
     """Return nodes s and weights of the integral of ``exp(-s) u(s)``, two a panel: (m,) arrays; weights sum to 1."""
     middle, half = (PANELS[1:] + PANELS[:-1]) / 2.0, np.diff(PANELS) / 2.0
     nodes = np.concatenate([middle - half / np.sqrt(3.0), middle + half / np.sqrt(3.0)])
@@ -139,40 +119,39 @@ def lag_rule() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return nodes, weights / weights.sum()
 
 
-def lever_arm_force(pose: Pose, r: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return ``[omega x (omega x r) + alpha x r] / 9.80665`` in g: (n, 3) array; r in m."""
+def _lever_arm_force(pose: Pose, r: Values) -> Values:
     omega, alpha = np.radians(pose.omega), np.radians(pose.alpha)
-    force: NDArray[np.float64] = np.cross(omega, np.cross(omega, r)) + np.cross(alpha, r)
+    force: Values = np.cross(omega, np.cross(omega, r)) + np.cross(alpha, r)
     return force / STANDARD_GRAVITY
 
 
-def lever_arm(scene: Scene, values: NDArray[np.float64]) -> Scene:
+def _lever_arm(scene: Scene, values: Values) -> Scene:
     """Put the sensor at a position in m from the turn axes."""
     return replace(scene, lever_arm=scene.lever_arm + values)
 
 
-def time_offset(scene: Scene, values: NDArray[np.float64]) -> Scene:
-    """Let the reading at t show the motion at t + tau; tau in s."""
+def _time_offset(scene: Scene, values: Values) -> Scene:
+    """Show the motion at t + tau in the reading at t; s."""
     return replace(scene, offset=scene.offset + values[0])
 
 
-def clock_rate(scene: Scene, values: NDArray[np.float64]) -> Scene:
-    """Let the sensor's clock run fast against the table's; ppm."""
+def _clock_rate(scene: Scene, values: Values) -> Scene:
+    """Make the sensor's clock fast against the table's; ppm."""
     return replace(scene, clock=scene.clock + 1e-6 * values[0])
 
 
-def low_pass_lag(scene: Scene, values: NDArray[np.float64]) -> Scene:
-    """Filter what the sensor feels by a first-order low pass; time constant in s."""
+def _low_pass_lag(scene: Scene, values: Values) -> Scene:
+    """Filter the motion by a first-order low pass; time constant in s."""
     return replace(scene, lag=scene.lag + values[0])
 
 
-def earth_rotation(scene: Scene, values: NDArray[np.float64]) -> Scene:
+def _earth_rotation(scene: Scene, values: Values) -> Scene:
     """Add Earth's rotation in the level frame; deg/s."""
     before = np.zeros(3) if scene.earth is None else scene.earth
     return replace(scene, earth=before + np.pad(values, (0, 3 - len(values))))
 
 
-def table_tilt(scene: Scene, values: NDArray[np.float64]) -> Scene:
+def _table_tilt(scene: Scene, values: Values) -> Scene:
     """Tilt the table about its level x and y; deg."""
     angle = float(np.linalg.norm(values))
     if angle == 0.0:
@@ -181,27 +160,27 @@ def table_tilt(scene: Scene, values: NDArray[np.float64]) -> Scene:
     return replace(scene, up=scene.up @ rotation_about(axis, np.array([angle]))[0])
 
 
-def table_axis_nonorthogonality(scene: Scene, values: NDArray[np.float64]) -> Scene:
+def _table_axis_nonorthogonality(scene: Scene, values: Values) -> Scene:
     """Turn each axis' direction by two angles across it; deg."""
     return _with_errors(scene, "direction", np.radians(values.reshape(3, 2)))
 
 
-def table_encoder_error(scene: Scene, values: NDArray[np.float64]) -> Scene:
-    """Let the true angle differ from the logged one by ``A cos + B sin`` of it; deg, two values an axis."""
+def _table_encoder_error(scene: Scene, values: Values) -> Scene:
+    """Change the true angle by ``A cos + B sin`` of the logged one; deg, two values an axis."""
     return _with_errors(scene, "encoder", values.reshape(3, 2))
 
 
-def table_rate_ripple(scene: Scene, values: NDArray[np.float64]) -> Scene:
-    """Let the true rate differ by ``A cos + B sin`` of the angle, relative; two values an axis."""
+def _table_rate_ripple(scene: Scene, values: Values) -> Scene:
+    """Change the true rate by ``A cos + B sin`` of the angle, relative; two values an axis."""
     return _with_errors(scene, "ripple", values.reshape(3, 2))
 
 
-def table_backlash(scene: Scene, values: NDArray[np.float64]) -> Scene:
-    """Let the table lag behind its log in the direction of the last move; deg, one value an axis."""
+def _table_backlash(scene: Scene, values: Values) -> Scene:
+    """Make the table lag behind its log in the direction of the last move; deg, one value an axis."""
     return _with_errors(scene, "backlash", values)
 
 
-def _with_errors(scene: Scene, name: str, values: NDArray[np.float64]) -> Scene:
+def _with_errors(scene: Scene, name: str, values: Values) -> Scene:
     if scene.axis is None or not isinstance(scene.trajectory, Turn):
         return scene
     turn = scene.trajectory
@@ -209,24 +188,21 @@ def _with_errors(scene: Scene, name: str, values: NDArray[np.float64]) -> Scene:
     return replace(scene, trajectory=replace(turn, errors=errors))
 
 
-ALTERATIONS: dict[str, Callable[[Scene, NDArray[np.float64]], Scene]] = {
-    function.__name__: function
-    for function in (
-        lever_arm,
-        time_offset,
-        clock_rate,
-        low_pass_lag,
-        earth_rotation,
-        table_tilt,
-        table_axis_nonorthogonality,
-        table_encoder_error,
-        table_rate_ripple,
-        table_backlash,
-    )
+ALTERATIONS: dict[str, Callable[[Scene, Values], Scene]] = {
+    "lever_arm": _lever_arm,
+    "time_offset": _time_offset,
+    "clock_rate": _clock_rate,
+    "low_pass_lag": _low_pass_lag,
+    "earth_rotation": _earth_rotation,
+    "table_tilt": _table_tilt,
+    "table_axis_nonorthogonality": _table_axis_nonorthogonality,
+    "table_encoder_error": _table_encoder_error,
+    "table_rate_ripple": _table_rate_ripple,
+    "table_backlash": _table_backlash,
 }
 
 
-def alter(scene: Scene, effects: dict[str, NDArray[np.float64]]) -> Scene:
+def alter(scene: Scene, effects: dict[str, Values]) -> Scene:
     """Return the scene with those of the effects in it that are not the sensor's own."""
     for name, values in effects.items():
         if name in ALTERATIONS:

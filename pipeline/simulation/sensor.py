@@ -48,13 +48,11 @@ class SimulatedSensor:
 
     Attributes
     ----------
-    sensor : str
-        ``accelerometer`` or ``gyroscope``.
     sheet : mapping
         The sensor's section of the configuration (full scale, counts, noise).
     bias : (3,) array, g or deg/s
     matrix : (3, 3) array
-        The calibration matrix that a perfect calibration finds, body = matrix @ (reading - bias - effects).
+        What a perfect calibration finds: body = matrix @ (reading - bias - effects).
     effects : dict of str to array
         Values of the parameters of each effect on the reading.
     kinds : dict of str to Effect
@@ -100,18 +98,9 @@ class SimulatedSensor:
 def bias_wander(
     sessions: list[NDArray[np.float64]], correlation_time: float, rng: np.random.Generator
 ) -> list[NDArray[np.float64]]:
-    """Return one realisation of a stationary Gauss-Markov process of unit variance for three axes.
+    """Return a stationary Gauss-Markov process of unit variance for three axes: (n, 3) array of each recording.
 
-    Parameters
-    ----------
-    sessions : list of (n,) arrays, s
-        Sample times of one recording after the other; each evenly sampled.
-    correlation_time : float, s
-    rng : Generator
-
-    Returns
-    -------
-    list of (n, 3) arrays
+    ``sessions``: (n,) sample times of one recording after the other, s, each evenly sampled.
     """
     from scipy.signal import lfilter  # noqa: PLC0415  (0.3 s, needed where readings are made alone)
 
@@ -130,19 +119,7 @@ def bias_wander(
 
 @dataclass(frozen=True)
 class Environment:
-    """Temperature over time.
-
-    Attributes
-    ----------
-    ambient, warm_up, drift : float, degC
-    warm_up_time : float, s
-    periods, phases : (2,) array, s and rad
-        Of the room's drift.
-    ramp, ramp_period : float, degC and s
-        Amplitude of the chamber's triangle and its period; 0 where there is none.
-    noise : float, degC
-        Of the thermometer.
-    """
+    """Temperature over time: degC, s and rad, as in the equation above; ``noise``: of the thermometer."""
 
     ambient: float
     warm_up: float
@@ -163,7 +140,7 @@ class Environment:
         return total
 
     def reading(self, time: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
-        """Return what the thermometer says."""
+        """Return the thermometer's reading: (n,) array, degC."""
         return self.temperature(time) + self.noise * rng.standard_normal(len(time))
 
 

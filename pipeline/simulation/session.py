@@ -14,18 +14,20 @@ import numpy as np
 from pipeline.model.kinematics import earth_rate
 from pipeline.records import AXES, SENSORS, Recording
 from pipeline.simulation.rate_table import random_errors
-from pipeline.simulation.scene import ALTERATIONS, Scene, alter
+from pipeline.simulation.scene import Scene, alter
 from pipeline.simulation.sensor import bias_wander
 from pipeline.simulation.trajectory import Gimbals, Moves, Turn, rotation_about
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from pipeline.records import Motion
+    from pipeline.simulation.description import UnitDescription
     from pipeline.simulation.sensor import Environment, SimulatedSensor
     from pipeline.simulation.trajectory import Planned
+
+    Values = NDArray[np.float64]
 
 STREAMS = ("unit", "effects", "motion", "table", "accelerometer", "gyroscope", "temperature", "link", "bench", "room")
 NANOSECONDS = 1_000_000_000
@@ -51,88 +53,73 @@ class Bench:
     sensors: Mapping[str, SimulatedSensor]
 
 
-@dataclass(frozen=True)
-class Session:
-    """A unit's recordings to be.
+def record(
+    planned: Sequence[Planned],
+    benches: Mapping[str, Bench],
+    effects: Mapping[str, dict[str, Values]],
+    *,
+    environment: Environment,
+    unit: UnitDescription,
+    pause: float,
+    streams: Streams,
+) -> list[Recording]:
+    """Make the recordings of a unit.
 
-    Attributes
+    Parameters
     ----------
-    planned : list of Planned
-    benches : dict of str to Bench
+    planned : sequence of Planned
+    benches : mapping
         Role to bench; the key ``""`` is for all roles that are not named.
-    alterations : dict of str to dict of str to array
-        Sensor to its effects of mounting, table and timing.
+    effects : mapping
+        Sensor to its effects; those of mounting, table and timing change the motion.
     environment : Environment
-    interval : float, s
+    unit : UnitDescription
+        For the sampling interval and the share of lost samples.
     pause : float, s
-    lost : float
+        Between the recordings, and before the first.
+    streams : Streams
     """
-
-    planned: list[Planned]
-    benches: dict[str, Bench]
-    alterations: dict[str, dict[str, NDArray[np.float64]]]
-    environment: Environment
-    interval: float
-    pause: float
-    lost: float
-
-    def recordings(self, streams: Streams) -> list[Recording]:
-        """Make the recordings."""
-        times = self._times()
-        seconds = [t / NANOSECONDS for t in times]
-        rng = {name: streams[name] for name in ("table", "temperature", "link", *SENSORS)}
-        benches = [self.benches.get(p.role, self.benches[""]) for p in self.planned]
-        scenes = [
-            _scene(p, b, time[0], rng["table"]) for p, b, time in zip(self.planned, benches, seconds, strict=True)
-        ]
-        wander = {s: bias_wander(seconds, benches[0].sensors[s].sheet["wander_time_s"], rng[s]) for s in SENSORS}
-        out = []
-        for k, (plan, bench, scene) in enumerate(zip(self.planned, benches, scenes, strict=True)):
-            motions = self._motions(scene, seconds[k])
-            accelerometer, gyroscope = (
-                self._reading(bench.sensors[s], motions[s], wander[s][k], rng[s]) for s in SENSORS
-            )
-            log = _log(plan, bench, seconds[k] - seconds[k][0])
-            whole = Recording(
-                plan.name,
-                plan.role,
-                None if plan.axis is None else AXES[plan.axis],
-                times[k],
-                accelerometer=accelerometer,
-                gyroscope=gyroscope,
-                temperature=_rounded(self.environment.reading(seconds[k], rng["temperature"]), TEMPERATURE_DECIMALS),
-                table_angle=log.get("table_angle"),
-                table_rate=log.get("table_rate"),
-                table_attitude=log.get("table_attitude"),
-            )
-            out.append(whole.select(received(len(times[k]), self.lost, rng["link"])) if self.lost else whole)
-        return out
-
-    def _times(self) -> list[NDArray[np.int64]]:
-        """Return the sample times: whole intervals since power-on."""
-        step = round(self.interval * NANOSECONDS)
-        out, now = [], self.pause
-        for plan in self.planned:
-            first = int(np.ceil(now / self.interval - 1e-9))
-            count = int(plan.trajectory.duration / self.interval + 1e-9) + 1
-            out.append((first + np.arange(count, dtype=np.int64)) * step)
-            now = float(out[-1][-1]) / NANOSECONDS + self.pause
-        return out
-
-    def _motions(self, scene: Scene, time: NDArray[np.float64]) -> dict[str, Motion]:
-        temperature = self.environment.temperature(time)
+    times = _times(planned, unit.interval_s, pause)
+    seconds = [t / NANOSECONDS for t in times]
+    rng = {name: streams[name] for name in ("table", "temperature", "link", *SENSORS)}
+    first = benches.get(planned[0].role, benches[""]).sensors
+    wander = {s: bias_wander(seconds, first[s].sheet["wander_time_s"], rng[s]) for s in SENSORS}
+    out = []
+    for k, (plan, time) in enumerate(zip(planned, seconds, strict=True)):
+        bench = benches.get(plan.role, benches[""])
+        scene = _scene(plan, bench, time[0], rng["table"])
+        temperature = environment.temperature(time)
         plain = scene.motion(time, temperature)
-        return {
-            s: alter(scene, self.alterations[s]).motion(time, temperature) if self.alterations[s] else plain
-            for s in SENSORS
-        }
+        readings: dict[str, Any] = {}
+        for s in SENSORS:
+            sensor, altered = bench.sensors[s], alter(scene, effects[s])
+            motion = plain if altered is scene else altered.motion(time, temperature)
+            white = sensor.white(unit.interval_s) * rng[s].standard_normal((len(time), 3))
+            reading = sensor.exact(motion) + white + sensor.sheet["bias_wander"] * wander[s][k]
+            readings[s] = _rounded(sensor.quantised(reading), sensor.decimals)
+        whole = Recording(
+            plan.name,
+            plan.role,
+            None if plan.axis is None else AXES[plan.axis],
+            times[k],
+            temperature=_rounded(environment.reading(time, rng["temperature"]), TEMPERATURE_DECIMALS),
+            **readings,
+            **_log(plan, bench, time - time[0]),
+        )
+        out.append(whole.select(received(len(time), unit.lost, rng["link"])) if unit.lost else whole)
+    return out
 
-    def _reading(
-        self, sensor: SimulatedSensor, motion: Motion, wander: NDArray[np.float64], rng: np.random.Generator
-    ) -> NDArray[np.float64]:
-        white = sensor.white(self.interval) * rng.standard_normal((len(motion.time), 3))
-        reading = sensor.exact(motion) + white + sensor.sheet["bias_wander"] * wander
-        return _rounded(sensor.quantised(reading), sensor.decimals)
+
+def _times(planned: Sequence[Planned], interval: float, pause: float) -> list[NDArray[np.int64]]:
+    """Return the sample times: whole intervals since power-on, ns."""
+    step = round(interval * NANOSECONDS)
+    out, now = [], pause
+    for plan in planned:
+        first = int(np.ceil(now / interval - 1e-9))
+        count = int(plan.trajectory.duration / interval + 1e-9) + 1
+        out.append((first + np.arange(count, dtype=np.int64)) * step)
+        now = float(out[-1][-1]) / NANOSECONDS + pause
+    return out
 
 
 def _scene(plan: Planned, bench: Bench, start: float, rng: np.random.Generator) -> Scene:
@@ -156,7 +143,7 @@ def _stops_and_goes(turn: Turn) -> bool:
     return bool(np.all(np.abs(np.diff(turn.program.stops)) < 180.0))
 
 
-def _log(plan: Planned, bench: Bench, time: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+def _log(plan: Planned, bench: Bench, time: Values) -> dict[str, Any]:
     """Return what the table logs: the commanded motion."""
     trajectory = plan.trajectory
     if bench.table["motion"] == "none":
@@ -165,7 +152,7 @@ def _log(plan: Planned, bench: Bench, time: NDArray[np.float64]) -> dict[str, ND
         angle, rate = trajectory.program.at(time)[:2]
         return {"table_angle": _rounded(angle, ANGLE_DECIMALS), "table_rate": _rounded(rate, ANGLE_DECIMALS)}
     if isinstance(trajectory, Gimbals):
-        rate = np.linalg.norm(trajectory.true(time).omega, axis=1)
+        rate = np.linalg.norm(trajectory.pose(time).omega, axis=1)
         attitude = _rounded(trajectory.quaternion(time), QUATERNION_DECIMALS)
         return {"table_attitude": attitude, "table_rate": _rounded(rate, ANGLE_DECIMALS)}
     assert isinstance(trajectory, Moves)  # noqa: S101
@@ -173,18 +160,13 @@ def _log(plan: Planned, bench: Bench, time: NDArray[np.float64]) -> dict[str, ND
 
 
 def received(count: int, lost: float, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Return which samples the radio link delivers; the first and the last always."""
+    """Return which samples the radio link delivers, all but a share of ``lost``; the first and the last always."""
     kept = rng.random(count) >= lost
     kept[[0, -1]] = True
     return kept
 
 
-def _rounded(values: NDArray[np.float64], decimals: int) -> NDArray[np.float64]:
+def _rounded(values: Values, decimals: int) -> Values:
     """Return what a reader of the printed values finds."""
-    rounded: NDArray[np.float64] = np.rint(values * 10.0**decimals) / 10.0**decimals
+    rounded: Values = np.rint(values * 10.0**decimals) / 10.0**decimals
     return rounded
-
-
-def hidden(effects: dict[str, dict[str, NDArray[np.float64]]]) -> dict[str, dict[str, NDArray[np.float64]]]:
-    """Return the effects that are not the sensors' own, per sensor."""
-    return {s: {n: v for n, v in own.items() if n in ALTERATIONS} for s, own in effects.items()}

@@ -1,28 +1,25 @@
 """Attitude of the body over time: turns about one axis, rests with moves between them, motion of three gimbals.
 
-Everything is evaluated analytically, at any time, from
-
-    level(t)   rows are the level axes in the body frame, so v_level = level @ v_body
-    omega(t)   angular rate of the body in the body frame, deg/s
-    alpha(t)   its derivative, deg/s^2
-
-A turn by A about the unit axis u (the same in body and level, since R_u u = u):
+Everything is evaluated analytically, at any time. A turn by A about the unit axis u has
 
     level = level_0 R_u(A),   omega = u dA/dt,   alpha = u d2A/dt2
 
-Random motion of a three-axis table: ``level = R_z(psi) R_y(theta) R_x(phi)``, each angle a steady turn plus a sum of
-sinusoids:
+and the random motion of a three-axis table ``level = R_z(psi) R_y(theta) R_x(phi)``, each angle a steady turn plus a
+sum of sinusoids,
 
     omega = (phi' - psi' sin theta,  theta' cos phi + psi' cos theta sin phi,  -theta' sin phi + psi' cos theta cos phi)
 
-where phi, theta, psi are the angles of the gimbals about x (inner), y and z (outer), each a steady turn plus a sum of
-sinusoids, and a dash is a time derivative.
+where
+
+level      : (3, 3), rows are the level axes in the body frame, so v_level = level @ v_body
+omega      : angular rate of the body in the body frame, deg/s; alpha is its derivative
+phi, theta, psi : angles of the gimbals about x (inner), y and z (outer); a dash is a time derivative
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -35,34 +32,39 @@ if TYPE_CHECKING:
 
     from pipeline.simulation.rate_table import Program
 
+    Values = NDArray[np.float64]
 
-@dataclass(frozen=True)
-class Pose:
+SWING_RMS_DEG = np.array([60.0, 42.0, 60.0])  # 42 deg of the middle gimbal: all attitudes evenly (``random_gimbals``)
+PERIOD_S = 40.0  # longest period of the sinusoids before the speed is chosen; its value cancels
+SINUSOIDS = 4  # for each gimbal
+COMES_UP_S = 5.0  # for a table to start from rest, see ``Eased``
+
+
+class Pose(NamedTuple):
     """Attitude and its derivatives at n times.
 
     Attributes
     ----------
     level : (n, 3, 3) array
-        Rows are the level axes in the body frame.
     omega, alpha : (n, 3) array, deg/s and deg/s^2, body frame
     angle, rate : (n,) array or None, deg and deg/s
         About the turn axis.
     direction : (n, 3) array or None
-        Unit vector of the turn that goes on or, at rest, of the last one; zeros before the first.
+        Unit vector of the present turn or, at rest, of the last one; zeros before the first.
     force : (n, 3) array or None, g, body frame
-        Specific force of a shaking plate, beside gravity.
+        Specific force of a shaking plate, in addition to gravity.
     """
 
-    level: NDArray[np.float64]
-    omega: NDArray[np.float64]
-    alpha: NDArray[np.float64]
-    angle: NDArray[np.float64] | None = None
-    rate: NDArray[np.float64] | None = None
-    direction: NDArray[np.float64] | None = None
-    force: NDArray[np.float64] | None = None
+    level: Values
+    omega: Values
+    alpha: Values
+    angle: Values | None = None
+    rate: Values | None = None
+    direction: Values | None = None
+    force: Values | None = None
 
 
-def rotation_about(axis: NDArray[np.float64], angle_deg: NDArray[np.float64]) -> NDArray[np.float64]:
+def rotation_about(axis: Values, angle_deg: Values) -> Values:
     """Return ``R_u(A) = I + sin A [u]x + (1 - cos A) [u]x^2``: (n, 3, 3) array.
 
     Parameters
@@ -75,21 +77,13 @@ def rotation_about(axis: NDArray[np.float64], angle_deg: NDArray[np.float64]) ->
     zero = np.zeros_like(x)
     cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
     angle = np.radians(angle_deg)[:, None, None]
-    rotation: NDArray[np.float64] = np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross)
+    rotation: Values = np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross)
     return rotation
 
 
 @dataclass(frozen=True)
 class Turn:
-    """Turns about one body axis, as commanded by a program.
-
-    Attributes
-    ----------
-    axis : int
-    program : Program
-    errors : TurnErrors
-        What the table does otherwise than commanded.
-    """
+    """Turns about one body axis, as commanded by a program, with the table's errors."""
 
     axis: int
     program: Program
@@ -100,28 +94,15 @@ class Turn:
         """Length in s."""
         return self.program.duration
 
-    def commanded(self, time: NDArray[np.float64]) -> Pose:
-        """Return the commanded pose."""
-        return self._pose(np.eye(3)[self.axis], *self.program.at(time))
-
-    def true(self, time: NDArray[np.float64]) -> Pose:
-        """Return the pose that the table really takes."""
+    def pose(self, time: Values) -> Pose:
+        """Return the pose at (n,) times, s."""
         angle, rate, acceleration = self.errors.motion(self.program, time)
-        move = self.program.at(time)[3]
-        pose = self._pose(self.errors.turn_axis(self.axis), angle, rate, acceleration, move)
-        return replace(pose, force=self.errors.force(self.program, time))
-
-    def _pose(
-        self,
-        u: NDArray[np.float64],
-        angle: NDArray[np.float64],
-        rate: NDArray[np.float64],
-        acceleration: NDArray[np.float64],
-        move: NDArray[np.int64],
-    ) -> Pose:
+        u = self.errors.turn_axis(self.axis)
         level = LEVEL_AT_ZERO[self.axis] @ rotation_about(u, angle)
+        move = self.program.at(time)[3]
         direction = np.append(np.sign(np.diff(self.program.stops)), 0.0)[move]
-        return Pose(level, rate[:, None] * u, acceleration[:, None] * u, angle, rate, direction[:, None] * u)
+        force = self.errors.force(self.program, time)
+        return Pose(level, rate[:, None] * u, acceleration[:, None] * u, angle, rate, direction[:, None] * u, force)
 
 
 @dataclass(frozen=True)
@@ -131,32 +112,31 @@ class Moves:
     Attributes
     ----------
     program : Program
-        Angle within each move from 0 on; move k turns from ``stops[k]`` to ``stops[k + 1]``.
+        Move k turns from ``stops[k]`` to ``stops[k + 1]``.
     axes : (m, 3) array
         Unit axis of each move, body frame.
     start : (3, 3) array
-        Level axes in the body frame, as rows, before the first move.
+        ``level`` before the first move.
     """
 
     program: Program
-    axes: NDArray[np.float64]
-    start: NDArray[np.float64] = field(default_factory=lambda: np.eye(3))
+    axes: Values
+    start: Values = field(default_factory=lambda: np.eye(3))
 
     @property
     def duration(self) -> float:
         """Length in s."""
         return self.program.duration
 
-    def attitudes(self) -> NDArray[np.float64]:
+    def attitudes(self) -> Values:
         """Return the attitude before each move and after the last: (m + 1, 3, 3) array."""
-        steps = rotation_about(self.axes, np.diff(self.program.stops))
         out = [self.start]
-        for step in steps:
+        for step in rotation_about(self.axes, np.diff(self.program.stops)):
             out.append(out[-1] @ step)
         return np.array(out)
 
-    def true(self, time: NDArray[np.float64]) -> Pose:
-        """Return the pose."""
+    def pose(self, time: Values) -> Pose:
+        """Return the pose at (n,) times, s."""
         angle, rate, acceleration, move = self.program.at(time)
         begun = move >= 0
         move = np.clip(move, 0, None)
@@ -164,13 +144,6 @@ class Moves:
         level = self.attitudes()[move] @ rotation_about(u, angle - self.program.stops[move])
         direction = np.where(begun[:, None], u, 0.0)
         return Pose(level, rate[:, None] * u, acceleration[:, None] * u, direction=direction)
-
-    def commanded(self, time: NDArray[np.float64]) -> Pose:
-        """Return the pose; it is nobody's command, but known to the simulation."""
-        return self.true(time)
-
-
-SWING_RMS_DEG = np.array([60.0, 42.0, 60.0])
 
 
 @dataclass(frozen=True)
@@ -186,13 +159,13 @@ class Gimbals:
     duration : float, s
     """
 
-    drift: NDArray[np.float64]
-    amplitude: NDArray[np.float64]
-    frequency: NDArray[np.float64]
-    phase: NDArray[np.float64]
+    drift: Values
+    amplitude: Values
+    frequency: Values
+    phase: Values
     duration: float
 
-    def angles(self, time: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    def angles(self, time: Values) -> tuple[Values, ...]:
         """Return the gimbal angles and their first two derivatives: three (3, n) arrays in deg and s."""
         w = 2.0 * np.pi * self.frequency[:, :, None]
         argument = w * time + self.phase[:, :, None]
@@ -201,7 +174,7 @@ class Gimbals:
         drift = self.drift[:, None]
         return drift * time + (a * sine).sum(1), drift + (a * w * cosine).sum(1), (-a * w * w * sine).sum(1)
 
-    def quaternion(self, time: NDArray[np.float64]) -> NDArray[np.float64]:
+    def quaternion(self, time: Values) -> Values:
         """Return the attitude, body to level: (n, 4) array, continuous in sign."""
         half = 0.5 * np.radians(self.angles(time)[0])
         (a, b, c), (x, y, z) = np.cos(half), np.sin(half)
@@ -215,8 +188,8 @@ class Gimbals:
             -1,
         )
 
-    def true(self, time: NDArray[np.float64]) -> Pose:
-        """Return the pose."""
+    def pose(self, time: Values) -> Pose:
+        """Return the pose at (n,) times, s."""
         angle, rate, acceleration = self.angles(time)
         (sx, sy, _), (cx, cy, _) = np.sin(np.radians(angle)), np.cos(np.radians(angle))
         p, q, r = np.radians(rate)
@@ -232,32 +205,60 @@ class Gimbals:
         )
         return Pose(attitude_matrix(self.quaternion(time)), np.degrees(omega), np.degrees(alpha))
 
-    def commanded(self, time: NDArray[np.float64]) -> Pose:
-        """Return the pose: the table follows its command."""
-        return self.true(time)
 
+@dataclass(frozen=True)
+class Eased(Gimbals):
+    """Motion of a table that begins and ends at rest: its path is run through at the time s(t).
 
-def random_gimbals(duration: float, peak_rate: float, rng: np.random.Generator, sinusoids: int = 4) -> Gimbals:
-    """Return a random motion whose |angular rate| peaks at ``peak_rate``.
-
-    The inner gimbal turns on and the middle one swings by 42 deg rms, which is what makes the mean squares of the three
-    components of the vertical equal: the attitudes cover the sphere evenly. How fast that path is run through is chosen
-    so that the rate peaks where it should.
-
-    Parameters
-    ----------
-    duration : float, s
-    peak_rate : float, deg/s
-    rng : Generator
-    sinusoids : int
-        For each gimbal; their frequencies lie within a factor of three.
+    While it begins, ``s(t) = T u^4 (5/2 - 3 u + u^2)``, ``u = t / T``, with ``T = COMES_UP_S``; while it ends, likewise
+    backwards.
     """
-    frequency = np.exp(rng.uniform(0.0, np.log(3.0), (3, sinusoids))) / 40.0
-    weight = rng.uniform(0.5, 1.0, (3, sinusoids))
+
+    def angles(self, time: Values) -> tuple[Values, ...]:
+        """Return the gimbal angles and their first two derivatives: three (3, n) arrays in deg and s."""
+        since, left = (np.clip(t / COMES_UP_S, 0.0, 1.0) for t in (time, self.duration - time))
+        between = np.clip(time - COMES_UP_S, 0.0, self.duration - 2.0 * COMES_UP_S)
+        run = COMES_UP_S * (_path(since) + 0.5 - _path(left)) + between
+        speed = _speed(since) * _speed(left)
+        change = (_growth(since) - _growth(left)) / COMES_UP_S
+        angle, rate, acceleration = super().angles(run)
+        return angle, rate * speed, acceleration * speed**2 + rate * change
+
+
+def _path(u: Values) -> Values:
+    return u**4 * (2.5 - 3.0 * u + u**2)
+
+
+def _speed(u: Values) -> Values:
+    return u**3 * (10.0 - 15.0 * u + 6.0 * u**2)
+
+
+def _growth(u: Values) -> Values:
+    return 30.0 * (u * (1.0 - u)) ** 2
+
+
+@dataclass(frozen=True)
+class Planned:
+    """One recording to be made: its name, role, turn axis (index or None) and trajectory."""
+
+    name: str
+    role: str
+    axis: int | None
+    trajectory: Turn | Moves | Gimbals
+
+
+def random_gimbals(duration: float, peak_rate: float, rng: np.random.Generator) -> Gimbals:
+    """Return a random motion whose |angular rate| peaks at ``peak_rate`` (deg/s).
+
+    The inner gimbal turns on and the middle one swings by 42 deg rms, so that the mean squares of the three components
+    of the vertical are equal: the attitudes cover the sphere evenly. The speed along the path is chosen for the peak.
+    """
+    frequency = np.exp(rng.uniform(0.0, np.log(3.0), (3, SINUSOIDS))) / PERIOD_S
+    weight = rng.uniform(0.5, 1.0, (3, SINUSOIDS))
     swing = np.sqrt(2.0) * SWING_RMS_DEG[:, None]
     amplitude = swing * weight / np.linalg.norm(weight, axis=1, keepdims=True)
-    phase = rng.uniform(0.0, 2.0 * np.pi, (3, sinusoids))
-    drift = np.array([0.6 * 360.0 / 40.0, 0.0, 0.0]) * rng.choice([-1.0, 1.0])
+    phase = rng.uniform(0.0, 2.0 * np.pi, (3, SINUSOIDS))
+    drift = np.array([0.6 * 360.0 / PERIOD_S, 0.0, 0.0]) * rng.choice([-1.0, 1.0])
 
     def at_speed(speed: float) -> Gimbals:
         return Gimbals(drift * speed, amplitude, frequency * speed, phase, duration)
@@ -266,12 +267,12 @@ def random_gimbals(duration: float, peak_rate: float, rng: np.random.Generator, 
     low, high = 1e-3, 1e3  # a faster run shows more of the path, so its peak grows with the speed, if not in proportion
     for _ in range(24):
         middle = float(np.sqrt(low * high))
-        peak = np.linalg.norm(at_speed(middle).true(time).omega, axis=1).max()
+        peak = np.linalg.norm(at_speed(middle).pose(time).omega, axis=1).max()
         low, high = (middle, high) if peak < peak_rate else (low, middle)
     return at_speed(low)
 
 
-def axis_and_angle(rotation: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+def axis_and_angle(rotation: Values) -> tuple[Values, float]:
     """Return the unit axis and the angle in deg, 0 to 180, of a rotation matrix.
 
     The quaternion is the eigenvector of Bar-Itzhack's matrix for its largest eigenvalue; it is good at 180 deg too.
@@ -285,12 +286,12 @@ def axis_and_angle(rotation: NDArray[np.float64]) -> tuple[NDArray[np.float64], 
     q = np.linalg.eigh(matrix)[1][:, -1]
     q = q if q[0] >= 0.0 else -q
     size = float(np.linalg.norm(q[1:]))
-    if size == 0.0:  # none: any axis will do
+    if size == 0.0:
         return np.array([1.0, 0.0, 0.0]), 0.0
     return q[1:] / size, float(np.degrees(2.0 * np.arctan2(size, q[0])))
 
 
-def orientations_24() -> NDArray[np.float64]:
+def orientations_24() -> Values:
     """Return eight attitudes 45 deg apart about each axis: (24, 3, 3) array; for z, body x points up at the first."""
     angles = np.linspace(0.0, 315.0, 8)
     x, y, z = np.eye(3)
@@ -299,23 +300,13 @@ def orientations_24() -> NDArray[np.float64]:
     return np.concatenate(turns)
 
 
-def six_positions() -> NDArray[np.float64]:
+def six_positions() -> Values:
     """Return six attitudes with each axis up and down: (6, 3, 3) array."""
     x, y, _ = np.eye(3)
     return np.concatenate([rotation_about(x, np.linspace(0.0, 270.0, 4)), rotation_about(y, np.array([-90.0, 90.0]))])
 
 
-def random_attitudes(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+def random_attitudes(count: int, rng: np.random.Generator) -> Values:
     """Return attitudes that are uniform over all rotations: (count, 3, 3) array."""
     q = rng.standard_normal((count, 4))
     return attitude_matrix(q / np.linalg.norm(q, axis=1, keepdims=True))
-
-
-@dataclass(frozen=True)
-class Planned:
-    """One recording to be made: its name, role, turn axis (index or None) and trajectory."""
-
-    name: str
-    role: str
-    axis: int | None
-    trajectory: Turn | Moves | Gimbals

@@ -16,10 +16,9 @@ from pipeline.io.ingest_settings import Checks
 from pipeline.io.read import to_recording
 from pipeline.records import rate_of_attitude
 from pipeline.signal.segments import cut
-from pipeline.simulation.campaign import course_of, simulate_unit
-from pipeline.simulation.description import UnitDescription
-from pipeline.simulation.one_session import TRANSIT
-from pipeline.simulation.procedures import plan
+from pipeline.simulation.campaign import simulate_unit
+from pipeline.simulation.description import UnitDescription, course_of
+from pipeline.simulation.procedures import TRANSIT, plan
 from pipeline.simulation.session import Streams
 
 if TYPE_CHECKING:

@@ -40,7 +40,7 @@ def test_rates_are_the_derivatives_of_the_attitude(name: str, trajectory: Any) -
     knots = [] if name == "random motion" else trajectory.program.knots
     time = np.arange(0.0131, trajectory.duration, 0.0977)
     time = time[[np.all(np.abs(t - np.asarray(knots)) > 2 * STEP) for t in time]]
-    before, now, after = (trajectory.true(t) for t in (time - STEP, time, time + STEP))
+    before, now, after = (trajectory.pose(t) for t in (time - STEP, time, time + STEP))
     # omega x: R^T dR/dt of the rotation that takes body to level vectors
     spin = np.einsum("nij,nik->njk", now.level, (after.level - before.level) / (2 * STEP))
     omega = np.degrees(np.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], -1))
@@ -80,7 +80,7 @@ def test_an_angle_may_be_asked_for_at_any_time() -> None:
 def test_gravity_in_a_turn_is_the_up_vector_turned_back(axis: int) -> None:
     turn = Turn(axis, a_program())
     time = np.linspace(0.0, turn.duration, 301)
-    up = turn.true(time).level[:, 2, :]
+    up = turn.pose(time).level[:, 2, :]
     np.testing.assert_allclose(up, turn_about_axis(UP_AT_ZERO[axis], axis, -turn.program.at(time)[0]), atol=1e-12)
 
 
@@ -101,13 +101,13 @@ def test_the_quaternion_of_random_motion_is_continuous_and_is_its_attitude() -> 
 
 def test_random_motion_peaks_at_the_rate_asked_for() -> None:
     for seed in range(10):
-        pose = random_gimbals(120.0, 40.0, np.random.default_rng(seed)).true(np.arange(0.0, 120.0, 0.12))
+        pose = random_gimbals(120.0, 40.0, np.random.default_rng(seed)).pose(np.arange(0.0, 120.0, 0.12))
         assert np.linalg.norm(pose.omega, axis=1).max() == pytest.approx(40.0, rel=0.02)
 
 
 def test_random_motion_shows_all_attitudes_evenly() -> None:
     motion = random_gimbals(6000.0, 40.0, np.random.default_rng(7))
-    up = motion.true(np.arange(0.0, 6000.0, 0.5)).level[:, 2, :]
+    up = motion.pose(np.arange(0.0, 6000.0, 0.5)).level[:, 2, :]
     np.testing.assert_allclose(np.mean(up**2, axis=0), 1.0 / 3.0, atol=0.03)
     assert np.all(up.max(0) > 0.9)
     assert np.all(up.min(0) < -0.9)
