@@ -39,8 +39,8 @@ from pipeline.estimation.rest_blocks import (
 )
 from pipeline.records import Noise, Recording
 from pipeline.signal.creep import along_gravity, creep_of
-from pipeline.signal.filter_noise import filter_autocovariance, variance_of_mean
-from pipeline.signal.rest_readings import rest_readings, stretches_of, usable
+from pipeline.signal.filters import filter_autocovariance, variance_of_mean
+from pipeline.signal.rests import rest_readings, stretches_of, usable
 from pipeline.signal.temperature import temperature_of
 
 if TYPE_CHECKING:

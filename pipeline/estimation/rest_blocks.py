@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.estimation.gauss_markov import Blocks, GaussMarkov, Setting, orthonormal, variance_of_average
-from pipeline.signal.filter_noise import variance_of_mean
+from pipeline.signal.filters import variance_of_mean
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

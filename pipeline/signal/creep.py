@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.signal.filter_noise import filter_autocovariance, variance_of_mean
+from pipeline.signal.filters import filter_autocovariance, variance_of_mean
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

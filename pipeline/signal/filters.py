@@ -28,25 +28,24 @@ square of the attenuation. Both multiply the standard deviation of white noise b
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from pipeline.errors import ConfigurationError, InputError
-from pipeline.records import Note
+from pipeline.records import Note, Recording
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from numpy.typing import NDArray
-
-    from pipeline.records import Recording
 
     Values = NDArray[np.float64]
 
-GAP = 1.5
-JITTER = 0.1
+GAP = 1.5  # medians of the interval: a lost sample makes two of one
+JITTER = 0.1  # of the interval: beyond it samples count as uneven
+IMPULSE_SAMPLES = 4096  # of a response, half of them on either side of the impulse: 20 s at 100 Hz
+FORGOTTEN = 1e-9  # of the variance: less does not change a digit that is published
 BANDS: dict[str, Literal["lowpass", "highpass", "bandpass", "bandstop"]] = {
     "low_pass": "lowpass",
     "high_pass": "highpass",
@@ -86,43 +85,60 @@ def apply_filter(recording: Recording, settings: dict[str, Any]) -> Recording:
             f"recording {recording.name} has {recording.samples} samples; a filter needs at least 2",
             recording.source.get("file"),
         )
-    zero_phase = bool(settings["zero_phase"])
-    interval = recording.interval
+    zero_phase, interval = bool(settings["zero_phase"]), recording.interval
     notes: tuple[Note, ...] = ()
     if name == "rc_low_pass":
         time_constant = _time_constant(settings, interval)
-        sections = _rc_section(time_constant, interval)
-        run = _rc_runner(recording.time, time_constant, zero_phase=zero_phase)
+        k = interval / (interval + time_constant)
+        sections = np.array([[k, 0.0, 0.0, 1.0, k - 1.0, 0.0]])
+        run = partial(_rc_filtered, recording.time, time_constant, zero_phase)
     else:
-        sections = _butterworth_sections(settings, interval)
-        run = _section_runner(sections, _starts(recording), zero_phase=zero_phase)
-        notes = _timing_notes(recording)
-    delay = 0.0 if zero_phase else _delay(name, settings, sections, interval)
+        sections, notes = _butterworth_sections(settings, interval), _timing_notes(recording)
+        run = partial(_section_filtered, sections, _starts(recording), zero_phase)
     return replace(
         recording,
         accelerometer=None if recording.accelerometer is None else run(recording.accelerometer),
         gyroscope=None if recording.gyroscope is None else run(recording.gyroscope),
         notes=recording.notes + notes,
-        filter={**settings, "delay_s": delay, "noise_gain": noise_gain(sections, zero_phase=zero_phase)},
+        filter={
+            **settings,
+            "delay_s": 0.0 if zero_phase else _delay(name, settings, sections, interval),
+            "noise_gain": _noise_gain(sections, zero_phase=zero_phase),
+        },
         encodings={k: v for k, v in recording.encodings.items() if not k.startswith(("accel", "gyro"))},
     )
 
 
-def rc_low_pass(time: Values, reading: Values, time_constant: float) -> Values:
-    """Filter readings by eq. 3.14, with the time since the sample before in each step.
+def filter_autocovariance(recording: Recording) -> Values:
+    """Return the autocovariance of a recording's filter output for white noise of variance 1: (l,) array from lag 0."""
+    if recording.filter["name"] == "none" or recording.samples < 2:
+        return np.ones(1)
+    impulse = np.zeros((IMPULSE_SAMPLES, 3))
+    impulse[IMPULSE_SAMPLES // 2] = 1.0
+    time_ns = np.arange(IMPULSE_SAMPLES) * round(recording.interval * 1e9)
+    response = apply_filter(Recording("impulse", "static", None, time_ns, impulse), recording.filter).accelerometer
+    assert response is not None  # noqa: S101
+    spectrum = np.fft.rfft(response[:, 0], 2 * IMPULSE_SAMPLES)
+    covariance: Values = np.fft.irfft(np.abs(spectrum) ** 2)[:IMPULSE_SAMPLES]
+    far = np.flatnonzero(np.abs(covariance) > FORGOTTEN * covariance[0])[-1]
+    return covariance[: far + 1]
 
-    Parameters
-    ----------
-    time : (n,) array, s
-    reading : (n, m) array
-    time_constant : float, s
 
-    Returns
-    -------
-    (n, m) array
+def variance_of_mean(covariance: Values, count: NDArray[np.int64]) -> Values:
+    """Return the variance of the mean of ``count`` successive samples of a stationary sequence.
 
-    Notes
-    -----
+    ``v_n = (r_0 + 2 sum_{l<n} (1 - l/n) r_l) / n``, r the autocovariance from lag 0; 0 beyond its end.
+    """
+    kinds, which = np.unique(count, return_inverse=True)
+    lag = np.arange(len(covariance))
+    weight = np.clip(1.0 - lag / kinds[:, None], 0.0, None) * np.where(lag == 0, 1.0, 2.0)
+    variance: Values = (weight @ covariance / kinds)[which]
+    return variance
+
+
+def _rc_low_pass(time: Values, reading: Values, time_constant: float) -> Values:
+    """Filter (n, m) readings by eq. 3.14.
+
     The recursion is summed in closed form over blocks: with P[n] = prod (1 - k), ``a[n] = P[n] (a[0] + sum k r / P)``.
     A block ends before P falls to 1e-100, which keeps all digits.
     """
@@ -142,19 +158,13 @@ def rc_low_pass(time: Values, reading: Values, time_constant: float) -> Values:
     return out
 
 
-def group_delay(sections: Values, omega: float) -> float:
-    """Return the group delay of second-order sections.
+def _rc_filtered(time: Values, time_constant: float, zero_phase: bool, reading: Values) -> Values:  # noqa: FBT001
+    forward = _rc_low_pass(time, reading, time_constant)
+    return _rc_low_pass(-time[::-1], forward[::-1], time_constant)[::-1] if zero_phase else forward
 
-    Parameters
-    ----------
-    sections : (m, 6) array
-        Rows b0 b1 b2 a0 a1 a2.
-    omega : float, rad a sample
 
-    Returns
-    -------
-    float, samples
-    """
+def _group_delay(sections: Values, omega: float) -> float:
+    """Return the group delay, samples, of second-order sections b0 b1 b2 a0 a1 a2 at omega, rad a sample."""
     n = np.arange(3)
     turn = np.exp(-1j * omega * n)
 
@@ -164,20 +174,9 @@ def group_delay(sections: Values, omega: float) -> float:
     return float(np.sum(delay(sections[:, :3]) - delay(sections[:, 3:])))
 
 
-def noise_gain(sections: Values, *, zero_phase: bool) -> float:
+def _noise_gain(sections: Values, *, zero_phase: bool) -> float:
     """Return the factor on the standard deviation of white noise.
 
-    Parameters
-    ----------
-    sections : (m, 6) array
-    zero_phase : bool
-
-    Returns
-    -------
-    float
-
-    Notes
-    -----
     The mean of |H|^2 over N frequencies differs from ``sum h^2`` by terms of size r^N, r the largest pole radius; N is
     chosen for r^N < 1e-16.
     """
@@ -215,19 +214,6 @@ def _require_below_nyquist(key: str, frequency: float | None, interval: float) -
         )
 
 
-def _rc_section(time_constant: float, interval: float) -> Values:
-    k = interval / (interval + time_constant)
-    return np.array([[k, 0.0, 0.0, 1.0, k - 1.0, 0.0]])
-
-
-def _rc_runner(time: Values, time_constant: float, *, zero_phase: bool) -> Callable[[Values], Values]:
-    def run(reading: Values) -> Values:
-        forward = rc_low_pass(time, reading, time_constant)
-        return rc_low_pass(-time[::-1], forward[::-1], time_constant)[::-1] if zero_phase else forward
-
-    return run
-
-
 def _butterworth_sections(settings: dict[str, Any], interval: float) -> Values:
     from scipy.signal import butter  # noqa: PLC0415  (0.6 s that the default, no filter, does not pay)
 
@@ -246,23 +232,19 @@ def _butterworth_sections(settings: dict[str, Any], interval: float) -> Values:
     return butter(order, band, BANDS[name], output="sos", fs=1.0 / interval)
 
 
-def _section_runner(sections: Values, starts: list[int], *, zero_phase: bool) -> Callable[[Values], Values]:
+def _section_filtered(sections: Values, starts: list[int], zero_phase: bool, reading: Values) -> Values:  # noqa: FBT001
     from scipy.signal import sosfilt, sosfilt_zi, sosfiltfilt  # noqa: PLC0415  (see _butterworth_sections)
 
     at_rest = sosfilt_zi(sections)[:, :, None]
-
-    def run(reading: Values) -> Values:
-        out = np.empty_like(reading)
-        for start, stop in pairwise(starts):
-            part = reading[start:stop]
-            if zero_phase:
-                padding = min(6 * len(sections) + 3, stop - start - 1)
-                out[start:stop] = sosfiltfilt(sections, part, axis=0, padlen=padding)
-            else:
-                out[start:stop] = sosfilt(sections, part, axis=0, zi=at_rest * part[0])[0]
-        return out
-
-    return run
+    out = np.empty_like(reading)
+    for start, stop in pairwise(starts):
+        part = reading[start:stop]
+        if zero_phase:
+            padding = min(6 * len(sections) + 3, stop - start - 1)
+            out[start:stop] = sosfiltfilt(sections, part, axis=0, padlen=padding)
+        else:
+            out[start:stop] = sosfilt(sections, part, axis=0, zi=at_rest * part[0])[0]
+    return out
 
 
 def _starts(recording: Recording) -> list[int]:
@@ -294,4 +276,4 @@ def _delay(name: str, settings: dict[str, Any], sections: Values, interval: floa
     if name == "band_pass":  # the middle of the band as the bilinear transform maps it
         edges = np.tan(np.pi * interval * np.array([settings["low_hz"], settings["high_hz"]]))
         omega = 2.0 * float(np.arctan(np.sqrt(np.prod(edges))))
-    return group_delay(sections, omega) * interval
+    return _group_delay(sections, omega) * interval

@@ -58,29 +58,25 @@ def quiet_pieces(rate: Values, stretches: Sequence[tuple[int, int]], interval: f
         Mean time between samples.
     shortest : int
         Samples of the shortest piece that is a rest.
-
-    Returns
-    -------
-    list of (int, int)
     """
     size = max(FEWEST, round(WINDOW_S / interval))
     if not stretches or min(stop - start for start, stop in stretches) < size:
         return list(stretches)
     parts = [rate[start:stop] for start, stop in stretches]
-    windows = [_windows(part, size) for part in parts]
-    medians = np.array([np.median(mean, axis=0) for mean, _ in windows])
+    of_parts = [windows(part, size) for part in parts]
+    medians = np.array([np.median(mean, axis=0) for mean, _ in of_parts])
     reference, resting = _references(medians)
-    off = [np.abs(mean - r) for (mean, _), r in zip(windows, reference, strict=True)]
+    off = [np.abs(mean - r) for (mean, _), r in zip(of_parts, reference, strict=True)]
     differences = np.concatenate([np.abs(np.diff(part, axis=0)) for part in parts])
     white = NORMAL * np.median(differences, axis=0) / np.sqrt(2.0 * size)
     spread = NORMAL * np.array([np.median(own, axis=0) for own in off])
-    noise = np.array([np.median(variance) for _, variance in windows])
+    noise = np.array([np.median(variance) for _, variance in of_parts])
     spread = np.where(resting[:, None], spread, np.median(spread, axis=0))
     limit = np.minimum(SIGNIFICANT * np.maximum(white, spread), np.maximum(SIGNIFICANT * white, TREMOR_LIMIT_DPS))
     loud = SIGNIFICANT**2 * np.where(resting, noise, np.median(noise))
     pieces: Spans = []
     for i, (start, stop) in enumerate(stretches):
-        turns = np.any(off[i] > limit[i], axis=1) | (windows[i][1] > loud[i])
+        turns = np.any(off[i] > limit[i], axis=1) | (of_parts[i][1] > loud[i])
         quiet = ~_widened(turns, size // 2, stop - start)
         turned = np.vstack([np.zeros(3), np.cumsum((parts[i] - reference[i]) * interval, axis=0)])
         found = _rests(quiet, turned, shortest)
@@ -90,14 +86,15 @@ def quiet_pieces(rate: Values, stretches: Sequence[tuple[int, int]], interval: f
     return pieces
 
 
-def _windows(part: Values, size: int) -> tuple[Values, Values]:
-    """Return the mean of each window, (m, 3), and its variance summed over the axes, (m,)."""
-    centred = part - np.median(part, axis=0)
-    sums = np.concatenate([np.zeros((1, 3)), np.cumsum(centred, axis=0)])
-    squares = np.concatenate([np.zeros((1, 3)), np.cumsum(centred**2, axis=0)])
+def windows(values: Values, size: int) -> tuple[Values, Values]:
+    """Return the mean of each window of ``size`` rows, (m, k), and its variance summed over the columns, (m,)."""
+    middle = np.median(values, axis=0)
+    centred = values - middle
+    sums = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(centred, axis=0)])
+    squares = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(centred**2, axis=0)])
     total, power = sums[size:] - sums[:-size], squares[size:] - squares[:-size]
-    variance = np.maximum(power - total**2 / size, 0.0).sum(axis=1) / (size - 1)
-    return total / size + np.median(part, axis=0), variance
+    variance = np.maximum((power - total**2 / size).sum(axis=1), 0.0) / (size - 1)
+    return total / size + middle, variance
 
 
 def _references(medians: Values) -> tuple[Values, NDArray[np.bool_]]:

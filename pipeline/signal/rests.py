@@ -20,12 +20,15 @@ by theta shortens the mean of a vector by theta^2 / 24, for 2 deg by 5e-5: 0.05 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.records import noise_of_steps
 from pipeline.signal.creep import creep_in
-from pipeline.signal.quiet_rates import RATE_LIMIT_DPS, quiet_pieces
+from pipeline.signal.filters import filter_autocovariance
+from pipeline.signal.quiet_rates import RATE_LIMIT_DPS, quiet_pieces, windows
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -34,15 +37,18 @@ if TYPE_CHECKING:
 
     from pipeline.records import Recording
 
-RATE_AT_REST_DPS = 0.02
-SETTLING_S = 0.3
+    Values = NDArray[np.float64]
+    Spans = list[tuple[int, int]]
+
+RATE_AT_REST_DPS = 0.02  # above the rate noise of a resting table
+SETTLING_S = 0.3  # fifteen time constants of the slowest filter of 20 ms, as in ``pipeline.model.encoder_trajectory``
 
 WINDOW_S = 0.5  # shorter than a rest, longer than a tremor's period (8 to 12 Hz)
-GAP_S = 1.0
-SHORTEST_REST_S = 1.0
+GAP_S = 1.0  # longer than any regular interval of a log
+SHORTEST_REST_S = 1.0  # two windows
 MULTIPLES = np.geomspace(4.0, 1000.0, 25)  # of a variance: 2 to 30 times the noise, in steps of an eighth
 SMALLEST_VARIANCE = 1e-12  # g^2, keeps the multiple of a noise-free recording above rounding
-NEIGHBOURS = 5
+NEIGHBOURS = 5  # rests: their median withstands two that turned
 TURN_LIMIT_DEG = 2.0  # 0.05 mg, see above
 # A steady tilt is modelled up to this rate (``pipeline.signal.creep``); units in real hands and on soft seats creep by
 # up to 0.3 deg/s.
@@ -50,21 +56,14 @@ CREEP_LIMIT_DPS, STEADY_LIMIT_DEG = 0.5, 10.0
 SCATTER_LIMIT = 3.0
 SMALLEST_SCATTER_G2 = 3e-6  # 1 mg on each axis, so that a quiet sensor may settle by 0.1 deg
 SIGNIFICANT = 6.0  # standard deviations
+GAP = 1.5  # medians of the interval: a lost sample makes two of one
+EDGE_S, FEWEST_TO_SETTLE = 0.5, 6  # of a rest that may still move, at most a third of it, and samples that show it
+SETTLED = 8.0  # of the noise between successive samples: white noise passes in 1e-14
 
 
 @dataclass(frozen=True)
 class Rest:
-    """One rest of a recording.
-
-    Attributes
-    ----------
-    start, stop : int
-        Its samples are ``start <= n < stop``.
-    accepted : bool
-        Whether its mean may be used.
-    reason : str
-        Why it is refused; empty where it is accepted.
-    """
+    """One rest of a recording: samples ``start <= n < stop``, and the reason where its mean may not be used."""
 
     start: int
     stop: int
@@ -72,7 +71,7 @@ class Rest:
     reason: str = ""
 
 
-def runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def runs(mask: NDArray[np.bool_]) -> Spans:
     """Return the (start, stop) index pairs of the runs of True in a mask."""
     starts, stops = _edges(mask)
     return list(zip(starts.tolist(), stops.tolist(), strict=True))
@@ -86,23 +85,11 @@ def _edges(mask: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64
     return edges[::2], edges[1::2]
 
 
-def still_samples(
-    time: NDArray[np.float64], rate: NDArray[np.float64], settling: float = SETTLING_S
-) -> NDArray[np.bool_]:
-    """Return which samples rest and have settled, by a table's rate.
+def still_samples(time: Values, rate: Values, settling: float = SETTLING_S) -> NDArray[np.bool_]:
+    """Return which samples rest and have settled, by a table's rate in deg/s: (n,) array of bool.
 
     A rest begins where |rate| falls under 0.02 deg/s; its first ``settling`` seconds are left out, unless the recording
     begins with it.
-
-    Parameters
-    ----------
-    time : (n,) array, s
-    rate : (n,) array, deg/s
-    settling : float, s
-
-    Returns
-    -------
-    (n,) array of bool
     """
     still = np.abs(rate) < RATE_AT_REST_DPS
     starts, stops = _edges(still)
@@ -116,14 +103,7 @@ def still_samples(
 def rests_from_table(recording: Recording) -> list[Rest]:
     """Return the rests by the table's rate, or by the derivative of its angle; none without such a log.
 
-    Parameters
-    ----------
-    recording : Recording
-
-    Returns
-    -------
-    list of Rest
-        Their first 0.3 s, and the delay of the recording's filter, are left out.
+    Their first 0.3 s, and the delay of the recording's filter, are left out.
     """
     if recording.table_rate is not None:
         rate = recording.table_rate
@@ -136,23 +116,15 @@ def rests_from_table(recording: Recording) -> list[Rest]:
 
 
 def find_rests(recording: Recording) -> list[Rest]:
-    """Find the rests of a hand-held recording from its readings.
+    """Find the rests of a hand-held recording from its readings: in order of time, at least 1 s long.
 
-    Parameters
-    ----------
-    recording : Recording
-        With accelerometer readings; those of the gyroscope, where it holds them, show rests that still turned.
-
-    Returns
-    -------
-    list of Rest
-        In order of time, at least 1 s long; those that moved are refused, with the reason.
+    Those that moved are refused, with the reason; readings of the gyroscope show rests that still turned.
     """
     force = recording.accelerometer
     size = max(5, round(WINDOW_S / _interval(recording))) if recording.samples > 1 else 5
     if force is None or recording.samples < 2 * size:
         return []
-    variance = _windowed_variance(force, size)
+    variance = windows(force, size)[1]
     noise = max(float(np.percentile(variance, 5.0)), SMALLEST_VARIANCE)
     variance[_spoilt(recording, size)] = np.inf
     found = [_below(variance, multiple * noise, recording, size) for multiple in MULTIPLES]
@@ -172,19 +144,9 @@ def _interval(recording: Recording) -> float:
 
 
 def assess_rests(recording: Recording, intervals: Sequence[tuple[int, int]], noise_variance: float) -> list[Rest]:
-    """Refuse those rests in which the sensor moved.
+    """Return rests of given start and stop; those in which the sensor moved are refused.
 
-    Parameters
-    ----------
-    recording : Recording
-    intervals : sequence of (int, int)
-        Start and stop of each rest.
-    noise_variance : float, g^2
-        Variance of the specific force at rest, summed over the axes.
-
-    Returns
-    -------
-    list of Rest
+    ``noise_variance`` is that of the specific force at rest, g^2, summed over the axes.
     """
     rests = [Rest(start, stop) for start, stop in intervals]
     reasons = [_turn(recording, r) or _scatter(recording, r, noise_variance) for r in rests]
@@ -193,20 +155,6 @@ def assess_rests(recording: Recording, intervals: Sequence[tuple[int, int]], noi
         replace(rest, accepted=not reason, reason=reason)
         for rest, reason in zip(rests, (a or b for a, b in zip(reasons, rates, strict=True)), strict=True)
     ]
-
-
-def _windowed_variance(values: NDArray[np.float64], size: int) -> NDArray[np.float64]:
-    """Return the variance in each window of ``size`` samples, summed over the columns: (n - size + 1,) array."""
-    centred = values - values.mean(axis=0)
-
-    def sums(x: NDArray[np.float64]) -> NDArray[np.float64]:
-        total = np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(x, axis=0)])
-        window: NDArray[np.float64] = total[size:] - total[:-size]
-        return window
-
-    squares = sums(centred**2) - sums(centred) ** 2 / size
-    variance: NDArray[np.float64] = np.maximum(squares.sum(axis=1), 0.0) / (size - 1)
-    return variance
 
 
 def _spoilt(recording: Recording, size: int) -> NDArray[np.bool_]:
@@ -221,7 +169,7 @@ def _spoilt(recording: Recording, size: int) -> NDArray[np.bool_]:
     return total[size:] > total[:-size]
 
 
-def _below(variance: NDArray[np.float64], threshold: float, recording: Recording, size: int) -> list[tuple[int, int]]:
+def _below(variance: Values, threshold: float, recording: Recording, size: int) -> Spans:
     """Return the trimmed stretches whose windows stay under a threshold, if long enough."""
     interval = _interval(recording)
     lag = int(np.ceil(5.0 * float(recording.filter.get("delay_s", 0.0)) / interval))
@@ -291,3 +239,62 @@ def _rate_reasons(recording: Recording, rests: Sequence[Rest]) -> list[str]:
             else ""
         )
     return reasons
+
+
+def stretches_of(recording: Recording, mask: NDArray[np.bool_]) -> Spans:
+    """Return the runs of a mask, cut at gaps in time."""
+    cuts = np.flatnonzero(np.diff(recording.time_ns) > GAP * recording.interval * 1e9) + 1
+    if len(cuts) == 0:
+        return runs(mask)
+    pieces: Spans = []
+    for start, stop in runs(mask):
+        edges = [start, *cuts[(cuts > start) & (cuts < stop)].tolist(), stop]
+        pieces += pairwise(edges)
+    return pieces
+
+
+def usable(recording: Recording, values: Values) -> NDArray[np.bool_]:
+    """Return which samples are neither missing nor marked by ingest: (n,) array."""
+    return np.asarray(np.isfinite(values).all(axis=1) & recording.valid)
+
+
+def rest_readings(recording: Recording, sensor: str, *, everything: bool) -> list[tuple[Values, Values]]:
+    """Return the times and readings of each rest of a recording."""
+    values = recording.reading(sensor)
+    assert values is not None  # noqa: S101
+    still = usable(recording, values)
+    if not everything:
+        found = rests_from_table(recording)
+        if not found and recording.role == "rests":
+            found = find_rests(recording)
+        resting = np.zeros(recording.samples, bool)
+        memory = len(filter_autocovariance(recording)) - 1  # so long a filter's output holds what was before the rest
+        ahead = memory if recording.filter.get("zero_phase") else 0
+        for rest in found:
+            first = rest.start + memory * (rest.start > 0)
+            resting[first : rest.stop - ahead * (rest.stop < recording.samples)] = rest.accepted
+        still &= resting
+    if everything:  # a gap does not end a static rest: the likelihood knows the times
+        return [(recording.time[still], values[still])] if still.any() else []
+    settled = _settled(recording, values, stretches_of(recording, still))
+    return [(recording.time[a:b], values[a:b]) for a, b in settled if b - a > 2]
+
+
+def _settled(recording: Recording, values: Values, stretches: Spans) -> Spans:
+    """Return rests without the samples at their edges that still move: the sensor's clock may be off the table's."""
+    ends = np.array(stretches, int).reshape(-1, 2)
+    lengths = ends[:, 1] - ends[:, 0]
+    edges = np.minimum(int(EDGE_S / recording.interval) + 1, lengths // 3)
+    for edge in np.unique(edges[lengths >= FEWEST_TO_SETTLE]).tolist():
+        alike = np.flatnonzero((edges == edge) & (lengths >= FEWEST_TO_SETTLE))
+        length = int(lengths[alike].min())
+        inside = values[ends[alike, :1] + np.arange(length)]
+        spread = noise_of_steps(np.abs(np.diff(inside, axis=1)), axis=1, keepdims=True)
+        for side in (1, -1):
+            ordered = inside if side == 1 else values[ends[alike, 1:] - 1 - np.arange(3 * edge)]
+            middle = np.median(ordered[:, edge : 3 * edge], axis=1, keepdims=True)
+            off = np.abs(ordered[:, :edge] - middle) > SETTLED * spread
+            moving = np.any(off & (spread > 0), axis=2)
+            cut = np.where(moving, np.arange(1, edge + 1), 0).max(axis=1)
+            ends[alike, 0 if side == 1 else 1] += side * cut
+    return [(a, b) for a, b in ends.tolist()]

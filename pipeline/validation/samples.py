@@ -22,7 +22,7 @@ from pipeline.model.effects.base import truth
 from pipeline.model.effects.timing import shifted
 from pipeline.model.kinematics import earth_rate, reference_motion
 from pipeline.signal.creep import believed_rates, creep_in
-from pipeline.signal.filter_noise import filter_autocovariance, variance_of_mean
+from pipeline.signal.filters import filter_autocovariance, variance_of_mean
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -12,8 +12,7 @@ from pipeline.estimation.gauss_markov import block_covariance, variance_of_avera
 from pipeline.estimation.noise import estimate_noise
 from pipeline.records import Recording
 from pipeline.signal.allan import allan_deviation
-from pipeline.signal.filter_noise import filter_autocovariance
-from pipeline.signal.filters import apply_filter
+from pipeline.signal.filters import apply_filter, filter_autocovariance
 
 SHEET = {"noise_density": 4e-4, "bias_wander": 1e-4, "wander_time_s": 100.0}
 NO_WANDER = {"noise_density": 4e-4, "bias_wander": 0.0, "wander_time_s": 100.0}

@@ -135,7 +135,7 @@ def _memory(recording: Recording) -> float:
     if applied["name"] == "none":
         return 0.0
     try:
-        from pipeline.signal.filter_noise import filter_autocovariance  # noqa: PLC0415  (only filtered recordings pay for it)
+        from pipeline.signal.filters import filter_autocovariance  # noqa: PLC0415  (only filtered recordings pay for it)
 
         covariance = np.abs(filter_autocovariance(recording))
     except (ConfigurationError, KeyError):

@@ -24,7 +24,7 @@ from pipeline.estimation.multi_position.rests import ROLE, rests_of
 from pipeline.estimation.rest_means import rest_means
 from pipeline.model.effects import effect
 from pipeline.model.measurement import compensate
-from pipeline.signal.filter_noise import filter_autocovariance, variance_of_mean
+from pipeline.signal.filters import filter_autocovariance, variance_of_mean
 from pipeline.signal.rests import Rest
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ import numpy as np
 
 from pipeline.estimation.rest_means import holdout_interval, rest_means, sound_samples, split_rests
 from pipeline.signal.creep import believed_rates, creep_in
-from pipeline.signal.filter_noise import filter_autocovariance, variance_of_mean
+from pipeline.signal.filters import filter_autocovariance, variance_of_mean
 from pipeline.signal.temperature import smooth_temperature
 
 if TYPE_CHECKING:
