@@ -12,16 +12,15 @@ A move of the table is
     turn about i  sum_n (w_i[n] - b_i)^2 > 0.8 sum_n |w[n] - b|^2 in a move
     step, turn    a move by less than half a turn, or by more
 
-where
-
-    r    : rate of the table: logged, or that of its angle or attitude
-    w, b : angular rate read by the sensor, and its median while the table rests
+where r is the rate of the table (logged, or that of its angle or attitude), w the angular rate that the sensor reads,
+and b the median of w while the table rests.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import replace
+from itertools import groupby, pairwise
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -36,37 +35,46 @@ if TYPE_CHECKING:
 
     from pipeline.records import Recording
 
-FEWEST_STOPS = 4
+    Values = NDArray[np.float64]
+
+FEWEST_STOPS = 4  # attitudes about one axis that determine a bias and a row of the matrix
 BESIDE_S, BESIDE_FREE_S = 30.0, 1.0  # of rest that a segment takes with it
-SHORTEST_STATIC_S, SHORTEST_FREE_S = 60.0, 10.0
-SLOWER = 1.2
-FEWEST_OF_A_SPLINE, AGREES = 6, 0.05
+SHORTEST_STATIC_S, SHORTEST_FREE_S = 60.0, 10.0  # shorter ones say nothing of the noise, of the held-out error
+SLOWER = 1.2  # rates that differ by less are one rate
+FEWEST_OF_A_SPLINE = 6  # samples of a quintic
+AGREES = 0.05  # of the mean rate: a gimbal alone differs from the attitude's rate by far more
 SHORT_NAMES = {"accelerometer": "accel", "gyroscope": "gyro", "validation": "validation", "static": "static"}
-ONE_AXIS = 0.8
-ENCODER_AGREES_DEG, ENCODER_AGREES = 5.0, 0.1
+ONE_AXIS = 0.8  # share of the energy of a turn about a body axis that is misaligned by 27 deg
+ENCODER_AGREES_DEG, ENCODER_AGREES = 5.0, 0.1  # a sample of a fast turn, and a coarse log of the rate
 HALF_A_TURN_DEG = 180.0
-HANDLED_DPS, NEAR_A_MOVE_S = 3.0, 0.5
+HANDLED_DPS, NEAR_A_MOVE_S = 3.0, 0.5  # above bias and vibration of a resting unit; the logs' clocks may be off
 
 
-@dataclass(frozen=True)
-class Segment:
-    """Samples ``start <= n < stop`` of a recording, and what they are for.
-
-    Attributes
-    ----------
-    start, stop : int
-    role : str
-        As of ``Recording``.
-    axis : str or None
-    what : str
-        In words.
-    """
+class Segment(NamedTuple):
+    """Samples ``start <= n < stop`` of a recording, the role and axis of a recording of them, and a description."""
 
     start: int
     stop: int
     role: str
     axis: str | None
     what: str
+
+
+class Move(NamedTuple):
+    """One move of the table: its samples, axis (None for several), angle (deg) and largest rate (deg/s)."""
+
+    start: int
+    stop: int
+    axis: int | None
+    angle: float
+    rate: float
+
+    @property
+    def kind(self) -> tuple[int | None, str]:
+        """Its axis, and whether it is a step, a turn or free motion."""
+        if self.axis is None:
+            return None, "free"
+        return self.axis, "turn" if self.angle >= HALF_A_TURN_DEG else "step"
 
 
 def cut(recording: Recording, windows: Sequence[Mapping[str, Any]] | None = None) -> list[Recording]:
@@ -84,28 +92,27 @@ def cut(recording: Recording, windows: Sequence[Mapping[str, Any]] | None = None
     InputError
         If nothing is found, or a window holds no samples.
     """
-    segments = find_segments(recording) if windows is None else [_of_window(recording, w) for w in windows]
+    segments = _find_segments(recording) if windows is None else [_of_window(recording, w) for w in windows]
     out: list[Recording] = []
     count: dict[str, int] = {}
     for segment in segments:
         name = SHORT_NAMES[segment.role] + (f"_{segment.axis}" if segment.axis else "")
         count[name] = count.get(name, 0) + 1
         part = recording.select(slice(segment.start, segment.stop))
-        rate = part.table_rate if segment.axis is not None else _size_of_rate(part)
         out.append(
             replace(
                 part,
                 name=name if count[name] == 1 else f"{name}_{count[name]}",
                 role=segment.role,
                 axis=segment.axis,
-                table_rate=rate,
+                table_rate=part.table_rate if segment.axis is not None else _size_of_rate(part),
                 notes=(*(recording.notes if not out else ()), _note(recording, segment, found=windows is None)),
             )
         )
     return out
 
 
-def _size_of_rate(part: Recording) -> NDArray[np.float64] | None:
+def _size_of_rate(part: Recording) -> Values | None:
     """Return the size of the table's rate: the logged one, unless by the attitude it is of one gimbal alone."""
     logged = None if part.table_rate is None else np.abs(part.table_rate)
     if part.table_attitude is None or part.samples < FEWEST_OF_A_SPLINE:
@@ -137,135 +144,28 @@ def _of_window(recording: Recording, window: Mapping[str, Any]) -> Segment:
     return Segment(int(start), int(stop), role, axis, f"{role} about {axis}" if axis else role)
 
 
-def find_segments(recording: Recording) -> list[Segment]:
-    """Find the turns, rests and free motion of one long recording, in order of time.
-
-    Raises
-    ------
-    InputError
-        If the log shows no table, no gyroscope or no turn.
-    """
-    rate, gyro = rate_of_table(recording), recording.gyroscope
+def _find_segments(recording: Recording) -> list[Segment]:
+    """Find the turns, rests and free motion of one long recording, in order of time."""
+    rate, gyro = _rate_of_table(recording), recording.gyroscope
     if rate is None or gyro is None:
         raise InputError(
             "the recording is to be cut into its turns, and it holds no gyroscope or no log of the table; give windows "
             "in procedure.recordings",
             recording.source.get("file"),
         )
-    moves = find_moves(recording, rate, gyro)
-    handled = handled_samples(recording, rate, gyro)
-    groups = groups_of(moves, handled)
-    segments = [s for group in groups for s in _segments(recording, group, moves, handled, groups)]
-    segments += _static(recording, rate, handled, segments)
+    session = _Session(recording, rate, gyro)
+    segments = [segment for group in session.groups for segment in session.segments(group)]
+    segments += session.static(segments)
     if not any(s.axis for s in segments):
         raise InputError(
-            f"no turns about one axis were found in {len(moves)} moves of the table; give windows in "
+            f"no turns about one axis were found in {len(session.moves)} moves of the table; give windows in "
             "procedure.recordings",
             recording.source.get("file"),
         )
     return sorted(segments, key=lambda s: (s.start, s.role))
 
 
-def _segments(
-    recording: Recording, group: list[Move], moves: Sequence[Move], handled: NDArray[np.bool_],
-    groups: Sequence[list[Move]],
-) -> list[Segment]:  # fmt: skip
-    """Return what a group of moves is for: one segment, two where an axis has no other, none for a mere transit."""
-    if group[0].axis is None:
-        group = _without_transits(recording, group)
-    start, stop = _extent(recording, group, moves, handled)
-    first = group[0]
-    if first.axis is None:
-        long = _seconds(recording, group[0].start, group[-1].stop) >= SHORTEST_FREE_S
-        return [Segment(start, stop, "validation", None, "motion about several axes")] if long else []
-    if not _useful(group):
-        return []
-    axis = AXES[first.axis]
-    rates = sorted({round(m.rate, 1) for m in group})
-    listed = f"{rates[0]:g}" if len(rates) == 1 else f"{rates[0]:g} to {rates[-1]:g}"
-    what = f"{len(group)} {first.kind}{'s'[: len(group) > 1]} about {axis} at {listed} deg/s"
-    return [Segment(start, stop, role, axis, what) for role in _roles(group, groups)]
-
-
-def _without_transits(recording: Recording, group: list[Move]) -> list[Move]:
-    """Return a group without the short moves around motion that lasts: they bring the table there and back."""
-    lasting = [k for k, m in enumerate(group) if _seconds(recording, m.start, m.stop) >= SHORTEST_FREE_S]
-    return group[lasting[0] : lasting[-1] + 1] if lasting else group
-
-
-def _seconds(recording: Recording, start: int, stop: int) -> float:
-    return float(recording.time[stop - 1] - recording.time[start])
-
-
-def _useful(group: Sequence[Move]) -> bool:
-    return group[0].kind == "turn" or (group[0].kind == "step" and len(group) >= FEWEST_STOPS - 1)
-
-
-def _roles(group: list[Move], groups: Sequence[list[Move]]) -> list[str]:
-    """Return the sensors that a group of moves about one axis is for."""
-    others = [g for g in groups if g[0].axis == group[0].axis and g is not group and _useful(g)]
-    if any(g[0].kind != group[0].kind for g in others):
-        return ["accelerometer" if group[0].kind == "step" else "gyroscope"]
-    rate = max(m.rate for m in group)
-    slowest = min((max(m.rate for m in g) for g in others), default=None)
-    fastest = max((max(m.rate for m in g) for g in others), default=0.0)
-    if slowest is None or max(rate, fastest) < SLOWER * min(rate, slowest):
-        return ["accelerometer", "gyroscope"]
-    return ["accelerometer"] if rate < slowest else ["gyroscope"]
-
-
-def _extent(
-    recording: Recording, group: list[Move], moves: Sequence[Move], handled: NDArray[np.bool_]
-) -> tuple[int, int]:
-    """Return the samples of a group with half of the rests beside it, 30 s at most, and nothing handled."""
-    beside = int((BESIDE_S if group[0].axis is not None else BESIDE_FREE_S) / recording.interval)
-    before = max((m.stop for m in moves if m.stop <= group[0].start), default=None)
-    after = min((m.start for m in moves if m.start >= group[-1].stop), default=None)
-    start = 0 if before is None else (before + group[0].start) // 2
-    stop = recording.samples if after is None else (group[-1].stop + after) // 2
-    start, stop = max(start, group[0].start - beside), min(stop, group[-1].stop + beside)
-    early = np.flatnonzero(handled[start : group[0].start])
-    late = np.flatnonzero(handled[group[-1].stop : stop])
-    margin = int(np.ceil(NEAR_A_MOVE_S / recording.interval))
-    start = start + int(early[-1]) + 1 + margin if early.size else start
-    stop = group[-1].stop + int(late[0]) - margin if late.size else stop
-    return min(start, group[0].start), max(stop, group[-1].stop)
-
-
-def _static(
-    recording: Recording, rate: NDArray[np.float64], handled: NDArray[np.bool_], others: Sequence[Segment]
-) -> list[Segment]:
-    """Return the longest rest that no other segment has taken, if it is long enough."""
-    still = (np.abs(rate) <= RATE_AT_REST_DPS) & ~handled
-    for other in others:
-        still[other.start : other.stop] = False
-    margin = int(np.ceil(NEAR_A_MOVE_S / recording.interval))
-    spans = [(a + margin * (a > 0), b - margin * (b < recording.samples)) for a, b in runs(still)]
-    longest = max(spans, key=lambda s: s[1] - s[0], default=(0, 0))
-    if (longest[1] - longest[0]) * recording.interval < SHORTEST_STATIC_S:
-        return []
-    return [Segment(*longest, "static", None, "a long rest")]
-
-
-@dataclass(frozen=True)
-class Move:
-    """One move of the table: its samples, axis (None for several), angle (deg) and largest rate (deg/s)."""
-
-    start: int
-    stop: int
-    axis: int | None
-    angle: float
-    rate: float
-
-    @property
-    def kind(self) -> str:
-        """What it is a part of."""
-        if self.axis is None:
-            return "free"
-        return "turn" if self.angle >= HALF_A_TURN_DEG else "step"
-
-
-def rate_of_table(recording: Recording) -> NDArray[np.float64] | None:
+def _rate_of_table(recording: Recording) -> Values | None:
     """Return the rate of the table, its size where only that is known: (n,) array, deg/s."""
     if recording.table_rate is not None:
         return recording.table_rate
@@ -276,59 +176,109 @@ def rate_of_table(recording: Recording) -> NDArray[np.float64] | None:
     return rate_of_attitude(recording.time, recording.table_attitude)
 
 
-def find_moves(recording: Recording, rate: NDArray[np.float64], gyro: NDArray[np.float64]) -> list[Move]:
-    """Return the moves of the table, in order of time.
+class _Session:
+    """A long recording with the table's rate and the sensor's, deg/s: its moves, and their groups."""
 
-    Parameters
-    ----------
-    recording : Recording
-    rate : (n,) array, deg/s
-        Of the table.
-    gyro : (n, 3) array, deg/s
-        Read by the sensor.
-    """
-    moving = np.abs(rate) > RATE_AT_REST_DPS
-    bias = np.median(gyro[~moving], axis=0) if np.any(~moving) else np.median(gyro, axis=0)
-    step = np.gradient(recording.time)
-    found = []
-    for start, stop in runs(moving):
-        energy = np.sum((gyro[start:stop] - bias) ** 2, axis=0)
+    def __init__(self, recording: Recording, rate: Values, gyro: Values) -> None:
+        self.recording, self.rate, self.gyro = recording, rate, gyro
+        self.moving = np.abs(rate) > RATE_AT_REST_DPS
+        self.bias = np.median(gyro if self.moving.all() else gyro[~self.moving], axis=0)
+        self.margin = int(np.ceil(NEAR_A_MOVE_S / recording.interval))
+        self.handled = self._handled()
+        step = np.gradient(recording.time)
+        self.moves = [self._move(start, stop, step) for start, stop in runs(self.moving)]
+        self.groups = self._groups()
+
+    def _handled(self) -> NDArray[np.bool_]:
+        """Return the samples at which the sensor turns and the table does not."""
+        if self.moving.all():
+            return np.zeros(len(self.moving), bool)
+        near = np.convolve(self.moving, np.ones(2 * self.margin + 1), "same") > 0.5
+        off = np.linalg.norm(self.gyro - self.bias, axis=1)
+        noise = float(np.median(off[~self.moving]))
+        return np.asarray((off > max(HANDLED_DPS, 10.0 * noise)) & ~near)
+
+    def _move(self, start: int, stop: int, step: Values) -> Move:
+        energy = np.sum((self.gyro[start:stop] - self.bias) ** 2, axis=0)
         axis = int(np.argmax(energy))
-        angle = float(np.sum(np.abs(rate[start:stop]) * step[start:stop]))
-        alone = energy[axis] > ONE_AXIS * energy.sum() and _encoder_agrees(recording, start, stop, angle)
-        found.append(Move(start, stop, axis if alone else None, angle, float(np.abs(rate[start:stop]).max())))
-    return found
+        rate = np.abs(self.rate[start:stop])
+        angle = float(np.sum(rate * step[start:stop]))
+        alone = energy[axis] > ONE_AXIS * energy.sum() and self._encoder_agrees(start, stop, angle)
+        return Move(start, stop, axis if alone else None, angle, float(rate.max()))
+
+    def _encoder_agrees(self, start: int, stop: int, angle: float) -> bool:
+        """Return whether the logged angle moves as the rate says: else it is not that of the gimbal that turns."""
+        if self.recording.table_angle is None:
+            return True
+        passed = float(np.sum(np.abs(np.diff(self.recording.table_angle[max(start - 1, 0) : stop + 1]))))
+        return abs(passed - angle) < ENCODER_AGREES_DEG + ENCODER_AGREES * angle
+
+    def _groups(self) -> list[list[Move]]:
+        """Return moves of one kind that follow each other, unless the sensor was mounted anew between."""
+        group, numbers = 0, [0] * len(self.moves)
+        for k, (last, move) in enumerate(pairwise(self.moves), 1):
+            group += last.kind != move.kind or bool(self.handled[last.stop : move.start].any())
+            numbers[k] = group
+        pairs = zip(numbers, self.moves, strict=True)
+        return [[move for _, move in together] for _, together in groupby(pairs, key=lambda pair: pair[0])]
+
+    def segments(self, group: list[Move]) -> list[Segment]:
+        """Return what a group of moves is for: one segment, two where an axis has no other, none for a transit."""
+        first = group[0]
+        if first.axis is None:  # without the short moves around it, which bring the table there and back
+            lasting = [k for k, move in enumerate(group) if self._seconds(move.start, move.stop) >= SHORTEST_FREE_S]
+            group = group[lasting[0] : lasting[-1] + 1] if lasting else group
+            if self._seconds(group[0].start, group[-1].stop) < SHORTEST_FREE_S:
+                return []
+            return [Segment(*self._extent(group), "validation", None, "motion about several axes")]
+        if not _useful(group):
+            return []
+        axis = AXES[first.axis]
+        rates = sorted({round(m.rate, 1) for m in group})
+        listed = f"{rates[0]:g}" if len(rates) == 1 else f"{rates[0]:g} to {rates[-1]:g}"
+        what = f"{len(group)} {first.kind[1]}{'s'[: len(group) > 1]} about {axis} at {listed} deg/s"
+        return [Segment(*self._extent(group), role, axis, what) for role in self._roles(group)]
+
+    def _seconds(self, start: int, stop: int) -> float:
+        return float(self.recording.time[stop - 1] - self.recording.time[start])
+
+    def _roles(self, group: list[Move]) -> list[str]:
+        """Return the sensors that a group of moves about one axis is for."""
+        others = [g for g in self.groups if g[0].axis == group[0].axis and g is not group and _useful(g)]
+        if any(g[0].kind != group[0].kind for g in others):
+            return ["accelerometer" if group[0].kind[1] == "step" else "gyroscope"]
+        rate, rates = max(m.rate for m in group), [max(m.rate for m in g) for g in others]
+        if not rates or max(rate, *rates) < SLOWER * min(rate, *rates):
+            return ["accelerometer", "gyroscope"]
+        return ["accelerometer"] if rate < min(rates) else ["gyroscope"]
+
+    def _extent(self, group: list[Move]) -> tuple[int, int]:
+        """Return the samples of a group with half of the rests beside it, 30 s at most, and nothing handled."""
+        first, last = group[0].start, group[-1].stop
+        beside = int((BESIDE_S if group[0].axis is not None else BESIDE_FREE_S) / self.recording.interval)
+        before = max((m.stop for m in self.moves if m.stop <= first), default=-first)  # none: from the first sample
+        after = min(
+            (m.start for m in self.moves if m.start >= last), default=2 * self.recording.samples - last
+        )  # none: to the last
+        start, stop = max((before + first) // 2, first - beside), min((last + after) // 2, last + beside)
+        early = np.flatnonzero(self.handled[start:first])
+        late = np.flatnonzero(self.handled[last:stop])
+        start = start + int(early[-1]) + 1 + self.margin if early.size else start
+        stop = last + int(late[0]) - self.margin if late.size else stop
+        return min(start, first), max(stop, last)
+
+    def static(self, others: Sequence[Segment]) -> list[Segment]:
+        """Return the longest rest that no other segment has taken, if it is long enough."""
+        still = ~self.moving & ~self.handled
+        for other in others:
+            still[other.start : other.stop] = False
+        last = self.recording.samples
+        spans = [(a + self.margin * (a > 0), b - self.margin * (b < last)) for a, b in runs(still)]
+        start, stop = max(spans, key=lambda s: s[1] - s[0], default=(0, 0))
+        if (stop - start) * self.recording.interval < SHORTEST_STATIC_S:
+            return []
+        return [Segment(start, stop, "static", None, "a long rest")]
 
 
-def _encoder_agrees(recording: Recording, start: int, stop: int, angle: float) -> bool:
-    """Return whether the logged angle moves as the rate says: else another gimbal turns than the one that is logged."""
-    if recording.table_angle is None:
-        return True
-    passed = float(np.sum(np.abs(np.diff(recording.table_angle[max(start - 1, 0) : stop + 1]))))
-    return abs(passed - angle) < ENCODER_AGREES_DEG + ENCODER_AGREES * angle
-
-
-def handled_samples(recording: Recording, rate: NDArray[np.float64], gyro: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return the samples at which the sensor turns and the table does not."""
-    moving = np.abs(rate) > RATE_AT_REST_DPS
-    if moving.all():
-        return np.zeros(len(moving), bool)
-    width = 2 * int(np.ceil(NEAR_A_MOVE_S / recording.interval)) + 1
-    near = np.convolve(moving, np.ones(width), "same") > 0.5
-    resting = gyro[~moving]
-    off = np.linalg.norm(gyro - np.median(resting, axis=0), axis=1)
-    noise = float(np.median(np.linalg.norm(resting - np.median(resting, axis=0), axis=1)))
-    return np.asarray((off > max(HANDLED_DPS, 10.0 * noise)) & ~near)
-
-
-def groups_of(moves: Sequence[Move], handled: NDArray[np.bool_]) -> list[list[Move]]:
-    """Return moves of one kind about one axis that follow each other, unless the sensor was mounted anew between."""
-    groups: list[list[Move]] = []
-    for move in moves:
-        last = groups[-1][-1] if groups else None
-        same = last is not None and (last.axis, last.kind) == (move.axis, move.kind)
-        if same and last is not None and not handled[last.stop : move.start].any():
-            groups[-1].append(move)
-        else:
-            groups.append([move])
-    return groups
+def _useful(group: Sequence[Move]) -> bool:
+    return group[0].kind[1] == "turn" or (group[0].kind[1] == "step" and len(group) >= FEWEST_STOPS - 1)
