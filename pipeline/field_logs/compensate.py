@@ -7,7 +7,7 @@ same for all formats. Memory is bounded by the largest block.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,16 +19,18 @@ from pipeline.model.compensation import SMOOTHING_S
 from pipeline.records import SENSORS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
 
+    from pipeline.field_logs.csv_log import CsvLog
+    from pipeline.field_logs.mcap_log import McapLog
     from pipeline.model.compensation import Compensation
 
     Readings = dict[str, NDArray[Any]]
 
-EPOCH_AFTER_S = 1e8  # 3 years: no sensor has been on for longer
+
 BLOCK_BYTES = 1 << 21  # of a text log: 20,000 rows, whose arrays take some 10 MB
 
 
@@ -108,24 +110,6 @@ class Result:
     warnings: list[str] = field(default_factory=list)
 
 
-class Log(Protocol):
-    """A log of some format and the log that is made of it.
-
-    ``smoothing`` of the temperature, s, is that of ``Compensation.stream``; 0 where the format smooths it itself.
-    """
-
-    smoothing: float
-
-    def blocks(self, needs: set[str], checks: LogChecks) -> Iterator[Block]:
-        """Yield the samples; ``needs`` are the signals that the fitted effects need."""
-
-    def write(self, block: Block, readings: Readings, changed: set[str]) -> None:
-        """Write a block with its calibrated readings; those of sensors that are not in ``changed`` are as before."""
-
-    def finish(self, result: Result) -> None:
-        """Write what follows the last block, and add what belongs into the result."""
-
-
 def compensate_log(
     compensation: Compensation,
     source: Path,
@@ -160,7 +144,7 @@ def compensate_log(
     checks, result = LogChecks(), Result(compensation.unit)
     calibrated = {s for s in SENSORS if compensation.calibration(s) is not None}
     with replacing(target) as out:
-        log: Log
+        log: CsvLog | McapLog
         if source.suffix.lower() == ".mcap":
             from pipeline.field_logs.mcap_log import McapLog  # noqa: PLC0415  (each log needs one of the two)
 

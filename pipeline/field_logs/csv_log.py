@@ -13,12 +13,13 @@ import pyarrow as pa
 from pyarrow import compute as pc
 
 from pipeline.errors import InputError
-from pipeline.field_logs.compensate import EPOCH_AFTER_S, Block
+from pipeline.field_logs.compensate import Block
 from pipeline.field_logs.log_checks import DECIMALS
+from pipeline.io.arrow import text_scalar, to_arrow, to_numpy
 from pipeline.io.csv_layout import Layout, find_faults
 from pipeline.io.ingest_settings import csv_formats
 from pipeline.io.text_log import TextLog
-from pipeline.io.units import COUNTS, TRIADS, UNITS, decode, to_house_unit
+from pipeline.io.units import COUNTS, SECOND_NS, SINCE_1970_NS, TRIADS, UNITS, decode, to_house_unit
 from pipeline.records import SENSORS, Encoding
 
 if TYPE_CHECKING:
@@ -35,11 +36,10 @@ if TYPE_CHECKING:
 
 SIGNALS = {**TRIADS, "temperature": ("temperature",), "time": ("time",)}
 CANONICAL = {c: f"{c}_{'g' if s == 'accelerometer' else 'dps'}" for s in SENSORS for c in TRIADS[s]}
-NANOSECONDS = 1e9
 
 
 class CsvLog:
-    """A text log; see ``pipeline.field_logs.compensate.Log``."""
+    """A text log and the log that is made of it; ``smoothing`` of the temperature, s, as of ``Compensation.stream``."""
 
     def __init__(self, source: Path, out: Output, profile: LogProfile, smoothing: float, block_bytes: int) -> None:
         formats = csv_formats(profile.ingest)
@@ -157,7 +157,7 @@ class CsvLog:
         except pa.ArrowInvalid:  # blanks, empty cells, or no number
             text = pc.utf8_trim_whitespace(text)
             found = pc.cast(pc.if_else(pc.equal(text, ""), pa.scalar(None, pa.string()), text), pa.float64())
-        return np.asarray(found.to_numpy(zero_copy_only=False))
+        return to_numpy(pc.fill_null(found, np.nan) if found.null_count else found)
 
     def _signals(self, cells: list[pa.Array], body: bytes, lines: NDArray[np.int64], rows: int) -> dict[str, Any]:
         """Return the signals of a block in g, deg/s, degC and s, the readings in body axes."""
@@ -173,7 +173,7 @@ class CsvLog:
         if self.settings.rate_hz is not None:
             out["time"] = np.arange(rows, rows + len(lines)) / self.settings.rate_hz
         if "time" in out:
-            if rows == 0 and out["time"][0] > EPOCH_AFTER_S:
+            if rows == 0 and out["time"][0] > SINCE_1970_NS / SECOND_NS:
                 self.origin = float(out["time"][0])
             out["time"] = out["time"] - self.origin
         return out
@@ -191,21 +191,21 @@ def _in_house_unit(column: Column, numbers: NDArray[np.float64]) -> NDArray[np.f
         return decode(numbers, Encoding(1.0 / column.counts_per_unit, column.offset))
     if column.channel == "time":
         multiplier, divisor = UNITS["time"][column.unit]
-        return numbers / (NANOSECONDS * divisor / multiplier)
+        return numbers / (SECOND_NS * divisor / multiplier)
     return to_house_unit(column.channel, numbers, column.unit)
 
 
 def _digits(values: NDArray[np.float64], decimal: str) -> pa.Array:
     """Return numbers as text, rounded to 1e-12."""
-    text = pc.cast(pa.array(np.round(values, DECIMALS) + 0.0), pa.string())
+    text = pc.cast(to_arrow(np.round(values, DECIMALS) + 0.0), pa.string())
     return text if decimal == "." else pc.replace_substring(text, ".", decimal)
 
 
 def _lines_of(columns: list[pa.Array], delimiter: str, *, quoted: bool) -> memoryview:
     """Return the rows as the lines of a text file; ``quoted``: cells may have to be quoted."""
     cells = [_quoted(column, delimiter) for column in columns] if quoted else list(columns)
-    cells[-1] = pc.binary_join_element_wise(cells[-1], "\n", "")
-    lines = pc.binary_join_element_wise(*cells, delimiter) if len(cells) > 1 else cells[0]
+    cells[-1] = pc.binary_join_element_wise(cells[-1], text_scalar("\n"), text_scalar(""))
+    lines = pc.binary_join_element_wise(*cells, text_scalar(delimiter)) if len(cells) > 1 else cells[0]
     ends = np.frombuffer(lines.buffers()[1], np.int32, len(lines) + 1, 4 * lines.offset)
     return memoryview(lines.buffers()[2])[ends[0] : ends[-1]]
 

@@ -16,14 +16,14 @@ import numpy as np
 from mcap.records import Channel, Metadata, Schema
 
 from pipeline.errors import IngestError, InputError
-from pipeline.field_logs.compensate import EPOCH_AFTER_S, Block
+from pipeline.field_logs.compensate import Block
 from pipeline.field_logs.mcap_messages import new_imu, replaced
 from pipeline.io.ingest_settings import mcap_format
 from pipeline.io.mcap_channels import MAPPED, TopicDecoder, kind_of, topic_of
 from pipeline.io.mcap_copy import McapCopy
 from pipeline.io.mcap_reader import McapReader
 from pipeline.io.ros2_messages import DEFINITIONS, IMU, TEMPERATURE
-from pipeline.io.units import TRIADS
+from pipeline.io.units import SECOND_NS, SINCE_1970_NS, TRIADS
 from pipeline.model.exponential_regression import ExponentialRegression
 
 if TYPE_CHECKING:
@@ -44,11 +44,10 @@ if TYPE_CHECKING:
 LAST_ID = 0xFFFF  # ids of added definitions count down from here, those of recorders up from 0
 SUFFIX = "_calibrated"
 METADATA = "imu_calibration"
-NANOSECONDS = 1e9
 
 
 class McapLog:
-    """An MCAP log; see ``pipeline.field_logs.compensate.Log``."""
+    """An MCAP log and the log that is made of it."""
 
     smoothing = 0.0  # ``Temperatures`` smooths
 
@@ -114,9 +113,9 @@ class McapLog:
         batch = self.readings.read(rows, self.reader)
         time_ns = rows.heads["log_time"].astype(np.int64) if batch.time_ns is None else batch.time_ns
         if self.origin_ns is None:
-            self.origin_ns = int(time_ns[0]) if time_ns[0] > EPOCH_AFTER_S * NANOSECONDS else 0
+            self.origin_ns = int(time_ns[0]) if time_ns[0] > SINCE_1970_NS else 0
         since = time_ns - self.origin_ns
-        signals = {"time": since // 10**9 + (since % 10**9) / NANOSECONDS}
+        signals = {"time": since // SECOND_NS + (since % SECOND_NS) / SECOND_NS}
         turned: set[str] = set()  # sensors whose axes are not the body's
         for sensor, triad in TRIADS.items():
             if triad[0] in batch.values:

@@ -85,47 +85,17 @@ def read_rows(path: Path, settings: CsvFormat, checks: Checks) -> Rows:
     """Return the rows of a file in its own order; an ``IngestError`` names the line."""
     with unchanged(path), path.open("rb") as stream:
         log = TextLog(stream, str(path), settings)
-        reader = _RowReader(log, path.stat().st_size)
+        reader = _RowReader(log)
         for body, lines in log:
             reader.add(body, lines)
         return reader.rows(checks)
 
 
-class _Columns:
-    """Columns that grow block by block, in memory for as many rows as the file is expected to hold."""
-
-    def __init__(self) -> None:
-        self.rows = 0
-        self._arrays: dict[int, NDArray[Any]] = {}
-
-    def append(self, columns: dict[int, NDArray[Any]], expected: int) -> None:
-        """Append rows to each column; ``expected`` is the number of rows of the file."""
-        stop = self.rows + len(next(iter(columns.values())))
-        for key, values in columns.items():
-            if key not in self._arrays or len(self._arrays[key]) < stop:
-                grown = np.empty(max(expected, stop + stop // 2), values.dtype)
-                if key in self._arrays:
-                    grown[: self.rows] = self[key]
-                self._arrays[key] = grown
-            self._arrays[key][self.rows : stop] = values
-        self.rows = stop
-
-    def insert(self, key: int, values: NDArray[Any]) -> None:
-        """Add a column to the rows so far."""
-        self._arrays[key] = values
-
-    def __contains__(self, key: int) -> bool:
-        return key in self._arrays
-
-    def __getitem__(self, key: int) -> NDArray[Any]:
-        return self._arrays[key][: self.rows]
-
-
 class _RowReader:
     """Numbers of a text log, gathered block by block."""
 
-    def __init__(self, log: TextLog, size: int) -> None:
-        self.log, self.path, self.settings, self.size = log, log.path, log.settings, size
+    def __init__(self, log: TextLog) -> None:
+        self.log, self.path, self.settings = log, log.path, log.settings
         self.allowed = {"not_finite"} if self.settings.nan == GAP else set()
         if self.settings.bad_rows == DROP:
             self.allowed |= {"bad_row", "nul", "not_a_number", "decimal_comma"}
@@ -134,7 +104,7 @@ class _RowReader:
         self.layout: Layout | None = None
         self.notes: list[Note] = []
         self.row_count = 0  # bad ones as well
-        self.columns = _Columns()
+        self.blocks: list[dict[int, NDArray[Any]]] = []  # columns of the valid rows
         self.faults: list[Fault] = []
         self.refused: list[Fault] = []
         self.last_row: tuple[int, str] | None = None
@@ -149,31 +119,27 @@ class _RowReader:
         else:
             self.last_row = int(lines[-1]), body[body.rfind(b"\n", 0, -1) + 1 : -1].decode("utf-8", "replace")
         if numbers:
-            columns = numbers | {LINES: lines} | self._exact_times(layout, body, numbers)
-            self.columns.append(columns, int(1.02 * len(lines) * self.size / len(body)) + 16)
+            self.blocks.append(numbers | {LINES: lines} | self._exact_times(layout, body, numbers))
 
     def rows(self, checks: Checks) -> Rows:
         """Return all rows, without those that may be dropped."""
         if self.layout is None:
             raise self.log.no_rows()
         notes, repaired = self._drop_faults(self.layout, checks)
+        columns = {
+            k: np.concatenate([b.pop(k) for b in self.blocks]) for k in list(self.blocks[0] if self.blocks else ())
+        }
         parted = [f.line for f in self.faults if f.parted_before]
-        keep: slice | NDArray[np.bool_] = slice(None)
-        if parted and self.columns.rows:
-            keep = ~np.isin(self.columns[LINES], parted)
-        lines = self.columns[LINES][keep] if self.columns.rows else np.zeros(0, np.int64)
-        if not lines.size:
+        if parted and columns:
+            keep = ~np.isin(columns[LINES], parted)
+            columns = {k: values[keep] for k, values in columns.items()}
+        if not columns or not columns[LINES].size:
             raise refusal(self.layout, self.faults)
-        restarts = [f.line for f in self.faults if f.kind == "restarted"]
+        lines, exact_ns = columns.pop(LINES), columns.pop(EXACT, None)
+        restarts = np.searchsorted(lines, [f.line for f in self.faults if f.kind == "restarted"])
+        notes = [*self.log.notes, *self.notes, *notes]
         return Rows(
-            layout=self.layout,
-            sha256=self.log.sha256,
-            numbers={index: self.columns[index][keep] for _, index in self.layout.columns},
-            lines=lines,
-            exact_ns=self.columns[EXACT][keep] if EXACT in self.columns else None,
-            notes=(*self.log.notes, *self.notes, *notes),
-            repaired=repaired,
-            restarts=tuple(np.searchsorted(lines, restarts).tolist()),
+            self.layout, self.log.sha256, columns, lines, exact_ns, tuple(notes), repaired, tuple(restarts.tolist())
         )
 
     def _find_layout(self, body: bytes, lines: NDArray[np.int64]) -> Layout:
@@ -219,10 +185,11 @@ class _RowReader:
             return {}
         column, index = clock
         largest = float(np.abs(numbers[index]).max()) * seconds_per_unit(column.unit)
-        if EXACT not in self.columns and largest < EXACT_BELOW_S:
-            return {}
-        if EXACT not in self.columns and self.columns.rows:
-            self.columns.insert(EXACT, whole_times(self.columns[index], column.unit))
+        if not (self.blocks and EXACT in self.blocks[0]):
+            if largest < EXACT_BELOW_S:
+                return {}
+            for block in self.blocks:
+                block[EXACT] = whole_times(block[index], column.unit)
         out_of_range = largest >= LONGEST_S  # refused later
         return {EXACT: np.zeros(len(numbers[index]), np.int64) if out_of_range else exact_times(layout, body)}
 
@@ -231,7 +198,7 @@ class _RowReader:
         if not self.faults:
             return [], 0
         final = self.faults[-1]
-        end = max(final.line, int(self.columns[LINES][-1]) if self.columns.rows else 0)
+        end = max(final.line, int(self.blocks[-1][LINES][-1]) if self.blocks else 0)
         cut = {final.line} if final.short and final.line == end else set()
         tail = [f for f in self.faults if f.line in cut or f.parted_before in cut]
         others = [f for f in self.faults if f not in tail and f.kind != "restarted"]

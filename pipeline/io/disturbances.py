@@ -31,8 +31,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.io.quality_flags import GAP, UNIT_NAMES
-from pipeline.records import conjugate_product, continuous, level_in_body, noise_of_steps
+from pipeline.io.quality_flags import GAP
+from pipeline.io.units import STANDARD_GRAVITY
+from pipeline.records import SENSOR_UNITS, conjugate_product, continuous, level_in_body, noise_of_steps
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -51,7 +52,7 @@ AROUND_S, FEWEST_AROUND = 0.5, 6  # on either side
 REST_S, FEWEST_OF_REST = 2.0, 40  # where the unit rests, more samples make the median more precise
 LATE_S = 0.1  # a delay of a low-cost filter or of the log
 WINDOWS = 40  # of a recording, to find the usual scatter of its rests
-LEVER_M, STANDARD_GRAVITY = 0.1, 9.80665
+LEVER_M = 0.1  # of the accelerometer from the turn axis, a usual fixture
 STILL_DEG = 0.05  # turned within a window that is at rest
 STILL_BY_HAND_DEG = 0.5  # as a gyroscope with noise and bias adds it up
 SAME_EVENT = 5  # samples between two that belong to one event; an event of several is widened by 2
@@ -85,7 +86,7 @@ def leave_out_disturbances(
     sensor, axis = where[column]
     events = 1 + int(np.count_nonzero(np.diff(rows) > SAME_EVENT))
     worst = (
-        f"largest: {sensor} {axis} is {excess[row, column]:.3g} {UNIT_NAMES[sensor]} beyond what noise and motion "
+        f"largest: {sensor} {axis} is {excess[row, column]:.3g} {SENSOR_UNITS[sensor]} beyond what noise and motion "
         f"allow at {recording.time_ns[row] / 1e9:.9g} s"
     )
     places = f"{rows.size} sample{'s' * (rows.size > 1)} in {events} place{'s' * (events > 1)}"
@@ -115,7 +116,7 @@ def disturbed(recording: Recording) -> tuple[Array, list[tuple[str, str]]]:
 
     Samples around an event of several have the excess of a rounding error, so that they go with it.
     """
-    found = [(s, r) for s in UNIT_NAMES if (r := recording.reading(s)) is not None]
+    found = [(s, r) for s in SENSOR_UNITS if (r := recording.reading(s)) is not None]
     where = [(s, axis) for s, _ in found for axis in "xyz"]
     raw = np.concatenate([r for _, r in found], axis=1)
     excess = np.zeros_like(raw)
@@ -271,7 +272,7 @@ def leave_out_shaken_rests(recording: Recording, note: Callable[[str, Index, str
     pieces = _pieces(recording)
     if len(pieces) < FEWEST_PIECES:
         return recording
-    found = {s: r for s in UNIT_NAMES if (r := recording.reading(s)) is not None and np.isfinite(r).all()}
+    found = {s: r for s in SENSOR_UNITS if (r := recording.reading(s)) is not None and np.isfinite(r).all()}
     worst: tuple[float, str] = (0.0, "")
     shaken = np.zeros(len(pieces), bool)
     for sensor, reading in found.items():

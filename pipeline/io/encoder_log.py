@@ -228,7 +228,10 @@ def interpolators(log: ChannelTable) -> dict[str, Callable[[Values], Values]]:
         slope = np.gradient(angle, own)
         if rate is not None and np.ptp(rate) > 0 and np.ptp(slope) > 0 and np.corrcoef(slope, rate)[0, 1] > SAME_SIGN:
             slope = rate  # it holds the sign as well
-        out["table_angle"] = lambda tau: _cubic(own, angle, slope, tau)
+        from scipy.interpolate import CubicHermiteSpline  # noqa: PLC0415  (0.3 s, needed by tables' logs alone)
+
+        cubic = CubicHermiteSpline(own, angle, slope)
+        out["table_angle"] = lambda tau: cubic(np.clip(tau, own[0], own[-1]))
     if ATTITUDE[0] in values:
         from scipy.interpolate import make_interp_spline  # noqa: PLC0415  (0.3 s, needed by attitude logs alone)
 
@@ -261,13 +264,3 @@ def _bent_line(own: Values, value: Values, tau: Values) -> Values:
     meet = (before * h - ahead) * (after * h - ahead) <= 0  # the slope between lies between those on either side
     bent = meet & (change[k - 1] > BENT * np.median(change)) & (tau >= own[1]) & (tau <= own[-2])
     return np.where(bent, np.where(before > after, np.minimum(left, right), np.maximum(left, right)), plain)
-
-
-def _cubic(own: Values, value: Values, slope: Values, tau: Values) -> Values:
-    """Return the cubic through value and slope at both ends of the interval of each time."""
-    k = np.clip(np.searchsorted(own, tau, side="right") - 1, 0, len(own) - 2)
-    h = own[k + 1] - own[k]
-    x = np.clip((tau - own[k]) / h, 0.0, 1.0)
-    rise = value[k + 1] - value[k] - slope[k] * h
-    bend = (slope[k + 1] - slope[k]) * h
-    return np.asarray(value[k] + x * slope[k] * h + x * x * (3 * rise - bend) + x**3 * (bend - 2 * rise))

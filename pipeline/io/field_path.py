@@ -106,6 +106,7 @@ def look_up(path: FieldPath, message: object) -> Any:  # noqa: ANN401  (a number
 
 
 def _step(value: Any, step: str | int, path: FieldPath) -> Any:  # noqa: ANN401
+    """Return a field of a protobuf message, an entry of a JSON object, or an element of a list."""
     descriptor = getattr(value, "DESCRIPTOR", None)
     if descriptor is not None and isinstance(step, str):
         known = descriptor.fields_by_name.get(step)
@@ -115,10 +116,10 @@ def _step(value: Any, step: str | int, path: FieldPath) -> Any:  # noqa: ANN401
             raise ValueError(f"it does not say {step} of {path.text}")
         return getattr(value, step)
     try:
-        return getattr(value, step) if isinstance(step, str) and not isinstance(value, dict) else value[step]
-    except (AttributeError, KeyError, IndexError, TypeError) as error:
-        known_names = list(value) if isinstance(value, dict) else getattr(value, "__slots__", [])
-        raise ValueError(f"it has no field {path.text}; there are {', '.join(map(str, known_names))}") from error
+        return value[step]
+    except (KeyError, IndexError, TypeError) as error:
+        names = value if isinstance(value, dict) else ()
+        raise ValueError(f"it has no field {path.text}; there are {', '.join(names)}") from error
 
 
 def number_at(path: FieldPath, message: object) -> float | None:

@@ -272,8 +272,6 @@ def _check_channels(formats: Iterable[CsvFormat]) -> None:
 
 def check_ingest(ingest: Mapping[str, Any], procedure: Mapping[str, Any] | None = None) -> None:
     """Refuse an ingest profile that no file could be read with, or whose parts do not suit the procedure."""
-    from pipeline.io.ingest_settings import mcap_format  # noqa: PLC0415  (it uses the checks of this module)
-
     mcap_format(ingest)
     checks_of(ingest)
     if ingest.get("csv"):

@@ -22,6 +22,7 @@ import pyarrow as pa
 from pyarrow import parquet
 
 from pipeline.errors import DamagedFileError, InputError
+from pipeline.io.arrow import to_arrow, to_numpy
 from pipeline.io.units import ACCELEROMETER, ATTITUDE, CHANNELS, GYROSCOPE, decode, encode
 from pipeline.records import Encoding, Note, Recording
 
@@ -64,24 +65,13 @@ def save_recordings(path: Path, recordings: Sequence[Recording]) -> None:
     ) as writer:
         tables = [
             pa.Table.from_arrays(
-                [_array(columns[n]) if n in columns else pa.nulls(r.samples, schema.field(n).type) for n in names],
+                [to_arrow(columns[n]) if n in columns else pa.nulls(r.samples, schema.field(n).type) for n in names],
                 schema=schema,
             )
             for r, columns in zip(recordings, stored, strict=True)
         ]
         writer.write_table(pa.concat_tables(tables) if tables else schema.empty_table(), row_group_size=ROW_GROUP)
     temporary.replace(path)
-
-
-def _values(column: Any) -> NDArray[Any]:  # noqa: ANN401  (pyarrow has no types)
-    """Return the numbers of a pyarrow column without nulls; ``to_numpy`` would import pandas, which takes 0.25 s."""
-    values: NDArray[Any] = np.from_dlpack(column.combine_chunks())
-    return values
-
-
-def _array(values: NDArray[Any]) -> pa.Array:
-    """Return numbers as pyarrow's; ``pyarrow.array`` would import pandas."""
-    return pa.Array.from_buffers(pa.from_numpy_dtype(values.dtype), len(values), [None, pa.py_buffer(values)])
 
 
 def load_recordings(path: Path) -> list[Recording]:
@@ -132,14 +122,14 @@ class _StoredColumns:
                 table = self._file.read(new, use_threads=False)
                 for name in new:
                     column = table.column(name)
-                    self._columns[name] = column if column.null_count else _values(column)
+                    self._columns[name] = column if column.null_count else to_numpy(column)
         return [self._part(entry, name, start) for name in names]
 
     def _part(self, entry: dict[str, Any], name: str, start: int) -> NDArray[Any]:
         """Return the rows of a recording in a decoded column."""
         rows, column = entry["rows"], self._columns[name]
         if not isinstance(column, np.ndarray):  # other recordings lack it: their rows are null
-            column, start = _values(column.slice(start, rows)), 0
+            column, start = to_numpy(column.slice(start, rows)), 0
         part: NDArray[Any] = column[start : start + rows]
         if len(part) != rows or zlib.crc32(part.view(np.uint8).data) != entry["crc32"][name]:
             raise self.damaged(f"{name} of the recording {entry['name']} does not match its checksum")

@@ -19,6 +19,7 @@ import numpy as np
 from pipeline.errors import IngestError
 from pipeline.io.timestamps import time_error
 from pipeline.io.units import ATTITUDE, DEGREES, TRIADS
+from pipeline.records import SENSOR_UNITS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -35,7 +36,6 @@ JITTER_NOTED, JITTER_TOO_LARGE = 0.2, 0.5  # rms, relative to the median interva
 FULL_SCALE_MARGIN = 1.2  # sensors read up to a fifth past their nominal range
 RAIL = 1e-4  # relative; the top code of 16 bits lies 3e-5 below full scale
 BEYOND = 1e-3  # relative; with nominal counts per unit the top code lies up to so far above
-UNIT_NAMES = {"accelerometer": "g", "gyroscope": "deg/s"}
 WINDOW = 64  # samples in which the share of equal neighbours is counted
 BY_CHANCE = 1e-6  # expected number of such runs in the recording
 SHORTEST_RUN = 20  # samples; the estimate of p from windows of 64 is too coarse for less
@@ -104,7 +104,7 @@ def flag_clipped(table: ChannelTable, sensor: str, full_scale: float, flags: NDA
         if largest > FULL_SCALE_MARGIN * full_scale:
             row = int(np.argmax(size > FULL_SCALE_MARGIN * full_scale))
             message = (
-                f"{channel} is {values[row]:.6g} {UNIT_NAMES[sensor]} at {table.time_ns[row] / 1e9:.9g} "
+                f"{channel} is {values[row]:.6g} {SENSOR_UNITS[sensor]} at {table.time_ns[row] / 1e9:.9g} "
                 f"s, beyond {FULL_SCALE_MARGIN} times the full scale of {full_scale:g}; correct "
                 f"ingest.csv.columns.{channel}.unit or sensor.{sensor}.full_scale"
             )
@@ -112,7 +112,7 @@ def flag_clipped(table: ChannelTable, sensor: str, full_scale: float, flags: NDA
         rows = np.flatnonzero(_at_rail(size, full_scale, count))
         if rows.size:
             flags[rows] |= CLIPPED
-            detail = f"{channel} reaches the full scale of {full_scale:g} {UNIT_NAMES[sensor]} and may be clipped"
+            detail = f"{channel} reaches the full scale of {full_scale:g} {SENSOR_UNITS[sensor]} and may be clipped"
             notes.append(table.note("N-CLIP", rows, detail))
     return notes
 
@@ -145,8 +145,8 @@ def flag_stuck(table: ChannelTable, sensor: str, flags: NDArray[np.uint16]) -> l
         others = [not s.any() or equal_share(s) <= QUIET for c, s in neighbours.items() if c != channel]
         if same.all() and len(same) >= DEAD_ROWS and others and all(others):
             message = (
-                f"{channel} is {table.values[channel][0] + 0.0:.6g} {UNIT_NAMES[sensor]} in all {len(same) + 1} rows, "
-                "while the other axes change"
+                f"{channel} is {table.values[channel][0] + 0.0:.6g} {SENSOR_UNITS[sensor]} in all {len(same) + 1} "
+                "rows, while the other axes change"
             )
             hint = "is the column right, and the sensor's axis alive?"
             raise IngestError(message, table.path, code="stuck", hint=hint)
@@ -161,7 +161,7 @@ def flag_stuck(table: ChannelTable, sensor: str, flags: NDArray[np.uint16]) -> l
         if 0 < rows.size < len(same) / 2:
             flags[rows] |= STUCK
             detail = (
-                f"{channel} stays at {table.values[channel][rows[0]]:.6g} {UNIT_NAMES[sensor]} for longer than its "
+                f"{channel} stays at {table.values[channel][rows[0]]:.6g} {SENSOR_UNITS[sensor]} for longer than its "
                 "noise allows: stuck, and left out of every fit"
             )
             notes.append(table.note("N-STUCK", rows, detail))

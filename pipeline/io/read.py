@@ -19,9 +19,9 @@ from pipeline.io.channel_table import STRAIGHT, axis_maps, to_body_axes
 from pipeline.io.disturbances import leave_out_disturbances, leave_out_shaken_rests
 from pipeline.io.encoder_log import unwrapped
 from pipeline.io.files import candidate_files, recording_files
-from pipeline.io.ingest_settings import checks_of
+from pipeline.io.ingest_settings import checks_of, csv_formats, mcap_format
 from pipeline.io.quality_flags import examine
-from pipeline.io.units import ATTITUDE, TABLE_CHANNELS, TRIADS
+from pipeline.io.units import ATTITUDE, SINCE_1970_NS, TABLE_CHANNELS, TRIADS
 from pipeline.records import Note, Recording, rate_of_attitude
 
 if TYPE_CHECKING:
@@ -32,8 +32,6 @@ if TYPE_CHECKING:
 
     from pipeline.io.channel_table import ChannelTable
     from pipeline.io.ingest_settings import Checks, CsvFormat
-
-EPOCH_AFTER_NS = 100_000_000 * 1_000_000_000  # 3 years: no sensor has been on for longer
 
 
 def read_recordings(
@@ -58,10 +56,10 @@ def read_recordings(
     files = recording_files(procedure, ingest, folder)
     wanted = candidate_files(procedure, ingest)
     _check_complete(procedure, files, wanted, folder)
-    checks, read = checks_of(ingest), table_reader(ingest)
+    checks, formats = checks_of(ingest), cache(lambda: csv_formats(ingest))
     recordings = []
     for name, paths in files.items():
-        table = read(paths)
+        table = read_table(paths, ingest, formats)
         other = [f for c in wanted[name] for f in c if folder / f not in paths and (folder / f).exists()]
         recording = to_recording(name, procedure["recordings"][name], table, sensor, checks)
         if other:
@@ -72,35 +70,21 @@ def read_recordings(
     return _compare_clocks(recordings)
 
 
-def read_table(paths: Sequence[Path], ingest: Mapping[str, Any]) -> ChannelTable:
-    """Read the file or files of one recording, by their suffix."""
-    return table_reader(ingest)(paths)
+def read_table(
+    paths: Sequence[Path], ingest: Mapping[str, Any], formats: Callable[[], list[CsvFormat]] | None = None
+) -> ChannelTable:
+    """Read the file or files of one recording, by their suffix; ``formats`` returns ``csv_formats(ingest)``."""
+    if paths[0].suffix == ".mcap":
+        from pipeline.io.mcap import read_mcap  # noqa: PLC0415  (the decoder costs what a text log need not pay)
 
+        return read_mcap(paths[0], mcap_format(ingest))
+    if paths[0].suffix == ".gcsv":
+        from pipeline.io.gcsv import read_gcsv  # noqa: PLC0415  (few units need it)
 
-def table_reader(ingest: Mapping[str, Any]) -> Callable[[Sequence[Path]], ChannelTable]:
-    """Return ``read_table`` for files of one profile, which is checked once, when the first of its kind is read."""
+        return read_gcsv(paths[0], checks_of(ingest))
+    from pipeline.io.csv_read import read_csv  # noqa: PLC0415  (a log of messages needs no parser of text)
 
-    @cache
-    def csv_layouts() -> list[CsvFormat]:
-        from pipeline.io.ingest_settings import csv_formats  # noqa: PLC0415
-
-        return csv_formats(ingest)
-
-    def read(paths: Sequence[Path]) -> ChannelTable:
-        if paths[0].suffix == ".mcap":
-            from pipeline.io.ingest_settings import mcap_format  # noqa: PLC0415
-            from pipeline.io.mcap import read_mcap  # noqa: PLC0415  (the decoder costs what a text log need not pay)
-
-            return read_mcap(paths[0], mcap_format(ingest))
-        if paths[0].suffix == ".gcsv":
-            from pipeline.io.gcsv import read_gcsv  # noqa: PLC0415
-
-            return read_gcsv(paths[0], checks_of(ingest))
-        from pipeline.io.csv_read import read_csv  # noqa: PLC0415
-
-        return read_csv(paths, csv_layouts(), checks_of(ingest))
-
-    return read
+    return read_csv(paths, formats() if formats else csv_formats(ingest), checks_of(ingest))
 
 
 def _check_complete(
@@ -206,7 +190,7 @@ def _check_different(recordings: Sequence[Recording]) -> None:
 
 def _compare_clocks(recordings: list[Recording]) -> list[Recording]:
     """Count times from power-on where they count from 1970, and say whether the recordings share a clock."""
-    if recordings and all(r.time_ns[0] > EPOCH_AFTER_NS for r in recordings):
+    if recordings and all(r.time_ns[0] > SINCE_1970_NS for r in recordings):
         origin = min(int(r.time_ns[0]) for r in recordings)
         detail = f"times count from the unit's first sample, {origin} ns in the clock of the files"
         note = Note("N-EPOCH", len(recordings), 0, 0, detail)

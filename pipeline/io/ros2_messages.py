@@ -18,7 +18,7 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import Writer
 
 from pipeline.errors import InputError
-from pipeline.io.units import STANDARD_GRAVITY
+from pipeline.io.units import SECOND_NS, STANDARD_GRAVITY
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -85,7 +85,6 @@ TOPICS = {
     QUATERNION_STAMPED: "/table/attitude",
 }
 JOINT = "table"
-NANOSECONDS = 1_000_000_000
 
 
 class _Message:
@@ -118,7 +117,7 @@ class _Message:
     def fill(self, time_ns: NDArray[np.int64], numbers: NDArray[np.float64]) -> NDArray[np.uint8]:
         """Return a message, a row of bytes, for each time and row of numbers."""
         table = np.tile(np.frombuffer(bytes(self.data), np.uint8), (len(time_ns), 1))
-        stamps = np.stack([time_ns // NANOSECONDS, time_ns % NANOSECONDS], axis=1).astype("<u4")
+        stamps = np.stack([time_ns // SECOND_NS, time_ns % SECOND_NS], axis=1).astype("<u4")
         table[:, 4:12] = stamps.view(np.uint8)
         for column, place in enumerate(self.places):
             table[:, place : place + 8] = np.ascontiguousarray(numbers[:, column], "<f8").view(np.uint8).reshape(-1, 8)
@@ -128,7 +127,7 @@ class _Message:
 def write_mcap(path: Path, recording: Recording) -> None:
     """Write a recording as ROS 2 messages; the file is replaced at once, never half written."""
     time = recording.time_ns
-    if len(time) and not (time.min() >= 0 and time.max() < 2**31 * NANOSECONDS):
+    if len(time) and not (time.min() >= 0 and time.max() < 2**31 * SECOND_NS):
         raise InputError("times of a ROS 2 stamp lie between 0 and 2^31 s", str(path))
     streams = _streams(recording)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import IngestError
-from pipeline.io.units import UNITS
+from pipeline.io.units import SECOND_NS, SINCE_1970_NS, UNITS
 from pipeline.records import Note
 
 if TYPE_CHECKING:
@@ -20,19 +20,19 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-SECOND = 1_000_000_000
+
 LARGEST = np.iinfo(np.int64).max
-SINCE_1970 = 100_000_000 * SECOND  # later than 3 years: no clock that counts from power-on
-YEAR_2000, YEAR_2100 = 946_684_800 * SECOND, 4_102_444_800 * SECOND
+
+YEAR_2000, YEAR_2100 = 946_684_800 * SECOND_NS, 4_102_444_800 * SECOND_NS
 COARSEST = 0.01  # of the median interval, the resolution of a moment that is sent as a floating-point number
 
 
 def nanoseconds(moment: tuple[int, int] | float | Decimal, unit: str) -> int:
     """Return one moment in ns: (seconds, nanoseconds), or a number in a unit."""
     if isinstance(moment, tuple):
-        if not 0 <= moment[1] < SECOND:
+        if not 0 <= moment[1] < SECOND_NS:
             raise ValueError(f"its stamp has {moment[1]} nanoseconds; 0 to 999999999 are possible")
-        found = moment[0] * SECOND + moment[1]
+        found = moment[0] * SECOND_NS + moment[1]
     else:
         found = int((Decimal(moment) * int(UNITS["time"][unit][0])).to_integral_value())
     if abs(found) > LARGEST:
@@ -43,11 +43,11 @@ def nanoseconds(moment: tuple[int, int] | float | Decimal, unit: str) -> int:
 def of_pair(seconds: NDArray[Any], nanos: NDArray[Any]) -> NDArray[np.int64]:
     """Return moments in ns of seconds and nanoseconds."""
     parts = nanos.astype(np.int64)
-    wrong = np.flatnonzero((parts < 0) | (parts >= SECOND))
+    wrong = np.flatnonzero((parts < 0) | (parts >= SECOND_NS))
     if wrong.size:
         row = int(wrong[0])
         raise ValueError(f"the stamp {row + 1} messages on has {parts[row]} nanoseconds; 0 to 999999999 are possible")
-    whole: NDArray[np.int64] = seconds.astype(np.int64) * SECOND + parts
+    whole: NDArray[np.int64] = seconds.astype(np.int64) * SECOND_NS + parts
     return whole
 
 
@@ -74,7 +74,7 @@ def check_plausible(
 
     ``difference_s``: how far both may be apart, beyond a constant where the stamps do not count from 1970; None: any.
     """
-    absolute = bool((np.abs(time) > SINCE_1970).any())
+    absolute = bool((np.abs(time) > SINCE_1970_NS).any())
     strange = np.flatnonzero((time < YEAR_2000) | (time > YEAR_2100)) if absolute else np.flatnonzero(time < 0)
     if strange.size:
         row = int(strange[0])
@@ -89,7 +89,7 @@ def check_plausible(
     apart = time - log_time
     if not (absolute and (log_time > YEAR_2000).all()):
         apart = apart - np.int64(np.median(apart[:: max(1, len(apart) // 1001)]))
-    far = np.flatnonzero(np.abs(apart) > difference_s * SECOND)
+    far = np.flatnonzero(np.abs(apart) > difference_s * SECOND_NS)
     if far.size:
         row = int(far[0])
         message = (
@@ -113,8 +113,8 @@ def in_order(
         return None, []
     notes = []
     late = np.maximum.accumulate(time) - time
-    if late.max() > reorder_s * SECOND:
-        row = int(np.argmax(late > reorder_s * SECOND))
+    if late.max() > reorder_s * SECOND_NS:
+        row = int(np.argmax(late > reorder_s * SECOND_NS))
         raise IngestError(
             f"message {row + 1} on {topic}: header stamp {time[row] / 1e9:.9g} s after "
             f"{(time[row] + late[row]) / 1e9:.9g} s ({int((steps < 0).sum())} such messages); stamps have to increase",

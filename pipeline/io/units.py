@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from pipeline.records import Encoding
 
 STANDARD_GRAVITY = 9.80665  # m/s^2
+SECOND_NS = 1_000_000_000
+SINCE_1970_NS = 100_000_000 * SECOND_NS  # 3 years: a later time does not count from power-on
 DEGREES = 180.0 / math.pi
 COUNTS = "counts"
 

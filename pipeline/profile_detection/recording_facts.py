@@ -14,9 +14,9 @@ from pipeline.io.mcap_channels import KINDS
 from pipeline.io.mcap_reader import McapReader
 from pipeline.io.message_decoder import object_decoder, ros_layouts
 from pipeline.io.message_layout import short_name
-from pipeline.io.quality_flags import CLIPPED, GAP, STUCK, UNIT_NAMES, equal_share
+from pipeline.io.quality_flags import CLIPPED, GAP, STUCK, equal_share
 from pipeline.profile_detection.unit_guesses import BURSTS, FEWEST_RESTS_FOR_A_SPHERE, sphere
-from pipeline.records import AXES, SENSORS
+from pipeline.records import AXES, SENSOR_UNITS, SENSORS
 from pipeline.signal.rests import rests_from_table
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ def _rests(recording: Recording) -> list[tuple[int, int]]:
 
 
 def _sensor(name: str, readings: NDArray[np.float64], rests: Sequence[tuple[int, int]]) -> str:
-    unit = UNIT_NAMES[name]
+    unit = SENSOR_UNITS[name]
     spans = [f"{a} {_number(v.min())} to {_number(v.max())}" for a, v in zip(AXES, readings.T, strict=True)]
     text = f"{', '.join(spans)} {unit}"
     if not rests:
@@ -158,7 +158,7 @@ def _clipping(recording: Recording, sensor: Mapping[str, Any]) -> str:
             continue
         if known[name] is not None:
             largest = float(np.abs(readings).max())
-            found.append(f"{name} up to {_number(largest)} of {known[name]:g} {UNIT_NAMES[name]}")
+            found.append(f"{name} up to {_number(largest)} of {known[name]:g} {SENSOR_UNITS[name]}")
             continue
         for axis, values in zip(AXES, readings.T, strict=True):
             short = "accel" if name == "accelerometer" else "gyro"

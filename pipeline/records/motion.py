@@ -72,27 +72,8 @@ class Motion:
 
     def select(self, index: NDArray[Any]) -> Motion:
         """Return the motion at some samples (a mask or integers), without the trajectory between samples."""
-
-        def cut(values: NDArray[Any] | None) -> NDArray[Any] | None:
-            return None if values is None else values[index]
-
-        return replace(
-            self,
-            time=self.time[index],
-            specific_force=self.specific_force[index],
-            angular_rate=self.angular_rate[index],
-            angular_acceleration=self.angular_acceleration[index],
-            specific_force_rate=self.specific_force_rate[index],
-            temperature=cut(self.temperature),
-            angle=cut(self.angle),
-            rate=cut(self.rate),
-            still=self.still[index],
-            at_offset=None,
-            at_lag=None,
-            level=cut(self.level),
-            direction=cut(self.direction),
-            reference_valid=cut(self.reference_valid),
-        )
+        found = {n: v[index] for n, v in vars(self).items() if isinstance(v, np.ndarray)}
+        return replace(self, **found, at_offset=None, at_lag=None)
 
 
 def motion_at_rest(time: NDArray[np.float64]) -> Motion:

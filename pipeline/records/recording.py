@@ -24,6 +24,10 @@ AXES = ("x", "y", "z")
 SENSORS = ("accelerometer", "gyroscope")
 NANOSECONDS = 1_000_000_000
 CLIPPED_OR_STUCK = 0b110  # bits 1 and 2 of ``Recording.flags``
+# Arrays of a recording with a row for each sample.
+OF_SAMPLES = (
+    "time_ns", "accelerometer", "gyroscope", "temperature", "table_angle", "table_rate", "table_attitude", "flags",
+)  # fmt: skip
 MEDIAN_STEP = 0.9539  # median of |w[n+1] - w[n]| of white noise with standard deviation 1: 0.67449 sqrt(2)
 
 
@@ -145,21 +149,7 @@ class Recording:
 
     def select(self, index: NDArray[Any] | slice) -> Self:
         """Return the recording with only the samples of ``index`` (slice, mask or integers)."""
-
-        def cut(values: NDArray[Any] | None) -> NDArray[Any] | None:
-            return None if values is None else values[index]
-
-        return replace(
-            self,
-            time_ns=self.time_ns[index],
-            accelerometer=cut(self.accelerometer),
-            gyroscope=cut(self.gyroscope),
-            temperature=cut(self.temperature),
-            table_angle=cut(self.table_angle),
-            table_rate=cut(self.table_rate),
-            table_attitude=cut(self.table_attitude),
-            flags=cut(self.flags),
-        )
+        return replace(self, **{n: v[index] for n in OF_SAMPLES if (v := getattr(self, n)) is not None})
 
 
 @dataclass(frozen=True)
