@@ -44,18 +44,13 @@ __all__ = ["__version__", "load_calibration", "load_campaign"]
 
 
 def load_calibration(path: str | Path, python_effects: Sequence[str | Path] = ()) -> Compensation:
-    """Load ``calibrations/<unit>.json`` as an object that compensates arrays.
+    """Load ``calibrations/<unit>.json``; ``.apply(accelerometer=..., gyroscope=..., ...)`` compensates arrays.
 
     Parameters
     ----------
     path : str or Path
     python_effects : sequence of str or Path
         Files of the effects in Python with which it was made; those from formulas come with the calibration.
-
-    Returns
-    -------
-    Compensation
-        Call ``apply(accelerometer=..., gyroscope=..., temperature=..., time=...)`` on it.
 
     Raises
     ------
@@ -70,23 +65,11 @@ def load_calibration(path: str | Path, python_effects: Sequence[str | Path] = ()
 
 
 def load_campaign(folder: str | Path) -> CampaignResults:
-    """Load the published results of a campaign as pandas DataFrames.
+    """Load ``results/<campaign>`` as pandas DataFrames; ``InputError`` where the folder holds no such results.
 
-    Parameters
-    ----------
-    folder : str or Path
-        ``results/<campaign>``.
-
-    Returns
-    -------
-    CampaignResults
-        ``.summary``, ``.parameters``, ``.errors``, ``.diagnosis``, ``.effects`` and ``.unit(name)``.
-
-    Raises
-    ------
-    InputError
-        If the folder holds no results of a campaign.
+    The tables are ``.summary``, ``.parameters``, ``.errors``, ``.diagnosis`` and ``.effects``; ``.unit(name)`` is one
+    unit.
     """
-    from pipeline.campaign_results import open_campaign  # noqa: PLC0415  (pandas is imported only where it is needed)
+    from pipeline.campaign_results import CampaignResults  # noqa: PLC0415  (pandas, only where it is needed)
 
-    return open_campaign(folder)
+    return CampaignResults(folder)

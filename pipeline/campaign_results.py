@@ -27,32 +27,23 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 JSON = dict[str, Any]
-PARAMETERS = ("unit", "sensor", "parameter", "value", "value_unit", "expanded_uncertainty", "coverage_factor")
-STEP = (
+DOCUMENTS = ("calibrations", "validations", "diagnoses")
+PARAMETERS = ("parameter", "value", "value_unit", "expanded_uncertainty", "coverage_factor")
+ERRORS = (
     "step", "rms_error", "mean_abs_error", "max_error", "min_error", "sum_abs_error", "change_percent",
-    "vector_rms_error",
+    "vector_rms_error", "noise_floor", "vector_noise_floor",
 )  # fmt: skip
-ERRORS = ("unit", "sensor", *STEP, "noise_floor", "vector_noise_floor")
 DIAGNOSIS = ("verdict", "residual_over_noise", "selected", "reason", "next_experiment", "override")
-RANKING = (
+EFFECTS = (
     "effect", "delta_bic", "p_value", "explained_share", "held_out_error_before", "held_out_error_after", "plausible",
+    "selected", "look_alikes",
 )  # fmt: skip
 FIGURES = ("_before", "_after", "_floor")  # endings of the columns of summary.csv that hold numbers
-EFFECTS = ("unit", "sensor", *RANKING, "selected", "look_alikes")
 
 
 @dataclass(frozen=True)
 class UnitResults:
-    """What was published of one unit.
-
-    Attributes
-    ----------
-    name : str
-    calibration : dict
-        ``calibrations/<unit>.json``; of a failed unit with ``status`` "failed" and ``error``.
-    validation, diagnosis : dict or None
-        ``validations/<unit>.json``, ``diagnoses/<unit>.json``; None where the unit failed.
-    """
+    """The documents of one unit, as in their files; of a failed unit ``calibration["error"]`` names the cause."""
 
     name: str
     calibration: JSON
@@ -68,10 +59,15 @@ class UnitResults:
 
 
 class CampaignResults:
-    """The published results of one campaign; see ``load_campaign``."""
+    """The published results of one campaign; see ``pipeline.load_campaign``."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, folder: str | Path) -> None:
+        self.folder = Path(folder)
+        if not (self.folder / "summary.csv").is_file():
+            parent = self.folder if self.folder.is_dir() else self.folder.parent
+            known = sorted(str(file.parent) for file in parent.glob("*/summary.csv"))
+            there = f"there are {', '.join(known)}" if known else f"{parent} holds no results of a campaign"
+            raise MissingInputError(f"holds no summary.csv of a campaign; {there}", str(folder))
         self._documents: dict[str, UnitResults] = {}
 
     def __repr__(self) -> str:
@@ -93,9 +89,8 @@ class CampaignResults:
         (g or deg/s), ``_verdict``, ``_selected`` (missing, joined by ";"), ``_reason``, ``_implausible``; ``pass``;
         and the user's own columns of ``units.csv``.
         """
-        file = self.folder / "summary.csv"
         kinds = {name: "float" if name.endswith(FIGURES) else "str" for name in COLUMNS} | {"pass": "boolean"}
-        return pd.read_csv(file, dtype=kinds, keep_default_na=False, na_values=[""])
+        return pd.read_csv(self.folder / "summary.csv", dtype=kinds, keep_default_na=False, na_values=[""])
 
     @cached_property
     def parameters(self) -> pd.DataFrame:
@@ -108,12 +103,12 @@ class CampaignResults:
         Elements of ``K = matrix^-1``, which a data sheet states: ``scale_factor_error_x`` (``K_xx - 1``) and
         ``cross_axis_xy`` (what axis x reads of a truth along y).
         """
-        rows = [
-            (unit.name, sensor, *parameter)
-            for unit, sensor, part in self._parts("calibration")
+        rows = (
+            about | dict(zip(PARAMETERS, parameter, strict=True))
+            for about, part in self._parts("calibration")
             for parameter in fitted_parameters(part) + reading_errors(part)
-        ]
-        return pd.DataFrame(rows, columns=list(PARAMETERS))
+        )
+        return pd.DataFrame(rows, columns=["unit", "sensor", *PARAMETERS])
 
     @cached_property
     def errors(self) -> pd.DataFrame:
@@ -124,12 +119,12 @@ class CampaignResults:
         ``change_percent`` (of mean_abs_error, against raw), ``vector_rms_error`` (empty without an attitude reference),
         ``noise_floor`` and ``vector_noise_floor`` (rms that noise alone gives).
         """
-        rows = [
-            {**part, **step, "unit": unit.name, "sensor": sensor, "step": step["name"]}
-            for unit, sensor, part in self._parts("validation")
+        rows = (
+            {**part, **step, **about, "step": step["name"]}
+            for about, part in self._parts("validation")
             for step in part.get("steps") or []
-        ]
-        return pd.DataFrame(rows, columns=list(ERRORS))
+        )
+        return pd.DataFrame(rows, columns=["unit", "sensor", *ERRORS])
 
     @cached_property
     def diagnosis(self) -> pd.DataFrame:
@@ -138,10 +133,10 @@ class CampaignResults:
         Columns: ``unit, sensor, verdict, residual_over_noise`` (rms residual of the diagnosis's own fit over the
         noise), ``selected`` (missing effects, joined by ";"), ``reason, next_experiment, override`` (text).
         """
-        rows = [
-            {"unit": unit.name, "sensor": sensor, **part, "selected": ";".join(part.get("selected") or [])}
-            for unit, sensor, part in self._parts("diagnosis")
-        ]
+        rows = (
+            {**part, **about, "selected": ";".join(part.get("selected") or [])}
+            for about, part in self._parts("diagnosis")
+        )
         return pd.DataFrame(rows, columns=["unit", "sensor", *DIAGNOSIS])
 
     @cached_property
@@ -153,62 +148,42 @@ class CampaignResults:
         ``plausible`` (within the data sheet), ``selected`` (bool), ``look_alikes`` (effects with much the same signal,
         joined by ";").
         """
-        rows = [
-            {
-                "unit": unit.name,
-                "sensor": sensor,
-                **entry,
-                "selected": entry["effect"] in (part.get("selected") or []),
-                "look_alikes": ";".join(a["effect"] for a in entry.get("look_alikes") or []),
-            }
-            for unit, sensor, part in self._parts("diagnosis")
+        rows = (
+            about
+            | entry
+            | {"selected": entry["effect"] in (part.get("selected") or [])}
+            | {"look_alikes": ";".join(a["effect"] for a in entry.get("look_alikes") or [])}
+            for about, part in self._parts("diagnosis")
             for entry in part.get("ranking") or []
-        ]
-        return pd.DataFrame(rows, columns=list(EFFECTS))
+        )
+        return pd.DataFrame(rows, columns=["unit", "sensor", *EFFECTS])
 
     def unit(self, name: str) -> UnitResults:
-        """Return calibration, validation and diagnosis of one unit.
-
-        Raises
-        ------
-        InputError
-            If the campaign has no such unit.
-        """
+        """Return the documents of one unit; ``InputError`` where the campaign has no such unit."""
         if name not in self._documents:
             if name not in self.units:
                 near = get_close_matches(name, self.units, n=5) or self.units[:5]
                 raise InputError(f"has no unit {name!r}; there are {', '.join(near)}", str(self.folder))
-            calibration = self._read("calibrations", name)
-            ok = calibration["status"] == "ok"
-            others = [self._read(folder, name) if ok else None for folder in ("validations", "diagnoses")]
-            self._documents[name] = UnitResults(name, calibration, *others)
+            calibration, *others = (self.folder / folder / f"{name}.json" for folder in DOCUMENTS)
+            found = _read(calibration)
+            ok = found["status"] == "ok"
+            self._documents[name] = UnitResults(name, found, *(_read(file) if ok else None for file in others))
         return self._documents[name]
 
-    def _parts(self, document: str) -> Iterator[tuple[UnitResults, str, JSON]]:
-        """Yield unit, sensor and the sensor's part of a document, where there is one."""
+    def _parts(self, document: str) -> Iterator[tuple[JSON, JSON]]:
+        """Yield ``{unit, sensor}`` and the sensor's part of a document, where there is one."""
         for unit in map(self.unit, self.units):
             for sensor in SENSORS:
                 part = (getattr(unit, document) or {}).get(sensor)
                 if part:
-                    yield unit, sensor, part
-
-    def _read(self, folder: str, unit: str) -> JSON:
-        file = self.folder / folder / f"{unit}.json"
-        try:
-            document: JSON = json.loads(file.read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            raise MissingInputError("does not exist; run the campaign again", str(file)) from None
-        except ValueError as error:
-            raise InputError(f"is not JSON: {error}; run the campaign again", str(file)) from None
-        return document
+                    yield {"unit": unit.name, "sensor": sensor}, part
 
 
-def open_campaign(folder: str | Path) -> CampaignResults:
-    """Return the results in a folder; see ``pipeline.load_campaign``."""
-    folder = Path(folder)
-    if (folder / "summary.csv").is_file():
-        return CampaignResults(folder)
-    parent = folder if folder.is_dir() else folder.parent
-    known = sorted(str(file.parent) for file in parent.glob("*/summary.csv"))
-    there = f"there are {', '.join(known)}" if known else f"{parent} holds no results of a campaign"
-    raise MissingInputError(f"holds no summary.csv of a campaign; {there}", str(folder))
+def _read(file: Path) -> JSON:
+    try:
+        document: JSON = json.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise MissingInputError("does not exist; run the campaign again", str(file)) from None
+    except ValueError as error:
+        raise InputError(f"is not JSON: {error}; run the campaign again", str(file)) from None
+    return document

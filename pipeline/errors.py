@@ -10,12 +10,8 @@ from __future__ import annotations
 class PipelineError(Exception):
     """A user error.
 
-    Parameters
-    ----------
-    message : str
-        What is wrong, where (line, time, axis), what was expected and what to do.
-    file : str, optional
-        The file concerned, with its line as ``path:line`` where there is one.
+    ``message``: what is wrong, where (line, time, axis), what was expected and what to do; ``file``: the file
+    concerned, with its line as ``path:line`` where there is one.
     """
 
     code: str = "error"

@@ -94,15 +94,7 @@ def _locked(stream: IO[str], kind: int) -> bool:
 
 
 def publish_all(new: Path, results: Path) -> None:
-    """Replace the published files by a complete new set.
-
-    Parameters
-    ----------
-    new : Path
-        Folder of the new set, below ``results``; it does not exist afterwards.
-    results : Path
-        Of the campaign.
-    """
+    """Replace the published files by the complete set in ``new``, a folder below ``results``, which is removed."""
     inodes = {item.name: item.lstat().st_ino for item in new.iterdir()}
     write_atomically(new / PLAN, json.dumps(inodes))
     flush_file_system(results)
@@ -132,18 +124,10 @@ def finish_publishing(results: Path) -> None:
 
 
 def record_written(results: Path, output: str, again: int, names: Sequence[str] = ("",)) -> None:
-    """Record the digests of what a job wrote.
+    """Record the digests of what a job wrote to ``output``, below ``results``.
 
-    Parameters
-    ----------
-    results : Path
-        Of the campaign.
-    output : str
-        Of the job, below ``results``.
-    again : int
-        As ``repetitions`` returned when the run was started.
-    names : sequence of str
-        Files and folders below the output; the output itself where all of it is the job's.
+    ``again``: as ``repetitions`` returned when the run was started; ``names``: files and folders below the output, the
+    output itself where all of it is the job's.
     """
     files = {name: _digest(results / output / name) for name in names}
     write_atomically(_record(results, output), json.dumps({"again": again, "files": files}, sort_keys=True))
@@ -169,23 +153,15 @@ def _record(results: Path, output: str) -> Path:
 
 def _digest(path: Path) -> str:
     """Return a digest of the names, sizes and times of a file, or of all files below a folder."""
-    lines: list[str] = []
-    folders = [str(path)]
-    while folders:
-        folder = folders.pop()
-        try:
-            with os.scandir(folder) as entries:
-                for entry in entries:
-                    if entry.is_dir(follow_symlinks=False):
-                        folders.append(entry.path)
-                    elif entry.name != SNAKEMAKE_TIMESTAMP:
-                        found = entry.stat(follow_symlinks=False)
-                        lines.append(f"{entry.path}\0{found.st_size}\0{found.st_mtime_ns}")
-        except NotADirectoryError:
-            found = os.lstat(folder)
-            lines.append(f"{folder}\0{found.st_size}\0{found.st_mtime_ns}")
-        except FileNotFoundError:
-            lines.append(f"{folder}\0absent")
-    lines.sort()
-    text = "\n".join(lines).replace(str(path), "")  # results may be moved
+    files = [f"{folder}/{name}" for folder, _, names in os.walk(path) for name in names]
+    lines = []
+    for file in files if path.is_dir() else [str(path)]:
+        if not file.endswith(SNAKEMAKE_TIMESTAMP):
+            try:
+                found = os.lstat(file)
+                state = f"{found.st_size}\0{found.st_mtime_ns}"
+            except FileNotFoundError:
+                state = "absent"
+            lines.append(f"{file}\0{state}")
+    text = "\n".join(sorted(lines)).replace(str(path), "")  # results may be moved
     return hashlib.sha256(text.encode(errors="surrogateescape")).hexdigest()[:32]

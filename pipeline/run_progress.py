@@ -27,6 +27,7 @@ import threading
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
+from statistics import fmean
 from typing import TYPE_CHECKING, TextIO
 
 from pipeline.results_folder import jobs_at_work, take_run
@@ -49,13 +50,14 @@ INTERRUPTED = ("Terminating processes on user request", "Shutting down, this mig
 
 @dataclass
 class Job:
-    """A job of Snakemake: rule, displayed name, number of units, log, and start time in s."""
+    """A job of Snakemake: rule, displayed name, number of units, log, start time in s, and how long it took in s."""
 
     rule: str
     name: str
     units: int
     log: Path
     since: float
+    seconds: float = 0.0
 
     def at(self) -> tuple[str, int] | None:
         """Return the unit that the job is at, and its number; None before the first."""
@@ -71,25 +73,13 @@ class Job:
 
 @dataclass
 class Progress:
-    """The jobs of a run.
-
-    Attributes
-    ----------
-    batches : mapping of str to int
-        Batch to its number of units.
-    wanted : dict of str to int
-        Rule to the number of its jobs in this run.
-    running, done : dict of int to Job, list of Job
-    seconds : dict of str to list of float
-        Rule to seconds a unit of each job that is done.
-    """
+    """The jobs of a run: units of each batch, jobs wanted of each rule, running, done, and s that failed ones took."""
 
     batches: Mapping[str, int]
     wanted: dict[str, int] = field(default_factory=dict)
     running: dict[int, Job] = field(default_factory=dict)
     done: list[Job] = field(default_factory=list)
-    seconds: dict[str, list[float]] = field(default_factory=dict)
-    worked: float = 0.0
+    lost: float = 0.0
     started: float = 0.0
 
     def start(self, number: int, rule: str, wildcards: Mapping[str, str], log: Path) -> None:
@@ -103,39 +93,40 @@ class Progress:
         job = self.running.pop(number, None)
         if job is None:
             return
-        seconds = time.time() - job.since
-        self.worked += seconds
-        if not failed:
+        job.seconds = time.time() - job.since
+        if failed:
+            self.lost += job.seconds
+        else:
             self.done.append(job)
-            self.seconds.setdefault(job.rule, []).append(seconds / job.units)
 
     def text(self) -> str:
         """Return the state of the run in one line."""
-        at = {number: job.at() for number, job in list(self.running.items())}
+        jobs = list(self.running.values())
+        at = [(job, *where) for job in jobs if (where := job.at())]
         units_done = sum(job.units for job in self.done if job.rule == LAST_STAGE)
         units = round(self.wanted.get(LAST_STAGE, 0) * self._mean_batch())
         parts = [f"{len(self.done)} of {sum(self.wanted.values())} jobs"]
         parts += [f"{units_done} of {units} units done"] * bool(units)
-        known = [(self.running[n], where) for n, where in at.items() if where and n in self.running]
-        for job, (unit, number) in sorted(known, key=lambda k: -k[0].since)[:NAMED_JOBS]:
+        for job, unit, number in sorted(at, key=lambda a: -a[0].since)[:NAMED_JOBS]:
             parts.append(f"{job.name}: {unit} ({number} of {job.units})")
-        left = self.seconds_left(at)
+        left = self._seconds_left(jobs, at)
         return " | ".join([*parts, *([f"about {duration(left)} left"] if left else [])])
 
-    def seconds_left(self, at: Mapping[int, tuple[str, int] | None]) -> float | None:
+    def _seconds_left(self, jobs: Sequence[Job], at: Sequence[tuple[Job, str, int]]) -> float | None:
         """Return the time that the rest will take, s; None until two jobs are done."""
-        mean = {rule: sum(values) / len(values) for rule, values in self.seconds.items() if rule in self.wanted}
-        if sum(len(v) for v in self.seconds.values()) < 2:
+        if len(self.done) < 2:
             return None
+        done = {rule: [job for job in self.done if job.rule == rule] for rule in self.wanted}
+        mean = {rule: fmean(job.seconds / job.units for job in of) for rule, of in done.items() if of}
         scale = sum(mean.values()) / sum(COST.get(rule, 1.0) for rule in mean)
         left = 0.0
-        for rule, jobs in self.wanted.items():
-            done = sum(job.units for job in self.done if job.rule == rule)
-            begun = sum(w[1] - 1 for n, w in at.items() if w and n in self.running and self.running[n].rule == rule)
-            size = self._mean_batch() if rule in PER_BATCH or jobs > 1 else 1.0
-            left += max(jobs * size - done - begun, 0.0) * mean.get(rule, scale * COST.get(rule, 1.0))
-        working = sum(time.time() - job.since for job in self.running.values())
-        jobs_at_a_time = (self.worked + working) / max(time.monotonic() - self.started, 1e-3)
+        for rule, count in self.wanted.items():
+            size = self._mean_batch() if rule in PER_BATCH or count > 1 else 1.0
+            begun = sum(number - 1 for job, _, number in at if job.rule == rule)
+            units = count * size - begun - sum(job.units for job in done[rule])
+            left += max(units, 0.0) * mean.get(rule, scale * COST.get(rule, 1.0))
+        worked = self.lost + sum(job.seconds for job in self.done) + sum(time.time() - job.since for job in jobs)
+        jobs_at_a_time = worked / max(time.monotonic() - self.started, 1e-3)
         return left / max(jobs_at_a_time, 1.0)
 
     def _mean_batch(self) -> float:
@@ -152,19 +143,10 @@ def duration(seconds: float) -> str:
 
 
 class Monitor(logging.Handler):
-    """Follows the log records of Snakemake and prints the progress of a run.
+    """Follows the log records of Snakemake and prints the progress of a run in ``results``.
 
     Snakemake's interface for logger plugins is not used: it needs a top-level package of its own, which Snakemake does
     not find in an editable installation.
-
-    Parameters
-    ----------
-    results : Path
-        Of the campaign.
-    batches : mapping of str to int
-        Batch to its number of units.
-    logger : logging.Logger
-        Of Snakemake.
     """
 
     def __init__(self, results: Path, batches: Mapping[str, int], logger: logging.Logger) -> None:
@@ -223,8 +205,7 @@ class Monitor(logging.Handler):
     def print_edited(self, edited: Sequence[str]) -> None:
         """Print which files were edited or deleted since they were made, and are made again."""
         if edited:
-            more = [f"  and {len(edited) - 10} more"] * (len(edited) > 10)
-            lines = ["Changed or deleted since the last run, made again:", *(f"  {c}" for c in edited[:10]), *more]
+            lines = ["Changed or deleted since the last run, made again:", *_first([f"  {c}" for c in edited])]
             print("\n".join(lines), file=self.stream, flush=True)
 
     def print_recovery(self) -> None:
@@ -237,16 +218,17 @@ class Monitor(logging.Handler):
         if self.refused == "LockException":
             unlock = shlex.join(["snakemake", "--unlock", *sys.argv[1:]])
             lines += [
-                "\nAnother run works in this directory, or one was killed here. Wait until it has ended, and then:"
+                "\nAnother run works in this directory, or one was killed here. Wait until it has ended, and then:",
+                f"  {command}",
+                "If none is at work:",
+                f"  {unlock} && {command}",
             ]
-            lines += [f"  {command}", "If none is at work:", f"  {unlock} && {command}"]
         if self.interrupted or getattr(sys, "last_type", None) is KeyboardInterrupt:
             lines += ["\nThe run was interrupted. Finished jobs are kept, others begin anew. To continue:"]
             lines += [f"  {command}"]
         elif self.failed:
             lines += [f"\n{len(self.failed)} jobs broke; what they had begun is removed, all others are done:"]
-            lines += [f"  {rule}: {_cause(log)} (all of it: {log})" for rule, log in self.failed[:10]]
-            lines += [f"  and {len(self.failed) - 10} more"] * (len(self.failed) > 10)
+            lines += _first([f"  {rule}: {_cause(log)} (all of it: {log})" for rule, log in self.failed])
             lines += ["Mend the cause, then run the same command again:", f"  {command}"]
         if lines:
             print("\n".join(lines), file=self.stream)
@@ -291,3 +273,8 @@ def _cause(log: Path) -> str:
     last = next((line for line in reversed(lines) if line.strip()), "")
     at = AT_UNIT.findall(last)
     return f"killed at unit {at[-1][0]}" if at else last or "killed, or could not be started"
+
+
+def _first(lines: Sequence[str]) -> list[str]:
+    more = [f"  and {len(lines) - 10} more"] * (len(lines) > 10)
+    return [*lines[:10], *more]
