@@ -113,7 +113,7 @@ def test_every_wrong_file_is_named_with_its_line_before_any_job(bench: Path) -> 
     with pytest.raises(ConfigurationError) as caught:
         load(bench)
     assert "bend.yaml:6: terms.k.formula: formula \"__import__('os')\", position 12" in str(caught.value)
-    assert "tip.yaml:2: owner: 'nobody': one of 'sensor', 'recording', 'mounting' or 'table'" in str(caught.value)
+    assert "tip.yaml:2: owner: one of 'sensor', 'recording', 'mounting' or 'table' is expected" in str(caught.value)
 
 
 def test_an_effect_is_refused_for_a_sensor_that_it_does_not_name(bench: Path) -> None:
