@@ -22,7 +22,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 pytestmark = pytest.mark.workflow
 
-# Found by the process whose copies run the jobs: disturbs the report of the first batch before it renames its first file.
+# Found by the process whose copies run the jobs: disturbs the first report before it renames its first file.
 # A shell that starts a job in the background ignores SIGINT for it, and children inherit that: Ctrl-C is set here.
 DISTURB = """
 import os, signal, sys, time
