@@ -13,7 +13,7 @@ from pipeline.model.effects.base import truth
 from pipeline.records import AXES, Motion, Recording
 from pipeline.simulation.procedures import Course, plan
 from pipeline.simulation.scene import ALTERATIONS, Scene, alter
-from pipeline.simulation.sensor import Environment
+from pipeline.simulation.session import Environment
 
 if TYPE_CHECKING:
     from pipeline.simulation.trajectory import Planned

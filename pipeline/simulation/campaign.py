@@ -21,29 +21,26 @@ from pipeline.errors import ConfigurationError
 from pipeline.io.csv_write import write_canonical_csv
 from pipeline.records import AXES, SENSORS
 from pipeline.simulation.description import course_of, read_config
-from pipeline.simulation.draw import drawn_effects, drawn_sensors, inline_effects
 from pipeline.simulation.procedures import ONE_RECORDING, plan
-from pipeline.simulation.sensor import random_environment
+from pipeline.simulation.sensor import decimals_of, drawn_effects, drawn_sensors
 from pipeline.simulation.session import (
     ANGLE_DECIMALS,
     QUATERNION_DECIMALS,
     TEMPERATURE_DECIMALS,
     Bench,
     Streams,
+    random_environment,
     record,
 )
 from pipeline.simulation.table_logs import columns_of, programs_of, with_table_log
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
-    from pipeline.model.effects.base import Effect
     from pipeline.records import Recording
     from pipeline.simulation.description import Description, UnitDescription
-    from pipeline.simulation.sensor import SimulatedSensor
+    from pipeline.simulation.sensor import Hidden, SimulatedSensor
     from pipeline.simulation.trajectory import Planned
 
 COLUMNS = ("unit", "serial", "lot", "date", "sensor", "table", "procedure", "method", "ingest", "filter", "overrides")
@@ -115,18 +112,28 @@ def simulate_unit(
     The seed and the unit's number in its campaign determine every random number. ``extra``: further recordings after
     those of the procedure.
     """
-    streams = Streams(seed, number)
+    streams, course = Streams(seed, number), course_of(unit)
     sheets = read_config("sensor", unit.sensor)
-    table = read_config("table", unit.table)
-    course = course_of(unit)
-    kinds, specification = inline_effects(unit.effects)
-    effects = drawn_effects(specification, sheets, streams["effects"], kinds)
-    given = {s: getattr(unit, s) for s in SENSORS}
-    sensors = drawn_sensors(sheets, given, effects, streams["unit"], kinds)
-    bench = Bench(table, _imperfections(table, unit.imperfections, streams["bench"]), sensors)
+    effects = drawn_effects(unit.effects, sheets, streams["effects"])
+
+    def bench_of(other: Mapping[str, Any]) -> Bench:
+        """Return the bench of the description with ``other`` settings; the same sensors, mounted anew."""
+        table = read_config("table", other.get("table", unit.table))
+        rng = streams["bench"]
+        imperfections = {
+            "angle_accuracy_deg": table["angle_accuracy_deg"],
+            "rate_error": table["rate_accuracy"] * rng.standard_normal(3),
+            "direction_deg": table["orthogonality_deg"] * rng.standard_normal((3, 2)),
+            **(other.get("imperfections", {}) if other else unit.imperfections),
+        }
+        given = {s: {**getattr(unit, s), **other.get(s, {})} for s in SENSORS}
+        return Bench(table, imperfections, drawn_sensors(sheets, given, effects, streams["unit"]))
+
+    bench = bench_of({})
     benches = {"": bench}
     if unit.held_out:
-        benches |= dict.fromkeys(("validation", "static"), _held_out_bench(unit, sheets, effects, streams, kinds))
+        benches |= dict.fromkeys(("validation", "static"), bench_of(unit.held_out))
+    table = bench.table
     by_hand = table["angle_accuracy_deg"] if table["motion"] == "none" else 0.0
     mover = streams["motion"] if unit.motion is None else Streams(seed, unit.motion)["motion"]
     planned = [*_wanted(unit, plan(unit.procedure, course, mover, by_hand)), *extra]
@@ -138,7 +145,7 @@ def simulate_unit(
     truth = {
         "seed": [seed, number],
         **{name: getattr(unit, name) for name in ("sensor", "table", "procedure", "interval_s", "lost")},
-        **{s: _truth(sensors[s], effects[s], unit.interval_s) for s in SENSORS},
+        **{s: _truth(bench.sensors[s], effects[s], unit.interval_s) for s in SENSORS},
         "imperfections": {k: np.asarray(v).tolist() for k, v in bench.imperfections.items()},
     }
     made = record(planned, benches, effects, environment=environment, unit=unit, pause=pause, streams=streams)
@@ -164,50 +171,22 @@ def _write_recording(folder: Path, recording: Recording, kind: str, sheets: dict
 
         write_mcap(folder / f"{recording.name}.mcap", recording)
         return
-    wanted = {f"accel_{a}_g": _digits(sheets["accelerometer"]) for a in AXES}
-    wanted |= {f"gyro_{a}_dps": _digits(sheets["gyroscope"]) for a in AXES}
+    wanted = {f"accel_{a}_g": decimals_of(sheets["accelerometer"]) for a in AXES}
+    wanted |= {f"gyro_{a}_dps": decimals_of(sheets["gyroscope"]) for a in AXES}
     wanted |= {"temperature_degc": TEMPERATURE_DECIMALS}
     wanted |= dict.fromkeys(("table_angle_deg", "table_rate_dps"), ANGLE_DECIMALS)
     wanted |= {f"table_q{c}": QUATERNION_DECIMALS for c in "wxyz"}
     write_canonical_csv(folder / f"{recording.name}.csv", recording, wanted)
 
 
-def _digits(sheet: dict[str, Any]) -> int:
-    return int(np.ceil(np.log10(sheet["counts_per_unit"]))) + 1
-
-
-def _imperfections(table: dict[str, Any], given: dict[str, Any], rng: np.random.Generator) -> dict[str, Any]:
-    """Return what the table does otherwise than commanded: as described, else by its accuracies."""
-    return {
-        "angle_accuracy_deg": table["angle_accuracy_deg"],
-        "rate_error": table["rate_accuracy"] * rng.standard_normal(3),
-        "direction_deg": table["orthogonality_deg"] * rng.standard_normal((3, 2)),
-        **given,
-    }
-
-
-def _held_out_bench(
-    unit: UnitDescription,
-    sheets: dict[str, Any],
-    effects: dict[str, dict[str, NDArray[np.float64]]],
-    streams: Streams,
-    kinds: dict[str, Effect],
-) -> Bench:
-    """Return the bench of the held-out motion; the sensors there are the same, mounted anew."""
-    given = {s: {**getattr(unit, s), **unit.held_out.get(s, {})} for s in SENSORS}
-    table = read_config("table", unit.held_out.get("table", unit.table))
-    imperfections = _imperfections(table, unit.held_out.get("imperfections", {}), streams["bench"])
-    return Bench(table, imperfections, drawn_sensors(sheets, given, effects, streams["unit"], kinds))
-
-
-def _truth(sensor: SimulatedSensor, effects: dict[str, NDArray[np.float64]], interval: float) -> dict[str, Any]:
-    defined = {name: sensor.kind(name).definition for name in effects if sensor.kind(name).definition}
+def _truth(sensor: SimulatedSensor, effects: Hidden, interval: float) -> dict[str, Any]:
+    defined = {name: kind.definition for name, (kind, _) in effects.items() if kind.definition}
     return {
         "bias": sensor.bias.tolist(),
         "matrix": sensor.matrix.tolist(),
         "effects": {
-            name: {p.name: float(v) for p, v in zip(sensor.kind(name).parameters(sensor.sensor), values, strict=True)}
-            for name, values in effects.items()
+            name: {p.name: float(v) for p, v in zip(kind.parameters(sensor.sensor), values, strict=True)}
+            for name, (kind, values) in effects.items()
         },
         **({"definitions": defined} if defined else {}),
         "noise": {

@@ -1,26 +1,27 @@
-"""Readings of a simulated sensor in a true motion, and the temperature of the unit.
+"""A simulated sensor, how its parameters are drawn, and the temperature of the unit.
 
     reading = clip(round(c (bias + K truth + effects + noise)) / c),   noise[n] = white w[n] + wander m[n]
     m[n+1] = r m[n] + sqrt(1 - r^2) w'[n],   r = exp(-(t[n+1] - t[n]) / T)
+    K^-1 = matrix = R_m^T S_n diag(S),   S_n = [[1, 0, 0], [n_yx, 1, 0], [n_zx, n_zy, 1]]
 
 where
 
-K      : (3, 3), scale factor, non-orthogonality and mounting in one, ``K = matrix^-1``
 c      : counts per g or deg/s
 white  : noise density * sqrt(1 / (2 dt)): the band up to Nyquist, unit of the sensor
 wander : standard deviation of the bias wander m, a Gauss-Markov process with correlation time T, which goes on between
          the recordings of a session
+S, n   : (3,) scale factors of the correction (body = matrix @ (reading - bias)), and non-orthogonality, rad
+R_m    : mounting, which takes body vectors to the sensor's axes: turns about x, then y, then z
 
-The temperature over the session is
+What a description leaves out is drawn: data-sheet limits are taken for three standard deviations; the mounting lies
+within 1 deg (Sudsanguan 2019, chapter 3). A description may also hide an effect by a formula:
 
-    T(t) = T_ambient + dT (1 - exp(-t / tau)) + d sum_k sin(2 pi t / p_k + phase_k) / 2 + ramp(t)
+    effects:
+      gyroscope.gear_mesh: {terms: {A: {formula: "cos(5 * radians(angle))", unit: deg/s}}, values: [0.03, 0.03, 0.03]}
 
-where
-
-T_ambient : room, degC
-dT, tau   : warm-up after power-on, degC and s
-d         : slow drift of the room, degC, with two periods p_k of half an hour to two hours
-ramp      : triangle of a thermal chamber, degC: up, down below the room, and back
+The keys are those of an effect's file (``pipeline.model.effects.declaration``), of which only ``terms`` is needed, and
+``values``: of the parameters, one size, or nothing where there are ``limits``. It is not in the catalogue, so it is
+unknown to a diagnosis.
 """
 
 from __future__ import annotations
@@ -30,8 +31,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.errors import ConfigurationError
 from pipeline.model.effects import effect
-from pipeline.model.effects.base import truth
+from pipeline.model.effects.base import parameter_limits, truth
+from pipeline.model.effects.files import effect_from
+from pipeline.records import SENSORS
+from pipeline.simulation.scene import ALTERATIONS
+from pipeline.simulation.trajectory import rotation_about
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -40,6 +46,23 @@ if TYPE_CHECKING:
 
     from pipeline.model.effects.base import Effect
     from pipeline.records import Motion
+
+    Values = NDArray[np.float64]
+    Hidden = dict[str, tuple[Effect, Values]]  # by name: an effect and the values of its parameters
+
+KEYS = {"bias", "matrix", "scale_factor", "non_orthogonality_deg", "mounting_deg"}
+NOISE_KEYS = {"noise_density", "bias_wander", "wander_time_s"}  # in place of those of the data sheet
+POSITIVE = {"time_constant", "tau"}
+# A typical size as a share of the largest plausible one, where that is not a half.
+TYPICAL_SHARE = {
+    "inner_lever_arms": 0.05,
+    "clock_rate": 0.02,
+    "table_tilt": 0.2,
+    "table_axis_nonorthogonality": 0.1,
+    "table_encoder_error": 0.1,
+    "table_rate_ripple": 0.1,
+    "table_backlash": 0.1,
+}
 
 
 @dataclass(frozen=True)
@@ -53,51 +76,42 @@ class SimulatedSensor:
     bias : (3,) array, g or deg/s
     matrix : (3, 3) array
         What a perfect calibration finds: body = matrix @ (reading - bias - effects).
-    effects : dict of str to array
-        Values of the parameters of each effect on the reading.
-    kinds : dict of str to Effect
-        Effects that are not in the catalogue, by name.
+    effects : dict
+        Those on the reading.
     """
 
     sensor: str
     sheet: Mapping[str, Any]
-    bias: NDArray[np.float64]
-    matrix: NDArray[np.float64]
-    effects: dict[str, NDArray[np.float64]] = field(default_factory=dict)
-    kinds: dict[str, Effect] = field(default_factory=dict)
+    bias: Values
+    matrix: Values
+    effects: Hidden = field(default_factory=dict)
 
-    def exact(self, motion: Motion) -> NDArray[np.float64]:
+    def exact(self, motion: Motion) -> Values:
         """Return the reading without noise and quantisation: (n, 3) array."""
         K = np.asarray(np.linalg.solve(self.matrix, np.eye(3)), np.float64)
-        reading: NDArray[np.float64] = self.bias + truth(self.sensor, motion) @ K.T
-        for name, values in self.effects.items():
-            reading = reading + self.kind(name).reading(self.sensor, motion, K, values)
+        reading: Values = self.bias + truth(self.sensor, motion) @ K.T
+        for kind, values in self.effects.values():
+            reading = reading + kind.reading(self.sensor, motion, K, values)
         return reading
-
-    def kind(self, name: str) -> Effect:
-        """Return an effect by name: one of its own, or of the catalogue."""
-        return self.kinds.get(name) or effect(name)
 
     def white(self, interval: float) -> float:
         """Return the standard deviation of one sample's white noise; interval in s."""
         return float(self.sheet["noise_density"]) * float(np.sqrt(0.5 / interval))
 
-    def quantised(self, reading: NDArray[np.float64]) -> NDArray[np.float64]:
+    def quantised(self, reading: Values) -> Values:
         """Return the reading in whole counts, at most at full scale: (n, 3) array, g or deg/s."""
         counts = np.round(reading * self.sheet["counts_per_unit"])
         top = self.sheet["full_scale"] * self.sheet["counts_per_unit"]
-        kept: NDArray[np.float64] = np.clip(counts, -top, top - 1.0) / self.sheet["counts_per_unit"]
+        kept: Values = np.clip(counts, -top, top - 1.0) / self.sheet["counts_per_unit"]
         return kept
 
-    @property
-    def decimals(self) -> int:
-        """Decimals that keep a printed reading within a tenth of a count."""
-        return int(np.ceil(np.log10(self.sheet["counts_per_unit"]))) + 1
+
+def decimals_of(sheet: Mapping[str, Any]) -> int:
+    """Return the decimals that keep a printed reading within a tenth of a count."""
+    return int(np.ceil(np.log10(sheet["counts_per_unit"]))) + 1
 
 
-def bias_wander(
-    sessions: list[NDArray[np.float64]], correlation_time: float, rng: np.random.Generator
-) -> list[NDArray[np.float64]]:
+def bias_wander(sessions: list[Values], correlation_time: float, rng: np.random.Generator) -> list[Values]:
     """Return a stationary Gauss-Markov process of unit variance for three axes: (n, 3) array of each recording.
 
     ``sessions``: (n,) sample times of one recording after the other, s, each evenly sampled.
@@ -125,21 +139,21 @@ class Environment:
     warm_up: float
     warm_up_time: float
     drift: float
-    periods: NDArray[np.float64]
-    phases: NDArray[np.float64]
+    periods: Values
+    phases: Values
     ramp: float = 0.0
     ramp_period: float = 3600.0
     noise: float = 0.03
 
-    def temperature(self, time: NDArray[np.float64]) -> NDArray[np.float64]:
+    def temperature(self, time: Values) -> Values:
         """Return the true temperature: (n,) array, degC; time in s since power-on."""
         room = np.sin(2.0 * np.pi * time[:, None] / self.periods + self.phases).sum(1) / 2.0
         triangle = 2.0 / np.pi * np.arcsin(np.sin(2.0 * np.pi * time / self.ramp_period))
         warm = self.warm_up * (1.0 - np.exp(-time / self.warm_up_time))
-        total: NDArray[np.float64] = self.ambient + warm + self.drift * room + self.ramp * triangle
+        total: Values = self.ambient + warm + self.drift * room + self.ramp * triangle
         return total
 
-    def reading(self, time: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
+    def reading(self, time: Values, rng: np.random.Generator) -> Values:
         """Return the thermometer's reading: (n,) array, degC."""
         return self.temperature(time) + self.noise * rng.standard_normal(len(time))
 
@@ -156,3 +170,110 @@ def random_environment(rng: np.random.Generator, *, ramp: float = 0.0, ramp_peri
         ramp=ramp,
         ramp_period=ramp_period,
     )
+
+
+def drawn_sensors(
+    sheets: Mapping[str, Mapping[str, Any]],
+    given: Mapping[str, Mapping[str, Any]],
+    effects: Mapping[str, Hidden],
+    rng: np.random.Generator,
+) -> dict[str, SimulatedSensor]:
+    """Return accelerometer and gyroscope of a unit, from the section of the configuration and the description of each.
+
+    Raises
+    ------
+    ConfigurationError
+        If a key of the description is not known.
+    """
+    mounting = rng.uniform(-1.0, 1.0, 3)
+    out = {}
+    for sensor in SENSORS:
+        unknown = sorted(set(given[sensor]) - KEYS - NOISE_KEYS)
+        if unknown:
+            known = ", ".join(sorted(KEYS | NOISE_KEYS))
+            raise ConfigurationError(f"{sensor}: {', '.join(unknown)} is not known; known: {known}")
+        sheet = {**sheets[sensor], **{key: given[sensor][key] for key in NOISE_KEYS & set(given[sensor])}}
+        own = {name: hidden for name, hidden in effects[sensor].items() if name not in ALTERATIONS}
+        drawn = _limited(sheet["bias"], rng)
+        bias = np.array(given[sensor].get("bias", drawn), float)
+        out[sensor] = SimulatedSensor(sensor, sheet, bias, _matrix(sheet, given[sensor], mounting, rng), own)
+    return out
+
+
+def _matrix(sheet: Mapping[str, Any], given: Mapping[str, Any], mounting: Values, rng: np.random.Generator) -> Values:
+    scale = 1.0 + _limited(sheet["scale_factor"], rng)
+    skew = np.degrees(_limited(sheet["cross_axis"], rng))
+    if "matrix" in given:
+        return np.array(given["matrix"], float)
+    if KEYS & set(given) - {"bias"}:
+        scale, skew, mounting = np.ones(3), np.zeros(3), np.zeros(3)
+    scale = np.array(given.get("scale_factor", scale), float)
+    lower = np.eye(3)
+    lower[[1, 2, 2], [0, 0, 1]] = np.radians(np.array(given.get("non_orthogonality_deg", skew), float))
+    angles = np.array(given.get("mounting_deg", mounting), float)
+    x, y, z = (rotation_about(axis, np.array([a]))[0] for axis, a in zip(np.eye(3), angles, strict=True))
+    matrix: Values = (z @ y @ x).T @ lower @ np.diag(scale)
+    return matrix
+
+
+def _limited(limit: float, rng: np.random.Generator) -> Values:
+    """Return three normal numbers with the limit at three standard deviations, cut there."""
+    return np.clip(rng.standard_normal(3) * limit / 3.0, -limit, limit)
+
+
+def drawn_effects(
+    specification: Mapping[str, Any], sheets: Mapping[str, Mapping[str, Any]], rng: np.random.Generator
+) -> dict[str, Hidden]:
+    """Return the effects that a description's ``effects`` hide in each sensor.
+
+    Raises
+    ------
+    ConfigurationError
+        If there is no such effect, it does not apply, its formula is wrong, or the number of values is.
+    """
+    out: dict[str, Hidden] = {sensor: {} for sensor in SENSORS}
+    for key, value in specification.items():
+        sensor, _, name = str(key).rpartition(".")
+        if isinstance(value, dict):
+            usual = {"owner": "table", "sensors": [sensor] if sensor else list(SENSORS), "meaning": "Hidden."}
+            definition = {"name": name, **usual, **{k: v for k, v in value.items() if k != "values"}}
+            kind, size = effect_from(definition, f"effects: {key}"), value.get("values")
+        else:
+            kind, size = effect(name), value
+        if sensor not in (*kind.sensors, ""):
+            raise ConfigurationError(f"effect {key}: {name} applies to the {' and '.join(kind.sensors)}")
+        for each in kind.sensors if sensor == "" else (sensor,):
+            if name in ALTERATIONS and each != kind.sensors[0] and sensor == "":
+                out[each][name] = out[kind.sensors[0]][name]  # one table, one clock: the same for both sensors
+            else:
+                out[each][name] = kind, _values(kind, each, size, sheets[each]["effects"], rng)
+    return out
+
+
+def _values(
+    kind: Effect,
+    sensor: str,
+    value: Any,  # noqa: ANN401  (None, a number or a list, as YAML gives it)
+    limits: Mapping[str, float],
+    rng: np.random.Generator,
+) -> Values:
+    name, parameters = kind.name, kind.parameters(sensor)
+    positive = np.array([p.name in POSITIVE for p in parameters])
+    sign = np.where(positive, 1.0, rng.choice([-1.0, 1.0], len(parameters)))
+    typical = TYPICAL_SHARE.get(name, 0.5) * parameter_limits(kind, sensor, limits)
+    drawn = sign * rng.uniform(0.7, 1.3, len(parameters)) * typical
+    given = np.array([]) if value is None else np.atleast_1d(np.asarray(value, float))
+    if len(given) == len(parameters):
+        return given
+    if len(given) == 1:
+        return np.where(positive, typical, sign * given[0])
+    if value is not None:
+        names = ", ".join(p.name for p in parameters)
+        raise ConfigurationError(
+            f"{sensor}.{name} takes one size or {len(parameters)} values ({names}), not {len(given)}"
+        )
+    if not np.all(np.isfinite(drawn)):
+        raise ConfigurationError(
+            f"{sensor}.{name}: the sensor's configuration has no limit of this effect, so no typical size; give one"
+        )
+    return np.asarray(drawn)

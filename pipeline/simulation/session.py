@@ -15,7 +15,7 @@ from pipeline.model.kinematics import earth_rate
 from pipeline.records import AXES, SENSORS, Recording
 from pipeline.simulation.rate_table import random_errors
 from pipeline.simulation.scene import Scene, alter
-from pipeline.simulation.sensor import bias_wander
+from pipeline.simulation.sensor import bias_wander, decimals_of
 from pipeline.simulation.trajectory import Gimbals, Moves, Turn, rotation_about
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.simulation.description import UnitDescription
-    from pipeline.simulation.sensor import Environment, SimulatedSensor
+    from pipeline.simulation.sensor import Hidden, SimulatedSensor
     from pipeline.simulation.trajectory import Planned
 
     Values = NDArray[np.float64]
@@ -45,6 +45,53 @@ class Streams:
 
 
 @dataclass(frozen=True)
+class Environment:
+    """Temperature over time, in degC, s and rad; ``noise``: of the thermometer.
+
+        T(t) = ambient + warm_up (1 - exp(-t / warm_up_time)) + drift sum_k sin(2 pi t / p_k + phase_k) / 2 + ramp(t)
+
+    where p_k are the two ``periods`` of the room, half an hour to two hours, and ``ramp(t)`` is the triangle of a
+    thermal chamber: up, down below the room, and back.
+    """
+
+    ambient: float
+    warm_up: float
+    warm_up_time: float
+    drift: float
+    periods: Values
+    phases: Values
+    ramp: float = 0.0
+    ramp_period: float = 3600.0
+    noise: float = 0.03
+
+    def temperature(self, time: Values) -> Values:
+        """Return the true temperature: (n,) array, degC; time in s since power-on."""
+        room = np.sin(2.0 * np.pi * time[:, None] / self.periods + self.phases).sum(1) / 2.0
+        triangle = 2.0 / np.pi * np.arcsin(np.sin(2.0 * np.pi * time / self.ramp_period))
+        warm = self.warm_up * (1.0 - np.exp(-time / self.warm_up_time))
+        total: Values = self.ambient + warm + self.drift * room + self.ramp * triangle
+        return total
+
+    def reading(self, time: Values, rng: np.random.Generator) -> Values:
+        """Return the thermometer's reading: (n,) array, degC."""
+        return self.temperature(time) + self.noise * rng.standard_normal(len(time))
+
+
+def random_environment(rng: np.random.Generator, *, ramp: float = 0.0, ramp_period: float = 3600.0) -> Environment:
+    """Return a room at about 25 degC (Sudsanguan 2019, 5.1) in which the unit warms up by a few degrees."""
+    return Environment(
+        ambient=25.0 + rng.uniform(-1.0, 1.0),
+        warm_up=rng.uniform(3.0, 6.0),
+        warm_up_time=rng.uniform(200.0, 400.0),
+        drift=0.3,
+        periods=rng.uniform(1800.0, 7200.0, 2),
+        phases=rng.uniform(0.0, 2.0 * np.pi, 2),
+        ramp=ramp,
+        ramp_period=ramp_period,
+    )
+
+
+@dataclass(frozen=True)
 class Bench:
     """Where a recording is made: table, what it does otherwise than commanded, and the sensors as mounted there."""
 
@@ -56,7 +103,7 @@ class Bench:
 def record(
     planned: Sequence[Planned],
     benches: Mapping[str, Bench],
-    effects: Mapping[str, dict[str, Values]],
+    effects: Mapping[str, Hidden],
     *,
     environment: Environment,
     unit: UnitDescription,
@@ -92,11 +139,11 @@ def record(
         plain = scene.motion(time, temperature)
         readings: dict[str, Any] = {}
         for s in SENSORS:
-            sensor, altered = bench.sensors[s], alter(scene, effects[s])
+            sensor, altered = bench.sensors[s], alter(scene, {name: values for name, (_, values) in effects[s].items()})
             motion = plain if altered is scene else altered.motion(time, temperature)
             white = sensor.white(unit.interval_s) * rng[s].standard_normal((len(time), 3))
             reading = sensor.exact(motion) + white + sensor.sheet["bias_wander"] * wander[s][k]
-            readings[s] = _rounded(sensor.quantised(reading), sensor.decimals)
+            readings[s] = _rounded(sensor.quantised(reading), decimals_of(sensor.sheet))
         whole = Recording(
             plan.name,
             plan.role,

@@ -19,13 +19,13 @@ where x is the true temperature from the coldest sample of the unit, 0, to the w
 
 The signal of a hidden effect over the noise is
 
-    lambda = sum over axes of |W (1 - P) s|^2
+    lambda = sum over axes of s^T C^-1 (s - P s)
 
 where
 
     s : what the effect adds to an axis' readings: the unit with it less the same unit, and the same noise, without it
-    W : the whitening filter of the true white noise and bias wander (Kalman's, for a first-order Gauss-Markov process)
-    P : the projection onto bias, truth and what each other hidden effect adds, all whitened
+    C : covariance of the true white noise and bias wander (``pipeline.estimation.gauss_markov``)
+    P : the projection, in the metric C^-1, onto bias, truth and what each other hidden effect adds
 
 A test with known noise and equation gains lambda in 2 log L on average, against the k log N + 10 (40 to 100) that a
 selection asks of k parameters. The rounding to whole counts differs between the two units and adds c^2 / 6 a sample on
@@ -39,13 +39,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.estimation.gauss_markov import Blocks, GaussMarkov, Setting
 from pipeline.model.effects.base import truth
 from pipeline.model.kinematics import reference_motion
 from pipeline.records import SENSORS
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, read_config
-from pipeline.simulation.sensor import random_environment
-from pipeline.simulation.session import Streams
+from pipeline.simulation.session import Streams, random_environment
 from pipeline.study.cases import COURSES, OF_TEMPERATURE
 
 if TYPE_CHECKING:
@@ -210,14 +210,29 @@ def signals_left(case: Case) -> dict[str, float]:
     time = np.concatenate([r.time for r in recordings])
     base = np.concatenate([truth(case.sensor, motion) for motion in motions])
     columns = np.column_stack([np.ones(len(time)), base, *signals])
-    size = np.maximum(np.abs(columns).max(axis=0), 1e-300)
-    white, wander = _white(sheet), case.wander * sheet["bias_wander"]
-    whitened = size * whiten(columns / size, time, white, wander, sheet["wander_time_s"])
-    rounding = 3 * len(time) / (6.0 * sheet["counts_per_unit"] ** 2 * white**2)
-    return {
-        name: max(0.0, float(sum(_left(whitened, 4 + 3 * j, axis) for axis in range(3))) - rounding)
-        for j, name in enumerate(case.hidden)
-    }
+    size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    white, n = _white(sheet), len(time)
+    each = Blocks(np.arange(n), np.ones(n), time, np.zeros(n), np.zeros(n, np.int64))
+    noise = GaussMarkov(each, [Setting(case.wander * sheet["bias_wander"] / white, sheet["wander_time_s"])])
+    products = noise.products(columns / size)[0] * np.outer(size, size) / white**2
+    rounding = 3 * n / (6.0 * sheet["counts_per_unit"] ** 2 * white**2)
+    found = {}
+    for k, name in enumerate(case.hidden):
+        left = 0.0
+        for axis in range(3):
+            own = 4 + 3 * k + axis
+            others = [*range(4), *(c for c in range(4 + axis, len(size), 3) if c != own)]
+            left += _beside(products, own, others)
+        found[name] = max(0.0, left - rounding)
+    return found
+
+
+def _beside(products: Values, own: int, others: list[int]) -> float:
+    """Return the square of a column that the projection onto the others leaves, from the products of all columns."""
+    cross, inner = products[others, own], products[np.ix_(others, others)]
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(inner), 1e-300))
+    inverse = np.linalg.pinv(inner * np.outer(scale, scale), rcond=1e-12, hermitian=True)
+    return float(products[own, own] - (scale * cross) @ inverse @ (scale * cross))
 
 
 def _used(case: Case) -> list[Recording]:
@@ -227,39 +242,3 @@ def _used(case: Case) -> list[Recording]:
 
 def _readings(recordings: Sequence[Recording], sensor: str) -> Values:
     return np.concatenate([np.asarray(r.reading(sensor)) for r in recordings])
-
-
-def _left(whitened: Values, at: int, axis: int) -> float:
-    """Return the square of an effect's whitened signal on one axis that base and other effects leave."""
-    signal = whitened[:, at + axis]
-    others = [k for k in range(4 + axis, whitened.shape[1], 3) if k != at + axis]
-    beside = whitened[:, [*range(4), *others]]
-    size = np.linalg.norm(beside, axis=0)
-    basis, _ = np.linalg.qr(beside[:, size > 0] / size[size > 0])
-    rest = signal - basis @ (basis.T @ signal)
-    return float(rest @ rest)
-
-
-def whiten(columns: Values, time: Values, white: float, wander: float, correlation_time: float) -> Values:
-    """Return columns after the filter that makes white noise plus a Gauss-Markov wander white, of variance 1.
-
-    Parameters
-    ----------
-    columns : (n, k) array, unit of the sensor
-    time : (n,) array, s
-    white, wander : float, unit of the sensor
-        Standard deviations.
-    correlation_time : float, s
-    """
-    decay = np.exp(-np.diff(time, prepend=time[0]) / correlation_time).tolist()
-    out = np.empty_like(columns)
-    mean, variance = np.zeros(columns.shape[1]), wander**2
-    for i, column in enumerate(columns):
-        mean = decay[i] * mean
-        variance = decay[i] ** 2 * variance + wander**2 * (1.0 - decay[i] ** 2)
-        innovation = column - mean
-        total = variance + white**2
-        out[i] = innovation / np.sqrt(total)
-        mean += variance / total * innovation
-        variance *= white**2 / total
-    return out

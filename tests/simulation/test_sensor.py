@@ -3,10 +3,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipeline.model.effects import effect
 from pipeline.records import Motion
 from pipeline.simulation.description import read_config
 from pipeline.simulation.scene import Scene
-from pipeline.simulation.sensor import SimulatedSensor, bias_wander
+from pipeline.simulation.sensor import SimulatedSensor, bias_wander, decimals_of
 from pipeline.simulation.trajectory import random_gimbals
 
 SHEETS = read_config("sensor", "mpu6050")
@@ -28,7 +29,11 @@ def test_a_reading_is_bias_plus_the_inverse_matrix_times_the_truth_plus_effects(
     matrix = np.array([[1.02, 0.01, 0.0], [-0.02, 0.98, 0.03], [0.0, 0.01, 1.01]])
     sensitivity = np.random.default_rng(1).normal(0.0, 0.1, 9)
     sensor = SimulatedSensor(
-        "gyroscope", SHEETS["gyroscope"], np.array([1.0, -2.0, 0.5]), matrix, {"g_sensitivity": sensitivity}
+        "gyroscope",
+        SHEETS["gyroscope"],
+        np.array([1.0, -2.0, 0.5]),
+        matrix,
+        {"g_sensitivity": (effect("g_sensitivity"), sensitivity)},
     )
     motion = a_motion()
     added = motion.specific_force @ sensitivity.reshape(3, 3).T
@@ -46,7 +51,7 @@ def test_readings_are_whole_counts_and_stop_at_full_scale() -> None:
     sensor = SimulatedSensor("accelerometer", SHEETS["accelerometer"], np.zeros(3), np.eye(3))
     counts = sensor.quantised(np.array([[0.1, -5.0, 5.0]])) * 16384.0
     assert counts.tolist() == [[1638.0, -32768.0, 32767.0]]
-    assert sensor.decimals == 6  # half a unit of the last digit is 0.008 counts
+    assert decimals_of(sensor.sheet) == 6  # half a unit of the last digit is 0.008 counts
 
 
 def test_wander_has_unit_variance_and_its_correlation_time_within_recordings_and_across_pauses() -> None:

@@ -7,19 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.study.bench import signals_left, whiten
+from pipeline.study.bench import signals_left
 from pipeline.study.cases import Case, draw
-
-WHITE, WANDER, TIME = 0.4, 0.3, 5.0
-
-
-def test_whitened_products_are_those_of_the_covariance() -> None:
-    rng = np.random.default_rng(1)
-    time = np.cumsum(rng.uniform(0.1, 3.0, 60))
-    columns = rng.standard_normal((60, 4))
-    covariance = WANDER**2 * np.exp(-np.abs(time[:, None] - time) / TIME) + WHITE**2 * np.eye(60)
-    whitened = whiten(columns, time, WHITE, WANDER, TIME)
-    assert whitened.T @ whitened == pytest.approx(columns.T @ np.linalg.solve(covariance, columns), rel=1e-12)
 
 
 def test_twice_the_effect_leaves_four_times_the_signal() -> None:
