@@ -14,7 +14,6 @@ import ast
 import re
 import warnings
 from dataclasses import dataclass
-from functools import partial
 from itertools import accumulate
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -104,7 +103,6 @@ FUNCTIONS: dict[str, Function] = {
     "step": Function(1, _step, "(imu_real)imu_step({})"),
     "band": Function(3, _band, "(imu_real)imu_band({}, {}, {})"),
 }
-CONSTANTS = {"pi": np.pi}
 OPERATORS: dict[type[ast.operator], tuple[Callable[..., Any], str]] = {
     ast.Add: (np.add, "+"),
     ast.Sub: (np.subtract, "-"),
@@ -124,35 +122,11 @@ HINTS = {
     "<": "; use step(x) or band(x, low, high)",
     ">": "; use step(x) or band(x, low, high)",
 }
-REFUSED: dict[type[ast.AST], str] = {
-    ast.Attribute: "an attribute (a name after a dot)",
-    ast.Subscript: "an index",
-    ast.Constant: "a text",
-    ast.Compare: "a comparison",
-    ast.BoolOp: "a logical operation",
-    ast.IfExp: "a condition",
-    ast.Lambda: "a function of its own",
-    ast.Tuple: "a list of values",
-    ast.GeneratorExp: "a loop",
-    ast.Await: "a keyword of Python",
-    ast.Yield: "a keyword of Python",
-    ast.BinOp: "this operator",
-    ast.UnaryOp: "this operator",
-    ast.Starred: "a star before a value",
-}
 
 
 @dataclass(frozen=True)
 class Formula:
-    """A formula, ready to be evaluated.
-
-    Attributes
-    ----------
-    text : str
-        As it was written.
-    signals : frozenset of str
-        The signals in it.
-    """
+    """A formula as it was written, and the signals in it, ready to be evaluated."""
 
     text: str
     signals: frozenset[str]
@@ -173,13 +147,7 @@ class Formula:
 
 
 def parse(text: str, where: str | None = None) -> Formula:
-    """Read a formula.
-
-    Parameters
-    ----------
-    text : str
-    where : str, optional
-        File (and line) that the messages name.
+    """Read a formula; messages name ``where``, its file and line.
 
     Raises
     ------
@@ -224,25 +192,23 @@ class _Reader:
         if depth > DEEPEST or self.nodes > MOST_NODES:
             raise self._refused(node, "the formula is nested too deeply or has too many parts; use several terms")
         if isinstance(node, ast.Constant):
-            return self._number(self._value(node))
+            return _number(self._value(node))
         if isinstance(node, ast.Name):
             return self._name(node)
         if isinstance(node, ast.Call):
             return self._call(node, depth)
         if isinstance(node, ast.UnaryOp) and isinstance(node.op, (ast.USub, ast.UAdd)):
             inner, c = self.read(node.operand, depth + 1)
-            return (partial(_apply, np.negative, (inner,)), f"(-{c})") if isinstance(node.op, ast.USub) else (inner, c)
+            return (_applied(np.negative, inner), f"(-{c})") if isinstance(node.op, ast.USub) else (inner, c)
         if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow):
             return self._power(node, depth)
         if isinstance(node, ast.BinOp) and type(node.op) in OPERATORS:
             function, sign = OPERATORS[type(node.op)]
             (left, c_left), (right, c_right) = self.read(node.left, depth + 1), self.read(node.right, depth + 1)
             c = f"({c_left} {sign} {c_right})"
-            return partial(_apply, function, (left, right)), IN_C_ONCE.get(c, c)
-        raise self._refused(node, f"{REFUSED.get(type(node), 'this')} has no place in a formula")
-
-    def _number(self, value: float) -> tuple[Evaluate, str]:
-        return partial(_constant, np.float64(value)), c_number(value)
+            return _applied(function, left, right), IN_C_ONCE.get(c, c)
+        known = "numbers, signals, functions and + - * / **"
+        raise self._refused(node, f"{ast.unparse(node)!r:.40} has no place in a formula; it holds {known}")
 
     def _value(self, node: ast.Constant) -> float:
         if isinstance(node.value, bool) or not isinstance(node.value, (int, float)):
@@ -256,14 +222,15 @@ class _Reader:
         return value
 
     def _name(self, node: ast.Name) -> tuple[Evaluate, str]:
-        if node.id in CONSTANTS:
-            return self._number(CONSTANTS[node.id])
-        if node.id not in SIGNALS:
-            function = f"; {node.id} is a function: write {node.id}(...)" if node.id in FUNCTIONS else ""
+        name = node.id
+        if name == "pi":
+            return _number(np.pi)
+        if name not in SIGNALS:
+            function = f"; {name} is a function: write {name}(...)" if name in FUNCTIONS else ""
             known = f"signals: {', '.join(SIGNALS)}; functions: {', '.join(FUNCTIONS)}"
-            raise self._refused(node, f"no signal is called {node.id!r}{function}; {known}")
-        self.signals.add(node.id)
-        return partial(_signal, node.id), SIGNALS[node.id].c
+            raise self._refused(node, f"no signal is called {name!r}{function}; {known}")
+        self.signals.add(name)
+        return lambda signals: signals[name], SIGNALS[name].c
 
     def _call(self, node: ast.Call, depth: int) -> tuple[Evaluate, str]:
         name = node.func.id if isinstance(node.func, ast.Name) else None
@@ -277,16 +244,16 @@ class _Reader:
         values, in_c = zip(*(self.read(argument, depth + 1) for argument in node.args), strict=True)
         if name == "abs" and SIMPLE_IN_C.fullmatch(in_c[0]):
             c = "({0} < 0 ? -{0} : {0})"
-        return partial(_apply, function, values), c.format(*in_c)
+        return _applied(function, *values), c.format(*in_c)
 
     def _power(self, node: ast.BinOp, depth: int) -> tuple[Evaluate, str]:
         base, c_base = self.read(node.left, depth + 1)
         exponent = self._exponent(node.right)
         if exponent not in POWERS:
-            c = f"(imu_real)pow({c_base}, {c_number(exponent)})"
-            return partial(_apply, np.power, (base, partial(_constant, np.float64(exponent)))), c
+            power = _applied(np.power, base, _number(exponent)[0])
+            return power, f"(imu_real)pow({c_base}, {c_number(exponent)})"
         function, short, c = POWERS[exponent]
-        return partial(_apply, function, (base,)), (short if SIMPLE_IN_C.fullmatch(c_base) else c).format(c_base)
+        return _applied(function, base), (short if SIMPLE_IN_C.fullmatch(c_base) else c).format(c_base)
 
     def _exponent(self, node: ast.expr) -> float:
         sign, number = 1.0, node
@@ -305,17 +272,13 @@ def c_number(value: float) -> str:
     return f"(imu_real){float(value)!r}"
 
 
-def _constant(value: np.float64, signals: Signals) -> np.float64:
-    del signals
-    return value
+def _number(value: float) -> tuple[Evaluate, str]:
+    constant = np.float64(value)
+    return lambda _: constant, c_number(value)
 
 
-def _signal(name: str, signals: Signals) -> NDArray[np.float64]:
-    return signals[name]
-
-
-def _apply(function: Callable[..., Any], parts: tuple[Evaluate, ...], signals: Signals) -> Any:  # noqa: ANN401
-    return function(*(part(signals) for part in parts))
+def _applied(function: Callable[..., Any], *parts: Evaluate) -> Evaluate:
+    return lambda signals: function(*(part(signals) for part in parts))
 
 
 def _refusal(text: str, place: int, reason: str, where: str | None) -> ConfigurationError:
