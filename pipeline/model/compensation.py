@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from pipeline.model.measurement import Truths
     from pipeline.records import FittedEffect, Motion, SensorCalibration
 
-SMOOTHING_S = 3.0  # thirty samples of a thermometer that is read ten times a second
+SMOOTHING_S = 3.0  # 30 samples of a thermometer at 10 Hz; a package warms up in minutes
 BLOCK = 8192  # samples that are computed at once: their arrays stay in the processor's cache
 OF_THE_ROOM = {"time", "temperature"}  # fields of a motion that do not depend on the readings
 OF_THE_PAST = {"specific_force_rate", "angular_acceleration", "direction"}
@@ -51,14 +51,8 @@ class Compensated(NamedTuple):
 class Steps:
     """The effects of one sensor by what they depend on, for Python and for ``calibration.h``.
 
-    Attributes
-    ----------
-    steady : list of FittedEffect
-        Those that depend on the time and the temperature alone.
-    moving : list of FittedEffect
-        Those that depend on the truth.
-    fields : dict of str to set of str
-        Effect to the fields of a motion that it reads.
+    ``steady`` depend on the time and the temperature alone, ``moving`` on the truth; ``fields`` are those of a motion
+    that each of them reads.
     """
 
     steady: list[FittedEffect]
@@ -90,15 +84,9 @@ def circular(steps: Mapping[str, Steps]) -> set[str]:
 
 
 class CompensationStream:
-    """Compensation of one log, block by block.
+    """Compensation of one log, block by block, by the calibrations of the calibrated sensors.
 
-    Parameters
-    ----------
-    unit : str
-    calibrations : dict of str to SensorCalibration
-        Those of the sensors that are calibrated.
-    smoothing : float, s
-        Memory of the temperature's smoothing (``pipeline.model.exponential_regression``); 0: none.
+    ``smoothing``, s, is the memory of the temperature's smoothing (``pipeline.model.exponential_regression``); 0: none.
     """
 
     def __init__(self, unit: str, calibrations: dict[str, SensorCalibration], smoothing: float) -> None:
@@ -216,15 +204,7 @@ def _checked(given: dict[str, Any]) -> tuple[dict[str, NDArray[Any]], bool]:
 
 @dataclass(frozen=True)
 class Compensation:
-    """The calibration of a unit, ready to be applied to arrays.
-
-    Attributes
-    ----------
-    accelerometer, gyroscope : SensorCalibration or None
-        None where the unit's sensor is not calibrated: its readings pass through unchanged.
-    unit : str
-        Name of the unit.
-    """
+    """The calibration of a unit, ready to be applied to arrays; readings of a sensor without one pass unchanged."""
 
     accelerometer: SensorCalibration | None
     gyroscope: SensorCalibration | None

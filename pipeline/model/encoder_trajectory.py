@@ -38,10 +38,8 @@ class EncoderTrajectory:
 
     Parameters
     ----------
-    time : (n,) array, s
-        At least 6, increasing.
-    angle : (n,) array, deg
-    rate : (n,) array, deg/s
+    time, angle, rate : (n,) array, s, deg, deg/s
+        At least 6 samples.
 
     Attributes
     ----------
@@ -144,12 +142,7 @@ class EncoderTrajectory:
         """Return the rate (deg/s) that a first-order lag shows, and its derivative (deg/s^2), at any times.
 
         A stretch ``r + a x`` leaves ``r + a (x - lag) + (L - r + a lag) exp(-x / lag)`` of what was shown before, L.
-
-        Parameters
-        ----------
-        time : (n,) array, s
-        lag : float, s
-            Time constant, above 0.
+        The time constant ``lag``, s, is above 0.
         """
         through = np.zeros(len(self.time))
         gain = np.zeros(len(self.time))
@@ -199,14 +192,7 @@ class EncoderTrajectory:
 
 
 def nearest_slope(time: Values, values: Values) -> Values:
-    """Return the derivative at each sample of the quartic through it and its four neighbours: (n,) array.
-
-    Parameters
-    ----------
-    time : (n,) array, s
-        n at least 5.
-    values : (n,) array
-    """
+    """Return the derivative at each of n >= 5 samples of the quartic through it and its four neighbours: (n,) array."""
     n = len(time)
     window = np.clip(np.arange(n) - 2, 0, n - 5) + np.arange(5)[:, None]
     t, v = time[window] - time, values[window]

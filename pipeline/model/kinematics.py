@@ -158,13 +158,8 @@ def _turn(  # noqa: PLR0917  (the symbols of the module's equations)
 def level_at_zero(axis: int, up: str = "") -> NDArray[np.float64]:
     """Return the level axes in the body frame at table angle 0, as rows: (3, 3) array.
 
-    Parameters
-    ----------
-    axis : int
-        Of the turn.
-    up : str
-        Body axis, with its sign, that points up all the time, where the turn axis stands vertical; level x is then the
-        body axis after it in cyclic order.
+    Where the turn axis stands vertical, ``up`` is the body axis, with its sign, that points up all the time; level x is
+    then the body axis after it in cyclic order.
     """
     if not up:
         return np.asarray(LEVEL_AT_ZERO[axis])

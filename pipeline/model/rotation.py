@@ -11,19 +11,7 @@ if TYPE_CHECKING:
 
 
 def turn_about_axis(vector: NDArray[np.float64], axis: int, angle_deg: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Turn vectors about a coordinate axis by each of several angles (right-handed).
-
-    Parameters
-    ----------
-    vector : (..., 3) array
-    axis : int
-        0, 1, 2 for x, y, z.
-    angle_deg : (n,) array, deg
-
-    Returns
-    -------
-    (n, ..., 3) array
-    """
+    """Turn (..., 3) vectors about coordinate axis 0, 1 or 2 by each of n angles (right-handed): (n, ..., 3) array."""
     j, k = (axis + 1) % 3, (axis + 2) % 3
     angle = np.radians(angle_deg).reshape(-1, *[1] * (vector.ndim - 1))
     c, s = np.cos(angle), np.sin(angle)

@@ -20,21 +20,9 @@ if TYPE_CHECKING:
 def allan_deviation(
     values: NDArray[np.float64], interval: float, points_per_decade: int = 10
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the overlapping Allan deviation.
+    """Return averaging times, s, and the overlapping Allan deviation of (n,) or (n, k) readings, evenly sampled.
 
-    Parameters
-    ----------
-    values : (n,) or (n, k) array
-        Readings at rest, evenly sampled.
-    interval : float, s
-    points_per_decade : int
-        Averaging times per decade.
-
-    Returns
-    -------
-    tau : (m,) array, s
-    deviation : (m,) or (m, k) array, unit of the values
-        Both empty where there are fewer than 3 values.
+    (m,) and (m,) or (m, k) arrays; both empty where there are fewer than 3 readings.
     """
     n = len(values)
     longest = (n - 1) // 2

@@ -29,9 +29,9 @@ if TYPE_CHECKING:
 
     Values = NDArray[np.float64]
 
-DEGREE = 2
+DEGREE = 2  # of the parabola
 SIGNIFICANT = 4.0  # standard deviations: of the two components, noise alone passes it in 3e-4
-FEWEST = 8  # samples from which a rest tells a slope beside its noise
+FEWEST = 8  # samples from which a slope has five degrees of freedom
 
 
 @dataclass(frozen=True)
@@ -41,19 +41,15 @@ class Creep:
     Attributes
     ----------
     rate : (3,) array, deg/s
-        omega across gravity, in the axes of the readings; zero where it does not stand out of the noise.
+        omega across gravity, in the axes of the readings; zero where it is not significant.
     measured : (3,) array, deg/s
-        The same, also where it may be noise.
-    uncertainty : float, deg/s
-        Standard uncertainty of each of its two components.
+        The same, also where it may be noise; ``uncertainty`` is the standard one of each of its two components.
     shortening : float
         By which share the mean of the readings is too short; 0 where the rate is zero.
-    squares : (3,) array
-        Sum of squares of the readings about their parabola.
-    freedom : int
-        Its degrees of freedom, an axis.
+    squares, freedom : (3,) array, int
+        Sum of squares of the readings about their parabola, and its degrees of freedom, an axis.
     bend : float, rad
-        How far the direction strays from a straight line, at most.
+        Largest departure of the direction from a straight line.
     """
 
     rate: Values
@@ -83,7 +79,7 @@ def believed_rates(creeps: Sequence[Creep]) -> tuple[Values, Values, float]:
     about : float, deg/s
         c.
     """
-    w, e = np.array([creep.measured for creep in creeps]).reshape(-1, 3), np.array([c.uncertainty for c in creeps])
+    w, e = np.array([c.measured for c in creeps]).reshape(-1, 3), np.array([c.uncertainty for c in creeps])
     known = e > 0.0
     half = 0.5 * np.sum(w**2, axis=1)
     if not known.any() or np.mean(half[known] / e[known] ** 2) <= 1.0 + SIGNIFICANT / np.sqrt(known.sum()):
@@ -103,10 +99,15 @@ def along_gravity(time: Values, force: Values) -> tuple[Values, bool]:
     along = force @ (mean / np.linalg.norm(mean))
     creeps = bool(creep_of(time, force).rate.any())
     if creeps:
-        x = 2.0 * (time - time[0]) / (time[-1] - time[0]) - 1.0
-        basis, _ = np.linalg.qr(np.polynomial.legendre.legvander(x, DEGREE))
-        along = along - basis[:, 1:] @ (basis[:, 1:].T @ along)
+        basis = _parabolas(time)[:, 1:]
+        along = along - basis @ (basis.T @ along)
     return along, creeps
+
+
+def _parabolas(time: Values) -> Values:
+    """Return an orthonormal basis of the parabolas in time: (n, 3) array, the constant first."""
+    x = 2.0 * (time - time[0]) / (time[-1] - time[0]) - 1.0
+    return np.linalg.qr(np.polynomial.legendre.legvander(x, DEGREE))[0]
 
 
 def creep_in(recording: Recording, start: int, stop: int) -> Creep:
@@ -124,15 +125,9 @@ def creep_in(recording: Recording, start: int, stop: int) -> Creep:
 
 
 def creep_of(time: Values, force: Values, share: float = 0.0) -> Creep:
-    """Return how a unit tilts within a rest.
+    """Return how a unit tilts within a rest of n readings of the accelerometer, g.
 
-    Parameters
-    ----------
-    time : (n,) array, s
-    force : (n, 3) array, g
-        Readings of the accelerometer.
-    share : float
-        Variance of their mean by white noise over that of one; 0 stands for 1/n.
+    ``share`` is the variance of their mean by white noise over that of one; 0 stands for 1/n.
     """
     n = len(time)
     mean = force.mean(axis=0) if n else np.zeros(3)
@@ -140,15 +135,12 @@ def creep_of(time: Values, force: Values, share: float = 0.0) -> Creep:
     if n < FEWEST or length == 0.0 or time[-1] <= time[0]:
         return Creep(np.zeros(3), np.zeros(3), 0.0, 0.0, np.sum((force - mean) ** 2, axis=0), max(n - 1, 0), 0.0)
     u, span = mean / length, float(time[-1] - time[0])
-    x = 2.0 * (time - time[0]) / span - 1.0
-    basis, _ = np.linalg.qr(np.polynomial.legendre.legvander(x, DEGREE))
+    basis = _parabolas(time)
     along = basis.T @ force
     squares = np.sum((force - basis @ along) ** 2, axis=0)
     freedom = n - DEGREE - 1
-    path = basis[:, 1:] @ along[1:]
-    path -= np.outer(path @ u, u)  # what is left turns gravity
-    line = basis[:, 1:2] @ along[1:2]
-    line -= np.outer(line @ u, u)
+    across = along - np.outer(along @ u, u)  # what turns gravity
+    path, line = basis[:, 1:] @ across[1:], basis[:, 1:2] @ across[1:2]
     white = float(np.sqrt(squares.sum() / (3 * freedom)))
     error = white * np.sqrt(12.0 * max(share, 1.0 / n)) / span
     slope = (line[-1] - line[0]) / span

@@ -34,14 +34,14 @@ if TYPE_CHECKING:
     Values = NDArray[np.float64]
     Spans = list[tuple[int, int]]
 
-WINDOW_S, FEWEST = 0.2, 3
-SIGNIFICANT = 6.0
-NEIGHBOURS = 5
+WINDOW_S, FEWEST = 0.2, 3  # shorter than a move; samples that have a variance
+SIGNIFICANT = 6.0  # q above
+NEIGHBOURS = 5  # stretches: their median withstands two that turned
 RATE_LIMIT_DPS = 0.7  # of a stretch against those around it: hand-held rests differ by g-sensitivity and creep
 # Of a window's mean, however much the stretch trembles. The rests of a published MPU-6050 recording in a hand reach 1.7
 # but for the ends of moves; its moves reach 60 (see tests/signal/test_rests.py).
 TREMOR_LIMIT_DPS = 2.5
-SAME_DEG = 2.0
+SAME_DEG = 2.0  # the limit of a rest in ``pipeline.signal.rests``
 NORMAL = 1.4826  # standard deviation over median absolute deviation of a normal distribution
 
 
@@ -110,11 +110,10 @@ def _references(medians: Values) -> tuple[Values, NDArray[np.bool_]]:
 
 def _widened(turns: NDArray[np.bool_], half: int, samples: int) -> NDArray[np.bool_]:
     """Return which samples lie within half a window of the middle of a window in which the unit turns."""
-    reach = np.zeros(samples + 1, np.intp)
-    middle = np.flatnonzero(turns) + half
-    np.add.at(reach, np.maximum(middle - half, 0), 1)
-    np.add.at(reach, np.minimum(middle + half + 1, samples), -1)
-    return np.asarray(np.cumsum(reach[:-1]) > 0)
+    near = np.zeros(samples, bool)
+    for start in np.flatnonzero(turns):
+        near[start : start + 2 * half + 1] = True
+    return near
 
 
 def _rests(quiet: NDArray[np.bool_], turned: Values, shortest: int) -> Spans:

@@ -39,13 +39,13 @@ if TYPE_CHECKING:
 
 FEWEST_STOPS = 4  # attitudes about one axis that determine a bias and a row of the matrix
 BESIDE_S, BESIDE_FREE_S = 30.0, 1.0  # of rest that a segment takes with it
-SHORTEST_STATIC_S, SHORTEST_FREE_S = 60.0, 10.0  # shorter ones say nothing of the noise, of the held-out error
+SHORTEST_STATIC_S, SHORTEST_FREE_S = 60.0, 10.0  # shorter rests determine no bias wander, shorter motion no mean error
 SLOWER = 1.2  # rates that differ by less are one rate
 FEWEST_OF_A_SPLINE = 6  # samples of a quintic
 AGREES = 0.05  # of the mean rate: a gimbal alone differs from the attitude's rate by far more
 SHORT_NAMES = {"accelerometer": "accel", "gyroscope": "gyro", "validation": "validation", "static": "static"}
 ONE_AXIS = 0.8  # share of the energy of a turn about a body axis that is misaligned by 27 deg
-ENCODER_AGREES_DEG, ENCODER_AGREES = 5.0, 0.1  # a sample of a fast turn, and a coarse log of the rate
+ENCODER_AGREES_DEG, ENCODER_AGREES = 5.0, 0.1  # one sample of 50 ms at 100 deg/s; a coarse log of the rate
 HALF_A_TURN_DEG = 180.0
 HANDLED_DPS, NEAR_A_MOVE_S = 3.0, 0.5  # above bias and vibration of a resting unit; the logs' clocks may be off
 

@@ -28,27 +28,18 @@ if TYPE_CHECKING:
 
     from pipeline.records import Recording
 
-BLOCK = 256
-NARROWEST_S = 0.5
-ROUNDING = 1e-12
+BLOCK = 256  # cells at once: their kernels stay in the processor's cache
+NARROWEST_S = 0.5  # below the thermal time constant of a package, which is seconds
+ROUNDING = 1e-12  # relative: some thousand roundings of a double
 DISTINCT, AT_ENDS = 6.0, 5.0  # standard deviations; by how much the variance is larger at the ends of a file
 
 
 def smooth_temperature(
     time: NDArray[np.float64], temperature: NDArray[np.float64], bandwidth: float = 10.0
 ) -> NDArray[np.float64]:
-    """Smooth a temperature log.
+    """Return a smoothed temperature log: (n,) array, degC; ``time`` increases.
 
-    Parameters
-    ----------
-    time : (n,) array, s, increasing
-    temperature : (n,) array, degC
-    bandwidth : float, s
-        Largest standard deviation of the kernel; 10 s averages over about 30 s.
-
-    Returns
-    -------
-    (n,) array, degC
+    ``bandwidth``, s, is the largest standard deviation of the kernel; 10 s averages over about 30 s.
     """
     if len(time) < 3 or time[-1] == time[0]:
         return _local_line(time, temperature, bandwidth)

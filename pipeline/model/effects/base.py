@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.records import SENSORS, Motion
+from pipeline.records import SENSOR_UNITS, SENSORS, Motion
 from pipeline.signal.rests import RATE_AT_REST_DPS
 
 if TYPE_CHECKING:
@@ -62,52 +62,24 @@ class Parameter:
 
 
 class Effect(abc.ABC):
-    """A physical effect on the readings of a sensor.
-
-    Attributes
-    ----------
-    needs : tuple of str
-        What the recording must hold in addition to a motion: ``temperature``, ``angle``, ``rate``, ``level``.
-    needs_clock : bool
-        Whether the time between the recordings must be known.
-    needs_motion : bool
-        Whether it adds nothing while the body rests.
-    needs_both_directions : bool
-        Whether turns in one direction show it as a part of bias and matrix.
-    nonlinear : tuple of str
-        Parameters in which the reading is not linear.
-    contains : tuple of str
-        Effects of which this is a generalisation; the two are never fitted together.
-    unseen : mapping of str to str
-        Sensor to the reason why the effect never changes its readings.
-    meaning : str
-        One sentence for the reader of a report.
-    excitation : str
-        What a recording must do for this effect to show, as advice to the user.
-    experiment : str
-        What separates it from its look-alikes, as advice to the user.
-    source : str
-        Where the equation comes from.
-    definition : dict or None
-        Of an effect of the user's own, what it was made from; it goes with every calibration that has the effect.
-    """
+    """A physical effect on the readings of a sensor."""
 
     name: str
     owner: Owner
     layout: Layout
-    sensors: tuple[str, ...] = SENSORS
-    needs: tuple[str, ...] = ()
-    needs_clock: bool = False
-    needs_motion: bool = False
-    needs_both_directions: bool = False
-    nonlinear: tuple[str, ...] = ()
-    contains: tuple[str, ...] = ()
-    unseen: Mapping[str, str] = MappingProxyType({})
-    meaning: str
-    excitation: str
-    experiment: str
-    source: str
-    definition: dict[str, Any] | None = None
+    sensors: tuple[str, ...] = SENSORS  # to which it applies
+    needs: tuple[str, ...] = ()  # fields that the motion must hold: temperature, angle, rate, level
+    needs_clock: bool = False  # the time between the recordings must be known
+    needs_motion: bool = False  # it adds nothing while the body rests
+    needs_both_directions: bool = False  # turns in one direction show it as a part of bias and matrix
+    nonlinear: tuple[str, ...] = ()  # parameters in which the reading is not linear
+    contains: tuple[str, ...] = ()  # effects of which this is a generalisation; the two are never fitted together
+    unseen: Mapping[str, str] = MappingProxyType({})  # sensor to the reason why its readings never change
+    meaning: str  # one sentence for the reader of a report
+    excitation: str  # advice: what a recording must do for this effect to show
+    experiment: str  # advice: what separates it from its look-alikes
+    source: str  # of the equation
+    definition: dict[str, Any] | None = None  # of a user's effect, its file; every calibration with the effect holds it
 
     @abc.abstractmethod
     def parameters(self, sensor: str) -> tuple[Parameter, ...]:
@@ -115,13 +87,7 @@ class Effect(abc.ABC):
 
     @abc.abstractmethod
     def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
-        """Return the derivatives of the reading in the shape that ``layout`` says.
-
-        Parameters
-        ----------
-        K : (3, 3) array
-            Inverse of the calibration matrix.
-        """
+        """Return the derivatives of the reading in the shape of ``layout``; K is the inverse of the matrix."""
 
     def columns(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
         """Return the derivative of the reading with respect to each parameter, at ``values``: (n, 3, p) array."""
@@ -256,10 +222,7 @@ def per_axis(regressors: Values) -> Values:
 
 
 def every_axis(regressors: Values) -> Values:
-    """Spread (n, q) regressors that act on each axis with coefficients of its own to (n, 3, 3 q) columns.
-
-    Parameter order: all of x, then y, then z, so that ``values.reshape(3, q) @ regressors[i]`` is what is added.
-    """
+    """Spread (n, q) regressors, q coefficients an axis, to (n, 3, 3 q) columns; order as of ``per_axis``."""
     return per_axis(np.broadcast_to(regressors[:, None, :], (len(regressors), 3, regressors.shape[1])))
 
 
@@ -270,7 +233,7 @@ def axis_parameters(symbol: str, unit: str, meaning: str) -> tuple[Parameter, ..
 
 def unit_of(sensor: str) -> str:
     """Return the unit of a sensor's readings."""
-    return "g" if sensor == "accelerometer" else "deg/s"
+    return SENSOR_UNITS[sensor]
 
 
 def parameter_limits(effect: Effect, sensor: str, limits: Mapping[str, float]) -> Values:

@@ -39,22 +39,12 @@ MOST_TERMS, LONGEST_TEXT, LONGEST_UNIT = 12, 500, 30  # above every shipped effe
 
 @dataclass(frozen=True)
 class Term:
-    """A coefficient for each axis or for all: unit, meaning and formulas.
+    """A term of an effect: its formulas, and a coefficient for each axis or for all."""
 
-    Attributes
-    ----------
-    unit : str or dict of str to str
-        For both sensors, or by sensor.
-    formulas : dict of str to Formula
-        By axis; ``""``: of every axis. Empty for a parameter of an effect in Python.
-    shared : bool
-        The formulas are a vector with one coefficient.
-    """
-
-    unit: str | dict[str, str]
+    unit: str | dict[str, str]  # of the coefficient, for both sensors or by sensor
     meaning: str = ""
-    formulas: dict[str, Formula] = field(default_factory=dict)
-    shared: bool = False
+    formulas: dict[str, Formula] = field(default_factory=dict)  # by axis, "" every axis; none: of an effect in Python
+    shared: bool = False  # the formulas are a vector with one coefficient
 
     @property
     def signals(self) -> frozenset[str]:
