@@ -24,12 +24,12 @@ import yaml
 from jinja2 import Environment, StrictUndefined, Template
 
 from pipeline.exports.c_effects import plan_of
-from pipeline.exports.sensors import FUNCTIONS, ExportedSensor, before_use, final_errors, missing, plain
+from pipeline.exports.sensors import FUNCTIONS, ExportedSensor, before_use, final_errors, plain
 from pipeline.files import write_atomically
 from pipeline.records import SENSORS, SensorCalibration
 
+JSON = dict[str, Any]
 TEMPLATES = Path(__file__).parent / "templates"
-Matrix = Literal["full", "diagonal", "none"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,10 +42,8 @@ class Format:
         Who reads the file, how it corrects a reading, and where that is documented.
     units : dict
         Sensor to the unit of readings: g or m/s^2, deg/s or rad/s. A sensor without a unit is not in the format.
-    needs : list of str
-        Sensors that must be calibrated; without them no file is written.
-    needs_counts : list of str
-        Sensors whose counts per unit must be known.
+    needs, needs_counts : list of str
+        Sensors that must be calibrated, and whose counts per unit must be known; without them no file is written.
     matrix : dict
         Sensor to what the format holds of its matrix; ``full`` by default.
     holds : list of str
@@ -63,13 +61,13 @@ class Format:
     consumer: str
     equation: str
     source: str
+    says: list[str]
     units: dict[str, Literal["g", "m/s^2", "deg/s", "rad/s"]]
     needs: list[str] = field(default_factory=list)
     needs_counts: list[str] = field(default_factory=list)
-    matrix: dict[str, Matrix] = field(default_factory=dict)
+    matrix: dict[str, Literal["full", "diagonal", "none"]] = field(default_factory=dict)
     holds: list[str] = field(default_factory=list)
     approximates: dict[str, str] = field(default_factory=dict)
-    says: list[str]
     adds: list[str] = field(default_factory=list)
     adds_with_temperature: list[str] = field(default_factory=list)
     errors: str | None = None
@@ -96,10 +94,8 @@ def formats() -> dict[str, tuple[Format, Template]]:
     return found
 
 
-def export_all(
-    calibration: dict[str, Any], settings: dict[str, Any], folder: Path, validation: dict[str, Any] | None = None
-) -> list[Path]:
-    """Write a calibration in every format.
+def export_all(calibration: JSON, settings: JSON, folder: Path, validation: JSON | None = None) -> list[Path]:
+    """Write a calibration in every format; return what was written.
 
     Parameters
     ----------
@@ -111,11 +107,6 @@ def export_all(
         Made if need be.
     validation : dict, optional
         ``validations/<unit>.json``.
-
-    Returns
-    -------
-    list of Path
-        What was written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     written = []
@@ -126,30 +117,18 @@ def export_all(
     return written
 
 
-def export(
-    name: str, calibration: dict[str, Any], settings: dict[str, Any], validation: dict[str, Any] | None = None
-) -> dict[str, str]:
+def export(name: str, calibration: JSON, settings: JSON, validation: JSON | None = None) -> dict[str, str]:
     """Return the files of one format, by name: none where it can hold nothing of this unit."""
     declared, template = formats()[name]
-    if declared.files:
-        parts = {file: replace(declared, **_alone(declared, s)) for s, file in declared.files.items()}
-    else:
-        parts = {name: declared}
+    parts = {
+        file: replace(declared, units={s: declared.units[s]}, needs=[s]) for s, file in declared.files.items()
+    } or {name: declared}
     texts = {file: _rendered(part, template, calibration, settings, validation) for file, part in parts.items()}
     return {file: text for file, text in texts.items() if text is not None}
 
 
-def _alone(declared: Format, sensor: str) -> dict[str, Any]:
-    """Return what changes in the declaration of a format with a file for each sensor."""
-    return {"units": {sensor: declared.units[sensor]}, "needs": [sensor]}
-
-
 def _rendered(
-    declared: Format,
-    template: Template,
-    document: dict[str, Any],
-    settings: dict[str, Any],
-    validation: dict[str, Any] | None,
+    declared: Format, template: Template, document: JSON, settings: JSON, validation: JSON | None
 ) -> str | None:
     """Return the text of a file, None where a sensor or its counts are missing."""
     sheets = settings.get("sensor") or {}
@@ -158,9 +137,8 @@ def _rendered(
         for s in SENSORS
         if s in declared.units and document.get(s)
     }
-    if not set(declared.needs) <= set(sensors):
-        return None
-    if any(not sensors[s].counts for s in declared.needs_counts if s in sensors):
+    without_counts = [s for s in declared.needs_counts if s in sensors and not sensors[s].counts]
+    if without_counts or not set(declared.needs) <= set(sensors):
         return None
     return template.render(
         **{s: sensors.get(s) for s in SENSORS},
@@ -173,23 +151,16 @@ def _rendered(
 
 
 def _remarks(
-    declared: Format,
-    sensors: dict[str, ExportedSensor],
-    document: dict[str, Any],
-    validation: dict[str, Any] | None,
+    declared: Format, sensors: dict[str, ExportedSensor], document: JSON, validation: JSON | None
 ) -> list[str]:
     """Return what a reader of the file must know, a sentence or a line each."""
     counts = {s: sensor.counts for s, sensor in sensors.items()}
-    known = {
-        "unit": document["unit"],
-        "sensor": document["sensor"],
-        "counts": counts,
-        "sensors": list(sensors.values()),
-    }
-    says = [line.format(**known) for line in declared.says]
-    lines = says + (before_use(document) if declared.units else [])
-    both = len(declared.units) == len(SENSORS)
-    lines += [f"Left out: {line}." for line in missing(document) if both]
+    known = {"unit": document["unit"], "sensor": document["sensor"], "counts": counts, "sensors": [*sensors.values()]}
+    lines = [line.format(**known) for line in declared.says] + (before_use(document) if declared.units else [])
+    if len(declared.units) == len(SENSORS):
+        reasons = document.get("not_calibrated") or {}
+        absent = [s for s in SENSORS if not document.get(s)]
+        lines += [f"Left out: the {s} is not calibrated: {reasons.get(s, 'no reason given')}." for s in absent]
     carried = [*declared.holds, *declared.approximates]
     for s, sensor in sensors.items():
         lost = [] if "any" in declared.holds else [name for name in sensor.effects if name not in carried]

@@ -32,18 +32,8 @@ ORDER = 4  # coefficients of a polynomial of third order in the temperature
 class ExportedSensor:
     """A calibrated sensor in the unit of a format.
 
-    Parameters
-    ----------
-    calibration : SensorCalibration
-    unit : str
-        g, m/s^2, deg/s or rad/s.
-    sheet : dict
-        The sensor's configuration.
-
     Attributes
     ----------
-    bias : (3,) array
-    matrix, K : (3, 3) array
     effects : dict of str to array
         Values of the effects that belong to the sensor itself.
     bench_effects : list of str
@@ -102,15 +92,11 @@ class ExportedSensor:
     @property
     def bias_polynomial(self) -> Values:
         """The bias, and how it changes per degC and per degC^2 from 25 degC: (3, 3) array, a row an axis."""
-        return np.asarray(self._bias_polynomial * self.factor)
-
-    @property
-    def _bias_polynomial(self) -> Values:
         found = np.zeros((3, 3))
         found[:, 0] = self.calibration.bias
         found[:, 1] += self.effects.get("bias_temperature", np.zeros(3))
         found[:, 1:] += self.effects.get("bias_temperature_quadratic", np.zeros(6)).reshape(3, 2)
-        return found
+        return found * self.factor
 
     @property
     def g_sensitivity(self) -> Values:
@@ -132,23 +118,22 @@ class ExportedSensor:
         powers = [M]
         while len(powers) < ORDER:
             powers.append(-powers[-1] @ D @ M)
-        offset = self._bias_polynomial
+        offset = self.bias_polynomial
         added = np.zeros((3, ORDER))
         for i, power in enumerate(powers):
             for j in range(min(3, ORDER - i)):
                 added[:, i + j] -= power @ offset[:, j]
-        return _of_temperature(np.stack(powers, axis=2)), _of_temperature(added) * self.factor
+        return _of_temperature(np.stack(powers, axis=2)), _of_temperature(added)
 
     def left_by_matrix(self, held: str) -> list[str]:
         """Return a sentence on the error that a format leaves which holds the diagonal of the matrix, or none of it."""
         if held == "full":
             return []
-        error = self.scale_error if held == "diagonal" else self.bias_error
-        what = "Cross-axis terms" if held == "diagonal" else "The matrix"
+        error, what = self.bias_error, f"The matrix of the {self.name} is"
+        if held == "diagonal":
+            error, what = self.scale_error, f"Cross-axis terms of the {self.name} are"
         left = f"{error:.2g} g at 1 g" if self.name == "accelerometer" else f"{100 * error:.2g} % of the rate"
-        return [
-            f"{what} of the {self.name} {'are' if held == 'diagonal' else 'is'} left out: that leaves about {left}."
-        ]
+        return [f"{what} left out: that leaves about {left}."]
 
 
 def _of_temperature(coefficients: Values) -> Values:
@@ -156,12 +141,6 @@ def _of_temperature(coefficients: Values) -> Values:
     orders = range(ORDER)
     change = [[comb(k, j) * (-REFERENCE_TEMPERATURE) ** (k - j) if j <= k else 0.0 for j in orders] for k in orders]
     return np.asarray(coefficients @ np.array(change), np.float64)
-
-
-def missing(document: dict[str, Any]) -> list[str]:
-    """Return a sentence for each sensor that was not calibrated."""
-    reasons = document.get("not_calibrated") or {}
-    return [f"the {s} is not calibrated: {reasons.get(s, 'no reason given')}" for s in SENSORS if not document.get(s)]
 
 
 def before_use(document: dict[str, Any]) -> list[str]:
@@ -178,13 +157,12 @@ def before_use(document: dict[str, Any]) -> list[str]:
 
 def final_errors(validation: dict[str, Any] | None, sensor: str) -> list[str]:
     """Return a sentence on the held-out error of a sensor with and without each effect."""
-    found = (validation or {}).get(sensor) or {}
-    steps = [s for s in found.get("steps") or [] if s["name"] == "calibrated" or s["name"].startswith("+ ")]
-    errors = ["unknown" if s["rms_error"] is None else f"{s['rms_error']:.4g} {found['unit']}" for s in steps]
-    return [
-        f"held-out rms error of the {sensor}, {step['name']}: {error}"
-        for step, error in zip(steps, errors, strict=True)
-    ]
+    found, lines = (validation or {}).get(sensor) or {}, []
+    for step in found.get("steps") or []:
+        if step["name"] == "calibrated" or step["name"].startswith("+ "):
+            error = "unknown" if step["rms_error"] is None else f"{step['rms_error']:.4g} {found['unit']}"
+            lines.append(f"held-out rms error of the {sensor}, {step['name']}: {error}")
+    return lines
 
 
 def lower_times_rotation(K: Values) -> tuple[Values, Values]:
