@@ -1,19 +1,18 @@
 """Search for the functional form of physics that the catalogue of effects does not hold.
 
 Where the residual depends on a covariate (``pipeline.diagnosis.residual_dependence``), each simple form in it is scored
-as an effect would be, beside base, configured and selected effects, on the axes that it improves:
+as an effect would be, beside base, configured and selected effects, on the a axes that it improves:
 
-    delta BIC = 2 (max log L' - max log L) - (r a + s) log N
+    delta BIC = 2 (max log L' - max log L) - (r a + s) log N,    r coefficients, s scanned parameters, N readings
 
-with r coefficients on each of a axes, s scanned parameters and N readings. The best form is published in words and as
-the definition of an effect, to be named, tried and confirmed by the user. A covariate on which the residual no longer
-depends beside the best form of another is marked as explained by it. Where slow effects were selected, a step or
+The best form is published in words and as the definition of an effect. Where slow effects were selected, a step or
 exponential of the temperature is tried in their place, and replaces them if it explains far more.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import chain, count
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -60,11 +59,8 @@ class FittedForm:
 def unexplained(selection: Selection) -> list[dict[str, Any]]:
     """Return the covariates on which the residual still depends, each with its form, the best first.
 
-    Returns
-    -------
-    list of dict
-        ``covariate, p_value, shape`` (words), ``axes, formulas, coefficients`` (of each axis), ``size, unit,
-        delta_bic, explained_by`` (another covariate whose form explains it too, or None) and ``kind``.
+    Entries hold ``covariate, p_value, shape`` (words), ``axes, formulas, coefficients`` (of each axis), ``size, unit,
+    delta_bic, explained_by`` (another covariate whose form explains it too, or None) and ``kind``.
     """
     found = dict(dependences(selection))
     sensor = selection.observations.sensor
@@ -80,7 +76,7 @@ def unexplained(selection: Selection) -> list[dict[str, Any]]:
         {
             "covariate": each.covariate,
             "p_value": found[each.covariate],
-            "shape": forms.in_words(each.form, each.sizes, each.gain.axes, sensor),
+            "shape": forms.described(each.form, each.sizes, each.gain.axes, sensor),
             "kind": each.form.kind,
             "axes": ["xyz"[c] for c in each.gain.axes],
             "formulas": list(each.form.formulas),
@@ -138,31 +134,26 @@ def _best_harmonics(selection: Selection, factor: str) -> FittedForm:
     tried = forms.harmonics(factor)
     projected = _projected(selection, [text for form in tried for text in form.formulas])
     chosen: list[int] = []
-    gain: Gain | None = None
+    best, index = _gain_of_harmonics(projected, [])
     while len(chosen) < MOST_HARMONICS:
         options = [[*chosen, n] for n in range(len(tried)) if n not in chosen]
         gains = [_gain_of_harmonics(projected, option) for option in options]
-        best = int(np.argmax([g.delta_bic for g in gains]))
-        if gain is not None and gains[best].delta_bic < gain.delta_bic + CLEARLY:
+        k = int(np.argmax([gain.delta_bic for gain, _ in gains]))
+        if chosen and gains[k][0].delta_bic < best.delta_bic + CLEARLY:
             break
-        chosen, gain = options[best], gains[best]
-    assert gain is not None  # noqa: S101
-    formulas = tuple(text for n in chosen for text in tried[n].formulas)
-    form = replace(tried[0], formulas=formulas, figures={"cycles": [tried[n].figures["cycles"][0] for n in chosen]})
-    found = _on_axes(projected.coefficients(_columns_of_harmonics(chosen), gain.setting), gain)
+        chosen, (best, index) = options[k], gains[k]
+    found = _on_axes(projected.coefficients(index, best.setting), best)
     amplitude = np.sqrt(np.sum(found.reshape(3, -1, 2) ** 2, axis=2)).max(axis=1)
-    return FittedForm("angle", form, gain, found, amplitude)
+    return FittedForm("angle", forms.harmonic(factor, [forms.CYCLES[n] for n in chosen]), best, found, amplitude)
 
 
-def _columns_of_harmonics(chosen: Sequence[int]) -> list[int]:
-    return [k for n in chosen for k in (2 * n, 2 * n + 1)]
-
-
-def _gain_of_harmonics(projected: ProjectedCurves, chosen: Sequence[int]) -> Gain:
-    index = projected.independent(_columns_of_harmonics(chosen))
-    if len(index) < 2 * len(chosen):
-        return replace(projected.gain(np.zeros_like(projected.left), 1), delta_bic=-np.inf)
-    return projected.gain(projected.drop(index)[:, :, -1], len(index), len(chosen))
+def _gain_of_harmonics(projected: ProjectedCurves, chosen: Sequence[int]) -> tuple[Gain, list[int]]:
+    """Return what some harmonics gain, nothing where one is held already, and their columns."""
+    columns = [k for n in chosen for k in (2 * n, 2 * n + 1)]
+    index = projected.independent(columns)
+    if not chosen or len(index) < len(columns):
+        return replace(projected.gain(np.zeros_like(projected.left), 1), delta_bic=-np.inf), columns
+    return projected.gain(projected.drop(index)[:, :, -1], len(index), len(chosen)), columns
 
 
 def _best_polynomial(selection: Selection, covariate: str, signal: str) -> FittedForm:
@@ -178,7 +169,7 @@ def _best_polynomial(selection: Selection, covariate: str, signal: str) -> Fitte
     index = kept[: best + 1]
     found = _on_axes(projected.coefficients(index, gains[best].setting), gains[best])
     formulas = tuple(texts[k] for k in index)
-    form = forms.Form("polynomial", signal, formulas, 0, {"order": (index[-1] + 1) if index else 0})
+    form = forms.polynomial(signal, formulas, (index[-1] + 1) if index else 0)
     return FittedForm(covariate, form, gains[best], found, _change(selection, formulas, found))
 
 
@@ -238,31 +229,23 @@ def _change(selection: Selection, formulas: Sequence[str], coefficients: Values)
     columns = forms.columns_of(formulas, selection.observations.sensor)
     values = np.concatenate([columns(part.motion) for part in selection.observations.parts])
     each = values if values.ndim == 3 else values[:, None, :]
-    change: Values = np.ptp(
-        np.einsum("ncr,cr->nc", np.broadcast_to(each, (len(each), 3, each.shape[2])), coefficients), axis=0
-    )
+    on_each_axis = np.broadcast_to(each, (len(each), 3, each.shape[2]))
+    change: Values = np.ptp(np.einsum("ncr,cr->nc", on_each_axis, coefficients), axis=0)
     return change
 
 
 def suggested_effect(
     unknown: Sequence[Mapping[str, Any]], sensor: str, taken: Collection[str] = ()
 ) -> dict[str, Any] | None:
-    """Return the definition of an effect with the best form, as a file in ``effects/`` holds it; None without one.
+    """Return the definition of an effect with the best form of what ``unexplained`` returned; None without one.
 
-    Parameters
-    ----------
-    unknown : sequence of mapping
-        What ``unexplained`` returned.
-    taken : collection of str
-        Names of existing effects.
+    Its name is none of those that are ``taken``.
     """
     if not unknown:
         return None
     entry = unknown[0]
-    name = f"unknown_{entry['covariate']}"
-    number = 2
-    while name in taken:
-        name, number = f"unknown_{entry['covariate']}_{number}", number + 1
+    plain = f"unknown_{entry['covariate']}"
+    name = next(n for n in chain([plain], (f"{plain}_{k}" for k in count(2))) if n not in taken)
     terms = dict(zip("ABCDEFGHIJ", entry["formulas"], strict=False))
     return {
         "name": name,
@@ -276,13 +259,7 @@ def suggested_effect(
 
 
 def effect_file(definition: Mapping[str, Any], unit: str) -> str:
-    """Return the text of an effect file, ready to be copied into a campaign's ``effects/``.
-
-    Parameters
-    ----------
-    unit : str
-        The unit that showed it.
-    """
+    """Return the text of an effect file, ready to be copied into a campaign's ``effects/``; a unit showed it."""
     import yaml  # noqa: PLC0415  (only a unit with unknown physics pays for it)
 
     name, sensor = definition["name"], definition["sensors"][0]
@@ -291,8 +268,7 @@ def effect_file(definition: Mapping[str, Any], unit: str) -> str:
         f"# To try it, copy this file to effects/{name}.yaml in the campaign's directory and add {name} to\n"
         f"# effects.{sensor}. To rename it, change the file's name and the one below together.\n"
     )
-    content = {key: list(value) if isinstance(value, tuple) else value for key, value in definition.items()}
-    return remarks + str(yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=110))
+    return remarks + str(yaml.safe_dump(dict(definition), sort_keys=False, allow_unicode=True, width=110))
 
 
 def select_with_form(
@@ -305,13 +281,7 @@ def select_with_form(
     """Select again with the best form in the base, so that effects of the catalogue no longer take its place.
 
     Where the residual stays far above the noise even so, the form is not what is missing, and nothing changes.
-
-    Parameters
-    ----------
-    unknown : sequence of mapping
-        What ``unexplained`` returned of it; where that is empty, nothing changes.
-    sheet : mapping
-        As for ``selection.select``.
+    ``unknown`` is what ``unexplained`` returned of the selection.
     """
     definition = suggested_effect(unknown, selection.observations.sensor, catalogue())
     if definition is None:

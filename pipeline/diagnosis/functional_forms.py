@@ -1,11 +1,9 @@
-"""Simple functional forms that a residual may have in one covariate, as formulas that a user's effect file may hold.
+"""Simple functional forms that a residual may have in one covariate v, as formulas that a user's effect file may hold.
 
-    harmonic    : a cos(n A) + b sin(n A), A the angle of the table, n = 1 to 12 cycles a turn
-    ripple      : u (a cos(n A) + b sin(n A)), u the rate about the axis, of a gyroscope
-    polynomial  : sum over p = 1 to d of a_p x^p, d = 2 to 5, x the covariate centred and scaled to its span
-    step        : a where the covariate is above a value; or a (1 + tanh((v - v_0) / w)) / 2
-    band        : a where the speed lies between two values
-    exponential : a exp(-(v - v_min) / s), which decays, or a exp((v - v_max) / s), which grows
+    harmonic, ripple : (1 or u) (a cos(n A) + b sin(n A)), A the table's angle, n = 1 to 12, u the rate of a gyroscope
+    polynomial       : sum over p = 1 to d of a_p x^p, d = 2 to 5, x the covariate centred and scaled to its span
+    step, band       : a where v > v_0; or a (1 + tanh((v - v_0) / w)) / 2; a where the speed lies between two values
+    exponential      : a exp(-(v - v_min) / s), which decays, or a exp((v - v_max) / s), which grows
 
 Places, widths and constants are scanned: first coarsely over the span, then about the best.
 """
@@ -14,10 +12,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from itertools import combinations
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.diagnosis.words import listed
 from pipeline.model.effects.base import truth, unit_of
 from pipeline.model.formula import parse
 
@@ -51,8 +50,9 @@ class Form:
     kind: str
     signal: str
     formulas: tuple[str, ...]  # one for each coefficient
-    scanned: int  # how many nonlinear parameters were scanned to find it
-    figures: dict[str, Any] = field(default_factory=dict)  # those: at, width, low, high, cycles, order, constant, grows
+    words: str  # a noun phrase, in which {size} stands for its size
+    scanned: int = 1  # how many nonlinear parameters were scanned to find it
+    place: float = 0.0  # of a step, or the constant of an exponential: where a finer scan begins
     combination: dict[int, float] = field(default_factory=dict)  # of the scan's columns; empty: its own formula
 
 
@@ -138,10 +138,17 @@ class Span:
 
 def harmonics(factor: str = "") -> list[Form]:
     """Return the harmonics of the table's angle; with the factor ``u`` those in proportion to the rate."""
+    return [harmonic(factor, [n]) for n in CYCLES]
+
+
+def harmonic(factor: str, cycles: Sequence[int]) -> Form:
+    """Return harmonics of so many cycles a turn as one form."""
     times = f"{factor} * " if factor else ""
-    kind = "ripple" if factor else "harmonic"
-    pairs = [(n, tuple(f"{times}{f}({n} * radians(angle))" for f in ("cos", "sin"))) for n in CYCLES]
-    return [Form(kind, "angle", formulas, 1, {"cycles": [n]}) for n, formulas in pairs]
+    formulas = tuple(f"{times}{f}({n} * radians(angle))" for n in cycles for f in ("cos", "sin"))
+    each = " and ".join(str(n) for n in sorted(cycles))
+    rate = " in proportion to the rate" if factor else ""
+    words = f"{each} cycle{'' if each == '1' else 's'} per turn of the table{rate}, amplitude {{size}}"
+    return Form("ripple" if factor else "harmonic", "angle", formulas, words)
 
 
 def powers(span: Span, name: str) -> tuple[str, ...]:
@@ -156,14 +163,17 @@ def powers(span: Span, name: str) -> tuple[str, ...]:
 
 def steps(span: Span, places: Sequence[float] | Values, widths: Sequence[float] = ()) -> list[Form]:
     """Return sharp steps at some places, or soft ones of some widths each."""
+    signal, unit, digits = span.signal, UNITS[span.signal], 0 if span.signal == "time" else 1
     found = []
     for p in places:
-        at = {"at": float(f"{p:.7g}")}
+        at = float(f"{p:.7g}")
+        words = f"a step at {at:.{digits}f} {unit}"
         if not widths:
-            found.append(Form("step", span.signal, (f"step({span.signal} - {p:.7g})",), 1, at))
+            found.append(Form("step", signal, (f"step({signal} - {p:.7g})",), f"{words}, of {{size}}", place=at))
         for width in widths:
-            soft = f"0.5 * (1 + tanh(({span.signal} - {p:.7g}) / {width:.3g}))"
-            found.append(Form("step", span.signal, (soft,), 2, at | {"width": float(f"{width:.3g}")}))
+            soft = f"0.5 * (1 + tanh(({signal} - {p:.7g}) / {width:.3g}))"
+            over = f"{words}, over about {2 * float(f'{width:.3g}'):.2g} {unit}, of {{size}}"
+            found.append(Form("step", signal, (soft,), over, 2, at))
     return found
 
 
@@ -173,22 +183,29 @@ def bands(span: Span, places: Values) -> list[Form]:
     for i, j in combinations(range(len(places)), 2):
         low, high = float(places[i]), float(places[j])
         text = f"band({span.signal}, {low:.5g}, {high:.5g})"
-        found.append(Form("band", span.signal, (text,), 2, {"low": low, "high": high}, {i: 1.0, j: -1.0}))
+        words = f"a band from {low:.3g} to {high:.3g} {UNITS[span.signal]} of {{size}}"
+        found.append(Form("band", span.signal, (text,), words, 2, combination={i: 1.0, j: -1.0}))
     return found
 
 
 def exponentials(span: Span, constants: Iterable[float]) -> list[Form]:
     """Return exponentials that decay from the smallest value, or grow towards the largest."""
-    found = []
+    found, signal = [], span.signal
     for constant in constants:
         s = span.rounded(constant)
-        decay = f"exp(({span.rounded(span.low):g} - {span.signal}) / {s:g})"
-        growth = f"exp(({span.signal} - {span.rounded(span.high):g}) / {s:g})"
-        found += [
-            Form("exponential", span.signal, (text,), 1, {"constant": s, "grows": grows})
-            for text, grows in ((decay, False), (growth, True))
-        ]
+        decay = f"exp(({span.rounded(span.low):g} - {signal}) / {s:g})"
+        growth = f"exp(({signal} - {span.rounded(span.high):g}) / {s:g})"
+        for text, way in ((decay, "decays"), (growth, "grows")):
+            words = f"an exponential of the {signal} that {way} with a constant of {s:.3g} {UNITS[signal]}"
+            found.append(Form("exponential", signal, (text,), f"{words}, {{size}} in all", place=s))
     return found
+
+
+def polynomial(signal: str, formulas: tuple[str, ...], order: int) -> Form:
+    """Return the sum of some powers of a signal."""
+    of = {"u": "the axis' own signal", "speed": "the speed"}.get(signal, signal)
+    words = f"a polynomial of order {order} in {of}, {{size}} over its span"
+    return Form("polynomial", signal, formulas, words, 0)
 
 
 def finer(form: Form, span: Span) -> list[Form]:
@@ -197,52 +214,24 @@ def finer(form: Form, span: Span) -> list[Form]:
         apart = span.size / PLACES
         if span.signal == "speed":
             places = span.places()
-            near = places[np.argsort(np.abs(places - form.figures["at"]))[:3]]
+            near = places[np.argsort(np.abs(places - form.place))[:3]]
             apart = float(np.ptp(near)) / 2.0
-        beside = form.figures["at"] + apart * np.arange(-FINE, FINE + 1) / FINE
+        beside = form.place + apart * np.arange(-FINE, FINE + 1) / FINE
         return steps(span, beside) + steps(span, beside[::3], [apart * w for w in WIDTHS])
     if form.kind == "exponential":
-        return exponentials(span, [form.figures["constant"] * f for f in FACTORS])
+        return exponentials(span, [form.place * f for f in FACTORS])
     return []
 
 
-def in_words(form: Form, sizes: Values, axes: Sequence[int], sensor: str) -> str:
-    """Return a fitted form as a noun phrase: ``a step at 31.0 degC, of 3.9 mg on x``.
+def described(form: Form, sizes: Values, axes: Sequence[int], sensor: str) -> str:
+    """Return a fitted form as a noun phrase: ``a step at 31.0 degC, of 3.9 mg on x and -2.1 mg on z``.
 
-    Parameters
-    ----------
-    sizes : (3,) array
-        Amplitude, height or whole change on each axis, unit of the sensor.
-    axes : sequence of int
-        On which the form acts.
+    ``sizes`` are amplitude, height or whole change on each axis, unit of the sensor; signed where a sign has a meaning.
     """
-    figures, unit = form.figures, UNITS.get(form.signal, "")
-    size = _sizes(form, sizes, axes, sensor)
-    if form.kind in ("harmonic", "ripple"):
-        cycles = " and ".join(str(n) for n in sorted(figures["cycles"]))
-        rate = " in proportion to the rate" if form.kind == "ripple" else ""
-        return f"{cycles} cycle{'' if cycles == '1' else 's'} per turn of the table{rate}, amplitude {size}"
-    if form.kind == "band":
-        return f"a band from {figures['low']:.3g} to {figures['high']:.3g} {unit} of {size}"
-    if form.kind == "step":
-        soft = f", over about {2 * figures['width']:.2g} {unit}" if "width" in figures else ""
-        at = f"{figures['at']:.0f}" if form.signal == "time" else f"{figures['at']:.1f}"
-        return f"a step at {at} {unit}{soft}, of {size}"
-    if form.kind == "exponential":
-        way = "grows" if figures["grows"] else "decays"
-        constant = f"{figures['constant']:.3g} {unit}"
-        return f"an exponential of the {form.signal} that {way} with a constant of {constant}, {size} in all"
-    of = {"u": "the axis' own signal", "speed": "the speed"}.get(form.signal, form.signal)
-    return f"a polynomial of order {figures['order']} in {of}, {size} over its span"
-
-
-def _sizes(form: Form, sizes: Values, axes: Sequence[int], sensor: str) -> str:
-    """Return the size on each axis: ``3.9 mg on x and -2.1 mg on z``; signed where a sign has a meaning."""
     unit, factor = unit_of(sensor), 1.0
     if form.kind == "ripple":
         unit, factor = "%", 100.0
     elif sensor == "accelerometer" and float(np.abs(sizes).max()) < 0.1:
         unit, factor = "mg", 1e3
     values = factor * (sizes if form.kind in ("step", "band") else np.abs(sizes))
-    listed = [f"{values[c]:.3g} {unit} on {'xyz'[c]}" for c in axes]
-    return " and ".join(filter(None, [", ".join(listed[:-1]), listed[-1]]))
+    return form.words.format(size=listed([f"{values[c]:.3g} {unit} on {'xyz'[c]}" for c in axes]))

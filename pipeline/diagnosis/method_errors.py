@@ -1,22 +1,15 @@
 """Errors that a method's own approximations leave, compared with a free fit of the same recordings.
 
 A method says ``truth = M (reading - b_m - z_m)``; bias b, matrix K and effects z of the free fit predict the reading.
-In a motion u that the recording's filter turns into u_f, the method's calibrated reading is off by
+In a motion u that the recording's filter turns into u_f, with E = M K - 1, the calibrated reading is off by
 
-    e = M (b - b_m) + (M K - 1) u_f + M (z - z_m) + (u_f - u)
+    M (b - b_m) [bias]  +  E u_f [diagonal: scale_factor; symmetric part off it: non_orthogonality, half of the angle by
+    which two axes depart from 90 deg; antisymmetric: rotation]  +  M (z - z_m) [two_sided]  +  u_f - u [filter_delay]
 
-    bias                 M (b - b_m)
-    scale_factor         diagonal of E = M K - 1
-    non_orthogonality    symmetric part of E off the diagonal: half of the angle by which two axes depart from 90 deg
-    rotation             antisymmetric part of E: the mounting
-    two_sided            M (z - z_m), of effects that the method always fits
-    filter_delay         u_f - u: the reading is late and smoothed
-
-and each has the share ``mean(e_k^2) / sum_j mean(e_j^2)``. A rotation or a delay does not change a magnitude, so the
-share of the error of the magnitude, ``d_k = |u_f + e_k| - |u_f|`` and for the filter ``|u_f| - |u(t - delay)|``, is
-published too. An error is named where it exceeds ``SURE`` standard uncertainties of both fits together, as if these
-were independent (which is never too small), and a fiftieth of either error. Where an effect is missing, bias and sides
-are not compared: the effect shifts both in the method's fit.
+each with the share ``mean(e_k^2) / sum_j mean(e_j^2)``, and of the error of the magnitude, ``|u_f + e_k| - |u_f|``, for
+the filter ``|u_f| - |u(t - delay)|``. An error is named where it exceeds ``SURE`` standard uncertainties of both fits,
+as if these were independent (which is never too small), and a fiftieth of either error. Where an effect is missing,
+bias and sides are not compared: the effect shifts both in the method's fit.
 """
 
 from __future__ import annotations
@@ -31,7 +24,7 @@ from pipeline.estimation.generalized_least_squares import fit_terms
 from pipeline.estimation.observations import through_filter
 from pipeline.model.effects import effect_of
 from pipeline.model.effects.base import truth, unit_of
-from pipeline.model.kinematics import earth_rate, reference_motion
+from pipeline.model.kinematics import table_motion
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -100,8 +93,6 @@ def method_errors(
 
     Parameters
     ----------
-    calibration : SensorCalibration
-        As the method has fitted it.
     selection : Selection
         The free fit, with what was selected.
     recordings : sequence of Recording
@@ -143,34 +134,20 @@ def method_errors(
 
 @dataclass(frozen=True)
 class _Difference:
-    """A method compared with the free fit: ``bias`` M (b - b_m), ``matrix`` E, and the uncertainty of both, (12,)."""
+    """A method compared with the free fit."""
 
     method: SensorCalibration
-    bias: Values
-    matrix: Values
-    uncertainty: Values
+    bias: Values  # (3,): M (b - b_m)
+    matrices: dict[str, Values]  # the parts of E: (3, 3) each
+    uncertainty: Values  # (12,), of bias and E
     free: Fit
-
-    @property
-    def symmetric(self) -> Values:
-        """Symmetric part of E off the diagonal."""
-        return 0.5 * (self.matrix + self.matrix.T) - np.diag(np.diag(self.matrix))
-
-    @property
-    def antisymmetric(self) -> Values:
-        """Antisymmetric part of E."""
-        return 0.5 * (self.matrix - self.matrix.T)
 
     def parts(self, motion: Motion) -> dict[str, Values]:
         """Return the error of the calibrated reading by its cause, without the filter's: (n, 3) arrays."""
         u = truth(self.method.sensor, motion)
-        return {
-            "bias": np.broadcast_to(self.bias, u.shape),
-            "scale_factor": u * np.diag(self.matrix),
-            "non_orthogonality": u @ self.symmetric.T,
-            "rotation": u @ self.antisymmetric.T,
-            "two_sided": self._of_effects(motion) @ self.method.matrix.T,
-        }
+        of_matrix = {name: u @ matrix.T for name, matrix in self.matrices.items()}
+        two_sided = self._of_effects(motion) @ self.method.matrix.T
+        return {"bias": np.broadcast_to(self.bias, u.shape), **of_matrix, "two_sided": two_sided}
 
     def _of_effects(self, motion: Motion) -> Values:
         """Return what the method's effects add at the free fit's values, less what they add at the method's."""
@@ -188,16 +165,11 @@ class _Difference:
     def certain(self, selected: Sequence[str]) -> dict[str, bool]:
         """Return which parts exceed the noise of the two fits."""
         u = self.uncertainty[3:].reshape(3, 3)
-        both = np.hypot(u, u.T) / 2.0 + np.diag(np.full(3, np.inf))
-        has = {effect.name for effect in self.method.effects}
-        whole = all(name in has for name in selected)
-        return {
-            "two_sided": whole,
-            "bias": whole and bool(np.any(np.abs(self.bias) > SURE * self.uncertainty[:3])),
-            "scale_factor": bool(np.any(np.abs(np.diag(self.matrix)) > SURE * np.diag(u))),
-            "non_orthogonality": bool(np.any(np.abs(self.symmetric) > SURE * both)),
-            "rotation": bool(np.any(np.abs(self.antisymmetric) > SURE * both)),
-        }
+        least = SURE * np.where(np.eye(3) > 0.0, u, np.hypot(u, u.T) / 2.0)
+        whole = {effect.name for effect in self.method.effects}.issuperset(selected)
+        of_bias = whole and bool(np.any(np.abs(self.bias) > SURE * self.uncertainty[:3]))
+        of_matrix = {name: bool(np.any(np.abs(matrix) > least)) for name, matrix in self.matrices.items()}
+        return {"two_sided": whole, "bias": of_bias, **of_matrix}
 
 
 def _difference_of(calibration: SensorCalibration, selection: Selection) -> _Difference:
@@ -215,7 +187,14 @@ def _difference_of(calibration: SensorCalibration, selection: Selection) -> _Dif
     of_free[3:, 3:], of_method[3:, 3:] = np.kron(M, np.eye(3)), np.kron(np.eye(3), free.K.T)
     covariance = of_free @ free.covariance[:12, :12] @ of_free.T + of_method @ own @ of_method.T
     uncertainty = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
-    return _Difference(calibration, M @ (free.bias - calibration.bias), M @ free.K - np.eye(3), uncertainty, free)
+    E = M @ free.K - np.eye(3)
+    diagonal = np.diag(np.diag(E))
+    parts = {
+        "scale_factor": diagonal,
+        "non_orthogonality": 0.5 * (E + E.T) - diagonal,
+        "rotation": 0.5 * (E - E.T),
+    }
+    return _Difference(calibration, M @ (free.bias - calibration.bias), parts, uncertainty, free)
 
 
 def _errors(difference: _Difference, recording: Recording, table: Mapping[str, Any]) -> Errors:
@@ -223,9 +202,7 @@ def _errors(difference: _Difference, recording: Recording, table: Mapping[str, A
     sensor = difference.method.sensor
     if recording.samples < 6 or recording.reading(sensor) is None:
         return {}
-    latitude, azimuth = table.get("latitude_deg"), table.get("azimuth_deg")
-    earth = None if latitude is None or azimuth is None else earth_rate(float(latitude), float(azimuth))
-    before = reference_motion(recording, float(table.get("gravity_g") or 1.0), earth)
+    before = table_motion(recording, table)
     if before is None:
         return {}
     filtered = recording.filter["name"] != "none"
@@ -264,11 +241,11 @@ def _size(name: str, difference: _Difference, own: Values, recordings: Sequence[
     sensor = difference.method.sensor
     if name == "bias":
         return {"size": float(np.abs(difference.bias).max()), "unit": unit_of(sensor)}
-    if name == "scale_factor":
-        return {"size": float(np.abs(np.diag(difference.matrix)).max()), "unit": "1"}
-    if name in ("non_orthogonality", "rotation"):
-        part = difference.symmetric if name == "non_orthogonality" else difference.antisymmetric
-        return {"size": float(np.degrees(np.abs(part).max())), "unit": "deg"}
+    if name in difference.matrices:
+        size = float(np.abs(difference.matrices[name]).max())
+        return (
+            {"size": size, "unit": "1"} if name == "scale_factor" else {"size": float(np.degrees(size)), "unit": "deg"}
+        )
     if name == "filter_delay":
         turns = [r for r in recordings if r.role == sensor]
         return {"size": max(_fastest(r) * float(r.filter.get("delay_s", 0.0)) for r in turns), "unit": "deg"}

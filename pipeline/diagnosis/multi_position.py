@@ -6,14 +6,10 @@ unit rests by hand, so that a scatter of the rests beyond that is reported, but 
 Twenty rests are too few to keep every third from a selection. So the selection uses all of them, and cross-validation
 judges it: of ``FOLDS`` models each leaves out every third rest with the move before it. ``held_out_error`` of a ranking
 is that of the selected effects, fitted without those rests; ``cross_validation`` repeats the selection without them.
-The published calibration keeps its own every third rest out and uses nothing of this.
 
-The residual is tested for a dependence on a covariate by curves with coefficients of their own in every axis:
-
-    time, temperature : powers 1 to d over their span, d = 2 and 3
-    specific_force    : Chebyshev polynomials of degree 4 and 5 of the axis' own component; the catalogue has the lower
-
-A covariate is named where one of its tests has delta BIC > 10 and m p < 1e-3, m the number of all tests.
+A residual depends on time, temperature (powers 1 to 2 or 3 over their span) or the axis' own specific force (Chebyshev
+polynomials of degree 4 and 5) where curves with coefficients of their own in every axis have delta BIC > 10 and
+m p < 1e-3, m the number of all tests.
 """
 
 from __future__ import annotations

@@ -1,20 +1,14 @@
 """On which covariates the residual still depends beside base, configured and selected effects.
 
-Generic curves in one covariate at a time are tried:
+    temperature, time, |omega| : Chebyshev polynomials of degree 1 to d over their span, d = 2 to 5
+    angle                      : cos and sin of n periods a turn, n = 3 to 8, one n and all of them
+    specific_force             : Chebyshev polynomials of degree 3 to 5 of one component, and of all
 
-    temperature, time : Chebyshev polynomials of degree 1 to d over their span, d = 2 to 5
-    rate              : those of |omega|
-    angle             : cos and sin of n periods a turn, n = 3 to 8, one n and all of them
-    specific_force    : Chebyshev polynomials of degree 3 to 5 of one component, and of all
-
-and, where effects were selected or the residual is above white noise,
-
-    temperature, time, |omega| : a step at one of 16 places of the span, sharp or soft
-    angle                      : for a gyroscope, n periods a turn in proportion to the rate, n = 2 to 8
-
-A covariate is named where one of its tests has delta BIC > 10 and m p < 1e-3, m the number of all tests, and has it too
-where the noise is not constrained by a static recording. The curves never take part in the selection, as a flexible
-curve would win against physics in the first round.
+are tried; where effects were selected or the residual is above white noise, a step at one of 16 places of the span of
+temperature, time and |omega|, sharp or soft, and for a gyroscope n = 2 to 8 periods in proportion to the rate. A
+covariate is named where one of its tests has delta BIC > 10 and m p < 1e-3, m the number of all tests, and has it too
+where the noise is not constrained by a static recording. A flexible curve would win against physics in the first round
+of a selection, so the curves never take part in it.
 """
 
 from __future__ import annotations
@@ -57,10 +51,7 @@ SIGNALS = {"temperature": "temperature", "time": "time", "rate": "speed"}  # of 
 def dependences(selection: Selection, explained: Curves | None = None) -> list[tuple[str, float]]:
     """Return the covariates on which the residual still depends, each with its p-value, the likeliest first.
 
-    Parameters
-    ----------
-    explained : callable, optional
-        Motion to (n, m) further curves that count as explained.
+    Curves ``explained`` (motion to (n, m) values) count as explained.
     """
     found = _significant(selection, explained)
     if any(name in SLOW for name in selection.names):

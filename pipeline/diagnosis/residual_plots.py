@@ -1,21 +1,17 @@
 """Plots of a diagnosis: its evidence, binned to a few points.
 
-Added-variable plot of one coefficient gamma of an effect, on the axis c,
+Added-variable plot of one coefficient gamma of an effect with the column x, on one axis (Frisch, Waugh and Lovell):
 
     x~ = x - X delta,    delta = (X^T C^-1 X)^-1 X^T C^-1 x,    y~ = gamma x~ + r - w
 
-    x : the effect's column, X all other columns of the model;  C : white noise plus bias wander
-    r : residual of the fit;  w : the bias wander that it implies, ``E[w | r] = wander covariance C^-1 r``
+X are all other columns of the model, C white noise plus bias wander, r the residual of the fit and w the wander that it
+implies, ``E[w | r]``; the least-squares line through (x~, y~) has the slope gamma, as ``x~^T C^-1 r = 0``. Of rests by
+hand, x and r are whitened, a point is a rest, and both are shown times the median white error of a rest.
 
-So y~ is the part of the reading that neither the other columns nor the wander explain, and the least-squares line
-through (x~, y~) has the slope gamma: ``x~^T C^-1 r = 0`` is the normal equation. Of rests by hand, x and r are whitened
-by the most likely noise, and a point is a rest; both are shown times the median white error of a rest.
+The plot of what is unexplained is the residual against the covariate on which it depends; where a functional form g
+is suggested, that of a fit with g beside the base, to which g is added again: the points scatter about the curve.
 
-The plot of what is unexplained is the residual r against the covariate on which it depends. Where a functional form g
-is suggested, r is that of a fit with g beside the base, and g is added to it again: the points scatter about the curve.
-
-Sources: M. C. Lovell, A Simple Proof of the FWL Theorem, J. Economic Education 39, 2008; R. D. Cook and S. Weisberg,
-Residuals and Influence in Regression, 1982, section 2.3 (added-variable and partial residual plots).
+Source: R. D. Cook and S. Weisberg, Residuals and Influence in Regression, 1982, section 2.3.
 """
 
 from __future__ import annotations

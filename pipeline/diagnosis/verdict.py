@@ -1,21 +1,18 @@
 """The verdict on one sensor: what its selection found, against the error on held-out motion.
 
-The held-out error of a complete calibration lies in the interval of ``pipeline.validation.expected_error``. The first
-that applies:
+The first that applies:
 
     reference_in_doubt  a check of the recordings found a contradiction (note ``N-REFERENCE``), or the residual of the
                         fit is noise alone and the held-out error is above its interval
     missing_effect      effects were selected, and with them the held-out error lies in its interval; effects beyond
                         the sensor's limits only where they lower the held-out error
-    unexplained         the residual of the fit, or the held-out error, is above what noise leaves, and no effect
-                        explains it
+    unexplained         the residual of the fit, or the held-out error, is above what noise leaves, unexplained
     floor_in_doubt      the held-out error is below its interval, or the residual far below the noise
     left_by_method      the error is above, but that of a free fit of the same recordings is not; or the method's matrix
-                        or bias differs from that of a free fit by more than both fits' noise, which the error of the
-                        magnitude need not show (a rotation)
+                        or bias differs from that of a free fit by more than both fits' noise
     not_enough_data, nothing_missing
 
-"Above" and "below" compare with the 99 % interval. A held-out error whose interval is not known decides nothing.
+The interval is the 99 % one of ``pipeline.validation.expected_error``; where it is not known, it decides nothing.
 """
 
 from __future__ import annotations
@@ -100,20 +97,8 @@ def verdict_of_selection(
 
     What is selected must explain most of the excess, unless nothing else is left. A residual that still depends on
     something beyond the catalogue is unexplained where that is worth naming beside what was selected; next to a much
-    larger effect it may be the small error of its linear equation.
-
-    Parameters
-    ----------
-    names : sequence of str
-        Selected effects.
-    unknown : sequence of mapping
-        Entries ``unexplained`` of the diagnosis.
-    share, gain : float
-        Share of the residual's excess that the selected effects explain, and what they gain in 2 log L.
-    above_noise : bool
-        Whether the residual stays far above the noise with them.
-    held_out : mapping or None
-        ``error_before, error_after, floor`` on held-out motion.
+    larger effect it may be the small error of its linear equation. ``share`` of the residual's excess and ``gain`` in
+    2 log L are what the selected effects explain; ``above_noise``: the residual stays far above the noise with them.
     """
     if _made_worse(held_out) or len(names) > BELIEVED:
         return "unexplained"
@@ -133,13 +118,7 @@ def _made_worse(held_out: Mapping[str, float] | None) -> bool:
 
 
 def held_out_of(part: Mapping[str, Any] | None) -> HeldOut | None:
-    """Return the last error of a sensor's validation; None where nothing is held out or no interval is known.
-
-    Parameters
-    ----------
-    part : mapping or None
-        The sensor's part of ``validations/<unit>.json``.
-    """
+    """Return the last error of a sensor's validation; None where nothing is held out or no interval is known."""
     if not part or not part.get("held_out") or not part.get("expected_rms_error"):
         return None
     return HeldOut(float(part["steps"][-1]["rms_error"]), *map(float, part["expected_rms_error"]))
@@ -166,16 +145,8 @@ def evidence_of(
 ) -> Evidence:
     """Return what decides; the held-out error of further fits only where that of the calibration is above its interval.
 
-    Parameters
-    ----------
-    document : mapping
-        The diagnosis of the selection alone.
-    settings : mapping
-        Sections ``table``, ``sensor``, ``procedure`` and ``method``.
-    validation : mapping or None
-        The sensor's part of ``validations/<unit>.json``; without it, the free fit stands for the calibration.
-    found : Findings or None
-        None where the recordings show no effect.
+    ``document`` is the diagnosis of the selection alone, and ``found`` what it was made of; without a ``validation``, a
+    free fit stands for the calibration.
     """
     method = settings.get("method") or {}
     free, full = (found.free, found.full) if found else (None, None)
@@ -330,22 +301,14 @@ def _of_method(e: Evidence) -> str:
 
 
 def judged(document: dict[str, Any], e: Evidence) -> dict[str, Any]:
-    """Return a diagnosis with the verdict by the evidence, its reason, and what to do next.
-
-    Parameters
-    ----------
-    document : dict
-        Of the selection alone.
-    """
+    """Return the diagnosis of a selection with the verdict by the evidence, its reason, and what to do next."""
     verdict, reason = decide(e)
-    step = _next_step(verdict, e)
-    if verdict == "unexplained" and e.implausible:
-        step = "check that every recording is of this unit in one mounting, and check its range and units"
-        step += f"; then {of_unknown(document['unexplained'])}" if document["unexplained"] else ""
-    elif verdict == "unexplained" != e.found:
-        step = of_unknown(document["unexplained"])
-    offered = {} if _offered(verdict, document, e) else {"override": ""}
-    return document | {"verdict": verdict, "reason": reason} | ({"next_experiment": step} if step else {}) | offered
+    return document | {
+        "verdict": verdict,
+        "reason": reason,
+        "next_experiment": _next_step(verdict, document, e) or document["next_experiment"],
+        "override": document["override"] if _offered(verdict, document, e) else "",
+    }
 
 
 def _offered(verdict: str, document: Mapping[str, Any], e: Evidence) -> bool:
@@ -360,8 +323,13 @@ def _offered(verdict: str, document: Mapping[str, Any], e: Evidence) -> bool:
     return bool(errors) and all(None not in pair and pair[1] ** 2 < (1.0 - HELPFUL) * pair[0] ** 2 for pair in errors)
 
 
-def _next_step(verdict: str, e: Evidence) -> str:
-    """Return what to do next where the verdict is about the recordings or the method; empty otherwise."""
+def _next_step(verdict: str, document: Mapping[str, Any], e: Evidence) -> str:
+    """Return what to do next where that is not what the selection says; empty otherwise."""
+    if verdict == "unexplained" and e.implausible:
+        step = "check that every recording is of this unit in one mounting, and check its range and units"
+        return f"{step}; then {of_unknown(document['unexplained'])}" if document["unexplained"] else step
+    if verdict == "unexplained" != e.found:
+        return of_unknown(document["unexplained"])
     if verdict == "reference_in_doubt":
         return "check the table's log and the mounting as said above, and record the recordings concerned again"
     if verdict == "floor_in_doubt":

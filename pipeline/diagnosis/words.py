@@ -42,13 +42,7 @@ VERDICTS = {
 
 
 def in_words(part: Mapping[str, Any] | None, sensor: str) -> list[str]:
-    """Return a sensor's diagnosis as sentences.
-
-    Parameters
-    ----------
-    part : mapping or None
-        The sensor's part of ``diagnoses/<unit>.json``; None where the sensor was not calibrated.
-    """
+    """Return a sensor's part of ``diagnoses/<unit>.json``, None where it was not calibrated, as sentences."""
     if part is None:
         return [f"The {sensor} was not calibrated, so there is nothing to diagnose."]
     lines = [_verdict(part, sensor), *([part["reason"]] if part.get("reason") else [])]

@@ -22,7 +22,7 @@ import numpy as np
 from pipeline.estimation.gauss_markov import Blocks, information
 from pipeline.estimation.sample_rows import Rows, followed, rows_of
 from pipeline.model.effects.base import turning_direction
-from pipeline.model.kinematics import earth_rate, reference_motion
+from pipeline.model.kinematics import earth_of, table_motion
 from pipeline.signal.filters import apply_filter
 
 if TYPE_CHECKING:
@@ -169,16 +169,14 @@ def observe(sensor: str, recordings: Sequence[Recording], table: Mapping[str, An
     table : mapping
         ``gravity_g``, ``latitude_deg``, ``azimuth_deg``.
     """
-    latitude, azimuth = table.get("latitude_deg"), table.get("azimuth_deg")
-    earth = None if latitude is None or azimuth is None else earth_rate(float(latitude), float(azimuth))
     parts = []
     for recording in recordings:
         if recording.role in ROLES and recording.samples >= 6:
-            part = _part(sensor, recording, float(table.get("gravity_g") or 1.0), earth)
+            part = _part(sensor, recording, table)
             if part is not None:
                 parts.append(part)
     parts.sort(key=_in_time)
-    return Observations(sensor, tuple(parts), earth is not None)
+    return Observations(sensor, tuple(parts), earth_of(table) is not None)
 
 
 def _in_time(part: Part) -> tuple[bool, str, float]:
@@ -187,11 +185,11 @@ def _in_time(part: Part) -> tuple[bool, str, float]:
     return not part.clock_shared, setup, float(part.motion.time[0]) if part.clock_shared or setup else 0.0
 
 
-def _part(sensor: str, recording: Recording, gravity: float, earth: NDArray[np.float64] | None) -> Part | None:
+def _part(sensor: str, recording: Recording, table: Mapping[str, Any]) -> Part | None:
     reading = recording.reading(sensor)
     if reading is None:
         return None
-    motion = reference_motion(recording, gravity, earth)
+    motion = table_motion(recording, table)
     if motion is None:
         return None
     motion = replace(motion, direction=turning_direction(motion))

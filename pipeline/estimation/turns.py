@@ -29,7 +29,7 @@ import numpy as np
 from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.gauss_markov import Blocks
 from pipeline.estimation.least_squares import ScaledColumns
-from pipeline.model.kinematics import earth_rate, reference_motion
+from pipeline.model.kinematics import table_motion
 from pipeline.signal.rests import runs
 
 if TYPE_CHECKING:
@@ -71,20 +71,6 @@ class Part:
         reading = self.recording.reading(sensor)
         assert reading is not None  # noqa: S101
         return reading[self.keep]
-
-
-def table_motion(recording: Recording, table: Mapping[str, Any]) -> Motion | None:
-    """Return the motion by the table's log, with Earth's rotation where the table's place and azimuth are set.
-
-    Parameters
-    ----------
-    recording : Recording
-    table : mapping
-        ``gravity_g``, ``latitude_deg``, ``azimuth_deg``.
-    """
-    latitude, azimuth = table.get("latitude_deg"), table.get("azimuth_deg")
-    earth = None if latitude is None or azimuth is None else earth_rate(latitude, azimuth)
-    return reference_motion(recording, float(table.get("gravity_g", 1.0)), earth)
 
 
 def parts_of(recordings: Sequence[Recording], sensor: str, table: Mapping[str, Any], method: str) -> list[Part]:

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -33,7 +33,7 @@ from pipeline.signal.rests import RATE_AT_REST_DPS, still_samples
 from pipeline.signal.temperature import temperature_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from numpy.typing import NDArray
 
@@ -56,6 +56,17 @@ def earth_rate(latitude_deg: float, azimuth_deg: float) -> NDArray[np.float64]:
     horizontal = np.cos(latitude)
     direction = np.array([horizontal * np.cos(azimuth), horizontal * np.sin(azimuth), np.sin(latitude)])
     return EARTH_RATE_DPS * direction
+
+
+def earth_of(table: Mapping[str, Any]) -> NDArray[np.float64] | None:
+    """Return Earth's rotation in the level frame, None where the table's latitude or azimuth is not set."""
+    latitude, azimuth = table.get("latitude_deg"), table.get("azimuth_deg")
+    return None if latitude is None or azimuth is None else earth_rate(float(latitude), float(azimuth))
+
+
+def table_motion(recording: Recording, table: Mapping[str, Any]) -> Motion | None:
+    """Return the motion by the table's log at its gravity, with Earth's rotation where that is known."""
+    return reference_motion(recording, float(table.get("gravity_g") or 1.0), earth_of(table))
 
 
 def reference_motion(

@@ -134,10 +134,7 @@ def best_changes(unit: UnitDescription, before: Document) -> list[Gain]:
     First goes the change that shows most effects for each minute that it takes (at least one: nothing is set up in
     less); of those that show nothing new, the one that lowers the smallest sizes most, as a logarithm a minute.
 
-    Parameters
-    ----------
-    before : dict
-        Its plan.
+    ``before`` is the plan of the unit's procedure.
     """
     if all(before[sensor]["reason"] for sensor in SENSORS):
         return []

@@ -50,16 +50,9 @@ Document = dict[str, Any]
 
 
 def plan_of(unit: UnitDescription, extra: Sequence[Planned] = (), *, half_only: bool = False) -> Document:
-    """Return the plan of a procedure.
+    """Return the plan of a unit's procedure with further recordings.
 
-    Parameters
-    ----------
-    unit : UnitDescription
-        Sensor, table, procedure, course and sampling.
-    extra : sequence of Planned
-        Further recordings.
-    half_only : bool
-        Leave out ``almost_sure`` and ``named``.
+    With ``half_only``, ``almost_sure`` and ``named`` are left out.
 
     Raises
     ------
@@ -174,12 +167,7 @@ class SimulatedProcedure:
 
 
 def simulate_procedure(unit: UnitDescription, extra: Sequence[Planned] = ()) -> SimulatedProcedure:
-    """Simulate a procedure in memory, without the unit's effects and the table's imperfections.
-
-    Parameters
-    ----------
-    extra : sequence of Planned
-        Further recordings after those of the procedure.
+    """Simulate a procedure and further recordings in memory, without the unit's effects and the table's imperfections.
 
     Raises
     ------
@@ -202,15 +190,8 @@ def noise_of_sheet(sheet: Mapping[str, Any], interval: float, *, long_rest: bool
 
         white^2 = noise_density^2 / (2 dt) + (1 / counts_per_unit)^2 / 12
 
-    with the sampling interval dt in s, the one-sided density in unit/sqrt(Hz), and the quantisation.
-
-    Parameters
-    ----------
-    sheet : mapping
-        The sensor's section of the configuration.
-    interval : float, s
-    long_rest : bool
-        Whether the noise will be estimated from a long rest.
+    with the sampling interval dt in s, the one-sided density in unit/sqrt(Hz), and the quantisation. ``long_rest``: the
+    noise will be estimated from a long rest.
     """
     variance = sheet["noise_density"] ** 2 * 0.5 / interval + 1.0 / (12.0 * sheet["counts_per_unit"] ** 2)
     wander = float(sheet.get("bias_wander") or 0.0)

@@ -17,20 +17,14 @@ TOP = 3  # changes that are printed
 
 
 def plan_text(document: Mapping[str, Any]) -> list[str]:
-    """Return a plan as lines.
-
-    Parameters
-    ----------
-    document : mapping
-        Of ``plan.plan_of``.
-    """
-    lines = [heading(document), *(f"note: {text}" for text in document["warnings"])]
+    """Return a plan (``plan.plan_of``) as lines."""
+    lines = [_heading(document), *(f"note: {text}" for text in document["warnings"])]
     for sensor in SENSORS:
         lines += ["", *_of_sensor(sensor, document[sensor])]
     return lines
 
 
-def heading(document: Mapping[str, Any]) -> str:
+def _heading(document: Mapping[str, Any]) -> str:
     """Return what is planned, as a line."""
     what = f"{document['sensor']} on {document['table']}, {document['procedure']}"
     where = " at the table" if document["at_a_table"] else ""
@@ -44,10 +38,10 @@ def _of_sensor(sensor: str, part: Mapping[str, Any]) -> list[str]:
     lines = [f"{sensor} (noise {noise['white']:.2g} {unit} a sample, bias wander {noise['wander']:.2g} {unit})"]
     head = ["effect", "smallest size", "of limit", "similar signal", "note"]
     if part["effects"]:
-        lines += aligned([head, *(_row(entry) for entry in part["effects"])])
+        lines += _aligned([head, *(_row(entry) for entry in part["effects"])])
     if part["not_observable"]:
         lines.append("  not observable:")
-        lines += aligned([[e["effect"], e["reason"]] for e in part["not_observable"]])
+        lines += _aligned([[e["effect"], e["reason"]] for e in part["not_observable"]])
     return lines
 
 
@@ -55,8 +49,8 @@ def _row(entry: Mapping[str, Any]) -> list[str]:
     alike = ", ".join(f"{a['effect']} {a['share']:.2f}" for a in entry["look_alikes"][:2])
     return [
         entry["effect"],
-        size(entry["smallest"], entry["unit"]),
-        share(entry["share_of_limit"]),
+        _size(entry["smallest"], entry["unit"]),
+        _share(entry["share_of_limit"]),
         alike,
         _note(entry),
     ]
@@ -68,18 +62,18 @@ def _note(entry: Mapping[str, Any]) -> str:
     limit = None if entry["share_of_limit"] is None else smallest / entry["share_of_limit"]
     never = named is None or (limit is not None and named > limit)
     if taken:
-        return f"named as {taken}" + ("" if never else f" below {size(named, entry['unit'])}")
+        return f"named as {taken}" + ("" if never else f" below {_size(named, entry['unit'])}")
     if never:
         return "not distinguishable from those"
-    return f"named from {size(named, entry['unit'])}" if named > CLEARLY_LARGER * smallest else ""
+    return f"named from {_size(named, entry['unit'])}" if named > CLEARLY_LARGER * smallest else ""
 
 
-def size(value: float, unit: str) -> str:
+def _size(value: float, unit: str) -> str:
     """Return a size with its unit."""
     return f"{value:.2g}" + ("" if unit == "1" else f" {unit}")
 
 
-def share(value: float | None) -> str:
+def _share(value: float | None) -> str:
     """Return a share of a limit in per cent."""
     if value is None:
         return "no limit"
@@ -87,14 +81,8 @@ def share(value: float | None) -> str:
 
 
 def side_by_side(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]:
-    """Return two plans beside each other as lines.
-
-    Parameters
-    ----------
-    first, second : mapping
-        Of ``plan.plan_of``.
-    """
-    lines = [f"A: {heading(first)}", f"B: {heading(second)}"]
+    """Return two plans beside each other as lines."""
+    lines = [f"A: {_heading(first)}", f"B: {_heading(second)}"]
     a, b = first["course"], second["course"]
     lines += [f"   {name}: {a[name]} in A, {b[name]} in B" for name in a if a[name] != b[name]]
     for name, document in (("A", first), ("B", second)):
@@ -112,20 +100,14 @@ def _compared(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]:
     for name in sorted(a.keys() | b.keys() | hidden):
         cells = [name]
         for found in (a.get(name), b.get(name)):
-            cells += [size(found["smallest"], found["unit"]), share(found["share_of_limit"])] if found else ["-", ""]
+            cells += [_size(found["smallest"], found["unit"]), _share(found["share_of_limit"])] if found else ["-", ""]
         both = name in a and name in b
         rows.append([*cells, f"{b[name]['smallest'] / a[name]['smallest']:.2f}" if both else ""])
-    return [*reasons, *(aligned(rows) if len(rows) > 1 else [])]
+    return [*reasons, *(_aligned(rows) if len(rows) > 1 else [])]
 
 
 def helps_most(gains: Sequence[Gain]) -> list[str]:
-    """Return the changes that help most as lines; the first is the most helpful.
-
-    Parameters
-    ----------
-    gains : sequence of Gain
-        In order.
-    """
+    """Return the changes that help most as lines, in the given order."""
     useful = [gain for gain in gains if gain.shown or gain.told or 100.0 * gain.factor < CLEARLY_SMALLER]
     if not useful:
         return ["additional recordings: none of those examined shows more"] if gains else []
@@ -153,7 +135,7 @@ def _listed(keys: Sequence[str]) -> str:
     return " and ".join(f"{', '.join(names)} of the {sensor}" for sensor, names in by_sensor.items() if names)
 
 
-def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
     """Return rows as lines whose columns begin at the same place."""
     widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
     return [

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.model.kinematics import earth_rate, reference_motion
+from pipeline.model.kinematics import table_motion
 from pipeline.model.measurement import predicted_reading
 from pipeline.records import AXES, SENSOR_UNITS, SensorCalibration
 from pipeline.report.chart import AXES_LEGEND, Band, Dots, Figure, Layer, Line, Panel, Samples, chart
@@ -67,14 +67,12 @@ def residuals(sensor: str, part: JSON, recordings: list[Recording], table: JSON)
     ``part``: the sensor's part of the calibration; ``table``: this section of the unit's configuration.
     """
     calibration = SensorCalibration.from_json(sensor, part)
-    latitude, azimuth = table.get("latitude_deg"), table.get("azimuth_deg")
-    earth = None if latitude is None or azimuth is None else earth_rate(latitude, azimuth)
     out = []
     for recording in recordings:
         reading = recording.reading(sensor)
         if recording.role != sensor or reading is None:
             continue
-        motion = reference_motion(recording, table.get("gravity_g") or 1.0, earth)
+        motion = table_motion(recording, table)
         if motion is not None:
             predicted = _filtered(recording, predicted_reading(calibration, motion))
             out.append(Residual(recording, motion, reading, predicted))

@@ -1,28 +1,15 @@
 """What a calibration is worth in an attitude: its drift on held-out motion, before and after.
 
-With a logged attitude. Gyroscope alone, from the table's attitude at the start:
+Gyroscope alone, from the table's attitude at the start, with the rotation vector a[n] over one interval, of rates w in
+rad/s that are interpolated by a cubic (Magnus expansion: A. Iserles et al., Lie-group methods, Acta Numerica 9, 2000):
 
     q[n+1] = q[n] exp(a[n] / 2)
     a[n] = dt (13 w[n] + 13 w[n+1] - w[n-1] - w[n+2]) / 24 + dt^2 (w[n] x w[n+1]) / 12
 
-where
-
-    q : attitude, body to level
-    w : angular rate, rad/s
-    a : rotation vector over one interval, of rates interpolated by a cubic through four samples. Source: A. Iserles et
-        al., Lie-group methods, Acta Numerica 9 (2000), 215-365, section 4 (Magnus expansion)
-
-The drift after one minute is the angle between integrated and logged rotation over any minute of the recording, root
-mean square over its starts. With the accelerometer an attitude is fused by the complementary filter of x-io
-Technologies' Fusion (``imufusion``; S. Madgwick, AHRS algorithms and calibration solutions, PhD thesis, Bristol 2014,
-chapter 7); its tilt is the angle between the verticals, where gravity bounds the drift.
-
-By hand. Each held-out move is integrated, from the rest before it to the rest after it:
-
-    error = angle(A u_before, u_after)
-
-with the direction u of gravity by the calibrated accelerometer and the rotation A by the gyroscope
-(``pipeline.estimation.multi_position.moves``).
+The drift is the angle between integrated and logged rotation over any minute, root mean square over its starts. The
+tilt of an attitude fused with the accelerometer (complementary filter of ``imufusion``; S. Madgwick, PhD thesis,
+Bristol 2014, chapter 7) is the angle between the verticals. By hand, each held-out move is integrated from the rest
+before it to the rest after it: the error is the angle between turned and observed direction of gravity.
 """
 
 from __future__ import annotations
@@ -65,12 +52,7 @@ SETTLED = 10.0  # s after which the tilt counts
 def attitude(
     accelerometer: SensorCalibration | None, gyroscope: SensorCalibration | None, recordings: Sequence[Recording]
 ) -> dict[str, Any]:
-    """Return the part ``attitude`` of ``validations/<unit>.json``.
-
-    Parameters
-    ----------
-    recordings : sequence of Recording
-        Of the unit; looked at is the first of role ``validation`` that logs the table's attitude.
+    """Return the part ``attitude`` of ``validations/<unit>.json``, by the first held-out recording of the attitude.
 
     Returns
     -------
@@ -120,13 +102,7 @@ def attitude(
 
 
 def integrate(time: Array, rate: Array, start: Rotation) -> Rotation:
-    """Return the attitude that angular rates add up to: n rotations, the first of them ``start``.
-
-    Parameters
-    ----------
-    time : (n,) array, s
-    rate : (n, 3) array, deg/s
-    """
+    """Return the attitude that angular rates, deg/s, add up to: n rotations, the first of them ``start``."""
     from scipy.spatial.transform import Rotation  # noqa: PLC0415  (0.2 s that only units with a logged attitude pay)
 
     w, dt = np.radians(rate), np.diff(time)[:, None]
@@ -149,14 +125,7 @@ def _product(p: Array, q: Array) -> Array:
 
 
 def drift(time: Array, estimate: Rotation, reference: Rotation, seconds: float) -> float:
-    """Return by how much an attitude is off after so many seconds, root mean square over starts, deg.
-
-    Parameters
-    ----------
-    time : (n,) array, s
-    estimate, reference : Rotation
-        n each.
-    """
+    """Return by how much an attitude is off after so many seconds, root mean square over starts, deg."""
     last = int(np.searchsorted(time, time[-1] - seconds + 1e-6, "right")) - 1
     start = np.unique(np.linspace(0, max(last, 0), STARTS).astype(int))
     interval = float(np.median(np.diff(time)))
@@ -243,14 +212,7 @@ def gravity_direction(
     noise: Noise | None,
     settings: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Return the part ``gravity_direction`` of ``validations/<unit>.json``.
-
-    Parameters
-    ----------
-    noise : Noise or None
-        Of the gyroscope.
-    settings : mapping
-        Section ``procedure``.
+    """Return the part ``gravity_direction`` of ``validations/<unit>.json``, with the noise of the gyroscope.
 
     Returns
     -------

@@ -1,15 +1,11 @@
-"""Held-out errors after each step of a calibration.
+"""Held-out errors after each step of a calibration: raw, after each stage, calibrated, with each effect added.
 
     accelerometer: e_n = |a_n| - gravity_g,    gyroscope: e_n = |g_n| - I_n        (Sudsanguan 2019, eqs 5.1 to 5.4)
-
-before anything (``raw``), after each stage of the fit, with matrix and bias, and with each fitted effect added:
-
     corrected = matrix @ (reading - bias - sum of effects)
 
 Where the attitude is logged, effects are those of the reference motion, effects of timing move the reference, and the
-vector error is ``sqrt(mean |corrected - truth|^2)``; it contains a misalignment between unit and table, unless the fit
-was against the same table. Without an attitude, effects are those of the log's own calibrated signals, by fixed point,
-and effects of timing move the logged rate.
+vector error is ``sqrt(mean |corrected - truth|^2)``. Without an attitude, effects are those of the log's own calibrated
+signals, by fixed point, and effects of timing move the logged rate.
 """
 
 from __future__ import annotations
@@ -47,10 +43,7 @@ def error_breakdown(
 ) -> tuple[list[dict[str, Any]], list[str]]:
     """Return the figures of every step, and notes on effects that the samples cannot show.
 
-    Parameters
-    ----------
-    other : SensorCalibration or None
-        Of the other sensor, for effects that need its signal.
+    ``other`` is that of the other sensor, for effects that need its signal.
     """
     stages = [(f"stage:{stage.name}", stage.correction) for stage in calibration.stages if stage.correction is not None]
     figures = [
@@ -78,6 +71,14 @@ def last_step(calibration: SensorCalibration, samples: Samples, other: SensorCal
     if any(_lack(calibration, fitted, samples) for fitted in calibration.effects):
         return None
     return _with_effects(calibration, calibration.effects, other, samples)
+
+
+def last_error_of_magnitude(
+    calibration: SensorCalibration, samples: Samples, other: SensorCalibration | None
+) -> NDArray[np.float64] | None:
+    """Return the error of the magnitude after the last step, (n,); None if an effect is left out."""
+    found = last_step(calibration, samples, other)
+    return None if found is None else np.linalg.norm(found[0], axis=1) - found[1]
 
 
 def with_known_effects(calibration: SensorCalibration, samples: Samples, other: SensorCalibration | None) -> Corrected:

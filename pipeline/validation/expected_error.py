@@ -1,27 +1,18 @@
 """The interval in which the held-out rms error lies with 99 % probability, if model, noise and uncertainties are right.
 
-A calibrated reading of held-out sample n, whose truth is t_n, is off by
+A calibrated reading of held-out sample n is off by ``M w_n + M m_n + J_n d``, where M is the calibration's matrix, w
+white noise behind the filter, m bias wander (a Gauss-Markov process, and the slower drift that data sheet and residuals
+of the fit allow), d errors of the calibration's parameters and of the scale of the table's rate (once: in the
+covariance where its budget has such a line, else as a parameter of its own), and J the derivative with respect to d.
 
-    x_n = M w_n + M m_n + J_n d
-
-where
-
-    M : the calibration's matrix
-    w : white noise behind the filter
-    m : bias wander: a Gauss-Markov process, and the slower drift that data sheet and residuals of the fit allow
-    d : errors of the calibration's parameters, and of the scale of the table's rate, which is counted once: in the
-        calibration's covariance where its budget has such a line, else as a parameter of its own
-    J : derivative of the calibrated reading with respect to d
-
-The squared error of the magnitude has the mean ``tr(W S)`` (``pipeline.validation.norm_error``), and its mean over
-samples is a quadratic form in Gaussians, with the cumulants
+The squared error of the magnitude has the mean ``tr(W S)`` (``pipeline.validation.norm_error``); its mean over samples
+is a quadratic form in Gaussians, replaced by a shifted chi-square with the same cumulants (J. P. Imhof, Biometrika 48
+(1961), 419-426, section 4), C the covariance of all w, m and d, and A the form:
 
     k_1 = tr Q,   k_2 = 2 tr Q^2,   k_3 = 8 tr Q^3,      Q = A C
 
-where C is the covariance of all w, m and d, and A the form. A shifted chi-square with the same cumulants takes its
-place (J. P. Imhof, Biometrika 48 (1961), 419-426, section 4). Wander and parameters are summed over blocks of samples,
-so that the size of Q does not depend on the number of samples. A finite recording does not determine the noise exactly,
-so the interval is that of a mixture over factors of the variances:
+Wander and parameters are summed over blocks of samples, which bounds the size of Q. A finite recording does not
+determine the noise exactly, so the interval is that of a mixture over factors of the variances:
 
     wander      exp(2 s z), z standard normal, s = sqrt(correlation time / length of static rest and fit)
     drift       z^2: its size is hardly known
@@ -89,13 +80,7 @@ def linearized(
     ``calibrated = M (reading - b - z)`` gives ``d/db = -M`` and ``d/dM_ij = e_i (M^-1 calibrated)_j``. Parameters of
     effects take a difference quotient over one standard uncertainty; where an effect moves the reference in time, the
     change of its magnitude counts along the truth with the opposite sign.
-
-    Parameters
-    ----------
-    truth : (n, 3) array
-        Of the reference.
-    other : SensorCalibration or None
-        Of the other sensor.
+    ``truth`` is the (n, 3) reference, ``other`` the calibration of the other sensor.
     """
     found = last_step(calibration, samples, other)
     known = np.flatnonzero(samples.known)
@@ -156,14 +141,9 @@ def expected_rms_error(
 ) -> tuple[float, float]:
     """Return the interval in which the rms error lies with 99 % probability, g or deg/s.
 
-    Parameters
-    ----------
-    calibration : SensorCalibration
-        With its covariance; without one, its parameters count as exact.
-    settings : mapping
-        Sections ``table`` (``rate_accuracy``) and ``sensor`` (``bias_wander``, ``wander_time_s``, ``counts_per_unit``).
-    fitted_s : float, s
-        Length of the recordings of the fit.
+    Without a covariance, the calibration's parameters count as exact. ``settings`` hold the sections ``table``
+    (``rate_accuracy``) and ``sensor`` (``bias_wander, wander_time_s, counts_per_unit``), ``fitted_s`` is the length of
+    the recordings of the fit.
     """
     sheet = (settings.get("sensor") or {}).get(calibration.sensor) or {}
     step = 1.0 / float(sheet["counts_per_unit"]) if sheet.get("counts_per_unit") else 0.0

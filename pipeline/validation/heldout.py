@@ -1,19 +1,13 @@
 """Held-out errors: what a calibration leaves on samples that no fit has seen, beside what noise alone would leave.
 
-Held out are the recordings of role ``validation``; without one, every third rest (``procedure.holdout_every``) of a
-recording of rests. Where nothing is held out, the samples of the fit are judged, and the result says so.
-
-Noise alone leaves, with D the variance of a sample's noise and M the calibration's matrix,
+Held out are the recordings of role ``validation``; without one, every third rest (``procedure.holdout_every``). Where
+nothing is held out, the samples of the fit are judged, and the result says so. With D the variance of a sample's noise,
 
     noise_floor = sqrt(mean E(|t + M n| - |t|)^2),    vector_noise_floor = sqrt(mean tr(M D M^T))
 
-Whether a calibration does harm follows from its squared errors against those of the raw readings, in pairs over B
-stretches of the held-out samples (rests count one by one),
-
-    d_b = mean over stretch b of (e_calibrated^2 - e_raw^2),    t = mean(d) sqrt(B) / s(d)
-
-It does harm where Student's t with B - 1 degrees of freedom exceeds that of probability ``LEVEL``, and its error is
-above the interval in which it is expected (``pipeline.validation.expected_error``).
+A calibration does harm where its squared errors less those of the raw readings, averaged over each of B stretches,
+have a Student's t of B - 1 degrees of freedom beyond that of probability ``LEVEL``, and its error is above the interval
+in which it is expected (``pipeline.validation.expected_error``).
 """
 
 from __future__ import annotations
@@ -27,7 +21,7 @@ from pipeline.estimation.rest_means import held_out_rests, split_rests
 from pipeline.model.effects.base import truth, unit_of
 from pipeline.model.kinematics import EARTH_RATE_DPS
 from pipeline.model.measurement import linear_truth
-from pipeline.validation.error_breakdown import error_breakdown, last_step
+from pipeline.validation.error_breakdown import error_breakdown, last_error_of_magnitude
 from pipeline.validation.expected_error import expected_rms_error, linearized
 from pipeline.validation.norm_error import squared_norm_errors
 from pipeline.validation.samples import samples_of_motion, samples_of_rests
@@ -80,38 +74,41 @@ def validate(
     ConfigurationError
         If a limit's name is unknown.
     """
-    samples, reason = _choose(calibration.sensor, recordings, noise, settings)
+    sensor = calibration.sensor
+    samples, reason = _choose(sensor, recordings, noise, settings)
+    count = int(sum(s.known.sum() for s in samples))
+    nothing: dict[str, Any] = dict.fromkeys((*FIGURES, "vector_rms_error"))
     part: dict[str, Any] = {
-        "unit": unit_of(calibration.sensor),
+        "unit": unit_of(sensor),
         "held_out": reason is None,
         "reason": reason,
-        "samples": int(sum(s.known.sum() for s in samples)),
+        "samples": count,
         "noise": {
             "white": noise.white.tolist(),
             "wander": noise.wander.tolist(),
             "correlation_time_s": noise.correlation_time,
             "source": noise.source,
         },
+        "noise_floor": None,
+        "vector_noise_floor": None,
+        "reference_rms": None,
+        "steps": [{"name": name, **nothing} for name in ("raw", "calibrated")],
+        "notes": [],
+        "expected_rms_error": None,
+        "worse_than_raw": None,
     }
-    if part["samples"] == 0:
-        nothing: dict[str, Any] = dict.fromkeys((*FIGURES, "vector_rms_error"))
-        part |= {"expected_rms_error": None, "noise_floor": None, "vector_noise_floor": None}
-        part |= {"reference_rms": None, "notes": [], "worse_than_raw": None}
-        part["steps"] = [{"name": name, **nothing} for name in ("raw", "calibrated")]
-    else:
+    if count:
         part["noise_floor"], part["vector_noise_floor"] = noise_floors(calibration, samples)
         part["reference_rms"] = float(np.sqrt(np.nanmean(np.concatenate([s.magnitude for s in samples]) ** 2)))
         part["steps"], part["notes"] = error_breakdown(calibration, samples, other)
-        part["expected_rms_error"], lack = _expected(
-            calibration, samples, noise, settings, other, fitted_s=_length(calibration.sensor, recordings)
-        )
+        fitted_s = _length(sensor, recordings)
+        expected, lack = _expected(calibration, samples, noise, settings, other, fitted_s=fitted_s)
+        part["expected_rms_error"] = expected
         part["notes"] += lack
-        part["worse_than_raw"] = (
-            _worse_than_raw(calibration, samples, part["expected_rms_error"], other) if part["held_out"] else None
-        )
-    part["limits"], part["pass"] = _check_limits(
-        calibration, part["steps"][-1], (settings.get("limits") or {}).get(calibration.sensor) or {}
-    )
+        if part["held_out"] and expected is not None:
+            part["worse_than_raw"] = _worse_than_raw(calibration, samples, expected[1], other)
+    limits = (settings.get("limits") or {}).get(sensor) or {}
+    part["limits"], part["pass"] = _check_limits(calibration, part["steps"][-1], limits)
     return part
 
 
@@ -159,23 +156,17 @@ def last_error(
 ) -> tuple[float, list[float]] | None:
     """Return the rms error after the last step and its interval; None where nothing is held out or no interval is told.
 
-    Parameters
-    ----------
-    calibration, recordings, noise, settings, other
-        As of ``validate``.
-    smoothed : bool
-        Whether the reference of a filtered recording goes through its filter, too: then the filter leaves no error.
+    With ``smoothed``, the reference of a filtered recording goes through its filter, too: the filter leaves no error.
     """
     samples, reason = _choose(calibration.sensor, recordings, noise, settings, smoothed=smoothed)
     if reason is not None:
         return None
     fitted_s = _length(calibration.sensor, recordings)
     expected, _ = _expected(calibration, samples, noise, settings, other, fitted_s=fitted_s)
-    found = [step for s in samples if (step := last_step(calibration, s, other)) is not None]
-    if expected is None or not found:
+    errors = [error for s in samples if (error := last_error_of_magnitude(calibration, s, other)) is not None]
+    if expected is None or not errors:
         return None
-    error = np.concatenate([np.linalg.norm(vector, axis=1) - magnitude for vector, magnitude, _ in found])
-    return float(np.sqrt(np.nanmean(error**2))), expected
+    return float(np.sqrt(np.nanmean(np.concatenate(errors) ** 2))), expected
 
 
 def noise_floors(calibration: SensorCalibration, samples: Sequence[Samples]) -> tuple[float, float | None]:
@@ -240,22 +231,17 @@ def _logs_table(recording: Recording) -> bool:
 
 
 def _worse_than_raw(
-    calibration: SensorCalibration,
-    samples: Sequence[Samples],
-    expected: Sequence[float] | None,
-    other: SensorCalibration | None,
+    calibration: SensorCalibration, samples: Sequence[Samples], most: float, other: SensorCalibration | None
 ) -> str | None:
-    """Return why a calibration must not be used, as one sentence; None where it may, or no interval is known."""
-    found = [last_step(calibration, held, other) for held in samples]
-    after = [
-        (np.linalg.norm(step[0], axis=1) - step[1])[s.known] for step, s in zip(found, samples, strict=True) if step
-    ]
-    if expected is None or len(after) < len(samples):
+    """Return why a calibration must not be used, as one sentence; None where it may: it leaves at most ``most``."""
+    found = [last_error_of_magnitude(calibration, s, other) for s in samples]
+    after = [error[s.known] for error, s in zip(found, samples, strict=True) if error is not None]
+    if len(after) < len(samples):
         return None
     raw = np.concatenate([(np.linalg.norm(s.reading, axis=1) - s.magnitude)[s.known] for s in samples])
     left = np.concatenate(after)
     sizes = [float(np.sqrt(np.mean(e**2))) for e in (raw, left)]
-    if sizes[1] <= max(sizes[0], expected[1]) or len(raw) < FEWEST:
+    if sizes[1] <= max(sizes[0], most) or len(raw) < FEWEST:
         return None
     pieces = np.array_split(left**2 - raw**2, min(STRETCHES, len(raw)))
     means = np.array([piece.mean() for piece in pieces])
@@ -267,7 +253,7 @@ def _worse_than_raw(
     unit = unit_of(calibration.sensor)
     return (
         f"the calibration makes held-out motion worse: {sizes[0]:.3g} {unit} rms before it, {sizes[1]:.3g} {unit} "
-        f"after, where noise and stated uncertainties leave at most {expected[1]:.3g} {unit}. Check that fit and "
+        f"after, where noise and stated uncertainties leave at most {most:.3g} {unit}. Check that fit and "
         "held-out recordings are of this unit in the same mounting, and what the table logged"
     )
 

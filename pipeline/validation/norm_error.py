@@ -1,12 +1,11 @@
-"""The mean squared error of the magnitude of a vector, given the covariance S of the vector's error x.
+"""The mean squared error of the magnitude of a vector t, given the covariance S of the vector's error x.
 
-    E(|t + x| - |t|)^2 = tr(W S),    W = u u' + g (1 - u u'),    u = t/|t|
+    E(|t + x| - |t|)^2 = tr(W S),    W = u u' + g (1 - u u'),    u = t/|t|,    g = 0 far from zero
 
-Far from zero g = 0. Near zero (a gyroscope at rest) the norm is not linear in x, and
+Near zero (a gyroscope at rest) the norm is not linear in x, and the mean is ``2 |t|^2 + tr S - 2 |t| E|t + x|``,
 
-    E(|y| - |t|)^2 = 2 |t|^2 + tr S - 2 |t| E|y|,     y ~ N(t, S)
-    E|y| = 1/sqrt(pi) int_0^inf (1 - phi(v^2)) / v^2 dv,   phi(s) = E exp(-s |y|^2)
-         = prod_i (1 + 2 s l_i)^(-1/2) exp(-s t_i^2 / (1 + 2 s l_i))
+    E|t + x| = 1/sqrt(pi) int_0^inf (1 - phi(v^2)) / v^2 dv
+    phi(s) = prod_i (1 + 2 s l_i)^(-1/2) exp(-s t_i^2 / (1 + 2 s l_i))
 
 with the eigenvalues l_i of S and the components t_i of t along its eigenvectors, by Gauss-Legendre quadrature after
 ``v = c tan(theta)``.

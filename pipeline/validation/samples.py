@@ -20,7 +20,7 @@ from pipeline.estimation.observations import through_filter
 from pipeline.estimation.rest_means import rest_means, split_rests
 from pipeline.model.effects.base import truth
 from pipeline.model.effects.timing import shifted
-from pipeline.model.kinematics import earth_rate, reference_motion
+from pipeline.model.kinematics import earth_of, table_motion
 from pipeline.signal.creep import believed_rates, creep_in
 from pipeline.signal.filters import filter_autocovariance, variance_of_mean
 
@@ -51,9 +51,7 @@ class Samples:
     temperature: NDArray[np.float64] | None  # (n,), degC
     resting: bool = False  # whether each sample is the mean of a rest
     alike: float = 1.0  # samples that share one value of the white noise, by the filter: sum_l r_l^2 / r_0^2 over lags
-    earth_left_out: bool = (
-        False  # whether Earth's rotation is configured and, without an attitude, not in the magnitude
-    )
+    earth_left_out: bool = False  # whether Earth's rotation is configured, but without an attitude not in the magnitude
 
     @property
     def variance(self) -> NDArray[np.float64]:
@@ -71,21 +69,14 @@ def samples_of_motion(
 ) -> Samples | None:
     """Return a recording's samples, or None where it holds no readings of the sensor or no reference for them.
 
-    Parameters
-    ----------
-    table : mapping
-        ``gravity_g``, ``latitude_deg``, ``azimuth_deg``.
-    smoothed : bool
-        Whether the reference goes through the recording's filter, where its attitude is known.
+    With ``smoothed``, the reference goes through the recording's filter, where its attitude is known.
     """
     reading = recording.reading(sensor)
     if reading is None or recording.samples == 0:
         return None
     gravity = float(table.get("gravity_g") or 1.0)
-    latitude, azimuth = table.get("latitude_deg"), table.get("azimuth_deg")
-    earth = None if latitude is None or azimuth is None else earth_rate(latitude, azimuth)
     delay = float(recording.filter.get("delay_s", 0.0))
-    motion = reference_motion(recording, gravity, earth)
+    motion, earth = table_motion(recording, table), earth_of(table)
     smoothed = smoothed and motion is not None and recording.filter["name"] != "none"
     if motion is not None:
         motion = through_filter(motion, recording) if smoothed else shifted(motion, -delay)
@@ -104,7 +95,7 @@ def samples_of_motion(
         recording.time,
         reading,
         magnitude,
-        np.broadcast_to(_white_variance(recording, noise), (n, 3)),
+        np.broadcast_to((float(recording.filter.get("noise_gain", 1.0)) * noise.white) ** 2, (n, 3)),
         np.broadcast_to(_wander_share(recording) * noise.wander**2, (n, 3)),
         motion,
         recording.reading(OTHER[sensor]),
@@ -168,12 +159,6 @@ def _creep(
     seen = error**2 + RAW**2 * np.sum(rate**2, axis=1)
     nearest = np.eye(3)[np.argmax(upward, axis=1)]  # one error: shared out to three axes it would count as several
     return rate, seen[:, None] * (1.0 - upward) + about**2 * nearest
-
-
-def _white_variance(recording: Recording, noise: Noise) -> NDArray[np.float64]:
-    """Return the variance of white noise behind the recording's filter: (3,) array."""
-    variance: NDArray[np.float64] = (float(recording.filter.get("noise_gain", 1.0)) * noise.white) ** 2
-    return variance
 
 
 def _wander_share(recording: Recording) -> float:

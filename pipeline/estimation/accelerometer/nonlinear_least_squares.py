@@ -34,13 +34,14 @@ from pipeline.estimation.monte_carlo import beside_trials, quadratic_results, th
 from pipeline.estimation.noise import prior_of
 from pipeline.estimation.rest_means import describe_rests
 from pipeline.estimation.table_errors import Reference, disturbance
-from pipeline.estimation.turns import blocks_of_samples, table_motion
+from pipeline.estimation.turns import blocks_of_samples
 from pipeline.estimation.uncertainty_budget import (
     combined,
     gravity_contribution,
     noise_contribution,
     scatter_contribution,
 )
+from pipeline.model.kinematics import table_motion
 from pipeline.records import SensorCalibration, StageResult, coverage_factor
 
 if TYPE_CHECKING:

@@ -16,7 +16,8 @@ import numpy as np
 
 from pipeline.errors import CannotCalibrateError
 from pipeline.estimation.rest_means import holdout_interval, rest_means, sound_samples, split_rests
-from pipeline.estimation.turns import stop_and_go, table_motion
+from pipeline.estimation.turns import stop_and_go
+from pipeline.model.kinematics import table_motion
 from pipeline.signal.creep import creep_in
 from pipeline.signal.rests import Rest, rests_from_table
 
