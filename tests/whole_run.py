@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from pipeline.config import load_campaign, settings_file
-from pipeline.model.effects import forget_registered
+from pipeline.model.effects import forget
 from pipeline.stages import batch, verdict
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ def run_jobs(campaign: Campaign) -> int:
         try:
             assert batch.main(stage, ["--config", file.write(), *given, *options, "--output", str(output)]) == 0
         finally:
-            forget_registered()  # a job is a process of its own
+            forget()  # a job is a process of its own
     mark, failures = campaign.results / "complete.json", batches / "gathered.json"
     return verdict.main(["--results", str(campaign.results), "--output", str(mark), "--failures", str(failures)])
 

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 NOT_WANTED = "not_wanted"  # stage of a sensor whose method is null
-OF_A_SETUP = ("mounting", "bias")  # effects that exist as one setup's own alone (pipeline.model.sessions)
+OF_A_SETUP = ("mounting", "bias")  # effects that exist as one setup's own alone (pipeline.model.effects.sessions)
 
 
 class Composer:

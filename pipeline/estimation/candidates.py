@@ -10,7 +10,7 @@ from pipeline.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.design import Term
 from pipeline.model.effects import catalogue, effect
 from pipeline.model.effects.base import parameter_limits
-from pipeline.model.sessions import OWN
+from pipeline.model.effects.sessions import OWN
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -4,7 +4,7 @@ Readings in ``sensor_msgs/Imu`` (ROS 2 or ROS 1) give copies of the originals in
 Readings that the profile maps from the fields of other messages (protobuf, JSON, own types) give ROS 2
 ``sensor_msgs/Imu``.
 
-A message knows the temperatures that stand before it in the file (``pipeline.model.exponential_regression``), as in a
+A message knows the temperatures that stand before it in the file (``pipeline.model.log_motion``), as in a
 running system. Messages before the first temperature get that one.
 """
 
@@ -24,7 +24,7 @@ from pipeline.io.mcap_copy import McapCopy
 from pipeline.io.mcap_reader import McapReader
 from pipeline.io.ros2_messages import DEFINITIONS, IMU, TEMPERATURE
 from pipeline.io.units import SECOND_NS, SINCE_1970_NS, TRIADS
-from pipeline.model.exponential_regression import ExponentialRegression
+from pipeline.model.log_motion import ExponentialRegression
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

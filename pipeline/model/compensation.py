@@ -21,8 +21,7 @@ from pipeline.errors import InputError
 from pipeline.model.calibration_file import read_calibration, sensor_of
 from pipeline.model.effects import register
 from pipeline.model.effects.files import load_python_effect
-from pipeline.model.exponential_regression import ExponentialRegression
-from pipeline.model.log_motion import SIGNALS, LogEnd, fields_used, log_motion
+from pipeline.model.log_motion import SIGNALS, ExponentialRegression, LogEnd, fields_used, log_motion
 from pipeline.model.measurement import Part, sensor_effects, solve, without_effects
 from pipeline.records import SENSORS
 
@@ -86,7 +85,7 @@ def circular(steps: Mapping[str, Steps]) -> set[str]:
 class CompensationStream:
     """Compensation of one log, block by block, by the calibrations of the calibrated sensors.
 
-    ``smoothing``, s, is the memory of the temperature's smoothing (``pipeline.model.exponential_regression``); 0: none.
+    ``smoothing``, s, is the memory of the temperature's smoothing (``pipeline.model.log_motion``); 0: none.
     """
 
     def __init__(self, unit: str, calibrations: dict[str, SensorCalibration], smoothing: float) -> None:
@@ -230,7 +229,7 @@ class Compensation:
         time : (n,) array or float, s since power-on, optional
             Likewise; also with it the temperature is smoothed, causally.
         smoothing : float, s
-            Memory of the temperature's smoothing (``pipeline.model.exponential_regression``); 0: none.
+            Memory of the temperature's smoothing (``pipeline.model.log_motion``); 0: none.
 
         Raises
         ------

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from pipeline.__main__ import main
-from pipeline.model.effects import forget_registered
+from pipeline.model.effects import forget
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -67,7 +67,7 @@ def test_an_effect_of_the_users_own_is_planned(capsys: pytest.CaptureFixture[str
     try:
         plan = json.loads(_out(capsys, *QUICK, "--no-extra", "--json", "--effect", str(file)))
     finally:
-        forget_registered()
+        forget()
     entry = next(e for e in plan["gyroscope"]["effects"] if e["effect"] == "gear_mesh")
     assert 0.0 < entry["smallest"] < 0.1
     assert entry["unit"] == "deg/s"
@@ -85,7 +85,7 @@ def test_an_effect_without_limits_is_planned_in_its_unit(
     try:
         lines = _out(capsys, *procedure, "--no-extra", "--effect", str(file)).splitlines()
     finally:
-        forget_registered()
+        forget()
     words = next(line.split() for line in lines if line.strip().startswith("sag "))
     assert words[2:5] == ["g", "no", "limit"]
     assert 1e-5 < float(words[1]) < 1e-2

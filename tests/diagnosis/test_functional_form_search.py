@@ -24,7 +24,7 @@ from pipeline.estimation.generalized_least_squares import fit_terms
 from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import Selection, select
-from pipeline.model.effects import forget_registered, register
+from pipeline.model.effects import forget, register
 from pipeline.model.effects.files import effect_from
 from pipeline.records import Recording, SensorCalibration
 from pipeline.signal.temperature import smooth_temperature
@@ -47,7 +47,7 @@ Extra = Callable[[Recording], np.ndarray]
 @pytest.fixture(autouse=True)
 def _nothing_registered() -> Iterator[None]:
     yield
-    forget_registered()
+    forget()
 
 
 def with_extra(sensor: str, extra: Extra, seed: int = 1, course: Course = SHORT, **session: Any) -> list[Recording]:

@@ -14,7 +14,7 @@ from pipeline.model.compensation import BLOCK, Compensation, load
 from pipeline.model.effects import catalogue
 from pipeline.model.effects.base import Owner
 from pipeline.model.effects.files import effect_from
-from pipeline.model.exponential_regression import ExponentialRegression
+from pipeline.model.log_motion import ExponentialRegression
 from pipeline.model.measurement import compensate, predicted_reading
 from pipeline.records import SENSORS, FittedEffect, Motion, SensorCalibration
 

@@ -22,7 +22,7 @@ from pipeline.model.effects import (
     catalogue,
     effect,
     effect_of,
-    forget_registered,
+    forget,
     register,
     register_user_effects,
 )
@@ -51,7 +51,7 @@ limits: {A: 0.1, B: 0.2}
 @pytest.fixture(autouse=True)
 def registry() -> Iterator[None]:
     yield
-    forget_registered()
+    forget()
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ import yaml
 
 from pipeline.commands.simulate import main
 from pipeline.errors import ConfigurationError
-from pipeline.model.effects import catalogue, forget_registered, register
+from pipeline.model.effects import catalogue, forget, register
 from pipeline.model.effects.files import effect_from
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription
@@ -28,7 +28,7 @@ EXACT = {"interval_s": 0.12, "course": COURSE, "sensor": "stim300"}
 @pytest.fixture(autouse=True)
 def registry() -> Iterator[None]:
     yield
-    forget_registered()
+    forget()
 
 
 def gyroscope_of_y(effects: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:

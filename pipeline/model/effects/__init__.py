@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import ConfigurationError
 from pipeline.model.effects.files import built_in_files, effect_from, load_python_effect, read_effect_file
+from pipeline.model.effects.sessions import OWN, in_session
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -72,18 +73,14 @@ def register_user_effects(section: Mapping[str, Any]) -> None:
         register(load_python_effect(entry["path"], entry["sha256"]))
 
 
-def forget(name: str) -> None:
-    """Take one registered effect out of the catalogue again."""
-    _registered.pop(name, None)
-
-
-def forget_registered() -> None:
-    """Take every registered effect out of the catalogue again."""
-    _registered.clear()
+def forget(*names: str) -> None:
+    """Take registered effects out of the catalogue again; all of them where none is named."""
+    for name in names or tuple(_registered):
+        _registered.pop(name, None)
 
 
 def effect(name: str) -> Effect:
-    """Return one effect by name; ``<effect>@<setup>`` is that of one session (``pipeline.model.sessions``).
+    """Return one effect by name; ``<effect>@<setup>`` is that of one session (``pipeline.model.effects.sessions``).
 
     Raises
     ------
@@ -141,7 +138,5 @@ def _defined(definition: str) -> Effect:
 
 @cache
 def _in_session(name: str) -> Effect:
-    from pipeline.model.sessions import OWN, in_session  # noqa: PLC0415  (it needs this package)
-
     base = name.partition("@")[0]
     return in_session(name, OWN.get(base) or effect(base))
