@@ -24,8 +24,7 @@ import numpy as np
 from pipeline.estimation.engine import LinearMap
 from pipeline.model.effects import effect
 from pipeline.model.effects.base import truth
-from pipeline.model.kinematics import earth_rate
-from pipeline.model.rotation import ABOUT
+from pipeline.model.kinematics import ABOUT, earth_rate
 from pipeline.records import noise_of_steps
 from pipeline.signal.rests import RATE_AT_REST_DPS
 

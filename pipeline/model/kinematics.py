@@ -7,7 +7,7 @@ A turn about body axis ``a`` by the angle ``A(t)``:
 where ``R_a`` is the right-handed rotation about axis a, ``up_a`` the body axis that points up at angle 0 (z for turns
 about x and y, x for turns about z), ``g`` the local gravity in g, and omega in rad/s.
 
-An attitude ``q(t)`` (body to level with z up):
+An attitude ``q(t)`` (w, x, y, z; body to level with z up):
 
     f = g * R(q)^T e_z,   omega = 2 vec(conj(q) dq/dt),   alpha = 2 vec(conj(q) d2q/dt2)
 
@@ -27,7 +27,6 @@ import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.model.encoder_trajectory import EncoderTrajectory
-from pipeline.model.rotation import ABOUT, attitude_matrix, turn_about_axis
 from pipeline.records import AXES, Motion, conjugate_product, continuous
 from pipeline.signal.rests import RATE_AT_REST_DPS, still_samples
 from pipeline.signal.temperature import temperature_of
@@ -231,3 +230,51 @@ def _rate_of(time: NDArray[np.float64], angle: NDArray[np.float64]) -> tuple[NDA
     bent = miss > max(VAGUE_DPS, 8.0 * float(np.percentile(miss, 10.0)))
     vague = np.logical_and(np.convolve(bent, np.ones(9), "same") > 0.5, np.logical_not(resting))
     return np.where(bent | resting, central, spline), vague
+
+
+def turn_about_axis(vector: NDArray[np.float64], axis: int, angle_deg: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Turn (..., 3) vectors about coordinate axis 0, 1 or 2 by each of n angles (right-handed): (n, ..., 3) array."""
+    j, k = (axis + 1) % 3, (axis + 2) % 3
+    angle = np.radians(angle_deg).reshape(-1, *[1] * (vector.ndim - 1))
+    c, s = np.cos(angle), np.sin(angle)
+    out = np.empty((len(angle), *vector.shape))
+    out[..., axis] = vector[..., axis]
+    out[..., j] = c * vector[..., j] - s * vector[..., k]
+    out[..., k] = s * vector[..., j] + c * vector[..., k]
+    return out
+
+
+def turn_by_vector(phi: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the rotations by vectors, ``exp [phi]x`` (Rodrigues): (..., 3) array, rad, to (..., 3, 3)."""
+    angle = np.linalg.norm(phi, axis=-1)
+    small = angle < 1e-6
+    safe = np.where(small, 1.0, angle)
+    s = np.where(small, 1.0, np.sin(safe) / safe)
+    c = np.where(small, 0.5, (1.0 - np.cos(safe)) / safe**2)
+    cross = skew(phi)
+    out: NDArray[np.float64] = np.eye(3) + s[..., None, None] * cross + c[..., None, None] * (cross @ cross)
+    return out
+
+
+def skew(v: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return ``[v]x``, with ``[v]x u = v x u``: (..., 3) array to (..., 3, 3)."""
+    out = np.zeros((*v.shape, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
+    return out
+
+
+def attitude_matrix(q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the rotation matrices of unit quaternions: (n, 4) to (n, 3, 3), body vectors to level vectors."""
+    w, x, y, z = q.T
+    return np.stack(
+        [
+            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
+            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
+            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
+        ],
+        1,
+    )
+
+
+ABOUT = skew(np.eye(3))  # ABOUT[a] @ u = e_a x u

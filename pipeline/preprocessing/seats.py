@@ -28,8 +28,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.model.kinematics import UP_AT_ZERO, level_at_zero
-from pipeline.model.rotation import skew, turn_about_axis, turn_by_vector
+from pipeline.model.kinematics import UP_AT_ZERO, level_at_zero, skew, turn_about_axis, turn_by_vector
 from pipeline.preprocessing.bench import ACROSS, by_convention
 from pipeline.records import AXES, Note
 

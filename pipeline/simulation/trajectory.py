@@ -23,8 +23,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from pipeline.model.kinematics import LEVEL_AT_ZERO
-from pipeline.model.rotation import attitude_matrix
+from pipeline.model.kinematics import LEVEL_AT_ZERO, attitude_matrix
 from pipeline.simulation.rate_table import TurnErrors
 
 if TYPE_CHECKING:

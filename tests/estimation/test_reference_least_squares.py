@@ -7,8 +7,7 @@ import pytest
 from table_turns import Bench, run_stages, settings, specific_force
 
 from pipeline.errors import CannotCalibrateError, NotObservableError
-from pipeline.model.kinematics import reference_motion
-from pipeline.model.rotation import attitude_matrix
+from pipeline.model.kinematics import attitude_matrix, reference_motion
 from pipeline.records import Recording, SensorCalibration, coverage_factor
 from pipeline.signal.filters import apply_filter
 

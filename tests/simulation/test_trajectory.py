@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.model.kinematics import UP_AT_ZERO
-from pipeline.model.rotation import attitude_matrix, turn_about_axis
+from pipeline.model.kinematics import UP_AT_ZERO, attitude_matrix, turn_about_axis
 from pipeline.simulation.procedures import Course, plan
 from pipeline.simulation.rate_table import Program, ProgramBuilder, TurnErrors
 from pipeline.simulation.trajectory import Moves, Turn, axis_and_angle, random_gimbals, rotation_about

@@ -33,7 +33,7 @@ from pipeline.estimation.multi_position.accelerometer import SMALLEST_NOISE, whi
 from pipeline.estimation.multi_position.gravity import observed_rests
 from pipeline.estimation.multi_position.model import Equations, State, effect_readings, motion_of
 from pipeline.estimation.multi_position.moves import moves_of, tangents, to_the_end
-from pipeline.model.rotation import skew
+from pipeline.model.kinematics import skew
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.estimation.rest_means import sound_samples
-from pipeline.model.rotation import turn_by_vector
+from pipeline.model.kinematics import turn_by_vector
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -20,7 +20,7 @@ import numpy as np
 
 from pipeline.errors import ConfigurationError
 from pipeline.model.effects.base import Effect, Layout, Owner, Parameter, truth, unit_of
-from pipeline.model.rotation import turn_by_vector
+from pipeline.model.kinematics import turn_by_vector
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -28,8 +28,7 @@ import numpy as np
 
 from pipeline.model.effects.base import Layout, length, turning_direction
 from pipeline.model.effects.formula_effect import DeclaredEffect
-from pipeline.model.kinematics import UP_AT_ZERO
-from pipeline.model.rotation import ABOUT, skew, turn_about_axis
+from pipeline.model.kinematics import ABOUT, UP_AT_ZERO, skew, turn_about_axis
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
