@@ -15,6 +15,7 @@ from pipeline.errors import ConfigurationError, InputError, PipelineError
 from pipeline.field_logs.log_checks import LogChecks
 from pipeline.field_logs.output import replacing, require_apart
 from pipeline.io.channel_table import STRAIGHT, axis_matrix, maps_of_log
+from pipeline.io.units import ACCELEROMETER, CANONICAL, GYROSCOPE, UNITS
 from pipeline.model.compensation import SMOOTHING_S
 from pipeline.records import SENSORS
 
@@ -35,10 +36,8 @@ BLOCK_BYTES = 1 << 21  # of a text log: 20,000 rows, whose arrays take some 10 M
 
 
 def _canonical() -> dict[str, Any]:
-    names = {"time": ("time_s", "s"), "temperature": ("temperature_degc", "degC")}
-    names |= {f"accel_{a}": (f"accel_{a}_g", "g") for a in "xyz"}
-    names |= {f"gyro_{a}": (f"gyro_{a}_dps", "deg/s") for a in "xyz"}
-    return {"csv": {"columns": {channel: {"column": c, "unit": unit} for channel, (c, unit) in names.items()}}}
+    used = ("time", "temperature", *ACCELEROMETER, *GYROSCOPE)
+    return {"csv": {"columns": {c: {"column": CANONICAL[c], "unit": next(iter(UNITS[c]))} for c in used}}}
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,18 @@ from pipeline.io.arrow import text_scalar, to_arrow, to_numpy
 from pipeline.io.csv_layout import Layout, find_faults
 from pipeline.io.ingest_settings import csv_formats
 from pipeline.io.text_log import TextLog
-from pipeline.io.units import COUNTS, SECOND_NS, SINCE_1970_NS, TRIADS, UNITS, decode, to_house_unit
+from pipeline.io.units import (
+    ACCELEROMETER,
+    CANONICAL,
+    COUNTS,
+    GYROSCOPE,
+    SECOND_NS,
+    SINCE_1970_NS,
+    TRIADS,
+    UNITS,
+    decode,
+    to_house_unit,
+)
 from pipeline.records import SENSORS, Encoding
 
 if TYPE_CHECKING:
@@ -35,7 +46,6 @@ if TYPE_CHECKING:
     from pipeline.io.text_log import Head
 
 SIGNALS = {**TRIADS, "temperature": ("temperature",), "time": ("time",)}
-CANONICAL = {c: f"{c}_{'g' if s == 'accelerometer' else 'dps'}" for s in SENSORS for c in TRIADS[s]}
 
 
 class CsvLog:
@@ -121,7 +131,7 @@ class CsvLog:
                 self.places[signal] = [i for c in present if (i := _index(c, names)) is not None]
         if not any(sensor in self.places for sensor in SENSORS):
             told = "--ingest names the profile that describes this log"
-            if set(CANONICAL.values()) & set(names):
+            if {CANONICAL[c] for c in (*ACCELEROMETER, *GYROSCOPE)} & set(names):
                 told = f"these are the columns that this command writes: the log is compensated already, else {told}"
             expected = ", ".join(str(self.columns[c].column) for s in SENSORS for c in TRIADS[s] if c in self.columns)
             raise InputError(f"no column of a sensor; expected {expected}, got {', '.join(names)[:200]}; {told}", where)

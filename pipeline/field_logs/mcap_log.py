@@ -19,7 +19,7 @@ from pipeline.errors import IngestError, InputError
 from pipeline.field_logs.compensate import Block
 from pipeline.field_logs.mcap_messages import new_imu, replaced
 from pipeline.io.ingest_settings import mcap_format
-from pipeline.io.mcap_channels import MAPPED, TopicDecoder, kind_of, topic_of
+from pipeline.io.mcap_channels import MAPPED, TopicDecoder, kind_of, listed_topics, topic_of
 from pipeline.io.mcap_copy import McapCopy
 from pipeline.io.mcap_reader import McapReader
 from pipeline.io.ros2_messages import DEFINITIONS, IMU, TEMPERATURE
@@ -166,9 +166,7 @@ class McapLog:
     def _check_topic(self, checks: LogChecks) -> None:
         """Refuse a log without readings, and note readings that this command has made."""
         if self.readings is None:
-            schemas, channels = self.reader.schemas, self.reader.channels.values()
-            kinds = {c.topic: schemas[c.schema_id].name if c.schema_id in schemas else "no type" for c in channels}
-            listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(kinds.items()))
+            listed = ", ".join(text for _, text in listed_topics(self.reader))
             named = self._named_topic() or f"a topic of type {IMU}"
             message = f"no messages on {named}; the file has {listed or 'none'}"
             hint = "ingest.mcap.topics of a profile (--ingest) reads other types by their fields"

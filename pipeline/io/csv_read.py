@@ -8,6 +8,7 @@ a table with a clock of its own is aligned with the sensor's (``pipeline.io.enco
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -88,34 +89,26 @@ def _joined(tables: Sequence[ChannelTable]) -> ChannelTable:
         return first
     for other in tables[1:]:
         _check_same_times(first, other)
-    return ChannelTable(
-        path=first.path,
-        time_ns=first.time_ns,
+    return replace(
+        first,
         values={k: v for t in tables for k, v in t.values.items()},
         source={**first.source, "parts": [t.source for t in tables]},
-        line_of=first.line_of,
         encodings={k: v for t in tables for k, v in t.encodings.items()},
         notes=tuple(n for t in tables for n in t.notes),
-        flags=first.flags,
     )
 
 
 def _check_same_times(first: ChannelTable, other: ChannelTable) -> None:
     """Refuse files that were not logged at the same times: their rows do not belong together."""
-    if np.array_equal(first.time_ns, other.time_ns):
-        return
     rows = min(len(first.time_ns), len(other.time_ns))
     differs = np.flatnonzero(first.time_ns[:rows] != other.time_ns[:rows])
-    if differs.size == 0:
-        message = (
-            f"{other.source['rows']} rows, but {first.path} has {first.source['rows']}; parts of one recording need "
-            "the same times"
-        )
+    same = "parts of one recording need the same times"
+    if differs.size:
+        row = int(differs[0])
+        times = f"time {other.time_ns[row] / 1e9:.9g} s differs from {first.time_ns[row] / 1e9:.9g} s"
+        hint = "a table's log with a clock of its own is marked own_clock: true"
+        message = f"{times} in {first.place(row)}; {same}"
+        raise IngestError(message, other.place(row), code="other_times", hint=hint)
+    if len(first.time_ns) != len(other.time_ns):
+        message = f"{other.source['rows']} rows, but {first.path} has {first.source['rows']}; {same}"
         raise IngestError(message, other.path, code="other_times")
-    row = int(differs[0])
-    message = (
-        f"time {other.time_ns[row] / 1e9:.9g} s differs from {first.time_ns[row] / 1e9:.9g} s in {first.place(row)}; "
-        "parts of one recording need the same times"
-    )
-    hint = "a table's log with a clock of its own is marked own_clock: true"
-    raise IngestError(message, other.place(row), code="other_times", hint=hint)

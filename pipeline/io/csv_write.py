@@ -8,6 +8,7 @@ so that the file holds the nearest decimal, and reading it gives ``round(value *
 from __future__ import annotations
 
 import os
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,7 +16,9 @@ import pyarrow as pa
 from pyarrow import csv
 
 from pipeline.errors import ConfigurationError
-from pipeline.io.units import ACCELEROMETER, ATTITUDE, GYROSCOPE, SCALARS
+from pipeline.io.arrow import to_arrow
+from pipeline.io.parquet import columns_of
+from pipeline.io.units import CANONICAL
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -25,51 +28,31 @@ if TYPE_CHECKING:
 
     from pipeline.records import Recording
 
-TIME = "time_s"
-HEADER = (
-    *(f"{c}_g" for c in ACCELEROMETER),
-    *(f"{c}_dps" for c in GYROSCOPE),
-    *(name for name in ("temperature_degc", "table_angle_deg", "table_rate_dps")),
-    *ATTITUDE,
-)
 
-
-def write_canonical_csv(path: Path, recording: Recording, decimals: Mapping[str, int] | None = None) -> None:
+def write_canonical_csv(path: Path, recording: Recording, decimals: Mapping[str, int] = MappingProxyType({})) -> None:
     """Write a recording as canonical CSV; the file is replaced at once, never half written.
 
     Readings are written along the body axes. ``decimals``: header name (``accel_x_g`` ...) to digits after the point; a
     column that is not named keeps every bit.
     """
-    decimals = decimals or {}
-    columns = _columns(recording)
-    unknown = [name for name in decimals if name not in HEADER]
+    unknown = [name for name in decimals if name not in CANONICAL.values()]
     if unknown:
-        raise ConfigurationError(f"decimals of unknown columns {', '.join(unknown)}; known are {', '.join(HEADER)}")
-    arrays = {TIME: _decimal(recording.time_ns, 9).cast(pa.decimal128(38, _time_digits(recording.time_ns)))}
-    for name, values in columns.items():
-        if name in decimals:
-            arrays[name] = _decimal(np.rint(values * 10.0 ** decimals[name]).astype(np.int64), decimals[name])
-        else:
-            arrays[name] = pa.array(values)
+        known = ", ".join(list(CANONICAL.values())[1:])
+        raise ConfigurationError(f"decimals of unknown columns {', '.join(unknown)}; known are {known}")
+    columns = columns_of(recording)
+    time = columns.pop("time_ns")
+    arrays = {CANONICAL["time"]: _decimal(time, 9).cast(pa.decimal128(38, _time_digits(time)))}
+    for channel, name in CANONICAL.items():
+        if channel in columns and name in decimals:
+            values = np.rint(columns[channel] * 10.0 ** decimals[name]).astype(np.int64)
+            arrays[name] = _decimal(values, decimals[name])
+        elif channel in columns:
+            arrays[name] = to_arrow(np.ascontiguousarray(columns[channel]))
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     with temporary.open("wb") as stream:
         stream.write((",".join(arrays) + "\n").encode())
         csv.write_csv(pa.table(arrays), stream, csv.WriteOptions(include_header=False))
     temporary.replace(path)
-
-
-def _columns(recording: Recording) -> dict[str, NDArray[np.float64]]:
-    """Return the channels of a recording under their canonical names."""
-    blocks = (recording.accelerometer, recording.gyroscope, *(getattr(recording, name) for name in SCALARS))
-    widths = (3, 3, 1, 1, 1, 4)
-    names = iter(HEADER)
-    out = {}
-    for block, width in zip((*blocks, recording.table_attitude), widths, strict=True):
-        for column in range(width):
-            name = next(names)
-            if block is not None:
-                out[name] = np.ascontiguousarray(block[:, column] if block.ndim == 2 else block)
-    return out
 
 
 def _time_digits(time_ns: NDArray[np.int64]) -> int:

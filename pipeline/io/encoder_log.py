@@ -111,15 +111,10 @@ def unwrapped(table: ChannelTable) -> ChannelTable:
 
 
 def align(sensor: ChannelTable, log: ChannelTable) -> ChannelTable:
-    """Return a sensor's log with the channels of a table's log at its own times.
+    """Return a sensor's log with the channels of a table's log at its own times; refuse logs of different motions.
 
     Rows that the table's log does not cover are left out. Where the table rests throughout, both logs are taken to
     begin together, as nothing depends on it.
-
-    Raises
-    ------
-    IngestError
-        If the two logs do not show the same motion, or the sensor's holds no gyroscope.
     """
     from pipeline.io.clock_alignment import fit_clocks  # noqa: PLC0415  (it reads the signals of this module)
 
@@ -156,13 +151,10 @@ def _notes(sensor: ChannelTable, rows: slice, fit: ClockFit, offset_s: float) ->
         f"(+- {_one_digit(fit.drift_uncertainty * 1e6)}); aligned by the motion in both logs (correlation "
         f"{fit.correlation:.5f})"
     )
-    first, last = sensor.line_of(rows.start), sensor.line_of(rows.stop - 1)
-    times = float(sensor.time_ns[rows.start]) / 1e9, float(sensor.time_ns[rows.stop - 1]) / 1e9
-    notes = [Note("N-SYNC", rows.stop - rows.start, first, last, detail, *times)]
-    lost = len(sensor.time_ns) - (rows.stop - rows.start)
-    if lost:
-        notes.append(Note("N-CUT", lost, first, last, f"{lost} rows that the table's log does not cover were left out"))
-    return notes
+    sync = sensor.note("N-SYNC", np.arange(rows.start, rows.stop), detail)
+    lost = len(sensor.time_ns) - sync.count
+    detail = f"{lost} rows that the table's log does not cover were left out"
+    return [sync, *([Note("N-CUT", lost, sync.first, sync.last, detail)] if lost else [])]
 
 
 def _one_digit(value: float) -> str:
@@ -177,8 +169,8 @@ def _merged(  # noqa: PLR0917  (parts of one table)
     values |= {channel: at(tau) for channel, at in interpolators(log).items()}
     source = {**sensor.source, "table_clock": clock} if clock else dict(sensor.source)
     same = log.source is sensor.source
-    return ChannelTable(
-        path=sensor.path,
+    return replace(
+        sensor,
         time_ns=sensor.time_ns[rows],
         values=values,
         source=source if same else {**source, "table_log": log.source},

@@ -27,7 +27,7 @@ from pipeline.io.channel_table import to_body_axes
 from pipeline.io.csv_read import read_one
 from pipeline.io.files import refuse_foreign, unchanged
 from pipeline.io.ingest_settings import Column, CsvFormat
-from pipeline.io.units import ATTITUDE, COUNTS, DEGREES, TRIADS
+from pipeline.io.units import ATTITUDE, CANONICAL, COUNTS, DEGREES, SCALARS, TRIADS, UNITS
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -38,12 +38,6 @@ if TYPE_CHECKING:
 FIRST_LINES = (b"GYROFLOW IMU LOG", b"CAMERA IMU LOG")
 LONGEST_HEADER = 1 << 16  # bytes that are searched for the line of names
 LAST_VERSION = "1.3"
-EXTRA = {
-    "temperature_degc": ("temperature", "degC"),
-    "table_angle_deg": ("table_angle", "deg"),
-    "table_rate_dps": ("table_rate", "deg/s"),
-    **{name: (name, "1") for name in ATTITUDE},
-}
 
 
 def read_gcsv(path: Path, checks: Checks) -> ChannelTable:
@@ -88,7 +82,8 @@ def _format(names: list[str], facts: dict[str, str], skip: int, path: Path) -> C
                 Column(channel=channel, column=f"{letter}{channel[-1]}", unit=COUNTS, counts_per_unit=per_unit)
                 for channel in TRIADS[sensor]
             ]
-    columns += [Column(channel=c, column=name, unit=unit, optional=True) for name, (c, unit) in EXTRA.items()]
+    others = [c for c in CANONICAL if c in (*SCALARS, *ATTITUDE)]
+    columns += [Column(channel=c, column=CANONICAL[c], unit=next(iter(UNITS[c])), optional=True) for c in others]
     return CsvFormat(skip_lines=skip, columns=tuple(columns))
 
 

@@ -16,7 +16,7 @@ from pipeline.errors import IngestError
 from pipeline.io.channel_table import ChannelTable
 from pipeline.io.files import unchanged
 from pipeline.io.ingest_settings import HEADER, OWN
-from pipeline.io.mcap_channels import MAPPED, TopicDecoder, kind_of, topic_of
+from pipeline.io.mcap_channels import MAPPED, TopicDecoder, kind_of, listed_topics, topic_of
 from pipeline.io.mcap_reader import McapReader
 from pipeline.io.ros2_messages import IMU, JOINT_STATE, QUATERNION_STAMPED, TEMPERATURE
 from pipeline.io.timestamps import check_fine, check_plausible, in_order
@@ -125,20 +125,15 @@ class _Log:
             if topic is not None:
                 topic.read(rows, self.reader)
         self._note_container()
-        base, values = self._mapped() if self.settings.topics else self._imu()
-        for kind, read in (
-            (TEMPERATURE, self._temperature),
-            (JOINT_STATE, self._table_values),
-            (QUATERNION_STAMPED, self._table_values),
-        ):
-            topic = self._only(kind, required=topic_of(kind, self.settings) is not None)
-            if topic is not None:
-                values |= {n: v for n, v in read(self._series(topic), base).items() if n not in values}
+        first, *others = self._chosen()
+        base = self._series(first)
+        values = dict(base.values)
+        for topic in others:
+            values = self._at_rows(self._series(topic), base) | values
         self._check_finite(values, base)
-        ignored = [listed for name, listed in self._listed() if name not in self.topics]
+        ignored = [listed for name, listed in listed_topics(self.reader) if name not in self.topics]
         if ignored:
-            detail = f"topics not used: {', '.join(ignored)}"
-            self.notes.append(Note("N-IGNORED", len(ignored), 0, 0, detail))
+            self.notes.append(Note("N-IGNORED", len(ignored), 0, 0, f"topics not used: {', '.join(ignored)}"))
         time = base.time_ns[base.time_ns <= self.end_ns]
         values = {c: v[: len(time)] for c, v in values.items()}
         source = {"file": self.path, "sha256": self.reader.sha256, "rows": len(time)}
@@ -162,65 +157,43 @@ class _Log:
             self.topics[name] = _Topic(TopicDecoder(name, kind, self.settings, self.path))
         return self.topics[name]
 
-    def _only(self, kind: str, *, required: bool) -> _Topic | None:
-        """Return the named topic, or the only topic of a type; None if there is none and none is required."""
+    def _only(self, kind: str, *, required: bool) -> list[_Topic]:
+        """Return the named topic, or the only topic of a type; none if there is none and none is required."""
         found = [t for t in self.topics.values() if t.decoder.kind == kind]
         if len(found) > 1:
-            message = (
-                f"{len(found)} topics are of type {kind}: {', '.join(t.decoder.topic for t in found)}; choose one in "
-                "ingest.mcap"
-            )
+            listed = ", ".join(t.decoder.topic for t in found)
+            message = f"{len(found)} topics are of type {kind}: {listed}; choose one in ingest.mcap"
             raise IngestError(message, self.path, code="ambiguous")
         if required and not found:
             named = topic_of(kind, self.settings)
             self._refuse_missing(f"no topic {named} of type {kind}" if named else f"no topic of type {kind}", kind)
-        return found[0] if found else None
+        return found
+
+    def _chosen(self) -> list[_Topic]:
+        """Return the topic of the rows, and then the others that are read."""
+        topics = self.settings.topics
+        if topics:
+            empty = [t for t in topics if t not in self.topics]
+            if empty:
+                self._refuse_missing(f"no messages on {', '.join(empty)}", MAPPED)
+            first = next((t for t, f in topics.items() if {ACCELEROMETER[0], GYROSCOPE[0]} & set(f)), None)
+            if first is None:
+                self._refuse_missing("ingest.mcap.topics names no accelerometer and no gyroscope", MAPPED)
+            chosen = [self.topics[t] for t in (first, *(t for t in topics if t != first))]
+        else:
+            chosen = self._only(IMU, required=True)
+        for kind in (TEMPERATURE, JOINT_STATE, QUATERNION_STAMPED):
+            chosen += self._only(kind, required=topic_of(kind, self.settings) is not None)
+        return chosen
 
     def _refuse_missing(self, what: str, kind: str) -> NoReturn:
-        listed = ", ".join(text for _, text in self._listed()) or "no topics"
+        listed = ", ".join(text for _, text in listed_topics(self.reader)) or "no topics"
         hint = "ingest.mcap.topics reads other types by their fields" if kind == IMU else ""
         raise IngestError(f"{what}; the file has {listed}", self.path, code="missing_topic", hint=hint)
-
-    def _listed(self) -> list[tuple[str, str]]:
-        """Return all topics, and each with its type."""
-        found = set()
-        for number, channel in self.reader.channels.items():
-            schema = self.reader.schemas.get(channel.schema_id)
-            kind = schema.name if schema else channel.message_encoding
-            empty = "" if self.reader.counts[number] else ", no messages"
-            found.add((channel.topic, f"{channel.topic} ({kind}{empty})"))
-        return sorted(found)
 
     def _series(self, topic: _Topic) -> _Series:
         self.encodings |= topic.decoder.encodings
         return topic.series(self.settings, self.notes)
-
-    def _imu(self) -> tuple[_Series, Columns]:
-        """Return the rows and channels of the Imu topic."""
-        topic = self._only(IMU, required=True)
-        assert topic is not None  # noqa: S101  (required)
-        base = self._series(topic)
-        return base, dict(base.values)
-
-    def _mapped(self) -> tuple[_Series, Columns]:
-        """Return the rows and channels of the topics whose fields the profile names."""
-        topics = self.settings.topics
-        empty = [t for t in topics if t not in self.topics]
-        if empty:
-            self._refuse_missing(f"no messages on {', '.join(empty)}", MAPPED)
-        first = next((t for t, f in topics.items() if {ACCELEROMETER[0], GYROSCOPE[0]} & set(f)), None)
-        if first is None:
-            self._refuse_missing("ingest.mcap.topics names no accelerometer and no gyroscope", MAPPED)
-        base = self._series(self.topics[first])
-        values = dict(base.values)
-        for rows in (self._series(self.topics[t]) for t in topics if t != first):
-            if self.settings.table_clock == OWN and set(rows.values) <= set(TABLE_CHANNELS):
-                self._keep_log(rows)
-            elif set(rows.values) == {"temperature"}:
-                values |= self._temperature(rows, base)
-            else:
-                values |= self._matched(rows, base)
-        return base, values
 
     def _temperature(self, series: _Series, base: _Series) -> Columns:
         """Return the temperature at the times of the rows."""
@@ -233,17 +206,14 @@ class _Log:
         times, own = base.time_ns - base.time_ns[0], series.time_ns - base.time_ns[0]
         return {n: np.interp(times, own, numbers) for n, numbers in series.values.items()}
 
-    def _table_values(self, series: _Series, base: _Series) -> Columns:
-        """Return a table's channels at the times of the rows; none if its clock is another one."""
-        if self.settings.table_clock == OWN:
-            self._keep_log(series)
+    def _at_rows(self, series: _Series, base: _Series) -> Columns:
+        """Return the channels of a topic at the times of the rows; none of a table's with a clock of its own."""
+        channels = set(series.values)
+        if self.settings.table_clock == OWN and channels <= set(TABLE_CHANNELS):  # aligned with the rows later
+            source = {"topic": series.topic, "rows": len(series.time_ns)}
+            self.table_logs.append(ChannelTable(self.path, series.time_ns, series.values, source, lambda _row: 0))
             return {}
-        return self._matched(series, base)
-
-    def _keep_log(self, rows: _Series) -> None:
-        """Keep the log of a table with a clock of its own, to be aligned with the rows."""
-        source = {"topic": rows.topic, "rows": len(rows.time_ns)}
-        self.table_logs.append(ChannelTable(self.path, rows.time_ns, rows.values, source, lambda _row: 0))
+        return self._temperature(series, base) if channels == {"temperature"} else self._matched(series, base)
 
     def _matched(self, series: _Series, base: _Series) -> Columns:
         """Return the channels of the messages with the stamps of the rows."""

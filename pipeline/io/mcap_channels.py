@@ -54,6 +54,17 @@ def topic_of(kind: str, settings: McapFormat) -> str | None:
     }[kind]
 
 
+def listed_topics(reader: McapReader) -> list[tuple[str, str]]:
+    """Return all topics of a file, each with its type in words."""
+    found = set()
+    for number, channel in reader.channels.items():
+        schema = reader.schemas.get(channel.schema_id)
+        kind = schema.name if schema else channel.message_encoding
+        empty = "" if reader.counts[number] else ", no messages"
+        found.add((channel.topic, f"{channel.topic} ({kind}{empty})"))
+    return sorted(found)
+
+
 class TopicDecoder:
     """Decoder of one topic; ``encodings`` are those of channels sent as counts, ``count`` the messages so far."""
 

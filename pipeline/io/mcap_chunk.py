@@ -38,14 +38,12 @@ LARGEST_CHUNK = 1 << 30  # bytes; recorders write about 1 MiB
 LARGEST_EXPANSION = 1000
 ALWAYS_ALLOWED = 1 << 24  # bytes; a small chunk of equal bytes packs better than any log
 MESSAGE_HEAD = 22  # bytes of a message before its data
-HEAD = np.dtype(
-    {
-        "names": ["opcode", "length", "channel", "sequence", "log_time", "publish_time"],
-        "formats": ["u1", "<u8", "<u2", "<u4", "<u8", "<u8"],
-        "offsets": [0, 1, 9, 11, 15, 23],
-        "itemsize": RECORD_HEAD + MESSAGE_HEAD,
-    }
-)
+HEAD = np.dtype({
+    "names": ["opcode", "length", "channel", "sequence", "log_time", "publish_time"],
+    "formats": ["u1", "<u8", "<u2", "<u4", "<u8", "<u8"],
+    "offsets": [0, 1, 9, 11, 15, 23],
+    "itemsize": RECORD_HEAD + MESSAGE_HEAD,
+})  # fmt: skip
 _RECORD, _HEAD = struct.Struct("<BQ"), struct.Struct("<BQH")
 
 
@@ -150,9 +148,10 @@ def unpack(content: bytes, expected: int, compression: str) -> bytes | memoryvie
 def split(run: Run) -> tuple[list[tuple[int, memoryview]], list[Rows]]:
     """Return the other records (opcode, content) of a run, and its messages; ``ValueError``: records do not fill it."""
     data = np.frombuffer(run.data, np.uint8)
-    first, others = _leading(run.data)
-    if first == len(data):
+    leading, others = _followed(run.data, 0, stop_at_message=True)
+    if not leading.size:
         return others, []
+    first = int(leading[0])
     whole = _alike(run, data, first)
     if whole is not None:
         return others, [whole]
@@ -161,12 +160,6 @@ def split(run: Run) -> tuple[list[tuple[int, memoryview]], list[Rows]]:
         starts, more = _followed(run.data, first)
         others += more
     return others, _by_channel(run, data, starts)
-
-
-def _leading(data: bytes | memoryview) -> tuple[int, list[tuple[int, memoryview]]]:
-    """Return where the first message begins, and the records before it."""
-    starts, others = _followed(data, 0, stop_at_message=True)
-    return (int(starts[0]) if starts.size else len(data)), others
 
 
 def _followed(

@@ -31,12 +31,10 @@ if TYPE_CHECKING:
     from pipeline.io.mcap_chunk import Rows
 
 DEFINITIONS = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel}
-ONLY_IN_DATA = frozenset(
-    {
-        *(Opcode.HEADER, Opcode.MESSAGE, Opcode.CHUNK, Opcode.MESSAGE_INDEX),
-        *(Opcode.ATTACHMENT, Opcode.METADATA, Opcode.DATA_END),
-    }
-)
+ONLY_IN_DATA = frozenset({
+    Opcode.HEADER, Opcode.MESSAGE, Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.METADATA,
+    Opcode.DATA_END,
+})  # fmt: skip
 ONLY_IN_SUMMARY = frozenset(Opcode) - ONLY_IN_DATA - frozenset(DEFINITIONS)
 _KINDS = frozenset(Opcode)
 COPY_AGAIN = "copy the file again from its source"
@@ -127,14 +125,10 @@ class McapReader:
             raise
         except Exception as error:
             reason = str(error) if isinstance(error, ValueError) else f"{type(error).__name__} {error}".strip()
-            raise IngestError(
-                f"truncated or damaged MCAP file: {reason}; {self.count} messages in {len(self.chunks)} chunks were "
-                "readable before",
-                self.path,
-                code="checksum" if "checksum" in reason else "incomplete" if "missing" in reason else "damaged",
-                offset=self._start,
-                hint=COPY_AGAIN,
-            ) from error
+            readable = f"{self.count} messages in {len(self.chunks)} chunks were readable before"
+            message = f"truncated or damaged MCAP file: {reason}; {readable}"
+            code = "checksum" if "checksum" in reason else "incomplete" if "missing" in reason else "damaged"
+            raise IngestError(message, self.path, code=code, offset=self._start, hint=COPY_AGAIN) from error
         self.sha256 = self._sha.hexdigest()
 
     def _take(self, size: int) -> bytes:
@@ -301,20 +295,16 @@ class McapReader:
         """Compare what was read with the summary; ``ValueError`` if a part is missing."""
         lost = set(self._chunk_index) - set(self.chunks)
         if lost or (self._chunk_index and not self.truncated and sorted(self._chunk_index) != self.chunks):
-            raise ValueError(
-                f"the summary lists {len(self._chunk_index)} chunks, and the file holds {len(self.chunks)} where it "
-                "may look for them: a part is missing"
-            )
+            what = f"the summary lists {len(self._chunk_index)} chunks, and the file holds {len(self.chunks)}"
+            raise ValueError(f"{what} where it may look for them: a part is missing")
         stated = self._statistics
         if stated is None:
             return
+        said = f"the summary says {stated.message_count} messages"
         if stated.message_count != self.count:
-            raise ValueError(
-                f"the summary says {stated.message_count} messages, the file holds {self.count}: a part is missing"
-            )
+            raise ValueError(f"{said}, the file holds {self.count}: a part is missing")
         if stated.channel_message_counts and Counter(stated.channel_message_counts) != self.counts:
-            message = f"the summary says {stated.message_count} messages, which the file does not hold by channel"
-            raise ValueError(message)
+            raise ValueError(f"{said}, which the file does not hold by channel")
         found = (len(self.chunks), len(self.attachments), len(self.metadata))
         if (stated.chunk_count, stated.attachment_count, stated.metadata_count) != found:
             raise ValueError(

@@ -45,7 +45,7 @@ PAGE_ENCODINGS = {"f": "BYTE_STREAM_SPLIT", "i": "DELTA_BINARY_PACKED", "u": "PL
 
 def save_recordings(path: Path, recordings: Sequence[Recording]) -> None:
     """Write the recordings of a unit; the file is replaced at once, never half written."""
-    stored = [_columns_of(r) for r in recordings]
+    stored = [columns_of(r) for r in recordings]
     counts = _encode_counts(recordings, stored)
     names = [c for c in COLUMNS if any(c in s for s in stored)] or ["time_ns"]
     types = {n: _type(n, [s[n] for s in stored if n in s]) for n in names}
@@ -180,8 +180,8 @@ for _name, _channels in {**BLOCKS, **{name: (name,) for name in SINGLES}}.items(
     setattr(_StoredRecording, _name, _property)
 
 
-def _columns_of(recording: Recording) -> dict[str, NDArray[Any]]:
-    """Return the columns that a recording holds."""
+def columns_of(recording: Recording) -> dict[str, NDArray[Any]]:
+    """Return the times, channels and flags that a recording holds, by name."""
     columns: dict[str, NDArray[Any]] = {"time_ns": recording.time_ns}
     for name, channels in BLOCKS.items():
         block = getattr(recording, name)

@@ -141,29 +141,22 @@ def flag_stuck(table: ChannelTable, sensor: str, flags: NDArray[np.uint16]) -> l
     for channel, same in neighbours.items():
         if not _in_a_row(same, SHORTEST_RUN - 1):
             continue
-        share = equal_share(same)
         others = [not s.any() or equal_share(s) <= QUIET for c, s in neighbours.items() if c != channel]
-        if same.all() and len(same) >= DEAD_ROWS and others and all(others):
-            message = (
-                f"{channel} is {table.values[channel][0] + 0.0:.6g} {SENSOR_UNITS[sensor]} in all {len(same) + 1} "
-                "rows, while the other axes change"
-            )
-            hint = "is the column right, and the sensor's axis alive?"
-            raise IngestError(message, table.path, code="stuck", hint=hint)
-        rows = _stuck_rows(same, share)
-        rows = rows[(flags[rows] & CLIPPED) == 0]
+        dead = bool(same.all()) and len(same) >= DEAD_ROWS
+        rows = _stuck_rows(same, equal_share(same))
+        rows = np.arange(len(same)) if dead else rows[(flags[rows] & CLIPPED) == 0]
+        if not rows.size:
+            continue
+        value = f"{table.values[channel][rows[0]] + 0.0:.6g} {SENSOR_UNITS[sensor]}"
         if rows.size >= len(same) / 2 and others and all(others):
-            message = (
-                f"{channel} stays at one value for longer than its noise allows in {rows.size} of "
-                f"{len(same) + 1} rows, while the other axes change"
-            )
-            raise IngestError(message, table.place(int(rows[0])), code="stuck", hint="is the sensor's axis alive?")
-        if 0 < rows.size < len(same) / 2:
+            part = f"stays at one value for longer than its noise allows in {rows.size} of"
+            what = f"is {value} in all" if dead else part
+            message = f"{channel} {what} {len(same) + 1} rows, while the other axes change"
+            hint = "is the column right, and the sensor's axis alive?"
+            raise IngestError(message, table.path if dead else table.place(int(rows[0])), code="stuck", hint=hint)
+        if rows.size < len(same) / 2:
             flags[rows] |= STUCK
-            detail = (
-                f"{channel} stays at {table.values[channel][rows[0]]:.6g} {SENSOR_UNITS[sensor]} for longer than its "
-                "noise allows: stuck, and left out of every fit"
-            )
+            detail = f"{channel} stays at {value} for longer than its noise allows: stuck, and left out of every fit"
             notes.append(table.note("N-STUCK", rows, detail))
     return notes
 

@@ -88,10 +88,7 @@ def read_table(
 
 
 def _check_complete(
-    procedure: Mapping[str, Any],
-    files: Mapping[str, list[Path]],
-    wanted: Mapping[str, list[list[str]]],
-    folder: Path,
+    procedure: Mapping[str, Any], files: Mapping[str, list[Path]], wanted: Mapping[str, list[list[str]]], folder: Path
 ) -> None:
     """Raise one error that names all missing files."""
     missing = []

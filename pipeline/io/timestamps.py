@@ -115,14 +115,13 @@ def in_order(
     late = np.maximum.accumulate(time) - time
     if late.max() > reorder_s * SECOND_NS:
         row = int(np.argmax(late > reorder_s * SECOND_NS))
-        raise IngestError(
+        message = (
             f"message {row + 1} on {topic}: header stamp {time[row] / 1e9:.9g} s after "
-            f"{(time[row] + late[row]) / 1e9:.9g} s ({int((steps < 0).sum())} such messages); stamps have to increase",
-            path,
-            code="bad_time",
-            hint=f"a log that was restarted belongs in two files (up to {reorder_s:g} s are put in order: "
-            "ingest.mcap.reorder_s)",
+            f"{(time[row] + late[row]) / 1e9:.9g} s ({int((steps < 0).sum())} such messages); stamps have to increase"
         )
+        allowed = f"up to {reorder_s:g} s are put in order: ingest.mcap.reorder_s"
+        hint = f"a log that was restarted belongs in two files ({allowed})"
+        raise IngestError(message, path, code="bad_time", hint=hint)
     order = np.argsort(time, kind="stable")
     inversions = int((steps < 0).sum())
     if inversions:

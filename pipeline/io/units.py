@@ -51,6 +51,17 @@ UNITS: dict[str, dict[str, tuple[float, float]]] = {
     **dict.fromkeys(ATTITUDE, _RATIO),
 }
 
+# Names of the columns in a canonical CSV, each in its house unit, the first of ``UNITS``.
+CANONICAL = {
+    "time": "time_s",
+    **{c: f"{c}_g" for c in ACCELEROMETER},
+    **{c: f"{c}_dps" for c in GYROSCOPE},
+    "temperature": "temperature_degc",
+    "table_angle": "table_angle_deg",
+    "table_rate": "table_rate_dps",
+    **{c: c for c in ATTITUDE},
+}
+
 # Spellings of units in the names of columns, lower case and without blanks, to the names used here.
 SPELLINGS = {
     "g": "g", "mg": "mg", "m/s^2": "m/s^2", "m/s2": "m/s^2", "m/s²": "m/s^2", "ms^-2": "m/s^2", "m/s/s": "m/s^2",
