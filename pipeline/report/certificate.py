@@ -54,19 +54,8 @@ ASKED = (
 def certificate(calibration: JSON, validation: JSON | None, settings: JSON, temperature: str | None) -> JSON:
     """Return the report of one calibrated unit.
 
-    Parameters
-    ----------
-    calibration, validation : dict
-        As in their files.
-    settings : dict
-        The unit's resolved configuration, with ``row`` (serial, lot, date of ``units.csv``).
-    temperature : str or None
-        Range of the sensor's temperature, degC; None where it was not recorded.
-
-    Returns
-    -------
-    dict
-        ``complete, stamp, missing, administrativeData, measurementResults`` and ``source``.
+    ``settings``: the unit's resolved configuration, with ``row`` (serial, lot, date of ``units.csv``); ``temperature``:
+    the range of the sensor's, degC, None where it was not recorded.
     """
     stated = settings["certificate"]
     document: JSON = {
@@ -235,4 +224,5 @@ def certificate_page(unit: str, report: JSON) -> str:
 
 def _css_text(text: str) -> Markup:
     """Return text for a string of a style sheet: everything but letters and digits as its number."""
-    return Markup("".join(c if c.isascii() and c.isalnum() else f"\\{ord(c):x} " for c in text))  # noqa: S704  (no markup left)
+    codes = "".join(c if c.isascii() and c.isalnum() else f"\\{ord(c):x} " for c in text)
+    return Markup(codes)  # noqa: S704  (no markup left)

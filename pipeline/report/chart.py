@@ -112,24 +112,11 @@ Layer = Line | Samples | Dots | Band
 
 @dataclass(frozen=True)
 class Panel:
-    """One field of a chart.
+    """One field of a chart: layers in the order in which they are drawn, and its axis y.
 
-    Attributes
-    ----------
-    layers : list of Line, Samples, Dots or Band
-        Drawn in this order.
-    label : str
-        Of the axis y, with unit.
-    height : int, px
-    levels : dict of str to float
-        Horizontal lines by their text.
-    limits : (low, high), optional
-        Of the axis y; from the layers where it is not given.
-    logarithmic : bool
-    names : list of (x, y, text)
-        Texts beside points; one that would cover another is left out.
-    rows : list of str
-        Names of y = 1, 2, ...
+    ``height``: px; ``levels``: horizontal lines by their text; ``limits``: of the axis, from the layers where not
+    given; ``names``: x, y and text beside points, left out where it would cover another; ``rows``: names of y = 1, 2,
+    ...
     """
 
     layers: list[Layer]
@@ -163,11 +150,8 @@ def chart(
     description : str
         What the chart shows, for screen readers.
     panels : list of Panel
-    x_label : str
-    kind : str
-        Of the axis x: "", "angle" (deg) or "log".
-    margin : float
-        By which axis x is wider than the values, as a share of their range.
+    x_label, kind, margin
+        Of the axis x: its label, "", "angle" (deg) or "log", and by which share of their range it exceeds the values.
     left : int, px
         Room for the ticks of the axes y.
     columns : sequence of str

@@ -87,14 +87,9 @@ def mean_of(values: ArrayLike, uncertainties: ArrayLike = math.nan) -> Estimate:
 
 
 def difference(first: pd.DataFrame, second: pd.DataFrame, pairs: Mapping[str, str] | None = None) -> Estimate:
-    """Return the mean of ``first`` minus that of ``second``.
+    """Return the mean of ``first`` minus that of ``second``: columns ``value`` and ``u`` (NaN: unknown) by unit.
 
-    Parameters
-    ----------
-    first, second : DataFrame
-        Columns ``value`` and ``u`` (NaN: unknown) by unit.
-    pairs : mapping of str to str, optional
-        Unit to what it shares with its pair; differences are then taken within the pairs.
+    ``pairs``: unit to what it shares with its pair; differences are then taken within the pairs.
     """
     if pairs is not None:
         a, b = (_averages(group, pairs) for group in (first, second))
@@ -134,14 +129,8 @@ def adjusted(p_values: Sequence[float]) -> list[float]:
 class Group:
     """A group of a comparison and the figures of its units for one sensor.
 
-    Attributes
-    ----------
-    name, series, label : str
-        Its name; its curve and its name on that curve.
-    asked : int
-        Units that it has, failed ones included.
-    figures : DataFrame
-        Rows of ``unit_figures`` by unit: those that were calibrated.
+    ``series, label``: its curve and its name on that curve; ``asked``: how many units it has, failed ones included;
+    ``figures``: rows of ``unit_figures`` by unit, those that were calibrated.
     """
 
     name: str

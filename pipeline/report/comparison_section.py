@@ -46,21 +46,11 @@ FIGURES = (
 def unit_figures(
     calibration: JSON, validation: JSON | None, diagnosis: JSON | None, truth: JSON | None = None
 ) -> list[JSON]:
-    """Return what is compared of a unit, a dict for each calibrated sensor.
+    """Return what is compared of a unit, a dict for each calibrated sensor; None becomes missing.
 
-    Parameters
-    ----------
-    calibration, validation, diagnosis : dict or None
-        As in their files.
-    truth : dict, optional
-        ``truth/<unit>.json`` of the recordings, where they are simulated.
-
-    Returns
-    -------
-    list of dict
-        ``unit, sensor``; rms errors ``before``, ``after`` and ``truth`` (against the truth) with the standard
-        uncertainty ``u_<name>`` (g or deg/s); ``noise_floor``; ``table_time``, the length of the recordings of the
-        fit (s); ``verdict``; ``parameters``: name to Parameter.
+    ``unit, sensor``; rms errors ``before``, ``after`` and ``truth`` (against ``truth/<unit>.json`` of simulated
+    recordings) with the standard uncertainty ``u_<name>`` (g or deg/s); ``noise_floor``; ``table_time``, the length of
+    the recordings of the fit (s); ``verdict``; ``parameters``: name to Parameter.
     """
     rows = []
     for sensor in SENSORS:
@@ -105,16 +95,9 @@ def _against_truth(part: JSON, held_out: JSON, truth: JSON | None) -> float | No
 
 
 def section(comparison: JSON, figures: Sequence[JSON], name: str) -> JSON:
-    """Return what the page shows of a comparison.
+    """Return what the page shows of a comparison, as ``pipeline.config.comparisons`` resolves it.
 
-    Parameters
-    ----------
-    comparison : dict
-        As ``pipeline.config.comparisons`` resolves it.
-    figures : sequence of dict
-        Of ``unit_figures``, of all units; failed units have none.
-    name : str
-        Identifier that is unique on the page.
+    ``figures``: ``unit_figures`` of all units, failed units have none; ``name``: an identifier, unique on the page.
     """
     frame = pd.DataFrame(list(figures), columns=list(FIGURES)).set_index("unit")
     against, pairs, sensors = comparison["against"], comparison["pairs"], []

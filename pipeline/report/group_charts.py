@@ -30,26 +30,11 @@ LOWEST = -100.0  # value at which a bar on a symlog axis ends
 
 @dataclass(frozen=True)
 class Point:
-    """One value.
+    """One value; None has no bar.
 
-    Attributes
-    ----------
-    label : str
-    value : float or None
-        None: no bar.
-    colour : int
-    interval : (low, high), optional
-        Of a mean; drawn in place of the bar.
-    units : tuple of float
-        The values behind a mean.
-    floor : float, optional
-        A level of this row alone: what noise alone gives.
-    x : float
-        Place along the axis of ``curves``.
-    series : str
-        Points of one series are joined in ``curves``.
-    note : str
-        Part of the description, and drawn where there is no value: why there is none.
+    ``interval``: low and high of a mean, drawn in place of the bar; ``units``: the values behind the mean; ``floor``:
+    what noise alone gives in this row; ``x, series``: place in ``curves``, which joins the points of a series;
+    ``note``: part of the description, drawn where there is no value.
     """
 
     label: str
@@ -72,12 +57,11 @@ def bars(
     kind: str = "log",
     brackets: Sequence[Mapping[int, str]] = (),
 ) -> Figure:
-    """Return a figure with a row for each value.
+    """Return a figure (its texts are given) with a row for each value.
 
     Parameters
     ----------
     figure : Figure
-        The texts.
     rows : sequence of Point
     label : str
         Of the values, with unit.
@@ -162,16 +146,8 @@ def stems(
 ) -> Figure:
     """Return a figure with a stem for each value, in groups: one colour for each place in a group.
 
-    Parameters
-    ----------
-    figure : Figure
-        The texts.
-    groups : mapping of str to sequence of float
-        As many values in each, by the text below the group.
-    label, x_label : str
-        Of the values, with unit, and of the groups.
-    levels : sequence of float
-        One for each group, joined by a dashed line.
+    ``groups``: as many values in each, by the text below the group; ``label, x_label``: of the values, with unit, and
+    of the groups; ``levels``: one for each group, joined by a dashed line.
     """
     values = np.array(list(groups.values()), float)
     at, zero = np.arange(1.0, len(values) + 1.0), np.zeros(len(values))
@@ -186,15 +162,7 @@ def stems(
 def curves(figure: Figure, points: Sequence[Point], label: str, x_label: str, *, named: bool) -> Figure:
     """Return a figure with means and their intervals along an axis, a colour for each series.
 
-    Parameters
-    ----------
-    figure : Figure
-        The texts.
-    points : sequence of Point
-        Each with an interval.
-    label, x_label : str
-    named : bool
-        Whether the label of each point is drawn beside it.
+    Each point has an interval; ``named``: its label is drawn beside it.
     """
     layers: list[Layer] = []
     for colour, series in enumerate(dict.fromkeys(p.series for p in points)):

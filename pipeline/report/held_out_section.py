@@ -55,15 +55,10 @@ def step_label(name: str) -> str:
 
 
 def error_steps(sensor: str, held_out: JSON, found: JSON, *, vector: bool) -> Figure | None:
-    """Draw the held-out error after each step, with the noise floor.
+    """Draw the held-out error after each step, with the noise floor; None where it is not known.
 
-    Parameters
-    ----------
-    sensor : str
-    held_out, found : dict
-        The sensor's parts of validation and diagnosis; effects that the diagnosis selected are further steps.
-    vector : bool
-        The error of the vector instead of the magnitude; None is returned where it is not known.
+    ``held_out, found``: the sensor's parts of validation and diagnosis; effects that the diagnosis selected are further
+    steps. ``vector``: the error of the vector instead of the magnitude.
     """
     key, floor_key = ("vector_rms_error", "vector_noise_floor") if vector else ("rms_error", "noise_floor")
     steps, floor, unit = held_out.get("steps", []), held_out.get(floor_key), SENSOR_UNITS[sensor]
@@ -102,16 +97,7 @@ def held_out_figures(
 ) -> list[Figure]:
     """Draw the error of the magnitude over each held-out recording with a reference, as the validation computes it.
 
-    Parameters
-    ----------
-    sensor : str
-    calibration : dict
-        As in its file.
-    held_out : dict
-        The sensor's part of the validation.
-    recordings : list of Recording
-    table : dict
-        The section ``table`` of the unit's configuration.
+    ``held_out``: the sensor's part of the validation; ``table``: this section of the unit's configuration.
     """
     fits = {s: SensorCalibration.from_json(s, calibration[s]) for s in SENSORS if calibration.get(s)}
     out = []
@@ -131,16 +117,7 @@ def held_out_over_time(
 ) -> Figure:
     """Draw the error of the magnitude in held-out motion before and after calibration.
 
-    Parameters
-    ----------
-    name : str
-        Of the figure.
-    sensor : str
-    recording : Recording
-    raw, calibrated : (n,) array, g or deg/s
-        Magnitude minus reference.
-    floor : float, optional
-        Root mean square error that noise alone gives.
+    ``raw, calibrated``: (n,) arrays of magnitude minus reference, g or deg/s; ``floor``: rms error by noise alone.
     """
     unit, x = SENSOR_UNITS[sensor], recording.time - recording.time[0]
     after: list[Layer] = [Samples(x, calibrated, 2, mean=True)]
@@ -160,13 +137,7 @@ def held_out_over_time(
 
 
 def attitude_over_time(found: JSON) -> Figure | None:
-    """Draw the attitude error of the integrated gyroscope, and the tilt error of the fused attitude.
-
-    Parameters
-    ----------
-    found : dict
-        Part ``attitude`` of a validation; None is returned where it holds no curve.
-    """
+    """Draw the attitude error of the integrated gyroscope and the tilt error of the fused attitude, of a validation."""
     curve = found.get("curve")
     if not curve:
         return None

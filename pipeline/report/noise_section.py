@@ -51,16 +51,8 @@ def allan(
 ) -> Figure | None:
     """Draw the Allan deviation of each axis; None where no recording holds a rest.
 
-    Parameters
-    ----------
-    sensor : str
-    recordings : list of Recording
-    noise : dict or None
-        The noise model: ``white, wander, correlation_time_s, source``.
-    sheet : dict
-        The sensor's section of the configuration.
-    wander : dict or None
-        That of the diagnosis: the wander that its fit needed.
+    ``noise``: the noise model; ``sheet``: the sensor's section of the configuration; ``wander``: that which the fit of
+    the diagnosis needed.
     """
     found = _longest_rest(sensor, recordings)
     if found is None:
@@ -127,16 +119,7 @@ def deviations(values: Values, interval: float) -> tuple[Values, Values]:
 
 
 def expected(white_density: float, wander: float, time: float, tau: Values) -> Values:
-    """Return the Allan deviation of white noise and Gauss-Markov wander: (m,) array.
-
-    Parameters
-    ----------
-    white_density : float
-        ``white sqrt(dt)``.
-    wander, time : float
-        Standard deviation, and correlation time in s.
-    tau : (m,) array, s
-    """
+    """Return the Allan deviation of white noise, given ``white sqrt(dt)``, and Gauss-Markov wander: (m,) array."""
     x = tau / time
     bend = (3.0 - 4.0 * np.exp(-x) + np.exp(-2.0 * x)) / (2.0 * x)
     variance = white_density**2 / tau + 2.0 * wander**2 / x * np.maximum(1.0 - bend, 0.0)

@@ -20,15 +20,6 @@ if TYPE_CHECKING:
 FOLDER = Path(__file__).parent / "templates"
 
 
-class _Pages(Environment):
-    """Templates whose values are mostly dicts: ``row.name`` looks for a key first, which is faster."""
-
-    def getattr(self, obj: Any, attribute: str) -> Any:  # noqa: ANN401  (as of the base class)
-        if type(obj) is dict and attribute in obj and not hasattr(dict, attribute):
-            return obj[attribute]
-        return super().getattr(obj, attribute)
-
-
 def _figure(value: object) -> str:
     """Return a number for a cell, empty where there is none."""
     return number(value) if isinstance(value, int | float) and value == value else ""  # noqa: PLR0124  (not NaN)
@@ -36,7 +27,7 @@ def _figure(value: object) -> str:
 
 @cache
 def _environment() -> Environment:
-    environment = _Pages(loader=FileSystemLoader(FOLDER), autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    environment = Environment(loader=FileSystemLoader(FOLDER), autoescape=True, trim_blocks=True, lstrip_blocks=True)
     numbers = (number, measured, percent, percent_change, probability, typeset)
     environment.filters |= {f.__name__: f for f in numbers} | {
         "words": plain,

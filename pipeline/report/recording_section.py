@@ -117,16 +117,7 @@ def sensor_temperature(recordings: list[Recording]) -> str | None:
 
 
 def segments(recordings: list[Recording], rests: dict[str, list[Rest]], calibration: JSON) -> Figure | None:
-    """Draw where each recording rests; None where no rest is known.
-
-    Parameters
-    ----------
-    recordings : list of Recording
-    rests : dict of str to list of Rest
-        Of ``rests_logged``.
-    calibration : dict
-        As in its file; ``rests``, or stages in ``details``, hold those that were found without a table.
-    """
+    """Draw where each recording rests, by the table's log or by the calibration; None where no rest is known."""
     drawn = [r for r in recordings if r.samples > 1]
     spans = {r.name: _spans(r, rests[r.name], calibration) for r in drawn}
     if not any(spans.values()):

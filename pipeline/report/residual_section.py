@@ -195,15 +195,8 @@ def harmonic_noise(residual: Residual, white: Values, wander: Values, time: floa
 
     The mean of ``a^2 + b^2`` of a harmonic is ``2 (2 white^2 / n + 2 S(f) / D)`` with the two-sided spectrum of the
     wander ``S = 2 s^2 T / (1 + (2 pi f T)^2)``, the recorded time D and the effective number of samples n, for which
-    ``1 / n`` is the mean of ``1 / (36 n_bin)``.
-
-    Parameters
-    ----------
-    residual : Residual
-    white, wander : (3,) array
-        Standard deviations; the largest axis counts.
-    time : float, s
-        Correlation time of the wander.
+    ``1 / n`` is the mean of ``1 / (36 n_bin)``. ``white, wander``: (3,) standard deviations, the largest axis counts;
+    ``time``: correlation time of the wander, s.
     """
     motion = residual.motion
     assert motion.angle is not None  # noqa: S101
