@@ -45,25 +45,13 @@ RECORDED = ("sensor", "table", "procedure", "samples", "interval_s", "lost")
 
 @dataclass(frozen=True)
 class TableLog:
-    """How the table is logged.
+    """How the table is logged."""
 
-    Attributes
-    ----------
-    kind : str
-        ``rows``: in the sensor's rows; ``file``: in a file of its own; ``program``: not at all.
-    interval_s : float
-        Of a file.
-    offset_s, drift_ppm : float or None
-        Of the file's clock; None: drawn at random, 0 to 100 s and of 50 ppm.
-    wrapped : bool
-        Whether the encoder starts again at 360 deg.
-    """
-
-    kind: str = "rows"
-    interval_s: float = 0.01
-    offset_s: float | None = None
-    drift_ppm: float | None = None
-    wrapped: bool = False
+    kind: str = "rows"  # rows: in the sensor's rows; file: in a file of its own; program: not at all
+    interval_s: float = 0.01  # of a file
+    offset_s: float | None = None  # of the file's clock; None: at random, 0 to 100 s
+    drift_ppm: float | None = None  # of the file's clock; None: at random, of 50 ppm
+    wrapped: bool = False  # whether the encoder starts again at 360 deg
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -72,66 +60,36 @@ class TableLog:
 
 @dataclass(frozen=True)
 class UnitDescription:
-    """One unit to be simulated.
-
-    Attributes
-    ----------
-    count : int
-        Units of this description; above 1, ``unit`` is a prefix.
-    columns : dict
-        Further columns of ``units.csv``: serial, lot, date, method, overrides ...
-    course : dict
-        How the procedure is run: attributes of ``procedures.Course``.
-    samples : int or None
-        About how many rows the unit's recordings have together.
-    lost : float
-        Share of the samples that the radio link loses.
-    accelerometer, gyroscope : dict
-        ``bias`` (g or deg/s), ``matrix``, or in its place ``scale_factor`` (of the correction),
-        ``non_orthogonality_deg`` (yx, zx, zy) and ``mounting_deg`` (turns about x, then y, then z); and
-        ``noise_density``, ``bias_wander``, ``wander_time_s`` in place of the data sheet's.
-    effects : dict
-        ``sensor.effect``, or ``effect`` alone for both sensors, to null (a typical size, at random), a number (that
-        size, with random signs), the list of the parameters' values, or a formula of its own (``inline_effects``).
-    imperfections : dict
-        What the table does otherwise than commanded: ``tilt_deg`` (2,) and the settings of
-        ``rate_table.random_errors``. What is left out follows from the accuracies of the table's configuration.
-    held_out : dict
-        Where the held-out motion and the long rest are recorded elsewhere: ``table``, ``imperfections``,
-        ``accelerometer``, ``gyroscope``.
-    temperature : dict
-        ``ambient``, ``warm_up``, ``drift`` in degC, to replace the random ones.
-    copy_of : str or None
-        The unit whose recordings these are once more, in another format or with another log of the table.
-    recordings : list of str
-        Those of the procedure's recordings that are made; empty for all.
-    motion : int or None
-        Number of the random motion: units of the same number and course move alike. None: each has a motion of its own.
-    table_log : dict
-        Attributes of ``TableLog``.
-    """
+    """One unit to be simulated."""
 
     unit: str
-    count: int = 1
+    count: int = 1  # above 1, ``unit`` is a prefix
     sensor: str = "mpu6050"
     table: str = "acutronic"
     procedure: str = "three_axis_turns"
-    columns: dict[str, Any] = field(default_factory=dict)
-    course: dict[str, Any] = field(default_factory=dict)
-    samples: int | None = None
+    columns: dict[str, Any] = field(default_factory=dict)  # of units.csv: serial, lot, date, method, overrides ...
+    course: dict[str, Any] = field(default_factory=dict)  # attributes of ``procedures.Course``
+    samples: int | None = None  # about how many rows the recordings have together
     interval_s: float = 0.12
-    lost: float = 0.0
+    lost: float = 0.0  # share of the samples that the radio link loses
     format: str = "csv"
+    # bias (g or deg/s), matrix, or in its place scale_factor (of the correction), non_orthogonality_deg (yx, zx, zy),
+    # mounting_deg (turns about x, then y, then z); noise_density, bias_wander, wander_time_s: not of the data sheet
     accelerometer: dict[str, Any] = field(default_factory=dict)
     gyroscope: dict[str, Any] = field(default_factory=dict)
+    # sensor.effect, or effect alone for both sensors, to null (a typical size, at random), a number (that size, with
+    # random signs), the list of the parameters' values, or a formula of its own (``sensor``)
     effects: dict[str, Any] = field(default_factory=dict)
+    # what the table does otherwise than commanded: tilt_deg (2,) and the settings of ``rate_table.random_errors``; what
+    # is left out follows from the accuracies of the table's configuration
     imperfections: dict[str, Any] = field(default_factory=dict)
+    # where held-out motion and long rest are recorded elsewhere: table, imperfections, accelerometer, gyroscope
     held_out: dict[str, Any] = field(default_factory=dict)
-    temperature: dict[str, Any] = field(default_factory=dict)
-    copy_of: str | None = None
-    recordings: list[str] = field(default_factory=list)
-    motion: int | None = None
-    table_log: dict[str, Any] = field(default_factory=dict)
+    temperature: dict[str, Any] = field(default_factory=dict)  # ambient, warm_up, drift in degC, if not at random
+    copy_of: str | None = None  # the unit whose recordings these are once more, in another format or table_log
+    recordings: list[str] = field(default_factory=list)  # those of the procedure's that are made; empty: all
+    motion: int | None = None  # number of the random motion: units of one number and course move alike; None: its own
+    table_log: dict[str, Any] = field(default_factory=dict)  # attributes of ``TableLog``
 
     def __post_init__(self) -> None:
         wrong = wrong_name(self.unit)

@@ -54,50 +54,24 @@ STEPS_DEG = (1.0, 2.0, 3.0, 5.0, 10.0, 15.0, 30.0, 45.0, 90.0)
 
 @dataclass(frozen=True)
 class Course:
-    """How a procedure is run.
+    """How a procedure is run."""
 
-    Attributes
-    ----------
-    step_deg, dwell_s : float
-        Of stop-and-go; the dwell is also the rest in each orientation or position.
-    accelerometer_rates_dps : tuple of float
-        Continuous turns in place of stop-and-go; empty for stop-and-go.
-    rates_dps, turns : tuple of float and int
-        Rates of the gyroscope's turns, and whole turns at each.
-    both_directions : bool
-        Each turn of the gyroscope (and each continuous one of the accelerometer) is also made backwards.
-    warm_up_rest_s, rest_s : float
-        Rest before the first turn of a recording for the gyroscope, and after each.
-    acceleration_dps2, step_rate_dps : float
-        Of the table; its rate between stops.
-    validation_s, validation_rate_dps : float
-        Length of the held-out motion (0: none), and the largest |rate| in it.
-    static_s : float
-        Length of the long rest; 0 for none.
-    pause_s : float
-        Between recordings, and before the first.
-    positions : int
-        Rests of ``multi_position``.
-    thermal_ramp_degc : float
-        Amplitude of the chamber's ramp in ``thermal_ramp``.
-    """
-
-    step_deg: float = 5.0
-    dwell_s: float = 1.0
-    accelerometer_rates_dps: tuple[float, ...] = ()
-    rates_dps: tuple[float, ...] = (60.0,)
-    both_directions: bool = False
-    turns: int = 1
-    warm_up_rest_s: float = 30.0
-    rest_s: float = 3.0
-    acceleration_dps2: float = 100.0
-    step_rate_dps: float = 20.0
-    validation_s: float = 120.0
-    validation_rate_dps: float = 40.0
-    static_s: float = 120.0
-    pause_s: float = 30.0
-    positions: int = 40
-    thermal_ramp_degc: float = 15.0
+    step_deg: float = 5.0  # of stop-and-go
+    dwell_s: float = 1.0  # rest at each stop, orientation or position
+    accelerometer_rates_dps: tuple[float, ...] = ()  # continuous turns in place of stop-and-go
+    rates_dps: tuple[float, ...] = (60.0,)  # of the gyroscope's turns
+    both_directions: bool = False  # each turn of the gyroscope and each continuous one is also made backwards
+    turns: int = 1  # whole turns at each rate
+    warm_up_rest_s: float = 30.0  # before the first turn of a recording for the gyroscope
+    rest_s: float = 3.0  # after each turn
+    acceleration_dps2: float = 100.0  # of the table
+    step_rate_dps: float = 20.0  # of the table between stops
+    validation_s: float = 120.0  # length of held-out motion; 0: none
+    validation_rate_dps: float = 40.0  # largest |rate| in it
+    static_s: float = 120.0  # length of the long rest; 0: none
+    pause_s: float = 30.0  # between recordings, and before the first
+    positions: int = 40  # rests of multi_position
+    thermal_ramp_degc: float = 15.0  # amplitude of the chamber's ramp in thermal_ramp
 
     def __post_init__(self) -> None:
         for name in ABOVE_ZERO:

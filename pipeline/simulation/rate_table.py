@@ -49,28 +49,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Program:
-    """One axis over time.
+    """One axis over time: m segments of constant acceleration; before the first and after the last it rests."""
 
-    Attributes
-    ----------
-    knots : (m,) array, s
-        Starts of the segments; before the first and after the last the axis rests.
-    angle, rate, acceleration : (m,) array, deg, deg/s, deg/s^2
-        At each knot; the acceleration holds until the next.
-    move : (m,) array of int
-        Number of the move that a segment belongs to; a rest has that of the move before it, -1 before the first.
-    stops : (moves + 1,) array, deg
-        Angle before each move, and after the last.
-    duration : float, s
-    """
-
-    knots: Values
-    angle: Values
-    rate: Values
-    acceleration: Values
-    move: NDArray[np.int64]
-    stops: Values
-    duration: float
+    knots: Values  # (m,), s, starts of the segments
+    angle: Values  # (m,), deg, at each knot
+    rate: Values  # (m,), deg/s, at each knot
+    acceleration: Values  # (m,), deg/s^2, until the next knot
+    move: NDArray[np.int64]  # (m,), number of the move; of a rest that of the move before it, -1 before the first
+    stops: Values  # (moves + 1,), deg, before each move and after the last
+    duration: float  # s
 
     def at(self, time: Values) -> tuple[Values, Values, Values, NDArray[np.int64]]:
         """Return angle (deg), rate (deg/s), acceleration (deg/s^2) and number of the move at any times: (n,) arrays."""
@@ -128,35 +115,16 @@ class ProgramBuilder:
 
 @dataclass(frozen=True)
 class TurnErrors:
-    """Errors of turns about one axis; none by default.
+    """Errors of turns about one axis; none by default."""
 
-    Attributes
-    ----------
-    encoder : (2,) array, deg
-        A and B above.
-    ripple : (2,) array, relative
-        a and b above.
-    stops : (moves + 1,) array or None, deg
-        Angle error ``D_k - C_k`` of each stop of the program.
-    backlash : float, deg
-        By which the table lags behind, in the direction of the last move.
-    direction : (2,) array, rad
-        Components of d along the two axes that follow the turn axis cyclically.
-    vibration : float, deg
-        Amplitude V.
-    shaking : float, g
-        Amplitude of the specific force of the vibration along each body axis, 120 deg apart in phase.
-    vibration_frequency : float, Hz
-    """
-
-    encoder: Values = field(default_factory=lambda: np.zeros(2))
-    ripple: Values = field(default_factory=lambda: np.zeros(2))
-    stops: Values | None = None
-    backlash: float = 0.0
-    direction: Values = field(default_factory=lambda: np.zeros(2))
-    vibration: float = 0.0
-    shaking: float = 0.0
-    vibration_frequency: float = 0.0
+    encoder: Values = field(default_factory=lambda: np.zeros(2))  # A and B above, deg
+    ripple: Values = field(default_factory=lambda: np.zeros(2))  # a and b above, relative
+    stops: Values | None = None  # (moves + 1,), deg: angle error D_k - C_k of each stop of the program
+    backlash: float = 0.0  # deg by which the table lags behind, in the direction of the last move
+    direction: Values = field(default_factory=lambda: np.zeros(2))  # d along the next two axes, cyclically, rad
+    vibration: float = 0.0  # amplitude V, deg
+    shaking: float = 0.0  # g, of the vibration along each body axis, 120 deg apart in phase
+    vibration_frequency: float = 0.0  # Hz
 
     def turn_axis(self, axis: int) -> Values:
         """Return the true turn axis: (3,) unit vector, body frame."""

@@ -43,34 +43,18 @@ PANELS = np.concatenate([np.linspace(0.0, 2.0, 21), np.linspace(2.25, 6.0, 16), 
 
 @dataclass(frozen=True)
 class Scene:
-    """The motion of one sensor in one recording.
-
-    Attributes
-    ----------
-    start : float, s
-        Time since power-on at which the trajectory begins.
-    axis : int or None
-        Turn axis.
-    gravity : float, g
-    up : (3,) array
-        The true vertical in the table's level frame, unit vector.
-    earth : (3,) array, deg/s
-        Earth's rotation in the level frame.
-    lever_arm : (3,) array, m
-    offset, clock, lag : float, s, 1, s
-        tau and epsilon above, and the time constant of the lag.
-    """
+    """The motion of one sensor in one recording."""
 
     trajectory: Turn | Moves | Gimbals
-    start: float = 0.0
-    axis: int | None = None
-    gravity: float = 1.0
-    up: Values = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
-    earth: Values | None = None
-    lever_arm: Values = field(default_factory=lambda: np.zeros(3))
-    offset: float = 0.0
-    clock: float = 0.0
-    lag: float = 0.0
+    start: float = 0.0  # s since power-on at which the trajectory begins
+    axis: int | None = None  # of the turn
+    gravity: float = 1.0  # g
+    up: Values = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))  # the true vertical in the level frame
+    earth: Values | None = None  # (3,), deg/s, Earth's rotation in the level frame
+    lever_arm: Values = field(default_factory=lambda: np.zeros(3))  # r, m
+    offset: float = 0.0  # tau, s
+    clock: float = 0.0  # epsilon
+    lag: float = 0.0  # time constant, s
 
     def motion(self, time: Values, temperature: Values | None = None) -> Motion:
         """Return the motion that the sensor shows at times of the log: s since power-on, (n,) array."""

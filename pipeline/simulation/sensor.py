@@ -67,24 +67,13 @@ TYPICAL_SHARE = {
 
 @dataclass(frozen=True)
 class SimulatedSensor:
-    """One accelerometer or gyroscope with known errors.
-
-    Attributes
-    ----------
-    sheet : mapping
-        The sensor's section of the configuration (full scale, counts, noise).
-    bias : (3,) array, g or deg/s
-    matrix : (3, 3) array
-        What a perfect calibration finds: body = matrix @ (reading - bias - effects).
-    effects : dict
-        Those on the reading.
-    """
+    """One accelerometer or gyroscope with known errors."""
 
     sensor: str
-    sheet: Mapping[str, Any]
-    bias: Values
-    matrix: Values
-    effects: Hidden = field(default_factory=dict)
+    sheet: Mapping[str, Any]  # its section of the configuration: full scale, counts, noise
+    bias: Values  # (3,), g or deg/s
+    matrix: Values  # (3, 3), of a perfect calibration: body = matrix @ (reading - bias - effects)
+    effects: Hidden = field(default_factory=dict)  # those on the reading
 
     def exact(self, motion: Motion) -> Values:
         """Return the reading without noise and quantisation: (n, 3) array."""

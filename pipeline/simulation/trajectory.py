@@ -40,27 +40,15 @@ COMES_UP_S = 5.0  # for a table to start from rest, see ``Eased``
 
 
 class Pose(NamedTuple):
-    """Attitude and its derivatives at n times.
+    """Attitude and its derivatives at n times."""
 
-    Attributes
-    ----------
-    level : (n, 3, 3) array
-    omega, alpha : (n, 3) array, deg/s and deg/s^2, body frame
-    angle, rate : (n,) array or None, deg and deg/s
-        About the turn axis.
-    direction : (n, 3) array or None
-        Unit vector of the present turn or, at rest, of the last one; zeros before the first.
-    force : (n, 3) array or None, g, body frame
-        Specific force of a shaking plate, in addition to gravity.
-    """
-
-    level: Values
-    omega: Values
-    alpha: Values
-    angle: Values | None = None
-    rate: Values | None = None
-    direction: Values | None = None
-    force: Values | None = None
+    level: Values  # (n, 3, 3)
+    omega: Values  # (n, 3), deg/s, body frame
+    alpha: Values  # (n, 3), deg/s^2, body frame
+    angle: Values | None = None  # (n,), deg, about the turn axis
+    rate: Values | None = None  # (n,), deg/s
+    direction: Values | None = None  # (n, 3), unit vector of the present or, at rest, the last turn; zeros before
+    force: Values | None = None  # (n, 3), g, body frame: of a shaking plate, in addition to gravity
 
 
 def rotation_about(axis: Values, angle_deg: Values) -> Values:
@@ -106,21 +94,11 @@ class Turn:
 
 @dataclass(frozen=True)
 class Moves:
-    """Rests in several attitudes and moves between them, each a turn about an axis of its own.
+    """Rests in several attitudes and moves between them, each a turn about an axis of its own."""
 
-    Attributes
-    ----------
-    program : Program
-        Move k turns from ``stops[k]`` to ``stops[k + 1]``.
-    axes : (m, 3) array
-        Unit axis of each move, body frame.
-    start : (3, 3) array
-        ``level`` before the first move.
-    """
-
-    program: Program
-    axes: Values
-    start: Values = field(default_factory=lambda: np.eye(3))
+    program: Program  # move k turns from stops[k] to stops[k + 1]
+    axes: Values  # (m, 3), unit axis of each move, body frame
+    start: Values = field(default_factory=lambda: np.eye(3))  # (3, 3), level before the first move
 
     @property
     def duration(self) -> float:
@@ -147,22 +125,13 @@ class Moves:
 
 @dataclass(frozen=True)
 class Gimbals:
-    """Random motion of a three-axis table: each gimbal angle a steady turn plus a sum of sinusoids.
+    """Random motion of a three-axis table: each gimbal angle a steady turn plus a sum of m sinusoids."""
 
-    Attributes
-    ----------
-    drift : (3,) array, deg/s
-        Steady rates of the gimbals about x (inner), y, z (outer).
-    amplitude, frequency, phase : (3, m) array, deg, Hz, rad
-        Of their sinusoids.
-    duration : float, s
-    """
-
-    drift: Values
-    amplitude: Values
-    frequency: Values
-    phase: Values
-    duration: float
+    drift: Values  # (3,), deg/s, steady rates of the gimbals about x (inner), y, z (outer)
+    amplitude: Values  # (3, m), deg
+    frequency: Values  # (3, m), Hz
+    phase: Values  # (3, m), rad
+    duration: float  # s
 
     def angles(self, time: Values) -> tuple[Values, ...]:
         """Return the gimbal angles and their first two derivatives: three (3, n) arrays in deg and s."""

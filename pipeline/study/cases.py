@@ -62,40 +62,22 @@ CYCLE_DEGC = 4.0
 
 @dataclass(frozen=True)
 class Case:
-    """One unit of a study: its truth.
-
-    Attributes
-    ----------
-    sensor : str
-        The one in which something is hidden.
-    hidden : dict of str to list of float
-        Effects and their parameters.
-    wander : float
-        Bias wander over that of the data sheet.
-    left_out : tuple of str
-        Effects that the catalogue is left without.
-    shape, amplitude : str and tuple of float
-        Physics that is not in the catalogue (empty: none), and its size on each axis over ``bench.AMPLITUDE``.
-    room_degc : float or None
-        Swing of the room's temperature, where it is not the usual one.
-    method : str
-        By which the base is calibrated.
-    """
+    """One unit of a study: its truth."""
 
     family: str
     number: int
     seed: int
     model: str
-    sensor: str
+    sensor: str  # the one in which something is hidden
     procedure: str
-    hidden: dict[str, list[float]] = field(default_factory=dict)
-    wander: float = 1.0
+    hidden: dict[str, list[float]] = field(default_factory=dict)  # effects and their parameters
+    wander: float = 1.0  # bias wander over that of the data sheet
     noise: str = "normal"
-    left_out: tuple[str, ...] = ()
-    shape: str = ""
-    amplitude: tuple[float, ...] = ()
-    room_degc: float | None = None
-    method: str = REFERENCE
+    left_out: tuple[str, ...] = ()  # effects that the catalogue is left without
+    shape: str = ""  # of physics that is not in the catalogue
+    amplitude: tuple[float, ...] = ()  # of that physics on each axis, over ``bench.AMPLITUDE``
+    room_degc: float | None = None  # swing of the room's temperature, where it is not the usual one
+    method: str = REFERENCE  # by which the base is calibrated
 
     @property
     def key(self) -> str:

@@ -48,10 +48,7 @@ class Line(NamedTuple):
 
 
 class Conclusion(NamedTuple):
-    """A conclusion of the thesis (``says``), its comparisons, why they come out so (``remark``), what is compared.
-
-    ``unit`` is deg/s, or mg for the accelerometer, whose errors are in g.
-    """
+    """A conclusion of the thesis (``says``), its comparisons, why they come out so (``remark``), what is compared."""
 
     says: str
     unit: str
@@ -63,25 +60,17 @@ class Conclusion(NamedTuple):
     def verdict(self) -> str:
         """Return the verdict that all lines share, else the counts of each."""
         counts = {v: sum(line.verdict == v for line in self.lines) for v in KINDS}
-        counts = {v: n for v, n in counts.items() if n}
-        return (
-            ", ".join(f"{v} in {n} of {len(self.lines)}" for v, n in counts.items())
-            if len(counts) > 1
-            else next(iter(counts))
-        )
-
-    @property
-    def kind(self) -> str:
-        """Return the CSS class of the verdict."""
-        return KINDS.get(self.verdict, "warn")
+        found = [v for v, n in counts.items() if n]
+        return found[0] if len(found) == 1 else ", ".join(f"{v} in {counts[v]} of {len(self.lines)}" for v in found)
 
 
 class Errors:
-    """Held-out errors of the study by set of recordings, method and seed."""
+    """Held-out errors of the study by set of recordings, method and seed: deg/s, of the accelerometer mg."""
 
     def __init__(self, rows: pd.DataFrame) -> None:
         judged = rows[(rows["cause"] == CAUSES.index(LOST)) & rows["error"].notna()]
-        self._errors = judged.set_index(["set", "method", "seed"])["error"].sort_index()
+        errors = judged["error"].where(judged["set"].str.contains("-gyro-"), 1000.0 * judged["error"])
+        self._errors = judged.assign(error=errors).set_index(["set", "method", "seed"])["error"].sort_index()
 
     def mean(self, name: str, method: str) -> Estimate:
         """Return the mean over seeds."""

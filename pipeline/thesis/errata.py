@@ -120,13 +120,11 @@ def _misprints(parameters: pd.DataFrame) -> Erratum:
     product = values(row, "O_{}") * values(row, "M_{}") * values(row, "S_{}")
     return Erratum(
         "Misprints: 1.998 and -0.005 in table 5.25 (MPU6050 (2)); 0.994 and 0.949 in table 5.23 (MPU6050 (1)); "
-        "73.609 in "
-        "table 5.13; the STIM300's staged row of table 5.24",
+        "73.609 in table 5.13; the STIM300's staged row of table 5.24",
         "1.007 and -0.009 (table 5.16); 0.999 and 0.938 (O M S of table 5.1); 73.603; it is continuous 0.5 deg/s, not "
         "stop 1 s",
         f"O M S of table 5.1, stop 1 s, is {', '.join(number(p, 3) for p in product)}; mean |e| of continuous 0.5 "
-        f"deg/s "
-        "changes by 77.271 % in table 5.13 as in table 5.24, that of stop 1 s by 70.526 % in table 5.12.",
+        "deg/s changes by 77.271 % in table 5.13 as in table 5.24, that of stop 1 s by 70.526 % in table 5.12.",
     )
 
 
@@ -148,12 +146,11 @@ def _cosines(results: Results) -> Erratum:
         "Stages 2 and 3 multiply readings by cosines",
         "That rotates nothing: for small angles it is a change of scale of second order. The full matrix is "
         "reference_least_squares.",
-        f"MPU6050 (1), stop 1 s: the true non-orthogonality of up to 0.29 deg makes O "
-        f"{' and '.join(number(p, 6) for p in parts)}; "
-        f"the cross terms that it would need are {number(np.radians(0.286), 2)}. Mean |e| after: {number(staged)} g "
-        f"with the "
-        f"stages, {number(results.error(f'{unit}-least-squares', 'accelerometer'))} g with the nine parameters of "
-        f"least squares.",
+        "MPU6050 (1), stop 1 s: the true non-orthogonality of up to 0.29 deg makes O "
+        f"{' and '.join(number(p, 6) for p in parts)}; the cross terms that it would need are "
+        f"{number(np.radians(0.286), 2)}. Mean |e| after: {number(staged)} g with the stages, "
+        f"{number(results.error(f'{unit}-least-squares', 'accelerometer'))} g with the nine parameters of least "
+        "squares.",
     )
 
 
@@ -162,7 +159,7 @@ def _delay(rows: pd.DataFrame) -> Erratum:
     methods = {"the filter": "staged", "one of the same gain without delay": "same-gain", "none": "unfiltered"}
     found = [
         f"with {what} "
-        + ", ".join(number(1000.0 * errors.mean(f"{device}-continuous-30dps", method).value) for device in DEVICES)
+        + ", ".join(number(errors.mean(f"{device}-continuous-30dps", method).value) for device in DEVICES)
         for what, method in methods.items()
     ]
     return Erratum(
@@ -235,6 +232,5 @@ def _anisotropy(errors: pd.DataFrame, results: Results) -> Erratum:
         "The gyroscope's held-out motion is called random",
         "It was not isotropic. The campaign's motion was chosen among 500 for its errors (simulation.yaml).",
         f"The printed bias of MPU6050 (1) makes a mean |e| of {number(isotropic)} deg/s in random directions, 1.724 "
-        f"was "
-        f"printed. Here, before: {'; '.join(parts)} deg/s.",
+        f"was printed. Here, before: {'; '.join(parts)} deg/s.",
     )

@@ -169,7 +169,8 @@ def _speed(rows: pd.DataFrame) -> Figure:
         for procedure in CONTINUOUS:
             mean = errors.mean(f"mpu6050-2-{procedure}", method)
             rate = _short(procedure)
-            points.append(Point(rate, mean.value, interval=mean.interval, x=float(rate), series=name))
+            low, high = (v / 1000.0 for v in mean.interval)
+            points.append(Point(rate, mean.value / 1000.0, interval=(low, high), x=float(rate), series=name))
     caption = (
         "MPU6050 (2), errata corrected; means over seeds with their 95 % intervals. The filter is on the turns and on "
         "the held-out motion, so without one more noise is left there; how an error grows with the rate is its own."

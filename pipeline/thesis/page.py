@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pandas as pd
 
-from pipeline.report.numbers import MINUS, NOTHING, number
+from pipeline.report.numbers import MINUS, NOTHING
 from pipeline.report.pages import template
 from pipeline.thesis.agreement import agreements, scatters
 from pipeline.thesis.conclusions import KINDS, conclusions
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from pipeline.report.comparison import Estimate
-    from pipeline.thesis.conclusions import Conclusion
 
 JSON = dict[str, Any]
 
@@ -51,7 +50,9 @@ def render(campaign: Path, folder: Path) -> str:
         tables=[_table(number, own) for number, own in cells.groupby("table", sort=False)],
         figures=all_figures(printed, results, rows, scatter),
         errata=errata(printed, results, rows),
-        conclusions=[_conclusion(c) for c in conclusions(rows)],
+        conclusions=conclusions(rows),
+        kinds=KINDS,
+        difference=_difference,
         agreements=agreements(printed, results).to_dict("records"),
         explanations=sorted(e for e in EXPLANATIONS if e.key in set(cells["key"])),
         scatter=[
@@ -104,39 +105,12 @@ def _cell(cell: JSON) -> JSON:
     return {**texts, "key": cell["key"]}
 
 
-def _conclusion(conclusion: Conclusion) -> JSON:
-    scale = 1000.0 if conclusion.unit == "mg" else 1.0
-    return {
-        "says": conclusion.says,
-        "caption": f"{conclusion.compared}, {conclusion.unit}",
-        "verdict": conclusion.verdict,
-        "kind": conclusion.kind,
-        "remark": conclusion.remark,
-        "lines": [
-            {
-                "what": line.what,
-                "first": number(scale * line.first.value),
-                "second": number(scale * line.second.value),
-                **_difference(line.difference, scale),
-                "count": line.difference.count,
-                "verdict": line.verdict,
-                "kind": KINDS[line.verdict],
-            }
-            for line in conclusion.lines
-        ],
-    }
-
-
-def _difference(estimate: Estimate, scale: float) -> dict[str, str]:
+def _difference(estimate: Estimate) -> tuple[str, str]:
     """Return a difference and its interval, to the decimals that two digits of the interval's half need."""
-    low, high = estimate.interval
-    half = scale * (high - low) / 2.0
+    half = estimate.expanded_uncertainty or 0.0
     decimals = max(0, 1 - math.floor(math.log10(half))) if half > 0.0 else 3
-
-    def text(value: float) -> str:
-        return f"{scale * value:+.{decimals}f}".replace("-", MINUS)
-
-    return {"difference": text(estimate.value), "interval": f"{text(low)} to {text(high)}"}
+    value, low, high = (f"{v:+.{decimals}f}".replace("-", MINUS) for v in (estimate.value, *estimate.interval))
+    return value, f"{low} to {high}"
 
 
 class Explanation(NamedTuple):
