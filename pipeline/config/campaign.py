@@ -192,7 +192,8 @@ def cut_batches(
             batch = f"{chain}-{number:04d}"
             batches[batch] = names[start:stop]
             configs = [units[n].config for n in batches[batch]]
-            effects = {sensor: any(c["effects"][sensor] for c in configs) for sensor in SENSORS}
+            seated = any(c["table"]["seat_deg"] is not None for c in configs)
+            effects = {sensor: seated or any(c["effects"][sensor] for c in configs) for sensor in SENSORS}
             stages = configs[0]["method"]["stages"]
             chains[batch] = {sensor: stages[sensor] + ["effects"] * effects[sensor] for sensor in SENSORS}
             start = stop

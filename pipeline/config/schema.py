@@ -71,6 +71,7 @@ class Table(Section):
     gravity_accuracy_g: NonNegative | None = None
     azimuth_accuracy_deg: NonNegative | None = None
     clock_accuracy_ppm: NonNegative | None = None
+    seat_deg: Annotated[float, Field(gt=0, le=10)] | None = None
 
 
 class Rest(Section):

@@ -27,6 +27,7 @@ NOISE = ("noise_density", "bias_wander", "wander_time_s")
 FIT_OF_TABLE = (
     "motion", "gravity_g", "latitude_deg", "azimuth_deg", "angle_accuracy_deg", "rate_accuracy", "orthogonality_deg",
     "wobble_deg", "levelling_deg", "gravity_accuracy_g", "azimuth_accuracy_deg", "clock_accuracy_ppm",
+    "seat_deg",
 )  # fmt: skip
 FIT_OF_SENSOR = (
     "full_scale", "counts_per_unit", *NOISE, "effects.bias_temperature", "effects.scale_factor_temperature",
@@ -45,7 +46,7 @@ LIMITS_OF_CHECKS = (
     "bias_temperature", "warm_up",
 )  # fmt: skip
 INGEST_OF_TABLE = (
-    "motion", "gravity_g", "rate_accuracy", "sense", "zero_deg", "angle_accuracy_deg", "orthogonality_deg",
+    "motion", "gravity_g", "rate_accuracy", "sense", "zero_deg", "angle_accuracy_deg", "orthogonality_deg", "seat_deg",
 )  # fmt: skip
 INGEST_OF_SENSOR = (
     "axis_map", "full_scale", "bias", "scale_factor", "cross_axis", *NOISE,
@@ -94,7 +95,10 @@ def select_settings(config: Mapping[str, Any], stage: str, sensor: str = "") -> 
         The sensor of a stage of a fit.
     """
     out: dict[str, Any] = {}
-    for *branch, leaf in _paths(stage, sensor):
+    paths = _paths(stage, sensor)
+    if stage == "effects" and sensor == "gyroscope" and _mountings(config):
+        paths = paths + _paths(stage, "accelerometer")  # gravity determines the mountings
+    for *branch, leaf in paths:
         source: Any = config
         target = out
         for step in branch:
@@ -103,6 +107,11 @@ def select_settings(config: Mapping[str, Any], stage: str, sensor: str = "") -> 
         if leaf in source or branch[-1:] != ["effects"]:  # a data sheet need not limit every effect
             target[leaf] = source[leaf]
     return out
+
+
+def _mountings(config: Mapping[str, Any]) -> bool:
+    """Return whether the gyroscope is fitted together with a mounting of the unit in each recording."""
+    return config["table"].get("seat_deg") is not None or "mounting" in (config["effects"]["gyroscope"] or ())
 
 
 @cache

@@ -19,7 +19,7 @@ from pipeline.diagnosis import multi_position, turntable
 from pipeline.diagnosis.verdict import evidence_of, judged
 from pipeline.diagnosis.words import next_experiment
 from pipeline.errors import NotObservableError
-from pipeline.estimation.effects import AUTO
+from pipeline.estimation.candidates import configured_effects
 from pipeline.estimation.multi_position.rests import is_multi_position
 from pipeline.estimation.selection import ALIKE, EVIDENCE, GATE_BIC, INFLATED
 from pipeline.model.effects import catalogue, effect
@@ -68,9 +68,9 @@ def diagnose(
         ``held_out`` (``error_before, error_after, floor``), without one ``cross_validation``.
     """
     sensor = calibration.sensor
-    wanted = settings["effects"][sensor]
-    configured = [] if wanted == AUTO else list(wanted)
-    procedure = multi_position if is_multi_position(sensor, recordings) else turntable
+    by_hand = is_multi_position(sensor, recordings)
+    procedure = multi_position if by_hand else turntable
+    configured = configured_effects(sensor, settings, [] if by_hand else recordings)
     found = None
     try:
         found = procedure.findings(calibration, recordings, noise, settings, configured, accelerometer=accelerometer)
@@ -146,7 +146,7 @@ def _estimates(found: Findings, score: Score) -> tuple[dict[str, Any], bool]:
             values, uncertainty = term.values, np.sqrt(np.clip(np.diag(found.covariance)[own], 0.0, None))
             if score.name in found.limits:
                 plausible = bool(np.all(np.abs(values) - 2.0 * uncertainty <= found.limits[score.name]))
-    described = effect(score.name).parameters(found.sensor)
+    described = effect(score.name).of_recordings(found.turns).parameters(found.sensor)
     return {
         p.name: {"value": float(v), "unit": p.unit, "standard_uncertainty": float(u) if u > 0 else None}
         for p, v, u in zip(described, values, uncertainty, strict=True)

@@ -50,6 +50,7 @@ class Findings:
     on_table: bool = True
     scatter: Mapping[str, float] = field(default_factory=dict)  # further entries of ``wander``
     more: Mapping[str, Any] = field(default_factory=dict)  # further entries of the document
+    turns: Sequence[str] = ()  # recordings that some effects have parameters for
 
     def share(self, drop: float) -> float:
         """Return the share of the residual's excess over the noise that a drop of its squares is."""

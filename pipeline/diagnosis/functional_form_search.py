@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from pipeline.diagnosis.functional_forms import Form
     from pipeline.diagnosis.residual_regression import Gain
     from pipeline.estimation.selection import Selection
-    from pipeline.records import Noise
+    from pipeline.records import Noise, SensorCalibration
 
     Values = NDArray[np.float64]
 
@@ -277,6 +277,8 @@ def select_with_form(
     configured: Sequence[str],
     noise: Noise | None,
     sheet: Mapping[str, Any],
+    *,
+    accelerometer: SensorCalibration | None = None,
 ) -> Selection:
     """Select again with the best form in the base, so that effects of the catalogue no longer take its place.
 
@@ -288,7 +290,9 @@ def select_with_form(
         return selection
     register(effect_from(definition, "a first guess"))
     try:
-        again = select(selection.observations, [*configured, definition["name"]], noise, sheet)
+        again = select(
+            selection.observations, [*configured, definition["name"]], noise, sheet, accelerometer=accelerometer
+        )
     finally:
         forget(definition["name"])
     floor = 0.0 if noise is None else float(np.sqrt(np.mean(noise.white**2 + noise.wander**2)))

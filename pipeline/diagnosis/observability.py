@@ -21,7 +21,7 @@ import numpy as np
 
 from pipeline.estimation.multi_position.model import refusal
 from pipeline.estimation.selection import GATE_BIC
-from pipeline.model.effects import catalogue
+from pipeline.model.effects import catalogue, effect
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Sequence
@@ -51,9 +51,19 @@ def _steady(span: float) -> str:
 
 
 def _hidden(sensor: str, held: Collection[str], reason: Callable[[Effect], str]) -> dict[str, str]:
-    """Return the effects of a sensor that have a reason not to be seen, but for those that the model holds."""
-    asked = [e for name, e in catalogue().items() if sensor in e.sensors and name not in held]
-    return {e.name: text for e in asked if (text := reason(e))}
+    """Return the effects of a sensor that have a reason not to be seen, but for those that the model holds.
+
+    Checks of the recordings look for effects of single turns (``Effect.of_turns``).
+    """
+    found = {}
+    for name, this in catalogue().items():
+        if sensor not in this.sensors or name in held or this.of_turns:
+            continue
+        within = next((other for other in held if name in effect(other).contains), None)
+        text = f"{within}, which is in the model, contains it" if within else reason(this)
+        if text:
+            found[name] = text
+    return found
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from pipeline.diagnosis.observability import not_observable, one_way
 from pipeline.diagnosis.residual_plots import plots
 from pipeline.diagnosis.verdict import verdict_of_selection
 from pipeline.diagnosis.words import FAR_OFF, plain
+from pipeline.estimation.candidates import turns_of
 from pipeline.estimation.design import Start
 from pipeline.estimation.generalized_least_squares import calibration_of, fit_terms
 from pipeline.estimation.observations import observe
@@ -55,12 +56,11 @@ def findings(
     NotObservableError
         If the recordings do not determine bias and matrix.
     """
-    del accelerometer
     sensor, sheet = calibration.sensor, settings["sensor"][calibration.sensor]
     observations = observe(sensor, recordings, settings["table"])
-    plain_selection = select(observations, configured, noise, sheet, calibration)
+    plain_selection = select(observations, configured, noise, sheet, calibration, accelerometer=accelerometer)
     unknown = unexplained(plain_selection)
-    selection = select_with_form(plain_selection, unknown, configured, noise, sheet)
+    selection = select_with_form(plain_selection, unknown, configured, noise, sheet, accelerometer=accelerometer)
     fits = _fits(selection)
     held, floor = _held_out(selection, fits, recordings, noise, settings["table"])
     held_out = None
@@ -127,6 +127,7 @@ def findings(
             "pictures": plots(plain_selection, unknown, noise, selection),
             "method_errors": method_errors(calibration, selection, recordings, settings),
         },
+        turns=turns_of(observations),
     )
 
 

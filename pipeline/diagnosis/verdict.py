@@ -2,8 +2,8 @@
 
 The first that applies:
 
-    reference_in_doubt  a check of the recordings found a contradiction (note ``N-REFERENCE``), or the residual of the
-                        fit is noise alone and the held-out error is above its interval
+    reference_in_doubt  a check of the recordings found a contradiction (notes ``N-REFERENCE``, ``N-SEATS``), or the
+                        residual of the fit is noise alone and the held-out error is above its interval
     missing_effect      effects were selected, and with them the held-out error lies in its interval; effects beyond
                         the sensor's limits only where they lower the held-out error
     unexplained         the residual of the fit, or the held-out error, is above what noise leaves, unexplained
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from pipeline.records import Noise, Recording, SensorCalibration
 
 IN_DOUBT = "N-REFERENCE"
+SEATS, OF_SEATS = "N-SEATS", ("mounting", "encoder_zero")  # the note that one mounting does not explain the turns
 EXPLAINED = 1.5  # times the noise: a residual of a fit up to it is noise; 0.92 to 1.14 in 140 sensors of null families
 MOSTLY = 0.5  # share of the residual's excess that selected effects must explain where something else is left
 BELIEVED = 3  # effects at once; more are what the catalogue makes of physics that it does not hold
@@ -124,13 +125,15 @@ def held_out_of(part: Mapping[str, Any] | None) -> HeldOut | None:
     return HeldOut(float(part["steps"][-1]["rms_error"]), *map(float, part["expected_rms_error"]))
 
 
-def doubts_of(sensor: str, recordings: Sequence[Recording]) -> list[str]:
+def doubts_of(sensor: str, recordings: Sequence[Recording], effects: Sequence[str] = ()) -> list[str]:
     """Return what the notes on the recordings say of the reference of a sensor.
 
-    A note on turns of the other sensor concerns that one alone.
+    A note on turns of the other sensor concerns that one alone. Mountings or zeros that are fitted or selected explain
+    the note that one mounting does not explain the turns.
     """
+    codes = {IN_DOUBT} if set(effects) & set(OF_SEATS) else {IN_DOUBT, SEATS}
     own = [r for r in recordings if r.role not in {"accelerometer", "gyroscope"} or r.role == sensor]
-    return [f"{r.name}: {note.detail}" for r in own for note in r.notes if note.code == IN_DOUBT]
+    return [f"{r.name}: {note.detail}" for r in own for note in r.notes if note.code in codes]
 
 
 def evidence_of(
@@ -172,7 +175,7 @@ def evidence_of(
         published=published,
         free=error_of(free, smoothed=True) if contradicted else None,
         full=error_of(full, smoothed=True) if contradicted else None,
-        doubts=doubts_of(sensor, recordings),
+        doubts=doubts_of(sensor, recordings, [*document["configured"], *document["selected"]]),
         approximations=[error["name"] for error in document["method_errors"] if error["name"] in COMPARED],
         unknown=[entry["covariate"] for entry in document["unexplained"] if not entry.get("explained_by")],
         implausible=() if accepted else implausible,

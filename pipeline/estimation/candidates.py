@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import ConfigurationError, NotObservableError
-from pipeline.estimation.design import Term
+from pipeline.estimation.design import NormalPrior, Term
 from pipeline.model.effects import catalogue, effect
 from pipeline.model.effects.base import parameter_limits
 from pipeline.model.effects.sessions import OWN
@@ -19,8 +19,13 @@ if TYPE_CHECKING:
 
     from pipeline.estimation.observations import Observations
     from pipeline.model.effects.base import Effect
-    from pipeline.records import SensorCalibration
+    from pipeline.records import Recording, SensorCalibration
 
+AUTO = "auto"  # in place of a list of effects: what the diagnosis selects
+MOUNTING, ZERO = "mounting", "encoder_zero"
+SEAT_DEG = (
+    5.0  # deg, where the mountings are fitted and the table's config states none: the default tolerance of ingest
+)
 SECOND = {"accelerometer": (), "gyroscope": ("table_encoder_error",)}  # exact look-alikes of a likelier effect
 
 
@@ -29,21 +34,46 @@ def parameter_names(sensor: str, effects: Sequence[Effect]) -> list[str]:
     return [f"{e.name}.{p.name}" for e in effects for p in e.parameters(sensor)]
 
 
-def starts_of(names: Sequence[str], sensor: str, known: SensorCalibration | None = None) -> list[list[Term]]:
+def configured_effects(sensor: str, settings: Mapping[str, Any], recordings: Sequence[Recording]) -> list[str]:
+    """Return the effects in the model: those of the bench, and those that are listed."""
+    wanted = settings["effects"][sensor]
+    listed = [] if wanted == AUTO else list(wanted)
+    return [*(name for name in bench_effects(sensor, settings, recordings) if name not in listed), *listed]
+
+
+def bench_effects(sensor: str, settings: Mapping[str, Any], recordings: Sequence[Recording]) -> list[str]:
+    """Return the effects of the bench: mountings where the table's config has them, else zeros that were found."""
+    if settings["table"].get("seat_deg") is not None:
+        return [MOUNTING]
+    found = any(note.code == "N-FOUND" for recording in recordings for note in recording.notes)
+    return [ZERO] if found and sensor == "accelerometer" else []
+
+
+def starts_of(
+    names: Sequence[str],
+    observed: Observations | str,
+    known: SensorCalibration | None = None,
+    accelerometer: SensorCalibration | None = None,
+) -> list[list[Term]]:
     """Return the terms from which a fit starts, every combination of the effects' starts.
 
     Parameters
     ----------
     names : sequence of str
-    sensor : str
+    observed : Observations or str
+        The sensor alone for recordings by hand.
     known : SensorCalibration, optional
         Its fitted effects start where they are.
+    accelerometer : SensorCalibration, optional
+        For the gyroscope: gravity determines the mountings.
 
     Raises
     ------
     ConfigurationError
         If an effect is unknown, named twice, contained in another, or not one of this sensor.
     """
+    sensor = observed if isinstance(observed, str) else observed.sensor
+    recordings = [] if isinstance(observed, str) else turns_of(observed)
     if len(set(names)) != len(names):
         raise ConfigurationError(f"effects.{sensor} names an effect twice: {', '.join(names)}")
     for name in names:
@@ -55,14 +85,55 @@ def starts_of(names: Sequence[str], sensor: str, known: SensorCalibration | None
     fitted = {} if known is None else {e.name: e.values for e in known.effects}
     combinations: list[list[Term]] = [[]]
     for name in names:
-        this = effect(name)
+        this = effect(name).of_recordings(recordings)
         if sensor not in this.sensors:
             raise ConfigurationError(
                 f"effects.{sensor} names {name}, which is an effect of the {this.sensors[0]} alone"
             )
-        values = [fitted[name]] if name in fitted else this.starts(sensor)
-        combinations = [[*before, Term(this, v)] for before in combinations for v in values]
+        prior = None
+        if name == MOUNTING and not isinstance(observed, str):
+            prior = _prior_of_mountings(recordings, observed.seat_deg or SEAT_DEG, accelerometer)
+        values = [fitted[name]] if name in fitted else this.starts(sensor) if prior is None else [prior.mean]
+        values = [v for v in values if len(v) == len(this.parameters(sensor))] or this.starts(sensor)
+        combinations = [[*before, Term(this, v, prior=prior)] for before in combinations for v in values]
     return combinations
+
+
+def turns_of(observations: Observations) -> list[str]:
+    """Return the names of the recordings of turns."""
+    return [part.name for part in observations.parts if part.motion.axis is not None]
+
+
+def _prior_of_mountings(
+    recordings: Sequence[str], seat_deg: float, accelerometer: SensorCalibration | None
+) -> NormalPrior:
+    """Return what is known of the rotations of the unit before the fit, in the frame of their mean.
+
+    ``theta_k ~ N(0, s^2)`` where gravity does not tell. Where the accelerometer was fitted with the mountings, its
+    estimate: it shares the rotation that is common to all recordings, which is part of the matrices of both sensors.
+
+    Parameters
+    ----------
+    recordings : sequence of str
+    seat_deg : float, deg
+        s.
+    accelerometer : SensorCalibration or None
+    """
+    size = 3 * len(recordings)
+    mean = np.zeros(size)
+    found = None if accelerometer is None else next((e for e in accelerometer.effects if e.name == MOUNTING), None)
+    if accelerometer is None or accelerometer.covariance is None or found is None or found.definition is None:
+        return NormalPrior(mean, np.eye(size) / seat_deg**2)
+    theirs, names = found.definition["recordings"], accelerometer.parameter_names()
+    first = names.index(f"{MOUNTING}.{next(iter(found.parameters))}")
+    mine = [(k, theirs.index(name)) for k, name in enumerate(recordings) if name in theirs]
+    here = np.concatenate([np.arange(3 * k, 3 * k + 3) for k, _ in mine])
+    there = np.concatenate([np.arange(3 * k, 3 * k + 3) for _, k in mine])
+    mean[here] = found.values[there]
+    covariance = seat_deg**2 * np.eye(size)
+    covariance[np.ix_(here, here)] = accelerometer.covariance[np.ix_(first + there, first + there)]
+    covariance += np.kron(np.full((len(recordings), len(recordings)), seat_deg**2 / len(recordings)), np.eye(3))
+    return NormalPrior(mean, np.asarray(np.linalg.inv(covariance), np.float64))
 
 
 def limits_of(sensor: str, sheet: Mapping[str, Any]) -> dict[str, NDArray[np.float64]]:
@@ -79,7 +150,7 @@ def limits_of(sensor: str, sheet: Mapping[str, Any]) -> dict[str, NDArray[np.flo
     found = {}
     for name, this in catalogue().items():
         limits = parameter_limits(this, sensor, given) if sensor in this.sensors else np.array([np.inf])
-        if np.all(np.isfinite(limits)):
+        if len(limits) and np.all(np.isfinite(limits)):
             found[name] = limits
     return found
 
@@ -87,7 +158,11 @@ def limits_of(sensor: str, sheet: Mapping[str, Any]) -> dict[str, NDArray[np.flo
 def candidates_for(observations: Observations, configured: Sequence[str]) -> list[Effect]:
     """Return the effects that could be missing and whose needs the recordings meet."""
     found = []
-    for name, this in catalogue().items():
+    recordings = turns_of(observations)
+    for name, listed in catalogue().items():
+        this = listed.of_recordings(recordings)
+        if this.of_turns and not observations.mounting_in_doubt:
+            continue
         if name in configured or observations.sensor not in this.sensors or observations.sensor in this.unseen:
             continue
         if name == "earth_rotation" and observations.earth:

@@ -38,6 +38,20 @@ BASE_NAMES = [f"bias_{a}" for a in "xyz"] + [f"matrix_{a}{b}" for a in "xyz" for
 
 
 @dataclass(frozen=True)
+class NormalPrior:
+    """What is known of an effect's p parameters before the readings: ``N(mean, precision^-1)``.
+
+    Attributes
+    ----------
+    mean : (p,) array
+    precision : (p, p) array
+    """
+
+    mean: NDArray[np.float64]
+    precision: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
 class Term:
     """An effect at given values of its parameters, as columns.
 
@@ -48,11 +62,14 @@ class Term:
         Where its derivative is taken.
     full : bool
         Whether the columns of its nonlinear parameters are among them.
+    prior : NormalPrior or None
+        Of the parameters; None: flat.
     """
 
     effect: Effect
     values: NDArray[np.float64]
     full: bool = False
+    prior: NormalPrior | None = None
 
     def layout(self) -> Layout:
         """Return how its columns act on the axes."""
@@ -183,6 +200,7 @@ class Design:
     ) -> None:
         self.scale = scale
         self._place(observations.sensor, terms)
+        self._priors = [(at, t.prior, t.values) for at, t in zip(self.slices, terms, strict=True) if t.prior]
         weight = observations.weight
         A = np.zeros((len(weight), self._width))
         A[:, self._readings] = observations.reading if target is None else target
@@ -261,24 +279,43 @@ class Design:
     def products(self, settings: Sequence[Setting]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return all products of parameters' columns and, last, the readings, (g, p + 1, p + 1); and log det C, (g,).
 
-        The determinant is known up to a constant.
+        Those of the priors are added. The determinant is known up to a constant.
         """
         local, logarithm = self.columns.products(settings)
         total = np.zeros((len(settings), (self.count + 1) ** 2))
         flat = local.reshape(len(settings), -1)
         for c in range(3):
             total[:, self._to[c]] += flat[:, self._from[c]] / self.scale[c] ** 2
-        return total.reshape(-1, self.count + 1, self.count + 1), 3.0 * logarithm
+        square = total.reshape(-1, self.count + 1, self.count + 1)
+        for at, prior, values in self._priors:  # as readings of the parameters themselves
+            rest = prior.mean - values
+            square[:, at, at] += prior.precision
+            square[:, at, -1] += prior.precision @ rest
+            square[:, -1, at] += prior.precision @ rest
+            square[:, -1, -1] += rest @ prior.precision @ rest
+        return square, 3.0 * logarithm
 
     def linear_map(self, setting: Setting) -> LinearMap:
         """Return what small changes of the readings do to the parameters, solved under a noise setting."""
-        gram = self.products([setting])[0][0, :-1, :-1]
-        size = np.where(self.sizes()[:-1] > 0, self.sizes()[:-1], 1.0)
-        inverse = np.linalg.pinv(gram / np.outer(size, size), rcond=1e-12, hermitian=True) / np.outer(size, size)
+        inverse = self._inverse(setting)
         influence = self.columns.influence(setting)
         weights = [influence[index[:-1]] for index in self._local]
         back = [inverse[:, index[:-1]] / s**2 for index, s in zip(self._total, self.scale, strict=True)]
         return LinearMap((weights[0], weights[1], weights[2]), (back[0], back[1], back[2]))
+
+    def prior_covariance(self, setting: Setting) -> NDArray[np.float64]:
+        """Return what the priors contribute to the covariance of the parameters: (p, p) array."""
+        inverse, total = self._inverse(setting), np.zeros((self.count, self.count))
+        for at, prior, _ in self._priors:
+            total += inverse[:, at] @ prior.precision @ inverse[at]
+        return total
+
+    def _inverse(self, setting: Setting) -> NDArray[np.float64]:
+        """Return the inverse of the products of the parameters' columns: (p, p) array."""
+        gram = self.products([setting])[0][0, :-1, :-1]
+        size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+        found = np.linalg.pinv(gram / np.outer(size, size), rcond=1e-12, hermitian=True) / np.outer(size, size)
+        return np.asarray(found, np.float64)
 
     def sizes(self) -> NDArray[np.float64]:
         """Return the norm of each parameter's column before the base was taken out: (p + 1,) array."""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from pipeline.errors import NotObservableError
+from pipeline.estimation.candidates import AUTO, MOUNTING, configured_effects
 from pipeline.estimation.generalized_least_squares import fit_joint
 from pipeline.estimation.multi_position.rests import is_multi_position
 from pipeline.estimation.noise import noise_of
@@ -15,8 +17,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.records import Recording
-
-AUTO = "auto"
 
 
 def fit(
@@ -38,21 +38,35 @@ def fit(
     SensorCalibration
         ``previous`` unchanged where there is nothing to add.
     """
-    wanted = settings["effects"][sensor]
     before = previous or SensorCalibration(sensor)
-    if not wanted:
+    by_hand = is_multi_position(sensor, recordings)
+    seated_anew = not by_hand and (settings.get("table") or {}).get("seat_deg") is not None
+    if not settings["effects"][sensor] and not seated_anew:
         return before
     noise = noise_of(sensor, recordings, settings)
-    if is_multi_position(sensor, recordings):
+    if by_hand:
         from pipeline.estimation.multi_position.result import fit_effects_by_rests  # noqa: PLC0415  (recordings by hand alone)
 
         return fit_effects_by_rests(before, recordings, noise, settings)
-    names = list(wanted)
-    if wanted == AUTO:
+    names = configured_effects(sensor, settings, recordings)
+    accelerometer = _mountings_by_gravity(recordings, settings) if sensor == "gyroscope" and MOUNTING in names else None
+    if settings["effects"][sensor] == AUTO:
         observations = observe(sensor, recordings, settings["table"])
         if not observations.parts:
             return before
-        names = select(observations, [], noise, settings["sensor"][sensor]).names
+        sheet = settings["sensor"][sensor]
+        names += select(observations, names, noise, sheet, accelerometer=accelerometer).names
     if not names:
         return before
-    return fit_joint(sensor, recordings, names, noise, settings, before)
+    return fit_joint(sensor, recordings, names, noise, settings, before, accelerometer)
+
+
+def _mountings_by_gravity(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> SensorCalibration | None:
+    """Return the accelerometer with the mountings of its turns; None where the recordings do not determine them."""
+    listed = settings["effects"]["accelerometer"]
+    wanted = AUTO if listed == AUTO else [MOUNTING, *(name for name in listed if name != MOUNTING)]
+    both = {**settings, "effects": {**settings["effects"], "accelerometer": wanted}}
+    try:
+        return fit("accelerometer", recordings, None, both)
+    except NotObservableError:
+        return None

@@ -139,7 +139,8 @@ class Posterior:
         average = np.diag(mean)
         known = average > 0.0
         size, inverse = np.ones(len(average)), np.zeros(len(average))
-        sigma = np.sqrt(np.diagonal(self.covariances, axis1=1, axis2=2)[:, known] / average[known])
+        variances = np.clip(np.diagonal(self.covariances, axis1=1, axis2=2)[:, known], 0.0, None)
+        sigma = np.sqrt(variances / average[known])
         inner, outer = (_within(self.weight, sigma, level) for level in (ONE_SIGMA, COVERED))
         size[known], inverse[known] = _student(inner, outer)
         freedom = np.where(known, 1.0 / np.maximum(1.0 / self.spare + inverse, 1e-300), np.inf)

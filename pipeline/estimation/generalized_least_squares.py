@@ -30,8 +30,15 @@ from pipeline.estimation.least_squares import certified
 from pipeline.estimation.noise import static_or_sheet
 from pipeline.estimation.observations import observe, weighted
 from pipeline.estimation.table_errors import Reference
-from pipeline.estimation.uncertainty_budget import budgeted, combined, noise_contribution, scatter_contribution
+from pipeline.estimation.uncertainty_budget import (
+    budgeted,
+    combined,
+    mounting_contribution,
+    noise_contribution,
+    scatter_contribution,
+)
 from pipeline.model.effects.base import Layout, truth
+from pipeline.model.effects.mounting import Mounting, in_mean_frame
 from pipeline.records import FittedEffect, SensorCalibration, StageResult
 
 if TYPE_CHECKING:
@@ -109,7 +116,7 @@ def fit_terms(observations: Observations, terms: Sequence[Term], start: Start, s
     settings : sequence of Setting
         Noises over which the likelihood is maximised.
     """
-    terms = [Term(term.effect, np.array(term.values, float), full=True) for term in terms]
+    terms = [replace(term, values=np.array(term.values, float), full=True) for term in terms]
     bias, K = start.bias.copy(), start.K.copy()
     linear = not any(term.effect.nonlinear or term.effect.layout == Layout.SHARED for term in terms)
     rounds, converged = 0, False
@@ -149,7 +156,7 @@ def _stepped(
     for term in terms:
         size = len(term.values)
         values = term.effect.stepped(term.values, step[at : at + size])
-        moved.append(Term(term.effect, values, full=True))
+        moved.append(replace(term, values=values))
         taken.append(values - term.values)
         at += size
     return bias + step[:3], K + step[3:BASE].reshape(3, 3), moved, np.concatenate(taken)
@@ -273,7 +280,7 @@ def fit_best(
     if len(combinations) > 1:
         scores = []
         for terms in combinations:
-            full = [Term(t.effect, np.array(t.values, float), full=True) for t in terms]
+            full = [replace(t, values=np.array(t.values, float), full=True) for t in terms]
             design = _at(observations, full, start.bias, start.K, start.scale)
             scores.append(_solve(design, observations, settings).log_likelihood)
         chosen = combinations[int(np.argmax(scores))]
@@ -290,8 +297,13 @@ def require_observable(observations: Observations, fit: Fit, scale: NDArray[np.f
     """
     design = _at(observations, fit.terms, fit.bias, fit.K, scale)
     names = [*BASE_NAMES, *parameter_names(observations.sensor, [t.effect for t in fit.terms])]
-    size = design.sizes()[:-1]
-    products = design.products([WHITE])[0][0, :-1, :-1] / np.outer(*[np.where(size > 0, size, 1.0)] * 2)
+    free = np.ones(len(names), bool)  # a prior determines the others
+    for at, term in zip(design.slices, fit.terms, strict=True):
+        free[at] = term.prior is None
+    names = [name for name, own in zip(names, free, strict=True) if own]
+    size = design.sizes()[:-1][free]
+    products = design.products([WHITE])[0][0, :-1, :-1][np.ix_(free, free)]
+    products = products / np.outer(*[np.where(size > 0, size, 1.0)] * 2)
     values, vectors = np.linalg.eigh(products)
     weak = [name for name, s in zip(names, size, strict=True) if s == 0]
     for value, vector in zip(values, vectors.T, strict=True):
@@ -317,6 +329,7 @@ def fit_joint(  # noqa: PLR0917  (the interface that the stages and the diagnosi
     noise: Noise | None,
     settings: Mapping[str, Any],
     start: SensorCalibration | None = None,
+    accelerometer: SensorCalibration | None = None,
 ) -> SensorCalibration:
     """Fit bias, matrix and effects together.
 
@@ -333,6 +346,8 @@ def fit_joint(  # noqa: PLR0917  (the interface that the stages and the diagnosi
         The unit's part of the configuration; its section ``table`` is read.
     start : SensorCalibration, optional
         The calibration so far: its stages are kept, its effects are starts.
+    accelerometer : SensorCalibration, optional
+        For the gyroscope: gravity determines the mountings.
 
     Returns
     -------
@@ -346,8 +361,8 @@ def fit_joint(  # noqa: PLR0917  (the interface that the stages and the diagnosi
     ConfigurationError
         If an effect is unknown or not one of this sensor.
     """
-    combinations = starts_of(effects, sensor, start)
     observations = weighted(observe(sensor, recordings, settings["table"]), noise)
+    combinations = starts_of(effects, observations, start, accelerometer)
     base = ordinary_base(observations, noise)
     require_available(observations, effects)
     grid = selection_grid(noise, RATIOS, TIMES)
@@ -372,6 +387,9 @@ def calibration_of(  # noqa: PLR0917  (what a fit with effects is)
     matrix = np.asarray(np.linalg.solve(fit.K, np.eye(3)), np.float64)
     change = np.eye(len(fit.covariance))
     change[3:BASE, 3:BASE] = -np.kron(matrix, matrix.T)
+    for place, term in zip(_slices(fit), fit.terms, strict=True):
+        if isinstance(term.effect, Mounting):
+            change = change @ in_mean_frame(fit.K, term.values, place, len(change))
     covariance = change @ fit.covariance @ change.T
     uncertainty = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
     effects, parameters, at = [], {}, BASE
@@ -420,7 +438,16 @@ def calibration_of(  # noqa: PLR0917  (what a fit with effects is)
     def results(drawn: NDArray[np.float64]) -> NDArray[np.float64]:
         return _with_matrix(values + drawn @ of_channels.T)
 
-    return budgeted(found, reference, errors, [noise_contribution(errors, whole, prior)], settings, results, names)
+    lines = [noise_contribution(errors, whole, prior)]
+    if any(term.prior for term in fit.terms):
+        lines.append(mounting_contribution(change @ design.prior_covariance(fit.setting) @ change.T))
+    return budgeted(found, reference, errors, lines, settings, results, names)
+
+
+def _slices(fit: Fit) -> list[slice]:
+    """Return the place of each effect's parameters."""
+    ends = BASE + np.cumsum([len(term.values) for term in fit.terms]).astype(int)
+    return [slice(int(end) - len(term.values), int(end)) for end, term in zip(ends, fit.terms, strict=True)]
 
 
 def _with_matrix(values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -21,7 +21,8 @@ import numpy as np
 
 from pipeline.estimation.gauss_markov import Blocks, information
 from pipeline.estimation.sample_rows import Rows, followed, rows_of
-from pipeline.model.effects.base import turning_direction
+from pipeline.estimation.table_errors import between_stops
+from pipeline.model.effects.base import length, turning_direction
 from pipeline.model.kinematics import earth_of, table_motion
 from pipeline.signal.filters import apply_filter
 
@@ -79,11 +80,20 @@ class Observations:
         In the order of time where the clock is shared.
     earth : bool
         Whether Earth's rotation is in the motion.
+    seat_deg : float or None, deg
+        Standard deviation of the rotation of the unit in each recording; None: one mounting for all.
+    mounting_in_doubt : bool
+        Whether one mounting does not explain all turns (note ``N-SEATS``).
+    angle_deg : float, deg
+        Standard uncertainty of the angle at each stop, where the unit is mounted anew for each turn; else 0.
     """
 
     sensor: str
     parts: tuple[Part, ...]
     earth: bool
+    seat_deg: float | None = None
+    mounting_in_doubt: bool = False
+    angle_deg: float = 0.0
 
     @cached_property
     def reading(self) -> NDArray[np.float64]:
@@ -154,8 +164,34 @@ def weighted(observations: Observations, noise: Noise | None) -> Observations:
     parts = []
     for part in observations.parts:
         share = information(noise, part.interval)
-        parts.append(part if share == 1.0 else replace(part, weight=share * part.weight, scatter=share * part.scatter))
+        fewer = part if share == 1.0 else replace(part, weight=share * part.weight, scatter=share * part.scatter)
+        parts.append(_with_stops(fewer, observations, float(np.mean(noise.white))) if noise is not None else fewer)
     return replace(observations, parts=tuple(parts))
+
+
+def _with_stops(part: Part, observations: Observations, white: float) -> Part:
+    """Return a part whose weights allow for the errors of the angle at the stops.
+
+    Rows at one stop, or in the turn from it to the next, share an error ``d``. Together they contain the information of
+    ``W / (1 + W d^2 / s^2)`` samples of white noise s. W is their weight, u the standard uncertainty of the angle and r
+    the rate:
+
+        accelerometer: d = u |f|        gyroscope: d = sqrt(2) u r / way, 0 at rest
+    """
+    motion, u = part.motion, np.radians(observations.angle_deg)
+    if u == 0.0 or white <= 0.0 or motion.axis is None or motion.angle is None or motion.rate is None:
+        return part
+    stop, _, slope, stops = between_stops(motion.angle, motion.rate)
+    moving = slope != 0.0
+    group = 2 * stop + moving
+    error = u * length(motion.specific_force)
+    if observations.sensor == "gyroscope":
+        error = np.sqrt(2.0) * observations.angle_deg * np.abs(motion.rate * slope)
+    together = np.bincount(group, part.weight * (error / white) ** 2, 2 * stops)
+    weight = part.weight / (1.0 + together[group])
+    rests = ~moving
+    share = float(weight[rests].sum() / part.weight[rests].sum()) if rests.any() else 1.0
+    return replace(part, weight=weight, scatter=share * part.scatter)
 
 
 def observe(sensor: str, recordings: Sequence[Recording], table: Mapping[str, Any]) -> Observations:
@@ -167,7 +203,7 @@ def observe(sensor: str, recordings: Sequence[Recording], table: Mapping[str, An
     recordings : sequence of Recording
         Those held out are left aside.
     table : mapping
-        ``gravity_g``, ``latitude_deg``, ``azimuth_deg``.
+        ``gravity_g``, ``latitude_deg``, ``azimuth_deg``, ``seat_deg``.
     """
     parts = []
     for recording in recordings:
@@ -176,7 +212,10 @@ def observe(sensor: str, recordings: Sequence[Recording], table: Mapping[str, An
             if part is not None:
                 parts.append(part)
     parts.sort(key=_in_time)
-    return Observations(sensor, tuple(parts), earth_of(table) is not None)
+    doubt = any(note.code == "N-SEATS" for recording in recordings for note in recording.notes)
+    seat = table.get("seat_deg")
+    angle = 0.0 if seat is None else float(table.get("angle_accuracy_deg") or 0.0)
+    return Observations(sensor, tuple(parts), earth_of(table) is not None, seat, doubt, angle)
 
 
 def _in_time(part: Part) -> tuple[bool, str, float]:

@@ -30,9 +30,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import ConfigurationError, NotObservableError
+from pipeline.estimation.candidates import bench_effects
 from pipeline.estimation.engine import LinearMap, assess_noise
+from pipeline.estimation.generalized_least_squares import fit_joint
 from pipeline.estimation.least_squares import ScaledColumns, certificate
-from pipeline.estimation.noise import prior_of
+from pipeline.estimation.noise import noise_of, prior_of
 from pipeline.estimation.table_errors import Reference, disturbance
 from pipeline.estimation.turns import blocks_of_samples, parts_of, settled
 from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution
@@ -121,6 +123,9 @@ def fit(
     def results(errors: NDArray[np.float64]) -> NDArray[np.float64]:
         return inverted(beta.T.ravel() + errors)
 
+    own = bench_effects(sensor, settings, recordings)
+    if own and settings["table"].get("seat_deg") is None:  # mountings are fitted by the stage ``effects``
+        return fit_joint(sensor, recordings, own, noise_of(sensor, recordings, settings), settings, found)
     return budgeted(found, reference, noise, contributions, settings, results)
 
 

@@ -110,6 +110,8 @@ def select(
     noise: Noise | None,
     sheet: Mapping[str, Any],
     known: SensorCalibration | None = None,
+    *,
+    accelerometer: SensorCalibration | None = None,
 ) -> Selection:
     """Select effects.
 
@@ -123,8 +125,10 @@ def select(
         The sensor's section of the configuration.
     known : SensorCalibration, optional
         Its effects are starts for the configured ones.
+    accelerometer : SensorCalibration, optional
+        For the gyroscope: gravity determines the mountings.
     """
-    return _Search(observations, configured, noise, sheet, known).run()
+    return _Search(observations, configured, noise, sheet, known, accelerometer=accelerometer).run()
 
 
 def unselected(
@@ -144,6 +148,8 @@ class _Search:
         noise: Noise | None,
         sheet: Mapping[str, Any],
         known: SensorCalibration | None,
+        *,
+        accelerometer: SensorCalibration | None = None,
     ) -> None:
         observations = weighted(observations, noise)
         self.observations = observations
@@ -151,7 +157,7 @@ class _Search:
         self.settings = selection_grid(noise)
         self.noise, self.sheet = noise, sheet
         self.limits = limits_of(observations.sensor, sheet)
-        combinations_ = starts_of(configured, observations.sensor, known)
+        combinations_ = starts_of(configured, observations, known, accelerometer)
         self.base = fit_best(observations, combinations_, self.start, self.settings)
         self.effects = candidates_for(observations, configured)
         self.names: list[str] = []
@@ -200,12 +206,12 @@ class _Search:
         """Fit with the new effect; rebuild the candidates if their columns depend on what has changed."""
         K = self.fit.K
         self._fit_selected()
-        if effect(name).nonlinear or np.abs(self.fit.K - K).max() > ANOTHER_K:
+        if effect(name).nonlinear or effect(name).moves or np.abs(self.fit.K - K).max() > ANOTHER_K:
             self.ranking = self._ranking()
 
     def _ranking(self) -> Ranking:
         """Build the linear problem: configured effects in the base, the others as candidates."""
-        fitted = {term.effect.name: Term(term.effect, term.values) for term in self.fit.terms}
+        fitted = {term.effect.name: replace(term, full=False) for term in self.fit.terms}
         configured = [replace(fitted[term.effect.name], full=True) for term in self.base.terms]
         candidates = []
         for this in self.effects:
@@ -317,7 +323,8 @@ class _Search:
     def _terms(self) -> list[Term]:
         """Return the selected effects at their fitted values, or at those of the step that accepted them."""
         held = {term.effect.name: term for term in self.fit.terms}
-        return [held.get(name, Term(effect(name), self.steps[name].values)) for name in self.names]
+        bound = {e.name: e for e in self.effects}
+        return [held.get(name) or Term(bound[name], self.steps[name].values) for name in self.names]
 
     def _own(self, name: str) -> float:
         """Return the delta BIC that a selected effect brings beside the others."""
@@ -379,7 +386,8 @@ class _Search:
     def _criterion(self, names: Sequence[str]) -> float:
         """Return ``2 log L - k log N`` of base and some candidates, at the values of the ranking."""
         found, _ = self.ranking.of_model(self._selected(names))
-        count = sum(len(effect(n).parameters(self.observations.sensor)) for n in names)
+        parameters = {e.name: len(e.parameters(self.observations.sensor)) for e in self.effects}
+        count = sum(parameters[n] for n in names)
         return 2.0 * found - count * float(np.log(self.ranking.samples))
 
     def _exchange(self) -> bool:

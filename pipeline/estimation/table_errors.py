@@ -59,7 +59,7 @@ IDLE = {  # sensors whose readings an input does not change
 
 
 ESTIMATES = {
-    "orthogonality of the table's axes": ("table_axis_nonorthogonality",),
+    "orthogonality of the table's axes": ("table_axis_nonorthogonality", "mounting"),
     "levelling": ("table_tilt",),
     "Earth's rotation": ("earth_rotation",),
 }
@@ -185,7 +185,7 @@ def _largest(reference: Reference) -> float:
         u = truth(reference.sensor, motion)
         size = max(size, tilt * float(np.abs(u).max()))
         if reference.sensor == "gyroscope" and motion.angle is not None and motion.rate is not None:
-            slope = float(np.abs(motion.rate * _between_stops(motion.angle, motion.rate)[2]).max())
+            slope = float(np.abs(motion.rate * between_stops(motion.angle, motion.rate)[2]).max())
             size = max(size, slope * float(table.get("angle_accuracy_deg") or 0.0))
             size = max(size, float(np.abs(motion.rate).max()) * float(table.get("rate_accuracy") or 0.0))
     return size
@@ -216,7 +216,7 @@ def _angle(reference: Reference) -> Values:
             groups.append(np.full(n, count))
             count += 1
             continue
-        stop, share, slope, stops = _between_stops(motion.angle, motion.rate)
+        stop, share, slope, stops = between_stops(motion.angle, motion.rate)
         if sensor == "accelerometer":
             turned = motion.specific_force @ (-np.radians(1.0) * K @ ABOUT[motion.axis]).T
             left.append(turned * (1.0 - share)[:, None])
@@ -237,7 +237,7 @@ def _angle(reference: Reference) -> Values:
     return np.concatenate([at_stops, *(_turned(reference, motion) for motion in attitudes)], axis=1)
 
 
-def _between_stops(angle: Values, rate: Values) -> tuple[NDArray[np.intp], Values, Values, int]:
+def between_stops(angle: Values, rate: Values) -> tuple[NDArray[np.intp], Values, Values, int]:
     """Return the stop at or before each sample, its share of the way to the next, and the slope of that, 1/deg.
 
     Where a recording does not begin or end with a rest, its first or last sample stands in for one.
@@ -276,7 +276,7 @@ def _rate(reference: Reference) -> Values:
         du = np.zeros((len(motion.time), 3, 3))
         if reference.sensor == "gyroscope":
             du[:, motion.axis, motion.axis] = motion.rate
-        elif _between_stops(motion.angle, motion.rate)[3] <= COUNTED_STOPS:
+        elif between_stops(motion.angle, motion.rate)[3] <= COUNTED_STOPS:
             travelled = np.concatenate([[0.0], np.cumsum(np.diff(motion.angle))])[:, None]
             du[:, :, motion.axis] = -np.radians(travelled * (motion.specific_force @ ABOUT[motion.axis].T))
         return du

@@ -104,8 +104,8 @@ def noise_contribution(noise: ResidualNoise, fit: LinearMap, prior: Prior) -> Co
     covariance, freedom = noise.posterior(fit).averaged()
     total = np.diag(covariance)
     white, wander = noise.variances(fit, prior)
-    white = np.minimum(white, total)
-    wander = np.minimum(wander, total - white)
+    white = np.clip(white, 0.0, np.clip(total, 0.0, None))  # rounding may leave a negative zero
+    wander = np.clip(wander, 0.0, np.clip(total - white, 0.0, None))
     parts = {
         "white noise": np.sqrt(white),
         "bias wander": np.sqrt(wander),
@@ -120,6 +120,11 @@ def scatter_contribution(
     """Return the contribution of the readings' scatter where a fit gives its covariance at once."""
     freedom = np.full(len(covariance), float(degrees_of_freedom))
     return Contribution(NOISE, "A", "Student's t", covariance, freedom, parts=dict(parts or {}), remark=remark)
+
+
+def mounting_contribution(covariance: Values) -> Contribution:
+    """Return what the priors of the mountings contribute, in the frame of their mean."""
+    return Contribution("mounting", "B", NORMAL, covariance, np.full(len(covariance), np.inf))
 
 
 def quantisation(noise: ResidualNoise, fit: LinearMap, counts_per_unit: float | None, unit: str) -> Contribution | str:

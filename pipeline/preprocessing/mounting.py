@@ -1,8 +1,9 @@
 """The mounting of the unit in each turn: found, compared with what is stated, and brought into the convention.
 
-Another turn axis, upward face or sense than stated, and a zero that is off by more than
-``procedure.mounting_tolerance_deg``, are refused with the setting that describes them; what is stated is applied to the
-table's angle and rate, so that everything after ingest works with the convention (``pipeline.preprocessing.bench``).
+Turn axis, upward face, sense and zero are applied to the table's angle and rate, so that everything after ingest works
+with the convention (``pipeline.preprocessing.bench``). Where gravity determines them and they differ from what is
+stated (the zero by more than ``procedure.mounting_tolerance_deg``), those that are found are applied, with the note
+``N-FOUND``. What the gyroscope alone shows, or what is not near a body axis, is refused.
 """
 
 from __future__ import annotations
@@ -71,17 +72,26 @@ def check_mounting(recordings: Sequence[Recording], settings: Mapping[str, Any])
         if recording.role == "rests":
             check_moves(recording, maps)
     tolerance = _tolerance(procedure, table, sensor)
-    departures = [d for t in known if (d := departure(t, tolerance)) is not None]
-    if departures:
-        raise _refusal(departures, known, accelerometer, maps)
-    doubts = seat_notes(known, table, sensor)
-    return [r if t is None else _applied(t, doubts.get(r.name, [])) for r, t in zip(recordings, turns, strict=True)]
+    departures = {t.name: d for t in known if (d := departure(t, tolerance)) is not None}
+    refused = [d for d in departures.values() if d.bench is None]
+    if _negated(known):
+        refused = list(departures.values())
+    if refused:
+        raise _refusal(refused, known, accelerometer, maps)
+    hint = _hint(list(departures.values()), known, accelerometer, maps) if departures else ""
+    zeros = refined_zeros(known) if departures and table.get("seat_deg") is None else {}
+    used = {t.name: _as_found(t, departures.get(t.name), zeros) for t in known}
+    doubts = seat_notes(list(used.values()), table, sensor) if table.get("seat_deg") is None else {}
+    return [
+        r if t is None else _applied(used[t.name], doubts.get(r.name, []), departures.get(t.name), hint)
+        for r, t in zip(recordings, turns, strict=True)
+    ]
 
 
 def _tolerance(procedure: Mapping[str, Any], table: Mapping[str, Any], sensor: Mapping[str, Any]) -> Tolerance:
     limits = (sensor.get("accelerometer") or {}).get("effects") or {}
     return Tolerance(
-        float(procedure.get("mounting_tolerance_deg") or TOLERANCE_DEG),
+        float(procedure.get("mounting_tolerance_deg") or TOLERANCE_DEG) + 3.0 * float(table.get("seat_deg") or 0.0),
         float(limits.get("time_offset") or TIME_OFFSET_S),
         float(table.get("rate_accuracy") or 0.0) if table.get("motion") == "commanded" else 0.0,
     )
@@ -165,7 +175,26 @@ def _hint(
     return f"if the bench is so, set {', or '.join(ways)} (docs/mounting.md); else correct the columns or the mounting"
 
 
-def _applied(turn: Turn, doubts: Sequence[Note]) -> Recording:
+def _negated(turns: Sequence[Turn]) -> bool:
+    """Return whether each turn shows the face opposite to the stated one: rather a negated accelerometer."""
+    found = [(t.found, t.stated) for t in turns if t.recording.role == "accelerometer"]
+    signs = {"+": "-", "-": "+"}
+    return len(found) > 1 and all(
+        f is not None and f.axis == s.axis and f.up == signs[s.up[0]] + s.up[1] for f, s in found
+    )
+
+
+def _as_found(turn: Turn, departure: Departure | None, zeros: Mapping[str, float]) -> Turn:
+    """Return a turn with the mounting that is found in place of the stated one, its zero by all turns together."""
+    if departure is None or departure.bench is None:
+        return turn
+    bench, recording = departure.bench, replace(turn.recording, axis=departure.bench.axis)
+    if turn.name in zeros and bench.axis == turn.stated.axis:
+        bench = replace(bench, zero_deg=zeros[turn.name])
+    return replace(turn, recording=recording, stated=bench)
+
+
+def _applied(turn: Turn, doubts: Sequence[Note], departure: Departure | None, hint: str) -> Recording:
     """Return the recording with angle and rate by the convention, a note where that changes them, and its doubts."""
     recording, bench = turn.recording, turn.stated
     notes = [*recording.notes, *doubts]
@@ -176,10 +205,11 @@ def _applied(turn: Turn, doubts: Sequence[Note]) -> Recording:
     if bench.conventional:
         return replace(recording, notes=tuple(notes))
     angle, rate = recording.table_angle, recording.table_rate
-    detail = f"as stated, {words(bench)}: the angle is taken {bench.sense:+d} times and {bench.offset:+g} deg"
+    how = "as stated" if departure is None else f"{departure.problem}; {hint}; used as found"
+    detail = f"{how}, {words(bench)}: the angle is taken {bench.sense:+d} times and {bench.offset:+.6g} deg"
     if bench.vertical:
         detail = f"as stated, body {bench.up} points up throughout; the angle is taken {bench.sense:+d} times"
-    notes.append(Note("N-MOUNTING", recording.samples, 0, 0, detail))
+    notes.append(Note("N-MOUNTING" if departure is None else "N-FOUND", recording.samples, 0, 0, detail))
     encodings = {k: e for k, e in recording.encodings.items() if k not in ("table_angle", "table_rate")}
     return replace(
         recording,
@@ -230,12 +260,15 @@ class Departure:
     problem : str
     settings : dict of str to str
         What describes it, by the key below the recording's entry in the procedure; empty where nothing does.
+    bench : Bench or None
+        The mounting by gravity, which is used; None: the turn is refused.
     """
 
     turn: Turn
     code: str
     problem: str
     settings: dict[str, str]
+    bench: Bench | None = None
 
 
 @dataclass(frozen=True)
@@ -289,7 +322,8 @@ def _axis(turn: Turn, tolerance: float) -> Departure | None:
         who = "gravity turns" if fit.turn_axis is not None else "the gyroscope turns"
         listed = ", ".join(f"{b} {g:+.3g}" for b, g in zip(AXES, direction, strict=True))
         problem = f"in {name} the table is said to turn about {axis}, and {who} about {nearest[1]} ({listed})"
-        return Departure(turn, "wrong_axis", problem, {"axis": nearest[1]})
+        bench = found_bench(fit, nearest[1]) if off <= tolerance else None
+        return Departure(turn, "wrong_axis", problem, {"axis": nearest[1]}, bench)
     if fit.turn_axis is not None and off > tolerance:
         problem = (
             f"in {name} gravity turns about an axis that is {off:.1f} deg off body {axis}; {tolerance:g} deg are "
@@ -322,8 +356,8 @@ def _face(turn: Turn, tolerance: Tolerance) -> Departure | None:
             return None
     code = "wrong_sense" if found.sense != stated.sense else "wrong_face" if found.up != stated.up else "wrong_zero"
     problem = (
-        f"{turn.name} is mounted otherwise than stated: found is {words(found)}; stated is {words(stated)}, to "
-        f"{allowed:.2g} deg (procedure.mounting_tolerance_deg)"
+        f"{turn.name} is mounted otherwise than stated, which is {words(stated)}, to {allowed:.2g} deg "
+        "(procedure.mounting_tolerance_deg)"
     )
     settings = {}
     if found.up != stated.up:
@@ -332,7 +366,7 @@ def _face(turn: Turn, tolerance: Tolerance) -> Departure | None:
         settings["sense"] = f"{found.sense}"
     if abs(found.zero_deg - stated.zero_deg) > tolerance.angle_deg:
         settings["zero_deg"] = f"{found.zero_deg:.1f}"
-    return Departure(turn, code, problem, settings)
+    return Departure(turn, code, problem, settings, found)
 
 
 def _upright(turn: Turn) -> Departure | None:

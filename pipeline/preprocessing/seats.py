@@ -17,7 +17,7 @@ they explain the 27 numbers within their limits, and level seats do not, the dia
 A turn for the gyroscope gives the direction of its turn axis in the frame of the accelerometer, ``K^T (q x p)``,
 whatever its zero and its time offset; the gyroscope alone could not tell it from a misalignment of its own.
 
-Turns that do not fit together get the note ``N-REFERENCE``.
+Turns that do not fit together get the note ``N-SEATS``.
 """
 
 from __future__ import annotations
@@ -317,7 +317,7 @@ def _in_doubt(turn: Turn) -> bool:
 
 
 def _note(turn: Turn, detail: str) -> Note:
-    return Note("N-REFERENCE", turn.recording.samples, 0, 0, detail)
+    return Note("N-SEATS", turn.recording.samples, 0, 0, detail)
 
 
 def _seats_in_words(slow: Sequence[tuple[Turn, Conventional]], found: Seats, allowed: float) -> str:
@@ -325,7 +325,8 @@ def _seats_in_words(slow: Sequence[tuple[Turn, Conventional]], found: Seats, all
         seats = "; ".join(f"{t.name} {letters(s)}" for (t, _), s in zip(slow, found.seats, strict=True))
         return (
             f"the unit does not sit alike in the turns, by more than {allowed:.2g} deg; its rotation against the mean "
-            f"of the turns: {seats}; seat it alike (docs/mounting.md)"
+            f"of the turns: {seats}; set table.seat_deg=1 to estimate them, or mount it once for all turns "
+            "(docs/mounting.md)"
         )
     settings = ", ".join(
         f"procedure.recordings.{t.name}.zero_deg={t.stated.zero_deg + t.stated.sense * z:.2f}"
@@ -341,5 +342,6 @@ def _seats_in_words(slow: Sequence[tuple[Turn, Conventional]], found: Seats, all
 def _axis_in_words(turn: Turn, off: Any, allowed: float) -> str:  # noqa: ANN401  ((3,) array)
     return (
         f"the unit does not sit in {turn.name} as in the turns for the accelerometer, by more than {allowed:.2g} deg: "
-        f"by gravity it is rotated by {letters(off)}, and the gyroscope's matrix is off by as much (docs/mounting.md)"
+        f"by gravity it is rotated by {letters(off)}, and the gyroscope's matrix is off by as much; set "
+        "table.seat_deg=1 to estimate it (docs/mounting.md)"
     )

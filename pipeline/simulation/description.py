@@ -81,7 +81,9 @@ class UnitDescription:
     # random signs), the list of the parameters' values, or a formula of its own (``sensor``)
     effects: dict[str, Any] = field(default_factory=dict)
     # what the table does otherwise than commanded: tilt_deg (2,) and the settings of ``rate_table.random_errors``; what
-    # is left out follows from the accuracies of the table's configuration
+    # is left out follows from the accuracies of the table's configuration. And how the unit is mounted: mounting_deg
+    # (recording to a rotation vector, body frame), zero_deg (recording to what the table shows at the convention's
+    # angle 0), sense (-1: the table counts the other way)
     imperfections: dict[str, Any] = field(default_factory=dict)
     # where held-out motion and long rest are recorded elsewhere: table, imperfections, accelerometer, gyroscope
     held_out: dict[str, Any] = field(default_factory=dict)

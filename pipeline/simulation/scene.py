@@ -25,7 +25,7 @@ import numpy as np
 
 from pipeline.records import Motion
 from pipeline.signal.rests import still_samples
-from pipeline.simulation.trajectory import Turn, rotation_about
+from pipeline.simulation.trajectory import Turn, mounted, rotation_about
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -55,6 +55,7 @@ class Scene:
     offset: float = 0.0  # tau, s
     clock: float = 0.0  # epsilon
     lag: float = 0.0  # time constant, s
+    mounting: Values = field(default_factory=lambda: np.eye(3))  # columns: axes of the unit in the trajectory's body
 
     def motion(self, time: Values, temperature: Values | None = None) -> Motion:
         """Return the motion that the sensor shows at times of the log: s since power-on, (n,) array."""
@@ -71,7 +72,7 @@ class Scene:
         return replace(motion, time=time, at_offset=lambda offset=0.0: self.motion(time + offset, temperature))
 
     def _without_lag(self, time: Values, temperature: Values | None) -> Motion:
-        pose = self.trajectory.pose(time - self.start)
+        pose = mounted(self.trajectory.pose(time - self.start), self.mounting)
         gravity = self.gravity * (self.up @ pose.level)
         force = gravity
         if np.any(self.lever_arm):

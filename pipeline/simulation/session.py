@@ -183,7 +183,10 @@ def _scene(plan: Planned, bench: Bench, start: float, rng: np.random.Generator) 
     up = rotation_about(tilt / size, np.array([size]))[0][2] if size else np.array([0.0, 0.0, 1.0])
     placed = table["latitude_deg"] is not None and table["azimuth_deg"] is not None
     earth = earth_rate(table["latitude_deg"], table["azimuth_deg"]) if placed else None
-    return Scene(trajectory, start, plan.axis, table["gravity_g"], up, earth)
+    turned = np.asarray(settings.get("mounting_deg", {}).get(plan.name, np.zeros(3)), float)
+    size = float(np.linalg.norm(turned))
+    mounting = rotation_about(turned / size, np.array([size]))[0] if size else np.eye(3)
+    return Scene(trajectory, start, plan.axis, table["gravity_g"], up, earth, mounting=mounting)
 
 
 def _stops_and_goes(turn: Turn) -> bool:
@@ -197,6 +200,8 @@ def _log(plan: Planned, bench: Bench, time: Values) -> dict[str, Any]:
         return {}
     if isinstance(trajectory, Turn):
         angle, rate = trajectory.program.at(time)[:2]
+        sense = bench.imperfections.get("sense", 1)
+        angle, rate = sense * angle + bench.imperfections.get("zero_deg", {}).get(plan.name, 0.0), sense * rate
         return {"table_angle": _rounded(angle, ANGLE_DECIMALS), "table_rate": _rounded(rate, ANGLE_DECIMALS)}
     if isinstance(trajectory, Gimbals):
         rate = np.linalg.norm(trajectory.pose(time).omega, axis=1)

@@ -51,6 +51,14 @@ class Pose(NamedTuple):
     force: Values | None = None  # (n, 3), g, body frame: of a shaking plate, in addition to gravity
 
 
+def mounted(pose: Pose, rotation: Values) -> Pose:
+    """Return the pose of a unit whose axes are the columns of a rotation, in the frame of the pose's body."""
+    if np.array_equal(rotation, np.eye(3)):
+        return pose
+    vectors = {name: getattr(pose, name) for name in ("level", "omega", "alpha", "direction", "force")}
+    return pose._replace(**{name: v @ rotation for name, v in vectors.items() if v is not None})
+
+
 def rotation_about(axis: Values, angle_deg: Values) -> Values:
     """Return ``R_u(A) = I + sin A [u]x + (1 - cos A) [u]x^2``: (n, 3, 3) array.
 

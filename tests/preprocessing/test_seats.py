@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 def doubted(recordings: list[Recording]) -> dict[str, str]:
     """Return recording to the text of its note."""
     checked = check_mounting(recordings, settings_of(recordings))
-    return {r.name: n.detail for r in checked for n in r.notes if n.code == "N-REFERENCE"}
+    return {r.name: n.detail for r in checked for n in r.notes if n.code == "N-SEATS"}
 
 
 def test_a_common_seat_is_a_part_of_the_matrix() -> None:

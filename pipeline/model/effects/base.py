@@ -23,7 +23,7 @@ from pipeline.records import SENSOR_UNITS, SENSORS, Motion
 from pipeline.signal.rests import RATE_AT_REST_DPS
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -72,6 +72,7 @@ class Effect(abc.ABC):
     needs_clock: bool = False  # the time between the recordings must be known
     needs_motion: bool = False  # it adds nothing while the body rests
     needs_both_directions: bool = False  # turns in one direction show it as a part of bias and matrix
+    of_turns: bool = False  # it has parameters of its own for each recording of a turn
     nonlinear: tuple[str, ...] = ()  # parameters in which the reading is not linear
     contains: tuple[str, ...] = ()  # effects of which this is a generalisation; the two are never fitted together
     unseen: Mapping[str, str] = MappingProxyType({})  # sensor to the reason why its readings never change
@@ -110,6 +111,11 @@ class Effect(abc.ABC):
         for j in range(1, regressors.shape[2]):
             added += regressors[:, :, j] * coefficients[..., j]
         return added
+
+    def of_recordings(self, names: Sequence[str]) -> Effect:
+        """Return the effect with the parameters that it has in these recordings; most have the same in all."""
+        del names
+        return self
 
     def moved(self, motion: Motion, values: Values) -> Motion:
         """Return the motion that acts on the sensor at the time stamps; only effects of timing change it."""
@@ -167,7 +173,7 @@ def _watched(seen: set[str]) -> Motion:
 
     time, vector = np.arange(2.0), np.ones((2, 3))
     at_rest = (vector, vector, vector, vector, np.full(2, 25.0), time, time, 0, np.ones(2, bool))
-    return Watched(time, *at_rest, direction=vector)
+    return Watched(time, *at_rest, direction=vector, level=np.tile(np.eye(3), (2, 1, 1)))
 
 
 def truth(sensor: str, motion: Motion) -> Values:

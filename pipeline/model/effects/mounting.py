@@ -1,0 +1,170 @@
+"""How the unit sits on the table in each recording: rotations of its mounting, and zeros of the table's angle.
+
+    mounting:      u' = exp([theta_k]x)^T u,   theta_k the rotation of the unit in recording k, body frame
+    encoder_zero:  u' = exp([zero_k e_a]x) u,  e_a the axis of turn k: the unit is at A - zero_k where the log says A
+
+and ``reading = b + K u' + ...`` with u the truth by the log. Both have parameters for each recording, so that they are
+bound to the recordings of a unit before they are fitted (``Effect.of_recordings``). They change the whole motion, so
+that the other effects act on what the rotated sensor senses.
+
+A rotation that all recordings share is a part of K. A prior chooses it: ``theta_k ~ N(0, s^2)``, so that the frame of
+the calibration is the mean of the mountings. Gravity determines the others: in turns about three axes, the constant and
+the two first harmonics of the accelerometer are 27 numbers against 9 of K, 3 of b and 6 of the mountings.
+"""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+
+from pipeline.model.effects.base import Layout, Parameter, truth
+from pipeline.model.effects.formula_effect import DeclaredEffect
+from pipeline.model.kinematics import skew, turn_by_vector
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.records import Motion
+
+    Values = NDArray[np.float64]
+
+STEP_DEG = 1e-3  # of the central difference of a rotation: its error is (step^2 / 6) rad = 5e-11
+VECTORS = ("specific_force", "angular_rate", "angular_acceleration", "specific_force_rate", "direction", "level")
+
+
+def rotated(motion: Motion, rotation: Values) -> Motion:
+    """Return a motion whose vectors are rotated, now and at any offset in time.
+
+    Parameters
+    ----------
+    motion : Motion
+    rotation : (3, 3) array
+        Applied to every vector in the body frame.
+    """
+    found: dict[str, Any] = {n: v @ rotation.T for n in VECTORS if (v := getattr(motion, n)) is not None}
+    for name in ("at_offset", "at_lag"):
+        trajectory = getattr(motion, name)
+        found[name] = None if trajectory is None else partial(_rotated_at, trajectory, rotation)
+    return replace(motion, **found)
+
+
+def _rotated_at(trajectory: Callable[..., Motion | None], rotation: Values, **at: Any) -> Motion | None:  # noqa: ANN401
+    there = trajectory(**at)
+    return there and rotated(there, rotation)
+
+
+class _OfRecordings(DeclaredEffect):
+    """A rotation of the motion in each recording: ``each`` parameters, deg, for a recording."""
+
+    layout = Layout.SHARED
+    of_turns = True
+    recordings: tuple[str, ...] = ()
+    suffixes: tuple[str, ...]
+    what: str
+
+    def of_recordings(self, names: Sequence[str]) -> Self:
+        """Return the effect with parameters for these recordings."""
+        bound = copy(self)
+        bound.recordings = tuple(names)
+        bound.definition = {"name": self.name, "recordings": list(names)}
+        return bound
+
+    def parameters(self, sensor: str) -> tuple[Parameter, ...]:
+        """Return the parameters of each recording, one recording after the other."""
+        del sensor
+        return tuple(
+            Parameter(f"{name}{suffix}", "deg", f"{self.what}{suffix.replace('_', ' about body ')}, {name}")
+            for name in self.recordings
+            for suffix in self.suffixes
+        )
+
+    def rotation(self, motion: Motion, values: Values) -> Values:
+        """Return the rotation of the vectors in the body frame by a recording's parameters: (..., 3, 3) array."""
+        raise NotImplementedError
+
+    def moved(self, motion: Motion, values: Values) -> Motion:
+        """Return the motion in the frame of the rotated unit."""
+        own = self._own(motion)
+        return rotated(motion, self.rotation(motion, values[own])) if own.stop and np.any(values[own]) else motion
+
+    def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
+        """Return the derivative of ``K u'`` with respect to each parameter, zeros for the other recordings."""
+        columns = np.zeros((len(motion.time), 3, len(values)))
+        own = self._own(motion)
+        if own.stop:
+            steps = STEP_DEG * np.eye(len(self.suffixes))
+            ahead, behind = (self.rotation(motion, values[own] + sign * steps) for sign in (1.0, -1.0))
+            slopes, u = (ahead - behind) / (2.0 * STEP_DEG), truth(sensor, motion)
+            columns[:, :, own] = np.stack([u @ (K @ slope).T for slope in slopes], axis=2)
+        return columns
+
+    def reading(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
+        """Return ``K (u' - u)``."""
+        return np.asarray((truth(sensor, self.moved(motion, values)) - truth(sensor, motion)) @ K.T)
+
+    def _own(self, motion: Motion) -> slice:
+        """Return the place of a recording's parameters; empty where it has none."""
+        if motion.recording not in self.recordings:
+            return slice(0, 0)
+        size = len(self.suffixes)
+        at = size * self.recordings.index(motion.recording)
+        return slice(at, at + size)
+
+
+class Mounting(_OfRecordings):
+    """The rotation of the unit in each recording: three parameters a recording."""
+
+    suffixes = ("_x", "_y", "_z")
+    what = "rotation of the unit"
+
+    def rotation(self, motion: Motion, values: Values) -> Values:
+        """Return ``exp([theta]x)^T``."""
+        del motion
+        return np.asarray(np.swapaxes(turn_by_vector(np.radians(values)), -1, -2))
+
+
+def in_mean_frame(K: Values, values: Values, at: slice, count: int) -> Values:
+    """Return the map of small errors of a fit to those in the frame of the mean of the mountings: (count, count) array.
+
+    Readings do not change with a rotation phi of the frame, ``K' = K exp([phi]x)``, ``exp([theta_k']x) =
+    exp([theta_k]x) exp([phi]x)``. With G the derivative of all parameters with respect to phi and A their mean
+    rotation, the map is ``1 - G (A G)^-1 A`` (S-transformation; Baarda, Publ. Geodesy 5, 1973).
+
+    Parameters
+    ----------
+    K : (3, 3) array
+    values : (3 m,) array, deg
+        Rotations of the unit.
+    at : slice
+        Their place among the parameters; K is row by row from 3 to 12.
+    count : int
+    """
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415  (0.1 s that only fits of mountings pay)
+
+    steps = Rotation.from_rotvec(STEP_DEG * np.eye(3), degrees=True)
+    G, mean = np.zeros((count, 3)), np.zeros((3, count))
+    G[3:12] = np.stack([np.radians(1.0) * (K @ turn).ravel() for turn in skew(np.eye(3))], axis=1)
+    theta = values.reshape(-1, 3)
+    moved = [(Rotation.from_rotvec(t, degrees=True) * steps).as_rotvec(degrees=True) - t for t in theta]
+    G[at] = np.concatenate([change.T for change in moved]) / STEP_DEG
+    mean[:, at] = np.tile(np.eye(3), len(theta)) / len(theta)
+    found: Values = np.eye(count) - G @ np.linalg.solve(mean @ G, mean)
+    return found
+
+
+class EncoderZero(_OfRecordings):
+    """The zero of the table's angle in each turn: one parameter a recording."""
+
+    suffixes = ("",)
+    what = "zero of the table's angle"
+
+    def rotation(self, motion: Motion, values: Values) -> Values:
+        """Return ``exp([zero e_a]x)``."""
+        assert motion.axis is not None  # noqa: S101
+        return turn_by_vector(np.radians(values) * np.eye(3)[motion.axis])

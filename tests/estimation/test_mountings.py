@@ -1,0 +1,121 @@
+"""Mountings of a unit in each turn, and zeros of the table's angle, against turns made by rotation matrices alone."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from pipeline.estimation.effects import fit
+from pipeline.estimation.reference_least_squares import fit as fit_to_reference
+from pipeline.model.effects import effect, effect_of
+from pipeline.model.kinematics import reference_motion
+from pipeline.preprocessing.mounting import check_mounting
+from pipeline.records import FittedEffect, Noise, Recording, SensorCalibration
+from pipeline.study.run import settings_of
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "preprocessing"))
+from benches import BIAS, K, Setup, recordings_of
+from benches import settings_of as bench_settings
+
+TURNS = [(role, axis) for role in ("accelerometer", "gyroscope") for axis in "xyz"]
+SEAT_DEG = 2.0
+
+
+def seated_anew(seed: int, seat_deg: float) -> tuple[list[Recording], np.ndarray]:
+    """Return a unit mounted anew in each turn, and its rotations: (6, 3) array, deg."""
+    seats = seat_deg * np.random.default_rng([seed, 1]).standard_normal((len(TURNS), 3))
+    made = [Setup(a, seat=s).recording(role, seed) for (role, a), s in zip(TURNS, seats, strict=True)]
+    return made, seats
+
+
+def settings() -> dict[str, Any]:
+    """Return settings of a table on which the unit is mounted anew for each turn."""
+    base = settings_of("mpu6050", "reference_least_squares")
+    table = {**base["table"], "angle_accuracy_deg": 0.0, "rate_accuracy": 0.0, "seat_deg": SEAT_DEG}
+    sheets = {s: {**base["sensor"][s], "bias_wander": 0.0} for s in K}  # the turns are made with white noise alone
+    whole = {**base, "sensor": {**base["sensor"], **sheets}, "table": table}
+    whole["effects"] = {"accelerometer": [], "gyroscope": []}
+    white = {"accelerometer": 8e-4, "gyroscope": 0.01}  # of benches.py
+    return {**whole, "noise": {s: Noise(np.full(3, w), np.zeros(3), 100.0, "rests") for s, w in white.items()}}
+
+
+def errors_over_u(found: SensorCalibration, seats: np.ndarray) -> np.ndarray:
+    """Return errors of bias and matrix over their standard uncertainties, in the frame of the mean mounting."""
+    frame = Rotation.from_rotvec(seats.mean(axis=0), degrees=True).as_matrix()
+    matrix = frame @ np.linalg.inv(K[found.sensor])
+    error = np.concatenate([found.bias - BIAS[found.sensor], (found.matrix - matrix).ravel()])
+    assert found.covariance is not None
+    return np.asarray(error / np.sqrt(np.diag(found.covariance)[:12]))
+
+
+def test_gravity_determines_the_mountings_of_both_sensors_to_their_uncertainty() -> None:
+    found: dict[str, list[np.ndarray]] = {sensor: [] for sensor in K}
+    for seed in range(4):
+        recordings, seats = seated_anew(seed, 1.0)
+        for sensor, z in found.items():
+            calibrated = fit(sensor, recordings, None, settings())
+            z.append(errors_over_u(calibrated, seats))
+            (mounting,) = calibrated.effects
+            assert mounting.name == "mounting"
+            assert np.allclose(mounting.values.reshape(-1, 3), seats - seats.mean(axis=0), atol=0.12)
+            assert calibrated.covariance is not None
+            assert np.sqrt(np.diag(calibrated.covariance)[3:12]).max() < 3e-3  # 1 deg of a mounting is 17e-3
+    for sensor, z in found.items():
+        assert 0.7 < np.sqrt(np.mean(np.square(z))) < 1.3, sensor  # 48 values: four standard errors
+        assert np.abs(z).max() < 4.0
+
+
+def test_without_mountings_the_same_turns_leave_a_wrong_matrix() -> None:
+    recordings, seats = seated_anew(0, 1.0)
+    plain = settings()
+    plain["table"]["seat_deg"] = None
+    assert np.abs(errors_over_u(fit_to_reference("gyroscope", recordings, None, plain), seats)).max() > 20.0
+
+
+def test_without_an_accelerometer_the_mountings_stay_as_uncertain_as_their_prior() -> None:
+    recordings = [r for r in seated_anew(0, 1.0)[0] if r.role == "gyroscope"]
+    blind = [replace(r, accelerometer=None) for r in recordings]
+    whole = settings()
+    found = fit("gyroscope", blind, None, whole)
+    assert found.covariance is not None
+    u = np.sqrt(np.diag(found.covariance)[3:12].reshape(3, 3)[~np.eye(3, dtype=bool)])
+    assert np.all(u > 0.5 * np.radians(SEAT_DEG))
+
+
+def test_a_zero_that_is_found_is_estimated_with_the_matrix() -> None:
+    z = []
+    for seed in range(4):
+        recordings = recordings_of({a: Setup(a, zero=37.0) for a in "xyz"}, seed)
+        found = check_mounting(recordings, bench_settings(recordings))
+        whole = settings()
+        whole["table"]["seat_deg"] = None
+        calibrated = fit_to_reference("accelerometer", found, None, whole)
+        assert [e.name for e in calibrated.effects] == ["encoder_zero"]
+        z.append(errors_over_u(calibrated, np.zeros((1, 3))))
+    assert 0.7 < np.sqrt(np.mean(np.square(z))) < 1.3
+    assert np.abs(z).max() < 4.0
+
+
+@pytest.mark.parametrize("name", ["mounting", "encoder_zero"])
+def test_columns_are_the_derivative_and_the_calibration_carries_the_recordings(name: str) -> None:
+    recordings = seated_anew(0, 1.0)[0][:2]
+    this = effect(name).of_recordings([r.name for r in recordings])
+    motion = reference_motion(recordings[1])
+    assert motion is not None
+    values = 2.0 * np.random.default_rng(3).standard_normal(len(this.parameters("accelerometer")))
+    columns = this.regressors("accelerometer", motion, K["accelerometer"], values)
+    for j, step in enumerate(1e-4 * np.eye(len(values))):
+        ahead, behind = (this.reading("accelerometer", motion, K["accelerometer"], values + s) for s in (step, -step))
+        assert np.allclose(columns[:, :, j], (ahead - behind) / 2e-4, atol=1e-9)
+    parameters = {p.name: {"value": float(v)} for p, v in zip(this.parameters("accelerometer"), values, strict=True)}
+    again = effect_of(FittedEffect(name, parameters, this.definition))
+    assert np.array_equal(again.moved(motion, values).specific_force, this.moved(motion, values).specific_force)
+    other = reference_motion(seated_anew(0, 1.0)[0][2])
+    assert other is not None
+    assert this.moved(other, values) is other

@@ -1,0 +1,201 @@
+"""Units on benches that depart from the convention: faces, senses, zeros, and a mounting of its own in each turn.
+
+    python tests/study/bench_units.py --units 1000 --seed 1 --out units.jsonl
+
+Each unit goes through the checks of its recordings, noise, fit, held-out error and diagnosis, as in a run. The line of
+a unit holds the error of each parameter over its expanded uncertainty, in the frame of the mean of the mountings. A
+unit that is in the file is not run again. Without --units the table of the file is printed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections import defaultdict
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from pipeline.diagnosis.diagnose import diagnose
+from pipeline.errors import PipelineError
+from pipeline.estimation.noise import noise_of
+from pipeline.estimation.stages import fit_stage
+from pipeline.estimation.uncertainty_budget import with_stated
+from pipeline.model.effects import built_in
+from pipeline.model.kinematics import reference_motion
+from pipeline.preprocessing.checks import check_recordings
+from pipeline.records import SENSORS, coverage_factor
+from pipeline.simulation.campaign import simulate_unit
+from pipeline.simulation.description import UnitDescription, read_config
+from pipeline.study.run import settings_of
+from pipeline.study.scores import wilson
+from pipeline.validation.heldout import validate
+
+TURNS = [f"{kind}_{axis}" for kind in ("accel", "gyro") for axis in "xyz"]
+COURSE: dict[str, Any] = {
+    "validation_s": 90.0, "static_s": 90.0, "warm_up_rest_s": 15.0, "step_deg": 10.0, "dwell_s": 1.5,
+    "rates_dps": (30.0, 100.0), "both_directions": True,
+}  # fmt: skip
+FACES = Rotation.create_group("O")
+KINDS = ("plain", "remounted", "seats", "seats_remounted")
+LARGEST_SEAT_DEG = 5.0
+NOT_HIDDEN = {"mounting", "encoder_zero", "table_axis_nonorthogonality", "earth_rotation", "table_tilt"}
+
+
+def drawn(kind: str, seed: int, number: int) -> tuple[UnitDescription, dict[str, Any]]:
+    """Return a unit and what is departed from: the rotation of each recording and the hidden effect."""
+    rng = np.random.default_rng([seed, number, KINDS.index(kind)])
+    face = FACES[int(rng.integers(24))] if "remounted" in kind else Rotation.identity()
+    seats = {name: np.zeros(3) for name in [*TURNS, "validation"]}
+    if "seats" in kind:
+        size = rng.uniform(0.0, LARGEST_SEAT_DEG)
+        for name in seats:
+            direction = rng.standard_normal(3)
+            seats[name] = size * rng.uniform(0.0, 1.0) * direction / np.linalg.norm(direction)
+    bench: dict[str, Any] = {
+        "direction_deg": np.zeros((3, 2)).tolist() if "seats" in kind else None,
+        "mounting_deg": {n: (face * Rotation.from_rotvec(s, degrees=True)).as_rotvec(degrees=True).tolist()
+                         for n, s in seats.items()},
+    }  # fmt: skip
+    bench = {key: value for key, value in bench.items() if value is not None}
+    if "remounted" in kind:
+        bench |= {
+            "sense": int(rng.choice([-1, 1])),
+            "zero_deg": dict.fromkeys(TURNS, float(rng.uniform(-180.0, 180.0))),
+        }
+    sensor = str(rng.choice(SENSORS))
+    names = [n for n, e in built_in().items() if sensor in e.sensors and sensor not in e.unseen and n not in NOT_HIDDEN]
+    effect = str(rng.choice(names)) if rng.random() < 0.4 else ""
+    description = UnitDescription(
+        f"u{number}",
+        sensor=("mpu6050", "stim300")[number // len(KINDS) % 2],
+        table="single_axis" if "seats" in kind else "acutronic",
+        course=COURSE,
+        imperfections=bench,
+        effects={f"{sensor}.{effect}": None} if effect else {},
+    )
+    return description, {"seats": seats, "face": face, "hidden": f"{sensor}.{effect}" if effect else ""}
+
+
+def judged(kind: str, seed: int, number: int) -> dict[str, Any]:
+    """Return what is said of one unit, by the functions that the stages of a run call, in their order."""
+    description, bench = drawn(kind, seed, number)
+    recordings, truth = simulate_unit(description, seed, number)
+    nominal = {r.name: _nominal(r, description.imperfections) for r in recordings if r.name in TURNS}
+    if bench["face"].magnitude() > 0.0 or "seats" in kind:
+        recordings = [_without_attitude(r) for r in recordings]
+    settings = settings_of(description.sensor, "reference_least_squares")
+    settings = {**settings, "table": {"name": description.table, **read_config("table", description.table)}}
+    line: dict[str, Any] = {"kind": kind, "seed": seed, "number": number, "model": description.sensor}
+    line |= {"hidden": bench["hidden"], "refused": None, "sensors": {}}
+    try:
+        recordings = check_recordings(recordings, settings)
+        noises = {s: noise_of(s, recordings, settings) for s in SENSORS}
+        fits = {}
+        for sensor in SENSORS:
+            found = None
+            for stage in ("reference_least_squares", "effects"):
+                found = fit_stage(sensor, stage, recordings, found, settings | {"noise": noises})
+            fits[sensor] = with_stated(found, recordings, settings)
+    except PipelineError as error:
+        return line | {"refused": error.message}
+    mean = _mean_mounting(nominal, recordings, bench) if "seats" in kind else Rotation.identity()
+    for sensor in SENSORS:
+        found = fits[sensor]
+        matrix = mean.as_matrix() @ np.array(truth[sensor]["matrix"])
+        error = np.concatenate([found.bias - truth[sensor]["bias"], (found.matrix - matrix).ravel()])
+        U = coverage_factor(found.freedom[:12]) * np.sqrt(np.diag(found.covariance)[:12])
+        held = validate(found, recordings, noises[sensor], settings)
+        said = diagnose(found, recordings, noises[sensor], settings, fits["accelerometer"], validation=held)
+        inside = held["expected_rms_error"][0] <= held["steps"][-1]["rms_error"] <= held["expected_rms_error"][1]
+        line["sensors"][sensor] = {
+            "error_over_U": (error / U).tolist(), "over_floor": held["steps"][-1]["rms_error"] / held["noise_floor"],
+            "inside": bool(inside), "verdict": said["verdict"], "selected": said["selected"], "reason": said["reason"],
+        }  # fmt: skip
+    return line
+
+
+def _nominal(recording: Any, bench: dict[str, Any]) -> Any:
+    """Return the motion before it is remounted: by the angle without sense and zero."""
+    angle = bench.get("sense", 1) * (recording.table_angle - bench.get("zero_deg", {}).get(recording.name, 0.0))
+    return reference_motion(
+        replace(recording, table_angle=angle, table_rate=bench.get("sense", 1) * recording.table_rate)
+    )
+
+
+def _mean_mounting(nominal: dict[str, Any], recordings: list[Any], bench: dict[str, Any]) -> Rotation:
+    """Return the mean of the true mountings against the convention that the checks applied, exactly."""
+    found = []
+    for recording in recordings:
+        if recording.name in nominal:
+            true, used = nominal[recording.name], reference_motion(recording)
+            body = bench["face"] * Rotation.from_rotvec(bench["seats"][recording.name], degrees=True)
+            size = np.abs(used.angular_rate).max()
+            seen = np.concatenate([true.specific_force, true.angular_rate / size]) @ body.as_matrix()
+            assumed = np.concatenate([used.specific_force, used.angular_rate / size])
+            found.append(Rotation.align_vectors(assumed, seen)[0].as_rotvec(degrees=True))
+    return Rotation.from_rotvec(np.mean(found, axis=0), degrees=True)
+
+
+def _without_attitude(recording: Any) -> Any:
+    return recording if recording.role != "validation" else replace(recording, table_attitude=None)
+
+
+def table(lines: list[dict[str, Any]]) -> str:
+    """Return the rows of a study as text."""
+    rows = []
+    for kind in KINDS:
+        chosen = [line for line in lines if line["kind"] == kind]
+        if not chosen:
+            continue
+        refused = [line for line in chosen if line["refused"]]
+        fine = [line for line in chosen if not line["refused"]]
+        rows.append(f"{kind}: {len(chosen)} units, {len(refused)} refused")
+        for sensor in SENSORS:
+            plain = [line["sensors"][sensor] for line in fine if not line["hidden"].startswith(sensor)]
+            hidden = [(line["hidden"].partition(".")[2], line["sensors"][sensor]) for line in fine
+                      if line["hidden"].startswith(sensor)]  # fmt: skip
+            if plain:
+                covered = np.abs([p["error_over_U"] for p in plain]) <= 1.0
+                low, high = wilson(int(covered.sum()), covered.size)
+                inside, silent = sum(p["inside"] for p in plain), defaultdict(int)
+                for p in plain:
+                    silent[p["verdict"]] += 1
+                rows.append(
+                    f"  {sensor}: coverage {100 * covered.mean():.1f} % ({100 * low:.1f} to {100 * high:.1f}), "
+                    f"parameters {100 * covered.mean(axis=0).min():.1f} to {100 * covered.mean(axis=0).max():.1f} %; "
+                    f"held-out inside {inside} of {len(plain)}; {dict(silent)}"
+                )
+            if hidden:
+                named = sum(name in said["selected"][:1] for name, said in hidden)
+                rows.append(f"  {sensor}: hidden effect named first {named} of {len(hidden)}")
+    return "\n".join(rows) + "\n"
+
+
+def main() -> None:
+    """Run the units that are not in the file, and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--units", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--kinds", nargs="+", default=KINDS)
+    parser.add_argument("--out", required=True)
+    options = parser.parse_args()
+    file = Path(options.out)
+    lines = [json.loads(text) for text in file.read_text(encoding="utf-8").splitlines()] if file.exists() else []
+    known = {(line["kind"], line["seed"], line["number"]) for line in lines}
+    for number in range(options.units):
+        kind = options.kinds[number % len(options.kinds)]
+        if (kind, options.seed, number) in known:
+            continue
+        lines.append(judged(kind, options.seed, number))
+        with file.open("a", encoding="utf-8") as stream:
+            stream.write(json.dumps(lines[-1]) + "\n")
+    sys.stdout.write(table(lines))
+
+
+if __name__ == "__main__":
+    main()
