@@ -10,12 +10,8 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from pipeline.commands.run import add_run_options, run_snakemake
-from pipeline.config.campaign import find_campaign
-from pipeline.config.compose import Composer
+from pipeline.config.campaign import find_campaign, read_layers
 from pipeline.config.devices import edit_effects, sensor_and_effect
-from pipeline.config.layers import as_list, load_layers
-from pipeline.config.sheet import read_sheet
-from pipeline.config.user_effects import PYTHON
 from pipeline.errors import ConfigurationError, MissingInputError
 from pipeline.files import write_atomically
 from pipeline.outcome import RESULTS, read_summary, run_command
@@ -56,8 +52,7 @@ def change(arguments: argparse.Namespace, *, remove: bool) -> int:
     """Edit the device files and run the campaign; the exit code is that of the run."""
     given = _settings(arguments.config)
     directory = find_campaign(arguments.campaign)
-    composer = Composer(directory, as_list(given.get(PYTHON, []), PYTHON, "a list of paths of Python files"))
-    layers = load_layers(directory, given, read_sheet(directory / "units.csv"), composer.options["sensor"])
+    composer, layers = read_layers(directory, given)
     wanted = _wanted(arguments, directory.name)
     edits = [edit_effects(unit, effects, layers, composer, remove=remove) for unit, effects in wanted.items()]
     for edit in edits:

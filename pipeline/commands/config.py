@@ -12,17 +12,16 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from pipeline.config.campaign import find_campaign
-from pipeline.config.compose import Composer
-from pipeline.config.layers import load_layers
+from pipeline.config.campaign import find_campaign, read_layers
 from pipeline.config.options import GROUPS, Problem, default_option, nearest, parse, read_option
-from pipeline.config.sheet import read_sheet
+from pipeline.config.user_effects import PYTHON
 from pipeline.errors import ConfigurationError
 from pipeline.files import CONFIGS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
+    from pipeline.config.compose import Composer
     from pipeline.config.layers import Layer
 
 Key = tuple[str, ...]  # the path of a value
@@ -38,12 +37,12 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--python-effect", action="append", default=[], metavar="FILE", help="as python_effects=")
     arguments = parser.parse_args(argv)
     directory, unit = find_campaign(arguments.campaign), arguments.unit
-    composer = Composer(directory, arguments.python_effect)
-    sheet = read_sheet(directory / "units.csv")
-    if unit not in sheet.rows:
-        raise ConfigurationError(f"no unit {unit!r}{nearest(unit, sheet.rows)}", str(directory / "units.csv"))
-    given = {"overrides": arguments.overrides}
-    layers = load_layers(directory, given, sheet, composer.options["sensor"]).of(unit)
+    composer, all_layers = read_layers(directory, {"overrides": arguments.overrides, PYTHON: arguments.python_effect})
+    if unit not in all_layers.sheet.rows:
+        raise ConfigurationError(
+            f"no unit {unit!r}{nearest(unit, all_layers.sheet.rows)}", str(directory / "units.csv")
+        )
+    layers = all_layers.of(unit)
     try:
         config = composer.unit(unit, [text for _, text in layers])
     except Problem as problem:

@@ -4,7 +4,6 @@ Only this package knows Hydra; jobs read the JSON files that it writes.
 """
 
 from pipeline.config.campaign import Campaign, UnitRow, load_campaign
-from pipeline.config.code import code_digest
-from pipeline.config.stage_settings import settings_file
+from pipeline.config.stage_settings import code_digest, settings_file
 
 __all__ = ["Campaign", "UnitRow", "code_digest", "load_campaign", "settings_file"]

@@ -24,6 +24,8 @@ from pipeline.history import SENSORS
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from pipeline.config.layers import Layers
+
 SMALLEST_BATCH, LARGEST_BATCH = 25, 160  # units: seconds a job, as long as its start; a minute, to fill all cores
 
 
@@ -122,8 +124,7 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
     for name in (str(directory), str(settings.get("results", ""))):
         if any(unicodedata.category(character) in ("Cc", "Cs") for character in name):
             raise ConfigurationError(f"{name!r}: a path without control characters, in UTF-8, is expected; rename it")
-    composer = Composer(directory, as_list(settings.get(PYTHON, []), PYTHON, "a list of paths of Python files"))
-    layers = load_layers(directory, settings, read_sheet(directory / "units.csv"), composer.options["sensor"])
+    composer, layers = read_layers(directory, settings)
     units: dict[str, UnitRow] = {}
     problems: dict[str, list[str]] = {}
     for name, row in layers.sheet.rows.items():
@@ -141,6 +142,12 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
     compare = resolve_comparisons(layers.campaign.compare, units, str(directory / "campaign.yaml"))
     page, simulation = layers.campaign.page, layers.simulation
     return Campaign(directory.name, directory, results, units, batches, chains, compare, simulation, settings, page)
+
+
+def read_layers(directory: Path, settings: Mapping[str, Any]) -> tuple[Composer, Layers]:
+    """Read the options, the sheet and the overrides of a campaign and of the command line."""
+    composer = Composer(directory, as_list(settings.get(PYTHON, []), PYTHON, "a list of paths of Python files"))
+    return composer, load_layers(directory, settings, read_sheet(directory / "units.csv"), composer.options["sensor"])
 
 
 def find_campaign(name: str) -> Path:

@@ -1,26 +1,31 @@
-"""The settings that each stage reads, in a file named after its content.
+"""What decides whether a job is done again: the settings that its stage reads, and the code that it runs.
 
-A job cannot read other settings, and the name of the file is a parameter of its rule; so a changed setting reruns
-exactly the stages that read it. Settings that all units of a batch share stand in the file once, under ``common``.
+A job reads no settings but those of a file named after its content, and that name is a parameter of its rule: a changed
+setting reruns exactly the stages that read it. Settings that all units of a batch share stand in the file once, under
+``common``. Snakemake sees the shell command of a rule, not the package that it calls, so a digest of the code is a
+parameter too.
 """
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import json
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.config.user_effects import effects_for
-from pipeline.files import write_atomically
+from pipeline.files import CONFIGS, write_atomically
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from pathlib import Path
+    from collections.abc import Iterator, Mapping, Sequence
 
     from pipeline.config.campaign import Campaign
 
+PACKAGE = Path(__file__).resolve().parents[1]
+EFFECTS = CONFIGS / "effect"  # what pipeline.model.effects.files reads
 # Dotted keys that a stage reads; {sensor} is the sensor that the stage is about.
 BOTH = ("accelerometer", "gyroscope")
 NOISE = ("noise_density", "bias_wander", "wander_time_s")
@@ -83,17 +88,7 @@ def config_sha256(config: Mapping[str, Any]) -> str:
 
 
 def select_settings(config: Mapping[str, Any], stage: str, sensor: str = "") -> dict[str, Any]:
-    """Return the settings of a unit that a stage reads.
-
-    Parameters
-    ----------
-    config : mapping
-        The unit's whole configuration, with its digest for those stages that read it.
-    stage : str
-        Key of ``READS``; other names are stages of a fit.
-    sensor : str
-        The sensor of a stage of a fit.
-    """
+    """Return the settings of a unit that a stage reads: a key of ``READS``, or a stage of the fit of a sensor."""
     out: dict[str, Any] = {}
     paths = _paths(stage, sensor)
     if stage == "effects" and sensor == "gyroscope" and _mountings(config):
@@ -136,16 +131,9 @@ class SettingsFile:
 def settings_file(
     campaign: Campaign, stage: str, units: Sequence[str], sensor: str = "", again: int = 0
 ) -> SettingsFile:
-    """Return the settings of some units that a stage reads.
+    """Return the file with the settings of some units that a stage, of a fit of a sensor, reads.
 
-    Parameters
-    ----------
-    stage : str
-        Key of ``READS``; other names are stages of a fit.
-    sensor : str
-        The sensor of a stage of a fit.
-    again : int
-        How often the job is repeated because its output was edited (``pipeline.results_folder``).
+    ``again`` is how often the job is repeated because its output was edited (``pipeline.results_folder``).
     """
     if stage == "gather":
         content = _of_gather(campaign)
@@ -210,3 +198,71 @@ def _of_gather(campaign: Campaign) -> dict[str, Any]:
 
 def _canonical(value: Any) -> bytes:  # noqa: ANN401  (any JSON value)
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+
+
+@cache
+def code_digest(module: str) -> str:
+    """Return a digest of a module's source and of every module of the package that it imports, at any depth.
+
+    A package counts with all that lies beside its ``__init__`` where it finds its modules on disk (exports), a module
+    that imports jinja2 with the ``templates`` beside it, the effects with their files in ``configs/effect/``.
+    """
+    digest = hashlib.sha256()
+    for file in sorted(_closure(module)):
+        digest.update(str(file.relative_to(PACKAGE.parent)).encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+@cache
+def _closure(module: str) -> frozenset[Path]:
+    seen: set[Path] = set()
+    todo = [file for file in [_file_of(module)] if file]
+    while todo:
+        file = todo.pop()
+        if file not in seen:
+            seen.add(file)
+            todo.extend(_imports(file))
+    return frozenset(seen)
+
+
+@cache
+def _imports(file: Path) -> tuple[Path, ...]:
+    if file.suffix != ".py":
+        return ()
+    source = file.read_bytes()
+    found: list[Path | None] = []
+    if file.name == "__init__.py" and b"import_module(" in source:
+        found += [f for f in file.parent.rglob("*") if f.is_file() and f.suffix != ".pyc"]
+    if file == PACKAGE / "model" / "effects" / "files.py":
+        found += [*file.parent.glob("*.py")]  # classes that the files name
+        found += [f for f in sorted(EFFECTS.glob("*.yaml")) if b"\nbuilt_in: true" in f.read_bytes()]
+    for node in _statements(ast.parse(source).body):
+        if isinstance(node, ast.Import):
+            found += [_file_of(alias.name) for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
+            found.append(_file_of(node.module))
+            if node.module == "jinja2":
+                found += (file.parent / "templates").glob("*")
+            found += [_file_of(f"{node.module}.{alias.name}") for alias in node.names]
+    return tuple(f for f in found if f)
+
+
+def _statements(body: list[ast.stmt]) -> Iterator[ast.stmt]:
+    """Yield statements and those within them; expressions, which are most of a tree, hold no import."""
+    for node in body:
+        yield node
+        for field in ("body", "orelse", "finalbody"):
+            yield from _statements(getattr(node, field, []))
+        for part in (*getattr(node, "handlers", []), *getattr(node, "cases", [])):
+            yield from _statements(part.body)
+
+
+@cache
+def _file_of(module: str) -> Path | None:
+    if module != "pipeline" and not module.startswith("pipeline."):
+        return None
+    path = PACKAGE.joinpath(*module.split(".")[1:])
+    for file in (path / "__init__.py", path.with_suffix(".py")):
+        if file.is_file():
+            return file
+    return None
