@@ -49,7 +49,7 @@ ABOVE_ZERO = (
     "validation_rate_dps",
 )  # fmt: skip
 ZERO_OR_MORE = ("warm_up_rest_s", "rest_s", "validation_s", "static_s", "pause_s", "thermal_ramp_degc")
-STEPS_DEG = (1.0, 2.0, 3.0, 5.0, 10.0, 15.0, 30.0, 45.0, 90.0)
+STEPS_DEG = (1.0, 2.0, 3.0, 5.0, 10.0, 15.0, 30.0, 45.0, 90.0)  # divisors of a turn
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,8 @@ A lag is a first-order low pass of the true motion, ``y(t) = integral_0^inf exp(
 rule on short panels: the corners of a ramp lie anywhere in the past, and no smooth rule would follow them.
 
 Effects of place, mounting, table and timing use exact geometry instead of the linear columns that the estimation uses.
-Each function of ``ALTERATIONS`` takes a scene and the effect's parameters, and returns the scene with that effect.
+Each of ``ALTERATIONS`` takes a scene and the parameters (in units of ``configs/effect``), and returns the scene
+with that effect.
 """
 
 from __future__ import annotations
@@ -28,13 +29,14 @@ from pipeline.signal.rests import still_samples
 from pipeline.simulation.trajectory import Turn, mounted, rotation_about
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from numpy.typing import NDArray
 
     from pipeline.simulation.trajectory import Gimbals, Moves, Pose
 
     Values = NDArray[np.float64]
+    Alteration = Callable[["Scene", Values], "Scene"]
 
 STANDARD_GRAVITY = 9.80665  # m/s^2, CGPM 1901
 # Edges of the panels in time constants: exp(-20) is 2e-9.
@@ -110,28 +112,7 @@ def _lever_arm_force(pose: Pose, r: Values) -> Values:
     return force / STANDARD_GRAVITY
 
 
-def _lever_arm(scene: Scene, values: Values) -> Scene:
-    """Put the sensor at a position in m from the turn axes."""
-    return replace(scene, lever_arm=scene.lever_arm + values)
-
-
-def _time_offset(scene: Scene, values: Values) -> Scene:
-    """Show the motion at t + tau in the reading at t; s."""
-    return replace(scene, offset=scene.offset + values[0])
-
-
-def _clock_rate(scene: Scene, values: Values) -> Scene:
-    """Make the sensor's clock fast against the table's; ppm."""
-    return replace(scene, clock=scene.clock + 1e-6 * values[0])
-
-
-def _low_pass_lag(scene: Scene, values: Values) -> Scene:
-    """Filter the motion by a first-order low pass; time constant in s."""
-    return replace(scene, lag=scene.lag + values[0])
-
-
 def _earth_rotation(scene: Scene, values: Values) -> Scene:
-    """Add Earth's rotation in the level frame; deg/s."""
     before = np.zeros(3) if scene.earth is None else scene.earth
     return replace(scene, earth=before + np.pad(values, (0, 3 - len(values))))
 
@@ -145,49 +126,45 @@ def _table_tilt(scene: Scene, values: Values) -> Scene:
     return replace(scene, up=scene.up @ rotation_about(axis, np.array([angle]))[0])
 
 
-def _table_axis_nonorthogonality(scene: Scene, values: Values) -> Scene:
-    """Turn each axis' direction by two angles across it; deg."""
-    return _with_errors(scene, "direction", np.radians(values.reshape(3, 2)))
+def _added(field_name: str, factor: float = 1.0) -> Alteration:
+    """Return an effect that adds its parameters, in units of ``factor``, to a field of the scene."""
+
+    def altered(scene: Scene, values: Values) -> Scene:
+        added = factor * (values if len(values) > 1 else values[0])
+        return replace(scene, **{field_name: getattr(scene, field_name) + added})
+
+    return altered
 
 
-def _table_encoder_error(scene: Scene, values: Values) -> Scene:
-    """Change the true angle by ``A cos + B sin`` of the logged one; deg, two values an axis."""
-    return _with_errors(scene, "encoder", values.reshape(3, 2))
+def _of_turn(field_name: str, shape: tuple[int, ...] = (3, 2)) -> Alteration:
+    """Return an effect that adds its parameters, one row an axis, to a field of the errors of a turn."""
+
+    def altered(scene: Scene, values: Values) -> Scene:
+        turn = scene.trajectory
+        if scene.axis is None or not isinstance(turn, Turn):
+            return scene
+        values = np.radians(values) if field_name == "direction" else values
+        added = getattr(turn.errors, field_name) + values.reshape(shape)[scene.axis]
+        return replace(scene, trajectory=replace(turn, errors=replace(turn.errors, **{field_name: added})))
+
+    return altered
 
 
-def _table_rate_ripple(scene: Scene, values: Values) -> Scene:
-    """Change the true rate by ``A cos + B sin`` of the angle, relative; two values an axis."""
-    return _with_errors(scene, "ripple", values.reshape(3, 2))
-
-
-def _table_backlash(scene: Scene, values: Values) -> Scene:
-    """Make the table lag behind its log in the direction of the last move; deg, one value an axis."""
-    return _with_errors(scene, "backlash", values)
-
-
-def _with_errors(scene: Scene, name: str, values: Values) -> Scene:
-    if scene.axis is None or not isinstance(scene.trajectory, Turn):
-        return scene
-    turn = scene.trajectory
-    errors = replace(turn.errors, **{name: getattr(turn.errors, name) + values[scene.axis]})
-    return replace(scene, trajectory=replace(turn, errors=errors))
-
-
-ALTERATIONS: dict[str, Callable[[Scene, Values], Scene]] = {
-    "lever_arm": _lever_arm,
-    "time_offset": _time_offset,
-    "clock_rate": _clock_rate,
-    "low_pass_lag": _low_pass_lag,
+ALTERATIONS: dict[str, Alteration] = {
+    "lever_arm": _added("lever_arm"),
+    "time_offset": _added("offset"),
+    "clock_rate": _added("clock", 1e-6),
+    "low_pass_lag": _added("lag"),
     "earth_rotation": _earth_rotation,
     "table_tilt": _table_tilt,
-    "table_axis_nonorthogonality": _table_axis_nonorthogonality,
-    "table_encoder_error": _table_encoder_error,
-    "table_rate_ripple": _table_rate_ripple,
-    "table_backlash": _table_backlash,
+    "table_axis_nonorthogonality": _of_turn("direction"),
+    "table_encoder_error": _of_turn("encoder"),
+    "table_rate_ripple": _of_turn("ripple"),
+    "table_backlash": _of_turn("backlash", (3,)),
 }
 
 
-def alter(scene: Scene, effects: dict[str, Values]) -> Scene:
+def alter(scene: Scene, effects: Mapping[str, Values]) -> Scene:
     """Return the scene with those of the effects in it that are not the sensor's own."""
     for name, values in effects.items():
         if name in ALTERATIONS:

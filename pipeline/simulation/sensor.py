@@ -52,8 +52,8 @@ if TYPE_CHECKING:
 
 KEYS = {"bias", "matrix", "scale_factor", "non_orthogonality_deg", "mounting_deg"}
 NOISE_KEYS = {"noise_density", "bias_wander", "wander_time_s"}  # in place of those of the data sheet
-POSITIVE = {"time_constant", "tau"}
-# A typical size as a share of the largest plausible one, where that is not a half.
+POSITIVE = {"time_constant", "tau"}  # parameters without a sign
+# A typical size as a share of the largest plausible one, where that is not a half: those limits are wide (assumption).
 TYPICAL_SHARE = {
     "inner_lever_arms": 0.05,
     "clock_rate": 0.02,

@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     Values = NDArray[np.float64]
 
 STREAMS = ("unit", "effects", "motion", "table", "accelerometer", "gyroscope", "temperature", "link", "bench", "room")
-NANOSECONDS = 1_000_000_000
-ANGLE_DECIMALS, QUATERNION_DECIMALS, TEMPERATURE_DECIMALS = 6, 9, 3
+NANOSECONDS = 1_000_000_000  # in a second
+ANGLE_DECIMALS, QUATERNION_DECIMALS, TEMPERATURE_DECIMALS = 6, 9, 3  # of CSV files: far below any noise
 
 
 class Streams:
@@ -83,7 +83,7 @@ def random_environment(rng: np.random.Generator, *, ramp: float = 0.0, ramp_peri
         ambient=25.0 + rng.uniform(-1.0, 1.0),
         warm_up=rng.uniform(3.0, 6.0),
         warm_up_time=rng.uniform(200.0, 400.0),
-        drift=0.3,
+        drift=0.3,  # of an air-conditioned room
         periods=rng.uniform(1800.0, 7200.0, 2),
         phases=rng.uniform(0.0, 2.0 * np.pi, 2),
         ramp=ramp,
@@ -175,7 +175,7 @@ def _scene(plan: Planned, bench: Bench, start: float, rng: np.random.Generator) 
     trajectory = plan.trajectory
     if isinstance(trajectory, Turn) and table["motion"] != "none":
         if plan.role == "accelerometer" and _stops_and_goes(trajectory):
-            settings["rate_error"] = (0.0, 0.0, 0.0)  # steps are counted: what is lost is lost while it turns fast
+            settings["rate_error"] = (0.0, 0.0, 0.0)  # motors lose steps in fast turns only
         errors = random_errors(trajectory.program, rng, settings, trajectory.axis)
         trajectory = Turn(trajectory.axis, trajectory.program, errors)
     tilt = np.append(np.asarray(settings.get("tilt_deg", (0.0, 0.0)), float), 0.0)

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 MARGIN_S = 2.0  # by which a log of its own begins earlier and ends later than the recording
 LARGEST_OFFSET_S, DRIFT_PPM = 100.0, 50.0  # of a clock at random: the drift is a standard deviation, that of a quartz
-NANOSECONDS = 1_000_000_000
+NANOSECONDS = 1_000_000_000  # in a second
 NO_TABLE: dict[str, Any] = {"table_angle": None, "table_rate": None, "table_attitude": None}
 INGEST = "table_log"  # configs/ingest that reads a log of its own
 COMMENT = "# The table has no encoders: its program in place of its log. Written by python -m pipeline simulate.\n"

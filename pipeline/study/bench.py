@@ -1,13 +1,12 @@
 """Recordings of a case, simulated with exact geometry, with noise and physics that the diagnosis does not model.
 
-Further noise goes on over the recordings of a unit, at the time steps t:
+Further noise continues over all recordings of a unit, at the time t:
 
     ar_06, ar_09 : first-order autoregression with that coefficient, of the white noise's standard deviation
     random_walk  : sigma_b sqrt(t / T), the data sheet's wander sigma_b per its correlation time T
     one_over_f   : amplitudes of a spectrum 1/f, scaled to three times the data sheet's wander
 
-and physics in another form than the catalogue's, A of the data sheet's order, on every axis with a size and a sign of
-its own:
+and physics in another functional form than the catalogue's, with its own size and sign on each axis:
 
     gear_mesh        : A cos(5 angle)
     temperature_step : A (1 + tanh((x - 1/2) / 0.04)) / 2
@@ -15,7 +14,7 @@ its own:
     exponential      : A (exp(3 x) - 1) / (exp(3) - 1)
     band             : A where 4 < |omega| < 7 deg/s
 
-where x is the true temperature from the coldest sample of the unit, 0, to the warmest, 1.
+where x is the true temperature from the coldest sample of the unit, 0, to the warmest, 1, and A is ``AMPLITUDE``.
 
 The signal of a hidden effect over the noise is
 
@@ -29,7 +28,7 @@ where
 
 A test with known noise and equation gains lambda in 2 log L on average, against the k log N + 10 (40 to 100) that a
 selection asks of k parameters. The rounding to whole counts differs between the two units and adds c^2 / 6 a sample on
-average, where c is one count; it is taken off.
+average, where c is one count; this is subtracted.
 """
 
 from __future__ import annotations
@@ -61,7 +60,7 @@ if TYPE_CHECKING:
 INTERVAL_S = 0.12  # the default of ``UnitDescription``
 PERFECT = {"angle_accuracy_deg": 0.0, "rate_error": (0.0, 0.0, 0.0), "direction_deg": [[0.0, 0.0]] * 3}
 OF_WHITE = {"ar_06": 0.6, "ar_09": 0.9}  # coefficient of the autoregression
-AMPLITUDE = {
+AMPLITUDE = {  # g and deg/s; by assumption the order of data-sheet effects of the MPU-6050, well above its noise
     "gear_mesh": {"accelerometer": 2e-3, "gyroscope": 0.03},
     "temperature_step": {"accelerometer": 4e-3, "gyroscope": 0.06},
     "saturation": {"accelerometer": 3e-3, "gyroscope": 0.6},

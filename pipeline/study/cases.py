@@ -15,9 +15,9 @@ Every case follows from its family, number and the study's seed. Families:
     staged               one effect, in a unit whose base is calibrated stage by stage
 
 Effects have the size of the data sheet. Sizes of the MPU-6050 are those of the MPU-6000/6050 product specification 3.4,
-of the STIM300 those of its data sheet TS1524 and of the STIM210's gyroscopes, both as far as they say; the others are
-engineering assumptions. One number is for all parameters, with random signs. A lag is at least the shortest that the
-register map knows.
+of the STIM300 those of its data sheet TS1524 and of the STIM210's gyroscopes, where they state them; the others, like
+the shares and rates below, are assumptions. One number is for all parameters, with random signs. A lag is at least the
+shortest of the register map.
 """
 
 from __future__ import annotations
@@ -41,23 +41,24 @@ FAMILIES = (
     "removed", "one_axis", *(f"shape_{shape}" for shape in SHAPES), "lost", "coarse", "cold",
     *(f"cycle_{shape}" for shape in OF_TEMPERATURE), "staged",
 )  # fmt: skip  # a new one goes last: its place is part of every case's random numbers
+# Long recordings at several rates, so that each observable effect can be detected.
 LONG: dict[str, Any] = {"rates_dps": (20.0, 60.0, 100.0, 200.0), "static_s": 300.0}
 COURSES: dict[str, dict[str, Any]] = {
     "stop_and_go": {**LONG, "step_deg": 3.0, "dwell_s": 2.0, "both_directions": True},
     "continuous": {**LONG, "accelerometer_rates_dps": (2.0, 5.0, 30.0), "both_directions": True},
     "one_way": {**LONG, "step_deg": 3.0, "dwell_s": 2.0},
 }
-ALTERNATIVES = [
+ALTERNATIVES = [  # not hidden together: their signals are nearly alike
     {"time_offset", "low_pass_lag"},
     {"lever_arm", "inner_lever_arms"},
     {"bias_temperature", "bias_temperature_quadratic"},
     {"table_rate_ripple", "table_encoder_error"},
 ]
-FACTOR = {"small": 0.3, "tiny": 0.1}
-WANDER = {"white": 0.0, "normal": 1.0, "wander": 5.0, "random_walk": 0.0, "one_over_f": 0.0}
-STIM_SHARE = 0.25
+FACTOR = {"small": 0.3, "tiny": 0.1}  # of the data sheet's size
+WANDER = {"white": 0.0, "normal": 1.0, "wander": 5.0, "random_walk": 0.0, "one_over_f": 0.0}  # of the data sheet's
+STIM_SHARE = 0.25  # of the units of the families that have both models
 REFERENCE, STAGED = "reference_least_squares", "staged"
-CYCLE_DEGC = 4.0
+CYCLE_DEGC = 4.0  # swing of a room without air conditioning over hours
 
 
 @dataclass(frozen=True)
@@ -158,7 +159,7 @@ def _unseen(number: int, seed: int, rng: np.random.Generator) -> Case:
     return Case("unseen", number, seed, "mpu6050", sensor, procedure, hidden)
 
 
-TABLE = {
+TABLE = {  # deg; ripple relative: a table of hobby parts, by assumption
     "table_tilt": 0.2,
     "table_axis_nonorthogonality": 0.1,
     "table_encoder_error": 0.1,

@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
 JSON = dict[str, Any]
 Rows = list[list[Any]]
-LISTED = 40
+LISTED = 40  # cases on the page that miss a goal
 OF_SIZE = ("single", "small", "tiny")
-BOUNDS = (0.0, 30.0, 60.0, 100.0, 200.0, 500.0, float("inf"))
+BOUNDS = (0.0, 30.0, 60.0, 100.0, 200.0, 500.0, float("inf"))  # of lambda, around the 40 to 100 that a selection asks
 HEAD = """\
 # The blind study: how often the diagnosis is right
 

@@ -28,11 +28,11 @@ KINDS = {CONFIRMED: "good", REFUTED: "bad", NONE: "warn", OPEN: "warn"}  # CSS c
 SMALLEST = 0.01  # of the error: differences within it are none
 ALIKE = 0.05  # of the error: by how much rates that are called alike may differ
 WHY_SPEED = (
-    "A delay turns all angles of a turn alike: it moves neither the 90 deg between two extremes nor their height. So "
-    "the stages do not feel it, as long as they leave out the rests at the ends of a turn, which are not late: fitted "
-    "together with them, 30 deg/s shifts the bias of x by 12 mg and feigns an asymmetry of 1.6 %. What the stages feel "
-    "is the filter's gain: a turn at 30 deg/s loses {loss} % of its amplitude, and run both ways the filter takes "
-    "twice as much. With no filter speed costs next to nothing (see the verdict above)."
+    "A delay shifts all angles of a turn equally: it changes neither the 90 deg between two extremes nor their height. "
+    "So it does not affect the stages, as long as they leave out the rests at the ends of a turn, which are not late: "
+    "fitted together with them, 30 deg/s shifts the bias of x by 12 mg and appears as an asymmetry of 1.6 %. The "
+    "filter's gain does affect them: a turn at 30 deg/s loses {loss} % of its amplitude, and twice as much where the "
+    "filter runs both ways. Without a filter, the rate has hardly any effect (see the verdict above)."
 )
 READINGS = {"printed": "as printed", "staged": "errata corrected"}
 
@@ -163,11 +163,11 @@ def _best_procedure(errors: Errors) -> Conclusion:
         "The best accelerometer procedure is stop and go with 10 s",
         "mg",
         lines,
-        "As printed, more samples make the largest one larger: its excess over the peak grows with their number "
-        "(stop 10 s has 200 times those of continuous 30 deg/s), the scale factor falls with it, and the longest "
-        "procedure does worst. With fitted sinusoids what is left is the noise of the held-out motion, alike for all "
-        "procedures up to 10 deg/s on the MPU6050. On the STIM300, whose noise is low, 10 deg/s gains a tenth: what "
-        "the filter takes of the turn makes up for what it takes of the held-out motion.",
+        "As printed, the excess of the largest sample over the peak grows with the number of samples (stop 10 s has "
+        "200 times those of continuous 30 deg/s), the scale factor decreases with it, and the longest procedure is "
+        "worst. With fitted sinusoids the noise of the held-out motion remains, equal for all procedures up to "
+        "10 deg/s on the MPU6050. On the STIM300, whose noise is low, 10 deg/s is better by a tenth: the filter "
+        "attenuates the turn as much as the held-out motion.",
     )
 
 
