@@ -8,8 +8,14 @@ import os
 for _threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_threads, "1")  # before numpy is imported
 
+import pytest  # noqa: E402
 from hypothesis import HealthCheck, settings  # noqa: E402
 
 # The same cases each time, and none fails for the machine being busy; ``--hypothesis-profile default`` varies.
 settings.register_profile("fixed", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("fixed")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Run whole campaigns first: a long file at the end would leave the other worker idle."""
+    items.sort(key=lambda item: item.get_closest_marker("workflow") is None)

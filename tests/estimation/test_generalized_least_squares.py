@@ -14,10 +14,13 @@ from pipeline.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.effects import fit as fit_effects
 from pipeline.estimation.gauss_markov import Products, Setting
 from pipeline.estimation.generalized_least_squares import fit_joint
+from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.observations import observe
+from pipeline.estimation.selection import select
 from pipeline.model.effects import effect
 from pipeline.records import SensorCalibration
 from pipeline.signal.filters import apply_filter
+from pipeline.simulation.description import read_config
 
 TABLE = {"gravity_g": 1.0, "latitude_deg": None, "azimuth_deg": None}
 SETTINGS: dict[str, Any] = {"table": TABLE}
@@ -95,6 +98,18 @@ def test_what_the_recordings_do_not_determine_is_refused_by_name(
 ) -> None:
     with pytest.raises(NotObservableError, match=message):
         fit_joint(sensor, record(Session(1, course, **session)), names, None, SETTINGS)
+
+
+def test_an_effect_that_contains_a_configured_one_is_not_added_to_it() -> None:
+    """The two are never fitted together; a parabola of the bias leaves much to find beside a configured line."""
+    hidden = {"accelerometer": {"bias_temperature_quadratic": np.full(6, 1e-5)}}
+    recordings, sheet = record(Session(3, effects=hidden, ramp=20.0)), read_config("sensor", "mpu6050")["accelerometer"]
+    noise = estimate_noise("accelerometer", recordings, sheet)
+    found = select(observe("accelerometer", recordings, TABLE), ["bias_temperature"], noise, sheet)
+    score = found.alone["bias_temperature_quadratic"]
+    assert score.delta_bic > 50.0
+    assert score.admissible
+    assert found.names == []
 
 
 def test_a_lever_arm_is_refused_where_the_table_only_stops_and_goes() -> None:
