@@ -1,11 +1,14 @@
 """``compare`` of ``campaign.yaml``: which units it becomes, and what of it is refused."""
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
 
 from pipeline.config import load_campaign
+from pipeline.config.comparisons import resolve_comparisons
 from pipeline.errors import ConfigurationError
 
 SHEET = """unit,serial,method,rate_dps,overrides
@@ -17,34 +20,47 @@ C1,S1,,,method=cholesky_lu
 """
 
 
-def resolved(tmp_path: Path, compare: object) -> list[dict[str, object]]:
-    directory = tmp_path / "bench"
-    directory.mkdir(exist_ok=True)
+Resolve = Callable[[Any], list[dict[str, Any]]]
+
+
+@pytest.fixture(scope="module")
+def resolved(tmp_path_factory: pytest.TempPathFactory) -> Resolve:
+    directory = tmp_path_factory.mktemp("compared")
     (directory / "units.csv").write_text(SHEET)
-    (directory / "campaign.yaml").write_text(yaml.safe_dump({"compare": compare}))
-    return load_campaign({"campaign": str(directory)}).compare
+    units = load_campaign({"campaign": str(directory)}).units
+    return lambda compare: resolve_comparisons(compare, units, "campaign.yaml")
+
+
+def test_the_campaigns_file_states_what_is_compared(tmp_path: Path) -> None:
+    (tmp_path / "units.csv").write_text(SHEET)
+    (tmp_path / "campaign.yaml").write_text(yaml.safe_dump({"compare": [["A1", "B1"]]}))
+    (made,) = load_campaign({"campaign": str(tmp_path)}).compare
+    assert members(made) == {"A1": ["A1"], "B1": ["B1"]}
+    (tmp_path / "campaign.yaml").write_text(yaml.safe_dump({"compare": {"title": "Mine"}}))
+    with pytest.raises(ConfigurationError, match=r"a list of comparisons is expected, got \{'title"):
+        load_campaign({"campaign": str(tmp_path)})
 
 
 def members(comparison: dict[str, object]) -> dict[str, list[str]]:
     return {g["name"]: g["units"] for g in comparison["groups"]}  # type: ignore[index, attr-defined]
 
 
-def test_a_list_of_units_compares_unit_with_unit(tmp_path: Path) -> None:
-    plain, titled = resolved(tmp_path, [["A1", "B1"], {"title": "Mine", "units": ["A2", "C1"], "against": "C1"}])
+def test_a_list_of_units_compares_unit_with_unit(resolved: Resolve) -> None:
+    plain, titled = resolved([["A1", "B1"], {"title": "Mine", "units": ["A2", "C1"], "against": "C1"}])
     assert (plain["title"], members(plain), plain["against"]) == ("Comparison 1", {"A1": ["A1"], "B1": ["B1"]}, "A1")
     assert (titled["title"], titled["against"]) == ("Mine", "C1")
 
 
-def test_columns_choose_units_by_the_configuration_that_they_end_up_with(tmp_path: Path) -> None:
+def test_columns_choose_units_by_the_configuration_that_they_end_up_with(resolved: Resolve) -> None:
     groups = {"default": {"method": "reference_least_squares"}, "filtered": {"filter": "rc_low_pass"}, "one": ["C1"]}
-    (made,) = resolved(tmp_path, [{"groups": groups, "pairs": "serial"}])
+    (made,) = resolved([{"groups": groups, "pairs": "serial"}])
     assert members(made) == {"default": ["A1", "A2"], "filtered": ["B1", "B2"], "one": ["C1"]}
     assert made["pairs"] == {"A1": "S1", "A2": "S2", "B1": "S1", "B2": "S2", "C1": "S1"}
 
 
-def test_values_of_columns_make_groups_whose_last_column_runs_along_a_curve(tmp_path: Path) -> None:
+def test_values_of_columns_make_groups_whose_last_column_runs_along_a_curve(resolved: Resolve) -> None:
     where = {"method": ["staged", "reference_least_squares"]}
-    (made,) = resolved(tmp_path, [{"by": ["method", "rate_dps"], "x": "rate_dps", "where": where}])
+    (made,) = resolved([{"by": ["method", "rate_dps"], "x": "rate_dps", "where": where}])
     assert [(g["series"], g["label"], g["units"]) for g in made["groups"]] == [  # type: ignore[attr-defined]
         ("reference_least_squares", "5", ["A1"]),
         ("reference_least_squares", "20", ["A2"]),
@@ -68,9 +84,8 @@ def test_values_of_columns_make_groups_whose_last_column_runs_along_a_curve(tmp_
         ({"units": ["A1", "A2"], "agianst": "A1"}, "agianst: unknown key; nearest: against"),
         ({"units": ["A1", "A2"], "against": "A3"}, "against: no group is called 'A3'"),
         ({"by": "method", "x": "rate_dps"}, "x: unit C1 has '' in column 'rate_dps', which is no number"),
-        ("A1", "a list of comparisons is expected, got {'compare"),
     ],
 )
-def test_what_cannot_be_compared_is_refused_before_any_job(tmp_path: Path, entry: object, message: str) -> None:
+def test_what_cannot_be_compared_is_refused_before_any_job(resolved: Resolve, entry: object, message: str) -> None:
     with pytest.raises(ConfigurationError, match=message):
-        resolved(tmp_path, {"compare": 1} if entry == "A1" else [entry])
+        resolved([entry])

@@ -39,6 +39,11 @@ def test_twenty_rests_name_what_is_hidden_and_nothing_else(sensor: str, name: st
         assert judged["error_after"] < 0.7 * judged["error_before"]
         best = part["ranking"][0]
         assert best["held_out_error_after"] < 0.7 * best["held_out_error_before"]
+        assert (best["effect"], best["plausible"], part["override"]) == (name, True, f"effects.{sensor}=[{name}]")
+        configured = drawn.settings | {"effects": {"accelerometer": [], sensor: [name]}}
+        mended = diagnose(found, recordings, estimate_noise(sensor, recordings, sheet), configured, felt)
+        assert mended["selected"] == []
+        assert mended["residual_over_noise"] < 1.5 < part["residual_over_noise"]
     elif not name:
         assert judged is None
         assert part["residual_over_noise"] < 1.5

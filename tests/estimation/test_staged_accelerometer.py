@@ -201,10 +201,10 @@ def test_what_shakes_a_moving_table_is_among_the_printed_extremes_and_not_in_fit
 
 
 def test_stated_uncertainty_covers_the_truth() -> None:
-    # 80 units, 9 parameters each, 95 % claimed; four standard deviations of 80 independent units would be 0.10.
+    # 50 units, 9 parameters each, 95 % claimed; three standard deviations of 50 independent units are 0.09.
     rng = np.random.default_rng(7)
     hits = []
-    for seed in range(80):
+    for seed in range(50):
         K, bias, c = np.diag(rng.normal(1.0, 0.01, 3)), rng.normal(0, 0.05, 3), rng.normal(0, 0.003, 3)
         bench = Bench("accelerometer", bias, K, c=c, white=8e-4, wander_size=1e-4, seed=seed)
         found = run_stages("accelerometer", STAGES, bench.stop_and_go(20.0, 1.2), settings())
