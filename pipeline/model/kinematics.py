@@ -43,6 +43,7 @@ EARTH_RATE_DPS = 360.0 / 86164.0905  # a sidereal day, s
 UP_AT_ZERO = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
 # Rows: level x, y, z axes in the body frame at table angle 0, for turns about x, y, z.
 LEVEL_AT_ZERO = np.array([np.eye(3), np.eye(3), [[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]])
+ABOUT = np.cross(np.eye(3)[:, None], np.eye(3)).transpose(0, 2, 1)  # ABOUT[a] @ u = e_a x u
 NODES, WEIGHTS = np.polynomial.laguerre.laggauss(4)  # of integrals of exp(-x) u(x), for the lag of smooth signals
 
 
@@ -266,15 +267,5 @@ def skew(v: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def attitude_matrix(q: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the rotation matrices of unit quaternions: (n, 4) to (n, 3, 3), body vectors to level vectors."""
-    w, x, y, z = q.T
-    return np.stack(
-        [
-            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
-            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
-            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
-        ],
-        1,
-    )
-
-
-ABOUT = skew(np.eye(3))  # ABOUT[a] @ u = e_a x u
+    cross = skew(q[:, 1:])
+    return np.asarray(np.eye(3) + 2.0 * (q[:, :1, None] * cross + cross @ cross))

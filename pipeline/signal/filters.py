@@ -94,7 +94,7 @@ def apply_filter(recording: Recording, settings: dict[str, Any]) -> Recording:
         run = partial(_rc_filtered, recording.time, time_constant, zero_phase)
     else:
         sections, notes = _butterworth_sections(settings, interval), _timing_notes(recording)
-        run = partial(_section_filtered, sections, _starts(recording), zero_phase)
+        run = partial(_section_filtered, sections, stretch_starts(recording), zero_phase)
     return replace(
         recording,
         accelerometer=None if recording.accelerometer is None else run(recording.accelerometer),
@@ -247,8 +247,8 @@ def _section_filtered(sections: Values, starts: list[int], zero_phase: bool, rea
     return out
 
 
-def _starts(recording: Recording) -> list[int]:
-    """Return where the stretches without a gap begin, and the end."""
+def stretch_starts(recording: Recording) -> list[int]:
+    """Return the first sample of each stretch without a gap, and the number of samples."""
     gaps = np.flatnonzero(np.diff(recording.time) > GAP * recording.interval) + 1
     return [0, *gaps.tolist(), recording.samples]
 
@@ -256,7 +256,7 @@ def _starts(recording: Recording) -> list[int]:
 def _timing_notes(recording: Recording) -> tuple[Note, ...]:
     """Say where the samples are not what a filter of evenly spaced samples expects."""
     notes = []
-    starts = _starts(recording)
+    starts = stretch_starts(recording)
     if len(starts) > 2:
         detail = f"{recording.name}: the filter started anew after each of {len(starts) - 2} gaps"
         notes.append(Note("N-FILTER-RESTART", len(starts) - 2, 0, 0, detail))

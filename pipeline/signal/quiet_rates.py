@@ -10,7 +10,7 @@ where
     r   : median of m in the stretch that the accelerometer calls quiet, which contains bias, g-sensitivity and a steady
           creep; where it departs from the median of the stretches around it by more than the limit of a rest's rate,
           the stretch is mostly a turn, and that median replaces it
-    s_c : white noise of a sample: median |y[i+1] - y[i]| / (0.6745 sqrt 2)
+    s_c : white noise of a sample, by the differences of successive samples
     d_c : 1.4826 times the median of |m_c - r_c| in the stretch: the standard deviation of m, tremor of a hand included,
           where the unit rests for more than half of the stretch; q d_c is limited to a hand's largest tremor
     V   : median of sum_c v_c in the stretch: noise and tremor
@@ -25,6 +25,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+
+from pipeline.records import noise_of_steps
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -68,7 +70,7 @@ def quiet_pieces(rate: Values, stretches: Sequence[tuple[int, int]], interval: f
     reference, resting = _references(medians)
     off = [np.abs(mean - r) for (mean, _), r in zip(of_parts, reference, strict=True)]
     differences = np.concatenate([np.abs(np.diff(part, axis=0)) for part in parts])
-    white = NORMAL * np.median(differences, axis=0) / np.sqrt(2.0 * size)
+    white = noise_of_steps(differences) / np.sqrt(size)
     spread = NORMAL * np.array([np.median(own, axis=0) for own in off])
     noise = np.array([np.median(variance) for _, variance in of_parts])
     spread = np.where(resting[:, None], spread, np.median(spread, axis=0))

@@ -27,7 +27,7 @@ import numpy as np
 
 from pipeline.records import noise_of_steps
 from pipeline.signal.creep import creep_in
-from pipeline.signal.filters import filter_autocovariance
+from pipeline.signal.filters import filter_autocovariance, stretch_starts
 from pipeline.signal.quiet_rates import RATE_LIMIT_DPS, quiet_pieces, windows
 
 if TYPE_CHECKING:
@@ -56,7 +56,6 @@ CREEP_LIMIT_DPS, STEADY_LIMIT_DEG = 0.5, 10.0
 SCATTER_LIMIT = 3.0  # times the noise; noise alone stays below 1.3 in the 100 samples of a rest at 100 Hz
 SMALLEST_SCATTER_G2 = 3e-6  # 1 mg on each axis, so that a quiet sensor may settle by 0.1 deg
 SIGNIFICANT = 6.0  # standard deviations
-GAP = 1.5  # medians of the interval: a lost sample makes two of one
 EDGE_S, FEWEST_TO_SETTLE = 0.5, 6  # of a rest that may still move, at most a third of it, and samples that show it
 SETTLED = 8.0  # of the noise between successive samples: white noise passes in 1e-14
 
@@ -243,13 +242,10 @@ def _rate_reasons(recording: Recording, rests: Sequence[Rest]) -> list[str]:
 
 def stretches_of(recording: Recording, mask: NDArray[np.bool_]) -> Spans:
     """Return the runs of a mask, cut at gaps in time."""
-    cuts = np.flatnonzero(np.diff(recording.time_ns) > GAP * recording.interval * 1e9) + 1
-    if len(cuts) == 0:
-        return runs(mask)
+    cuts = np.array(stretch_starts(recording)[1:-1], int)
     pieces: Spans = []
     for start, stop in runs(mask):
-        edges = [start, *cuts[(cuts > start) & (cuts < stop)].tolist(), stop]
-        pieces += pairwise(edges)
+        pieces += pairwise([start, *cuts[(cuts > start) & (cuts < stop)].tolist(), stop])
     return pieces
 
 
