@@ -33,6 +33,7 @@ def _environment() -> Environment:
         "words": plain,
         "figure": _figure,
         "unit": unit_text,
+        "numeric": lambda column: "#" + column,
         "parameter_texts": parameter_texts,
         "details": stage_details,
         "monte_carlo": monte_carlo_of,
