@@ -28,17 +28,10 @@ def _figure(value: object) -> str:
 @cache
 def _environment() -> Environment:
     environment = Environment(loader=FileSystemLoader(FOLDER), autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    numbers = (number, measured, percent, percent_change, probability, typeset)
-    environment.filters |= {f.__name__: f for f in numbers} | {
-        "words": plain,
-        "figure": _figure,
-        "unit": unit_text,
-        "numeric": lambda column: "#" + column,
-        "parameter_texts": parameter_texts,
-        "details": stage_details,
-        "monte_carlo": monte_carlo_of,
-        "convergence": convergence_of,
-    }
+    functions = (number, measured, percent, percent_change, probability, typeset, parameter_texts)
+    environment.filters |= {function.__name__: function for function in functions}
+    environment.filters |= {"words": plain, "figure": _figure, "unit": unit_text, "numeric": "#{}".format}
+    environment.filters |= {"details": stage_details, "monte_carlo": monte_carlo_of, "convergence": convergence_of}
     environment.globals["asset"] = asset
     return environment
 
