@@ -166,7 +166,8 @@ class Composer:
         chosen.setdefault("table", str(procedure["table"]))
         if "method" not in chosen:
             without = self._read("table", chosen["table"])["motion"] == "none" or procedure["table"] == "hand"
-            chosen["method"] = "nonlinear_least_squares" if without else "reference_least_squares"
+            usual = "nonlinear_least_squares" if without else "reference_least_squares"
+            chosen["method"] = str(procedure.get("method") or usual)
         return chosen
 
     def _read(self, group: str, option: str) -> dict[str, Any]:

@@ -98,7 +98,7 @@ class Repeated(Section):
 class Window(Section):
     """A part of one long recording, in s from its first sample."""
 
-    role: Literal["accelerometer", "gyroscope", "validation", "static"]
+    role: Literal["accelerometer", "gyroscope", "rests", "validation", "static"]
     axis: Axis | None = None
     start_s: NonNegative
     stop_s: Positive
@@ -119,15 +119,33 @@ class RecordingFile(Section):
     windows: list[Window] | None = None
 
 
+class Faces(Section):
+    """Faces that are placed up by hand."""
+
+    accuracy_deg: Positive
+
+
+class HandTurns(Section):
+    """Turns by hand of a stated total angle."""
+
+    angle_deg: Positive
+    accuracy_deg: Positive
+    axis_accuracy_deg: Positive
+    holdout_every: Annotated[int, Field(ge=0)]
+
+
 class Procedure(Section):
     """Which recordings a calibration consists of."""
 
     name: str
     table: str
+    method: str | None = None
     folder: str
     recordings: dict[str, RecordingFile]
     holdout_every: Annotated[int, Field(ge=0)]
     mounting_tolerance_deg: Positive = 5.0
+    faces: Faces | None = None
+    turns: HandTurns | None = None
 
 
 class Stages(Section):

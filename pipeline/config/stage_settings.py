@@ -29,6 +29,7 @@ EFFECTS = CONFIGS / "effect"  # what pipeline.model.effects.files reads
 # Dotted keys that a stage reads; {sensor} is the sensor that the stage is about.
 BOTH = ("accelerometer", "gyroscope")
 NOISE = ("noise_density", "bias_wander", "wander_time_s")
+BY_HAND = tuple(f"procedure.{key}" for key in ("holdout_every", "faces", "turns"))
 FIT_OF_TABLE = (
     "motion", "gravity_g", "latitude_deg", "azimuth_deg", "angle_accuracy_deg", "rate_accuracy", "orthogonality_deg",
     "wobble_deg", "levelling_deg", "gravity_accuracy_g", "azimuth_accuracy_deg", "clock_accuracy_ppm",
@@ -41,8 +42,7 @@ FIT_OF_SENSOR = (
 FIT = (
     *(f"table.{key}" for key in FIT_OF_TABLE),
     *(f"sensor.{{sensor}}.{key}" for key in FIT_OF_SENSOR),
-    "sensor.temperature_accuracy_degc", "procedure.holdout_every", "method.{sensor}", "method.as_printed",
-    "uncertainty.monte_carlo",
+    "sensor.temperature_accuracy_degc", *BY_HAND, "method.{sensor}", "method.as_printed", "uncertainty.monte_carlo",
 )  # fmt: skip
 # Effects that explain a departure of table, clock or gyroscope: the checks of the recordings read their limits.
 LIMITS_OF_CHECKS = (
@@ -57,10 +57,11 @@ INGEST_OF_SENSOR = (
     "axis_map", "full_scale", "bias", "scale_factor", "cross_axis", *NOISE,
     *(f"effects.{name}" for name in LIMITS_OF_CHECKS),
 )  # fmt: skip
-SENSORS_AND_TABLE = ("sensor", "table", "procedure.holdout_every")
+SENSORS_AND_TABLE = ("sensor", "table", *BY_HAND)
 READS: dict[str, tuple[str, ...]] = {
     "ingest": (
-        "ingest", "procedure.folder", "procedure.recordings", "procedure.mounting_tolerance_deg", "sensor.axis_map",
+        "ingest", "procedure.folder", "procedure.recordings", "procedure.mounting_tolerance_deg", "procedure.turns",
+        "sensor.axis_map",
         *(f"table.{key}" for key in INGEST_OF_TABLE),
         *(f"sensor.{sensor}.{key}" for sensor in BOTH for key in INGEST_OF_SENSOR),
     ),

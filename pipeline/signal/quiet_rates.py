@@ -9,7 +9,8 @@ where
     n   : samples of the window, 0.2 s and at least 3
     r   : median of m in the stretch that the accelerometer calls quiet, which contains bias, g-sensitivity and a steady
           creep; where it departs from the median of the stretches around it by more than the limit of a rest's rate,
-          the stretch is mostly a turn, and that median replaces it
+          the stretch is mostly a turn, and that median replaces it; of one or two stretches, where it departs from the
+          mean of their first and last window, which agree, that mean
     s_c : white noise of a sample, by the differences of successive samples
     d_c : 1.4826 times the median of |m_c - r_c| in the stretch: the standard deviation of m, tremor of a hand included,
           where the unit rests for more than half of the stretch; q d_c is limited to a hand's largest tremor
@@ -67,7 +68,7 @@ def quiet_pieces(rate: Values, stretches: Sequence[tuple[int, int]], interval: f
     parts = [rate[start:stop] for start, stop in stretches]
     of_parts = [windows(part, size) for part in parts]
     medians = np.array([np.median(mean, axis=0) for mean, _ in of_parts])
-    reference, resting = _references(medians)
+    reference, resting = _references(medians, np.array([mean[[0, -1]] for mean, _ in of_parts]))
     off = [np.abs(mean - r) for (mean, _), r in zip(of_parts, reference, strict=True)]
     differences = np.concatenate([np.abs(np.diff(part, axis=0)) for part in parts])
     white = noise_of_steps(differences) / np.sqrt(size)
@@ -99,13 +100,18 @@ def windows(values: Values, size: int) -> tuple[Values, Values]:
     return total / size + middle, variance
 
 
-def _references(medians: Values) -> tuple[Values, NDArray[np.bool_]]:
-    """Return each stretch's own median, or of one that is mostly a turn that of those around it; and which rest."""
+def _references(medians: Values, ends: Values) -> tuple[Values, NDArray[np.bool_]]:
+    """Return the rate at rest of each stretch, and which of them mostly rest; ``ends`` are (m, 2, 3)."""
     out, resting = medians.copy(), np.ones(len(medians), bool)
+    if len(medians) <= 2:
+        middle = ends.mean(axis=1)
+        still = np.abs(ends[:, 0] - ends[:, 1]).max(axis=1) < RATE_LIMIT_DPS
+        resting = ~(still & (np.abs(medians - middle).max(axis=1) > RATE_LIMIT_DPS))
+        return np.where(resting[:, None], medians, middle), resting
     for i, own in enumerate(medians):
         first = int(np.clip(i - NEIGHBOURS // 2, 0, max(len(medians) - NEIGHBOURS, 0)))
         around = np.median(medians[first : first + NEIGHBOURS], axis=0)
-        if len(medians) > 2 and np.abs(own - around).max() > RATE_LIMIT_DPS:
+        if np.abs(own - around).max() > RATE_LIMIT_DPS:
             out[i], resting[i] = around, False
     return out, resting
 

@@ -43,7 +43,9 @@ SHORTEST_STATIC_S, SHORTEST_FREE_S = 60.0, 10.0  # shorter rests determine no bi
 SLOWER = 1.2  # rates that differ by less are one rate
 FEWEST_OF_A_SPLINE = 6  # samples of a quintic
 AGREES = 0.05  # of the mean rate: a gimbal alone differs from the attitude's rate by far more
-SHORT_NAMES = {"accelerometer": "accel", "gyroscope": "gyro", "validation": "validation", "static": "static"}
+SHORT_NAMES = {
+    "accelerometer": "accel", "gyroscope": "gyro", "rests": "rests", "validation": "validation", "static": "static",
+}  # fmt: skip
 ONE_AXIS = 0.8  # share of the energy of a turn about a body axis that is misaligned by 27 deg
 ENCODER_AGREES_DEG, ENCODER_AGREES = 5.0, 0.1  # one sample of 50 ms at 100 deg/s; a coarse log of the rate
 HALF_A_TURN_DEG = 180.0
@@ -77,7 +79,9 @@ class Move(NamedTuple):
         return self.axis, "turn" if self.angle >= HALF_A_TURN_DEG else "step"
 
 
-def cut(recording: Recording, windows: Sequence[Mapping[str, Any]] | None = None) -> list[Recording]:
+def cut(
+    recording: Recording, windows: Sequence[Mapping[str, Any]] | None = None, *, found: bool = False
+) -> list[Recording]:
     """Return the segments of one long recording as recordings of their own.
 
     Parameters
@@ -85,7 +89,9 @@ def cut(recording: Recording, windows: Sequence[Mapping[str, Any]] | None = None
     recording : Recording
     windows : sequence of mapping, optional
         ``role``, ``axis``, ``start_s`` and ``stop_s`` (in the recording's own time, from its first sample), in place of
-        what is found.
+        what is found here.
+    found : bool
+        Whether the windows were found in the recording.
 
     Raises
     ------
@@ -106,7 +112,7 @@ def cut(recording: Recording, windows: Sequence[Mapping[str, Any]] | None = None
                 role=segment.role,
                 axis=segment.axis,
                 table_rate=part.table_rate if segment.axis is not None else _size_of_rate(part),
-                notes=(*(recording.notes if not out else ()), _note(recording, segment, found=windows is None)),
+                notes=(*(recording.notes if not out else ()), _note(recording, segment, found=found or windows is None)),
             )
         )
     return out

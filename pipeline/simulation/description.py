@@ -27,7 +27,7 @@ from pipeline.errors import ConfigurationError, MissingInputError
 from pipeline.files import CONFIGS
 from pipeline.io.files import wrong_name
 from pipeline.io.yaml_file import read_yaml
-from pipeline.simulation.procedures import ONE_RECORDING, TABLE_PROCEDURES, Course, fit_to_samples
+from pipeline.simulation.procedures import FERRARIS, ONE_RECORDING, TABLE_PROCEDURES, Course, fit_to_samples
 
 if TYPE_CHECKING:
     import argparse
@@ -40,6 +40,8 @@ _, FILE, PROGRAM = KINDS
 UNITS_OF_A_LOT = 25  # of a described count of units: a round number
 # By hand, rests are longer and moves faster than on a table, and there is no held-out motion with a reference.
 BY_HAND = Course(dwell_s=4.0, step_rate_dps=60.0, acceleration_dps2=200.0, validation_s=0.0)
+# Each turn there and back, the second held out between rests of 4 s and more; 360 deg in some 3 s.
+FACES_AND_TURNS = replace(BY_HAND, dwell_s=5.0, rates_dps=(120.0,), both_directions=True)
 RECORDED = ("sensor", "table", "procedure", "samples", "interval_s", "lost")
 
 
@@ -122,6 +124,7 @@ class UnitDescription:
 def course_of(unit: UnitDescription) -> Course:
     """Return how the unit's procedure is run: as described, and fitted to its number of samples."""
     base = Course() if unit.procedure in TABLE_PROCEDURES else BY_HAND
+    base = FACES_AND_TURNS if unit.procedure == FERRARIS else base
     wanted: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in unit.course.items()}
     course = replace(base, **wanted)
     if unit.samples is None:
@@ -248,6 +251,8 @@ def add_recording_options(parser: argparse.ArgumentParser) -> None:
     add("--pause", dest="pause_s", type=float, metavar="S", help="between recordings (30)")
     add("--thermal-ramp", dest="thermal_ramp_degc", type=float, metavar="DEGC",
         help="of thermal_ramp: up and down (15)")  # fmt: skip
+    add("--turn-error", dest="turn_error_deg", type=float, metavar="DEG", help="of a hand's total angle in ferraris (3)")
+    add("--turn-axis-error", dest="turn_axis_error_deg", type=float, metavar="DEG", help="of its turn axis (1.5)")
 
 
 def described(arguments: Mapping[str, Any]) -> dict[str, Any]:

@@ -3,14 +3,14 @@
 ``three_axis_turns`` and ``thermal_ramp`` (Sudsanguan 2019, chapter 4): about each axis, stop-and-go or continuous turns
 for the accelerometer, turns at one or several rates between rests for the gyroscope; then held-out random motion and a
 long rest. ``orientations_24`` (Sudsanguan 2018): eight rests 45 deg apart about each axis. ``six_positions``: each axis
-up and down. ``multi_position``: rests in random attitudes.
+up and down. ``multi_position``: rests in random attitudes. ``ferraris``: six faces up, then turns about each axis.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -39,7 +39,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-ONE_RECORDING = "one_recording"
+ONE_RECORDING, FERRARIS = "one_recording", "ferraris"
+AGAIN = 0.1  # of a face's tilt, by which a rest on the same face differs
 TRANSIT = "transit"  # name and role of a move between recordings
 TRANSIT_RATE_DPS = 20.0  # as between stops
 LEAST_ANGLE_DEG = 1e-6  # below it nothing moves: rounding
@@ -48,7 +49,10 @@ ABOVE_ZERO = (
     "step_deg", "dwell_s", "accelerometer_rates_dps", "rates_dps", "turns", "acceleration_dps2", "step_rate_dps",
     "validation_rate_dps",
 )  # fmt: skip
-ZERO_OR_MORE = ("warm_up_rest_s", "rest_s", "validation_s", "static_s", "pause_s", "thermal_ramp_degc")
+ZERO_OR_MORE = (
+    "warm_up_rest_s", "rest_s", "validation_s", "static_s", "pause_s", "thermal_ramp_degc",
+    "turn_error_deg", "turn_axis_error_deg",
+)  # fmt: skip
 STEPS_DEG = (1.0, 2.0, 3.0, 5.0, 10.0, 15.0, 30.0, 45.0, 90.0)  # divisors of a turn
 
 
@@ -72,6 +76,8 @@ class Course:
     pause_s: float = 30.0  # between recordings, and before the first
     positions: int = 40  # rests of multi_position
     thermal_ramp_degc: float = 15.0  # amplitude of the chamber's ramp in thermal_ramp
+    turn_error_deg: float = 3.0  # by hand in ferraris, standard deviation of the total angle of each turn
+    turn_axis_error_deg: float = 1.5  # and of each of the two angles between a body axis and the turns about it
 
     def __post_init__(self) -> None:
         for name in ABOVE_ZERO:
@@ -105,10 +111,14 @@ def plan(procedure: str, course: Course, rng: np.random.Generator, hand_accuracy
         "six_positions": six_positions,
         "multi_position": lambda: random_attitudes(course.positions, rng),
     }
-    if procedure not in attitudes:
-        known = ", ".join((*TABLE_PROCEDURES, *attitudes))
+    if procedure not in {*attitudes, FERRARIS}:
+        known = ", ".join((*TABLE_PROCEDURES, *attitudes, FERRARIS))
         raise ConfigurationError(f"no procedure is called {procedure!r}; known: {known}")
-    planned = [Planned("recording", "rests", None, _rests(attitudes[procedure](), course, rng, hand_accuracy))]
+    if procedure == FERRARIS:
+        motion = _faces_and_turns(course, rng, hand_accuracy)
+    else:
+        motion = _rests(attitudes[procedure](), course, rng, hand_accuracy)
+    planned = [Planned("recording", "rests", None, motion)]
     if course.validation_s > 0.0:
         count = max(2, int(course.validation_s / (course.dwell_s + 2.0)))
         held_out = _rests(random_attitudes(count, rng), replace(course, warm_up_rest_s=0.0), rng, 0.0)
@@ -235,3 +245,34 @@ def _level(plan: Planned, time: float) -> NDArray[np.float64]:
     """Return the attitude at a time in s of a recording: (3, 3) array."""
     level: NDArray[np.float64] = plan.trajectory.pose(np.array([time])).level[0]
     return level
+
+
+def _faces_and_turns(course: Course, rng: np.random.Generator, accuracy: float) -> Moves:
+    """Return rests on six faces, then turns about each axis with its face up; a face and an axis keep their errors."""
+    positions, tilt = six_positions(), accuracy * rng.standard_normal((6, 3))
+    off = np.radians(course.turn_axis_error_deg) * rng.standard_normal((3, 3)) * (1.0 - np.eye(3))
+    builder = ProgramBuilder(course.acceleration_dps2).rest(max(course.warm_up_rest_s, course.dwell_s))
+    axes: list[NDArray[np.float64]] = []
+    start = at = positions[0] @ _turned(tilt[0])
+    upward = [int(np.argmax(positions[:, 2, axis])) for axis in range(3)]
+    for face, axis in [*((f, None) for f in range(1, 6)), *zip(upward, range(3), strict=True)]:
+        target = positions[face] @ _turned(tilt[face] + AGAIN * accuracy * rng.standard_normal(3))
+        about, angle = axis_and_angle(at.T @ target)
+        builder.turn(angle, course.step_rate_dps).rest(course.dwell_s)
+        axes += [about] * bool(angle)
+        at = target
+        for rate, sign in (
+            product(course.rates_dps, (1.0, -1.0)[: 1 + course.both_directions]) if axis is not None else ()
+        ):
+            about = (np.eye(3)[axis] + off[axis]) / np.linalg.norm(np.eye(3)[axis] + off[axis])
+            angle = sign * 360.0 * course.turns + course.turn_error_deg * float(rng.standard_normal())
+            builder.turn(angle, rate).rest(course.dwell_s)
+            axes.append(about)
+            at = at @ _turned(angle * about)
+    return Moves(builder.build(), np.array(axes), start)
+
+
+def _turned(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the rotation by a vector in deg: (3, 3) array."""
+    size = float(np.linalg.norm(vector))
+    return np.asarray(rotation_about(vector / (size or 1.0), np.array([size]))[0])

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.io.parquet import save_recordings
 from pipeline.io.read import read_recordings
 from pipeline.preprocessing.checks import check_recordings
+from pipeline.signal.hand_turns import held_out_windows
 from pipeline.signal.segments import cut
 
 if TYPE_CHECKING:
@@ -20,9 +21,15 @@ def process_unit(job: Job, unit: str, settings: dict[str, Any]) -> None:
     directory, procedure = Path(job.run["directory"]), settings["procedure"]
     recordings = []
     folder = directory / procedure["folder"]
-    for read in read_recordings(procedure, settings["ingest"], settings["sensor"], folder):
+    whole = read_recordings(procedure, settings["ingest"], settings["sensor"], folder)
+    held_out = any(read.role == "validation" for read in whole)
+    for read in whole:
         windows = procedure["recordings"][read.name].get("windows")
-        recordings += cut(read, windows) if read.role == "session" else [read]
+        if read.role == "rests" and procedure["turns"] and not held_out:
+            turns = held_out_windows(read, procedure["turns"])
+            recordings += cut(read, turns, found=True) if turns else [read]
+        else:
+            recordings += cut(read, windows) if read.role == "session" else [read]
     named = []
     for recording in check_recordings(recordings, settings):
         path = Path(recording.source["file"])

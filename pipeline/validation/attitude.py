@@ -21,6 +21,7 @@ import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.estimation.design import Term
+from pipeline.estimation.multi_position.faces_and_turns import with_stated_turns
 from pipeline.estimation.multi_position.gravity import observed_rests
 from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
 from pipeline.estimation.multi_position.model import State
@@ -219,7 +220,8 @@ def gravity_direction(
     dict
         ``reason`` (why there is none, else None), ``moves`` (how many), ``mean_deg``, ``rms_deg`` and ``max_deg`` (each
         ``before`` and ``after`` the gyroscope's calibration), ``noise_floor_deg`` (the mean that white noise alone
-        gives) and ``creeping_rests`` (in which the unit went on turning).
+        gives) and ``creeping_rests`` (in which the unit went on turning). Where the procedure states turns, ``turns``:
+        ``recording, time_s, axis, stated_deg`` and ``angle_deg`` (``before`` and ``after``) of each.
     """
     if not is_multi_position("gyroscope", recordings):
         return {"reason": "not recorded by hand"}
@@ -231,12 +233,22 @@ def gravity_direction(
         return {"reason": "no rest is held out"}
     rests, gravity = observed
     judged = replace(rests, held_out=~rests.held_out)
-    model = GyroscopeModel(judged, moves_of(recordings, judged), gravity, noise, fewest=1)
+    moves, turns = moves_of(recordings, judged), settings["procedure"].get("turns")
+    moves = with_stated_turns(moves, judged, turns) if moves and turns else moves
+    model = GyroscopeModel(judged, moves, gravity, noise, fewest=1)
     if model.moves is None:
         return {"reason": "no move is held out"}
     terms = tuple(Term(effect(e.name), e.values) for e in gyroscope.effects)
-    before = model.direction_errors(State(np.zeros(3), np.eye(3)))[0]
-    after, floor = model.direction_errors(State(gyroscope.bias, gyroscope.matrix, terms))
+    raw, calibrated = State(np.zeros(3), np.eye(3)), State(gyroscope.bias, gyroscope.matrix, terms)
+    before = model.direction_errors(raw)[0]
+    after, floor = model.direction_errors(calibrated)
+    own = {}
+    if turns:
+        pairs = (model.describe_turns(state, recordings) for state in (raw, calibrated))
+        own["turns"] = [
+            {**last, "angle_deg": {"before": first["angle_deg"], "after": last["angle_deg"]}}
+            for first, last in zip(*pairs, strict=True)
+        ]
     return {
         "reason": None,
         "moves": model.moves.count,
@@ -245,4 +257,5 @@ def gravity_direction(
         "max_deg": {"before": float(np.max(before)), "after": float(np.max(after))},
         "noise_floor_deg": float(np.mean(floor)),
         "creeping_rests": int(np.count_nonzero(gravity.creeping)),
+        **own,
     }

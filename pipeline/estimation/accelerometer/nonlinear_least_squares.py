@@ -79,15 +79,27 @@ def fit(
     previous : SensorCalibration or None
         The result of the stage before; only its stages are kept.
     settings : mapping
-        Sections ``table`` (``gravity_g``), ``procedure`` (``holdout_every``) and ``sensor``.
+        Sections ``table`` (``gravity_g``), ``procedure`` (``holdout_every``; ``faces``: the full matrix, by
+        ``pipeline.estimation.multi_position.faces_fit``) and ``sensor``.
 
     Raises
     ------
     CannotCalibrateError
         If there is no recording for it.
     NotObservableError
-        If the orientations are too few or too much alike.
+        If the orientations are too few or too much alike, or a stated face is missing.
     """
+    if not settings["procedure"].get("faces"):
+        return _fit_triangular(recordings, previous, settings)
+    from pipeline.estimation.multi_position.faces_fit import fit_faces, require_faces  # noqa: PLC0415  (needs this module)
+
+    require_faces(recordings, settings)
+    return fit_faces(_fit_triangular(recordings, previous, settings), recordings, settings)
+
+
+def _fit_triangular(
+    recordings: Sequence[Recording], previous: SensorCalibration | None, settings: Mapping[str, Any]
+) -> SensorCalibration:
     gravity_g = float(settings["table"].get("gravity_g", 1.0))
     orientations = orientations_of(recordings, settings)
     found = _fit_determined(orientations, gravity_g)

@@ -8,6 +8,7 @@ the others have less weight (``pipeline.estimation.multi_position.fit``).
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.least_squares import certified
 from pipeline.estimation.multi_position.fit import fit as fit_by_hand
 from pipeline.estimation.multi_position.fit import fit_robustly
-from pipeline.estimation.multi_position.gyroscope import FEWEST_MOVES, model_of
+from pipeline.estimation.multi_position.gyroscope import FEWEST_MOVES, MOVED, model_of
 from pipeline.estimation.multi_position.likelihood import NEW, prior_hypotheses
 from pipeline.estimation.multi_position.model import State
 from pipeline.estimation.multi_position.rests import ROLE, is_multi_position
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from pipeline.records import Recording
 
 NAME = "rests_and_moves"
+MOVED_TIMES = 2  # an error of 0.7 deg squared is 0.01 deg, as large as the noise of a move; a second time 1e-4 deg
 UNKNOWN = 0.05  # of an element of the matrix: beyond it nothing of it is known
 ADVICE = "record some 24 rests, each in another orientation, with moves about changing axes between them"
 
@@ -75,7 +77,14 @@ def fit(
     _require_determined(model.equations(start).base)
     prior = prior_of("gyroscope", recordings, settings)
     noises = prior_hypotheses(prior, float(np.mean(model.white)), model.kinds)
-    model, found, outlying = fit_robustly(model, lambda weighted: fit_by_hand(weighted, start, noises, {}), recordings)
+    fitted = partial(fit_by_hand, start=start, hypotheses=noises, limits={})
+    model, found, outlying = fit_robustly(model, fitted, recordings)
+    moved, faces = np.zeros(12), settings["procedure"].get("faces")
+    for _ in range(MOVED_TIMES if faces else 0):
+        moved = model.accelerometer_errors(found)
+        model = model_of(recordings, None, noise, settings, moved=moved)
+        assert model is not None  # noqa: S101
+        model, found, outlying = fit_robustly(model, partial(fitted, start=found.state), recordings)
     assert model.moves is not None  # noqa: S101
     names = [f"bias_{a}" for a in AXES] + [f"matrix_{a}{b}" for a in AXES for b in AXES]
     _require_known(names, np.sqrt(np.diag(found.covariance)), model.moves.count)
@@ -85,7 +94,7 @@ def fit(
         name: {"value": float(v), "unit": "deg/s" if i < 3 else "1", "standard_uncertainty": float(u)}
         for i, (name, v, u) in enumerate(zip(names, values, uncertainty, strict=True))
     }
-    apart = found.residual[model.rests_equations :] * found.error[model.rests_equations :]
+    apart = found.residual[model.of_moves] * found.error[model.of_moves]
     at_rest = found.residual[: model.rests_equations] * found.error[: model.rests_equations]
     details = {
         "rests": len(model.rests.time),
@@ -99,6 +108,10 @@ def fit(
         "condition": found.condition,
         "degrees_of_freedom": float(found.degrees_of_freedom.min()),
     }
+    if faces:
+        details[MOVED] = moved.tolist()
+    if model.turns is not None:
+        details["turns"] = model.describe_turns(found.state, recordings)
     correction = {"steps": [{"subtract": found.state.bias.tolist()}, {"matrix": found.state.matrix.tolist()}]}
     result = StageResult(NAME, parameters, float(np.sqrt(np.mean(at_rest**2))), correction, details)
     calibration = SensorCalibration(

@@ -9,6 +9,8 @@ where
     b, M: bias, g, and matrix ``M = Q L``: |f| determines the lower triangular L, and not the rotation Q, which is kept
     z   : effects, at the force of the magnitude of gravity; p their parameters
     s_e : standard deviation of |f| by white noise: ``s_e^2 = w sum_c (M^T n)_c^2 s_c^2``
+
+Where the procedure states faces, their equations follow (``faces_and_turns``), and the matrix is full.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.estimation.multi_position.faces_and_turns import faces_of
 from pipeline.estimation.multi_position.model import Equations, State, effect_readings, motion_of
 from pipeline.estimation.multi_position.rests import HELD_OUT, rests_of
 
@@ -26,6 +29,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.estimation.design import Term
+    from pipeline.estimation.multi_position.faces_and_turns import Faces
     from pipeline.estimation.multi_position.rests import Rests
     from pipeline.records import Motion, Noise, Recording, SensorCalibration
 
@@ -49,6 +53,8 @@ class AccelerometerModel:
     noise : Noise or None
     held : Rests, optional
         Those that no fit sees.
+    faces : Faces, optional
+        Of ``rests``, where they are stated.
     """
 
     sensor = "accelerometer"
@@ -60,12 +66,14 @@ class AccelerometerModel:
         calibration: SensorCalibration,
         gravity_g: float,
         noise: Noise | None,
+        *,
         held: Rests | None = None,
+        faces: Faces | None = None,
     ) -> None:
-        self.rests, self.gravity, self.held = rests, gravity_g, held
+        self.rests, self.gravity, self.held, self.faces = rests, gravity_g, held, faces
         self.calibration, self.noise = calibration, noise
         self.white = np.maximum(white_of(rests, noise), SMALLEST_NOISE)
-        self.directions = _directions(calibration)
+        self.directions = _directions(calibration) if faces is None else np.eye(12)
         self.rests_equations = len(rests.time)
 
     def equations(self, state: State, candidates: Sequence[Term] = ()) -> Equations:
@@ -86,7 +94,7 @@ class AccelerometerModel:
 
         hold = np.zeros((3, len(error), len(error)))
         hold[:, np.arange(len(error)), np.arange(len(error))] = (along * self.white / error[:, None]).T
-        return Equations(
+        equations = Equations(
             residual=(target - length) / error,
             base=full @ self.directions / error[:, None],
             effects=[columns(term) for term in state.terms],
@@ -97,6 +105,25 @@ class AccelerometerModel:
             length=rests.length,
             joined=rests.joined,
             error=error,
+        )
+        if self.faces is None:
+            return equations
+        W = self.faces.weights() / self.gravity
+        WM = W @ state.matrix
+        wide = np.sqrt(self.faces.error**2 + np.einsum("rmc,m,c->r", WM**2, rests.share, self.white**2))
+        moved = np.einsum("rmi,mj->rij", W, v).reshape(-1, 9)
+
+        def of_faces(term: Term) -> Values:
+            Z = term.effect.columns(self.sensor, motion, K, term.values)
+            return np.asarray(np.einsum("rmc,mcp->rp", -WM, Z) / wide[:, None])
+
+        return equations.followed_by(
+            residual=-np.einsum("rmc,mc->r", W, force) / wide,
+            base=np.concatenate([-WM.sum(axis=1), moved], axis=1) @ self.directions / wide[:, None],
+            effects=[of_faces(term) for term in state.terms],
+            candidates=[of_faces(term) for term in candidates],
+            bias=np.einsum("rmc,c->crm", WM, self.white) / wide[:, None],
+            error=self.gravity * wide,
         )
 
     def specific_force(self, state: State, rests: Rests) -> tuple[Values, Values]:
@@ -126,7 +153,8 @@ class AccelerometerModel:
     def without(self, held: NDArray[np.bool_]) -> AccelerometerModel:
         """Return the model with some of its rests held out."""
         kept, judged = self.rests.select(~held), self.rests.select(held)
-        return AccelerometerModel(kept, self.calibration, self.gravity, self.noise, judged)
+        faces = self.faces and self.faces.select(~held)
+        return AccelerometerModel(kept, self.calibration, self.gravity, self.noise, held=judged, faces=faces)
 
     def _motion(self, force: Values, rests: Rests) -> Motion:
         return motion_of(rests.time, force, np.zeros_like(force), rests.temperature, still=True)
@@ -171,4 +199,6 @@ def model_of(
         return None
     gravity = float(settings["table"].get("gravity_g") or 1.0)
     held = rests_of("accelerometer", recordings, settings, role=HELD_OUT) or rests.select(rests.held_out)
-    return AccelerometerModel(rests.select(~rests.held_out), calibration, gravity, noise, held)
+    used = rests.select(~rests.held_out)
+    faces = faces_of(used, (used.reading - calibration.bias) @ calibration.matrix.T, settings)
+    return AccelerometerModel(used, calibration, gravity, noise, held=held, faces=faces)

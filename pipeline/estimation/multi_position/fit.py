@@ -362,11 +362,10 @@ def fit_robustly(
 
 def _over_noise(model: GyroscopeModel, found: Fit) -> tuple[Values, Values]:
     """Return t of each move, and its residual, deg."""
-    first = model.rests_equations
     C = model.equations(found.state).covariance(found.noise)
-    error = found.error[first:].reshape(-1, 2)
-    r = found.residual[first:].reshape(-1, 2) * error
-    variance = np.diag(C)[first:].reshape(-1, 2) * error**2 - model.excess[:, None]
+    error = found.error[model.of_moves].reshape(-1, 2)
+    r = found.residual[model.of_moves].reshape(-1, 2) * error
+    variance = np.diag(C)[model.of_moves].reshape(-1, 2) * error**2 - model.excess[:, None]
     size = np.sqrt(np.sum(r**2 / variance, axis=1))
     scale = float(np.median(size)) / np.sqrt(2.0 * np.log(2.0))
     return size / max(scale, 1e-12), np.linalg.norm(r, axis=1)

@@ -14,7 +14,7 @@ then shows where the move ended, with more noise than the mean.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -57,10 +57,14 @@ class Gravity:
         Standard deviation by the scatter of the accelerometer's rests.
     ends : (m,) array, g
         Standard deviation of each end beyond that, by what is not known of the creep.
+    root : (12, 12) array
+        Errors of the accelerometer's bias and matrix, each of one standard uncertainty and independent, in columns.
     shared : (m, 3, 12) array, g
-        What the errors of the accelerometer's calibration, each of its standard uncertainty, do to the force.
+        What they do to the force.
     creeping : (m,) array of bool
         Whether the half second next to a move is off the mean by more than 4 s.
+    moved : (12,) array
+        By how many of these errors the calibration was moved before all this was computed.
     """
 
     force: Values
@@ -68,14 +72,23 @@ class Gravity:
     at_end: Values
     spread: Values
     ends: Values
+    root: Values
     shared: Values
     creeping: NDArray[np.bool_]
+    moved: Values
 
 
 def observed_rests(
-    recordings: Sequence[Recording], accelerometer: SensorCalibration, settings: Mapping[str, Any], role: str = ROLE
+    recordings: Sequence[Recording],
+    accelerometer: SensorCalibration,
+    settings: Mapping[str, Any],
+    role: str = ROLE,
+    moved: Values | None = None,
 ) -> tuple[Rests, Gravity] | None:
-    """Return the gyroscope's rests and gravity at them, or None where the recordings of a role hold none."""
+    """Return the gyroscope's rests and gravity at them, or None where the recordings of a role hold none.
+
+    ``moved`` is added to bias and matrix of the accelerometer, (12,): gravity is linear in their errors from there on.
+    """
     of_force = rests_of("accelerometer", recordings, settings, accelerometer, role)
     of_rate = rests_of("gyroscope", recordings, settings, accelerometer, role)
     if of_force is None or of_rate is None:
@@ -87,15 +100,21 @@ def observed_rests(
     )
     if len(of_rate.time) == 0:
         return None
-    return of_rate, gravity_of(recordings, of_force, accelerometer)
+    return of_rate, gravity_of(recordings, of_force, accelerometer, moved)
 
 
-def gravity_of(recordings: Sequence[Recording], rests: Rests, accelerometer: SensorCalibration) -> Gravity:
-    """Return gravity at the rests of the accelerometer."""
+def gravity_of(
+    recordings: Sequence[Recording], rests: Rests, accelerometer: SensorCalibration, moved: Values | None = None
+) -> Gravity:
+    """Return gravity at the rests of the accelerometer; ``moved`` as of ``observed_rests``."""
+    root, moved = _root(accelerometer), np.zeros(12) if moved is None else moved
+    accelerometer = replace(
+        accelerometer, bias=accelerometer.bias + moved[:3], matrix=accelerometer.matrix + moved[3:].reshape(3, 3)
+    )
     white = float(np.mean(rests.white**2))
     force = _force(rests.reading, rests, accelerometer)
     u = _unit(force)
-    ends, moved, noise = [], np.zeros(len(u), bool), rests.share.copy()
+    ends, creeping, noise = [], np.zeros(len(u), bool), rests.share.copy()
     for at_start in (True, False):
         reading, share = _near(recordings, rests, at_start=at_start)
         near = _unit(_force(reading, rests, accelerometer))
@@ -104,11 +123,13 @@ def gravity_of(recordings: Sequence[Recording], rests: Rests, accelerometer: Sen
         creeps = np.linalg.norm(near - steady, axis=1) > SIGNIFICANT * np.sqrt(share * white)
         ends.append(np.where(creeps[:, None], near, steady))
         noise = np.where(creeps, np.maximum(noise, share), noise)
-        moved |= np.linalg.norm(near - u, axis=1) > SIGNIFICANT * np.sqrt(share * white)
+        creeping |= np.linalg.norm(near - u, axis=1) > SIGNIFICANT * np.sqrt(share * white)
     between = [float(stage.details.get("scatter_between_rests") or 0.0) for stage in accelerometer.stages]
     spread = np.sqrt(noise * white + max(between, default=0.0) ** 2)
     unsure = np.linalg.norm(force, axis=1) * np.radians(rests.creep_error) * 0.5 * rests.length
-    return Gravity(force, ends[0], ends[1], spread, unsure, _of_calibration(accelerometer, rests.reading), moved)
+    v = rests.reading - accelerometer.bias
+    shared = -accelerometer.matrix @ root[:3] + np.einsum("mj,ijp->mip", v, root[3:].reshape(3, 3, -1))
+    return Gravity(force, ends[0], ends[1], spread, unsure, root, shared, creeping, np.linalg.pinv(root) @ moved)
 
 
 def _force(reading: Values, rests: Rests, accelerometer: SensorCalibration) -> Values:
@@ -136,12 +157,10 @@ def _near(recordings: Sequence[Recording], rests: Rests, *, at_start: bool) -> t
     return reading, share
 
 
-def _of_calibration(accelerometer: SensorCalibration, reading: Values) -> Values:
-    """Return what errors of one standard uncertainty, independent of each other, do to the force: (m, 3, 12) array."""
+def _root(accelerometer: SensorCalibration) -> Values:
+    """Return the root of the covariance of bias and matrix; zeros where there is none."""
     if accelerometer.covariance is None:
-        return np.zeros((len(reading), 3, 12))
+        return np.zeros((12, 12))
     values, vectors = np.linalg.eigh(accelerometer.covariance[:12, :12])
-    root = vectors * np.sqrt(np.clip(values, 0.0, None))
-    v = reading - accelerometer.bias
-    change: Values = -accelerometer.matrix @ root[:3] + np.einsum("mj,ijp->mip", v, root[3:].reshape(3, 3, -1))
-    return change
+    root: Values = vectors * np.sqrt(np.clip(values, 0.0, None))
+    return root

@@ -15,7 +15,8 @@ where
 
 Two moves share the error of a rest's direction, and all share those of the accelerometer's calibration:
 ``du = (1 - u u^T) (M_a dy - M_a db_a + dM_a v_a) / G``. The frame is that of the accelerometer's matrix. One move does
-not show a turn about the vertical; other moves do, as the vertical is elsewhere in the body.
+not show a turn about the vertical; other moves do, as the vertical is elsewhere in the body. Where the procedure states
+the total angle of turns, their equations follow (``faces_and_turns``).
 
 Source: Tedaldi, Pretto & Menegatti, ICRA 2014, eq. 12.
 """
@@ -30,10 +31,12 @@ import numpy as np
 from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.multi_position.accelerometer import SMALLEST_NOISE, white_of
+from pipeline.estimation.multi_position.faces_and_turns import require_turns, turn_rows, with_stated_turns
 from pipeline.estimation.multi_position.gravity import observed_rests
 from pipeline.estimation.multi_position.model import Equations, State, effect_readings, motion_of
 from pipeline.estimation.multi_position.moves import moves_of, tangents, to_the_end
 from pipeline.model.kinematics import skew
+from pipeline.records import AXES
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -41,6 +44,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.estimation.design import Term
+    from pipeline.estimation.multi_position.fit import Fit
     from pipeline.estimation.multi_position.gravity import Gravity
     from pipeline.estimation.multi_position.moves import Moves
     from pipeline.estimation.multi_position.rests import Rests
@@ -51,6 +55,7 @@ if TYPE_CHECKING:
 FEWEST_MOVES = 6  # two equations each, for the nine of the matrix
 ROUNDS = 6
 SETTLED_DPS = 1e-7
+MOVED = "accelerometer_moved"
 
 
 class GyroscopeModel:
@@ -65,22 +70,33 @@ class GyroscopeModel:
         At each rest, by the accelerometer.
     noise : Noise or None
     fewest : int
-        Moves, below which none is looked at.
+        Moves, below which none is looked at, unless a stated turn is among them.
+    turns : mapping, optional
+        Section ``procedure.turns``.
     """
 
     sensor = "gyroscope"
 
     def __init__(
-        self, rests: Rests, moves: Moves | None, gravity: Gravity, noise: Noise | None, fewest: int = FEWEST_MOVES
+        self,
+        rests: Rests,
+        moves: Moves | None,
+        gravity: Gravity,
+        noise: Noise | None,
+        *,
+        fewest: int = FEWEST_MOVES,
+        turns: Mapping[str, Any] | None = None,
     ) -> None:
         force = gravity.force
         self.white = np.maximum(white_of(rests, noise), SMALLEST_NOISE)
         self.rests, self.force = rests.select(~rests.held_out), force[~rests.held_out]
         self.held, self.held_force = rests.select(rests.held_out), force[rests.held_out]
-        self.moves = moves if moves is not None and moves.count >= fewest else None
+        self.moves = moves if moves is not None and (moves.count >= fewest or moves.stated.any()) else None
+        self.turns = turn_rows(self.moves, turns) if self.moves is not None and turns else None
         self.kinds = 1 if self.moves is None else 2
         self.directions = np.eye(12)[:, : 3 if self.moves is None else 12]
         self.rests_equations = 3 * len(self.rests.time)
+        self.of_moves = slice(self.rests_equations, self.rests_equations + (2 * self.moves.count if self.moves else 0))
         self.gravity = float(np.median(np.linalg.norm(force, axis=1)))
         if self.moves is not None:
             self.before, self.after = gravity.at_end[self.moves.before], gravity.at_start[self.moves.after]
@@ -90,8 +106,10 @@ class GyroscopeModel:
             self.across = across
             self.ends = np.degrees(gravity.ends / self.gravity)[:, None, None] * across
             self.shared = np.degrees(across @ gravity.shared / self.gravity)
+            self.moved = gravity.moved
             self.excess = np.zeros(self.moves.count)
-        self.every, self.known = rests, (gravity, noise, fewest)
+        self.every = rests
+        self.known: dict[str, Any] = {"gravity": gravity, "noise": noise, "fewest": fewest, "turns": turns}
 
     def equations(self, state: State, candidates: Sequence[Term] = ()) -> Equations:
         """Return the linear form at some parameters."""
@@ -114,7 +132,7 @@ class GyroscopeModel:
         def stacked(name: str) -> Any:  # noqa: ANN401
             return np.concatenate([piece[name] for piece in pieces])
 
-        return Equations(
+        equations = Equations(
             residual=stacked("residual"),
             base=stacked("base") @ self.directions,
             effects=[np.concatenate(z) for z in zip(*(piece["effects"] for piece in pieces), strict=True)],
@@ -127,6 +145,11 @@ class GyroscopeModel:
             error=stacked("error"),
             common=_blocks([piece["common"] for piece in pieces], sizes),
             direction=_blocks([piece.get("direction") for piece in pieces], sizes),
+        )
+        if self.turns is None:
+            return equations
+        return equations.followed_by(
+            **self._of_turns(state, candidates), bias=np.zeros((3, len(self.turns.value), column))
         )
 
     def samples(self) -> float:
@@ -145,8 +168,7 @@ class GyroscopeModel:
 
     def with_excess(self, variance: Values) -> GyroscopeModel:
         """Return the model with an error of its own for each move, of a variance in deg^2: (k,) array."""
-        gravity, noise, fewest = self.known
-        out = GyroscopeModel(self.every, self.moves, gravity, noise, fewest)
+        out = GyroscopeModel(self.every, self.moves, **self.known)
         out.excess = variance
         return out
 
@@ -155,8 +177,7 @@ class GyroscopeModel:
         out = self.every.held_out.copy()
         out[~self.every.held_out] = held
         moves = None if self.moves is None else self.moves.select(~out[self.moves.after])
-        gravity, noise, fewest = self.known
-        return GyroscopeModel(replace(self.every, held_out=out), moves, gravity, noise, fewest)
+        return GyroscopeModel(replace(self.every, held_out=out), moves, **self.known)
 
     def direction_errors(self, state: State) -> tuple[Values, Values]:
         """Return the angle of each move between integrated and measured gravity, and its mean by noise alone, deg.
@@ -243,18 +264,65 @@ class GyroscopeModel:
             return np.asarray((W @ -np.einsum("ksej,ksjp->kep", PM, Z)).reshape(n, -1))
 
         apart = np.degrees(np.einsum("kej,kj->ke", E, self.after - predicted))
+        shared = np.einsum("kij,kjmc,mcp->kip", W, directions, self.shared).reshape(n, -1)
         return {
-            "residual": np.einsum("kij,kj->ki", W, apart).ravel(),
+            "residual": np.einsum("kij,kj->ki", W, apart).ravel() - shared @ self.moved,
             "base": (W @ base).reshape(n, 12),
             "effects": [columns(term) for term in state.terms],
             "candidates": [columns(term) for term in candidates],
             "bias": bias.reshape(3, n, moves.count),
             "error": np.sqrt(np.einsum("kii->ki", variance)).ravel(),
-            "common": self._common(W, directions),
+            "common": self._common(W, directions) + shared @ shared.T,
+            "shared": shared,
             "direction": self._of_directions(W, directions, np.sqrt(np.einsum("kii->ki", variance))),
             "start": moves.time[:, 0],
             "length": moves.time[:, -1] - moves.time[:, 0],
             "recording": self.every.recording[moves.after],
+        }
+
+    def turned_angles(self, state: State) -> Values:
+        """Return Phi, the integral of the calibrated rate over each move, in the body's axes: (k, 3) array, deg."""
+        assert self.moves is not None  # noqa: S101
+        angle: Values = np.einsum("ks,ksi->ki", self.moves.weight, self._turned(state)[1]) @ state.matrix.T
+        return angle
+
+    def describe_turns(self, state: State, recordings: Sequence[Recording]) -> list[dict[str, Any]]:
+        """Return recording, start in s, axis, stated and calibrated total angle in deg of each stated turn."""
+        assert self.moves is not None  # noqa: S101
+        angles = self.turned_angles(state)
+        return [
+            {
+                "recording": recordings[int(self.every.recording[self.moves.after[k]])].name,
+                "time_s": float(self.moves.time[k, 0]),
+                "axis": AXES[axis],
+                "stated_deg": float(self.moves.stated[k, axis]),
+                "angle_deg": float(angles[k, axis]),
+            }
+            for k, axis in zip(*np.nonzero(self.moves.stated), strict=True)
+        ]
+
+    def _of_turns(self, state: State, candidates: Sequence[Term]) -> dict[str, Any]:
+        moves, turns, M = self.moves, self.turns, state.matrix
+        assert moves is not None  # noqa: S101
+        assert turns is not None  # noqa: S101
+        motion, v, _ = self._turned(state)
+        total = np.einsum("ks,ksi->ki", moves.weight, v)
+        WM = turns.weight @ M
+        noise = np.einsum("rkc,c,k->r", WM**2, self.white**2, np.sum(moves.weight**2, axis=1))
+        error = np.sqrt(turns.error**2 + noise)
+        bias = -np.einsum("rkc,k->rc", WM, moves.weight.sum(axis=1))
+        matrix = np.einsum("rki,kj->rij", turns.weight, total).reshape(-1, 9)
+
+        def columns(term: Term) -> Values:
+            Z = term.effect.columns(self.sensor, motion, state.K, term.values).reshape(*moves.weight.shape, 3, -1)
+            return np.asarray(-np.einsum("rkc,ks,kscp->rp", WM, moves.weight, Z) / error[:, None])
+
+        return {
+            "residual": (turns.value - np.einsum("rkc,kc->r", WM, total)) / error,
+            "base": np.concatenate([bias, matrix], axis=1) @ self.directions / error[:, None],
+            "effects": [columns(term) for term in state.terms],
+            "candidates": [columns(term) for term in candidates],
+            "error": error,
         }
 
     def _directions(self, E: Values, A: Values) -> Values:
@@ -267,14 +335,21 @@ class GyroscopeModel:
         return out
 
     def _common(self, W: Values, directions: Values) -> Values:
-        """Return what the accelerometer's errors have in common for different moves: (2 k, 2 k) array."""
+        """Return what the errors of the rests' means have in common for different moves: (2 k, 2 k) array."""
         n = 2 * len(W)
         directions = np.einsum("kij,kjmc->kimc", W, directions)
         means = np.einsum("kimc,mcd->kimd", directions, self.spread).reshape(n, -1)
-        calibration = np.einsum("kimc,mcp->kip", directions, self.shared).reshape(n, -1)
         apart = np.kron(np.eye(len(W)), np.ones((2, 2))) == 0.0
-        common: Values = np.where(apart, means @ means.T, 0.0) + calibration @ calibration.T
+        common: Values = np.where(apart, means @ means.T, 0.0)
         return common
+
+    def accelerometer_errors(self, found: Fit) -> Values:
+        """Return the errors of the accelerometer's bias and matrix, as the moves tell them: (12,) array."""
+        equations = self.equations(found.state)
+        shared = np.zeros((len(equations.residual), 12))
+        shared[self.of_moves] = self._of_moves(found.state, ())["shared"]
+        white, _ = equations.whitened(found.noise, np.column_stack([shared, equations.residual]))
+        return np.asarray(-self.known["gravity"].root @ (white[:, :12].T @ white[:, 12]))
 
     def _of_directions(self, W: Values, directions: Values, error: Values) -> Values:
         """Return what errors of the rests' directions, as large as a typical white error, share: (2 k, 2 k) array."""
@@ -329,6 +404,8 @@ def model_of(
     noise: Noise | None,
     settings: Mapping[str, Any],
     accelerometer: SensorCalibration | None = None,
+    *,
+    moved: Values | None = None,
 ) -> GyroscopeModel | None:
     """Return the model of the recordings' rests and moves, or None where they hold no rest.
 
@@ -342,6 +419,8 @@ def model_of(
         Sections ``table`` and ``procedure``.
     accelerometer : SensorCalibration, optional
         Without it, the accelerometer is calibrated here; ``CannotCalibrateError`` where that fails.
+    moved : (12,) array, optional
+        As of ``gravity.observed_rests``; without it, as ``calibration`` states.
     """
     if accelerometer is None:
         try:
@@ -350,15 +429,20 @@ def model_of(
             raise CannotCalibrateError(
                 f"the gyroscope by hand needs the direction of gravity by a calibrated accelerometer: {lack.message}"
             ) from lack
-    observed = observed_rests(recordings, accelerometer, settings)
+    told = [stage.details for stage in calibration.stages] if calibration is not None else []
+    if moved is None:
+        moved = next((np.array(d[MOVED]) for d in told if MOVED in d), None)
+    observed = observed_rests(recordings, accelerometer, settings, moved=moved)
     if observed is None:
         return None
     rests, gravity = observed
-    moves = moves_of(recordings, rests)
+    moves, turns = moves_of(recordings, rests), settings["procedure"].get("turns")
+    if turns:
+        moves = moves and with_stated_turns(moves, rests, turns)
+        require_turns(moves, rests, recordings, turns)
     if moves is not None and calibration is not None:
-        told = [move for stage in calibration.stages for move in stage.details.get("moves_outlying", ())]
-        off = {(move["recording"], float(move["time_s"])) for move in told}
+        off = {(move["recording"], float(move["time_s"])) for d in told for move in d.get("moves_outlying", ())}
         names = [recordings[int(i)].name for i in rests.recording[moves.after]]
         keys = zip(names, moves.time[:, 0].tolist(), strict=True)
         moves = moves.select(np.array([key not in off for key in keys]))
-    return GyroscopeModel(rests, moves, gravity, noise)
+    return GyroscopeModel(rests, moves, gravity, noise, turns=turns)

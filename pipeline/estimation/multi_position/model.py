@@ -124,6 +124,38 @@ class Equations:
             _kernels={},
         )
 
+    def followed_by(
+        self,
+        *,
+        residual: Values,
+        base: Values,
+        effects: list[Values],
+        candidates: list[Values],
+        bias: Values,
+        error: Values,
+    ) -> Equations:
+        """Return these equations and further ones, of stated faces or turns, that no scatter adds to."""
+        more = len(residual)
+
+        def padded(block: Values | None) -> Values | None:
+            return None if block is None else np.pad(block, ((0, more), (0, more)))
+
+        pairs = ((self.effects, effects), (self.candidates, candidates))
+        both = [[np.concatenate(z) for z in zip(own, new, strict=True)] for own, new in pairs]
+        return replace(
+            self,
+            residual=np.concatenate([self.residual, residual]),
+            base=np.concatenate([self.base, base]),
+            effects=both[0],
+            candidates=both[1],
+            scatter=np.pad(self.scatter, ((0, 0), (0, more))),
+            bias=np.concatenate([self.bias, bias], axis=1),
+            error=np.concatenate([self.error, error]),
+            common=padded(self.common),
+            direction=padded(self.direction),
+            _kernels={},
+        )
+
     def covariance(self, noise: NoiseHypothesis) -> Values:
         """Return C: (n, n) array."""
         C = np.diag(1.0 + np.square(noise.scatter) @ self.scatter)

@@ -70,6 +70,8 @@ class Moves:
         0 beyond a move's end.
     doubt : (k, s, 3) array, deg
         Standard uncertainty, along one direction each, of the angle in the readings' axes: bends that share a sample.
+    stated : (k, 3) array, deg
+        Total angle that the procedure states, in the column of its axis; 0 where it states none.
     """
 
     before: NDArray[np.intp]
@@ -79,6 +81,7 @@ class Moves:
     temperature: Values
     weight: Values
     doubt: Values
+    stated: Values
 
     def select(self, index: NDArray[np.bool_]) -> Moves:
         """Return some of the moves."""
@@ -129,7 +132,7 @@ def moves_of(recordings: Sequence[Recording], rests: Rests) -> Moves | None:
     share = (time - rests.time[before][:, None]) / (rests.time[after] - rests.time[before])[:, None]
     warm = rests.temperature[before][:, None]
     temperature = warm + share * (rests.temperature[after][:, None] - warm)
-    return Moves(before, after, reading - taken, time, temperature, weight, doubt)
+    return Moves(before, after, reading - taken, time, temperature, weight, doubt, np.zeros((len(found), 3)))
 
 
 def _bends(reading: Values, weight: Values, least: float) -> tuple[Values, Values]:

@@ -1,0 +1,138 @@
+"""Faces and turns by hand, against the truth of a simulated unit, and the errors of recordings that lack one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from ferraris_session import PROCEDURE, Session, held_out, in_parts, simulated
+from scipy import stats
+
+from pipeline.errors import NotObservableError
+from pipeline.estimation.multi_position.gyroscope import model_of
+from pipeline.estimation.multi_position.model import State
+from pipeline.estimation.noise import estimate_noise, noise_of
+from pipeline.signal.hand_turns import multiples
+from pipeline.validation.attitude import gravity_direction
+
+FACE = np.radians(PROCEDURE["faces"]["accuracy_deg"])
+OFF_DIAGONAL = [4, 5, 6, 8, 9, 10]
+
+
+@pytest.fixture(scope="module")
+def whole() -> Session:
+    return held_out(simulated(2))
+
+
+def without(session: Session, start_s: float, stop_s: float) -> Session:
+    """Return the session without a part of its first recording."""
+    first, *others = session.recordings
+    time = first.time - first.time[0]
+    return replace(session, recordings=[first.select((time < start_s) | (time > stop_s)), *others])
+
+
+@pytest.mark.parametrize("sensor", ["accelerometer", "gyroscope"])
+def test_both_matrices_are_full_and_within_their_uncertainty(whole: Session, sensor: str) -> None:
+    error, u, freedom = whole.errors(sensor)
+    assert np.all(u > 0.0)
+    assert np.all(np.abs(error) < stats.t.ppf(1.0 - 1e-3 / 24, freedom) * u)
+
+
+def test_a_face_is_known_to_the_hand_and_the_length_of_gravity_to_the_noise(whole: Session) -> None:
+    _, u, _ = whole.errors("accelerometer")
+    # Two faces up and down tell each of these elements: the mean of two angles.
+    assert u[OFF_DIAGONAL] == pytest.approx(FACE / np.sqrt(2.0), rel=0.35)
+    assert u[[3, 7, 11]].max() < 0.1 * FACE
+
+
+def test_turns_alone_give_scale_and_direction_to_the_stated_accuracy() -> None:
+    turns = PROCEDURE["turns"]
+    session = in_parts(simulated(3))
+    found = session.fit("gyroscope")
+    _, u, _ = session.errors("gyroscope")
+    # The move of a turn adds what gravity before and after it says, so that no element is known worse than stated.
+    assert np.all(u[[3, 7, 11]] < 1.3 * turns["accuracy_deg"] / 360.0)
+    assert np.all(u[OFF_DIAGONAL] < 1.3 * np.radians(turns["axis_accuracy_deg"]))
+    told = found.stages[-1].details["turns"]
+    assert [(t["recording"], t["axis"], abs(t["stated_deg"])) for t in told] == [
+        (f"{axis}_rot", axis, 360.0) for axis in "xyz"
+    ]
+    assert all(abs(t["angle_deg"] - t["stated_deg"]) < 4.0 * turns["accuracy_deg"] for t in told)
+
+
+def test_an_accurate_stop_gives_an_accurate_scale() -> None:
+    stated = {"turns": PROCEDURE["turns"] | {"accuracy_deg": 0.3}}
+    session = in_parts(simulated(4, procedure=stated, course={"turn_error_deg": 0.3}))
+    error, u, freedom = session.errors("gyroscope")
+    assert np.median(u[[3, 7, 11]]) < 1.1 * 0.3 / 360.0  # an axis askew in the chip adds what its other elements leave
+    assert np.all(np.abs(error) < stats.t.ppf(1.0 - 1e-3 / 12, freedom) * u)
+
+
+def test_a_turn_of_other_angle_is_counted_in_multiples() -> None:
+    assert multiples(np.array([3.0, -718.0, 20.0]), 360.0) == (1, -2)
+    assert multiples(np.array([181.0, 5.0, -7.0]), 90.0) == (0, 2)
+    assert multiples(np.array([90.0, 1.0, 0.0]), 360.0) == (0, 0)
+    assert multiples(np.array([300.0, 1.0, 0.0]), 360.0)[1] == 0
+    assert multiples(np.array([360.0, 120.0, 0.0]), 360.0)[1] == 0
+
+
+def test_every_second_turn_is_held_out_and_judged(whole: Session) -> None:
+    roles = [r.role for r in whole.recordings]
+    assert roles.count("validation") == 3
+    assert all(r.start_s is None or r.detail.endswith("found") for part in whole.recordings for r in part.notes)
+    fits = {sensor: whole.fit(sensor) for sensor in ("accelerometer", "gyroscope")}
+    noise = estimate_noise("gyroscope", whole.recordings, whole.settings["sensor"]["gyroscope"])
+    found = gravity_direction(fits["accelerometer"], fits["gyroscope"], whole.recordings, noise, whole.settings)
+    assert found["moves"] == 3
+    assert found["mean_deg"]["after"] < 3.0 * found["noise_floor_deg"] < 0.1 * found["mean_deg"]["before"]
+    turns = found["turns"]
+    assert [t["axis"] for t in turns] == ["x", "y", "z"]
+    assert all(t["stated_deg"] == -360.0 for t in turns)
+    assert all(abs(t["angle_deg"]["after"] + 360.0) < 12.0 for t in turns)
+
+
+def test_a_rotation_of_the_case_changes_both_frames_and_no_move(whole: Session) -> None:
+    """The moves tell nothing of the common frame: else the gyroscope would claim to know it better than the faces."""
+    gyroscope, accelerometer = whole.fit("gyroscope"), whole.fit("accelerometer")
+    noise = noise_of("gyroscope", whole.recordings, whole.settings)
+    model = model_of(whole.recordings, gyroscope, noise, whole.settings)
+    assert model is not None
+    piece = model._of_moves(State(gyroscope.bias, gyroscope.matrix), ())
+    for x in range(3):
+        R = np.zeros((3, 3))
+        R[(x + 1) % 3, (x + 2) % 3], R[(x + 2) % 3, (x + 1) % 3] = -1.0, 1.0
+        turned = np.append(np.zeros(3), (R @ gyroscope.matrix).ravel())
+        felt = np.linalg.pinv(model.known["gravity"].root) @ np.append(np.zeros(3), (R @ accelerometer.matrix).ravel())
+        moved, known = piece["base"] @ turned, piece["shared"] @ felt
+        assert np.linalg.norm(moved - known) * np.sqrt(0.5) * FACE < 1.0
+        assert np.linalg.norm(moved) * FACE > 20.0
+
+
+def test_a_missing_face_is_named() -> None:
+    session = simulated(5)
+    first = session.recordings[0]
+    assert first.accelerometer is not None
+    down = first.accelerometer[:, 1] < -0.8
+    gone = replace(session, recordings=[first.select(~down), *session.recordings[1:]])
+    with pytest.raises(NotObservableError, match=r"no rest with body -y up, within 15 deg: .*Nearest to up"):
+        gone.fit("accelerometer")
+
+
+def test_a_missing_turn_is_named_with_the_largest_about_its_axis() -> None:
+    session = simulated(6, course={"turns": 1, "both_directions": False})
+    first = session.recordings[0]
+    assert first.gyroscope is not None
+    fast = np.flatnonzero(np.abs(first.gyroscope[:, 2]) > 90.0)
+    cut = without(session, *(first.time[[fast[0] - 50, len(first.time) - 1]] - first.time[0]))
+    with pytest.raises(NotObservableError, match=r"no turn about z by a multiple of 360 deg.* the largest about z is"):
+        cut.fit("gyroscope")
+
+
+def test_an_implausible_angle_is_named_in_whole_and_in_parts() -> None:
+    stated = {"turns": PROCEDURE["turns"] | {"angle_deg": 500.0}}
+    session = simulated(7, procedure=stated)
+    with pytest.raises(NotObservableError, match=r"no turn about x by a multiple of 500 deg.*is \((-)?3\d\d\.\d, "):
+        session.fit("gyroscope")
+    with pytest.raises(NotObservableError, match=r"recording x_rot is no turn about x by a multiple of 500 deg"):
+        in_parts(session).fit("gyroscope")
