@@ -21,7 +21,7 @@ import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.estimation.design import Term
-from pipeline.estimation.multi_position.faces_and_turns import with_stated_turns
+from pipeline.estimation.multi_position.faces_and_turns import turns_of
 from pipeline.estimation.multi_position.gravity import observed_rests
 from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
 from pipeline.estimation.multi_position.model import State
@@ -233,9 +233,9 @@ def gravity_direction(
         return {"reason": "no rest is held out"}
     rests, gravity = observed
     judged = replace(rests, held_out=~rests.held_out)
-    moves, turns = moves_of(recordings, judged), settings["procedure"].get("turns")
-    moves = with_stated_turns(moves, judged, turns) if moves and turns else moves
-    model = GyroscopeModel(judged, moves, gravity, noise, fewest=1)
+    stated, whole = settings["procedure"].get("turns"), role if role == HELD_OUT else ""
+    turns = turns_of(recordings, judged, accelerometer, stated, whole)[0] if stated else None
+    model = GyroscopeModel(judged, moves_of(recordings, judged), gravity, noise, fewest=1, turns=turns)
     if model.moves is None:
         return {"reason": "no move is held out"}
     terms = tuple(Term(effect(e.name), e.values) for e in gyroscope.effects)
@@ -244,7 +244,7 @@ def gravity_direction(
     after, floor = model.direction_errors(calibrated)
     own = {}
     if turns:
-        pairs = (model.describe_turns(state, recordings) for state in (raw, calibrated))
+        pairs = (model.described_turns(state) for state in (raw, calibrated))
         own["turns"] = [
             {**last, "angle_deg": {"before": first["angle_deg"], "after": last["angle_deg"]}}
             for first, last in zip(*pairs, strict=True)

@@ -68,7 +68,7 @@ def fit(
         )
     noise = noise_of("gyroscope", recordings, settings)
     model = model_of(recordings, None, noise, settings)
-    if model is None or model.moves is None:
+    if model is None or (model.moves is None and model.turns is None):
         raise NotObservableError(
             f"the gyroscope's matrix needs at least {FEWEST_MOVES} moves between rests, without gaps or clipped "
             f"readings: {ADVICE}"
@@ -80,14 +80,14 @@ def fit(
     fitted = partial(fit_by_hand, start=start, hypotheses=noises, limits={})
     model, found, outlying = fit_robustly(model, fitted, recordings)
     moved, faces = np.zeros(12), settings["procedure"].get("faces")
-    for _ in range(MOVED_TIMES if faces else 0):
+    for _ in range(MOVED_TIMES if faces and model.moves else 0):
         moved = model.accelerometer_errors(found)
         model = model_of(recordings, None, noise, settings, moved=moved)
         assert model is not None  # noqa: S101
         model, found, outlying = fit_robustly(model, partial(fitted, start=found.state), recordings)
-    assert model.moves is not None  # noqa: S101
+    moves = model.moves.count if model.moves else 0
     names = [f"bias_{a}" for a in AXES] + [f"matrix_{a}{b}" for a in AXES for b in AXES]
-    _require_known(names, np.sqrt(np.diag(found.covariance)), model.moves.count)
+    _require_known(names, np.sqrt(np.diag(found.covariance)), moves)
     values = np.concatenate([found.state.bias, found.state.matrix.ravel()])
     uncertainty = np.sqrt(np.diag(found.covariance))
     parameters = {
@@ -96,12 +96,12 @@ def fit(
     }
     apart = found.residual[model.of_moves] * found.error[model.of_moves]
     at_rest = found.residual[: model.rests_equations] * found.error[: model.rests_equations]
-    details = {
+    details: dict[str, Any] = {
         "rests": len(model.rests.time),
-        "moves": model.moves.count,
-        "direction_error_rms_deg": float(np.sqrt(np.mean(apart**2))),
+        "moves": moves,
+        "direction_error_rms_deg": float(np.sqrt(np.mean(apart**2))) if moves else None,
         "scatter_of_rests": found.noise.scatter[0],
-        "scatter_of_moves": found.noise.scatter[1],
+        "scatter_of_moves": found.noise.scatter[1] if moves else None,
         "scatter_of_directions": found.noise.direction,
         "moves_weighted_down": len(outlying),
         "moves_outlying": outlying,
@@ -111,7 +111,7 @@ def fit(
     if faces:
         details[MOVED] = moved.tolist()
     if model.turns is not None:
-        details["turns"] = model.describe_turns(found.state, recordings)
+        details["turns"] = model.described_turns(found.state)
     correction = {"steps": [{"subtract": found.state.bias.tolist()}, {"matrix": found.state.matrix.tolist()}]}
     result = StageResult(NAME, parameters, float(np.sqrt(np.mean(at_rest**2))), correction, details)
     calibration = SensorCalibration(

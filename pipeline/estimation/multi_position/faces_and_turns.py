@@ -19,11 +19,14 @@ of three-axial rate gyro and accelerometers, Sensors and Materials 7 (1995), 311
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pipeline.errors import NotObservableError
+from pipeline.estimation.multi_position.moves import sound_span
+from pipeline.estimation.multi_position.rests import ROLE
 from pipeline.records import AXES
 from pipeline.signal.hand_turns import ACROSS, multiples
 
@@ -32,9 +35,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.estimation.multi_position.moves import Moves
     from pipeline.estimation.multi_position.rests import Rests
-    from pipeline.records import Recording
+    from pipeline.records import Recording, SensorCalibration
 
     Values = NDArray[np.float64]
 
@@ -98,75 +100,163 @@ def faces_of(rests: Rests, force: Values, settings: Mapping[str, Any]) -> Faces 
 
 
 @dataclass(frozen=True)
-class TurnRows:
-    """Equations ``sum_k weight_k . Phi_k = value +- error`` of stated turns: (r, k, 3), (r,) and (r,) arrays, deg."""
+class Turns:
+    """The samples of turns of a stated total angle, padded to the longest, and their equations.
 
+    Attributes
+    ----------
+    name : tuple of str
+        Of each turn's recording.
+    stated : (t, 3) array, deg
+        Total angle, in the column of its axis.
+    found : (t, 3) array, deg
+        Integral of the readings less those at rest.
+    reading, force : (t, s, 3) array, deg/s and g
+        Angular rate as it was read; specific force by the calibrated accelerometer.
+    time, temperature : (t, s) array, s and degC
+    weight : (t, s) array, s
+        In an integral by the trapezoidal rule; 0 beyond a turn's end.
+    rows : (r, t, 3) array
+        Weights of Phi in the equations.
+    value, error : (r,) array, deg
+        Of the equations, and standard uncertainty.
+    """
+
+    name: tuple[str, ...]
+    stated: Values
+    found: Values
+    reading: Values
+    force: Values
+    time: Values
+    temperature: Values
     weight: Values
+    rows: Values
     value: Values
     error: Values
 
 
-def turn_rows(moves: Moves, turns: Mapping[str, Any]) -> TurnRows | None:
-    """Return the equations of the moves whose total angle is stated; None where there is none."""
+def turns_of(
+    recordings: Sequence[Recording],
+    rests: Rests,
+    accelerometer: SensorCalibration,
+    turns: Mapping[str, Any],
+    role: str = ROLE,
+) -> tuple[Turns | None, list[tuple[Recording, float, Values]]]:
+    """Return the moves that are turns by a multiple of the stated angle, and all moves.
+
+    A move goes from one rest to the next of its recording. A recording that the procedure calls a turn about an axis is
+    one move as a whole where two rests bound none.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+    rests : Rests
+        All of the gyroscope. A move that ends at one that is held out is left out.
+    accelerometer : SensorCalibration
+    turns : mapping
+        Section ``procedure.turns``.
+    role : str
+        Of the recordings that may be a turn as a whole; empty for none.
+
+    Returns
+    -------
+    Turns or None
+    list of (Recording, float, (3,) array)
+        Recording, start in s and integrated readings in deg of each move.
+    """
+    spans = [
+        (int(rests.recording[j]), slice(int(rests.span[i, 1]) - 1, int(rests.span[j, 0]) + 1))
+        for i, j in pairwise(range(len(rests.time)))
+        if rests.recording[i] == rests.recording[j] and not rests.held_out[j]
+    ]
+    bounded = {index for index, _ in spans}
+    spans += [
+        (index, slice(0, r.samples))
+        for index, r in enumerate(recordings)
+        if r.axis is not None and r.role == role and r.gyroscope is not None and index not in bounded
+    ]
+    spans = [(index, span) for index, span in spans if sound_span(recordings[index], span)]
+    angle_deg, bias = float(turns["angle_deg"]), np.average(rests.reading, axis=0, weights=rests.count)
+    moves, chosen, stated = [], [], []
+    for index, span in spans:
+        recording = recordings[index]
+        angle = np.asarray(
+            np.trapezoid(np.asarray(recording.gyroscope)[span] - bias, recording.time[span], axis=0), np.float64
+        )
+        axis, count = multiples(angle, angle_deg)
+        moves.append((recording, float(recording.time[span.start]), angle))
+        if count:
+            chosen.append((recording, span, angle))
+            stated.append(count * angle_deg * np.eye(3)[axis])
+    return (_padded(chosen, np.array(stated), accelerometer, turns) if chosen else None), moves
+
+
+def _padded(
+    chosen: Sequence[tuple[Recording, slice, Values]],
+    stated: Values,
+    accelerometer: SensorCalibration,
+    turns: Mapping[str, Any],
+) -> Turns:
+    shape = (len(chosen), max(span.stop - span.start for _, span, _ in chosen))
+    reading, force = np.zeros((*shape, 3)), np.zeros((*shape, 3))
+    time, temperature, weight = np.zeros(shape), np.full(shape, np.nan), np.zeros(shape)
+    for k, (recording, span, _) in enumerate(chosen):
+        at = np.minimum(np.arange(shape[1]) + span.start, span.stop - 1)
+        felt = np.asarray(recording.accelerometer)[at] - accelerometer.bias
+        reading[k], force[k], time[k] = (
+            np.asarray(recording.gyroscope)[at],
+            felt @ accelerometer.matrix.T,
+            recording.time[at],
+        )
+        if recording.temperature is not None:
+            temperature[k] = recording.temperature[at]
+        step = np.diff(time[k])
+        weight[k, :-1] += 0.5 * step
+        weight[k, 1:] += 0.5 * step
     rows, value, error = [], [], []
-    for k, axis in zip(*np.nonzero(moves.stated), strict=True):
-        rows.append(np.outer(np.eye(moves.count)[k], np.eye(3)[axis]))
-        value.append(moves.stated[k, axis])
+    for k, axis in zip(*np.nonzero(stated), strict=True):
+        rows.append(np.outer(np.eye(len(chosen))[k], np.eye(3)[axis]))
+        value.append(stated[k, axis])
         error.append(float(turns["accuracy_deg"]))
-    for axis in np.flatnonzero(np.any(moves.stated, axis=0)):
-        share = np.degrees(np.sign(moves.stated[:, axis]) / np.sum(np.abs(moves.stated[:, axis])))
+    for axis in np.flatnonzero(np.any(stated, axis=0)):
+        share = np.degrees(np.sign(stated[:, axis]) / np.sum(np.abs(stated[:, axis])))
         rows += [share[:, None] * e for i, e in enumerate(np.eye(3)) if i != axis]
         value += [0.0, 0.0]
         error += 2 * [float(turns["axis_accuracy_deg"])]
-    return TurnRows(np.array(rows), np.array(value), np.array(error)) if rows else None
+    names, found = tuple(r.name for r, _, _ in chosen), np.array([angle for _, _, angle in chosen])
+    samples = reading, force, time, temperature, weight
+    return Turns(names, stated, found, *samples, np.array(rows), np.array(value), np.array(error))
 
 
-def integrated(moves: Moves, rests: Rests) -> Values:
-    """Return the integral of each move's readings, less those of the rests beside it: (k, 3) array, deg."""
-    bias = 0.5 * (rests.reading[moves.before] + rests.reading[moves.after])
-    angle: Values = np.einsum("ks,ksi->ki", moves.weight, moves.reading - bias[:, None])
-    return angle
-
-
-def with_stated_turns(moves: Moves, rests: Rests, turns: Mapping[str, Any]) -> Moves:
-    """Return moves that know which of them are turns by a multiple of the stated angle."""
-    stated = np.zeros((moves.count, 3))
-    for k, angle in enumerate(integrated(moves, rests)):
-        axis, count = multiples(angle, float(turns["angle_deg"]))
-        stated[k, axis] = count * float(turns["angle_deg"])
-    return replace(moves, stated=stated)
-
-
-def require_turns(moves: Moves | None, rests: Rests, recordings: Sequence[Recording], turns: Mapping[str, Any]) -> None:
+def require_turns(
+    found: Turns | None, moves: Sequence[tuple[Recording, float, Values]], turns: Mapping[str, Any]
+) -> None:
     """Raise where an axis has no stated turn, or a recording that is a turn about an axis holds another one.
 
     Raises
     ------
     NotObservableError
     """
-    angle_deg = float(turns["angle_deg"])
-    found = np.zeros((0, 3)) if moves is None else integrated(moves, rests)
-    stated = np.zeros((0, 3)) if moves is None else moves.stated
-    where = [] if moves is None else [recordings[int(i)] for i in rests.recording[moves.after]]
-    begin = [] if moves is None else moves.time[:, 0].tolist()
-    expected = f"a multiple of {angle_deg:g} deg, within a tenth and a quarter of {angle_deg:g} deg"
+    expected = f"a multiple of {float(turns['angle_deg']):g} deg, within a tenth of it and a quarter of that angle"
     advice = (
         "turn the unit from rest to rest about each body axis, and state the angle in procedure.turns.angle_deg; an "
         "angle that is wrong in all turns shows a wrong unit or range of the gyroscope"
     )
-    for part in {id(r): r for r in recordings if r.axis is not None and r.role == "rests"}.values():
-        own = [k for k, r in enumerate(where) if r is part]
-        if not any(stated[k, AXES.index(part.axis)] for k in own):
-            seen = ", ".join(_angles(found[k]) for k in own) or "no move between two rests of a second or more"
+    stated = np.zeros((0, 3)) if found is None else found.stated
+    names = () if found is None else found.name
+    for part in {id(r): r for r, _, _ in moves if r.axis is not None}.values():
+        own = [row for name, row in zip(names, stated, strict=True) if name == part.name]
+        if not any(row[AXES.index(str(part.axis))] for row in own):
+            seen = ", ".join(_angles(angle) for r, _, angle in moves if r is part)
             raise NotObservableError(
                 f"recording {part.name} is no turn about {part.axis} by {expected}: the readings show {seen}; {advice}",
                 part.source.get("file"),
             )
     for axis, name in enumerate(AXES):
         if not np.any(stated[:, axis]):
-            about = [k for k, a in enumerate(found) if np.linalg.norm(np.delete(a, axis)) < ACROSS * abs(a[axis])]
-            k = max(about, key=lambda k: abs(found[k, axis]), default=None)
-            seen = "none" if k is None else f"{_angles(found[k])} at {begin[k]:.1f} s of {where[k].name}"
+            about = [m for m in moves if np.linalg.norm(np.delete(m[2], axis)) < ACROSS * abs(m[2][axis])]
+            largest = max(about, key=lambda m: abs(m[2][axis]), default=None)
+            seen = f"{_angles(largest[2])} at {largest[1]:.1f} s of {largest[0].name}" if largest else "none"
             raise NotObservableError(
                 f"there is no turn about {name} by {expected}; the largest about {name} is {seen}: {advice}"
             )

@@ -319,7 +319,6 @@ def fit_robustly(
     Parameters
     ----------
     model : GyroscopeModel
-        With moves.
     fitted : callable
         Fits a model.
     recordings : sequence of Recording
@@ -331,7 +330,9 @@ def fit_robustly(
     list of dict
         The outlying moves: ``recording, time_s, error_deg, over_noise, weight``.
     """
-    found = fitted(model)
+    found, moves = fitted(model), model.moves
+    if moves is None:
+        return model, found, []
     t, error = _over_noise(model, found)
     limit = np.sqrt(2.0 * np.log(len(t) / FALSE_ALARM))
     excess, weight = np.zeros(len(t)), np.ones(len(t))
@@ -345,8 +346,6 @@ def fit_robustly(
         model = model.with_excess(excess)
         found = fitted(model)
         t, error = _over_noise(model, found)
-    moves = model.moves
-    assert moves is not None  # noqa: S101
     outlying = [
         {
             "recording": recordings[int(model.every.recording[moves.after[k]])].name,

