@@ -112,7 +112,10 @@ def cut(
                 role=segment.role,
                 axis=segment.axis,
                 table_rate=part.table_rate if segment.axis is not None else _size_of_rate(part),
-                notes=(*(recording.notes if not out else ()), _note(recording, segment, found=found or windows is None)),
+                notes=(
+                    *(recording.notes if not out else ()),
+                    _note(recording, segment, found=found or windows is None),
+                ),
             )
         )
     return out

@@ -251,7 +251,9 @@ def add_recording_options(parser: argparse.ArgumentParser) -> None:
     add("--pause", dest="pause_s", type=float, metavar="S", help="between recordings (30)")
     add("--thermal-ramp", dest="thermal_ramp_degc", type=float, metavar="DEGC",
         help="of thermal_ramp: up and down (15)")  # fmt: skip
-    add("--turn-error", dest="turn_error_deg", type=float, metavar="DEG", help="of a hand's total angle in ferraris (3)")
+    add(
+        "--turn-error", dest="turn_error_deg", type=float, metavar="DEG", help="of a hand's total angle in ferraris (3)"
+    )
     add("--turn-axis-error", dest="turn_axis_error_deg", type=float, metavar="DEG", help="of its turn axis (1.5)")
 
 

@@ -244,7 +244,7 @@ def gravity_direction(
     after, floor = model.direction_errors(calibrated)
     own = {}
     if turns:
-        pairs = (model.described_turns(state) for state in (raw, calibrated))
+        pairs = (turns.described(state) for state in (raw, calibrated))
         own["turns"] = [
             {**last, "angle_deg": {"before": first["angle_deg"], "after": last["angle_deg"]}}
             for first, last in zip(*pairs, strict=True)

@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import NotObservableError
+from pipeline.estimation.multi_position.model import effect_readings, motion_of
 from pipeline.estimation.multi_position.moves import sound_span
 from pipeline.estimation.multi_position.rests import ROLE
 from pipeline.records import AXES
@@ -35,8 +36,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from pipeline.estimation.design import Term
+    from pipeline.estimation.multi_position.model import State
     from pipeline.estimation.multi_position.rests import Rests
-    from pipeline.records import Recording, SensorCalibration
+    from pipeline.records import Motion, Recording, SensorCalibration
 
     Values = NDArray[np.float64]
 
@@ -109,8 +112,6 @@ class Turns:
         Of each turn's recording.
     stated : (t, 3) array, deg
         Total angle, in the column of its axis.
-    found : (t, 3) array, deg
-        Integral of the readings less those at rest.
     reading, force : (t, s, 3) array, deg/s and g
         Angular rate as it was read; specific force by the calibrated accelerometer.
     time, temperature : (t, s) array, s and degC
@@ -124,7 +125,6 @@ class Turns:
 
     name: tuple[str, ...]
     stated: Values
-    found: Values
     reading: Values
     force: Values
     time: Values
@@ -133,6 +133,49 @@ class Turns:
     rows: Values
     value: Values
     error: Values
+
+    def equations(self, state: State, candidates: Sequence[Term], white: Values, directions: Values) -> dict[str, Any]:
+        """Return residual, columns and errors, as of ``model.Equations``; ``white`` (3,) is the noise of a sample."""
+        WM = self.rows @ state.matrix
+        motion, v = self._samples(state)
+        total = np.einsum("ts,tsi->ti", self.weight, v)
+        noise = np.einsum("rtc,c,t->r", WM**2, white**2, np.sum(self.weight**2, axis=1))
+        error = np.sqrt(self.error**2 + noise)
+        bias = -np.einsum("rtc,t->rc", WM, self.weight.sum(axis=1))
+        matrix = np.einsum("rti,tj->rij", self.rows, total).reshape(-1, 9)
+
+        def columns(term: Term) -> Values:
+            Z = term.effect.columns("gyroscope", motion, state.K, term.values).reshape(*self.weight.shape, 3, -1)
+            return np.asarray(-np.einsum("rtc,ts,tscp->rp", WM, self.weight, Z) / error[:, None])
+
+        return {
+            "residual": (self.value - np.einsum("rtc,tc->r", WM, total)) / error,
+            "base": np.concatenate([bias, matrix], axis=1) @ directions / error[:, None],
+            "effects": [columns(term) for term in state.terms],
+            "candidates": [columns(term) for term in candidates],
+            "error": error,
+        }
+
+    def described(self, state: State) -> list[dict[str, Any]]:
+        """Return recording, start in s, axis, stated and calibrated total angle in deg of each turn."""
+        angles = np.einsum("ts,tsi->ti", self.weight, self._samples(state)[1]) @ state.matrix.T
+        return [
+            {
+                "recording": self.name[t],
+                "time_s": float(self.time[t, 0]),
+                "axis": AXES[axis],
+                "stated_deg": float(self.stated[t, axis]),
+                "angle_deg": float(angles[t, axis]),
+            }
+            for t, axis in zip(*np.nonzero(self.stated), strict=True)
+        ]
+
+    def _samples(self, state: State) -> tuple[Motion, Values]:
+        """Return the motion of all samples, and ``v = y - b - z``."""
+        plain = self.reading - state.bias
+        force, rate = self.force.reshape(-1, 3), (plain @ state.matrix.T).reshape(-1, 3)
+        motion = motion_of(self.time.ravel(), force, rate, self.temperature.ravel(), still=False)
+        return motion, plain - effect_readings("gyroscope", state.terms, motion, state.K).reshape(plain.shape)
 
 
 def turns_of(
@@ -186,21 +229,21 @@ def turns_of(
         axis, count = multiples(angle, angle_deg)
         moves.append((recording, float(recording.time[span.start]), angle))
         if count:
-            chosen.append((recording, span, angle))
+            chosen.append((recording, span))
             stated.append(count * angle_deg * np.eye(3)[axis])
     return (_padded(chosen, np.array(stated), accelerometer, turns) if chosen else None), moves
 
 
 def _padded(
-    chosen: Sequence[tuple[Recording, slice, Values]],
+    chosen: Sequence[tuple[Recording, slice]],
     stated: Values,
     accelerometer: SensorCalibration,
     turns: Mapping[str, Any],
 ) -> Turns:
-    shape = (len(chosen), max(span.stop - span.start for _, span, _ in chosen))
+    shape = (len(chosen), max(span.stop - span.start for _, span in chosen))
     reading, force = np.zeros((*shape, 3)), np.zeros((*shape, 3))
     time, temperature, weight = np.zeros(shape), np.full(shape, np.nan), np.zeros(shape)
-    for k, (recording, span, _) in enumerate(chosen):
+    for k, (recording, span) in enumerate(chosen):
         at = np.minimum(np.arange(shape[1]) + span.start, span.stop - 1)
         felt = np.asarray(recording.accelerometer)[at] - accelerometer.bias
         reading[k], force[k], time[k] = (
@@ -223,9 +266,8 @@ def _padded(
         rows += [share[:, None] * e for i, e in enumerate(np.eye(3)) if i != axis]
         value += [0.0, 0.0]
         error += 2 * [float(turns["axis_accuracy_deg"])]
-    names, found = tuple(r.name for r, _, _ in chosen), np.array([angle for _, _, angle in chosen])
     samples = reading, force, time, temperature, weight
-    return Turns(names, stated, found, *samples, np.array(rows), np.array(value), np.array(error))
+    return Turns(tuple(r.name for r, _ in chosen), stated, *samples, np.array(rows), np.array(value), np.array(error))
 
 
 def require_turns(

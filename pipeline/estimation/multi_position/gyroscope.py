@@ -36,7 +36,6 @@ from pipeline.estimation.multi_position.gravity import observed_rests
 from pipeline.estimation.multi_position.model import Equations, State, effect_readings, motion_of
 from pipeline.estimation.multi_position.moves import moves_of, tangents, to_the_end
 from pipeline.model.kinematics import skew
-from pipeline.records import AXES
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -106,7 +105,6 @@ class GyroscopeModel:
             self.across = across
             self.ends = np.degrees(gravity.ends / self.gravity)[:, None, None] * across
             self.shared = np.degrees(across @ gravity.shared / self.gravity)
-            self.moved = gravity.moved
             self.excess = np.zeros(self.moves.count)
         self.every = rests
         self.known: dict[str, Any] = {"gravity": gravity, "noise": noise, "fewest": fewest, "turns": turns}
@@ -148,9 +146,8 @@ class GyroscopeModel:
         )
         if self.turns is None:
             return equations
-        return equations.followed_by(
-            **self._of_turns(state, candidates), bias=np.zeros((3, len(self.turns.value), column))
-        )
+        of_turns = self.turns.equations(state, candidates, self.white, self.directions)
+        return equations.followed_by(**of_turns, bias=np.zeros((3, len(self.turns.value), column)))
 
     def samples(self) -> float:
         """Return how many samples are behind the equations."""
@@ -266,7 +263,7 @@ class GyroscopeModel:
         apart = np.degrees(np.einsum("kej,kj->ke", E, self.after - predicted))
         shared = np.einsum("kij,kjmc,mcp->kip", W, directions, self.shared).reshape(n, -1)
         return {
-            "residual": np.einsum("kij,kj->ki", W, apart).ravel() - shared @ self.moved,
+            "residual": np.einsum("kij,kj->ki", W, apart).ravel() - shared @ self.known["gravity"].moved,
             "base": (W @ base).reshape(n, 12),
             "effects": [columns(term) for term in state.terms],
             "candidates": [columns(term) for term in candidates],
@@ -278,54 +275,6 @@ class GyroscopeModel:
             "start": moves.time[:, 0],
             "length": moves.time[:, -1] - moves.time[:, 0],
             "recording": self.every.recording[moves.after],
-        }
-
-    def described_turns(self, state: State) -> list[dict[str, Any]]:
-        """Return recording, start in s, axis, stated and calibrated total angle in deg of each stated turn."""
-        turns = self.turns
-        assert turns is not None  # noqa: S101
-        angles = np.einsum("ts,tsi->ti", turns.weight, self._in_turns(state)[1]) @ state.matrix.T
-        return [
-            {
-                "recording": turns.name[t],
-                "time_s": float(turns.time[t, 0]),
-                "axis": AXES[axis],
-                "stated_deg": float(turns.stated[t, axis]),
-                "angle_deg": float(angles[t, axis]),
-            }
-            for t, axis in zip(*np.nonzero(turns.stated), strict=True)
-        ]
-
-    def _in_turns(self, state: State) -> tuple[Motion, Values]:
-        """Return the motion of all samples of the stated turns, and ``v = y - b - z``."""
-        turns = self.turns
-        assert turns is not None  # noqa: S101
-        plain = turns.reading - state.bias
-        force, rate = turns.force.reshape(-1, 3), (plain @ state.matrix.T).reshape(-1, 3)
-        motion = motion_of(turns.time.ravel(), force, rate, turns.temperature.ravel(), still=False)
-        return motion, plain - effect_readings(self.sensor, state.terms, motion, state.K).reshape(plain.shape)
-
-    def _of_turns(self, state: State, candidates: Sequence[Term]) -> dict[str, Any]:
-        turns = self.turns
-        assert turns is not None  # noqa: S101
-        WM = turns.rows @ state.matrix
-        motion, v = self._in_turns(state)
-        total = np.einsum("ts,tsi->ti", turns.weight, v)
-        noise = np.einsum("rtc,c,t->r", WM**2, self.white**2, np.sum(turns.weight**2, axis=1))
-        error = np.sqrt(turns.error**2 + noise)
-        bias = -np.einsum("rtc,t->rc", WM, turns.weight.sum(axis=1))
-        matrix = np.einsum("rti,tj->rij", turns.rows, total).reshape(-1, 9)
-
-        def columns(term: Term) -> Values:
-            Z = term.effect.columns(self.sensor, motion, state.K, term.values).reshape(*turns.weight.shape, 3, -1)
-            return np.asarray(-np.einsum("rtc,ts,tscp->rp", WM, turns.weight, Z) / error[:, None])
-
-        return {
-            "residual": (turns.value - np.einsum("rtc,tc->r", WM, total)) / error,
-            "base": np.concatenate([bias, matrix], axis=1) @ self.directions / error[:, None],
-            "effects": [columns(term) for term in state.terms],
-            "candidates": [columns(term) for term in candidates],
-            "error": error,
         }
 
     def _directions(self, E: Values, A: Values) -> Values:
