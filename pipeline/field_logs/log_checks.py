@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.io.units import STANDARD_GRAVITY
 from pipeline.records import SENSORS
 
 if TYPE_CHECKING:
@@ -30,10 +31,10 @@ if TYPE_CHECKING:
     Values = NDArray[np.float64]
 
 DECIMALS = 12  # that ``apply`` writes: far below any sensor's resolution, above the rounding of a double
-WINDOW = 100
+WINDOW = 100  # samples: 0.1 to 1 s at usual rates
 MOST_WINDOWS = 20_000  # 2 million samples, 6 MB: the memory stays bounded
-QUIET, QUIETEST = 2.0, 0.1
-FEWEST_RESTS = 3
+QUIET, QUIETEST = 2.0, 0.1  # ratio of scatters, and share of the windows, as the module's description states
+FEWEST_RESTS = 3  # directions of gravity, for three axes
 DIRECTED = 0.1  # scatter over mean of a rest's specific force: its direction is known to 0.1 / sqrt(100) rad = 0.6 deg
 # Error after over error before. Where errors of both kinds are alike, by chance: a drift as large as the bias, three
 # components each, P(F(3, 3) < 1/9) = 4 %. An accelerometer is judged in three directions or more, and where the
@@ -41,7 +42,7 @@ DIRECTED = 0.1  # scatter over mean of a rest's specific force: its direction is
 WORSE = {"accelerometer": 1.2, "gyroscope": 3.0}
 KNOWN = 5.0  # standard errors of a rest's mean that the error after is above
 APART_DEG = 30.0  # orientations that count as different; the least turn of gravity that is compared with the rate
-GRAVITY_UNITS = {"m/s^2": 9.80665, "mg": 1000.0}
+GRAVITY_UNITS = {"m/s^2": STANDARD_GRAVITY, "mg": 1000.0}
 NEAR = 0.15  # a median |a| this near to a unit's factor is read in that unit
 STRANGE_G = (0.5, 2.0)  # median |a| of a log; walking, driving and flying stay within
 CELLS, LEAST_CELLS, SHARE = 200, 10, 0.6  # of a column; the share of cells with 12 decimals, 0.9 expected

@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import stat
 import sys
 import time
 from contextlib import contextmanager, suppress
 from typing import IO, TYPE_CHECKING
 
 from pipeline.errors import InputError, MissingInputError
+from pipeline.io.files import not_regular
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -25,13 +25,13 @@ def require_apart(source: Path, target: Path) -> None:
     """Refuse a log that is no file, and an output (``-``: stdout) that cannot be made or would overwrite it."""
     if not source.exists():
         raise MissingInputError("there is no such log", str(source))
-    mode = source.stat().st_mode
-    if not stat.S_ISREG(mode):
-        kind = "a directory" if stat.S_ISDIR(mode) else "a pipe or a device"
-        raise InputError(f"this is {kind}; expected a file: save the log, then name that file", str(source))
+    other = not_regular(source)
+    if other:
+        raise InputError(f"{other}: save the log, then name that file", str(source))
     if (descriptor := _descriptor(target)) is not None:
-        if _is_open(descriptor) and os.path.samestat(os.fstat(descriptor), source.stat()):
-            raise InputError("the output would overwrite the log; choose another file", str(target))
+        with suppress(OSError):  # it may be closed
+            if os.path.samestat(os.fstat(descriptor), source.stat()):
+                raise InputError("the output would overwrite the log; choose another file", str(target))
         return
     if target.is_dir():
         raise InputError("the output is a directory; name a file for -o", str(target))
@@ -41,24 +41,14 @@ def require_apart(source: Path, target: Path) -> None:
         raise InputError("the directory of the output does not exist; make it first", str(target))
     kinds = [KINDS.get(file.suffix.lower(), "text" if file is source else None) for file in (source, target)]
     if kinds[1] is not None and kinds[0] != kinds[1]:
-        raise InputError(
-            f"the log is {kinds[0]}, and so is the output, but its name ends in {target.suffix}: choose another name",
-            str(target),
-        )
+        message = f"the log is {kinds[0]}, and so is the output, but its name ends in {target.suffix}"
+        raise InputError(f"{message}: choose another name", str(target))
 
 
 def _descriptor(target: Path) -> int | None:
     """Return the number of the open file that a target names; None for a path."""
     found = DESCRIPTOR.fullmatch(str(target))
     return int(found[1] or 1) if found else None
-
-
-def _is_open(descriptor: int) -> bool:
-    try:
-        os.fstat(descriptor)
-    except OSError:
-        return False
-    return True
 
 
 class Output:

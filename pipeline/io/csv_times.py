@@ -18,6 +18,7 @@ import numpy as np
 import pyarrow as pa
 
 from pipeline.errors import IngestError
+from pipeline.io.quality_flags import REPAIRED
 from pipeline.io.timestamps import time_error
 from pipeline.io.units import UNITS
 from pipeline.records import Note
@@ -33,12 +34,11 @@ if TYPE_CHECKING:
 
 EXACT_BELOW_S = 1e6  # half a nanosecond is 2^-53 of 4.5e6 s
 LONGEST_S = 9.2e9  # int64 nanoseconds end at 292 years
-DECIMAL_DIGITS = {"s": 9, "ms": 6, "us": 3, "ns": 0}
+DECIMAL_DIGITS = {"s": 9, "ms": 6, "us": 3, "ns": 0}  # of whole nanoseconds
 COARSEST = 0.01  # of the median interval
 NEAR = 2.5  # intervals
 LARGEST_DISPLACEMENT = 5  # rows
 RESET_INTERVALS = 5  # a time that falls back by more begins another session
-REPAIRED = np.uint16(8)
 
 
 def time_column(layout: Layout) -> tuple[Column, int] | None:
@@ -127,7 +127,10 @@ def in_order(
         return rows, time_ns
     time_ns, wraps = _unwrap(time_ns, tick_ns)
     if wraps:
-        rows = replace(rows, notes=(*rows.notes, _wrap_note(wraps, rows.lines, tick_ns)))
+        modulus, lines = wraps[0][1], [int(rows.lines[row]) for row, _ in wraps]
+        bits = next((b for b in (16, 24, 32) if round(2**b * tick_ns) == modulus), 32)
+        what = f"the time counter of {bits} bits started again at 0 (every {modulus / 1e9:.9g} s) and was counted on"
+        rows = replace(rows, notes=(*rows.notes, Note("N-WRAP", len(wraps), lines[0], lines[-1], what)))
     back = np.flatnonzero(np.diff(time_ns) <= 0)
     if back.size == 0:
         return rows, time_ns
@@ -201,13 +204,6 @@ def _unwrap(time_ns: NDArray[np.int64], tick_ns: float) -> tuple[NDArray[np.int6
             added[rows + 1] = modulus
             return time_ns + np.cumsum(added), [(int(r) + 1, modulus) for r in rows]
     return time_ns, []
-
-
-def _wrap_note(wraps: list[tuple[int, int]], lines: NDArray[np.int64], tick_ns: float) -> Note:
-    modulus = wraps[0][1]
-    bits = next((b for b in (16, 24, 32) if round(2**b * tick_ns) == modulus), 32)
-    detail = f"the time counter of {bits} bits started again at 0 (every {modulus / 1e9:.9g} s) and was counted on"
-    return Note("N-WRAP", len(wraps), int(lines[wraps[0][0]]), int(lines[wraps[-1][0]]), detail)
 
 
 def _one_session(

@@ -135,7 +135,7 @@ def disturbed(recording: Recording) -> tuple[Array, list[tuple[str, str]]]:
         allowed = change[where[column][0]]
         jumps = np.flatnonzero(jump[:, column] > np.minimum(allowed[:-1], allowed[1:]))
         usual = motion.scatter_of_rests(values[:, column]) if jumps.size else None
-        for n in _beside(jumps, recording.samples):
+        for n in np.unique(np.clip(np.concatenate([jumps, jumps + 1]), 0, recording.samples - 1)):  # on either side
             window, resting = motion.around(n)
             around = values[window, column]
             middle = float(np.median(around))
@@ -158,11 +158,6 @@ def _scatter(values: Array) -> float:
     return MEDIAN_SIZE * float(np.median(np.abs(values - np.median(values))))
 
 
-def _beside(jumps: NDArray[np.intp], samples: int) -> NDArray[np.intp]:
-    """Return the samples on either side of each jump."""
-    return np.unique(np.clip(np.concatenate([jumps, jumps + 1]), 0, samples - 1))
-
-
 def _widened(excess: Array) -> Array:
     rows = np.flatnonzero(np.any(excess > 0, axis=1))
     for event in np.split(rows, np.flatnonzero(np.diff(rows) > SAME_EVENT) + 1):
@@ -181,7 +176,8 @@ class _Motion:
         self.long = max(FEWEST_OF_REST, int(np.ceil(REST_S / recording.interval)))
         rate = self._rate()
         self.unknown = rate is None
-        self.by_hand = rate is not None and recording.table_rate is None and not self._logs() and not self._static()
+        by_table = [recording.table_rate, recording.table_angle, recording.table_attitude]
+        self.by_hand = rate is not None and recording.role != "static" and all(log is None for log in by_table)
         if rate is None:
             rate = np.zeros((recording.samples, 1))
         self.rate = rate
@@ -195,12 +191,6 @@ class _Motion:
             np.concatenate([[0.0], np.cumsum(v)]) for v in (turned, changed, pulled)
         )
 
-    def _logs(self) -> bool:
-        return self.recording.table_angle is not None or self.recording.table_attitude is not None
-
-    def _static(self) -> bool:
-        return self.recording.role == "static"
-
     def _rate(self) -> Array | None:
         """Return the rate: (n, 1) or (n, 3) array, deg/s; None where nothing tells it."""
         r = self.recording
@@ -213,7 +203,7 @@ class _Motion:
         if r.table_angle is not None:
             rate = np.diff(r.table_angle) / np.diff(r.time)
             return np.append(rate, rate[-1])[:, None]
-        if self._static():
+        if r.role == "static":
             return np.zeros((r.samples, 1))
         return None if r.gyroscope is None else r.gyroscope - np.median(r.gyroscope, axis=0)
 

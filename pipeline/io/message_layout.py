@@ -36,7 +36,7 @@ STRING = "string"
 _SECTION = re.compile(r"^={20,}\s*$", re.MULTILINE)
 _LINE = re.compile(r"([A-Za-z][\w/]*)(?:<=\d+)?(\[(?:<=)?\d*\])?\s+([A-Za-z]\w*)\s*(=)?.*")
 _SEQUENCE = -1
-ENCAPSULATION = 4
+ENCAPSULATION = 4  # bytes before the content: its representation and options
 LITTLE_ENDIAN = b"\x00\x01\x00\x00"
 BIG_ENDIAN = b"\x00\x00"
 DEEPEST = 32  # types within types

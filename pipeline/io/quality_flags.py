@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from pipeline.io.ingest_settings import Checks
     from pipeline.records import Note
 
-GAP, CLIPPED, STUCK = np.uint16(1), np.uint16(2), np.uint16(4)
+GAP, CLIPPED, STUCK, REPAIRED = np.uint16(1), np.uint16(2), np.uint16(4), np.uint16(8)  # bits of ``Recording.flags``
 GAP_INTERVALS = 1.5  # half way to one missing sample
 JITTER_NOTED, JITTER_TOO_LARGE = 0.2, 0.5  # rms, relative to the median interval; spectra need regular samples
 FULL_SCALE_MARGIN = 1.2  # sensors read up to a fifth past their nominal range
@@ -46,13 +46,11 @@ QUATERNION_TOLERANCE = 0.01  # components rounded to two decimals
 RATE_TOLERANCE = 0.2  # another unit of time is off by 1000
 ENOUGH = 200_000  # samples that a median is taken of
 TURNING_DPS = 5.0  # below, the bias of a low-cost gyroscope is of the same size
-_OTHER_UNITS = (
-    (1e-3, "times of a unit a thousand times shorter"),
-    (1e3, "times of a unit a thousand times longer"),
-    (1e-6, "times of a unit a million times shorter"),
-    (1e6, "times of a unit a million times longer"),
-    (1e-9, "ns"),
-)
+# Factors by which intervals are wrong, and what the times are then.
+_OTHER_FACTORS = {
+    1e-3: "times of a unit a thousand times shorter", 1e3: "times of a unit a thousand times longer",
+    1e-6: "times of a unit a million times shorter", 1e6: "times of a unit a million times longer", 1e-9: "ns",
+}  # fmt: skip
 
 
 def flag_gaps(table: ChannelTable, flags: NDArray[np.uint16], checks: Checks) -> list[Note]:
@@ -242,7 +240,10 @@ def _check_rate(table: ChannelTable, checks: Checks) -> None:
     ratio = interval_us * checks.rate_hz / 1e6
     if abs(ratio - 1.0) <= RATE_TOLERANCE:
         return
-    unit = next((f"; the numbers look like {u}" for f, u in _OTHER_UNITS if abs(ratio * f - 1.0) <= RATE_TOLERANCE), "")
+    unit = ""
+    for factor, times in _OTHER_FACTORS.items():
+        if abs(ratio * factor - 1.0) <= RATE_TOLERANCE:
+            unit = f"; the numbers look like {times}"
     message = (
         f"the median interval is {interval_us:g} us, and ingest.checks.rate_hz of {checks.rate_hz:g} Hz asks for "
         f"{1e6 / checks.rate_hz:g} us{unit}"

@@ -50,7 +50,7 @@ UNIT_ENDINGS = (
 )  # fmt: skip
 LINES_TRIED = 400  # with each separator
 MOST_ROWS = 200_000  # read as numbers; bounds the cost
-FEWEST_ROWS = FEWEST_COLUMNS = 3
+FEWEST_ROWS = FEWEST_COLUMNS = 3  # less is no log of a three-axis sensor
 SEPARATORS = (",", ";", "\t", "|", " ")
 NUMBER = {
     ".": re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?"),

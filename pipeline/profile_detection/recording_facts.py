@@ -35,7 +35,7 @@ PLATEAU = 3  # samples at the largest value; noise repeats it less often
 AS_SAID, ABOUT_AS_SAID = 0.1, 0.35  # of the angle; an accelerometer that is not calibrated leaves some degrees
 LABEL = 16  # width of the labels, characters
 WIDTH = 118  # characters of a line
-LISTED_NOTES = 20
+LISTED_NOTES = 20  # the rest is counted; they fit one screen
 
 Line = tuple[str, str]
 MOST_FIELDS = 24  # listed of a message
@@ -213,18 +213,13 @@ def _units(recording: Recording, rests: Sequence[tuple[int, int]]) -> list[Line]
 
 
 def _notes(notes: Sequence[Note]) -> list[str]:
-    if not notes:
-        return ["none"]
-    lines = [_describe_note(n) for n in notes[:LISTED_NOTES]]
-    return lines + ([f"and {len(notes) - LISTED_NOTES} more"] if len(notes) > LISTED_NOTES else [])
-
-
-def _describe_note(note: Note) -> str:
-    """Return a note as one line."""
-    count = f" x {note.count}" if note.count > 1 else ""
-    last = f" to {note.last}" if note.last != note.first else ""
-    place = f", line {note.first}{last}" if note.first else ""
-    return f"{note.code}{count}{place}: {note.detail}"
+    lines = []
+    for note in notes[:LISTED_NOTES]:
+        count = f" x {note.count}" if note.count > 1 else ""
+        last = f" to {note.last}" if note.last != note.first else ""
+        place = f", line {note.first}{last}" if note.first else ""
+        lines.append(f"{note.code}{count}{place}: {note.detail}")
+    return (lines + [f"and {len(notes) - LISTED_NOTES} more"] * (len(notes) > LISTED_NOTES)) or ["none"]
 
 
 def _number(value: float, digits: int = 4) -> str:

@@ -32,7 +32,7 @@ USUAL_COUNTS_PER_G = (16384.0, 8192.0, 4096.0, 2048.0, 1024.0, 256.0)  # 2, 4, 8
 # 16 bits for 250, 500, 1000, 2000, 4000 deg/s (InvenSense, Bosch).
 USUAL_COUNTS_PER_DPS = (131.0, 65.5, 32.8, 16.4, 8.2)
 OFFSETS = (0.0, 32768.0, 8192.0, 2048.0)  # middle of 16, 14 and 12 bits without a sign
-SCALES = np.geomspace(1.0, 1000.0, 481)
+SCALES = np.geomspace(1.0, 1000.0, 481)  # counts per deg/s that are tried, 1.4 % apart
 ASSUMED_HZ = 100.0  # where the time is not known
 CONVINCING_DEG = 12.0  # below half of the residual angle of the next usual scale in a quarter turn
 TOO_FAST_FOR_RADIANS = 40.0  # rad/s, 2300 deg/s: beyond the range of usual sensors

@@ -189,9 +189,9 @@ def test_what_is_no_log_and_no_place_for_one_is_refused(calibration: Path, tmp_p
     log = write(tmp_path / "log.csv", readings()[:50])
     os.mkfifo(tmp_path / "pipe.csv")
     cases = [
-        (tmp_path / "pipe.csv", tmp_path / "out.csv", "a pipe or a device"),
+        (tmp_path / "pipe.csv", tmp_path / "out.csv", "a FIFO"),
         (tmp_path, tmp_path / "out.csv", "a directory"),
-        (Path("/dev/null"), tmp_path / "out.csv", "a pipe or a device"),
+        (Path("/dev/null"), tmp_path / "out.csv", "is a device"),
         (log, tmp_path, "the output is a directory"),
         (log, tmp_path / "none" / "out.csv", "directory of the output does not exist"),
         (log, tmp_path / "out.mcap", "the log is text, and so is the output"),
