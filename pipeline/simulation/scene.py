@@ -26,7 +26,7 @@ import numpy as np
 
 from pipeline.records import Motion
 from pipeline.signal.rests import still_samples
-from pipeline.simulation.trajectory import Turn, mounted, rotation_about
+from pipeline.simulation.trajectory import Turn, mounted, rotation_by
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -119,11 +119,7 @@ def _earth_rotation(scene: Scene, values: Values) -> Scene:
 
 def _table_tilt(scene: Scene, values: Values) -> Scene:
     """Tilt the table about its level x and y; deg."""
-    angle = float(np.linalg.norm(values))
-    if angle == 0.0:
-        return scene
-    axis = np.array([values[0], values[1], 0.0]) / angle
-    return replace(scene, up=scene.up @ rotation_about(axis, np.array([angle]))[0])
+    return replace(scene, up=scene.up @ rotation_by(np.append(values, 0.0)))
 
 
 def _added(field_name: str, factor: float = 1.0) -> Alteration:

@@ -16,7 +16,7 @@ from pipeline.records import AXES, SENSORS, Recording
 from pipeline.simulation.rate_table import random_errors
 from pipeline.simulation.scene import Scene, alter
 from pipeline.simulation.sensor import bias_wander, decimals_of
-from pipeline.simulation.trajectory import Gimbals, Moves, Turn, rotation_about
+from pipeline.simulation.trajectory import Gimbals, Moves, Turn, rotation_by
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -178,14 +178,10 @@ def _scene(plan: Planned, bench: Bench, start: float, rng: np.random.Generator) 
             settings["rate_error"] = (0.0, 0.0, 0.0)  # motors lose steps in fast turns only
         errors = random_errors(trajectory.program, rng, settings, trajectory.axis)
         trajectory = Turn(trajectory.axis, trajectory.program, errors)
-    tilt = np.append(np.asarray(settings.get("tilt_deg", (0.0, 0.0)), float), 0.0)
-    size = float(np.linalg.norm(tilt))
-    up = rotation_about(tilt / size, np.array([size]))[0][2] if size else np.array([0.0, 0.0, 1.0])
+    up = rotation_by(np.append(np.asarray(settings.get("tilt_deg", (0.0, 0.0)), float), 0.0))[2]
     placed = table["latitude_deg"] is not None and table["azimuth_deg"] is not None
     earth = earth_rate(table["latitude_deg"], table["azimuth_deg"]) if placed else None
-    turned = np.asarray(settings.get("mounting_deg", {}).get(plan.name, np.zeros(3)), float)
-    size = float(np.linalg.norm(turned))
-    mounting = rotation_about(turned / size, np.array([size]))[0] if size else np.eye(3)
+    mounting = rotation_by(np.asarray(settings.get("mounting_deg", {}).get(plan.name, np.zeros(3)), float))
     return Scene(trajectory, start, plan.axis, table["gravity_g"], up, earth, mounting=mounting)
 
 

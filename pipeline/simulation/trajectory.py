@@ -76,6 +76,12 @@ def rotation_about(axis: Values, angle_deg: Values) -> Values:
     return rotation
 
 
+def rotation_by(vector_deg: Values) -> Values:
+    """Return the rotation about a vector, by its length in deg: (3, 3) array."""
+    size = float(np.linalg.norm(vector_deg))
+    return rotation_about(vector_deg / size, np.array([size]))[0] if size else np.eye(3)
+
+
 @dataclass(frozen=True)
 class Turn:
     """Turns about one body axis, as commanded by a program, with the table's errors."""

@@ -191,12 +191,7 @@ class Drawn:
     def least_squares_accelerometer(self) -> Row:
         """Return the error that nonlinear least squares leaves."""
         table, sensor = (read_config(group, getattr(self.own.unit, group)) for group in ("table", "sensor"))
-        settings = {
-            "table": table,
-            "sensor": sensor,
-            "procedure": {"holdout_every": 0},
-            "method": {"as_printed": False},
-        }
+        settings = {"table": table, "sensor": sensor, "procedure": {"holdout_every": 0}}
         fitted = nonlinear_least_squares.fit(self.turns(), None, settings)
         return {"error": self._accelerometer_error(partial(linear_truth, fitted))}
 
