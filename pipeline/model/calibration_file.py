@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from pipeline.model.checked import Check
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 1  # of the files that this version writes
 # Readings in another unit or range are calibrated by a matrix of that factor: 16 between the ranges of an accelerometer
 # (2 to 32 g), 32 between those of a gyroscope (125 to 4000 deg/s), 57 for rad/s, 1000 for mg and mdps.
 LARGEST_FACTOR = 1000.0

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 VAGUE_DPS = 0.01  # the noise of a gyroscope's sample; below it a doubtful rate does no harm
 EARTH_RATE_DPS = 360.0 / 86164.0905  # a sidereal day, s
-UP_AT_ZERO = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+UP_AT_ZERO = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])  # see above
 # Rows: level x, y, z axes in the body frame at table angle 0, for turns about x, y, z.
 LEVEL_AT_ZERO = np.array([np.eye(3), np.eye(3), [[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]])
 ABOUT = np.cross(np.eye(3)[:, None], np.eye(3)).transpose(0, 2, 1)  # ABOUT[a] @ u = e_a x u

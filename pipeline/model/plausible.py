@@ -50,7 +50,7 @@ FACTORS = {
         1.0 / 6.0: "in revolutions a minute, and read as deg/s",
     },
 }
-RANGES = [2.0**n for n in range(-6, 7) if n]
+RANGES = [2.0**n for n in range(-6, 7) if n]  # ratios of the ranges of one sensor: neighbours differ by two
 OF_BIAS = "an offset of raw counts that is not taken off, another column, or a damaged axis"
 OF_CROSS_AXIS = "another column or axis map, or a unit that moved on the table between recordings"
 OF_EFFECT = "another effect that looks alike, or an error of the table, its log or the time stamps"

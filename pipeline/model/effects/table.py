@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     Values = NDArray[np.float64]
 
 UPRIGHT = 0.5  # sine of the turn axis's elevation, which is 0 or 1: gravity turns with the angle, or not at all
-SIGNS = np.array([[1.0], [-1.0]])
+SIGNS = np.array([[1.0], [-1.0]])  # of d_x and d_y in the equation above
 
 
 class TableTilt(DeclaredEffect):

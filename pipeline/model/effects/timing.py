@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 STARTS_S = (60.0, 180.0, 500.0, 1500.0)  # of a part of some grams to a box of some kilograms, in steps of three
 SHORTEST_S, LONGEST_S = 1.0, 1e5  # beyond these it is a step at the start, or a drift
 START_LAG_S = 0.005  # above 0, where a lag and a time offset have the same column; below the lag of a 30 Hz filter
-PPM = 1e-6
+PPM = 1e-6  # one part in a million
 STEP_S = 1e-5  # of the central difference: its rounding is 1e-11 of u per second
 
 
