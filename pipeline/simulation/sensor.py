@@ -231,6 +231,10 @@ def drawn_effects(
             kind, size = effect(name), value
         if sensor not in (*kind.sensors, ""):
             raise ConfigurationError(f"effect {key}: {name} applies to the {' and '.join(kind.sensors)}")
+        if kind.of_turns:
+            raise ConfigurationError(
+                f"effect {key}: {name} has parameters for each recording; give imperfections mounting_deg or zero_deg"
+            )
         for each in kind.sensors if sensor == "" else (sensor,):
             if name in ALTERATIONS and each != kind.sensors[0] and sensor == "":
                 out[each][name] = out[kind.sensors[0]][name]  # one table, one clock: the same for both sensors

@@ -218,6 +218,7 @@ def test_a_fleet_is_drawn_from_the_data_sheet() -> None:
     [
         ({"effects": {"gyroscope.lever_arm": 0.1}}, "lever_arm applies to the accelerometer"),
         ({"effects": {"accelerometer.lever": 0.1}}, "no effect is called 'lever'"),
+        ({"effects": {"mounting": 1.0}}, "has parameters for each recording; give imperfections mounting_deg"),
         ({"effects": {"lever_arm": [1.0, 2.0]}}, "takes one size or 3 values (r_x, r_y, r_z), not 2"),
         ({"sensor": "mpu9"}, "no sensor is called 'mpu9'; known: generic, mpu6050, stim300"),
         ({"procedure": "dance"}, "no procedure is called 'dance'"),

@@ -11,7 +11,7 @@ from pipeline.model.effects.formula_effect import FormulaEffect
 from pipeline.model.kinematics import earth_rate
 from pipeline.simulation.rate_table import ProgramBuilder, TurnErrors
 from pipeline.simulation.scene import ALTERATIONS, STANDARD_GRAVITY, Scene, alter
-from pipeline.simulation.trajectory import Turn, random_gimbals
+from pipeline.simulation.trajectory import Turn, random_gimbals, rotation_by
 
 SIZES = {
     "lever_arm": 0.05, "time_offset": 1e-4, "clock_rate": 1.0, "low_pass_lag": 1e-4, "earth_rotation": 4e-3,
@@ -91,9 +91,27 @@ def test_earth_rotation_is_sensed_along_the_body_axes() -> None:
 
 def test_effects_of_timing_and_of_the_table_in_python_have_exact_geometry() -> None:
     physical = {name: kind for name, kind in catalogue().items() if kind.owner in (Owner.MOUNTING, Owner.TABLE)}
-    in_python = {name for name, kind in physical.items() if not isinstance(kind, FormulaEffect)}
+    in_python = {name for name, kind in physical.items() if not isinstance(kind, FormulaEffect) and not kind.of_turns}
     assert in_python <= set(ALTERATIONS) <= set(physical)
     assert set(ALTERATIONS) == set(SIZES)
+    assert {name for name, kind in physical.items() if kind.of_turns} == {"mounting", "encoder_zero"}  # tested below
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_mounting_and_a_zero_of_one_recording_are_the_rotations_of_their_effects(axis: int) -> None:
+    time, plain = np.arange(0.03, 12.0, 0.12), turn_scene(axis=axis)
+    theta, zero = np.array([1.5, -2.0, 0.7]), 3.0
+    program = plain.trajectory.program
+    turned = replace(plain, trajectory=Turn(axis, replace(program, angle=program.angle + zero)))
+    for name, values, log, true in (
+        ("mounting", theta, plain, replace(plain, mounting=rotation_by(theta))),
+        ("encoder_zero", np.array([zero]), turned, plain),
+    ):
+        kind = effect(name).of_recordings(["turn"])
+        moved = kind.moved(replace(log.motion(time), recording="turn"), values)
+        exact = true.motion(time)
+        for vector in ("specific_force", "angular_rate", "angular_acceleration", "specific_force_rate"):
+            np.testing.assert_allclose(getattr(moved, vector), getattr(exact, vector), atol=1e-11)
 
 
 @pytest.mark.parametrize("name", sorted(ALTERATIONS))
