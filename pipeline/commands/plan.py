@@ -150,6 +150,6 @@ def _of_gain(gain: Gain) -> dict[str, Any]:
         "options": gain.change.options,
         "minutes": gain.minutes,
         "shows": list(gain.shown),
-        "tells_apart": list(gain.told),
+        "tells_apart": list(gain.distinguished),
         "size_factor": gain.factor,
     }

@@ -62,7 +62,7 @@ def diagnose(
     -------
     dict
         ``verdict, reason`` (``pipeline.diagnosis.verdict``), ``residual_over_noise, selected, ranking, not_observable,
-        unexplained, next_experiment, override``; beside these ``configured, suggested_effect``
+        unexplained, next_experiment, override``; in addition ``configured, suggested_effect``
         (``pipeline.diagnosis.functional_form_search``), ``wander`` (``ratio, time_s, standard_deviation, expected,
         inflated``), ``pictures`` (``...residual_plots``), ``method_errors`` (``...method_errors``), on a table
         ``held_out`` (``error_before, error_after, floor``), without one ``cross_validation``.

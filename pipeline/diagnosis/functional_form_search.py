@@ -1,7 +1,7 @@
 """Search for the functional form of physics that the catalogue of effects does not hold.
 
 Where the residual depends on a covariate (``pipeline.diagnosis.residual_dependence``), each simple form in it is scored
-as an effect would be, beside base, configured and selected effects, on the a axes that it improves:
+as an effect would be, given base, configured and selected effects, on the a axes that it improves:
 
     delta BIC = 2 (max log L' - max log L) - (r a + s) log N,    r coefficients, s scanned parameters, N readings
 

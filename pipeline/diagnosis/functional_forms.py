@@ -209,15 +209,15 @@ def polynomial(signal: str, formulas: tuple[str, ...], order: int) -> Form:
 
 
 def finer(form: Form, span: Span) -> list[Form]:
-    """Return forms of the same kind about one: steps beside it, sharp and soft, or other constants."""
+    """Return forms of the same kind near one: steps at other places, sharp and soft, or other constants."""
     if form.kind == "step":
         apart = span.size / PLACES
         if span.signal == "speed":
             places = span.places()
             near = places[np.argsort(np.abs(places - form.place))[:3]]
             apart = float(np.ptp(near)) / 2.0
-        beside = form.place + apart * np.arange(-FINE, FINE + 1) / FINE
-        return steps(span, beside) + steps(span, beside[::3], [apart * w for w in WIDTHS])
+        around = form.place + apart * np.arange(-FINE, FINE + 1) / FINE
+        return steps(span, around) + steps(span, around[::3], [apart * w for w in WIDTHS])
     if form.kind == "exponential":
         return exponentials(span, [form.place * f for f in FACTORS])
     return []

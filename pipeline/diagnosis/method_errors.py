@@ -103,7 +103,7 @@ def method_errors(
     Returns
     -------
     list of dict
-        ``name, meaning, size, unit, share`` of the error on the method's own recordings; beside these ``rms`` (there,
+        ``name, meaning, size, unit, share`` of the error on the method's own recordings; in addition ``rms`` (there,
         unit of the sensor), ``held_out_share`` and ``held_out_magnitude_share`` (on held-out motion, or None).
     """
     stages = [stage.name for stage in calibration.stages]
@@ -152,14 +152,13 @@ class _Difference:
     def _of_effects(self, motion: Motion) -> Values:
         """Return what the method's effects add at the free fit's values, less what they add at the method's."""
         added = np.zeros((len(motion.time), 3))
-        fitted = {term.effect.name: term for term in self.free.terms}
+        fitted = {term.effect.name: term.values for term in self.free.terms}
         for effect in self.method.effects:
             this = effect_of(effect)
-            if this.moves or not this.available(motion):
-                continue
-            added -= this.reading(self.method.sensor, motion, self.free.K, effect.values)
-            if effect.name in fitted:
-                added += this.reading(self.method.sensor, motion, self.free.K, fitted[effect.name].values)
+            if not this.moves and this.available(motion):
+                added -= this.reading(self.method.sensor, motion, self.free.K, effect.values)
+                if effect.name in fitted:
+                    added += this.reading(self.method.sensor, motion, self.free.K, fitted[effect.name])
         return added
 
     def certain(self, selected: Sequence[str]) -> dict[str, bool]:

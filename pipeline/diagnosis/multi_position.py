@@ -1,7 +1,8 @@
 """What the selection finds in rests and moves by hand, where no table logged the motion.
 
-The residual of the rests is compared with white noise and the expected bias instability. Nobody states how firmly a
-unit rests by hand, so that a scatter of the rests beyond that is reported, but alone is no sign of a missing effect.
+The residual of the rests is compared with white noise and the expected bias instability. How firmly a unit
+rests by hand is not known, so that a scatter of the rests beyond that is reported, but alone is no sign of a missing
+effect.
 
 Twenty rests are too few to keep every third from a selection. So the selection uses all of them, and cross-validation
 judges it: of ``FOLDS`` models each leaves out every third rest with the move before it. ``held_out_error`` of a ranking
@@ -48,12 +49,12 @@ if TYPE_CHECKING:
 
 NEEDED = MORE
 FAR_ABOVE = 10.0  # times the noise: no unit that somebody sets down or holds rests so badly
-FOLDS = 3
+FOLDS = 3  # as every third rest is held out of a published fit (procedure.holdout_every)
 SPARE = 2  # equations beyond the parameters, from which on a fold is judged
 LEAST_SPAN = 1.0  # s or degC: of a covariate
 FORCE = ("8 * u ** 4 - 8 * u ** 2 + 1", "16 * u ** 5 - 20 * u ** 3 + 5 * u")  # Chebyshev polynomials of u in g
 WORTH = 0.25  # share of the residual's mean square, of what could be its cause
-MOST_NAMED = 3
+MOST_NAMED = 3  # effects in a sentence
 FIRM = 2.0  # times the noise, above which the scatter of the rests is worth a word
 
 
@@ -96,27 +97,27 @@ def findings(
         return f"to make bias temperature observable: record {warmth.excitation}" if warmth.name in hidden else ""
 
     return Findings(
-        sensor,
-        selection.names,
-        verdict,
-        selection.steps,
-        selection.first.scores,
-        selection.fits[-1].state.terms,
-        selection.fits[-1].covariance,
-        selection.limits,
-        lambda name: _shares(selection, name),
-        chi,
-        lambda name: float(signal[name] @ signal[name]) if name in signal else 0.0,
-        max(chi[0] - (len(selection.fits[0].residual) - selection.fits[0].rank), chi[0] - chi[-1]),
-        _held_out_errors(selection) if selection.names else [None],
-        hidden,
-        unknown,
-        over,
-        left_over,
-        [(h.ratio, h.time, float(score)) for h, score in zip(selection.hypotheses, likely, strict=True)],
-        float(np.sqrt(np.mean(model.white**2))),
-        None if expected is None else float(np.sqrt(np.mean(expected.wander**2))),
-        advice,
+        sensor=sensor,
+        selected=selection.names,
+        verdict=verdict,
+        steps=selection.steps,
+        alone=selection.first.scores,
+        terms=selection.fits[-1].state.terms,
+        covariance=selection.fits[-1].covariance,
+        limits=selection.limits,
+        shares=lambda name: _shares(selection, name),
+        left=chi,
+        drop_alone=lambda name: float(signal[name] @ signal[name]) if name in signal else 0.0,
+        excess=max(chi[0] - (len(selection.fits[0].residual) - selection.fits[0].rank), chi[0] - chi[-1]),
+        held_out=_held_out_errors(selection) if selection.names else [None],
+        hidden=hidden,
+        unknown=unknown,
+        over_noise=over,
+        left_over_noise=left_over,
+        noises=[(h.ratio, h.time, score) for h, score in zip(selection.hypotheses, likely.tolist(), strict=True)],
+        white=float(np.sqrt(np.mean(model.white**2))),
+        expected_wander=None if expected is None else float(np.sqrt(np.mean(expected.wander**2))),
+        advice=advice,
         full=(lambda: calibration_of(model, selection.fits[-1], calibration, settings)) if selection.names else None,
         other=accelerometer if sensor == "gyroscope" else None,
         on_table=False,
@@ -156,8 +157,8 @@ def _model_of_all_rests(
     every = {**settings, "procedure": {**settings["procedure"], "holdout_every": 0}}
     if calibration.sensor == "accelerometer":
         return require_model(recordings, with_all_rests(calibration, noise), noise, every)
-    felt = accelerometer and with_all_rests(accelerometer, None)
-    return require_model(recordings, calibration, noise, every, felt)
+    other = accelerometer and with_all_rests(accelerometer, None)
+    return require_model(recordings, calibration, noise, every, other)
 
 
 def require_model(
@@ -184,7 +185,7 @@ def require_model(
 
 
 def _without_creep(noise: Noise | None, sheet: Mapping[str, Any]) -> Noise | None:
-    """Return the noise with the data sheet's wander, where only rests by hand tell one.
+    """Return the noise with the data sheet's wander, where only rests by hand determine one.
 
     A unit that creeps from its attitude moves gravity from one axis to another, which is no wander of a bias.
     """
@@ -235,16 +236,12 @@ def _held_out_errors(selection: Selection) -> list[float | None]:
     if model.held_out_error(selection.fits[0].state) is not None:  # a recording for validation
         return [model.held_out_error(found.state) for found in selection.fits]
     near = {n: FAR * limit for n, limit in selection.limits.items() if effect(n).nonlinear}
-    errors = []
+    errors: list[float | None] = []
     for found in selection.fits:
-        squares: list[float] = []
-        for part, held in _folds(model):
-            fitted = fit(part, found.state, selection.hypotheses, near)
-            if len(fitted.residual) < fitted.rank + SPARE:
-                squares = []
-                break
-            squares.append(_squared(part, fitted.state) * held)
-        errors.append(float(np.sqrt(np.sum(squares) / len(model.rests.time))) if squares else None)
+        folds = [(part, held, fit(part, found.state, selection.hypotheses, near)) for part, held in _folds(model)]
+        judged = all(len(fitted.residual) >= fitted.rank + SPARE for _, _, fitted in folds)
+        square = sum(_squared(part, fitted.state) * held for part, held, fitted in folds) / len(model.rests.time)
+        errors.append(float(np.sqrt(square)) if judged else None)
     return errors
 
 
@@ -323,7 +320,7 @@ def _curves(covariate: str, formulas: Sequence[str], sensor: str) -> Term:
 
 
 def _suspects(selection: Selection, hidden: Mapping[str, str]) -> list[str]:
-    """Return the effects that these recordings cannot tell, and that could be what the residual holds.
+    """Return the effects that these recordings cannot distinguish, and that could be what the residual holds.
 
     Such an effect shows in the equations, and at its limits it brings at least the share ``WORTH`` of the mean square
     that is left; or it goes with the temperature, which was not recorded or did not change enough.
@@ -348,8 +345,5 @@ def _of_scatter(names: Sequence[str], over_noise: float) -> str:
         return f"set the unit down firmly for each rest: {many} and follow nothing that is recorded"
     alike = listed([plain(name) for name in names[:MOST_NAMED]], "or")
     warm = any("temperature" in catalogue()[name].needs for name in names)
-    beside = ", with the temperature of the sensor beside them" if warm else ""
-    return (
-        f"{MORE}{beside}: {many}, and an unsteady hand explains that no better than {alike}, which "
-        "these rests do not tell"
-    )
+    temperature = ", with the temperature of the sensor" if warm else ""
+    return f"{MORE}{temperature}: {many}, and they cannot distinguish an unsteady hand from {alike}"

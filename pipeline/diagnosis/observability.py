@@ -14,7 +14,6 @@ drifts of half the limit, 0 of 4 are found in 4 minutes, 14 of 16 in 8, and 16 o
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -66,16 +65,6 @@ def _hidden(sensor: str, held: Collection[str], reason: Callable[[Effect], str])
     return found
 
 
-@dataclass(frozen=True)
-class _Facts:
-    """What the recordings of turns did."""
-
-    temperature: bool  # whether every recording holds one
-    span: float  # of the temperature, degC
-    moving: bool  # whether any used sample moves
-    one_way: bool
-
-
 def one_way(observations: Observations) -> bool:
     """Return whether the table turns, about no axis in both directions."""
     ways: dict[int, set[float]] = {}
@@ -91,22 +80,18 @@ def _moving(observations: Observations) -> bool:
 
 
 def not_observable(selection: Selection, configured: Sequence[str]) -> dict[str, str]:
-    """Return the effects that turns cannot show beside those of the model, with the reason and what would show them."""
+    """Return the effects not in the model that turns cannot show, with the reason and what would show them."""
     observations = selection.observations
-    warmth = [part.motion.temperature for part in observations.parts]
-    known = [t for t in warmth if t is not None]
-    span = float(np.ptp(np.concatenate(known))) if known else 0.0
-    facts = _Facts(len(known) == len(warmth), span, _moving(observations), one_way(observations))
 
     def reason(this: Effect) -> str:
-        found = _reason(this, selection, facts)
+        found = _reason(this, selection)
         return f"{found}; it needs {this.excitation}" if found and observations.sensor not in this.unseen else found
 
     earth = ["earth_rotation"] if observations.earth else []
     return _hidden(observations.sensor, [*configured, *selection.names, *earth], reason)
 
 
-def _reason(this: Effect, selection: Selection, facts: _Facts) -> str:
+def _reason(this: Effect, selection: Selection) -> str:
     observations, places = selection.observations, selection.first.indices(this.name)
     motions = [part.motion for part in observations.parts]
     lacking = [
@@ -115,15 +100,19 @@ def _reason(this: Effect, selection: Selection, facts: _Facts) -> str:
         if need in this.needs and all(getattr(motion, need) is None for motion in motions)
     ]
     warm = "temperature" in this.needs
+    warmth = [motion.temperature for motion in motions]
+    known = [t for t in warmth if t is not None]
+    span = float(np.ptp(np.concatenate(known))) if known else 0.0
+    moving = _moving(observations)
     in_one = "every turn goes in one direction, in which it looks exactly like a part of bias and matrix"
     checks = [
         (observations.sensor in this.unseen, this.unseen.get(observations.sensor, "")),
-        (warm and not facts.temperature, "the recordings hold no temperature"),
+        (warm and len(known) < len(warmth), "the recordings hold no temperature"),
         (this.needs_clock and not observations.clock_shared, "the time between the recordings is not known"),
         (bool(lacking), f"the recordings hold {' and '.join(lacking)}"),
-        (not places and this.needs_motion and not facts.moving, "the table never moved while it was sampled"),
-        (warm and (not places or facts.span < LEAST_SPAN_DEGC), _steady(facts.span)),
-        (not places and this.needs_both_directions and facts.one_way, in_one),
+        (not places and this.needs_motion and not moving, "the table never moved while it was sampled"),
+        (warm and (not places or span < LEAST_SPAN_DEGC), _steady(span)),
+        (not places and this.needs_both_directions and one_way(observations), in_one),
         (not places, "bias and matrix explain all that it would add in this motion"),
     ]
     return next((reason for applies, reason in checks if applies), "") or _faint(this, selection, places)
@@ -141,7 +130,7 @@ def _faint(this: Effect, selection: Selection, places: Sequence[int]) -> str:
 
 
 def not_observable_by_hand(selection: by_hand.Selection, configured: Sequence[str]) -> dict[str, str]:
-    """Return the effects that rests and moves cannot show beside those of the model, each with the reason."""
+    """Return the effects not in the model that rests and moves cannot show, each with the reason."""
     held = [*configured, *selection.names]
     return _hidden(selection.model.sensor, held, lambda this: _reason_by_hand(this, selection))
 
@@ -159,7 +148,7 @@ def _reason_by_hand(this: Effect, selection: by_hand.Selection) -> str:
         return "at rest nothing moves, and it adds nothing"
     few = len(base.residual) - base.rank < FEWEST
     if few if score is None else selection.first.spare[this.name] == 0.0:
-        return f"{len(model.rests.time)} rests are too few to tell it from their scatter; {MORE}"
+        return f"{len(model.rests.time)} rests are too few to distinguish it from their scatter; {MORE}"
     if score is None:
         seen = "rests and moves by hand" if model.kinds > 1 else "rests"
         return f"in {seen} bias and matrix explain all that it would add"

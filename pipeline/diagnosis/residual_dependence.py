@@ -1,4 +1,4 @@
-"""On which covariates the residual still depends beside base, configured and selected effects.
+"""On which covariates the residual still depends, given base, configured and selected effects.
 
     temperature, time, |omega| : Chebyshev polynomials of degree 1 to d over their span, d = 2 to 5
     angle                      : cos and sin of n periods a turn, n = 3 to 8, one n and all of them
@@ -146,11 +146,11 @@ def _bases_of(selection: Selection) -> list[tuple[str, Curves, list[Block]]]:
     components: list[Block] = [(range(3 * i, 3 * i + 3), 3) for i in range(3)]
     bases: list[tuple[str, Curves, list[Block]]] = [("specific_force", _force, [*components, (range(9), 9)])]
     if observations.clock_shared:
-        bases.append(("time", _chebyshev("time", motions), degrees))
+        bases.append(("time", _chebyshev(Span.of(observations, "time")), degrees))
     if all(m.temperature is not None for m in motions):
-        bases.append(("temperature", _chebyshev("temperature", motions), degrees))
+        bases.append(("temperature", _chebyshev(Span.of(observations, "temperature")), degrees))
     if any(np.any(~m.still) for m in motions):
-        bases.append(("rate", _chebyshev("speed", motions), degrees))
+        bases.append(("rate", _chebyshev(Span.of(observations, "speed")), degrees))
     if any(m.axis is not None for m in motions):
         count = MOST - FEWEST + 1
         single: list[Block] = [((j, count + j), 2) for j in range(count)]
@@ -158,14 +158,11 @@ def _bases_of(selection: Selection) -> list[tuple[str, Curves, list[Block]]]:
     return bases
 
 
-def _chebyshev(signal: str, motions: Sequence[Motion]) -> Curves:
+def _chebyshev(span: Span) -> Curves:
     """Return what evaluates Chebyshev polynomials of degree 1 to 5 of a signal over its span."""
-    values = [np.asarray(signals_of(motion)[signal]) for motion in motions]
-    low, high = min(float(v.min()) for v in values), max(float(v.max()) for v in values)
-    width = max(high - low, 1e-12)
 
     def curves(motion: Motion) -> Values:
-        x = 2.0 * (np.asarray(signals_of(motion)[signal]) - low) / width - 1.0
+        x = 2.0 * (np.asarray(signals_of(motion)[span.signal]) - span.low) / span.size - 1.0
         return np.asarray(chebvander(x, DEGREE)[:, 1:], np.float64)
 
     return curves

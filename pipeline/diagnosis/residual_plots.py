@@ -9,7 +9,7 @@ implies, ``E[w | r]``; the least-squares line through (x~, y~) has the slope gam
 hand, x and r are whitened, a point is a rest, and both are shown times the median white error of a rest.
 
 The plot of what is unexplained is the residual against the covariate on which it depends; where a functional form g
-is suggested, that of a fit with g beside the base, to which g is added again: the points scatter about the curve.
+is suggested, that of a fit of base and g, to which g is added again: the points scatter about the curve.
 
 Source: R. D. Cook and S. Weisberg, Residuals and Influence in Regression, 1982, section 2.3.
 """

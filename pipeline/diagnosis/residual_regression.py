@@ -140,7 +140,7 @@ class ProjectedCurves:
         return together
 
     def _each(self, index: Sequence[int]) -> tuple[Values, NDArray[np.bool_]]:
-        """Return what each curve explains beside those before it, and whether it is independent of them: (t, 3, r)."""
+        """Return what each curve adds to those before it, and whether it is independent of them: (t, 3, r)."""
         inner, cross = self.inner[:, :, index][:, :, :, index], self.cross[:, :, index].copy()
         error = self.error[:, :, index].copy()
         explained, independent = np.zeros_like(cross), np.zeros(cross.shape, bool)

@@ -58,26 +58,33 @@ def findings(
     """
     sensor, sheet = calibration.sensor, settings["sensor"][calibration.sensor]
     observations = observe(sensor, recordings, settings["table"])
-    plain_selection = select(observations, configured, noise, sheet, calibration, accelerometer=accelerometer)
-    unknown = unexplained(plain_selection)
-    selection = select_with_form(plain_selection, unknown, configured, noise, sheet, accelerometer=accelerometer)
-    fits = _fits(selection)
-    held, floor = _held_out(selection, fits, recordings, noise, settings["table"])
+    selection = select(observations, configured, noise, sheet, calibration, accelerometer=accelerometer)
+    unknown = unexplained(selection)
+    reported = select_with_form(selection, unknown, configured, noise, sheet, accelerometer=accelerometer)
+    fits = _fits(reported)
+    held, floor = _held_out(reported, fits, recordings, noise, settings["table"])
     held_out = None
     if held is not None and noise is not None:
         held_out = {"error_before": held[0], "error_after": held[-1], "floor": floor}
-    hidden = not_observable(selection, configured)
+    hidden = not_observable(reported, configured)
     left = [fit.residual_rms**2 for fit in fits]
     noise_square = None if noise is None else float(np.mean(noise.white**2 + noise.wander**2))
     least = left[-1] if noise_square is None else noise_square
-    within = not selection.names and left[0] < CLOSE * least
-    excess = left[0] if within else max(left[0] - least, left[0] - left[-1])
-    share = float(np.clip((left[0] - left[-1]) / excess, 0.0, 1.0)) if excess > 0.0 else 0.0
-    explained = selection.first.explained([])
-    first_scale = float(np.mean(selection.start.scale**2) / selection.first.samples)
-    scores = selection.ranking.log_likelihoods(selection.chosen())
-    settings_of = selection.ranking.settings
-    suggested = None if selection is plain_selection else suggested_effect(unknown, sensor, catalogue())
+    at_noise = not reported.names and left[0] < CLOSE * least
+    excess = left[0] if at_noise else max(left[0] - least, left[0] - left[-1])
+    verdict = verdict_of_selection(
+        reported.names,
+        unknown,
+        float(np.clip((left[0] - left[-1]) / excess, 0.0, 1.0)) if excess > 0.0 else 0.0,
+        2.0 * (reported.fit.log_likelihood - reported.base.log_likelihood),
+        above_noise=noise_square is not None and left[-1] > FAR_ABOVE**2 * noise_square,
+        held_out=held_out,
+    )
+    explained, white_square = reported.first.explained([]), float(np.mean(reported.start.scale**2))
+
+    def drop_alone(name: str) -> float:
+        most = max((explained[j] for j in reported.first.indices(name)), default=0.0)
+        return float(most) / reported.first.samples * white_square
 
     def advice(verdict: str) -> str:
         if verdict == "unexplained":
@@ -88,44 +95,39 @@ def findings(
         return f"to make {plain(shown)} observable: record {catalogue()[shown].excitation}" if shown else ""
 
     def calibrated(fit: Fit) -> SensorCalibration:
-        return calibration_of(sensor, fit, plain_selection.observations, None, settings)
+        return calibration_of(sensor, fit, selection.observations, None, settings)
 
+    scores = reported.ranking.log_likelihoods(reported.chosen())
+    hypotheses = list(zip(reported.ranking.settings, scores.tolist(), strict=True))[1:]  # the first is white noise
     return Findings(
-        sensor,
-        selection.names,
-        verdict_of_selection(
-            selection.names,
-            unknown,
-            share,
-            2.0 * (selection.fit.log_likelihood - selection.base.log_likelihood),
-            above_noise=noise_square is not None and left[-1] > FAR_ABOVE**2 * noise_square,
-            held_out=held_out,
-        ),
-        selection.steps,
-        selection.alone,
-        selection.fit.terms,
-        selection.fit.covariance,
-        selection.limits,
-        lambda name: _shares(selection, name),
-        left,
-        lambda name: first_scale * float(max((explained[j] for j in selection.first.indices(name)), default=0.0)),
-        excess,
-        held or [None] * len(fits),
-        hidden,
-        unknown,
-        _over_noise(plain_selection.base, recordings, noise),
-        _over_noise(plain_selection.fit, recordings, noise),
-        [(s.ratio, s.time, float(score)) for s, score in zip(settings_of[1:], scores[1:], strict=True)],
-        float(np.sqrt(np.mean(selection.start.scale**2))),
-        None if noise is None else float(np.sqrt(np.mean(noise.wander**2))),
-        advice,
-        free=lambda: calibrated(plain_selection.base),
-        full=(lambda: calibrated(plain_selection.fit)) if plain_selection.names else None,
+        sensor=sensor,
+        selected=reported.names,
+        verdict=verdict,
+        steps=reported.steps,
+        alone=reported.alone,
+        terms=reported.fit.terms,
+        covariance=reported.fit.covariance,
+        limits=reported.limits,
+        shares=lambda name: _shares(reported, name),
+        left=left,
+        drop_alone=drop_alone,
+        excess=excess,
+        held_out=held or [None] * len(fits),
+        hidden=hidden,
+        unknown=unknown,
+        over_noise=_over_noise(selection.base, recordings, noise),
+        left_over_noise=_over_noise(selection.fit, recordings, noise),
+        noises=[(setting.ratio, setting.time, score) for setting, score in hypotheses],
+        white=float(np.sqrt(white_square)),
+        expected_wander=None if noise is None else float(np.sqrt(np.mean(noise.wander**2))),
+        advice=advice,
+        free=lambda: calibrated(selection.base),
+        full=(lambda: calibrated(selection.fit)) if selection.names else None,
         more={
             "held_out": held_out,
-            "suggested_effect": suggested,
-            "pictures": plots(plain_selection, unknown, noise, selection),
-            "method_errors": method_errors(calibration, selection, recordings, settings),
+            "suggested_effect": None if reported is selection else suggested_effect(unknown, sensor, catalogue()),
+            "pictures": plots(selection, unknown, noise, reported),
+            "method_errors": method_errors(calibration, reported, recordings, settings),
         },
         turns=turns_of(observations),
     )

@@ -76,7 +76,7 @@ class Evidence:
     full: HeldOut | None = None  # of the free fit with the selected effects
     doubts: Sequence[str] = ()  # what the recordings' checks say of the reference
     approximations: Sequence[str] = ()  # what the method's matrix and bias lack (``pipeline.diagnosis.method_errors``)
-    unknown: Sequence[str] = ()  # covariates on which the residual depends beside what was selected
+    unknown: Sequence[str] = ()  # covariates on which the residual depends, given what was selected
     implausible: Sequence[str] = ()  # selected effects beyond the sensor's limits, where that is not accepted
     held_out: Mapping[str, float] | None = None  # ``error_before, error_after, floor`` of the selection's own fits
     method: str = ""
@@ -97,7 +97,7 @@ def verdict_of_selection(
     """Return the verdict of a selection alone.
 
     What is selected must explain most of the excess, unless nothing else is left. A residual that still depends on
-    something beyond the catalogue is unexplained where that is worth naming beside what was selected; next to a much
+    something beyond the catalogue is unexplained where that is worth naming; next to a much
     larger effect it may be the small error of its linear equation. ``share`` of the residual's excess and ``gain`` in
     2 log L are what the selected effects explain; ``above_noise``: the residual stays far above the noise with them.
     """
@@ -231,13 +231,13 @@ def _why_unexplained(e: Evidence) -> str:
             f"It takes {len(e.selected)} effects together to explain the residual, more than a unit usually has: the "
             "true one may not be in the catalogue."
         )
-    beside = f" with {names}" if e.selected else ""
+    given = f" with {names}" if e.selected else ""
     if e.unknown:
         depends = listed([plain(n) for n in e.unknown])
-        found.append(f"The residual{beside} depends on {depends} in a form that no effect of the catalogue has.")
+        found.append(f"The residual{given} depends on {depends} in a form that no effect of the catalogue has.")
     left = e.left_over_noise if e.selected else e.over_noise
     if left is not None and (left > EXPLAINED or not found):
-        found.append(f"The residual of the fit{beside} is {left:.3g} times the noise.")
+        found.append(f"The residual of the fit{given} is {left:.3g} times the noise.")
     return " ".join(found) or "No effect of the catalogue explains the residual."
 
 

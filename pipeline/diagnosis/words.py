@@ -99,9 +99,9 @@ def _selected(entry: Mapping[str, Any], sensor: str, *, with_form: bool) -> list
         lines.append(f"Its signal is similar to that of {alike}.")
     before, after = entry["held_out_error_before"], entry["held_out_error_after"]
     if before is not None and after is not None:
-        beside = ", with the functional form below fitted too" if with_form else ""
+        given = ", with the functional form below fitted too" if with_form else ""
         lines.append(
-            f"It changes the rms error on held-out motion from {before:.4g} to {after:.4g} {unit_of(sensor)}{beside}."
+            f"It changes the rms error on held-out motion from {before:.4g} to {after:.4g} {unit_of(sensor)}{given}."
         )
     return lines
 

@@ -46,11 +46,14 @@ class Change:
 
 
 def changes(unit: UnitDescription) -> list[Change]:
-    """Return what could be recorded beside the procedure of a unit."""
+    """Return what could be recorded in addition to the procedure of a unit."""
     course = course_of(unit)
     fixed = replace(unit, samples=None, course=asdict(course))
-    of = _on_a_table if unit.procedure in TABLE_PROCEDURES else _by_hand
-    return [*of(fixed, course), *_anywhere(fixed, course)]
+    found = list((_on_a_table if unit.procedure in TABLE_PROCEDURES else _by_hand)(fixed, course))
+    if course.static_s < LONG_REST_S:
+        what = f"a long rest of {LONG_REST_S / 60.0:g} min, to determine the noise"
+        found.append(_with(fixed, what, f"--static {LONG_REST_S:g}", static_s=LONG_REST_S))
+    return found
 
 
 def _with(unit: UnitDescription, what: str, options: str, **course: Any) -> Change:  # noqa: ANN401  (any attribute)
@@ -109,22 +112,14 @@ def _by_hand(unit: UnitDescription, course: Course) -> Iterator[Change]:
         yield Change(what, "--procedure multi_position", replace(unit, procedure="multi_position"))
 
 
-def _anywhere(unit: UnitDescription, course: Course) -> Iterator[Change]:
-    if course.static_s < LONG_REST_S:
-        what = f"a long rest of {LONG_REST_S / 60.0:g} min, to determine the noise"
-        yield _with(unit, what, f"--static {LONG_REST_S:g}", static_s=LONG_REST_S)
-
-
 @dataclass(frozen=True)
 class Gain:
     """What a change would bring."""
 
     change: Change
     minutes: float  # more at the table
-    shown: tuple[
-        str, ...
-    ]  # ``sensor.effect`` that become observable; one of the table only if neither sensor showed it
-    told: tuple[str, ...]  # those that would no longer be taken for a look-alike
+    shown: tuple[str, ...]  # ``sensor.effect`` that become observable; of the table only if neither sensor showed it
+    distinguished: tuple[str, ...]  # those that would no longer be taken for a look-alike
     factor: float  # geometric mean of the new smallest sizes over the old ones, of effects observable in both
 
 
@@ -139,13 +134,12 @@ def best_changes(unit: UnitDescription, before: Document) -> list[Gain]:
     if all(before[sensor]["reason"] for sensor in SENSORS):
         return []
     gains = [_gain(change, before, plan_of(change.unit, change.extra, half_only=True)) for change in changes(unit)]
-    return sorted(gains, key=_worth)
 
+    def worth(gain: Gain) -> tuple[float, float]:
+        minutes = max(gain.minutes, 1.0)
+        return -len(gain.shown) / minutes, float(np.log(gain.factor)) / minutes
 
-def _worth(gain: Gain) -> tuple[float, float]:
-    """Return what sorts the most helpful change first."""
-    minutes = max(gain.minutes, 1.0)
-    return -len(gain.shown) / minutes, float(np.log(gain.factor)) / minutes
+    return sorted(gains, key=worth)
 
 
 def _gain(change: Change, before: Document, after: Document) -> Gain:

@@ -5,7 +5,7 @@ signs. An effect is found where the gain in 2 log L that it brings passes the ga
 look-alike i, which leaves a part of its signal, has the better BIC. N readings, k parameters, m candidates:
 
 Turns on a table (``TurntableLimits``), whose readings are many. With the whitened sum of squares ``a^2 lambda_t`` of a
-signal of size a beside the base, and that of noise alone, ``T_t = s^-2 tr(C_t^-1 C)``, under the noise setting t,
+signal of size a, given the base, and that of noise alone, ``T_t = s^-2 tr(C_t^-1 C)``, under the noise setting t,
 
     log L_t(a) = -N/2 log [(T_t + a^2 lambda_t) / N] - penalty_t,    g(a) = 2 [max_t log L_t(0) - max_t log L_t(a)]
     P(found) = P(chi^2_k(g) > max(k log N + 10, quantile of chi^2_k at 1 - 0.01/m))
@@ -74,7 +74,7 @@ class Detection:
 
 @dataclass(frozen=True)
 class _Signal:
-    """One effect with s patterns of signs, beside r rivals that reproduce a part of it."""
+    """One effect with s patterns of signs, and r rivals that reproduce a part of it."""
 
     found: Callable[[float], Values]  # share of the limits to the probability that it passes the gate: (s,) array
     ahead: Callable[[float], Values]  # and to the probability that its BIC is better than a rival's: (r, s) array

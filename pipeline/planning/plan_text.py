@@ -81,7 +81,7 @@ def _share(value: float | None) -> str:
 
 
 def side_by_side(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]:
-    """Return two plans beside each other as lines."""
+    """Return two plans as lines, side by side."""
     lines = [f"A: {_heading(first)}", f"B: {_heading(second)}"]
     a, b = first["course"], second["course"]
     lines += [f"   {name}: {a[name]} in A, {b[name]} in B" for name in a if a[name] != b[name]]
@@ -108,7 +108,7 @@ def _compared(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]:
 
 def helps_most(gains: Sequence[Gain]) -> list[str]:
     """Return the changes that help most as lines, in the given order."""
-    useful = [gain for gain in gains if gain.shown or gain.told or 100.0 * gain.factor < CLEARLY_SMALLER]
+    useful = [gain for gain in gains if gain.shown or gain.distinguished or 100.0 * gain.factor < CLEARLY_SMALLER]
     if not useful:
         return ["additional recordings: none of those examined shows more"] if gains else []
     lines = ["additional recordings, the most helpful first:"]
@@ -122,7 +122,7 @@ def helps_most(gains: Sequence[Gain]) -> list[str]:
 def _brought(gain: Gain) -> str:
     """Return the effect of a change on what can be found; the factor is a mean over effects and sensors."""
     parts = [f"shows {_listed(gain.shown)}"] if gain.shown else []
-    parts += [f"distinguishes {_listed(gain.told)} from similar effects"] if gain.told else []
+    parts += [f"distinguishes {_listed(gain.distinguished)} from similar effects"] if gain.distinguished else []
     percent = 100.0 * gain.factor
     whose = "the others" if parts else "effects"
     smaller = percent < CLEARLY_SMALLER

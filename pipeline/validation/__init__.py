@@ -1,1 +1,1 @@
-"""Errors on held-out motion, beside the noise floor."""
+"""Errors on held-out motion, and the noise floor."""

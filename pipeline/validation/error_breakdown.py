@@ -21,7 +21,7 @@ from pipeline.estimation.correction import apply_correction
 from pipeline.model.effects import effect_of
 from pipeline.model.effects.base import truth
 from pipeline.model.log_motion import LogEnd, fields_used, log_motion
-from pipeline.model.measurement import Part, inverse_of, linear_truth, solve
+from pipeline.model.measurement import Part, linear_truth, solve
 from pipeline.records import Motion
 from pipeline.validation.samples import OTHER
 
@@ -88,17 +88,16 @@ def with_known_effects(calibration: SensorCalibration, samples: Samples, other: 
 
 
 def _uncorrected(samples: Samples, readings: NDArray[np.float64]) -> Corrected:
-    """Return readings beside the reference as it was logged."""
+    """Return readings, and the reference as it was logged."""
     return readings, samples.magnitude, None if samples.motion is None else truth(samples.sensor, samples.motion)
 
 
 def _figures(name: str, corrected: Sequence[Corrected]) -> dict[str, Any]:
     error = np.concatenate([np.linalg.norm(vector, axis=1) - magnitude for vector, magnitude, _ in corrected])
-    squares = None
-    differences = [vector - known for vector, _, known in corrected if known is not None]
-    if len(differences) == len(corrected):
-        squares = np.sum(np.concatenate(differences) ** 2, axis=1)[np.isfinite(error)]
-    error = error[np.isfinite(error)]
+    known = np.isfinite(error)
+    differences = [vector - true for vector, _, true in corrected if true is not None]
+    off = np.concatenate(differences)[known] if len(differences) == len(corrected) else None
+    error = error[known]
     return {
         "name": name,
         "mean_abs_error": float(np.mean(np.abs(error))),
@@ -107,7 +106,7 @@ def _figures(name: str, corrected: Sequence[Corrected]) -> dict[str, Any]:
         "min_error": float(np.min(error)),
         "rms_error": float(np.sqrt(np.mean(error**2))),
         "change_percent": None,
-        "vector_rms_error": None if squares is None else float(np.sqrt(np.mean(squares))),
+        "vector_rms_error": None if off is None else float(np.sqrt(np.mean(np.sum(off**2, axis=1)))),
     }
 
 
@@ -138,20 +137,22 @@ def _with_effects(
     """Return calibrated readings, magnitude and vector of the reference with some effects."""
     if not effects:
         return _uncorrected(samples, linear_truth(calibration, samples.reading))
+    own = [fitted for fitted in effects if not effect_of(fitted).moves]
     if samples.motion is None:
-        own = [fitted for fitted in effects if not effect_of(fitted).moves]
-        moves = [fitted for fitted in effects if effect_of(fitted).moves]
+        moves = [fitted for fitted in effects if fitted not in own]
         return _from_own_signals(calibration, own, samples, other), _moved_magnitude(samples, moves), None
-    sensor, motion, K = calibration.sensor, samples.motion, inverse_of(calibration)
-    for fitted in effects:
-        motion = effect_of(fitted).moved(motion, fitted.values)
-    rest = samples.reading
-    for fitted in effects:
-        if not effect_of(fitted).moves:
-            rest = rest - effect_of(fitted).reading(sensor, motion, K, fitted.values)
-    moved, logged = truth(sensor, motion), truth(sensor, samples.motion)
+    motion = _moved(samples.motion, effects)
+    rest = Part.of(calibration, own).take_off(samples.reading, motion)
+    moved, logged = truth(samples.sensor, motion), truth(samples.sensor, samples.motion)
     change = np.linalg.norm(moved, axis=1) - np.linalg.norm(logged, axis=1)
     return linear_truth(calibration, rest), samples.magnitude + change, moved
+
+
+def _moved(motion: Motion, effects: Sequence[FittedEffect]) -> Motion:
+    """Return the motion after the effects of timing."""
+    for fitted in effects:
+        motion = effect_of(fitted).moved(motion, fitted.values)
+    return motion
 
 
 def _moved_magnitude(samples: Samples, effects: Sequence[FittedEffect]) -> NDArray[np.float64]:
@@ -178,10 +179,7 @@ def _moved_magnitude(samples: Samples, effects: Sequence[FittedEffect]) -> NDArr
     def moved_on(before: float | NDArray[np.float64], offset: float | NDArray[np.float64]) -> Motion:
         return motion(before + offset)
 
-    moved = motion()
-    for fitted in effects:
-        moved = effect_of(fitted).moved(moved, fitted.values)
-    return np.abs(moved.angular_rate[:, 0])
+    return np.asarray(np.abs(_moved(motion(), effects).angular_rate[:, 0]))
 
 
 def _from_own_signals(

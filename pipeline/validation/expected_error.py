@@ -123,12 +123,12 @@ def _changed_parameters(calibration: SensorCalibration) -> Iterator[tuple[int, S
 
 @dataclass(frozen=True)
 class _Uncertain:
-    """What is random beside the white noise."""
+    """What is random in addition to the white noise."""
 
     covariance: Values  # (p + 1, p + 1), of the parameters and of the scale of the table's rate
     noise: Noise
     coarse: Values  # (3,), variance of rounding that is no part of the white noise
-    drift: Values  # (3,), variance of a drift beside the wander
+    drift: Values  # (3,), variance of a drift in addition to the wander
     drift_time: float  # s
 
 
@@ -167,7 +167,7 @@ def expected_rms_error(
 
 
 def _drift(residual_wander: Values | None, noise: Noise, size: float, time: float) -> Values:
-    """Return the variance of a drift beside the wander: (3,) array.
+    """Return the variance of a drift in addition to the wander: (3,) array.
 
     It is the data sheet's wander (``size``, ``time``) beyond the wander that was seen, and what the residuals of the
     fit, which last longer than a rest, show beyond it. A residual may hold a missing effect, so at most ``INFLATED``

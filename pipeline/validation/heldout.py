@@ -1,4 +1,4 @@
-"""Held-out errors: what a calibration leaves on samples that no fit has seen, beside what noise alone would leave.
+"""Held-out errors: what a calibration leaves on samples that no fit has seen, and what noise alone would leave.
 
 Held out are the recordings of role ``validation``; without one, every third rest (``procedure.holdout_every``). Where
 nothing is held out, the samples of the fit are judged, and the result says so. With D the variance of a sample's noise,
@@ -154,7 +154,7 @@ def last_error(
     other: SensorCalibration | None = None,
     smoothed: bool = False,
 ) -> tuple[float, list[float]] | None:
-    """Return the rms error after the last step and its interval; None where nothing is held out or no interval is told.
+    """Return the rms error after the last step and its interval; None without held-out motion or interval.
 
     With ``smoothed``, the reference of a filtered recording goes through its filter, too: the filter leaves no error.
     """
@@ -203,7 +203,7 @@ def _choose(
 
     def moving(role: str) -> list[Samples]:
         chosen = [r for r in recordings if r.role == role]
-        if by_rests:  # hand-held: between its rests nobody knows the specific force
+        if by_rests:  # hand-held: between its rests the specific force is not known
             chosen = [r for r in chosen if _logs_table(r)]
         found = [samples_of_motion(sensor, r, noise, table, smoothed=smoothed) for r in chosen]
         return [s for s in found if s is not None and np.isfinite(s.reading).all(axis=1).any()]
@@ -261,7 +261,7 @@ def _worse_than_raw(
 def _check_limits(
     calibration: SensorCalibration, last: Mapping[str, Any], limits: Mapping[str, float | None]
 ) -> tuple[list[dict[str, Any]], bool | None]:
-    """Return each limit beside its figure, and whether all are kept (None: there is no limit).
+    """Return each limit with its figure, and whether all are kept (None: there is no limit).
 
     A limit that is null is not checked; a figure that is not known does not pass.
     """
