@@ -1,4 +1,10 @@
-"""What a selection found, in the same terms for turns on a table and for rests and moves by hand."""
+"""What a selection found, in the same terms for turns on a table and for rests and moves by hand, as a document.
+
+A noise model with bias wander can take up a missing effect. So the fitted wander, ``sigma = q s`` with its ratio q to
+the white noise s, is compared with that of the rests or the data sheet:
+
+    inflated:   sigma > 3 sigma_expected   and   log L(best) - max {log L(q, tau): q s <= 3 sigma_expected} > 5
+"""
 
 from __future__ import annotations
 
@@ -6,6 +12,10 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from pipeline.diagnosis.words import next_experiment
+from pipeline.estimation.selection import ALIKE, EVIDENCE, GATE_BIC, INFLATED
+from pipeline.model.effects import effect
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -17,6 +27,8 @@ if TYPE_CHECKING:
     from pipeline.records import SensorCalibration
 
     Values = NDArray[np.float64]
+
+LEAST_RATIO = 0.03  # of the white noise: the smallest wander of the selection's settings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,3 +68,94 @@ class Findings:
         """Return the share of the residual's excess over the noise that a drop of its squares is."""
         excess = max(self.excess, drop)
         return float(np.clip(drop / excess, 0.0, 1.0)) if excess > 0.0 else 0.0
+
+
+def document_of(found: Findings, configured: list[str]) -> dict[str, Any]:
+    """Return a sensor's part of ``diagnoses/<unit>.json``, with the verdict of the selection alone."""
+    others = sorted(found.alone.values(), key=lambda s: -s.delta_bic)
+    unselected = [s.name for s in others if s.name not in found.selected and s.name not in found.hidden]
+    ranking = [_entry(found, name) for name in (*found.selected, *unselected)]
+    verdict = found.verdict
+    if verdict == "nothing_missing" and not ranking and found.hidden:
+        verdict = "not_enough_data"
+    return {
+        "verdict": verdict,
+        "residual_over_noise": found.over_noise,
+        "selected": list(found.selected),
+        "ranking": ranking,
+        "not_observable": [{"effect": name, "reason": reason} for name, reason in found.hidden.items()],
+        "unexplained": found.unknown,
+        "suggested_effect": None,
+        "next_experiment": next_experiment(verdict, ranking, found),
+        "override": _override(found.sensor, [*configured, *found.selected]) if found.selected else "",
+        "configured": configured,
+        "wander": _wander(found),
+        "method_errors": [],
+        **found.more,
+    }
+
+
+def _override(sensor: str, names: Sequence[str]) -> str:
+    return f"effects.{sensor}=[{','.join(names)}]"
+
+
+def _entry(found: Findings, name: str) -> dict[str, Any]:
+    """Return one line of the ranking."""
+    score = found.steps.get(name) or found.alone[name]
+    before = after = None
+    drop = found.drop_alone(name)
+    if name in found.selected:
+        step = found.selected.index(name)
+        before, after = found.held_out[step : step + 2]
+        drop = found.left[step] - found.left[step + 1]
+    estimates, plausible = _estimates(found, score)
+    shares = found.shares(name) if score.delta_bic > GATE_BIC else {}
+    alike = sorted(((share, other) for other, share in shares.items() if share > ALIKE), reverse=True)
+    return {
+        "effect": name,
+        "delta_bic": score.delta_bic,
+        "p_value": score.p_value,
+        "parameters": estimates,
+        "explained_share": found.share(drop),
+        "held_out_error_before": before,
+        "held_out_error_after": after,
+        "look_alikes": [{"effect": other, "share": share} for share, other in alike],
+        "plausible": plausible,
+        **({"meaning": effect(name).meaning} if effect(name).definition else {}),
+    }
+
+
+def _estimates(found: Findings, score: Score) -> tuple[dict[str, Any], bool]:
+    """Return the parameters, and whether they are plausible: of the fit of all selected, or of the effect alone."""
+    values, uncertainty, plausible = score.values, score.uncertainty, score.plausible
+    at = len(found.covariance) - sum(len(term.values) for term in found.terms)
+    for term in found.terms:
+        own = slice(at, at + len(term.values))
+        at = own.stop
+        if term.effect.name == score.name and score.name in found.selected:
+            values, uncertainty = term.values, np.sqrt(np.clip(np.diag(found.covariance)[own], 0.0, None))
+            if score.name in found.limits:
+                plausible = bool(np.all(np.abs(values) - 2.0 * uncertainty <= found.limits[score.name]))
+    described = effect(score.name).of_recordings(found.turns).parameters(found.sensor)
+    return {
+        p.name: {"value": float(v), "unit": p.unit, "standard_uncertainty": float(u) if u > 0 else None}
+        for p, v, u in zip(described, values, uncertainty, strict=True)
+    }, plausible
+
+
+def _wander(found: Findings) -> dict[str, Any]:
+    """Return the wander under which base, configured and selected effects explain the readings best."""
+    ratio, time, best = max(found.noises, key=lambda noise: noise[2])
+    inflated = False
+    if found.expected_wander is not None:
+        most = INFLATED * max(found.expected_wander / found.white, LEAST_RATIO)
+        believed = [score for other, _, score in found.noises if other <= most]
+        inflated = ratio > most and (not believed or best - max(believed) > EVIDENCE)
+    return {
+        "ratio": float(ratio),
+        "time_s": float(time) if ratio else None,
+        "standard_deviation": float(ratio * found.white),
+        "expected": found.expected_wander,
+        "inflated": bool(inflated),
+        **found.scatter,
+    }

@@ -46,7 +46,7 @@ OWNERS = {"harmonic": "table", "ripple": "table", "band": "table"}
 
 
 @dataclass(frozen=True)
-class FittedForm:
+class _FittedForm:
     """The best functional form in one covariate."""
 
     covariate: str
@@ -90,7 +90,7 @@ def unexplained(selection: Selection) -> list[dict[str, Any]]:
     ]
 
 
-def _instead_of_slow_effects(selection: Selection) -> FittedForm | None:
+def _instead_of_slow_effects(selection: Selection) -> _FittedForm | None:
     """Return a step or exponential of the temperature that explains far more than the selected slow effects.
 
     Where the unit only warms up, all of these are one curve in time, and none is far better.
@@ -108,12 +108,12 @@ def _instead_of_slow_effects(selection: Selection) -> FittedForm | None:
     return found if found.gain.delta_bic > worth + max(MUCH, FAR_MORE * gain) else None
 
 
-def _rank(fitted: FittedForm) -> float:
+def _rank(fitted: _FittedForm) -> float:
     """Return the order of forms: time, of which everything slow is a function, only where it is clearly better."""
     return -fitted.gain.delta_bic + (CLEARLY if fitted.covariate == "time" else 0.0)
 
 
-def _best_form(selection: Selection, covariate: str) -> FittedForm:
+def _best_form(selection: Selection, covariate: str) -> _FittedForm:
     """Return the best form in a covariate."""
     sensor = selection.observations.sensor
     if covariate == "angle":
@@ -129,7 +129,7 @@ def _best_form(selection: Selection, covariate: str) -> FittedForm:
     return max(found, key=lambda fitted: fitted.gain.delta_bic)
 
 
-def _best_harmonics(selection: Selection, factor: str) -> FittedForm:
+def _best_harmonics(selection: Selection, factor: str) -> _FittedForm:
     """Return harmonics of the table's angle, added one by one while delta BIC rises clearly."""
     tried = forms.harmonics(factor)
     projected = _projected(selection, [text for form in tried for text in form.formulas])
@@ -144,7 +144,7 @@ def _best_harmonics(selection: Selection, factor: str) -> FittedForm:
         chosen, (best, index) = options[k], gains[k]
     found = _on_axes(projected.coefficients(index, best.setting), best)
     amplitude = np.sqrt(np.sum(found.reshape(3, -1, 2) ** 2, axis=2)).max(axis=1)
-    return FittedForm("angle", forms.harmonic(factor, [forms.CYCLES[n] for n in chosen]), best, found, amplitude)
+    return _FittedForm("angle", forms.harmonic(factor, [forms.CYCLES[n] for n in chosen]), best, found, amplitude)
 
 
 def _gain_of_harmonics(projected: ProjectedCurves, chosen: Sequence[int]) -> tuple[Gain, list[int]]:
@@ -156,7 +156,7 @@ def _gain_of_harmonics(projected: ProjectedCurves, chosen: Sequence[int]) -> tup
     return projected.gain(projected.drop(index)[:, :, -1], len(index), len(chosen)), columns
 
 
-def _best_polynomial(selection: Selection, covariate: str, signal: str) -> FittedForm:
+def _best_polynomial(selection: Selection, covariate: str, signal: str) -> _FittedForm:
     """Return the polynomial of the best order, without powers that base or effects hold already."""
     own = "fz" if selection.observations.sensor == "accelerometer" else "wz"
     span = forms.Span.of(selection.observations, own if signal == "u" else signal)
@@ -170,10 +170,10 @@ def _best_polynomial(selection: Selection, covariate: str, signal: str) -> Fitte
     found = _on_axes(projected.coefficients(index, gains[best].setting), gains[best])
     formulas = tuple(texts[k] for k in index)
     form = forms.polynomial(signal, formulas, (index[-1] + 1) if index else 0)
-    return FittedForm(covariate, form, gains[best], found, _change(selection, formulas, found))
+    return _FittedForm(covariate, form, gains[best], found, _change(selection, formulas, found))
 
 
-def _best_scanned(selection: Selection, covariate: str, signal: str) -> tuple[FittedForm, float]:
+def _best_scanned(selection: Selection, covariate: str, signal: str) -> tuple[_FittedForm, float]:
     """Return the best step, band or exponential, by a coarse and a fine scan, and the log likelihood without it."""
     span = forms.Span.of(selection.observations, signal)
     places = span.places()
@@ -190,7 +190,7 @@ def _best_scanned(selection: Selection, covariate: str, signal: str) -> tuple[Fi
     inner = np.einsum("q,cqp,p->c", weights, projected.inner[gain.setting], weights)
     found = _on_axes((projected.cross[gain.setting] @ weights / np.maximum(inner, 1e-300))[:, None], gain)
     sizes = found[:, 0] if form.kind != "exponential" else _change(selection, form.formulas, found)
-    return FittedForm(covariate, form, gain, found, sizes), projected.before
+    return _FittedForm(covariate, form, gain, found, sizes), projected.before
 
 
 def _best_of(
