@@ -84,10 +84,7 @@ FORWARD = (
 
 
 def method_errors(
-    calibration: SensorCalibration,
-    selection: Selection,
-    recordings: Sequence[Recording],
-    settings: Mapping[str, Any],
+    calibration: SensorCalibration, selection: Selection, recordings: Sequence[Recording], settings: Mapping[str, Any]
 ) -> list[dict[str, Any]]:
     """Return what the method's approximations leave, the largest share first; nothing where its fit is free.
 

@@ -101,8 +101,7 @@ def validate(
         part["noise_floor"], part["vector_noise_floor"] = noise_floors(calibration, samples)
         part["reference_rms"] = float(np.sqrt(np.nanmean(np.concatenate([s.magnitude for s in samples]) ** 2)))
         part["steps"], part["notes"] = error_breakdown(calibration, samples, other)
-        fitted_s = _length(sensor, recordings)
-        expected, lack = _expected(calibration, samples, noise, settings, other, fitted_s=fitted_s)
+        expected, lack = _expected(calibration, recordings, samples, noise, settings, other=other)
         part["expected_rms_error"] = expected
         part["notes"] += lack
         if part["held_out"] and expected is not None:
@@ -114,12 +113,12 @@ def validate(
 
 def _expected(
     calibration: SensorCalibration,
+    recordings: Sequence[Recording],
     samples: Sequence[Samples],
     noise: Noise,
     settings: Mapping[str, Any],
-    other: SensorCalibration | None,
     *,
-    fitted_s: float,
+    other: SensorCalibration | None,
 ) -> tuple[list[float] | None, list[str]]:
     """Return the interval of the last step's rms error (None where an effect is left out), and notes on it.
 
@@ -129,6 +128,8 @@ def _expected(
     known = [p for p in parts if p is not None]
     if len(known) < len(parts):
         return None, []
+    own = [r for r in recordings if r.role in {calibration.sensor, "rests"} and r.samples]
+    fitted_s = sum(float(r.time[-1] - r.time[0]) for r in own if r.reading(calibration.sensor) is not None)
     low, high = expected_rms_error(calibration, known, noise, settings, fitted_s)
     if not any(s.earth_left_out for s in samples):
         return [low, high], []
@@ -137,12 +138,6 @@ def _expected(
         f"error allows for its {EARTH_RATE_DPS:.2g} deg/s"
     )
     return [max(low - EARTH_RATE_DPS, 0.0), high + EARTH_RATE_DPS], [note]
-
-
-def _length(sensor: str, recordings: Sequence[Recording]) -> float:
-    """Return how long the recordings of a sensor's fit last, s."""
-    own = [r.time for r in recordings if r.role in {sensor, "rests"} and r.reading(sensor) is not None and r.samples]
-    return float(sum(time[-1] - time[0] for time in own))
 
 
 def last_error(
@@ -161,8 +156,7 @@ def last_error(
     samples, reason = _choose(calibration.sensor, recordings, noise, settings, smoothed=smoothed)
     if reason is not None:
         return None
-    fitted_s = _length(calibration.sensor, recordings)
-    expected, _ = _expected(calibration, samples, noise, settings, other, fitted_s=fitted_s)
+    expected, _ = _expected(calibration, recordings, samples, noise, settings, other=other)
     errors = [error for s in samples if (error := last_error_of_magnitude(calibration, s, other)) is not None]
     if expected is None or not errors:
         return None
@@ -204,7 +198,8 @@ def _choose(
     def moving(role: str) -> list[Samples]:
         chosen = [r for r in recordings if r.role == role]
         if by_rests:  # hand-held: between its rests the specific force is not known
-            chosen = [r for r in chosen if _logs_table(r)]
+            logs = ("table_attitude", "table_rate", "table_angle")
+            chosen = [r for r in chosen if any(getattr(r, log) is not None for log in logs)]
         found = [samples_of_motion(sensor, r, noise, table, smoothed=smoothed) for r in chosen]
         return [s for s in found if s is not None and np.isfinite(s.reading).all(axis=1).any()]
 
@@ -223,11 +218,6 @@ def _choose(
     lack = f"no held-out recording holds readings of the {sensor} and a reference for them"
     fitted = moving(sensor) or resting(rests_of("rests")) or resting(rests_of(sensor))
     return fitted, lack + ("; judged on the samples of the fit" if fitted else "")
-
-
-def _logs_table(recording: Recording) -> bool:
-    logs = (recording.table_attitude, recording.table_rate, recording.table_angle)
-    return any(log is not None for log in logs)
 
 
 def _worse_than_raw(

@@ -58,5 +58,5 @@ def test_advice_names_what_too_few_rests_cannot_tell_where_they_scatter() -> Non
     assert part["selected"] == []
     assert part["residual_over_noise"] > 2.0
     assert "quadratic_nonlinearity" in [entry["effect"] for entry in part["not_observable"]]
-    assert "no better than quadratic nonlinearity" in part["next_experiment"]
+    assert "an unsteady hand from quadratic nonlinearity" in part["next_experiment"]
     assert "firmly" not in part["next_experiment"]
