@@ -57,16 +57,9 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run_snakemake(arguments: argparse.Namespace, config: Sequence[str], options: Sequence[str] = ()) -> int:
-    """Run a campaign with the shipped rules and return the exit code.
+    """Run a campaign with the shipped rules, settings KEY=VALUE and options of Snakemake; return the exit code.
 
-    Parameters
-    ----------
-    arguments : argparse.Namespace
-        With ``campaign`` and what ``add_run_options`` adds.
-    config : sequence of str
-        Settings of the run, ``KEY=VALUE``.
-    options : sequence of str
-        Further options of Snakemake.
+    ``arguments`` holds ``campaign`` and what ``add_run_options`` adds.
     """
     settings = [f"campaign={arguments.campaign}", *config]
     settings += [f"results={arguments.results}"] * (arguments.results != RESULTS)

@@ -78,12 +78,9 @@ class Composer:
         self._valid_ingest: set[str] = set()
 
     def unit(self, name: str, layers: Sequence[str]) -> dict[str, Any]:
-        """Return the checked configuration of a unit; raises ``Problem`` one line for each thing that is wrong.
+        """Return the checked configuration of a unit from its overrides, weakest first.
 
-        Parameters
-        ----------
-        layers : sequence of str
-            Hydra overrides, weakest first.
+        Raises ``Problem`` with one line for each thing that is wrong.
         """
         groups, values = self.split(layers)
         key = repr((sorted(groups.items()), values))

@@ -49,19 +49,10 @@ def sensor_and_effect(text: str) -> tuple[str, str]:
 def edit_effects(
     unit: str, effects: Sequence[tuple[str, str]], layers: Layers, composer: Composer, *, remove: bool = False
 ) -> Edit:
-    """Return the unit's device file with effects added or removed.
+    """Return the unit's device file with effects, each sensor and name, added or removed.
 
     Raises ``ConfigurationError`` if the unit or an effect is unknown, a stronger layer sets the effects, or the file
     cannot be edited.
-
-    Parameters
-    ----------
-    effects : sequence of (str, str)
-        Sensor and effect.
-    layers : Layers
-        Of the campaign, with what the command line gives.
-    remove : bool
-        Whether the effects are removed.
     """
     file = _file(unit, layers, composer.campaign)
     text = file.read_bytes().decode() if file.is_file() else ""  # line ends as they are
@@ -112,15 +103,6 @@ def set_override(text: str, key: str, override: str | None, file: str) -> str:
     """Return a device file with the override of a key replaced, added, or (None) removed; all else stays as it is.
 
     Raises ``ConfigurationError`` if the file has a form that cannot be edited in place.
-
-    Parameters
-    ----------
-    text : str
-        Of the file; may be empty.
-    override : str or None
-        ``key=value``.
-    file : str
-        For the message.
     """
     wanted = _changed([(entry, entry) for entry in _overrides(text)], key, override, override)
     edited = _edited(text, key, override)

@@ -138,14 +138,7 @@ def load_layers(directory: Path, settings: Mapping[str, Any], sheet: Sheet, sens
 
     Raises ``ConfigurationError`` naming the file and the key.
 
-    Parameters
-    ----------
-    directory : Path
-        Of the campaign.
-    settings : mapping
-        Of ``--config``: ``overrides`` and ``unit_overrides``.
-    sensors : iterable of str
-        Names of the sensor configs.
+    ``settings`` are those of ``--config``, ``sensors`` the names of the sensor configs.
     """
     path = directory / "campaign.yaml"
     file = _read(path, CampaignFile) if os.path.lexists(path) else CampaignFile()

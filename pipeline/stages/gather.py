@@ -171,10 +171,7 @@ def _publish_histories(new: Path, entries: Sequence[JSON]) -> None:
 def same_files(inputs: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[list[str]]:
     """Return the files of several units with the same content under different names.
 
-    Parameters
-    ----------
-    inputs : mapping of str to sequence of mapping
-        Unit to its inputs: ``file``, ``sha256``. One file that several units are calibrated from is not reported.
+    One file that several units are calibrated from is not reported.
     """
     known: dict[str, dict[str, str]] = {}
     for unit, files in inputs.items():
