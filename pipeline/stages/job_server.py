@@ -27,9 +27,8 @@ def start_server() -> Callable[[], None]:
 
     if sys.platform != "linux":
         return lambda: None
-    folder = tempfile.TemporaryDirectory(prefix="imu-calibration-")
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    os.environ[ADDRESS] = os.path.join(folder.name, "jobs")  # noqa: PTH118  (pathlib would be imported by each job)
+    os.environ[ADDRESS] = os.path.join(tempfile.mkdtemp(prefix="imu-calibration-"), "jobs")  # noqa: PTH118  (pathlib would be imported by each job)
     listener.bind(os.environ[ADDRESS])
     listener.listen(128)
     with listener:
@@ -43,7 +42,6 @@ def start_server() -> Callable[[], None]:
     def end() -> None:
         os.environ.pop(ADDRESS, None)
         server.communicate()  # closes its standard input, at which it ends
-        folder.cleanup()
 
     return end
 
@@ -65,8 +63,9 @@ def run_on_server(argv: Sequence[str]) -> int | None:
 
 
 def serve(listener: socket.socket, stages: Sequence[str], run_command: Callable[[list[str]], int]) -> int:
-    """Serve until the standard input is closed; run a command in each forked process."""
+    """Serve until the standard input is closed, also by a killed run; run a command in each forked process."""
     import gc  # noqa: PLC0415
+    import shutil  # noqa: PLC0415
     import signal  # noqa: PLC0415
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the jobs receive it too
@@ -75,6 +74,7 @@ def serve(listener: socket.socket, stages: Sequence[str], run_command: Callable[
     request = _next_job(listener)
     listener.close()
     if request is None:
+        shutil.rmtree(os.path.dirname(os.environ[ADDRESS]), ignore_errors=True)  # noqa: PTH120
         return 0
     signal.signal(signal.SIGINT, signal.default_int_handler)
     return _run_job(run_command, *request)

@@ -18,8 +18,11 @@ VERDICT = [sys.executable, "-m", "pipeline", "verdict", "--results", "results", 
 @pytest.fixture(scope="module")
 def _server() -> Iterator[None]:
     end = start_server()
+    folder = Path(os.environ["IMU_CALIBRATION_JOB_SERVER"]).parent
+    assert folder.is_dir()
     yield
     end()
+    assert not folder.exists()
 
 
 @pytest.mark.usefixtures("_server")
