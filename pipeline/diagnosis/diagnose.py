@@ -63,7 +63,7 @@ def diagnose(
     found = None
     try:
         found = procedure.findings(calibration, recordings, noise, settings, configured, accelerometer=accelerometer)
-        document = document_of(found, configured)
+        document = document_of(found, configured, settings["effects"][sensor])
     except NotObservableError as reason:
         document = _not_enough_data(sensor, configured, reason.message, procedure.NEEDED)
     evidence = evidence_of(document, sensor, recordings, noise, settings, validation=validation, found=found)

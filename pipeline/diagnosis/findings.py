@@ -70,8 +70,12 @@ class Findings:
         return float(np.clip(drop / excess, 0.0, 1.0)) if excess > 0.0 else 0.0
 
 
-def document_of(found: Findings, configured: list[str]) -> dict[str, Any]:
-    """Return a sensor's part of ``diagnoses/<unit>.json``, with the verdict of the selection alone."""
+def document_of(found: Findings, configured: list[str], wanted: Sequence[str] | str) -> dict[str, Any]:
+    """Return a sensor's part of ``diagnoses/<unit>.json``, with the verdict of the selection alone.
+
+    ``configured`` holds ``wanted``, the effects that are listed, and those of the bench, which need no override.
+    """
+    listed = [name for name in configured if name in wanted]
     others = sorted(found.alone.values(), key=lambda s: -s.delta_bic)
     unselected = [s.name for s in others if s.name not in found.selected and s.name not in found.hidden]
     ranking = [_entry(found, name) for name in (*found.selected, *unselected)]
@@ -87,7 +91,7 @@ def document_of(found: Findings, configured: list[str]) -> dict[str, Any]:
         "unexplained": found.unknown,
         "suggested_effect": None,
         "next_experiment": next_experiment(verdict, ranking, found),
-        "override": _override(found.sensor, [*configured, *found.selected]) if found.selected else "",
+        "override": _override(found.sensor, [*listed, *found.selected]) if found.selected else "",
         "configured": configured,
         "wander": _wander(found),
         "method_errors": [],

@@ -90,9 +90,7 @@ def starts_of(
             raise ConfigurationError(
                 f"effects.{sensor} names {name}, which is an effect of the {this.sensors[0]} alone"
             )
-        prior = None
-        if name == MOUNTING and not isinstance(observed, str):
-            prior = _prior_of_mountings(recordings, observed.seat_deg or SEAT_DEG, accelerometer)
+        prior = None if isinstance(observed, str) else prior_of(this, observed, accelerometer)
         values = [fitted[name]] if name in fitted else this.starts(sensor) if prior is None else [prior.mean]
         values = [v for v in values if len(v) == len(this.parameters(sensor))] or this.starts(sensor)
         combinations = [[*before, Term(this, v, prior=prior)] for before in combinations for v in values]
@@ -104,21 +102,22 @@ def turns_of(observations: Observations) -> list[str]:
     return [part.name for part in observations.parts if part.motion.axis is not None]
 
 
-def _prior_of_mountings(
-    recordings: Sequence[str], seat_deg: float, accelerometer: SensorCalibration | None
-) -> NormalPrior:
-    """Return what is known of the rotations of the unit before the fit, in the frame of their mean.
+def prior_of(this: Effect, observed: Observations, accelerometer: SensorCalibration | None) -> NormalPrior | None:
+    """Return what is known of the rotations of the unit before the fit; None for other effects.
 
-    ``theta_k ~ N(0, s^2)`` where gravity does not tell. Where the accelerometer was fitted with the mountings, its
-    estimate: it shares the rotation that is common to all recordings, which is part of the matrices of both sensors.
+    ``theta_k ~ N(0, s^2)`` where gravity does not determine them. Where the accelerometer was fitted with the
+    mountings, its estimate: both sensors share the rotation that is common to all recordings, a part of their matrices.
 
     Parameters
     ----------
-    recordings : sequence of str
-    seat_deg : float, deg
-        s.
+    this : Effect
+    observed : Observations
     accelerometer : SensorCalibration or None
+        For the gyroscope.
     """
+    if this.name != MOUNTING:
+        return None
+    recordings, seat_deg = turns_of(observed), observed.seat_deg or SEAT_DEG
     size = 3 * len(recordings)
     mean = np.zeros(size)
     found = None if accelerometer is None else next((e for e in accelerometer.effects if e.name == MOUNTING), None)

@@ -38,7 +38,7 @@ from pipeline.estimation.uncertainty_budget import (
     scatter_contribution,
 )
 from pipeline.model.effects.base import Layout, truth
-from pipeline.model.effects.mounting import Mounting, in_mean_frame
+from pipeline.model.effects.mounting import Mounting, in_mean_frame, to_mean_frame
 from pipeline.records import FittedEffect, SensorCalibration, StageResult
 
 if TYPE_CHECKING:
@@ -384,6 +384,11 @@ def calibration_of(  # noqa: PLR0917  (what a fit with effects is)
     With ``settings``, the accuracies of their table are in the uncertainties, but for those that an effect of the fit
     estimates.
     """
+    for place, term in enumerate(fit.terms):
+        if isinstance(term.effect, Mounting):
+            K, theta = to_mean_frame(fit.K, term.values)
+            terms = (*fit.terms[:place], replace(term, values=theta), *fit.terms[place + 1 :])
+            fit = replace(fit, K=K, terms=terms)
     matrix = np.asarray(np.linalg.solve(fit.K, np.eye(3)), np.float64)
     change = np.eye(len(fit.covariance))
     change[3:BASE, 3:BASE] = -np.kron(matrix, matrix.T)

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.estimation.candidates import candidates_for, limits_of, starts_of
+from pipeline.estimation.candidates import candidates_for, limits_of, prior_of, starts_of
 from pipeline.estimation.design import BASE, Start, Term, ordinary_base
 from pipeline.estimation.gauss_markov import selection_grid
 from pipeline.estimation.generalized_least_squares import Fit, fit_best, fit_terms
@@ -160,6 +160,7 @@ class _Search:
         combinations_ = starts_of(configured, observations, known, accelerometer)
         self.base = fit_best(observations, combinations_, self.start, self.settings)
         self.effects = candidates_for(observations, configured)
+        self.priors = {e.name: prior_of(e, observations, accelerometer) for e in self.effects}
         self.names: list[str] = []
         self.steps: dict[str, Score] = {}
         self.fit = self.base
@@ -218,7 +219,8 @@ class _Search:
             if this.name in fitted:
                 candidates.append(fitted[this.name])
             elif this.moves:
-                candidates.append(Term(this, np.zeros(len(this.parameters(self.observations.sensor)))))
+                start = np.zeros(len(this.parameters(self.observations.sensor)))
+                candidates.append(Term(this, start, prior=self.priors[this.name]))
             else:
                 candidates += [Term(this, values) for values in this.starts(self.observations.sensor)]
         return Ranking(self.observations, configured, candidates, self.fit.K, self.start.scale, self.settings)
@@ -324,7 +326,9 @@ class _Search:
         """Return the selected effects at their fitted values, or at those of the step that accepted them."""
         held = {term.effect.name: term for term in self.fit.terms}
         bound = {e.name: e for e in self.effects}
-        return [held.get(name) or Term(bound[name], self.steps[name].values) for name in self.names]
+        return [
+            held.get(name) or Term(bound[name], self.steps[name].values, prior=self.priors[name]) for name in self.names
+        ]
 
     def _own(self, name: str) -> float:
         """Return the delta BIC that a selected effect brings beside the others."""

@@ -105,11 +105,11 @@ def check_moves(recording: Recording, maps: Mapping[str, Sequence[str]]) -> None
     missed = _missed(moves, np.eye(3))
     if missed < FEWEST_MISSED:
         return
-    others = sorted((_missed(moves, D), i) for i, D in enumerate(_signed_permutations()))
+    others = sorted((_missed(moves, D), i) for i, D in enumerate(signed_permutations()))
     best, alone = others[0][0], others[1][0] > others[0][0]
     if best > missed / CLEARLY_FEWER:
         return
-    D = _signed_permutations()[others[0][1]] if alone else None
+    D = signed_permutations()[others[0][1]] if alone else None
     raise IngestError(
         f"accelerometer and gyroscope contradict each other: in {missed} of {len(moves)} moves between rests gravity "
         f"turns by more than {FAILS_DEG:g} deg otherwise than the angular rates say, and with other axes of the "
@@ -125,7 +125,8 @@ def _missed(moves: Sequence[Move], D: Matrix) -> int:
     return int(np.sum(left > FAILS_DEG))
 
 
-def _signed_permutations() -> list[Matrix]:
+def signed_permutations() -> list[Matrix]:
+    """Return the 48 maps of axes onto signed axes: (3, 3) arrays."""
     return [
         axis_matrix([s + a for s, a in zip(signs, order, strict=True)])
         for order in itertools.permutations(AXES)

@@ -28,9 +28,9 @@ from pipeline.preprocessing.bench import (
     stated_bench,
     usual_up,
 )
-from pipeline.preprocessing.frames import as_map, check_moves, check_turns, nearest_permutation
+from pipeline.preprocessing.frames import as_map, check_moves, check_turns, nearest_permutation, signed_permutations
 from pipeline.preprocessing.seats import refined_zeros, seat_notes
-from pipeline.records import AXES, Note
+from pipeline.records import AXES, Note, level_in_body
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -74,13 +74,15 @@ def check_mounting(recordings: Sequence[Recording], settings: Mapping[str, Any])
     tolerance = _tolerance(procedure, table, sensor)
     departures = {t.name: d for t in known if (d := departure(t, tolerance)) is not None}
     refused = [d for d in departures.values() if d.bench is None]
-    if _negated(known):
+    found = [replace(t, found=departures[t.name].bench) if t.name in departures else t for t in known]
+    if _negated(found, tolerance.angle_deg):
         refused = list(departures.values())
     if refused:
         raise _refusal(refused, known, accelerometer, maps)
     hint = _hint(list(departures.values()), known, accelerometer, maps) if departures else ""
-    zeros = refined_zeros(known) if departures and table.get("seat_deg") is None else {}
+    zeros = refined_zeros(found) if departures and table.get("seat_deg") is None else {}
     used = {t.name: _as_found(t, departures.get(t.name), zeros) for t in known}
+    recordings = [_turned_attitude(r) if departures else r for r in recordings]
     doubts = seat_notes(list(used.values()), table, sensor) if table.get("seat_deg") is None else {}
     return [
         r if t is None else _applied(used[t.name], doubts.get(r.name, []), departures.get(t.name), hint)
@@ -175,12 +177,42 @@ def _hint(
     return f"if the bench is so, set {', or '.join(ways)} (docs/mounting.md); else correct the columns or the mounting"
 
 
-def _negated(turns: Sequence[Turn]) -> bool:
-    """Return whether each turn shows the face opposite to the stated one: rather a negated accelerometer."""
+def _turned_attitude(recording: Recording) -> Recording:
+    """Return held-out motion whose attitude log is turned to the body axes that gravity shows.
+
+    Where turns are mounted otherwise than stated, the table's attitude is that of the stated axes. ``R(q) F`` is that
+    of the unit, with the rotation F by multiples of 90 deg under which the predicted specific force is nearest to the
+    accelerometer's.
+    """
+    q, force = recording.table_attitude, recording.accelerometer
+    if q is None or force is None or not recording.valid.any():
+        return recording
+    predicted = level_in_body(q)[recording.valid]
+    agreement = predicted.T @ force[recording.valid]
+    turns = [F for F in signed_permutations() if np.linalg.det(F) > 0.0]
+    F = max(turns, key=lambda turn: float(np.sum(turn * agreement)))
+    if np.array_equal(F, np.eye(3)):
+        return recording
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415  (0.1 s that only remounted units pay)
+
+    about = Rotation.from_quat(q, scalar_first=True) * Rotation.from_matrix(F)
+    names = [nearest_axis(row) for row in F]
+    detail = f"the attitude is turned to the axes of the unit: the table's x, y and z are body {', '.join(names)}"
+    note = Note("N-FOUND", recording.samples, 0, 0, detail)
+    attitude = np.asarray(about.as_quat(scalar_first=True), np.float64)
+    encodings = {k: e for k, e in recording.encodings.items() if k != "table_attitude"}
+    return replace(recording, table_attitude=attitude, encodings=encodings, notes=(*recording.notes, note))
+
+
+def _negated(turns: Sequence[Turn], tolerance: float) -> bool:
+    """Return whether each turn shows the opposite face at the stated zero: rather a negated accelerometer."""
     found = [(t.found, t.stated) for t in turns if t.recording.role == "accelerometer"]
     signs = {"+": "-", "-": "+"}
-    return len(found) > 1 and all(
-        f is not None and f.axis == s.axis and f.up == signs[s.up[0]] + s.up[1] for f, s in found
+    return bool(found) and all(
+        f is not None
+        and (f.axis, f.up) == (s.axis, signs[s.up[0]] + s.up[1])
+        and abs(f.zero_deg - s.zero_deg) <= tolerance
+        for f, s in found
     )
 
 
@@ -189,7 +221,7 @@ def _as_found(turn: Turn, departure: Departure | None, zeros: Mapping[str, float
     if departure is None or departure.bench is None:
         return turn
     bench, recording = departure.bench, replace(turn.recording, axis=departure.bench.axis)
-    if turn.name in zeros and bench.axis == turn.stated.axis:
+    if turn.name in zeros:
         bench = replace(bench, zero_deg=zeros[turn.name])
     return replace(turn, recording=recording, stated=bench)
 

@@ -58,6 +58,7 @@ def drawn(kind: str, seed: int, number: int) -> tuple[UnitDescription, dict[str,
             seats[name] = size * rng.uniform(0.0, 1.0) * direction / np.linalg.norm(direction)
     bench: dict[str, Any] = {
         "direction_deg": np.zeros((3, 2)).tolist() if "seats" in kind else None,
+        "rate_error": [0.0, 0.0, 0.0],  # encoders keep the angle over any number of turns
         "mounting_deg": {n: (face * Rotation.from_rotvec(s, degrees=True)).as_rotvec(degrees=True).tolist()
                          for n, s in seats.items()},
     }  # fmt: skip
@@ -137,8 +138,12 @@ def _mean_mounting(nominal: dict[str, Any], recordings: list[Any], bench: dict[s
             size = np.abs(used.angular_rate).max()
             seen = np.concatenate([true.specific_force, true.angular_rate / size]) @ body.as_matrix()
             assumed = np.concatenate([used.specific_force, used.angular_rate / size])
-            found.append(Rotation.align_vectors(assumed, seen)[0].as_rotvec(degrees=True))
-    return Rotation.from_rotvec(np.mean(found, axis=0), degrees=True)
+            found.append(Rotation.align_vectors(assumed, seen)[0])
+    mean = Rotation.identity()
+    for _ in range(10):  # the rotation after which the mean of the rotation vectors is 0
+        left = np.mean([(each * mean.inv()).as_rotvec() for each in found], axis=0)
+        mean = Rotation.from_rotvec(left) * mean
+    return mean
 
 
 def _without_attitude(recording: Any) -> Any:
