@@ -38,7 +38,7 @@ from pipeline.estimation.uncertainty_budget import (
     scatter_contribution,
 )
 from pipeline.model.effects.base import Layout, truth
-from pipeline.model.effects.mounting import Mounting, in_mean_frame, to_mean_frame
+from pipeline.model.effects.mounting import Mounting, errors_in_mean_frame, in_mean_frame
 from pipeline.records import FittedEffect, SensorCalibration, StageResult
 
 if TYPE_CHECKING:
@@ -384,17 +384,13 @@ def calibration_of(  # noqa: PLR0917  (what a fit with effects is)
     With ``settings``, the accuracies of their table are in the uncertainties, but for those that an effect of the fit
     estimates.
     """
-    for place, term in enumerate(fit.terms):
-        if isinstance(term.effect, Mounting):
-            K, theta = to_mean_frame(fit.K, term.values)
-            terms = (*fit.terms[:place], replace(term, values=theta), *fit.terms[place + 1 :])
-            fit = replace(fit, K=K, terms=terms)
+    fit = _in_mean_frame(fit)
     matrix = np.asarray(np.linalg.solve(fit.K, np.eye(3)), np.float64)
     change = np.eye(len(fit.covariance))
     change[3:BASE, 3:BASE] = -np.kron(matrix, matrix.T)
     for place, term in zip(_slices(fit), fit.terms, strict=True):
         if isinstance(term.effect, Mounting):
-            change = change @ in_mean_frame(fit.K, term.values, place, len(change))
+            change = change @ errors_in_mean_frame(fit.K, term.values, place, len(change))
     covariance = change @ fit.covariance @ change.T
     uncertainty = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
     effects, parameters, at = [], {}, BASE
@@ -447,6 +443,16 @@ def calibration_of(  # noqa: PLR0917  (what a fit with effects is)
     if any(term.prior for term in fit.terms):
         lines.append(mounting_contribution(change @ design.prior_covariance(fit.setting) @ change.T))
     return budgeted(found, reference, errors, lines, settings, results, names)
+
+
+def _in_mean_frame(fit: Fit) -> Fit:
+    """Return a fit in the frame of the mean of the mountings."""
+    for place, term in enumerate(fit.terms):
+        if isinstance(term.effect, Mounting):
+            K, theta = in_mean_frame(fit.K, term.values)
+            terms = (*fit.terms[:place], replace(term, values=theta), *fit.terms[place + 1 :])
+            return replace(fit, K=K, terms=terms)
+    return fit
 
 
 def _slices(fit: Fit) -> list[slice]:

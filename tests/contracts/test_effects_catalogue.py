@@ -10,7 +10,7 @@ import pytest
 from bench_session import CONTINUOUS, SIZE, K, Session, random_motion, record, values_of
 
 from pipeline.model.effects import built_in, catalogue, files
-from pipeline.model.effects.base import Owner, parameter_limits
+from pipeline.model.effects.base import Effect, Owner, parameter_limits
 from pipeline.model.effects.files import built_in_files
 from pipeline.model.kinematics import reference_motion
 from pipeline.records import SENSORS, Motion
@@ -34,13 +34,17 @@ BOTH = [
     "table_encoder_error",
     "table_rate_ripple",
     "table_backlash",
+    "mounting",
+    "encoder_zero",
 ]
+OF_TABLE = {"time_offset", "low_pass_lag", "clock_rate", "mounting", "encoder_zero"}
+TURNS = ["accel_x", "accel_y", "accel_z", "gyro_x", "gyro_y", "gyro_z"]
 ACCELEROMETER = ["cross_axis_nonlinearity", "hysteresis", "inner_lever_arms", "rate_dependence", "lever_arm"]
 GYROSCOPE = ["g_sensitivity", "g_squared_sensitivity", "earth_rotation"]
 OWNERS = {
     Owner.RECORDING: {"bias_drift"},
     Owner.MOUNTING: {"lever_arm", "earth_rotation"},
-    Owner.TABLE: {n for n in BOTH if n.startswith("table_")} | {"time_offset", "low_pass_lag", "clock_rate"},
+    Owner.TABLE: {n for n in BOTH if n.startswith("table_")} | OF_TABLE,
 }
 RATE_PRODUCT = """\
 # z = P w_y w_z
@@ -66,7 +70,11 @@ def motions() -> list[Motion]:
 def realistic(name: str, sensor: str) -> np.ndarray:
     if name in SIZE[sensor]:
         return values_of(sensor, name, np.random.default_rng(1))
-    return np.full(len(catalogue()[name].parameters(sensor)), 0.01)
+    return np.full(len(bound(name).parameters(sensor)), 0.01)
+
+
+def bound(name: str) -> Effect:
+    return catalogue()[name].of_recordings(TURNS)
 
 
 def test_catalogue_holds_every_effect_of_the_interface_for_its_sensors() -> None:
@@ -112,14 +120,14 @@ def test_one_file_adds_an_effect(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 @pytest.mark.parametrize(("name", "sensor"), CASES)
 def test_parameters_have_distinct_names_units_and_meanings(name: str, sensor: str) -> None:
-    parameters = catalogue()[name].parameters(sensor)
+    parameters = bound(name).parameters(sensor)
     assert len({p.name for p in parameters}) == len(parameters) > 0
     assert all(p.unit and p.meaning for p in parameters)
 
 
 @pytest.mark.parametrize(("name", "sensor"), CASES)
 def test_zero_parameters_change_nothing(name: str, sensor: str, motions: list[Motion]) -> None:
-    effect = catalogue()[name]
+    effect = bound(name)
     zero = np.zeros(len(effect.parameters(sensor)))
     for motion in motions:
         assert np.array_equal(effect.reading(sensor, motion, K[sensor], zero), np.zeros((len(motion.time), 3)))
@@ -128,7 +136,7 @@ def test_zero_parameters_change_nothing(name: str, sensor: str, motions: list[Mo
 
 @pytest.mark.parametrize(("name", "sensor"), CASES)
 def test_columns_are_the_central_differences_of_the_reading(name: str, sensor: str, motions: list[Motion]) -> None:
-    effect, values = catalogue()[name], realistic(name, sensor)
+    effect, values = bound(name), realistic(name, sensor)
     step = 1e-4 * np.where(values == 0, 1.0, np.abs(values))
     scale = 0.0
     for motion in motions:

@@ -17,6 +17,7 @@ from __future__ import annotations
 from copy import copy
 from dataclasses import replace
 from functools import partial
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -130,7 +131,7 @@ class Mounting(_OfRecordings):
         return np.asarray(np.swapaxes(turn_by_vector(np.radians(values)), -1, -2))
 
 
-def to_mean_frame(K: Values, values: Values) -> tuple[Values, Values]:
+def in_mean_frame(K: Values, values: Values) -> tuple[Values, Values]:
     """Return K and the rotations of the unit, deg, in the frame in which the mean of the rotations is 0."""
     from scipy.spatial.transform import Rotation  # noqa: PLC0415  (0.1 s that only fits of mountings pay)
 
@@ -140,7 +141,7 @@ def to_mean_frame(K: Values, values: Values) -> tuple[Values, Values]:
     return K @ turned.as_matrix(), (found * turned).as_rotvec(degrees=True).ravel()
 
 
-def in_mean_frame(K: Values, values: Values, at: slice, count: int) -> Values:
+def errors_in_mean_frame(K: Values, values: Values, at: slice, count: int) -> Values:
     """Return the map of small errors of a fit to those in the frame of the mean of the mountings: (count, count) array.
 
     Readings do not change with a rotation phi of the frame, ``K' = K exp([phi]x)``, ``exp([theta_k']x) =
@@ -174,6 +175,7 @@ class EncoderZero(_OfRecordings):
 
     suffixes = ("",)
     what = "zero of the table's angle"
+    unseen = MappingProxyType({"gyroscope": "a zero of the angle does not change the rate"})
 
     def rotation(self, motion: Motion, values: Values) -> Values:
         """Return ``exp([zero e_a]x)``."""
