@@ -101,8 +101,8 @@ class Axis:
 
     def pixels(self, value: float) -> float:
         """Return the place of a value, px; a value below the axis stands at its start."""
-        at = max(float(scaled(value, self.kind)), self.low)
-        return self.start + (at - self.low) / (self.high - self.low) * (self.stop - self.start)
+        at = float(scaled(value, self.kind)) if "log" in self.kind else value
+        return self.start + (max(at, self.low) - self.low) / (self.high - self.low) * (self.stop - self.start)
 
     def units(self, values: Values) -> NDArray[np.int64]:
         """Return the places of values in whole drawing units; values beyond the axis stand at its end."""

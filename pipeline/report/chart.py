@@ -223,8 +223,9 @@ def _draw(layer: Layer, x: Axis, y: Axis) -> str:
         return "".join(_samples(layer, column, f"c{colour}", x, y) for colour, column in columns)
     known = np.flatnonzero(np.isfinite(layer.x) & np.isfinite(layer.y))
     if isinstance(layer, Line):
-        pieces = np.split(known, np.flatnonzero(np.diff(known) > 1) + 1)
-        path = "".join(_line(x.units(layer.x[piece]), y.units(layer.y[piece])) for piece in pieces)
+        breaks = np.flatnonzero(np.diff(known) > 1) + 1
+        ends = (np.split(axis.units(v[known]), breaks) for axis, v in ((x, layer.x), (y, layer.y)))
+        path = "".join(_line(*piece) for piece in zip(*ends, strict=True))
         return f'<path class="line c{layer.colour} {layer.style}" d="{path}"/>'
     at, path, room = x.units(layer.x[known]), "", LARGE_DOTS
     if layer.low is not None and layer.high is not None:
@@ -257,6 +258,8 @@ def _line(x: NDArray[np.int64], y: NDArray[np.int64]) -> str:
     """Return the path through points, as differences."""
     if len(x) < 2:
         return _dots(x, y)
+    if len(x) == 2:  # most are rests, which are many
+        return f"M{x[0]} {y[0]}l{x[1] - x[0]} {y[1] - y[0]}"
     return f"M{x[0]} {y[0]}l{_path(' %d %d', np.diff(x), np.diff(y))[1:]}"
 
 
