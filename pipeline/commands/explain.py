@@ -138,7 +138,8 @@ def _held_out(part: JSON | None) -> list[str]:
         return []
     error, floor, unit = part["steps"][-1]["rms_error"], part["noise_floor"], part["unit"]
     ratio = f", {error / floor:.3g} times the noise floor" if floor else ""
-    return [f"In this run, the rms error of the magnitude on held-out motion is {error:.3g} {unit}{ratio}."]
+    where = "held-out motion" if part.get("held_out", True) else "the samples of the fit"
+    return [f"In this run, the rms error of the magnitude on {where} is {error:.3g} {unit}{ratio}."]
 
 
 def _implausible(calibration: JSON) -> str:

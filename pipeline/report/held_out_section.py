@@ -76,7 +76,8 @@ def error_steps(sensor: str, held_out: JSON, found: JSON, *, vector: bool) -> Fi
     if added:
         finding += f"; with the missing effects, at {number(added[-1].value)}"
     words = "if it were added" + (" with the suggested shape" if found.get("suggested_effect") else "")
-    caption = f"Held-out error of the {kind} after each step; the line is the error that noise alone gives."
+    whose = "Held-out error" if held_out.get("held_out", True) else "Error on the samples of the fit,"
+    caption = f"{whose} of the {kind} after each step; the line is the error that noise alone gives."
     figure = Figure(f"{sensor}-staircase-{kind}", finding, caption, (("c4", words),) if added else ())
     label = f"root mean square error, {unit} (logarithmic)"
     return bars(figure, rows + added, label, levels={"noise floor": floor or 0.0})
