@@ -60,6 +60,14 @@ def test_defaults_follow_the_procedure_and_the_table(tmp_path: Path) -> None:
     ]
 
 
+def test_a_procedure_may_choose_table_and_method(tmp_path: Path) -> None:
+    sheet = "unit,procedure,method,overrides\nA,ferraris,,procedure.turns.accuracy_deg=0.5\nB,ferraris,staged,\n"
+    units = load(campaign(tmp_path, sheet)).units
+    chosen = [(u.config["table"]["name"], u.config["method"]["name"]) for u in units.values()]
+    assert chosen == [("hand", "rests_and_moves"), ("hand", "staged")]
+    assert [u.config["procedure"]["turns"]["accuracy_deg"] for u in units.values()] == [0.5, 3.0]
+
+
 def test_methods_are_chosen_sensor_by_sensor(tmp_path: Path) -> None:
     sheet = "unit,method,overrides\nA,staged,method.gyroscope=cholesky_lu\n"
     config = load(campaign(tmp_path, sheet)).units["A"].config["method"]

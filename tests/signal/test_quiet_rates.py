@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hand_simulator import Drawn, Hand, draw
 
+from pipeline.records import Recording
 from pipeline.signal.rests import Rest, find_rests
 
 
@@ -46,3 +47,18 @@ def test_stamps_in_bursts_do_not_shorten_the_windows() -> None:
     late = time[number] + (np.arange(len(time)) % 5) * 200_000  # five samples arrive together, 0.2 ms apart
     found, burst = (find_rests(replace(drawn.recording, time_ns=t)) for t in (time, late))
     assert [(r.start, r.stop) for r in burst] == [(r.start, r.stop) for r in found]
+
+
+def test_a_lone_turn_about_the_vertical_has_a_rest_at_either_end() -> None:
+    """Nothing but the turn is recorded: the accelerometer feels no change, and most of the samples turn."""
+    rng = np.random.default_rng(5)
+    still, turning = 250, 600
+    rate = np.zeros((2 * still + turning, 3))
+    rate[still:-still, 2] = 60.0
+    rate += [1.5, -3.0, 0.4] + 0.03 * rng.standard_normal(rate.shape)
+    force = [0.01, 0.0, 1.0] + 0.002 * rng.standard_normal(rate.shape)
+    time = np.round(1e9 * np.arange(len(rate)) / 100.0).astype(np.int64)
+    found = find_rests(Recording("z_rot", "rests", "z", time, accelerometer=force, gyroscope=rate))
+    assert [r.accepted for r in found] == [True, True]
+    assert found[0].stop == pytest.approx(still, abs=25)
+    assert found[1].start == pytest.approx(still + turning, abs=25)

@@ -1,6 +1,6 @@
 """Faces and turns by hand: are the stated uncertainties those of the errors, whole and in parts?
 
-    python -m pytest -m study tests/study/test_ferraris_study.py -s        (200 units, MINUTES minutes)
+    python -m pytest -m study tests/study/test_ferraris_study.py -s        (200 fits of both sensors, some ten minutes)
 
 Every unit is drawn anew with the errors of a hand (``pipeline.simulation.procedures``): each face tilted by 1 deg about
 each level axis, each turn off by 3 deg, about an axis that is 1.5 deg off. Nothing is hidden. The hand's errors of the
