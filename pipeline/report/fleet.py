@@ -7,18 +7,26 @@ Units of one sensor model that were calibrated by one method are compared with e
 is a unit's distance in robust standard deviations. A unit is far where |z| > 6, with 20 units or more. A parameter
 drifts with the date where Spearman's rank correlation differs from zero, and differs between lots by the test of
 Kruskal and Wallis, both at 0.001 after Bonferroni's correction for the number of parameters. The drift is the slope of
-Theil and Sen. Repeatability is the pooled standard deviation of units that share a serial.
+Theil and Sen. Repeatability is the pooled standard deviation of units that share a serial. It is compared with the
+stated uncertainties: with weights ``w = 1 / u^2`` and the weighted mean m of each device,
+
+    chi^2 = sum(w (value - m)^2),    E_n = |a - b| / sqrt(U_a^2 + U_b^2)
+
+E_n is the largest of two calibrations of one device. At a p-value of chi^2 below 0.001, after the same correction, the
+calibrations of a device scatter more than they state.
 
 References
 ----------
 1. Rousseeuw & Croux, Alternatives to the median absolute deviation, J. Am. Stat. Assoc. 88 (1993) 1273.
 2. Sen, Estimates of the regression coefficient based on Kendall's tau, J. Am. Stat. Assoc. 63 (1968) 1379.
+3. ISO 13528:2022, 9.7 (E_n); JCGM 106:2012.
 """
 
 from __future__ import annotations
 
 import io
 import math
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -54,12 +62,12 @@ def unit_parameters(calibration: JSON) -> dict[str, Parameter]:
 
 
 def fleet_statistics(rows: Sequence[JSON], fitted: Mapping[str, Mapping[str, Parameter]]) -> JSON:
-    """Return the statistics of a fleet, ``fleet.json``: a list of dicts for each of ``STATISTICS``, and ``missing``.
+    """Return the statistics of a fleet, ``fleet.json``: a list of dicts for each statistic, and ``missing``.
 
     ``rows``: one a unit, as of ``summary_row``; ``fitted``: unit to its parameters, none of those that failed.
     """
     sheet = pd.DataFrame(rows, columns=["unit", "lot", "date", "serial", *SIBLINGS]).set_index("unit").replace("", None)
-    out: JSON = {key: [] for key in STATISTICS}
+    out: JSON = {key: [] for key in (*STATISTICS, "repeatability")}
     fitted_units = [unit for unit in sheet.index if fitted.get(unit)]
     for (model, method), siblings in sheet.loc[fitted_units].groupby(SIBLINGS, sort=False):
         units = {name: p.unit for unit in siblings.index for name, p in fitted[unit].items()}
@@ -68,7 +76,11 @@ def fleet_statistics(rows: Sequence[JSON], fitted: Mapping[str, Mapping[str, Par
             siblings.index,
             list(units),
         )
-        for key, statistic in STATISTICS.items():
+        statistics = {
+            **STATISTICS,
+            "repeatability": partial(_repeatability, stated=_uncertainties(siblings.index, fitted)),
+        }
+        for key, statistic in statistics.items():
             for name, found in statistic(values, siblings):
                 about = {"sensor": model, "method": method, "parameter": name, "unit": units[name]}
                 out[key].append(about | found)
@@ -135,8 +147,20 @@ def _lots(values: pd.DataFrame, siblings: pd.DataFrame) -> Iterable[tuple[str, J
             yield name, {"p_value": p, "lot": lot, "lot_median": medians[lot], "median": middle}
 
 
-def _repeatability(values: pd.DataFrame, siblings: pd.DataFrame) -> Iterable[tuple[str, JSON]]:
-    """Return the pooled standard deviation of the devices that were calibrated more than once."""
+def _uncertainties(
+    units: Iterable[str], fitted: Mapping[str, Mapping[str, Parameter]]
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Return standard and expanded uncertainty of each parameter of each unit."""
+    standard = {u: {n: p.standard_uncertainty for n, p in fitted[u].items()} for u in units}
+    expanded = {u: {n: p.expanded_uncertainty for n, p in fitted[u].items()} for u in units}
+    first, second = (pd.DataFrame.from_dict(found, "index").astype(float) for found in (standard, expanded))
+    return first, second
+
+
+def _repeatability(
+    values: pd.DataFrame, siblings: pd.DataFrame, stated: tuple[pd.DataFrame, pd.DataFrame]
+) -> Iterable[tuple[str, JSON]]:
+    """Return how the calibrations of a device scatter, where some were calibrated more than once."""
     serial = siblings["serial"].dropna()
     serial = serial[serial.duplicated(keep=False)]
     if serial.empty:
@@ -149,7 +173,33 @@ def _repeatability(values: pd.DataFrame, siblings: pd.DataFrame) -> Iterable[tup
         repeated, calibrations = int(counts[name].count()), int(counts[name].sum())
         if repeated:
             deviation = math.sqrt(squares[name] / (calibrations - repeated))
-            yield name, {"devices": repeated, "calibrations": calibrations, "standard_deviation": deviation}
+            found = {"devices": repeated, "calibrations": calibrations, "standard_deviation": deviation}
+            yield (
+                name,
+                found | _against_stated(values[name], serial, stated[0][name], stated[1][name], len(values.columns)),
+            )
+
+
+def _against_stated(
+    values: pd.Series, serial: pd.Series, standard: pd.Series, expanded: pd.Series, parameters: int
+) -> JSON:
+    """Return chi-square, its degrees of freedom and p-value, and the largest E_n; nothing without uncertainties."""
+    known = pd.DataFrame({"value": values, "u": standard, "U": expanded, "serial": serial}).dropna()
+    known = known[(known["u"] > 0.0) & known["serial"].duplicated(keep=False)]
+    if known.empty:
+        return {}
+    from scipy.special import chdtrc  # noqa: PLC0415  (0.1 s that only repeated calibrations need)
+
+    chi, freedom, largest = 0.0, 0, 0.0
+    for _, device in known.groupby("serial"):
+        value, w, U = (device[key].to_numpy() for key in ("value", "u", "U"))
+        w = 1.0 / w**2
+        chi += float(np.sum(w * (value - np.sum(w * value) / np.sum(w)) ** 2))
+        freedom += len(value) - 1
+        largest = max(largest, float(np.max(np.abs(value[:, None] - value) / np.hypot(U[:, None], U))))
+    p = float(chdtrc(freedom, chi))
+    found = {"chi_square": chi, "degrees_of_freedom": freedom, "p_value": p, "largest_en": largest}
+    return found | {"beyond_uncertainty": p * parameters < LEVEL}
 
 
 STATISTICS = {
@@ -157,7 +207,6 @@ STATISTICS = {
     "far": _far,
     "drift": _drift,
     "lots": _lots,
-    "repeatability": _repeatability,
 }
 
 

@@ -106,6 +106,24 @@ def test_repeatability_is_the_spread_within_devices_not_between_them() -> None:
     assert told["standard_deviation"] == pytest.approx(0.2, rel=0.1)
 
 
+@pytest.mark.parametrize(("scatter", "beyond"), [(0.05, False), (0.2, True)])
+def test_calibrations_of_a_device_are_compared_with_their_stated_uncertainty(scatter: float, *, beyond: bool) -> None:
+    rng = np.random.default_rng(7)
+    values = np.repeat(rng.normal(0.0, 5.0, 100), 3) + rng.normal(0.0, scatter, 300)
+    rows, found = fleet(values)
+    for i, row in enumerate(rows):
+        row["serial"] = f"S{i // 3}"
+    found = {u: {n: p._replace(coverage_factor=2.0) for n, p in own.items()} for u, own in found.items()}
+    (told,) = fleet_statistics(rows, found)["repeatability"]
+    groups = values.reshape(100, 3)
+    squares = np.sum((groups - groups.mean(axis=1, keepdims=True)) ** 2) / 0.05**2  # u is 0.1 / 2
+    assert told["chi_square"] == pytest.approx(squares)
+    assert told["degrees_of_freedom"] == 200
+    assert told["p_value"] == pytest.approx(stats.chi2.sf(squares, 200))
+    assert told["largest_en"] == pytest.approx(np.max(np.ptp(groups, axis=1)) / np.hypot(0.1, 0.1))
+    assert told["beyond_uncertainty"] is beyond
+
+
 def test_missing_effects_are_counted_with_the_lot_that_they_come_from() -> None:
     rows: list[dict[str, Any]] = [
         {"unit": f"U{i}", "lot": f"{i // 10}", "gyroscope_verdict": "nothing_missing"} for i in range(100)
