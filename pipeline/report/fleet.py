@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import io
 import math
-from functools import partial
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -49,6 +49,7 @@ LEVEL = 0.001  # of the tests of drift and lots, for a whole fleet
 MOST_PAIRED = 2000  # units that the slope is taken from: it needs all pairs of them
 DAYS_OF_A_YEAR = 365.25
 SIBLINGS = ["sensor", "method"]
+STANDARD, EXPANDED = attrgetter("standard_uncertainty"), attrgetter("expanded_uncertainty")
 
 
 def unit_parameters(calibration: JSON) -> dict[str, Parameter]:
@@ -76,12 +77,16 @@ def fleet_statistics(rows: Sequence[JSON], fitted: Mapping[str, Mapping[str, Par
             siblings.index,
             list(units),
         )
-        statistics = {
-            **STATISTICS,
-            "repeatability": partial(_repeatability, stated=_uncertainties(siblings.index, fitted)),
-        }
-        for key, statistic in statistics.items():
-            for name, found in statistic(values, siblings):
+        stated = [
+            pd.DataFrame(
+                [{n: read(p) for n, p in fitted[unit].items()} for unit in siblings.index], siblings.index, list(units)
+            ).astype(float)
+            for read in (STANDARD, EXPANDED)
+        ]
+        statistics = {key: statistic(values, siblings) for key, statistic in STATISTICS.items()}
+        statistics["repeatability"] = _repeatability(values, siblings, *stated)
+        for key, results in statistics.items():
+            for name, found in results:
                 about = {"sensor": model, "method": method, "parameter": name, "unit": units[name]}
                 out[key].append(about | found)
     out["far"].sort(key=lambda f: -abs(f["z"]))
@@ -147,18 +152,8 @@ def _lots(values: pd.DataFrame, siblings: pd.DataFrame) -> Iterable[tuple[str, J
             yield name, {"p_value": p, "lot": lot, "lot_median": medians[lot], "median": middle}
 
 
-def _uncertainties(
-    units: Iterable[str], fitted: Mapping[str, Mapping[str, Parameter]]
-) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return standard and expanded uncertainty of each parameter of each unit."""
-    standard = {u: {n: p.standard_uncertainty for n, p in fitted[u].items()} for u in units}
-    expanded = {u: {n: p.expanded_uncertainty for n, p in fitted[u].items()} for u in units}
-    first, second = (pd.DataFrame.from_dict(found, "index").astype(float) for found in (standard, expanded))
-    return first, second
-
-
 def _repeatability(
-    values: pd.DataFrame, siblings: pd.DataFrame, stated: tuple[pd.DataFrame, pd.DataFrame]
+    values: pd.DataFrame, siblings: pd.DataFrame, standard: pd.DataFrame, expanded: pd.DataFrame
 ) -> Iterable[tuple[str, JSON]]:
     """Return how the calibrations of a device scatter, where some were calibrated more than once."""
     serial = siblings["serial"].dropna()
@@ -174,17 +169,12 @@ def _repeatability(
         if repeated:
             deviation = math.sqrt(squares[name] / (calibrations - repeated))
             found = {"devices": repeated, "calibrations": calibrations, "standard_deviation": deviation}
-            yield (
-                name,
-                found | _against_stated(values[name], serial, stated[0][name], stated[1][name], len(values.columns)),
-            )
+            known = pd.DataFrame({"value": values[name], "u": standard[name], "U": expanded[name], "serial": serial})
+            yield name, found | _against_stated(known.dropna(), len(values.columns))
 
 
-def _against_stated(
-    values: pd.Series, serial: pd.Series, standard: pd.Series, expanded: pd.Series, parameters: int
-) -> JSON:
+def _against_stated(known: pd.DataFrame, parameters: int) -> JSON:
     """Return chi-square, its degrees of freedom and p-value, and the largest E_n; nothing without uncertainties."""
-    known = pd.DataFrame({"value": values, "u": standard, "U": expanded, "serial": serial}).dropna()
     known = known[(known["u"] > 0.0) & known["serial"].duplicated(keep=False)]
     if known.empty:
         return {}
