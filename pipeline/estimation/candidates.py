@@ -57,20 +57,9 @@ def starts_of(
 ) -> list[list[Term]]:
     """Return the terms from which a fit starts, every combination of the effects' starts.
 
-    Parameters
-    ----------
-    names : sequence of str
-    observed : Observations or str
-        The sensor alone for recordings by hand.
-    known : SensorCalibration, optional
-        Its fitted effects start where they are.
-    accelerometer : SensorCalibration, optional
-        For the gyroscope: gravity determines the mountings.
-
-    Raises
-    ------
-    ConfigurationError
-        If an effect is unknown, named twice, contained in another, or not one of this sensor.
+    ``observed``: the sensor alone for recordings by hand. ``known``: its fitted effects start where they are.
+    ``accelerometer``: for the gyroscope: gravity determines the mountings. Raises ``ConfigurationError`` if an effect
+    is unknown, named twice, contained in another, or not one of this sensor.
     """
     sensor = observed if isinstance(observed, str) else observed.sensor
     recordings = [] if isinstance(observed, str) else turns_of(observed)
@@ -108,12 +97,7 @@ def prior_of(this: Effect, observed: Observations, accelerometer: SensorCalibrat
     ``theta_k ~ N(0, s^2)`` where gravity does not determine them. Where the accelerometer was fitted with the
     mountings, its estimate: both sensors share the rotation that is common to all recordings, a part of their matrices.
 
-    Parameters
-    ----------
-    this : Effect
-    observed : Observations
-    accelerometer : SensorCalibration or None
-        For the gyroscope.
+    ``accelerometer``: for the gyroscope.
     """
     if this.name != MOUNTING:
         return None
@@ -138,12 +122,8 @@ def prior_of(this: Effect, observed: Observations, accelerometer: SensorCalibrat
 def limits_of(sensor: str, sheet: Mapping[str, Any]) -> dict[str, NDArray[np.float64]]:
     """Return the limits of plausibility of every effect's parameters, absolute values.
 
-    Parameters
-    ----------
-    sensor : str
-    sheet : mapping
-        ``effects`` of the sensor's data sheet: ``<effect>`` for all its parameters, ``<effect>_<parameter>`` for one
-        or, without the axis, for some of them.
+    ``sheet``: ``effects`` of the sensor's data sheet: ``<effect>`` for all its parameters, ``<effect>_<parameter>`` for
+    one or, without the axis, for some of them.
     """
     given = sheet.get("effects") or {}
     found = {}
@@ -180,10 +160,7 @@ def candidates_for(observations: Observations, configured: Sequence[str]) -> lis
 def require_available(observations: Observations, names: Sequence[str]) -> None:
     """Refuse effects whose needs the recordings do not meet.
 
-    Raises
-    ------
-    NotObservableError
-        Naming the effect and what to record.
+    Raises ``NotObservableError`` naming the effect and what to record.
     """
     setups = {part.motion.setup for part in observations.parts}
     for own in OWN:

@@ -28,20 +28,8 @@ KINDS = "subtract, matrix, two_sided"
 def apply_correction(correction: Mapping[str, Any] | None, readings: NDArray[np.float64]) -> NDArray[np.float64]:
     """Correct readings.
 
-    Parameters
-    ----------
-    correction : mapping or None
-        ``StageResult.correction``; None changes nothing.
-    readings : (n, 3) array, g or deg/s
-
-    Returns
-    -------
-    (n, 3) array, same unit
-
-    Raises
-    ------
-    ConfigurationError
-        If a step is of an unknown kind.
+    ``correction``: ``StageResult.correction``; None changes nothing. ``readings``: (n, 3), g or deg/s. Returns (n, 3),
+    same unit. Raises ``ConfigurationError`` if a step is of an unknown kind.
     """
     out = np.array(readings, float)
     for step in (correction or {}).get("steps", []):

@@ -39,37 +39,20 @@ BASE_NAMES = [f"bias_{a}" for a in "xyz"] + [f"matrix_{a}{b}" for a in "xyz" for
 
 @dataclass(frozen=True)
 class NormalPrior:
-    """What is known of an effect's p parameters before the readings: ``N(mean, precision^-1)``.
+    """What is known of an effect's p parameters before the readings: ``N(mean, precision^-1)``."""
 
-    Attributes
-    ----------
-    mean : (p,) array
-    precision : (p, p) array
-    """
-
-    mean: NDArray[np.float64]
-    precision: NDArray[np.float64]
+    mean: NDArray[np.float64]  # (p,)
+    precision: NDArray[np.float64]  # (p, p)
 
 
 @dataclass(frozen=True)
 class Term:
-    """An effect at given values of its parameters, as columns.
-
-    Attributes
-    ----------
-    effect : Effect
-    values : (p,) array
-        Where its derivative is taken.
-    full : bool
-        Whether the columns of its nonlinear parameters are among them.
-    prior : NormalPrior or None
-        Of the parameters; None: flat.
-    """
+    """An effect at given values of its parameters, as columns."""
 
     effect: Effect
-    values: NDArray[np.float64]
-    full: bool = False
-    prior: NormalPrior | None = None
+    values: NDArray[np.float64]  # (p,); where its derivative is taken
+    full: bool = False  # whether the columns of its nonlinear parameters are among them
+    prior: NormalPrior | None = None  # of the parameters; None: flat
 
     def layout(self) -> Layout:
         """Return how its columns act on the axes."""
@@ -113,28 +96,17 @@ def motions_of(part: Part, terms: Sequence[Term]) -> list[Motion]:
 
 @dataclass(frozen=True)
 class Start:
-    """The base by ordinary least squares.
+    """The base by ordinary least squares."""
 
-    Attributes
-    ----------
-    bias : (3,) array
-    K : (3, 3) array
-    scale : (3,) array
-        White noise of each axis, for the weights between the axes.
-    """
-
-    bias: NDArray[np.float64]
-    K: NDArray[np.float64]
-    scale: NDArray[np.float64]
+    bias: NDArray[np.float64]  # (3,)
+    K: NDArray[np.float64]  # (3, 3)
+    scale: NDArray[np.float64]  # (3,); white noise of each axis, for the weights between the axes
 
 
 def ordinary_base(observations: Observations, noise: Noise | None) -> Start:
     """Fit bias and matrix by ordinary least squares.
 
-    Raises
-    ------
-    NotObservableError
-        If the motion does not determine them.
+    Raises ``NotObservableError`` if the motion does not determine them.
     """
     names = [f"column {b} of the matrix" for b in "xyz"]
     if not observations.parts:
@@ -173,18 +145,9 @@ def _undetermined(sensor: str, names: Sequence[str]) -> str:
 class Design:
     """Products of base, terms and readings under noise settings.
 
-    Parameters
-    ----------
-    observations : Observations
-    terms : sequence of Term
-    K : (3, 3) array
-    scale : (3,) array
-    target : (n, 3) array, optional
-        What is to be explained; None: the readings.
-    project : bool
-        Take the base out of the other columns first, so that products keep their digits.
-    base : (n, 3) array, optional
-        Regressors of K in place of the truth.
+    ``scale``: (3,). ``target``: (n, 3), what is to be explained; None: the readings. ``project``: take the base out of
+    the other columns first, so that products keep their digits. ``base``: (n, 3), regressors of K in place of the
+    truth.
     """
 
     def __init__(

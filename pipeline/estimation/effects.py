@@ -24,19 +24,8 @@ def fit(
 ) -> SensorCalibration:
     """Fit the effects of ``settings["effects"][sensor]`` together with bias and matrix, whatever the method was.
 
-    Parameters
-    ----------
-    sensor : str
-    recordings : sequence of Recording
-    previous : SensorCalibration or None
-        The stage before.
-    settings : mapping
-        Sections ``effects``, ``sensor`` and ``table``; ``procedure`` for recordings by hand.
-
-    Returns
-    -------
-    SensorCalibration
-        ``previous`` unchanged where there is nothing to add.
+    ``settings``: sections ``effects``, ``sensor`` and ``table``; ``procedure`` for recordings by hand. Returns
+    ``previous`` unchanged where there is nothing to add.
     """
     before = previous or SensorCalibration(sensor)
     by_hand = is_multi_position(sensor, recordings)

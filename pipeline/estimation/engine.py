@@ -51,17 +51,12 @@ AVERAGED_OUT = 1e-3  # share of a column's size in block means, below which it d
 
 @dataclass(frozen=True)
 class LinearMap:
-    """What small changes of the readings do to the parameters of a solved fit.
+    """What small changes of the readings do to the parameters of a solved fit."""
 
-    Attributes
-    ----------
-    weights : tuple of three (q, n) arrays
-        A: weights of the readings of each channel in what is fitted of it; may be one array for all.
-    derivative : tuple of three (p, q) arrays
-        J: derivative of the parameters with respect to that.
-    """
-
+    # each (q, n): A, weights of the readings of each channel in what is fitted of it; may be one array for
+    # all
     weights: tuple[Values, Values, Values]
+    # each (p, q): J, derivative of the parameters with respect to that
     derivative: tuple[Values, Values, Values]
 
     @property
@@ -99,12 +94,7 @@ class LinearMap:
     def of_groups(self, change: Values, group: NDArray[np.intp], count: int) -> Values:
         """Return the change of the parameters by the change of each of ``count`` groups of readings: (p, count) array.
 
-        Parameters
-        ----------
-        change : (n, 3) array
-        group : (n,) array of int
-            0 .. count - 1.
-        count : int
+        ``change``: (n, 3). ``group``: (n,), 0 .. count - 1.
         """
         total = np.zeros((self.parameters, count))
         for J, A, dy in zip(self.derivative, self.weights, change.T, strict=True):
@@ -114,21 +104,11 @@ class LinearMap:
 
 @dataclass(frozen=True)
 class Posterior:
-    """The error of an estimate: a mixture of normal distributions, one for each hypothesis about the noise.
+    """The error of an estimate: a mixture of normal distributions, one for each hypothesis about the noise."""
 
-    Attributes
-    ----------
-    weight : (k,) array
-        They sum to 1.
-    covariances : (k, p, p) array
-        Under each hypothesis.
-    spare : float
-        Degrees of freedom of the scale of the noise.
-    """
-
-    weight: Values
-    covariances: Values
-    spare: float
+    weight: Values  # (k,); they sum to 1
+    covariances: Values  # (k, p, p); under each hypothesis
+    spare: float  # degrees of freedom of the scale of the noise
 
     def averaged(self) -> tuple[Values, Values]:
         """Return the covariance under all hypotheses together, (p, p), and the degrees of freedom, (p,).
@@ -207,29 +187,14 @@ def _quantiles() -> tuple[Values, Values, Values]:
 
 @dataclass(frozen=True)
 class ResidualNoise:
-    """Weighted hypotheses about the noise of the readings.
-
-    Attributes
-    ----------
-    blocks : Blocks
-    settings : list of Setting
-        Of k hypotheses.
-    weight : (k,) array
-        They sum to 1.
-    white_variance : (k, 3) array, square of the unit of the readings
-        s^2 of each hypothesis and channel.
-    spare : int
-        Degrees of freedom of s^2.
-    row_weight : (n,) array or None
-        Samples of each row; None: rows are samples.
-    """
+    """Weighted hypotheses about the noise of the readings."""
 
     blocks: Blocks
-    settings: list[Setting]
-    weight: Values
-    white_variance: Values
-    spare: float
-    row_weight: Values | None = None
+    settings: list[Setting]  # of k hypotheses
+    weight: Values  # (k,); they sum to 1
+    white_variance: Values  # (k, 3), square of the unit of the readings; s^2 of each hypothesis and channel
+    spare: float  # degrees of freedom of s^2
+    row_weight: Values | None = None  # (n,); samples of each row; None: rows are samples
 
     @classmethod
     def of(  # noqa: PLR0917  (what a restricted likelihood is)
@@ -243,17 +208,8 @@ class ResidualNoise:
     ) -> ResidualNoise:
         """Weight hypotheses by the restricted likelihood, maximised over s^2, times their prior.
 
-        Parameters
-        ----------
-        blocks : Blocks
-        settings : sequence of Setting
-        logarithm : (g,) array
-            ``log det C + log det(X^T C^-1 X)`` of all channels.
-        variance : (g, c) array
-            s^2 of each of c scales.
-        free : float
-            Values of each scale less its parameters.
-        row_weight : (n,) array, optional
+        ``logarithm``: (g,), ``log det C + log det(X^T C^-1 X)`` of all channels. ``variance``: (g, c), s^2 of each of c
+        scales. ``free``: values of each scale less its parameters. ``row_weight``: (n,).
         """
         score = -0.5 * (logarithm + free * np.log(variance).sum(axis=1)) + np.array([s.prior for s in settings])
         weight = np.exp(score - score.max())
@@ -320,20 +276,9 @@ def assess_noise(
     Where the table's stated accuracies are worse than the noise, the residuals show its errors, which have lines of
     their own in the budget. Then the directions in which these exceed white noise are projected out of all channels.
 
-    Parameters
-    ----------
-    residuals : (n, 3) array
-    design : (n, p) array
-        Columns that were fitted; those of one channel may be more than its own.
-    blocks : Blocks
-    prior : Prior
-    disturbance : (3 m, 3 m) array, optional
-        Covariance that the table's stated errors give the sums over the blocks, channel by channel.
-
-    Raises
-    ------
-    NotObservableError
-        If there are no more samples than parameters.
+    ``residuals``: (n, 3). ``design``: (n, p), columns that were fitted; those of one channel may be more than its own.
+    ``disturbance``: (3 m, 3 m), covariance that the table's stated errors give the sums over the blocks, channel by
+    channel. Raises ``NotObservableError`` if there are no more samples than parameters.
     """
     count = blocks.weight[:, None]
     spare = len(count) - design.shape[1]

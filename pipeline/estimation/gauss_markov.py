@@ -67,21 +67,11 @@ WHITE = Setting(0.0, 1.0)
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known of the bias instability before the residuals are seen.
+    """What is known of the bias instability before the residuals are seen."""
 
-    Attributes
-    ----------
-    wander : float, unit of the sensor
-        Its standard deviation; 0 where nothing is known.
-    time : float, s
-        Its correlation time.
-    width : float
-        Standard deviation of the logarithm of ``wander``.
-    """
-
-    wander: float = 0.0
-    time: float = DEFAULT_TIME_S
-    width: float = SHEET_WIDTH
+    wander: float = 0.0  # unit of the sensor; its standard deviation; 0 where nothing is known
+    time: float = DEFAULT_TIME_S  # s; its correlation time
+    width: float = SHEET_WIDTH  # standard deviation of the logarithm of ``wander``
 
     def log_belief(self, wander: Values) -> Values:
         """Return the log prior, up to a constant, of (m,) standard deviations of which the first is 0.
@@ -136,11 +126,7 @@ def fast(noise: Noise | None) -> bool:
 def information(noise: Noise | None, interval: float) -> float:
     """Return the effective information per sample, relative to white noise: ``1 / (1 + 2 q tau / dt)``.
 
-    Parameters
-    ----------
-    noise : Noise or None
-    interval : float, s
-        dt.
+    ``interval``: s, dt.
     """
     if noise is None or not fast(noise) or not np.all(noise.white > 0):
         return 1.0
@@ -175,25 +161,14 @@ def block_covariance(start: Values, length: Values, tau: float) -> Values:
 
 @dataclass(frozen=True)
 class Blocks:
-    """Blocks of consecutive rows.
+    """Blocks of consecutive rows."""
 
-    Attributes
-    ----------
-    first : (m,) array of int
-        First row of each; a block ends where the next begins.
-    weight : (m,) array
-        Samples of each, ``1 / v``.
-    start, length : (m,) arrays, s
-        A block of length 0 counts as one instant: the bias does not change within it.
-    clock : (m,) array of int
-        Blocks of the same number have a known distance in time.
-    """
-
-    first: NDArray[np.intp]
-    weight: Values
+    first: NDArray[np.intp]  # (m,); first row of each; a block ends where the next begins
+    weight: Values  # (m,); samples of each, ``1 / v``
+    # each (m,), s; a block of length 0 counts as one instant: the bias does not change within it
     start: Values
     length: Values
-    clock: NDArray[np.int64]
+    clock: NDArray[np.int64]  # (m,); blocks of the same number have a known distance in time
 
     @cached_property
     def order(self) -> NDArray[np.intp]:
@@ -218,12 +193,7 @@ class Blocks:
 class GaussMarkov:
     """C at the settings of a grid: solutions, products, log determinant, traces and draws.
 
-    Parameters
-    ----------
-    blocks : Blocks
-    settings : sequence of Setting
-    variance : (m,) array, optional
-        v; without it ``1 / weight``.
+    ``variance``: (m,), v; without it ``1 / weight``.
     """
 
     def __init__(self, blocks: Blocks, settings: Sequence[Setting], variance: Values | None = None) -> None:
@@ -282,18 +252,9 @@ class GaussMarkov:
     def restricted(self, design: Values, values: Values) -> tuple[Values, Values]:
         """Return the terms of the restricted likelihood of (m, c) values beside the columns of a design.
 
-        Parameters
-        ----------
-        design : (m, p) array
-            Of full rank, see ``orthonormal``.
-        values : (m, c) array
-
-        Returns
-        -------
-        log_determinant : (g,) array
-            ``log det C + log det(X^T C^-1 X)``.
-        squares : (g, c) array
-            ``y^T P y``, the weighted sum of squared residuals of each channel.
+        ``design``: (m, p), of full rank, see ``orthonormal``. ``values``: (m, c). Returns ``log_determinant`` (g,):
+        ``log det C + log det(X^T C^-1 X)``; ``squares`` (g, c): ``y^T P y``, the weighted sum of squared residuals of
+        each channel.
         """
         p = design.shape[1]
         products = self.products(np.concatenate([design, values], axis=1))
@@ -340,12 +301,7 @@ class GaussMarkov:
 class Products:
     """Products of (n, p) columns of samples under every setting.
 
-    Parameters
-    ----------
-    blocks : Blocks
-    weight : (n,) array
-        Samples of each row.
-    columns : (n, p) array
+    ``weight``: (n,), samples of each row. ``columns``: (n, p).
     """
 
     def __init__(self, blocks: Blocks, weight: Values, columns: Values) -> None:

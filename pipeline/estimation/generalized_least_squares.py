@@ -59,62 +59,30 @@ LEAST_EIGENVALUE = 1e-7  # of the products of columns of unit norm: a column is 
 
 @dataclass(frozen=True)
 class Fit:
-    """Base and effects that explain the readings best.
+    """Base and effects that explain the readings best."""
 
-    Attributes
-    ----------
-    bias : (3,) array
-    K : (3, 3) array
-    terms : tuple of Term
-        The effects at their values.
-    covariance : (12 + p, 12 + p) array
-        Of bias, K (row by row) and the effects' parameters, as the noise settings of the fit weight it.
-    log_likelihood : float
-        Under the best noise setting, up to a constant of the readings.
-    setting : Setting
-        That noise setting.
-    degrees_of_freedom : float
-    residual_rms : float
-        Of single samples, unit of the sensor.
-    rounds : int
-    converged : bool
-    condition : float
-        Of the scaled products of columns.
-    cosine : float
-        Largest between what is left of the readings and a column, both whitened.
-    rank : int
-        Parameters, or combinations of them, that the readings determine.
-    scale : (3,) array
-        White noise of each axis, for the weights between the axes.
-    """
-
-    bias: NDArray[np.float64]
-    K: NDArray[np.float64]
-    terms: tuple[Term, ...]
+    bias: NDArray[np.float64]  # (3,)
+    K: NDArray[np.float64]  # (3, 3)
+    terms: tuple[Term, ...]  # the effects at their values
+    # (12 + p, 12 + p); of bias, K (row by row) and the effects' parameters, as the noise settings of the fit weight it
     covariance: NDArray[np.float64]
-    log_likelihood: float
-    setting: Setting
+    log_likelihood: float  # under the best noise setting, up to a constant of the readings
+    setting: Setting  # that noise setting
     degrees_of_freedom: float
-    residual_rms: float
+    residual_rms: float  # of single samples, unit of the sensor
     rounds: int
     converged: bool
-    condition: float
-    cosine: float
-    rank: int
-    scale: NDArray[np.float64]
+    condition: float  # of the scaled products of columns
+    cosine: float  # largest between what is left of the readings and a column, both whitened
+    rank: int  # parameters, or combinations of them, that the readings determine
+    scale: NDArray[np.float64]  # (3,); white noise of each axis, for the weights between the axes
 
 
 def fit_terms(observations: Observations, terms: Sequence[Term], start: Start, settings: Sequence[Setting]) -> Fit:
     """Fit base and effects from given values.
 
-    Parameters
-    ----------
-    observations : Observations
-    terms : sequence of Term
-        Effects and where their nonlinear parameters start.
-    start : Start
-    settings : sequence of Setting
-        Noises over which the likelihood is maximised.
+    ``terms``: effects and where their nonlinear parameters start. ``settings``: noises over which the likelihood is
+    maximised.
     """
     terms = [replace(term, values=np.array(term.values, float), full=True) for term in terms]
     bias, K = start.bias.copy(), start.K.copy()
@@ -290,10 +258,7 @@ def fit_best(
 def require_observable(observations: Observations, fit: Fit, scale: NDArray[np.float64]) -> None:
     """Refuse a fit that the recordings do not determine.
 
-    Raises
-    ------
-    NotObservableError
-        Naming the parameters.
+    Raises ``NotObservableError`` naming the parameters.
     """
     design = _at(observations, fit.terms, fit.bias, fit.K, scale)
     names = [*BASE_NAMES, *parameter_names(observations.sensor, [t.effect for t in fit.terms])]
@@ -333,33 +298,11 @@ def fit_joint(  # noqa: PLR0917  (the interface that the stages and the diagnosi
 ) -> SensorCalibration:
     """Fit bias, matrix and effects together.
 
-    Parameters
-    ----------
-    sensor : str
-    recordings : sequence of Recording
-        All of a unit; those held out are left aside.
-    effects : sequence of str
-        In the order in which they are reported.
-    noise : Noise or None
-        Pins the bias wander where it comes from a static recording.
-    settings : mapping
-        The unit's part of the configuration; its section ``table`` is read.
-    start : SensorCalibration, optional
-        The calibration so far: its stages are kept, its effects are starts.
-    accelerometer : SensorCalibration, optional
-        For the gyroscope: gravity determines the mountings.
-
-    Returns
-    -------
-    SensorCalibration
-        With ``effects`` and a stage ``effects``.
-
-    Raises
-    ------
-    NotObservableError
-        If the recordings do not determine a parameter.
-    ConfigurationError
-        If an effect is unknown or not one of this sensor.
+    ``recordings``: all of a unit; those held out are left aside. ``effects``: in the order in which they are reported.
+    ``noise``: pins the bias wander where it comes from a static recording. ``start``: the calibration so far: its
+    stages are kept, its effects are starts. ``accelerometer``: for the gyroscope: gravity determines the mountings.
+    Raises ``NotObservableError`` if the recordings do not determine a parameter; ``ConfigurationError`` if an effect is
+    unknown or not one of this sensor.
     """
     observations = weighted(observe(sensor, recordings, settings["table"]), noise)
     combinations = starts_of(effects, observations, start, accelerometer)

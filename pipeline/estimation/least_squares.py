@@ -106,33 +106,16 @@ class ScaledColumns:
 
 @dataclass(frozen=True)
 class LeastSquaresResult:
-    """The outcome of a least-squares problem with n residuals and p parameters.
+    """The outcome of a least-squares problem with n residuals and p parameters."""
 
-    Attributes
-    ----------
-    x : (p,) array
-    covariance : (p, p) array
-    residual : (n,) array
-        As minimised, that is weighted where weights were given.
-    degrees_of_freedom : int
-        n - p.
-    rank : int
-    condition : float
-        Condition number of the Jacobian with its columns scaled to unit norm.
-    cosine : float
-        Largest |cosine| between the residual and a column of the Jacobian.
-    converged : bool
-        Whether the residual is orthogonal to the columns, or the next step is below the rounding of x.
-    """
-
-    x: Values
-    covariance: Values
-    residual: Values
-    degrees_of_freedom: int
+    x: Values  # (p,)
+    covariance: Values  # (p, p)
+    residual: Values  # (n,); as minimised, that is weighted where weights were given
+    degrees_of_freedom: int  # n - p
     rank: int
-    condition: float
-    cosine: float
-    converged: bool
+    condition: float  # condition number of the Jacobian with its columns scaled to unit norm
+    cosine: float  # largest |cosine| between the residual and a column of the Jacobian
+    converged: bool  # whether the residual is orthogonal to the columns, or the next step is below the rounding of x
 
     @property
     def standard_uncertainty(self) -> Values:
@@ -155,19 +138,9 @@ def solve_linear(
 ) -> LeastSquaresResult:
     """Solve ``min |y - A x|``.
 
-    Parameters
-    ----------
-    A : (n, p) array
-    y : (n,) array
-    sigma : float, optional
-        Standard deviation of one residual; None estimates it from the residuals.
-    names : sequence of str, optional
-        Names of the parameters, for the message where they are not determined.
-
-    Raises
-    ------
-    NotObservableError
-        If the columns are linearly dependent or fewer equations than parameters are given.
+    ``A``: (n, p). ``y``: (n,). ``sigma``: standard deviation of one residual; None estimates it from the residuals.
+    ``names``: names of the parameters, for the message where they are not determined. Raises ``NotObservableError`` if
+    the columns are linearly dependent or fewer equations than parameters are given.
     """
     factors = ScaledColumns.of(A)
     factors.require_full_rank(names)
@@ -188,29 +161,11 @@ def solve_nonlinear(
 ) -> LeastSquaresResult:
     """Minimise ``|residuals(x)|``.
 
-    Parameters
-    ----------
-    residuals : callable
-        (p,) to (n,).
-    start : (p,) array
-    jacobian : callable, optional
-        (p,) to (n, p). None differentiates by a complex step, for which ``residuals`` must be analytic.
-    sigma, names
-        As in ``solve_linear``.
-    iterations : int
-        Limit on the number of Gauss-Newton steps.
-    far : bool
-        Whether the start may be far off, so that a trust region is tried where Gauss-Newton steps fail.
-
-    Returns
-    -------
-    LeastSquaresResult
-        ``converged`` is False where the certificate fails; that is an outcome, no exception.
-
-    Raises
-    ------
-    NotObservableError
-        If the data do not determine all parameters.
+    ``residuals``: (p,) to (n,). ``start``: (p,). ``jacobian``: (p,) to (n, p). None differentiates by a complex step,
+    for which ``residuals`` must be analytic. ``sigma``, ``names``: as in ``solve_linear``. ``iterations``: limit on the
+    number of Gauss-Newton steps. ``far``: whether the start may be far off, so that a trust region is tried where
+    Gauss-Newton steps fail. Returns ``converged`` is False where the certificate fails; that is an outcome, no
+    exception. Raises ``NotObservableError`` if the data do not determine all parameters.
     """
     jacobian = jacobian or complex_step_jacobian(residuals)
     with np.errstate(all="ignore"):  # steps that overflow do not lower the sum of squares
@@ -282,15 +237,8 @@ def _halved(residuals: Function, x: Values, r: Values, step: Values) -> tuple[Va
 def certificate(A: Values, residual: Values, condition: float, rank: int) -> dict[str, Any]:
     """Return what shows that a linear estimate is a minimum, as ``SensorCalibration.convergence`` holds it.
 
-    Parameters
-    ----------
-    A : (n, p) array
-        Columns, the same for each channel.
-    residual : (n,) or (n, m) array
-        Of m channels.
-    condition : float
-        Of the scaled columns.
-    rank : int
+    ``A``: (n, p), columns, the same for each channel. ``residual``: (n,) or (n, m), of m channels. ``condition``: of
+    the scaled columns.
     """
     products = np.abs(A.T @ residual)
     size = np.multiply.outer(np.linalg.norm(A, axis=0), np.linalg.norm(residual, axis=0))

@@ -43,34 +43,22 @@ NEWTONS = 4  # each squares the relative error of a step that starts at 1e-2 or 
 
 @dataclass(frozen=True)
 class Distribution:
-    """The results of a Monte Carlo run.
+    """The results of a Monte Carlo run."""
 
-    Attributes
-    ----------
-    estimate, standard_uncertainty : (n,) array
-    symmetric, shortest : (n, 2) array
-        Coverage intervals: with as much outside on either side, and the shortest (7.7, 5.3.4).
-    """
-
+    # each (n,)
     estimate: Values
     standard_uncertainty: Values
+    # each (n, 2); coverage intervals: with as much outside on either side, and the shortest (7.7, 5.3.4)
     symmetric: Values
     shortest: Values
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """The interval by the law of propagation against the one by Monte Carlo.
+    """The interval by the law of propagation against the one by Monte Carlo."""
 
-    Attributes
-    ----------
-    tolerance : (n,) array
-        delta.
-    low, high : (n,) array
-        By how much the lower and the upper ends differ.
-    """
-
-    tolerance: Values
+    tolerance: Values  # (n,); delta
+    # each (n,); by how much the lower and the upper ends differ
     low: Values
     high: Values
 
@@ -142,16 +130,8 @@ def beside_trials(
 ) -> SensorCalibration:
     """Return a calibration whose budget also holds the Monte Carlo run, and how it compares.
 
-    Parameters
-    ----------
-    calibration : SensorCalibration
-        With its budget.
-    draw : callable
-        Generator and t to (t, p) parameters.
-    trials : int
-        M.
-    direct : sequence of Contribution
-        Sources of type B that act on the parameters themselves.
+    ``calibration``: with its budget. ``draw``: generator and t to (t, p) parameters. ``trials``: M. ``direct``: sources
+    of type B that act on the parameters themselves.
     """
     rng, drawn = np.random.default_rng(SEED), []
     for start in range(0, trials, BATCH):
@@ -202,19 +182,8 @@ def quadratic_results(columns: Values, curvature: Values, inverse: Values) -> Ca
 
         g(d) = (X + H d)^T W (X d + d^T H d / 2 - e) = 0
 
-    Parameters
-    ----------
-    columns : (n, p) array
-        X.
-    curvature : (n, p, p) array
-        H, symmetric in its last two.
-    inverse : (n, n) array
-        W, the weights of the fit.
-
-    Returns
-    -------
-    callable
-        (t, n) errors e to (t, p) steps d, by Gauss-Newton.
+    ``columns``: (n, p), X. ``curvature``: (n, p, p), H, symmetric in its last two. ``inverse``: (n, n), W, the weights
+    of the fit. Returns (t, n) errors e to (t, p) steps d, by Gauss-Newton.
     """
     size = np.sqrt(np.einsum("np,nm,mp->p", columns, inverse, columns))
     size = np.where(size > 0.0, size, 1.0)

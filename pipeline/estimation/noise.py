@@ -60,18 +60,8 @@ SEEN, AGREES = 6.0, 4.0  # twice the gain in log-likelihood
 def estimate_noise(sensor: str, recordings: list[Recording], data_sheet: dict[str, Any]) -> Noise:
     """Return white noise and bias wander of a sensor.
 
-    Parameters
-    ----------
-    sensor : str
-        ``accelerometer`` or ``gyroscope``.
-    recordings : list of Recording
-    data_sheet : dict
-        ``noise_density`` (g/sqrt(Hz) or deg/s/sqrt(Hz)), ``bias_wander`` (g or deg/s), ``wander_time_s``.
-
-    Raises
-    ------
-    ConfigurationError
-        If neither the recordings nor the data sheet tell the noise.
+    ``data_sheet``: ``noise_density`` (g/sqrt(Hz) or deg/s/sqrt(Hz)), ``bias_wander`` (g or deg/s), ``wander_time_s``.
+    Raises ``ConfigurationError`` if neither the recordings nor the data sheet tell the noise.
     """
     known = [r for r in recordings if r.role != "validation" and r.reading(sensor) is not None and r.samples > 1]
     static = [r for r in known if r.role == "static"]
@@ -92,12 +82,7 @@ def estimate_noise(sensor: str, recordings: list[Recording], data_sheet: dict[st
 def noise_of(sensor: str, recordings: Sequence[Recording], settings: Mapping[str, Any]) -> Noise | None:
     """Return the noise that a stage before has found, else the estimate; None where nothing tells it.
 
-    Parameters
-    ----------
-    sensor : str
-    recordings : sequence of Recording
-    settings : mapping
-        ``noise`` by sensor, where a stage before has found it; ``sensor``, the data sheet.
+    ``settings``: ``noise`` by sensor, where a stage before has found it; ``sensor``, the data sheet.
     """
     if "noise" in settings:
         known: Noise | None = settings["noise"][sensor]
@@ -114,12 +99,7 @@ def prior_of(sensor: str, recordings: Sequence[Recording], settings: Mapping[str
     A standard deviation from a rest of length T, about ``T / (2 tau)`` independent values, has the relative uncertainty
     ``sqrt(tau / T)``.
 
-    Parameters
-    ----------
-    sensor : str
-    recordings : sequence of Recording
-    settings : mapping
-        Section ``sensor``.
+    ``settings``: section ``sensor``.
     """
     sheet = settings.get("sensor", {}).get(sensor) or {}
     static = any(r.role == "static" and r.reading(sensor) is not None and r.samples > 1 for r in recordings)

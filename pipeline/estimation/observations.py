@@ -42,57 +42,31 @@ LONGEST_RESPONSE = 400  # samples
 
 @dataclass(frozen=True)
 class Part:
-    """The rows of one recording.
-
-    Attributes
-    ----------
-    name, role : str
-    motion : Motion
-    reading : (m, 3) array, g or deg/s
-    weight : (m,) array
-        Samples of each row, less what a filter's correlation takes from their information.
-    scatter : (3,) array
-        Sum of squares about the means, weighted.
-    clock_shared : bool
-    interval : float, s
-        Between the recording's samples.
-    """
+    """The rows of one recording."""
 
     name: str
     role: str
     motion: Motion
-    reading: NDArray[np.float64]
+    reading: NDArray[np.float64]  # (m, 3), g or deg/s
+    # (m,); samples of each row, less what a filter's correlation takes from their information
     weight: NDArray[np.float64]
-    scatter: NDArray[np.float64]
+    scatter: NDArray[np.float64]  # (3,); sum of squares about the means, weighted
     clock_shared: bool
-    interval: float
+    interval: float  # s; between the recording's samples
     moved: dict[tuple[tuple[str, bytes], ...], Motion] = field(default_factory=dict, compare=False, repr=False)
 
 
 @dataclass(frozen=True)
 class Observations:
-    """What a fit sees of one sensor.
-
-    Attributes
-    ----------
-    sensor : str
-    parts : tuple of Part
-        In the order of time where the clock is shared.
-    earth : bool
-        Whether Earth's rotation is in the motion.
-    seat_deg : float or None, deg
-        Standard deviation of the rotation of the unit in each recording; None: one mounting for all.
-    mounting_in_doubt : bool
-        Whether one mounting does not explain all turns (note ``N-SEATS``).
-    angle_deg : float, deg
-        Standard uncertainty of the angle at each stop, where the unit is mounted anew for each turn; else 0.
-    """
+    """What a fit sees of one sensor."""
 
     sensor: str
-    parts: tuple[Part, ...]
-    earth: bool
+    parts: tuple[Part, ...]  # in the order of time where the clock is shared
+    earth: bool  # whether Earth's rotation is in the motion
+    # standard deviation of the rotation of the unit in each recording; None: one mounting for all
     seat_deg: float | None = None
-    mounting_in_doubt: bool = False
+    mounting_in_doubt: bool = False  # whether one mounting does not explain all turns (note ``N-SEATS``)
+    # deg; standard uncertainty of the angle at each stop, where the unit is mounted anew for each turn; else 0
     angle_deg: float = 0.0
 
     @cached_property
@@ -153,14 +127,7 @@ def _follows(before: Part | None, part: Part) -> bool:
 
 
 def weighted(observations: Observations, noise: Noise | None) -> Observations:
-    """Return observations whose weights say how much correlated noise leaves of their information.
-
-    Parameters
-    ----------
-    observations : Observations
-    noise : Noise or None
-        See ``pipeline.estimation.gauss_markov.information``.
-    """
+    """Return observations whose weights say how much correlated noise leaves of their information."""
     parts = []
     for part in observations.parts:
         share = information(noise, part.interval)
@@ -197,13 +164,8 @@ def _with_stops(part: Part, observations: Observations, white: float) -> Part:
 def observe(sensor: str, recordings: Sequence[Recording], table: Mapping[str, Any]) -> Observations:
     """Return what a fit sees of one sensor: every recording with its readings and a table's motion.
 
-    Parameters
-    ----------
-    sensor : str
-    recordings : sequence of Recording
-        Those held out are left aside.
-    table : mapping
-        ``gravity_g``, ``latitude_deg``, ``azimuth_deg``, ``seat_deg``.
+    ``recordings``: those held out are left aside. ``table``: ``gravity_g``, ``latitude_deg``, ``azimuth_deg``,
+    ``seat_deg``.
     """
     parts = []
     for recording in recordings:
@@ -272,12 +234,7 @@ def through_filter(motion: Motion, recording: Recording) -> Motion:
     The filter is linear, so that filtered readings are the model of filtered truth; in effects that are not linear in
     the truth the order matters, but only while the filter's output changes.
 
-    Parameters
-    ----------
-    motion : Motion
-        At all samples of the recording.
-    recording : Recording
-        With the filter's settings.
+    ``recording``: with the filter's settings.
     """
     signals = ("specific_force", "angular_rate"), ("specific_force_rate", "angular_acceleration")
     found: dict[str, Any] = {}

@@ -32,54 +32,28 @@ RIDGE = 1e-11
 
 @dataclass(frozen=True)
 class Score:
-    """What one candidate would bring.
-
-    Attributes
-    ----------
-    name : str
-    delta_bic, p_value : float
-        Against the model without it; p of the likelihood ratio.
-    parameters : int
-        k above.
-    values, uncertainty : (p,) array
-        Estimates and standard uncertainties, nonlinear parameters at their start.
-    log_likelihood : float
-    setting : int
-        Index of its best noise setting.
-    admissible : bool
-        Whether it adds anything that the chosen effects cannot do.
-    plausible : bool
-        Whether the estimates are within the sensor's limits.
-    drop : float
-        By how much the estimates lower the unwhitened sum of squares.
-    """
+    """What one candidate would bring."""
 
     name: str
+    # against the model without it; p of the likelihood ratio
     delta_bic: float
     p_value: float
-    parameters: int
+    parameters: int  # k above
+    # each (p,); estimates and standard uncertainties, nonlinear parameters at their start
     values: NDArray[np.float64]
     uncertainty: NDArray[np.float64]
     log_likelihood: float
-    setting: int
-    admissible: bool = True
-    plausible: bool = True
-    drop: float = 0.0
+    setting: int  # index of its best noise setting
+    admissible: bool = True  # whether it adds anything that the chosen effects cannot do
+    plausible: bool = True  # whether the estimates are within the sensor's limits
+    drop: float = 0.0  # by how much the estimates lower the unwhitened sum of squares
 
 
 class Ranking:
     """Every candidate as a small linear problem beside base and configured effects.
 
-    Parameters
-    ----------
-    observations : Observations
-    configured : sequence of Term
-        Effects that belong to the base.
-    candidates : sequence of Term
-        One effect may be there several times, at several values of its nonlinear parameters.
-    K : (3, 3) array
-    scale : (3,) array
-    settings : sequence of Setting
+    ``configured``: effects that belong to the base. ``candidates``: one effect may be there several times, at several
+    values of its nonlinear parameters. ``scale``: (3,).
     """
 
     def __init__(  # noqa: PLR0917  (they are the problem)
@@ -151,12 +125,8 @@ class Ranking:
     def scores(self, selected: Sequence[int], limits: dict[str, NDArray[np.float64]]) -> list[Score]:
         """Return what each candidate brings beside the selected ones, best first.
 
-        Parameters
-        ----------
-        selected : sequence of int
-            Indices of candidates.
-        limits : dict
-            Effect to (p,) array, limits of plausibility of the parameters' absolute values.
+        ``selected``: indices of candidates. ``limits``: effect to (p,) array, limits of plausibility of the parameters'
+        absolute values.
         """
         products = self.chosen(selected)
         before = float(self.log_likelihood(products[:, -1, -1])[1:].max())
@@ -242,14 +212,8 @@ class Ranking:
     def shares(self, j: int, selected: Sequence[int], setting: int) -> dict[str, float]:
         """Return which share of a candidate's fitted signal each other effect reproduces.
 
-        Parameters
-        ----------
-        j : int
-            The candidate.
-        selected : sequence of int
-            Other candidates that the model holds.
-        setting : int
-            Index of the noise setting.
+        ``j``: the candidate. ``selected``: other candidates that the model holds. ``setting``: index of the noise
+        setting.
         """
         others = [i for i in selected if i != j]
         products = self.chosen(others)[setting]
@@ -290,10 +254,7 @@ class Ranking:
 def without(products: NDArray[np.float64], index: NDArray[np.intp]) -> NDArray[np.float64]:
     """Return products of columns after some of them are projected out of all: (t, p, p) array, zeros in theirs.
 
-    Parameters
-    ----------
-    products : (t, p, p) array
-    index : (q,) array of int
+    ``products``: (t, p, p). ``index``: (q,).
     """
     if len(index) == 0:
         return products
@@ -304,10 +265,7 @@ def without(products: NDArray[np.float64], index: NDArray[np.intp]) -> NDArray[n
 def projection(products: NDArray[np.float64], index: NDArray[np.intp]) -> NDArray[np.float64]:
     """Return the coefficients by which some of the columns come closest to each column: (t, q, p) array.
 
-    Parameters
-    ----------
-    products : (t, p, p) array
-    index : (q,) array of int
+    ``products``: (t, p, p). ``index``: (q,).
     """
     inner, cross = products[:, index[:, None], index], products[:, index, :]
     size = np.sqrt(np.maximum(np.einsum("tii->ti", inner), 1e-300))

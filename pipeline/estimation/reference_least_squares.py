@@ -64,22 +64,9 @@ def fit(
 ) -> SensorCalibration:
     """Fit bias and matrix of a sensor against the table's motion.
 
-    Parameters
-    ----------
-    sensor : str
-        ``accelerometer`` or ``gyroscope``; recordings of that role are used.
-    recordings : sequence of Recording
-    previous : SensorCalibration or None
-        Only its stages are kept.
-    settings : mapping
-        Sections ``table`` and ``sensor``.
-
-    Raises
-    ------
-    CannotCalibrateError
-        If no recording of the sensor's own logs the table's motion.
-    NotObservableError
-        If the recordings do not determine all columns.
+    ``previous``: only its stages are kept. ``settings``: sections ``table`` and ``sensor``. Raises
+    ``CannotCalibrateError`` if no recording of the sensor's own logs the table's motion; ``NotObservableError`` if the
+    recordings do not determine all columns.
     """
     parts = [_select(sensor, part) for part in parts_of(recordings, sensor, settings["table"], NAME)]
     y = np.concatenate([part.reading(sensor) for part in parts])

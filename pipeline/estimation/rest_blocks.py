@@ -46,60 +46,32 @@ class Rest:
 
 @dataclass(frozen=True)
 class RestBlocks:
-    """Block means and scatter of rests.
+    """Block means and scatter of rests."""
 
-    Attributes
-    ----------
-    start, length : (b,) arrays, s
-        First sample time and duration of each block.
-    count : (b,) array of int
-        Samples of each.
-    mean : (b, 3) array
-        Less the mean of its rest.
-    rest : (b,) array of int
-        The rest that each belongs to.
-    clock : (b,) array of int
-        Blocks of the same number have a known distance in time.
-    cut : (b,) array of bool
-        Whether its rest holds two blocks or more; the mean of a single one does not show the bias move.
-    scatter : (3,) array
-        Sum of squares about the block means.
-    """
-
+    # each (b,), s; first sample time and duration of each block
     start: NDArray[np.float64]
     length: NDArray[np.float64]
-    count: NDArray[np.int64]
-    mean: NDArray[np.float64]
-    rest: NDArray[np.int64]
-    clock: NDArray[np.int64]
+    count: NDArray[np.int64]  # (b,); samples of each
+    mean: NDArray[np.float64]  # (b, 3); less the mean of its rest
+    rest: NDArray[np.int64]  # (b,); the rest that each belongs to
+    clock: NDArray[np.int64]  # (b,); blocks of the same number have a known distance in time
+    # (b,); whether its rest holds two blocks or more; the mean of a single one does not show the bias move
     cut: NDArray[np.bool_]
-    scatter: NDArray[np.float64]
+    scatter: NDArray[np.float64]  # (3,); sum of squares about the block means
 
 
 @dataclass(frozen=True)
 class Likelihood:
-    """The likelihood over a grid, and white noise at each of its points.
+    """The likelihood over a grid, and white noise at each of its points."""
 
-    Attributes
-    ----------
-    log_likelihood : (t, r, 3) array
-        At each correlation time, by ``RATIOS``, by axis.
-    white : (t, r, 3) array
-        The estimate at each point.
-    """
-
-    log_likelihood: NDArray[np.float64]
-    white: NDArray[np.float64]
+    log_likelihood: NDArray[np.float64]  # (t, r, 3); at each correlation time, by ``RATIOS``, by axis
+    white: NDArray[np.float64]  # (t, r, 3); the estimate at each point
 
 
 def blocks_of(rests: Sequence[Rest], shortest: int) -> RestBlocks:
     """Cut rests into blocks.
 
-    Parameters
-    ----------
-    rests : sequence of Rest
-    shortest : int
-        Fewest samples of a block in a rest that is cut.
+    ``shortest``: fewest samples of a block in a rest that is cut.
     """
     sizes = np.array([len(rest.time) for rest in rests])
     size = max(shortest, int(np.ceil(sizes.sum() / BLOCKS)))
@@ -156,14 +128,8 @@ def likelihood(
 ) -> Likelihood:
     """Return the likelihood of white noise and bias over the grid.
 
-    Parameters
-    ----------
-    blocks : RestBlocks
-    design : (c, p) array
-        The nuisance columns d, at the c blocks that are ``cut``.
-    covariance : (l,) array
-        The filter's autocovariance r.
-    correlation_times : (t,) array, s
+    ``design``: (c, p), the nuisance columns d, at the c blocks that are ``cut``. ``covariance``: (l,), the filter's
+    autocovariance r. ``correlation_times``: (t,), s.
     """
     v = variance_of_mean(covariance, blocks.count)
     within = float(np.sum(blocks.count * (covariance[0] - v)))

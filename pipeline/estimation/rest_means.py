@@ -28,21 +28,11 @@ BY_HAND = ("rests", "validation")
 
 @dataclass(frozen=True)
 class RestSplit:
-    """The rests of one recording, each in order of time.
+    """The rests of one recording, each in order of time."""
 
-    Attributes
-    ----------
-    used : tuple of Rest
-        For the fit.
-    held_out : tuple of Rest
-        For the validation.
-    left_out : tuple of Rest
-        Refused, with the reason.
-    """
-
-    used: tuple[Rest, ...]
-    held_out: tuple[Rest, ...]
-    left_out: tuple[Rest, ...]
+    used: tuple[Rest, ...]  # for the fit
+    held_out: tuple[Rest, ...]  # for the validation
+    left_out: tuple[Rest, ...]  # refused, with the reason
 
 
 def holdout_interval(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> int:
@@ -57,11 +47,7 @@ def split_rests(recording: Recording, every: int) -> RestSplit:
 
     The middle one of each group of ``every`` is held out: the first and the last rest stay in the fit.
 
-    Parameters
-    ----------
-    recording : Recording
-        By the table's log where it has one, else by its readings.
-    every : int
+    ``recording``: by the table's log where it has one, else by its readings.
     """
     rests = rests_from_table(recording) or find_rests(recording)
     sound = [rest for rest in rests if rest.accepted]
@@ -76,18 +62,9 @@ def split_rests(recording: Recording, every: int) -> RestSplit:
 def held_out_rests(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> dict[str, list[Rest]]:
     """Return the rests that no fit uses, by the name of their recording.
 
-    Parameters
-    ----------
-    recordings : sequence of Recording
-        Those of role ``rests`` count.
-    settings : mapping
-        Section ``procedure``: ``holdout_every``.
-
-    Returns
-    -------
-    dict of str to list of Rest
-        Empty where there is a recording for validation. The move before a rest ends with it: it begins where the rest
-        before, held out or not, stops.
+    ``recordings``: those of role ``rests`` count. ``settings``: section ``procedure``: ``holdout_every``. Returns empty
+    where there is a recording for validation. The move before a rest ends with it: it begins where the rest before,
+    held out or not, stops.
     """
     every = holdout_interval(recordings, settings)
     if not every:
@@ -98,17 +75,8 @@ def held_out_rests(recordings: Sequence[Recording], settings: Mapping[str, Any])
 def rests_by_use(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> dict[str, list[dict[str, Any]]]:
     """Return the rests of the recordings of role ``rests``: which a fit would use, and which not, with the reason.
 
-    Parameters
-    ----------
-    recordings : sequence of Recording
-    settings : mapping
-        Section ``procedure``: ``holdout_every``.
-
-    Returns
-    -------
-    dict of str to list of dict
-        ``rests_used``, ``rests_held_out``, ``rests_left_out``, each as of ``describe_rests``; what a fit itself leaves
-        out counts as used here.
+    ``settings``: section ``procedure``: ``holdout_every``. Returns ``rests_used``, ``rests_held_out``,
+    ``rests_left_out``, each as of ``describe_rests``; what a fit itself leaves out counts as used here.
     """
     every = holdout_interval(recordings, settings)
     found: dict[str, list[dict[str, Any]]] = {"rests_used": [], "rests_held_out": [], "rests_left_out": []}
@@ -148,12 +116,8 @@ def rest_means(
     By hand a unit may creep: the mean over its directions is too short, and is made longer by that (see
     ``pipeline.signal.creep``).
 
-    Returns
-    -------
-    means : (m, 3) array, g or deg/s
-        NaN where a rest has no sound sample.
-    counts : (m,) array
-        Number of samples averaged.
+    Returns ``means`` (m, 3), g or deg/s: NaN where a rest has no sound sample; ``counts`` (m,): number of samples
+    averaged.
     """
     reading = recording.reading(sensor)
     if reading is None or not rests:

@@ -37,33 +37,19 @@ ARRAYS = (
 
 @dataclass(frozen=True)
 class Rows:
-    """Groups of a recording's samples whose means are the rows of a fit.
+    """Groups of a recording's samples whose means are the rows of a fit."""
 
-    Attributes
-    ----------
-    kept : (k,) array of int
-        Indices of the samples.
-    first : (m,) array of int
-        Where in ``kept`` each group starts.
-    count : (m,) array
-        Samples of each group.
-    total : int
-        Samples of the recording.
-    """
-
-    kept: NDArray[np.intp]
-    first: NDArray[np.intp]
-    count: NDArray[np.float64]
-    total: int
+    kept: NDArray[np.intp]  # (k,); indices of the samples
+    first: NDArray[np.intp]  # (m,); where in ``kept`` each group starts
+    count: NDArray[np.float64]  # (m,); samples of each group
+    total: int  # samples of the recording
 
     def settled(self, reading: NDArray[np.float64]) -> Rows:
         """Return rows in which groups that scatter too much are taken apart into their samples.
 
         By the table's log they are at rest; where the sensor's clock is off, it still moves at their edge.
 
-        Parameters
-        ----------
-        reading : (n, 3) array, g or deg/s
+        ``reading``: (n, 3), g or deg/s.
         """
         size = self.count.astype(int)
         if np.all(size < 2):
@@ -122,13 +108,8 @@ class Rows:
 def rows_of(motion: Motion, sound: NDArray[np.bool_], *, together: bool = True) -> Rows:
     """Choose the samples of a fit and group those of a rest.
 
-    Parameters
-    ----------
-    motion : Motion
-    sound : (n,) array of bool
-        Samples whose readings can be used.
-    together : bool
-        Whether the samples of a rest are alike; after a filter they are not.
+    ``sound``: (n,), samples whose readings can be used. ``together``: whether the samples of a rest are alike; after a
+    filter they are not.
     """
     moving = np.linalg.norm(motion.angular_rate, axis=1) > RATE_AT_REST_DPS
     if motion.rate is not None:

@@ -63,37 +63,15 @@ ANOTHER_K = 2e-3  # change of K that changes the columns of effects that the axe
 
 @dataclass
 class Selection:
-    """What was selected, and how every candidate did.
+    """What was selected, and how every candidate did."""
 
-    Attributes
-    ----------
-    names : list of str
-        Selected effects, in order.
-    steps : dict of str to Score
-        Of each selected effect when it was accepted.
-    alone : dict of str to Score
-        Of each candidate against the base.
-    fit : Fit
-        Base, configured and selected effects.
-    base : Fit
-        Base and configured effects.
-    first : Ranking
-        The linear problem of the base.
-    ranking : Ranking
-        The linear problem with the selected effects at their values.
-    observations : Observations
-    start : Start
-    settings : list of Setting
-    limits : dict of str to array
-    """
-
-    names: list[str]
-    steps: dict[str, Score]
-    alone: dict[str, Score]
-    fit: Fit
-    base: Fit
-    first: Ranking
-    ranking: Ranking
+    names: list[str]  # selected effects, in order
+    steps: dict[str, Score]  # of each selected effect when it was accepted
+    alone: dict[str, Score]  # of each candidate against the base
+    fit: Fit  # base, configured and selected effects
+    base: Fit  # base and configured effects
+    first: Ranking  # the linear problem of the base
+    ranking: Ranking  # the linear problem with the selected effects at their values
     observations: Observations
     start: Start
     settings: list[Setting]
@@ -115,18 +93,9 @@ def select(
 ) -> Selection:
     """Select effects.
 
-    Parameters
-    ----------
-    observations : Observations
-    configured : sequence of str
-        Effects that are in the model already.
-    noise : Noise or None
-    sheet : mapping
-        The sensor's section of the configuration.
-    known : SensorCalibration, optional
-        Its effects are starts for the configured ones.
-    accelerometer : SensorCalibration, optional
-        For the gyroscope: gravity determines the mountings.
+    ``configured``: effects that are in the model already. ``sheet``: the sensor's section of the configuration.
+    ``known``: its effects are starts for the configured ones. ``accelerometer``: for the gyroscope: gravity determines
+    the mountings.
     """
     return _Search(observations, configured, noise, sheet, known, accelerometer=accelerometer).run()
 

@@ -43,18 +43,7 @@ def fit_stage(
 ) -> SensorCalibration:
     """Run a stage on the result of the stage before.
 
-    Parameters
-    ----------
-    sensor, stage : str
-    recordings : sequence of Recording
-    previous : SensorCalibration or None
-    settings : mapping
-        The unit's part of the configuration.
-
-    Raises
-    ------
-    CannotCalibrateError
-        If the sensor's method is null, or the stage cannot use these recordings.
+    Raises ``CannotCalibrateError`` if the sensor's method is null, or the stage cannot use these recordings.
     """
     if stage == NOT_WANTED:
         raise CannotCalibrateError(f"method.{sensor} is null: the configuration leaves this sensor uncalibrated")

@@ -67,32 +67,18 @@ ESTIMATES = {
 
 @dataclass(frozen=True)
 class Reference:
-    """The motion at the rows of a fit, recording by recording, and its linear map.
-
-    Attributes
-    ----------
-    sensor : str
-    motions : sequence of Motion
-        Their samples, one after the other, are the columns of the map's weights.
-    fit : LinearMap
-    K : (3, 3) array
-    table : mapping
-    """
+    """The motion at the rows of a fit, recording by recording, and its linear map."""
 
     sensor: str
-    motions: Sequence[Motion]
+    motions: Sequence[Motion]  # their samples, one after the other, are the columns of the map's weights
     fit: LinearMap
-    K: Values
+    K: Values  # (3, 3)
     table: Mapping[str, Any]
 
     def summed(self, change: Callable[[Motion], Values | None], inputs: int) -> Values:
         """Return what inputs do to the parameters, each by a change of the truth: (p, inputs) array.
 
-        Parameters
-        ----------
-        change : callable
-            Motion to (n, 3, inputs), or None where they do nothing.
-        inputs : int
+        ``change``: motion to (n, 3, inputs), or None where they do nothing.
         """
         total, row = np.zeros((self.fit.parameters, inputs)), 0
         for motion in self.motions:
@@ -118,11 +104,7 @@ class StatedError:
 def table_errors(reference: Reference, estimated: Sequence[str] = ()) -> tuple[list[StatedError], dict[str, str]]:
     """Return each stated accuracy with its effect, and why the others are not included.
 
-    Parameters
-    ----------
-    reference : Reference
-    estimated : sequence of str
-        Effects of the fit: what one of them estimates is no input any more.
+    ``estimated``: effects of the fit: what one of them estimates is no input any more.
     """
     effects = {
         "table angle": _angle,
@@ -150,17 +132,7 @@ def table_errors(reference: Reference, estimated: Sequence[str] = ()) -> tuple[l
 def disturbance(reference: Reference, residuals: Values, blocks: Blocks) -> Values | None:
     """Return the covariance that the stated accuracies give the sums over blocks, or None where noise hides it.
 
-    Parameters
-    ----------
-    reference : Reference
-        Its linear map is not used.
-    residuals : (n, 3) array
-    blocks : Blocks
-
-    Returns
-    -------
-    (3 b, 3 b) array
-        Channel by channel.
+    ``reference``: its linear map is not used. ``residuals``: (n, 3). Returns (3 b, 3 b): channel by channel.
     """
     white = float(noise_of_steps(np.abs(np.diff(residuals, axis=0))).min())
     if not 0.0 < white < _largest(reference) * np.sqrt(blocks.weight.max()):

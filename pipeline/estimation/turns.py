@@ -53,18 +53,11 @@ WEAKEST_DIRECTION = 1e-3  # smallest singular value of unit columns that still c
 
 @dataclass(frozen=True)
 class Part:
-    """The samples of one recording that a fit uses.
-
-    Attributes
-    ----------
-    recording : Recording
-    motion : Motion
-    keep : (n,) array of bool
-    """
+    """The samples of one recording that a fit uses."""
 
     recording: Recording
     motion: Motion
-    keep: NDArray[np.bool_]
+    keep: NDArray[np.bool_]  # (n,)
 
     def reading(self, sensor: str) -> NDArray[np.float64]:
         """Return the readings that are used: (k, 3) array."""
@@ -76,18 +69,7 @@ class Part:
 def parts_of(recordings: Sequence[Recording], sensor: str, table: Mapping[str, Any], method: str) -> list[Part]:
     """Return the recordings made for a sensor that hold its readings and the table's motion, without bad samples.
 
-    Parameters
-    ----------
-    recordings : sequence of Recording
-    sensor : str
-    table : mapping
-    method : str
-        Name of the method, for the message.
-
-    Raises
-    ------
-    CannotCalibrateError
-        If there is none.
+    ``method``: name of the method, for the message. Raises ``CannotCalibrateError`` if there is none.
     """
     own = [r for r in recordings if r.role == sensor and r.reading(sensor) is not None]
     parts = []
@@ -155,43 +137,21 @@ def filtered_alike(part: Part) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class Sinusoid:
-    """The sinusoid of one channel in one turn.
+    """The sinusoid of one channel in one turn."""
 
-    Attributes
-    ----------
-    coefficients : (3,) or (4,) array, g
-        z, then the cosine's and the sine's coefficient, then c where both sides were fitted.
-    columns : (n, p) array
-    weights : (p, n) array
-        ``coefficients = weights @ readings``.
-    residuals : (n,) array, g
-    condition : float
-        Of the columns, scaled.
-    """
-
+    # (3,) or (4,), g; z, then the cosine's and the sine's coefficient, then c where both sides were fitted
     coefficients: NDArray[np.float64]
-    columns: NDArray[np.float64]
-    weights: NDArray[np.float64]
-    residuals: NDArray[np.float64]
-    condition: float
+    columns: NDArray[np.float64]  # (n, p)
+    weights: NDArray[np.float64]  # (p, n); ``coefficients = weights @ readings``
+    residuals: NDArray[np.float64]  # (n,), g
+    condition: float  # of the columns, scaled
 
 
 def fit_sinusoid(angle_deg: NDArray[np.float64], reading: NDArray[np.float64], *, sides: bool, where: str) -> Sinusoid:
     """Fit a sinusoid of the table angle.
 
-    Parameters
-    ----------
-    angle_deg : (n,) array, deg
-    reading : (n,) array, g
-    sides : bool
-        Whether the two sides may differ.
-    where : str
-        Channel and turn, for the message.
-
-    Raises
-    ------
-    NotObservableError
-        If the angles do not determine it.
+    ``angle_deg``: (n,), deg. ``reading``: (n,), g. ``sides``: whether the two sides may differ. ``where``: channel and
+    turn, for the message. Raises ``NotObservableError`` if the angles do not determine it.
     """
     angle = np.radians(angle_deg)
     columns = harmonic = np.column_stack([np.ones_like(angle), np.cos(angle), np.sin(angle)])
@@ -227,10 +187,7 @@ def _factors(columns: NDArray[np.float64], where: str) -> ScaledColumns:
 def blocks_of_samples(parts: Sequence[tuple[Recording, NDArray[np.bool_]]]) -> Blocks:
     """Cut the chosen samples of recordings, stacked in their order, into about ``BLOCKS`` blocks of equal size.
 
-    Parameters
-    ----------
-    parts : sequence of (Recording, (n,) array of bool)
-        Each recording and which of its samples are used.
+    ``parts``: each recording and which of its samples are used.
     """
     used = [int(keep.sum()) for _, keep in parts]
     size = max(1, -(-sum(used) // BLOCKS))

@@ -66,12 +66,8 @@ def propagate(
 def effective_degrees_of_freedom(contributions: ArrayLike, degrees_of_freedom: ArrayLike) -> Values:
     """Return ``nu_eff`` by Welch and Satterthwaite: (n,) array, infinite where no finite one contributes.
 
-    Parameters
-    ----------
-    contributions : (m, n) array
-        Standard uncertainty that each of m inputs contributes to each of n results; the inputs are independent.
-    degrees_of_freedom : (m,) or (m, n) array
-        Of each; may be infinite.
+    ``contributions``: (m, n), standard uncertainty that each of m inputs contributes to each of n results; the inputs
+    are independent. ``degrees_of_freedom``: (m,) or (m, n), of each; may be infinite.
     """
     u = np.atleast_2d(np.asarray(contributions, float))
     nu = np.asarray(degrees_of_freedom, float)
@@ -92,15 +88,7 @@ def type_b(  # noqa: PLR0917  (the columns of a budget's line)
 
 
 def noise_contribution(noise: ResidualNoise, fit: LinearMap, prior: Prior) -> Contribution:
-    """Return what white noise, bias instability and lack of fit contribute.
-
-    Parameters
-    ----------
-    noise : ResidualNoise
-    fit : LinearMap
-    prior : Prior
-        The bias instability that was expected.
-    """
+    """Return what white noise, bias instability and lack of fit contribute."""
     covariance, freedom = noise.posterior(fit).averaged()
     total = np.diag(covariance)
     white, wander = noise.variances(fit, prior)
@@ -167,13 +155,7 @@ def combined(
 ) -> SensorCalibration:
     """Return a calibration with the covariance and the degrees of freedom of all contributions together.
 
-    Parameters
-    ----------
-    calibration : SensorCalibration
-    contributions : sequence of Contribution
-        Of all of its parameters.
-    not_included : mapping of str to str
-        Source to the reason why it is not among them.
+    ``contributions``: of all of its parameters. ``not_included``: source to the reason why it is not among them.
     """
     covariance = np.sum([c.covariance for c in contributions], axis=0)
     freedom = effective_degrees_of_freedom(
@@ -203,19 +185,10 @@ def budgeted(  # noqa: PLR0917  (what a fit on a table is)
 ) -> SensorCalibration:
     """Return a calibration on a table with its budget, and a Monte Carlo run beside it where that is asked for.
 
-    Parameters
-    ----------
-    calibration : SensorCalibration
-    reference : Reference
-    noise : ResidualNoise
-    contributions : sequence of Contribution
-        The first that of the noise; the others act on the parameters themselves.
-    settings : mapping
-        Sections ``sensor``, for the size of a count, and ``uncertainty``.
-    results : callable
-        (t, q) errors of what the fit's map makes of the channels, one after the other, to (t, p) parameters.
-    estimated : sequence of str
-        Effects of the fit: what one of them estimates is no input any more.
+    ``contributions``: the first that of the noise; the others act on the parameters themselves. ``settings``: sections
+    ``sensor``, for the size of a count, and ``uncertainty``. ``results``: (t, q) errors of what the fit's map makes of
+    the channels, one after the other, to (t, p) parameters. ``estimated``: effects of the fit: what one of them
+    estimates is no input any more.
     """
     sensor = calibration.sensor
     counts = ((settings.get("sensor") or {}).get(sensor) or {}).get("counts_per_unit")
@@ -246,13 +219,7 @@ def with_stated(
 ) -> SensorCalibration:
     """Return a calibration whose budget holds temperature and repeatability, as far as they are stated.
 
-    Parameters
-    ----------
-    calibration : SensorCalibration
-    recordings : sequence of Recording
-        Of the fit; only their temperature is used.
-    settings : mapping
-        Section ``sensor``.
+    ``recordings``: of the fit; only their temperature is used. ``settings``: section ``sensor``.
     """
     before, budget = calibration.covariance, calibration.budget
     if before is None or budget is None:

@@ -49,30 +49,14 @@ ROUNDS = 20
 
 @dataclass(frozen=True)
 class Ellipsoid:
-    """Parameters of ``u = L (y - b)`` and how well they fit.
+    """Parameters of ``u = L (y - b)`` and how well they fit."""
 
-    Attributes
-    ----------
-    values : (9,) array
-        b, then the lower triangle of L row by row.
-    free : (9,) array of bool
-        Those that were fitted.
-    fit : LeastSquaresResult
-        Its residuals are ``weight * error``.
-    weight : (m,) array, 1/g
-        Square root of w.
-    error : (m,) array, g
-        |u| - G.
-    between : float, g
-        s_r.
-    """
-
-    values: Values
-    free: Mask
-    fit: LeastSquaresResult
-    weight: Values
-    error: Values
-    between: float
+    values: Values  # (9,); b, then the lower triangle of L row by row
+    free: Mask  # (9,); those that were fitted
+    fit: LeastSquaresResult  # its residuals are ``weight * error``
+    weight: Values  # (m,), 1/g; square root of w
+    error: Values  # (m,), g; |u| - G
+    between: float  # g; s_r
 
     @property
     def bias(self) -> Values:
@@ -119,16 +103,7 @@ def derivative_of(y: Values, values: Values) -> Values:
 def fit_ellipsoid(orientations: Orientations, gravity_g: float, free: Mask) -> Ellipsoid:
     """Fit some of the nine values; the others stay those of an ideal sensor.
 
-    Parameters
-    ----------
-    orientations : Orientations
-    gravity_g : float, g
-    free : (9,) array of bool
-
-    Raises
-    ------
-    NotObservableError
-        If the orientations do not determine them.
+    ``free``: (9,). Raises ``NotObservableError`` if the orientations do not determine them.
     """
     y, variance = orientations.mean, orientations.variance
     target = np.sqrt(gravity_g**2 + 2.0 * variance)

@@ -72,22 +72,12 @@ def fit(
 ) -> SensorCalibration:
     """Fit bias, scale factors and misalignment of the accelerometer.
 
-    Parameters
-    ----------
-    recordings : sequence of Recording
-        Rests in many orientations (role ``rests``), or a table's turns (role ``accelerometer``).
-    previous : SensorCalibration or None
-        The result of the stage before; only its stages are kept.
-    settings : mapping
-        Sections ``table`` (``gravity_g``), ``procedure`` (``holdout_every``; ``faces``: the full matrix, by
-        ``pipeline.estimation.multi_position.faces_fit``) and ``sensor``.
-
-    Raises
-    ------
-    CannotCalibrateError
-        If there is no recording for it.
-    NotObservableError
-        If the orientations are too few or too much alike, or a stated face is missing.
+    ``recordings``: rests in many orientations (role ``rests``), or a table's turns (role ``accelerometer``).
+    ``previous``: the result of the stage before; only its stages are kept. ``settings``: sections ``table``
+    (``gravity_g``), ``procedure`` (``holdout_every``; ``faces``: the full matrix, by
+    ``pipeline.estimation.multi_position.faces_fit``) and ``sensor``. Raises ``CannotCalibrateError`` if there is no
+    recording for it; ``NotObservableError`` if the orientations are too few or too much alike, or a stated face is
+    missing.
     """
     if not settings["procedure"].get("faces"):
         return _fit_triangular(recordings, previous, settings)

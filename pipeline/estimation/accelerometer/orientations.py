@@ -33,33 +33,16 @@ SMALLEST_NOISE = 1e-9  # g, keeps the weights of a noise-free recording finite
 
 @dataclass(frozen=True)
 class Orientations:
-    """Rows of mean readings.
+    """Rows of mean readings."""
 
-    Attributes
-    ----------
-    mean : (m, 3) array, g
-    count : (m,) array
-        Samples of each row.
-    white : float, g
-        Standard deviation of a raw sample about the mean of its row, averaged over the axes; 0 where no row has two.
-    parts : tuple of (Recording, (n,) array of bool)
-        The samples behind the rows, in order.
-    row : (k,) array of int
-        Row of each of these samples.
-    by_hand : bool
-        Whether every row is a hand-held rest.
-    rests : tuple of (Recording, Rest)
-        The rest behind each row, where all are rests of a hand-held recording.
-    held_out, left_out : tuple of (Recording, Rest)
-    """
-
-    mean: NDArray[np.float64]
-    count: NDArray[np.int64]
+    mean: NDArray[np.float64]  # (m, 3), g
+    count: NDArray[np.int64]  # (m,); samples of each row
+    # g; standard deviation of a raw sample about the mean of its row, averaged over the axes; 0 where no row has two
     white: float
-    parts: tuple[tuple[Recording, NDArray[np.bool_]], ...]
-    row: NDArray[np.intp]
-    by_hand: bool
-    rests: tuple[tuple[Recording, Rest], ...]
+    parts: tuple[tuple[Recording, NDArray[np.bool_]], ...]  # the samples behind the rows, in order
+    row: NDArray[np.intp]  # (k,); row of each of these samples
+    by_hand: bool  # whether every row is a hand-held rest
+    rests: tuple[tuple[Recording, Rest], ...]  # the rest behind each row, where all are rests of a hand-held recording
     held_out: tuple[tuple[Recording, Rest], ...]
     left_out: tuple[tuple[Recording, Rest], ...]
 
@@ -77,17 +60,8 @@ class Orientations:
 def orientations_of(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> Orientations:
     """Collect the rows of all recordings made for the accelerometer.
 
-    Parameters
-    ----------
-    recordings : sequence of Recording
-        Those of role ``rests`` and ``accelerometer`` are used.
-    settings : mapping
-        Sections ``table`` and ``procedure``.
-
-    Raises
-    ------
-    CannotCalibrateError
-        If no such recording holds readings of the accelerometer.
+    ``recordings``: those of role ``rests`` and ``accelerometer`` are used. ``settings``: sections ``table`` and
+    ``procedure``. Raises ``CannotCalibrateError`` if no such recording holds readings of the accelerometer.
     """
     every = holdout_interval(recordings, settings)
     chosen = [r for r in recordings if r.role in {"rests", "accelerometer"} and r.accelerometer is not None]

@@ -42,43 +42,23 @@ TIMES = (0.5, 1.0, 2.0)  # of the correlation time that is believed
 
 @dataclass(frozen=True)
 class RestErrors:
-    """The errors of a fit to m rests.
+    """The errors of a fit to m rests."""
 
-    Attributes
-    ----------
-    error : (m,) array, g
-    derivative : (m, p) array
-        Of the length of gravity with respect to the parameters.
-    along : (m, 3) array
-        a_i.
-    variance : (m,) array, g^2
-        v_i.
-    between : float, g
-        What they scatter beyond white noise, taken for independent.
-    start, length : (m,) arrays, s
-    joined : (m, m) array of bool
-        Whether the time between two rests is known.
-    """
-
-    error: Values
-    derivative: Values
-    along: Values
-    variance: Values
-    between: float
+    error: Values  # (m,), g
+    derivative: Values  # (m, p); of the length of gravity with respect to the parameters
+    along: Values  # (m, 3); a_i
+    variance: Values  # (m,), g^2; v_i
+    between: float  # g; what they scatter beyond white noise, taken for independent
+    # each (m,), s
     start: Values
     length: Values
-    joined: NDArray[np.bool_]
+    joined: NDArray[np.bool_]  # (m, m); whether the time between two rests is known
 
 
 def rest_scatter(rests: RestErrors, gain: Values, prior: Prior) -> Contribution:
     """Return what the rests' scatter contributes to ``gain @ errors``.
 
-    Parameters
-    ----------
-    rests : RestErrors
-    gain : (p, m) array
-    prior : Prior
-        Of the bias wander.
+    ``gain``: (p, m). ``prior``: of the bias wander.
     """
     spare = len(rests.error) - rests.derivative.shape[1]
     weight, covariances = rest_candidates(rests, gain, prior)

@@ -74,25 +74,14 @@ ASYMMETRY = "scale_factor_asymmetry"
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one stage found.
+    """What one stage found."""
 
-    Attributes
-    ----------
-    steps : list of dict
-        Its steps of the correction, see ``pipeline.estimation.correction``.
-    values : dict of str to (float, str)
-        Value and unit of each of its parameters.
-    positive, negative : (3,) array
-        Its factors in the contract's form.
-    subtracted : (3,) array, g
-        Its offset.
-    """
-
-    steps: list[dict[str, Any]]
-    values: Quantities
+    steps: list[dict[str, Any]]  # its steps of the correction, see ``pipeline.estimation.correction``
+    values: Quantities  # value and unit of each of its parameters
+    # each (3,); its factors in the contract's form
     positive: Values = field(default_factory=lambda: np.ones(3))
     negative: Values = field(default_factory=lambda: np.ones(3))
-    subtracted: Values = field(default_factory=lambda: np.zeros(3))
+    subtracted: Values = field(default_factory=lambda: np.zeros(3))  # (3,), g; its offset
 
 
 def _per_axis(name: str, values: Values, unit: str) -> Quantities:
@@ -247,16 +236,7 @@ def follow(
 ) -> Corrected:
     """Run stages one after the other, each on the output of the one before.
 
-    Parameters
-    ----------
-    extremes : Extremes
-        Of the uncorrected readings.
-    names : sequence of str
-        Stages, in order.
-    gravity_g : float, g
-    as_printed : bool
-    start : Corrected, optional
-        Output of the stage before the first.
+    ``start``: output of the stage before the first.
     """
     found = start or Corrected()
     for step in found.steps:
@@ -277,25 +257,10 @@ def fit(
 ) -> SensorCalibration:
     """Run one stage of the staged method on the output of the stage before.
 
-    Parameters
-    ----------
-    name : str
-        The stage.
-    recordings : sequence of Recording
-        Those of role ``accelerometer`` are used.
-    previous : SensorCalibration or None
-        The result of the stage before.
-    settings : mapping
-        Sections ``table``, ``method`` and ``sensor``.
-
-    Raises
-    ------
-    CannotCalibrateError
-        If no recording of the accelerometer logs the table's motion.
-    NotObservableError
-        If there is no turn about one of the axes, or it does not show a sinusoid.
-    ConfigurationError
-        If the stage before is not one of this method.
+    ``recordings``: those of role ``accelerometer`` are used. ``settings``: sections ``table``, ``method`` and
+    ``sensor``. Raises ``CannotCalibrateError`` if no recording of the accelerometer logs the table's motion;
+    ``NotObservableError`` if there is no turn about one of the axes, or it does not show a sinusoid;
+    ``ConfigurationError`` if the stage before is not one of this method.
     """
     before = stages_before("accelerometer", previous, STAGES)
     as_printed = bool(settings["method"].get("as_printed", False))

@@ -39,25 +39,18 @@ OTHERS = ((1, 2), (2, 0), (0, 1))  # first and second axis of a turn about x, y,
 
 @dataclass(frozen=True)
 class Extremes:
-    """What the staged method knows of the turns.
+    """What the staged method knows of the turns."""
 
-    Attributes
-    ----------
-    angle_high, angle_low : (3, 2) array, deg
-        Table angle where the first and the second axis of the turn about x, y, z read most and least.
-    high, low : (3, 2) array, g
-        Largest and smallest readings of each axis, one from each of the two turns in which it goes up and down.
-    level : (3, m) array, g
-        Readings of each axis where it is level.
-    height : (3,) array, g
-        What each axis reads while the table turns about it: by default the amplitude of its swing, as printed its mean.
-    """
-
+    # each (3, 2), deg; table angle where the first and the second axis of the turn about x, y, z read most and least
     angle_high: Values
     angle_low: Values
+    # each (3, 2), g; largest and smallest readings of each axis, one from each of the two turns in which it goes up and
+    # down
     high: Values
     low: Values
-    level: Values
+    level: Values  # (3, m), g; readings of each axis where it is level
+    # (3,), g; what each axis reads while the table turns about it: by default the amplitude of its swing, as printed
+    # its mean
     height: Values
 
     @property
@@ -105,31 +98,18 @@ class Extremes:
 
 @dataclass(frozen=True)
 class Turn:
-    """The samples that are used of all recordings of turns about one axis.
+    """The samples that are used of all recordings of turns about one axis."""
 
-    Attributes
-    ----------
-    angle : (n,) array, deg
-    reading : (n, 3) array, g
-    used : list of (Recording, array of bool)
-        Where they come from, in order.
-    motions : list of Motion
-        By the table, at these samples.
-    """
-
-    angle: Values
-    reading: Values
-    used: list[tuple[Recording, NDArray[np.bool_]]]
-    motions: list[Motion]
+    angle: Values  # (n,), deg
+    reading: Values  # (n, 3), g
+    used: list[tuple[Recording, NDArray[np.bool_]]]  # where they come from, in order
+    motions: list[Motion]  # by the table, at these samples
 
 
 def turns_of(parts: Sequence[Part], *, as_printed: bool) -> list[Turn]:
     """Return the turns about x, y and z.
 
-    Raises
-    ------
-    NotObservableError
-        If there is none about one of the axes.
+    Raises ``NotObservableError`` if there is none about one of the axes.
     """
     turns = []
     for axis in range(3):
@@ -170,10 +150,7 @@ def sinusoids_of(turns: Sequence[Turn]) -> list[list[Sinusoid]]:
 def extremes_of_sinusoids(coefficients: Sequence[Sequence[Values]]) -> Extremes:
     """Return the extremes of fitted sinusoids.
 
-    Parameters
-    ----------
-    coefficients : [turn][channel] of (3,) or (4,) arrays
-        ``Sinusoid.coefficients``.
+    ``coefficients``: ``Sinusoid.coefficients``.
     """
     angle = np.empty((3, 2))
     high, low, level = np.empty((3, 2)), np.empty((3, 2)), np.empty((3, 3))

@@ -69,23 +69,10 @@ def fit(
 ) -> SensorCalibration:
     """Fit the matrix of the gyroscope to integrated turns.
 
-    Parameters
-    ----------
-    recordings : sequence of Recording
-        Those of role ``gyroscope`` are used; each must log the table's motion.
-    previous : SensorCalibration
-        The result of the stage ``bias``.
-    settings : mapping
-        Sections ``table``, ``method`` (``as_printed``) and ``sensor``.
-
-    Raises
-    ------
-    CannotCalibrateError
-        If no recording of the gyroscope logs the table's motion.
-    NotObservableError
-        If there is no turn about one of the axes.
-    ConfigurationError
-        If no stage before it estimated the bias.
+    ``recordings``: those of role ``gyroscope`` are used; each must log the table's motion. ``previous``: the result of
+    the stage ``bias``. ``settings``: sections ``table``, ``method`` (``as_printed``) and ``sensor``. Raises
+    ``CannotCalibrateError`` if no recording of the gyroscope logs the table's motion; ``NotObservableError`` if there
+    is no turn about one of the axes; ``ConfigurationError`` if no stage before it estimated the bias.
     """
     if previous is None:
         raise ConfigurationError(
@@ -148,12 +135,7 @@ def fit(
 
 
 def factorise(A: Values) -> _Factors:
-    """Return S (positive), T (unit lower triangular) and M (orthonormal) with ``A = S T M``.
-
-    Parameters
-    ----------
-    A : (3, 3) array, not singular
-    """
+    """Return S (positive), T (unit lower triangular) and M (orthonormal) with ``A = S T M``."""
     L = np.linalg.cholesky(A @ A.T)
     S = np.diag(L).copy()
     return _Factors(S, L / S[:, None], np.linalg.solve(L, A))

@@ -36,33 +36,16 @@ SMALLEST_ANGLE_DEG = 1.0
 
 @dataclass(frozen=True)
 class Turns:
-    """Samples at rest and in turns of all recordings, stacked, and what they integrate to.
+    """Samples at rest and in turns of all recordings, stacked, and what they integrate to."""
 
-    Attributes
-    ----------
-    reading : (n, 3) array, deg/s
-    rate : (n, 3) array, deg/s
-        By the table, Earth's rotation included where it is known.
-    rest : (n,) array of bool
-    weight : (n,) array, s
-        Of each sample in the integral of its turn; 0 at rest.
-    turn : (n,) array of int
-        Turn of each sample, -1 at rest.
-    parts : tuple of (Recording, (n,) array of bool)
-    left_out : int
-        Turns with clipped or stuck readings.
-    motions : tuple of Motion
-        By the table, at these samples.
-    """
-
-    reading: Values
-    rate: Values
-    rest: NDArray[np.bool_]
-    weight: Values
-    turn: NDArray[np.intp]
+    reading: Values  # (n, 3), deg/s
+    rate: Values  # (n, 3), deg/s; by the table, Earth's rotation included where it is known
+    rest: NDArray[np.bool_]  # (n,)
+    weight: Values  # (n,), s; of each sample in the integral of its turn; 0 at rest
+    turn: NDArray[np.intp]  # (n,); turn of each sample, -1 at rest
     parts: tuple[tuple[Recording, NDArray[np.bool_]], ...]
-    left_out: int
-    motions: tuple[Motion, ...]
+    left_out: int  # turns with clipped or stuck readings
+    motions: tuple[Motion, ...]  # by the table, at these samples
 
     def integral(self, values: Values) -> Values:
         """Return the integral of (n, 3) values over each turn: (t, 3) array, deg."""
@@ -129,14 +112,7 @@ def _moves(part: Part) -> list[tuple[int, int]]:
 def require_turns(U: Values) -> None:
     """Raise where the turns do not span all three axes.
 
-    Parameters
-    ----------
-    U : (t, 3) array, deg
-        Angle of each turn about each axis.
-
-    Raises
-    ------
-    NotObservableError
+    ``U``: (t, 3), deg, angle of each turn about each axis. Raises ``NotObservableError``.
     """
     total = np.sqrt(np.sum(U**2, axis=0))
     largest = float(total.max(initial=0.0))

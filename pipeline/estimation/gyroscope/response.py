@@ -38,21 +38,11 @@ DELAYS_TO_SETTLE = 12.0  # the same for a filter that is known by its delay alon
 
 @dataclass(frozen=True)
 class Response:
-    """What the readings of rests and steady turns say.
+    """What the readings of rests and steady turns say."""
 
-    Attributes
-    ----------
-    rest : (3,) array, deg/s
-        Mean reading at rest.
-    slope : (3, 3) array
-        Row i: reading of x, y, z per deg/s about axis i.
-    rate : (3,) array, deg/s
-        I: mean magnitude of the rate about each axis; 0 where none was recorded.
-    """
-
-    rest: NDArray[np.float64]
-    slope: NDArray[np.float64]
-    rate: NDArray[np.float64]
+    rest: NDArray[np.float64]  # (3,), deg/s; mean reading at rest
+    slope: NDArray[np.float64]  # (3, 3); row i: reading of x, y, z per deg/s about axis i
+    rate: NDArray[np.float64]  # (3,), deg/s; I: mean magnitude of the rate about each axis; 0 where none was recorded
 
     def corrected(self, step: Mapping[str, Any]) -> Response:
         """Return the response of readings after a step of a correction."""
@@ -73,26 +63,14 @@ class Response:
 
 @dataclass(frozen=True)
 class Samples:
-    """The samples that are used, stacked.
+    """The samples that are used, stacked."""
 
-    Attributes
-    ----------
-    reading : (n, 3) array, deg/s
-        Less Earth's rotation where it is known.
-    rate : (n, 3) array, deg/s
-        Signed rate of the table about its turn axis, in that axis's column; 0 at rest.
-    blocks : Blocks
-    total : int
-        Samples of the recordings.
-    motions : tuple of Motion
-        By the table, at these samples; at rest in a static recording.
-    """
-
-    reading: NDArray[np.float64]
+    reading: NDArray[np.float64]  # (n, 3), deg/s; less Earth's rotation where it is known
+    # (n, 3), deg/s; signed rate of the table about its turn axis, in that axis's column; 0 at rest
     rate: NDArray[np.float64]
     blocks: Blocks
-    total: int
-    motions: tuple[Motion, ...]
+    total: int  # samples of the recordings
+    motions: tuple[Motion, ...]  # by the table, at these samples; at rest in a static recording
 
     @property
     def speed(self) -> NDArray[np.float64]:

@@ -43,21 +43,10 @@ def fit(
 ) -> SensorCalibration:
     """Fit bias and matrix of the gyroscope.
 
-    Parameters
-    ----------
-    recordings : sequence of Recording
-        Those of role ``rests``.
-    previous : SensorCalibration or None
-        Only its stages are kept.
-    settings : mapping
-        Sections ``table`` (``gravity_g``), ``procedure`` (``holdout_every``) and ``sensor``.
-
-    Raises
-    ------
-    CannotCalibrateError
-        If there are no rests by hand, or the accelerometer cannot be calibrated.
-    NotObservableError
-        If the moves are too few or too much alike.
+    ``recordings``: those of role ``rests``. ``previous``: only its stages are kept. ``settings``: sections ``table``
+    (``gravity_g``), ``procedure`` (``holdout_every``) and ``sensor``. Raises ``CannotCalibrateError`` if there are no
+    rests by hand, or the accelerometer cannot be calibrated; ``NotObservableError`` if the moves are too few or too
+    much alike.
     """
     if not is_multi_position("gyroscope", recordings):
         raise CannotCalibrateError(f"rests and moves need a recording by hand with the gyroscope's readings: {ADVICE}")

@@ -123,15 +123,7 @@ def follow(
 ) -> Corrected:
     """Run stages one after the other, each on the output of the one before.
 
-    Parameters
-    ----------
-    response : Response
-        Of the uncorrected readings.
-    names : sequence of str
-        Stages, in order.
-    as_printed : bool
-    start : sequence of mapping
-        The correction by the stages before the first.
+    ``start``: the correction by the stages before the first.
     """
     found = Corrected([dict(step) for step in start])
     for step in start:
@@ -148,25 +140,10 @@ def fit(
 ) -> SensorCalibration:
     """Run one stage of the staged method on the output of the stage before.
 
-    Parameters
-    ----------
-    name : str
-        The stage.
-    recordings : sequence of Recording
-        Those of role ``gyroscope`` are used, and for want of a rest in them those of role ``static``.
-    previous : SensorCalibration or None
-        The result of the stage before.
-    settings : mapping
-        Sections ``table``, ``method`` and ``sensor``.
-
-    Raises
-    ------
-    CannotCalibrateError
-        If no recording of the gyroscope logs the table's motion.
-    NotObservableError
-        If there is no rest, or no steady turn about an axis that the stage needs.
-    ConfigurationError
-        If the stage before is not one of this method.
+    ``recordings``: those of role ``gyroscope`` are used, and for want of a rest in them those of role ``static``.
+    ``settings``: sections ``table``, ``method`` and ``sensor``. Raises ``CannotCalibrateError`` if no recording of the
+    gyroscope logs the table's motion; ``NotObservableError`` if there is no rest, or no steady turn about an axis that
+    the stage needs; ``ConfigurationError`` if the stage before is not one of this method.
     """
     before = stages_before("gyroscope", previous, STAGES)
     as_printed = bool(settings["method"].get("as_printed", False))

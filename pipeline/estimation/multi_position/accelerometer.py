@@ -43,18 +43,8 @@ SMALLEST_NOISE = 1e-9  # g
 class AccelerometerModel:
     """Equations of the accelerometer's rests.
 
-    Parameters
-    ----------
-    rests : Rests
-        Those of the fit.
-    calibration : SensorCalibration
-        Of the method before: its matrix gives the rotation, and a part of L that it could not determine stays.
-    gravity_g : float, g
-    noise : Noise or None
-    held : Rests, optional
-        Those that no fit sees.
-    faces : Faces, optional
-        Of ``rests``, where they are stated.
+    ``rests``: those of the fit. ``calibration``: of the method before: its matrix gives the rotation, and a part of L
+    that it could not determine stays. ``held``: those that no fit sees. ``faces``: of ``rests``, where they are stated.
     """
 
     sensor = "accelerometer"

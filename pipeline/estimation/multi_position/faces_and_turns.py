@@ -49,18 +49,10 @@ FACES = [f"{sign}{axis}" for axis in AXES for sign in "+-"]
 
 @dataclass(frozen=True)
 class Faces:
-    """The faces on which a unit rests.
+    """The faces on which a unit rests."""
 
-    Attributes
-    ----------
-    face : (m,) array of int
-        Of each rest, as of ``FACES``; -1 for none.
-    error : float, rad
-        s_f.
-    """
-
-    face: NDArray[np.intp]
-    error: float
+    face: NDArray[np.intp]  # (m,); of each rest, as of ``FACES``; -1 for none
+    error: float  # rad; s_f
 
     def select(self, index: NDArray[np.bool_]) -> Faces:
         """Return the faces of some of the rests."""
@@ -78,10 +70,7 @@ class Faces:
 def faces_of(rests: Rests, force: Values, settings: Mapping[str, Any]) -> Faces | None:
     """Return on which face each rest is, by its specific force (m, 3); None where the procedure states no faces.
 
-    Raises
-    ------
-    NotObservableError
-        If there is no rest on a face.
+    Raises ``NotObservableError`` if there is no rest on a face.
     """
     stated = settings["procedure"].get("faces")
     if not stated:
@@ -104,33 +93,19 @@ def faces_of(rests: Rests, force: Values, settings: Mapping[str, Any]) -> Faces 
 
 @dataclass(frozen=True)
 class Turns:
-    """The samples of turns of a stated total angle, padded to the longest, and their equations.
+    """The samples of turns of a stated total angle, padded to the longest, and their equations."""
 
-    Attributes
-    ----------
-    name : tuple of str
-        Of each turn's recording.
-    stated : (t, 3) array, deg
-        Total angle, in the column of its axis.
-    reading, force : (t, s, 3) array, deg/s and g
-        Angular rate as it was read; specific force by the calibrated accelerometer.
-    time, temperature : (t, s) array, s and degC
-    weight : (t, s) array, s
-        In an integral by the trapezoidal rule; 0 beyond a turn's end.
-    rows : (r, t, 3) array
-        Weights of Phi in the equations.
-    value, error : (r,) array, deg
-        Of the equations, and standard uncertainty.
-    """
-
-    name: tuple[str, ...]
-    stated: Values
+    name: tuple[str, ...]  # of each turn's recording
+    stated: Values  # (t, 3), deg; total angle, in the column of its axis
+    # each (t, s, 3), deg/s and g; angular rate as it was read; specific force by the calibrated accelerometer
     reading: Values
     force: Values
+    # each (t, s), s and degC
     time: Values
     temperature: Values
-    weight: Values
-    rows: Values
+    weight: Values  # (t, s), s; in an integral by the trapezoidal rule; 0 beyond a turn's end
+    rows: Values  # (r, t, 3); weights of Phi in the equations
+    # each (r,), deg; of the equations, and standard uncertainty
     value: Values
     error: Values
 
@@ -190,22 +165,9 @@ def turns_of(
     A move goes from one rest to the next of its recording. A recording that the procedure calls a turn about an axis is
     one move as a whole where two rests bound none.
 
-    Parameters
-    ----------
-    recordings : sequence of Recording
-    rests : Rests
-        All of the gyroscope. A move that ends at one that is held out is left out.
-    accelerometer : SensorCalibration
-    turns : mapping
-        Section ``procedure.turns``.
-    role : str
-        Of the recordings that may be a turn as a whole; empty for none.
-
-    Returns
-    -------
-    Turns or None
-    list of (Recording, float, (3,) array)
-        Recording, start in s and integrated readings in deg of each move.
+    ``rests``: all of the gyroscope. A move that ends at one that is held out is left out. ``turns``: section
+    ``procedure.turns``. ``role``: of the recordings that may be a turn as a whole; empty for none. Returns list of
+    (Recording, float, (3,) array): recording, start in s and integrated readings in deg of each move.
     """
     spans = [
         (int(rests.recording[j]), slice(int(rests.span[i, 1]) - 1, int(rests.span[j, 0]) + 1))
@@ -275,9 +237,7 @@ def require_turns(
 ) -> None:
     """Raise where an axis has no stated turn, or a recording that is a turn about an axis holds another one.
 
-    Raises
-    ------
-    NotObservableError
+    Raises ``NotObservableError``.
     """
     expected = f"a multiple of {float(turns['angle_deg']):g} deg, within a tenth of it and a quarter of that angle"
     advice = (

@@ -42,10 +42,7 @@ def fit_faces(
 ) -> SensorCalibration:
     """Return the calibration of rests and their faces; ``before`` is that of the rests alone.
 
-    Raises
-    ------
-    NotObservableError
-        If there is no rest on a face.
+    Raises ``NotObservableError`` if there is no rest on a face.
     """
     model = model_of(recordings, before, noise_of("accelerometer", recordings, settings), settings)
     assert model is not None  # noqa: S101

@@ -63,45 +63,24 @@ ROBUST_ROUNDS, SETTLED = 6, 0.05  # weights that change by less are final
 
 @dataclass(frozen=True)
 class Fit:
-    """The parameters that explain rests and moves best.
-
-    Attributes
-    ----------
-    state : State
-    covariance : (b + p, b + p) array
-        Of the base parameters along the model's directions, and of the effects'.
-    log_likelihood : float
-    noise : NoiseHypothesis
-        The most likely one.
-    degrees_of_freedom : (b + p,) array
-    residual, error : (n,) arrays
-        Residual over the white noise of each equation, and that white noise.
-    rank : int
-        Directions that the equations determine.
-    rounds : int
-    converged : bool
-    condition, cosine : float
-        Of the whitened columns; the largest cosine between the whitened residual and a column.
-    hypotheses : tuple of (NoiseHypothesis, float, float)
-        Those of the average, the weight of each, and its k.
-    precision : (b + p,) array
-        P.
-    """
+    """The parameters that explain rests and moves best."""
 
     state: State
-    covariance: Values
+    covariance: Values  # (b + p, b + p); of the base parameters along the model's directions, and of the effects'
     log_likelihood: float
-    noise: NoiseHypothesis
-    degrees_of_freedom: Values
+    noise: NoiseHypothesis  # the most likely one
+    degrees_of_freedom: Values  # (b + p,)
+    # each (n,); residual over the white noise of each equation, and that white noise
     residual: Values
     error: Values
-    rank: int
+    rank: int  # directions that the equations determine
     rounds: int
     converged: bool
+    # of the whitened columns; the largest cosine between the whitened residual and a column
     condition: float
     cosine: float
-    hypotheses: tuple[tuple[NoiseHypothesis, float, float], ...]
-    precision: Values
+    hypotheses: tuple[tuple[NoiseHypothesis, float, float], ...]  # those of the average, the weight of each, and its k
+    precision: Values  # (b + p,); P
 
 
 @dataclass(frozen=True)
@@ -316,19 +295,8 @@ def fit_robustly(
 ) -> tuple[GyroscopeModel, Fit, list[dict[str, Any]]]:
     """Fit rests and moves with weights of Student's t where a move is outlying.
 
-    Parameters
-    ----------
-    model : GyroscopeModel
-    fitted : callable
-        Fits a model.
-    recordings : sequence of Recording
-
-    Returns
-    -------
-    GyroscopeModel, Fit
-        With the variance that the weights add.
-    list of dict
-        The outlying moves: ``recording, time_s, error_deg, over_noise, weight``.
+    ``fitted``: fits a model. Returns ``GyroscopeModel, Fit`` with the variance that the weights add; ``list of dict``
+    the outlying moves: ``recording, time_s, error_deg, over_noise, weight``.
     """
     found, moves = fitted(model), model.moves
     if moves is None:

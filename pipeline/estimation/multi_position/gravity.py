@@ -45,37 +45,20 @@ SIGNIFICANT = 4.0
 
 @dataclass(frozen=True)
 class Gravity:
-    """Gravity at every rest.
+    """Gravity at every rest."""
 
-    Attributes
-    ----------
-    force : (m, 3) array, g
-        Specific force of each rest's mean.
-    at_start, at_end : (m, 3) array
-        Unit vectors along it where the move before ends and where the next one begins.
-    spread : (m,) array, g
-        Standard deviation by the scatter of the accelerometer's rests.
-    ends : (m,) array, g
-        Standard deviation of each end beyond that, by what is not known of the creep.
-    root : (12, 12) array
-        Errors of the accelerometer's bias and matrix, each of one standard uncertainty and independent, in columns.
-    shared : (m, 3, 12) array, g
-        What they do to the force.
-    creeping : (m,) array of bool
-        Whether the half second next to a move is off the mean by more than 4 s.
-    moved : (12,) array
-        By how many of these errors the calibration was moved before all this was computed.
-    """
-
-    force: Values
+    force: Values  # (m, 3), g; specific force of each rest's mean
+    # each (m, 3); unit vectors along it where the move before ends and where the next one begins
     at_start: Values
     at_end: Values
-    spread: Values
-    ends: Values
+    spread: Values  # (m,), g; standard deviation by the scatter of the accelerometer's rests
+    ends: Values  # (m,), g; standard deviation of each end beyond that, by what is not known of the creep
+    # (12, 12); errors of the accelerometer's bias and matrix, each of one standard uncertainty and independent, in
+    # columns
     root: Values
-    shared: Values
-    creeping: NDArray[np.bool_]
-    moved: Values
+    shared: Values  # (m, 3, 12), g; what they do to the force
+    creeping: NDArray[np.bool_]  # (m,); whether the half second next to a move is off the mean by more than 4 s
+    moved: Values  # (12,); by how many of these errors the calibration was moved before all this was computed
 
 
 def observed_rests(

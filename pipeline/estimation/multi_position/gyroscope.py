@@ -61,18 +61,8 @@ MOVED = "accelerometer_moved"
 class GyroscopeModel:
     """Equations of the gyroscope's rests and moves.
 
-    Parameters
-    ----------
-    rests : Rests
-        All, also those held out: a move may begin at one.
-    moves : Moves or None
-    gravity : Gravity
-        At each rest, by the accelerometer.
-    noise : Noise or None
-    fewest : int
-        Moves, below which none is looked at.
-    turns : Turns, optional
-        Of a stated total angle.
+    ``rests``: all, also those held out: a move may begin at one. ``gravity``: at each rest, by the accelerometer.
+    ``fewest``: moves, below which none is looked at. ``turns``: of a stated total angle.
     """
 
     sensor = "gyroscope"
@@ -361,18 +351,10 @@ def model_of(
 ) -> GyroscopeModel | None:
     """Return the model of the recordings' rests and moves, or None where they hold no rest.
 
-    Parameters
-    ----------
-    recordings : sequence of Recording
-    calibration : SensorCalibration or None
-        Of the gyroscope: moves that its method found outlying are left out.
-    noise : Noise or None
-    settings : mapping
-        Sections ``table`` and ``procedure``.
-    accelerometer : SensorCalibration, optional
-        Without it, the accelerometer is calibrated here; ``CannotCalibrateError`` where that fails.
-    moved : (12,) array, optional
-        As of ``gravity.observed_rests``; without it, as ``calibration`` states.
+    ``calibration``: of the gyroscope: moves that its method found outlying are left out. ``settings``: sections
+    ``table`` and ``procedure``. ``accelerometer``: without it, the accelerometer is calibrated here;
+    ``CannotCalibrateError`` where that fails. ``moved``: (12,), as of ``gravity.observed_rests``; without it, as
+    ``calibration`` states.
     """
     if accelerometer is None:
         try:

@@ -44,30 +44,14 @@ SELECTION_SCATTER = ((0.0, 2.0, 6.0, 20.0), (0.0, 4.0, 16.0))  # of rests, and o
 
 @dataclass(frozen=True)
 class NoiseHypothesis:
-    """One noise.
+    """One noise."""
 
-    Attributes
-    ----------
-    ratio : float
-        q, bias over white noise.
-    time : float, s
-        Correlation time of the bias.
-    scatter : tuple of float
-        The a_j: of rests, and of moves.
-    belief : float
-        Prior log weight of the bias.
-    direction : float
-        c.
-    none : float
-        Prior log weight of each kind without scatter.
-    """
-
-    ratio: float
-    time: float
-    scatter: tuple[float, ...]
-    belief: float
-    direction: float = 0.0
-    none: float = 0.0
+    ratio: float  # q, bias over white noise
+    time: float  # s; correlation time of the bias
+    scatter: tuple[float, ...]  # the a_j: of rests, and of moves
+    belief: float  # prior log weight of the bias
+    direction: float = 0.0  # c
+    none: float = 0.0  # prior log weight of each kind without scatter
 
     @property
     def prior(self) -> float:
@@ -91,12 +75,7 @@ class NoiseHypothesis:
 def selection_hypotheses(noise: Noise | None, kinds: int) -> list[NoiseHypothesis]:
     """Return the hypotheses over which models are compared: every bias instability with every scatter.
 
-    Parameters
-    ----------
-    noise : Noise or None
-        A static recording pins the bias instability.
-    kinds : int
-        Of scatter: that of rests, and that of moves.
+    ``noise``: A static recording pins the bias instability. ``kinds``: of scatter: that of rests, and that of moves.
     """
     settings = selection_grid(noise)
     if kinds > 1:  # two kinds of scatter leave nothing to tell of a bias far from that of a static recording
@@ -110,14 +89,7 @@ def selection_hypotheses(noise: Noise | None, kinds: int) -> list[NoiseHypothesi
 def prior_hypotheses(prior: Prior, white: float, kinds: int) -> list[NoiseHypothesis]:
     """Return the hypotheses over which a covariance is averaged.
 
-    Parameters
-    ----------
-    prior : Prior
-        Of the bias instability.
-    white : float, unit of the sensor
-        White noise of a sample.
-    kinds : int
-        Of scatter.
+    ``prior``: of the bias instability. ``white``: unit of the sensor, white noise of a sample. ``kinds``: of scatter.
     """
     bias = np.append(0.0, prior.wander * FACTORS if prior.wander > 0.0 else white * np.array(RATIOS))
     pairs = zip((bias / white).tolist(), prior.log_belief(bias).tolist(), strict=True)
@@ -142,26 +114,15 @@ def log_likelihood(rss: Values, n: int, log_determinant: Values) -> Values:
 
 @dataclass(frozen=True)
 class ProjectedCandidates:
-    """Whitened candidates and residual with the model's columns projected out, under each of t hypotheses.
+    """Whitened candidates and residual with the model's columns projected out, under each of t hypotheses."""
 
-    Attributes
-    ----------
-    raw : list of (t, n, p) array
-        Projected columns of each candidate.
-    orthonormal : list of (t, p, p) array
-        ``raw @ orthonormal`` are orthonormal directions; zeros where a candidate has fewer than columns.
-    residual : (t, n) array
-    basis : (t, n, b) array
-        Orthonormal, of the model's columns.
-    log_determinant : (t,) array
-        log det C, less twice the prior.
-    """
-
-    raw: list[Values]
+    raw: list[Values]  # list of (t, n, p); projected columns of each candidate
+    # list of (t, p, p); ``raw @ orthonormal`` are orthonormal directions; zeros where a candidate has fewer than
+    # columns
     orthonormal: list[Values]
-    residual: Values
-    basis: Values
-    log_determinant: Values
+    residual: Values  # (t, n)
+    basis: Values  # (t, n, b); orthonormal, of the model's columns
+    log_determinant: Values  # (t,); log det C, less twice the prior
 
     def of_model(self) -> tuple[float, int]:
         """Return log L of the model, and the index of its best hypothesis."""
@@ -190,14 +151,8 @@ class ProjectedCandidates:
     def correction(self, j: int, at: int, added: int, kinds: Values) -> float:
         """Return the factor on the gain by candidate j; 0 where fewer than two equations are left to judge it.
 
-        Parameters
-        ----------
-        j, at : int
-            Candidate and hypothesis.
-        added : int
-            Parameters, also those whose column is zero at their start.
-        kinds : (s, n) array
-            Positive where an equation is of a kind.
+        ``j``, ``at``: candidate and hypothesis. ``added``: parameters, also those whose column is zero at their start.
+        ``kinds``: (s, n), positive where an equation is of a kind.
         """
         power = np.sum(self.shown(j, at) ** 2, axis=1)
         leverage = np.sum(self.basis[at] ** 2, axis=1) + power

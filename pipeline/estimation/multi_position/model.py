@@ -66,39 +66,21 @@ class State:
 
 @dataclass(frozen=True)
 class Equations:
-    """The linear form at some parameters; see the module.
+    """The linear form at some parameters; see the module."""
 
-    Attributes
-    ----------
-    residual : (n,) array
-    base : (n, b) array
-        Columns of bias and matrix.
-    effects, candidates : list of (n, p) array
-        Columns of the effects of the model, and of effects that are not in it.
-    scatter : (s, n) array
-        The g_j.
-    bias : (3, n, t) array
-        H, axis by axis.
-    start, length : (t,) arrays, s
-        The stretches of time.
-    joined : (t, t) array of bool
-        Whether the time between them is known.
-    error : (n,) array, g, deg/s or deg
-        Standard deviation of each equation by white noise.
-    common, direction : (n, n) array or None
-        S and D.
-    """
-
-    residual: Values
-    base: Values
+    residual: Values  # (n,)
+    base: Values  # (n, b); columns of bias and matrix
+    # each list of (n, p); columns of the effects of the model, and of effects that are not in it
     effects: list[Values]
     candidates: list[Values]
-    scatter: Values
-    bias: Values
+    scatter: Values  # (s, n); the g_j
+    bias: Values  # (3, n, t); H, axis by axis
+    # each (t,), s; the stretches of time
     start: Values
     length: Values
-    joined: NDArray[np.bool_]
-    error: Values
+    joined: NDArray[np.bool_]  # (t, t); whether the time between them is known
+    error: Values  # (n,), g, deg/s or deg; standard deviation of each equation by white noise
+    # each (n, n); S and D
     common: Values | None = None
     direction: Values | None = None
     _kernels: dict[float, Values] = field(default_factory=dict, compare=False, repr=False)

@@ -55,29 +55,19 @@ BENT = 8.0  # second difference over white noise, 2.4 of which is the noise's ow
 
 @dataclass(frozen=True)
 class Moves:
-    """The samples of all moves, padded to the longest.
+    """The samples of all moves, padded to the longest."""
 
-    Attributes
-    ----------
-    before, after : (k,) array of int
-        Rests between which each move lies.
-    reading : (k, s, 3) array, deg/s
-        Less what the trapezoidal rule is off by bends between samples; the last sample is repeated.
-    time : (k, s) array, s
-    temperature : (k, s) array, degC
-        As of the rests before and after, in between by straight line; NaN where none was recorded.
-    weight : (k, s) array, s
-        0 beyond a move's end.
-    doubt : (k, s, 3) array, deg
-        Standard uncertainty, along one direction each, of the angle in the readings' axes: bends that share a sample.
-    """
-
+    # each (k,); rests between which each move lies
     before: NDArray[np.intp]
     after: NDArray[np.intp]
+    # (k, s, 3), deg/s; less what the trapezoidal rule is off by bends between samples; the last sample is repeated
     reading: Values
-    time: Values
+    time: Values  # (k, s), s
+    # (k, s), degC; as of the rests before and after, in between by straight line; NaN where none was recorded
     temperature: Values
-    weight: Values
+    weight: Values  # (k, s), s; 0 beyond a move's end
+    # (k, s, 3), deg; standard uncertainty, along one direction each, of the angle in the readings' axes: bends that
+    # share a sample
     doubt: Values
 
     def select(self, index: NDArray[np.bool_]) -> Moves:
@@ -135,12 +125,7 @@ def moves_of(recordings: Sequence[Recording], rests: Rests) -> Moves | None:
 def _bends(reading: Values, weight: Values, least: float) -> tuple[Values, Values]:
     """Return the excess of the trapezoidal rule by bends between samples, as rates, and its standard uncertainty.
 
-    Parameters
-    ----------
-    reading : (k, s, 3) array, deg/s
-    weight : (k, s) array, s
-    least : float, deg/s
-        Second differences below it are noise.
+    ``reading``: (k, s, 3), deg/s. ``weight``: (k, s), s. ``least``: deg/s, second differences below it are noise.
     """
     second = np.diff(np.pad(reading, ((0, 0), (1, 1), (0, 0)), mode="edge"), n=2, axis=1)
     second[np.linalg.norm(second, axis=2) < least] = 0.0
@@ -192,13 +177,7 @@ def clocks_of(time: Values, rate: Values, moves: Sequence[slice], white: Values)
     digits of a clock that ticks every 9.999 ms holds steps of 10 ms and now and then one of 9 ms, over which 200 deg/s
     would be integrated wrongly by 0.2 deg.
 
-    Parameters
-    ----------
-    time : (n,) array, s
-    rate : (n, 3) array, deg/s
-    moves : sequence of slice
-    white : (3,) array, deg/s
-        White noise of a sample.
+    ``time``: (n,), s. ``rate``: (n, 3), deg/s. ``white``: (3,), deg/s, white noise of a sample.
     """
     whole = _regular_stamps(time)
     if whole is not None:
@@ -222,10 +201,7 @@ def sound_span(recording: Recording, span: slice) -> bool:
 def to_the_end(rate: Values, time: Values) -> Values:
     """Return A_k for every sample of every move: (k, s, 3, 3) array.
 
-    Parameters
-    ----------
-    rate : (k, s, 3) array, deg/s
-    time : (k, s) array, s
+    ``rate``: (k, s, 3), deg/s. ``time``: (k, s), s.
     """
     omega, dt = np.radians(rate), np.diff(time, axis=1)[:, :, None]
     phi = 0.5 * (omega[:, 1:] + omega[:, :-1]) * dt + np.cross(omega[:, :-1], omega[:, 1:]) * dt**2 / 12.0

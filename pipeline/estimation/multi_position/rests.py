@@ -30,52 +30,26 @@ ROLE, HELD_OUT = "rests", "validation"
 
 @dataclass(frozen=True)
 class Rests:
-    """Rests of all recordings, in order.
+    """Rests of all recordings, in order."""
 
-    Attributes
-    ----------
-    reading : (m, 3) array, g or deg/s
-        Means.
-    count : (m,) array
-        Samples of each.
-    share : (m,) array
-        Variance of each mean by white noise, over that of a raw sample.
-    scatter : (m, 3) array
-        Sums of squares about the means.
-    start, length, time : (m,) arrays, s
-        When each begins, how long it is, and its mean time.
-    temperature : (m,) array, degC
-        NaN where none was recorded.
-    recording : (m,) array of int
-        Index of the recording that each belongs to.
-    held_out : (m,) array of bool
-    span : (m, 2) array of int
-        Its first sample, and the one after its last.
-    creep : (m, 3) array, deg/s
-        Rate across gravity at which the unit tilts, by the readings of the accelerometer; 0 where it stands still.
-    creep_error : (m,) array, deg/s
-        Standard uncertainty of each of its two components.
-    creep_about : (m,) array, deg/s
-        Standard deviation of the rate about gravity.
-    clock_shared : bool
-        Whether the time between the recordings is known.
-    """
-
-    reading: Values
-    count: NDArray[np.int64]
-    share: Values
-    scatter: Values
+    reading: Values  # (m, 3), g or deg/s; means
+    count: NDArray[np.int64]  # (m,); samples of each
+    share: Values  # (m,); variance of each mean by white noise, over that of a raw sample
+    scatter: Values  # (m, 3); sums of squares about the means
+    # each (m,), s; when each begins, how long it is, and its mean time
     start: Values
     length: Values
     time: Values
-    temperature: Values
-    recording: NDArray[np.intp]
-    held_out: NDArray[np.bool_]
-    span: NDArray[np.intp]
+    temperature: Values  # (m,), degC; NaN where none was recorded
+    recording: NDArray[np.intp]  # (m,); index of the recording that each belongs to
+    held_out: NDArray[np.bool_]  # (m,)
+    span: NDArray[np.intp]  # (m, 2); its first sample, and the one after its last
+    # (m, 3), deg/s; rate across gravity at which the unit tilts, by the readings of the accelerometer; 0 where it
+    # stands still
     creep: Values
-    creep_error: Values
-    creep_about: Values
-    clock_shared: bool
+    creep_error: Values  # (m,), deg/s; standard uncertainty of each of its two components
+    creep_about: Values  # (m,), deg/s; standard deviation of the rate about gravity
+    clock_shared: bool  # whether the time between the recordings is known
 
     def select(self, index: NDArray[np.bool_]) -> Self:
         """Return some of the rests."""
@@ -115,16 +89,8 @@ def rests_of(
 ) -> Rests | None:
     """Return the rests of the recordings of a role, or None where there are none.
 
-    Parameters
-    ----------
-    sensor : str
-    recordings : sequence of Recording
-    settings : mapping
-        Section ``procedure``: ``holdout_every``.
-    accelerometer : SensorCalibration, optional
-        Rests that its method left out are left out here.
-    role : str
-        ``rests``, or ``validation``, whose rests are all held out.
+    ``settings``: section ``procedure``: ``holdout_every``. ``accelerometer``: rests that its method left out are left
+    out here. ``role``: ``rests``, or ``validation``, whose rests are all held out.
     """
     every = holdout_interval(recordings, settings) if role == ROLE else 0
     refused = _left_out(accelerometer)

@@ -59,16 +59,8 @@ def model_of(
 ) -> Model | None:
     """Return the model of the sensor of a calibration, or None where its recordings hold no rest.
 
-    Parameters
-    ----------
-    recordings : sequence of Recording
-    calibration : SensorCalibration
-        Of the sensor's method.
-    noise : Noise or None
-    settings : mapping
-        Sections ``table`` and ``procedure``.
-    other : SensorCalibration, optional
-        Of the accelerometer, where the sensor is the gyroscope; without it, it is calibrated here.
+    ``calibration``: of the sensor's method. ``settings``: sections ``table`` and ``procedure``. ``other``: of the
+    accelerometer, where the sensor is the gyroscope; without it, it is calibrated here.
     """
     if calibration.sensor == "accelerometer":
         return accelerometer.model_of(recordings, calibration, noise, settings)
@@ -80,26 +72,9 @@ def fit_effects_by_rests(
 ) -> SensorCalibration:
     """Fit the effects of ``settings["effects"]`` together with bias and matrix to rests and moves.
 
-    Parameters
-    ----------
-    before : SensorCalibration
-        Of the sensor's method.
-    recordings : sequence of Recording
-    noise : Noise or None
-    settings : mapping
-        Sections ``effects``, ``sensor``, ``table`` and ``procedure``.
-
-    Returns
-    -------
-    SensorCalibration
-        ``before`` unchanged where there is nothing to add.
-
-    Raises
-    ------
-    NotObservableError
-        If rests and moves do not determine an effect.
-    ConfigurationError
-        If an effect is unknown or not one of this sensor.
+    ``before``: of the sensor's method. ``settings``: sections ``effects``, ``sensor``, ``table`` and ``procedure``.
+    Returns ``before`` unchanged where there is nothing to add. Raises ``NotObservableError`` if rests and moves do not
+    determine an effect; ``ConfigurationError`` if an effect is unknown or not one of this sensor.
     """
     sensor = before.sensor
     wanted, sheet = settings["effects"][sensor], settings["sensor"][sensor]

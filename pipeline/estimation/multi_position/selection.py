@@ -46,56 +46,26 @@ COMPETES = 0.6  # share of the best delta BIC above which an effect is fitted to
 
 @dataclass(frozen=True)
 class Scored:
-    """The scores of all candidates, given a model.
+    """The scores of all candidates, given a model."""
 
-    Attributes
-    ----------
-    scores : dict of str to Score
-        Of those that the equations show.
-    visible : dict of str to float
-        Mean gain of each with its parameters at their limits; infinite without limits.
-    shown : dict of str to array
-        Orthonormal directions of each under the model's best hypothesis.
-    spare : dict of str to float
-        The factor on its gain; 0 where too few equations are left to judge it.
-    signal : dict of str to array
-        Its fitted, whitened signal there.
-    """
-
-    scores: dict[str, Score]
-    visible: dict[str, float]
-    shown: dict[str, Values]
-    spare: dict[str, float]
-    signal: dict[str, Values]
+    scores: dict[str, Score]  # of those that the equations show
+    visible: dict[str, float]  # mean gain of each with its parameters at their limits; infinite without limits
+    shown: dict[str, Values]  # orthonormal directions of each under the model's best hypothesis
+    spare: dict[str, float]  # the factor on its gain; 0 where too few equations are left to judge it
+    signal: dict[str, Values]  # its fitted, whitened signal there
 
 
 @dataclass
 class Selection:
-    """What was selected, and how every candidate did.
-
-    Attributes
-    ----------
-    names : list of str
-    steps : dict of str to Score
-        Of each selected effect when it was accepted.
-    fits : list of Fit
-        Base and configured effects, then with each further selected one; the last is the whole model.
-    first, last : Scored
-        Given base and configured effects, and given all that was selected.
-    own : dict of str to Scored
-        Given all selected effects but one.
-    model : Model
-    hypotheses : list of NoiseHypothesis
-    candidates : list of Effect
-    limits : dict of str to array
-    """
+    """What was selected, and how every candidate did."""
 
     names: list[str]
-    steps: dict[str, Score]
-    fits: list[Fit]
+    steps: dict[str, Score]  # of each selected effect when it was accepted
+    fits: list[Fit]  # base and configured effects, then with each further selected one; the last is the whole model
+    # given base and configured effects, and given all that was selected
     first: Scored
     last: Scored
-    own: dict[str, Scored]
+    own: dict[str, Scored]  # given all selected effects but one
     model: Model
     hypotheses: list[NoiseHypothesis]
     candidates: list[Effect]
@@ -107,15 +77,8 @@ def select(
 ) -> Selection:
     """Select effects.
 
-    Parameters
-    ----------
-    model : Model
-    start : SensorCalibration
-        Where the fit of the base starts; its effects are starts of the configured ones.
-    configured : sequence of str
-    noise : Noise or None
-    sheet : mapping
-        The sensor's section of the configuration.
+    ``start``: where the fit of the base starts; its effects are starts of the configured ones. ``sheet``: the sensor's
+    section of the configuration.
     """
     return _Search(model, start, configured, noise, sheet).run()
 
