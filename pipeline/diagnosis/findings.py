@@ -60,6 +60,7 @@ class Findings:
     full: Callable[[], SensorCalibration] | None = None  # with what was selected, where that is something
     other: SensorCalibration | None = None  # of the other sensor
     on_table: bool = True
+    departures: Sequence[str] = ()  # of faces and turns by hand from what is stated
     scatter: Mapping[str, float] = field(default_factory=dict)  # further entries of ``wander``
     more: Mapping[str, Any] = field(default_factory=dict)  # further entries of the document
     turns: Sequence[str] = ()  # recordings that some effects have parameters for

@@ -121,6 +121,7 @@ def findings(
         full=(lambda: calibration_of(model, selection.fits[-1], calibration, settings)) if selection.names else None,
         other=accelerometer if sensor == "gyroscope" else None,
         on_table=False,
+        departures=[text for stage in calibration.stages for text in stage.details.get("departures", ())],
         scatter={"scatter_over_noise": float(best.scatter[0])},
         more={
             "pictures": {

@@ -2,8 +2,9 @@
 
 The first that applies:
 
-    reference_in_doubt  a check of the recordings found a contradiction (notes ``N-REFERENCE``, ``N-SEATS``), or the
-                        residual of the fit is noise alone and the held-out error is above its interval
+    reference_in_doubt  a check of the recordings found a contradiction (notes ``N-REFERENCE``, ``N-SEATS``), a face or
+                        turn by hand departs from what is stated, or the residual of the fit is noise alone and the
+                        held-out error is above its interval
     missing_effect      effects were selected, and with them the held-out error lies in its interval; effects beyond
                         the sensor's limits only where they lower the held-out error
     unexplained         the residual of the fit, or the held-out error, is above what noise leaves, unexplained
@@ -175,7 +176,10 @@ def evidence_of(
         published=published,
         free=error_of(free, smoothed=True) if contradicted else None,
         full=error_of(full, smoothed=True) if contradicted else None,
-        doubts=doubts_of(sensor, recordings, [*document["configured"], *document["selected"]]),
+        doubts=[
+            *doubts_of(sensor, recordings, [*document["configured"], *document["selected"]]),
+            *(found.departures if found else ()),
+        ],
         approximations=[error["name"] for error in document["method_errors"] if error["name"] in COMPARED],
         unknown=[entry["covariate"] for entry in document["unexplained"] if not entry.get("explained_by")],
         implausible=() if accepted else implausible,

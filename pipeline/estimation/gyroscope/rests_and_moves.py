@@ -101,6 +101,7 @@ def fit(
         details[MOVED] = moved.tolist()
     if model.turns is not None:
         details["turns"] = model.turns.described(found.state)
+        details["departures"] = model.turns.departures(found.state)
     correction = {"steps": [{"subtract": found.state.bias.tolist()}, {"matrix": found.state.matrix.tolist()}]}
     result = StageResult(NAME, parameters, float(np.sqrt(np.mean(at_rest**2))), correction, details)
     calibration = SensorCalibration(

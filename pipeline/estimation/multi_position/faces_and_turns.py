@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     Values = NDArray[np.float64]
 
 NEAR_DEG = 15.0  # of a face's axis, within which a rest is on that face: a chip askew in its case, and a hand
+DEPARTS = 4.5  # standard uncertainties: two angles exceed it with a probability of 4e-5
 FACES = [f"{sign}{axis}" for axis in AXES for sign in "+-"]
 
 
@@ -143,6 +144,26 @@ class Turns:
                 "angle_deg": float(angles[t, axis]),
             }
             for t, axis in zip(*np.nonzero(self.stated), strict=True)
+        ]
+
+    def departures(self, state: State) -> list[str]:
+        """Return in words where a calibrated turn is farther from what is stated than its uncertainty allows."""
+        angles = np.einsum("ts,tsi->ti", self.weight, self._samples(state)[1]) @ state.matrix.T
+        off = np.abs(np.einsum("rti,ti->r", self.rows, angles) - self.value)
+        count = len(self.name)
+        across = np.linalg.norm(off[count:].reshape(-1, 2), axis=1)
+        turned = [
+            (f"the turn at {self.time[t, 0]:.1f} s of {self.name[t]} is", off[t], self.error[t], "accuracy_deg")
+            for t in range(count)
+        ]
+        turned += [
+            (f"the axis of the turns about {AXES[axis]} is", angle, self.error[-1], "axis_accuracy_deg")
+            for axis, angle in zip(np.flatnonzero(np.any(self.stated, axis=0)), across, strict=True)
+        ]
+        return [
+            f"{what} {angle:.1f} deg off, {angle / error:.1f} times procedure.turns.{name}"
+            for what, angle, error, name in turned
+            if angle > DEPARTS * error
         ]
 
     def _samples(self, state: State) -> tuple[Motion, Values]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from pipeline.estimation.least_squares import certified
 from pipeline.estimation.multi_position.accelerometer import model_of
-from pipeline.estimation.multi_position.faces_and_turns import FACES, faces_of
+from pipeline.estimation.multi_position.faces_and_turns import DEPARTS, FACES, faces_of
 from pipeline.estimation.multi_position.fit import fit
 from pipeline.estimation.multi_position.likelihood import prior_hypotheses
 from pipeline.estimation.multi_position.model import State
@@ -58,7 +58,15 @@ def fit_faces(
     }
     force, _ = model.specific_force(found.state, model.rests)
     off = np.degrees(np.einsum("rmc,mc->r", model.faces.weights(), force) / model.gravity).reshape(-1, 2)
+    departs = zip(FACES, np.linalg.norm(off, axis=1), strict=True)
+    accuracy = float(settings["procedure"]["faces"]["accuracy_deg"])
     details = {
+        "departures": [
+            f"face {name} is {angle:.1f} deg off what the others say, {angle / accuracy:.1f} times "
+            "procedure.faces.accuracy_deg"
+            for name, angle in departs
+            if angle > DEPARTS * accuracy
+        ],
         "rests_on_faces": {name: int(np.count_nonzero(model.faces.face == i)) for i, name in enumerate(FACES)},
         "face_off_deg": dict(zip(FACES, np.linalg.norm(off, axis=1).tolist(), strict=True)),
         "scatter_of_rests": found.noise.scatter[0],

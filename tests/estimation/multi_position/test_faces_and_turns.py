@@ -9,6 +9,7 @@ import pytest
 from ferraris_session import PROCEDURE, Session, held_out, in_parts, simulated
 from scipy import stats
 
+from pipeline.diagnosis.diagnose import diagnose
 from pipeline.errors import NotObservableError
 from pipeline.estimation.multi_position.gyroscope import model_of
 from pipeline.estimation.multi_position.model import State
@@ -35,6 +36,7 @@ def without(session: Session, start_s: float, stop_s: float) -> Session:
 @pytest.mark.parametrize("sensor", ["accelerometer", "gyroscope"])
 def test_both_matrices_are_full_and_within_their_uncertainty(whole: Session, sensor: str) -> None:
     error, u, freedom = whole.errors(sensor)
+    assert not whole.fit(sensor).stages[-1].details["departures"]
     assert np.all(u > 0.0)
     assert np.all(np.abs(error) < stats.t.ppf(1.0 - 1e-3 / 24, freedom) * u)
 
@@ -66,6 +68,19 @@ def test_an_accurate_stop_gives_an_accurate_scale() -> None:
     error, u, freedom = session.errors("gyroscope")
     assert np.median(u[[3, 7, 11]]) < 1.25 * 0.3 / 360.0  # an axis askew in the chip adds what its other elements leave
     assert np.all(np.abs(error) < stats.t.ppf(1.0 - 1e-3 / 12, freedom) * u)
+
+
+def test_a_hand_that_departs_from_what_is_stated_is_doubted() -> None:
+    stated = {"turns": PROCEDURE["turns"] | {"accuracy_deg": 0.3}, "faces": {"accuracy_deg": 0.1}}
+    session = simulated(8, procedure=stated)
+    found = {sensor: session.fit(sensor) for sensor in ("accelerometer", "gyroscope")}
+    told = {sensor: fit.stages[-1].details["departures"] for sensor, fit in found.items()}
+    assert any("times procedure.faces.accuracy_deg" in text for text in told["accelerometer"])
+    assert any("times procedure.turns.accuracy_deg" in text for text in told["gyroscope"])
+    noise = estimate_noise("gyroscope", session.recordings, session.settings["sensor"]["gyroscope"])
+    document = diagnose(found["gyroscope"], session.recordings, noise, session.settings)
+    assert document["verdict"] == "reference_in_doubt"
+    assert told["gyroscope"][0] in document["reason"]
 
 
 def test_a_turn_of_other_angle_is_counted_in_multiples() -> None:
