@@ -255,12 +255,16 @@ class _Search:
         """
         if score.name in DELAYS and any(name in DELAYS for name in self.names):
             return False
-        held = [*self.names, *(term.effect.name for term in self.base.terms)]
-        if any(score.name in effect(name).contains or name in effect(score.name).contains for name in held):
+        if self._overlaps(score.name, self.names):
             return False
         real = score.name != DELAYS[1] or score.values[0] > 0
         significant = score.delta_bic > self._gate(score.name) and score.p_value * len(self.effects) < GATE_P
         return bool(score.admissible and significant and real and self._matters(score, beside))
+
+    def _overlaps(self, name: str, selected: Sequence[str]) -> bool:
+        """Return whether an effect contains, or is contained in, one that is configured or selected."""
+        held = [*selected, *(term.effect.name for term in self.base.terms)]
+        return any(name in effect(other).contains or other in effect(name).contains for other in held)
 
     def _gate(self, name: str) -> float:
         """Return the delta BIC to pass: beside large effects, what their equations leave may not pass for another."""
@@ -371,7 +375,14 @@ class _Search:
             others = [n for n in self.names if n != name]
             scores = self.ranking.scores(self._selected(others), self.limits)
             own = next((s.delta_bic for s in scores if s.name == name), float("-inf"))
-            rivals = [s for s in scores if s.name != name and s.admissible and not effect(s.name).moves]
+            rivals = [
+                s
+                for s in scores
+                if s.name != name
+                and s.admissible
+                and not effect(s.name).moves
+                and not self._overlaps(s.name, others)
+            ]
             if rivals and rivals[0].delta_bic > own + GATE_BIC:
                 rival = rivals[0]
                 self.names[self.names.index(name)] = rival.name
@@ -430,7 +441,8 @@ class _Search:
         logarithm = float(np.log(self.ranking.samples))
         best: tuple[float, int, int] = (2.0 * GATE_BIC, -1, -1)
         for j, k in combinations(able, 2):
-            if self.ranking.candidates[j].effect.name == self.ranking.candidates[k].effect.name:
+            one, other = (self.ranking.candidates[i].effect.name for i in (j, k))
+            if one == other or self._overlaps(one, [other]) or self._overlaps(other, [one]):
                 continue
             found, count = self.ranking.pair(j, k)
             best = max(best, (2.0 * (found - before) - count * logarithm, j, k))
