@@ -378,10 +378,7 @@ class _Search:
             rivals = [
                 s
                 for s in scores
-                if s.name != name
-                and s.admissible
-                and not effect(s.name).moves
-                and not self._overlaps(s.name, others)
+                if s.name != name and s.admissible and not effect(s.name).moves and not self._overlaps(s.name, others)
             ]
             if rivals and rivals[0].delta_bic > own + GATE_BIC:
                 rival = rivals[0]
