@@ -28,14 +28,16 @@ of the sampling rate, which is allowed for.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.io.units import TRIADS
 from pipeline.model.kinematics import EARTH_RATE_DPS
 from pipeline.preprocessing.evidence import LEAST_RATE_DPS, axis_index, place, quantiles, rate_of_turn, refusal
-from pipeline.records import AXES, SENSORS, Note
+from pipeline.records import SENSOR_UNITS, SENSORS, Note
 from pipeline.signal.rests import RATE_AT_REST_DPS, rests_from_table, runs
 
 if TYPE_CHECKING:
@@ -43,11 +45,12 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from pipeline.errors import IngestError
     from pipeline.records import Recording
 
     Array = NDArray[np.float64]
 
-BLOCK_S, FEWEST_OF_BLOCK = 1.0, 16
+BLOCK_S, FEWEST_OF_BLOCK = 1.0, 16  # shorter than a knock with its decay; samples, for a standard deviation
 FEWEST_OF_REST, RESTS = 8, 3  # samples of a rest, and rests of a recording, by which the usual scatter is told
 LOUDER = 4.0  # the scatter of 16 samples of white noise is so large in fewer than 1 of 10^9 blocks
 QUARTER_SIZE, UNUSUAL, WIDEST = 0.6745, 5.0, 0.4  # quartile of a normal distribution; its standard deviations
@@ -57,13 +60,12 @@ SIGNIFICANT = 6.0  # standard deviations, as in pipeline.signal.rests
 FEWEST_SAMPLES = 60  # as of pipeline.estimation.noise, which tells no noise by fewer
 SHORTEST_S = 10.0  # in which a wander of 100 s changes by a third of its size
 UNKNOWN_DEGC = 5.0  # change of temperature in some minutes of a room, where none is logged
-HALF_TURN_DEG = 180.0
+HALF_TURN_DEG = 180.0  # in which both axes across a level turn vary by 1 g at least
 SPANNED = 0.2  # of what the motion requires
 INNER = (0.05, 0.95)  # shares of the samples
 COPIED = 0.5  # share of the changes of an axis that are another's to the last digit
 LEVEL_G = 0.5  # of the axes across a turn together, from which gravity turns in the body
-FEWEST = 32
-SHORT = {"accelerometer": "accel", "gyroscope": "gyro"}
+FEWEST = 32  # samples, of which an axis is copied or stays
 
 
 def check_static(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> list[Recording]:
@@ -105,8 +107,7 @@ def _doubted(
             rests = _rests_by_hand(recordings, sensor)
         if reading is None or not len(rests) or not len(blocks := _blocks(recording, reading)):
             continue
-        step = np.abs(np.diff(reading, axis=0))
-        step = np.where(step > 0.0, step, np.inf).min(axis=0, initial=np.inf)
+        step = _digit(reading)
         own, usual = np.median(_moments(blocks), axis=0), np.median(rests, axis=0)
         louder = float(np.max(own[0] / np.maximum(usual[0], step)))
         quieter = float(np.min(usual[1] / np.maximum(own[1], step)))
@@ -120,20 +121,25 @@ def _doubted(
                 f"the {sensor} has at most {1.0 / quieter:.2g} times the white noise of the rests of the other "
                 "recordings: if the recording is of another unit, the noise of this one is underestimated"
             )
-        if sensor == "gyroscope":
-            sheet = sheets.get(sensor) or {}
+        sheet = sheets.get(sensor)
+        if sensor == "gyroscope" and sheet:
             means = rests[:, 2]
             away = float(np.max([means.min(axis=0) - own[2], own[2] - means.max(axis=0)]))
-            most = SIGNIFICANT * float(usual[0].max()) / np.sqrt(FEWEST_OF_REST) + _bias_change(
-                [recording, *others], sheet
-            )
-            if sheet and away > most:
+            noise = SIGNIFICANT * float(usual[0].max()) / np.sqrt(FEWEST_OF_REST)
+            most = noise + _bias_change([recording, *others], sheet)
+            if away > most:
                 details.append(
                     f"the {sensor} reads {away:.3g} deg/s beyond all rests of the other recordings, where the data "
                     f"sheet allows {most:.3g}: is the static recording of this unit?"
                 )
     notes = [Note("N-REFERENCE", recording.samples, 0, 0, detail) for detail in details]
-    return replace(recording, notes=(*recording.notes, *notes)) if notes else recording
+    return replace(recording, notes=(*recording.notes, *notes))
+
+
+def _digit(reading: Array) -> Array:
+    """Return the smallest change of each axis between two samples, infinity where it stays: (3,) array."""
+    step = np.abs(np.diff(reading, axis=0))
+    return np.asarray(np.where(step > 0.0, step, np.inf).min(axis=0, initial=np.inf))
 
 
 def _bias_change(recordings: Sequence[Recording], sheet: Mapping[str, Any]) -> float:
@@ -148,29 +154,30 @@ def _bias_change(recordings: Sequence[Recording], sheet: Mapping[str, Any]) -> f
     return attitude + 2.0 * EARTH_RATE_DPS + _slow(sheet, change, duration)
 
 
-def _blocks(recording: Recording, reading: Array) -> Array:
-    """Return the readings in blocks of a second: (k, n, 3) array."""
+def _blocks(recording: Recording, values: Array) -> Array:
+    """Return the samples in blocks of a second: (n, 3) array to (k, size, 3), (n,) array to (k, size)."""
     size = max(FEWEST_OF_BLOCK, round(BLOCK_S / recording.interval))
-    count = len(reading) // size
-    return reading[: count * size].reshape(count, size, 3)
+    count = len(values) // size
+    return values[: count * size].reshape(count, size, *values.shape[1:])
 
 
 def _resting(recording: Recording, rests_of: Mapping[str, Array], sheets: Mapping[str, Any]) -> Recording:
-    size = max(FEWEST_OF_BLOCK, round(BLOCK_S / recording.interval)) if recording.samples > 1 else FEWEST_OF_BLOCK
-    count = recording.samples // size
+    """Return the longest part of a static recording that rests."""
+    if recording.samples < 2 * FEWEST_OF_BLOCK:
+        return recording
+    count, size = _blocks(recording, recording.time).shape
     if count < 2:
         return recording
     moving, why = np.zeros(count, bool), ""
     if recording.table_rate is not None:
-        rate = np.abs(recording.table_rate[: count * size]).reshape(count, size).max(axis=1)
-        found = rate >= RATE_AT_REST_DPS
-        why = f"the table turns at up to {rate.max():.3g} deg/s" if found.any() else ""
-        moving |= found
+        rate = np.abs(_blocks(recording, recording.table_rate)).max(axis=1)
+        moving = rate >= RATE_AT_REST_DPS
+        why = f"the table turns at up to {rate.max():.3g} deg/s" if moving.any() else ""
     for sensor in SENSORS:
         reading = recording.reading(sensor)
         if reading is None:
             continue
-        blocks = reading[: count * size].reshape(count, size, 3)
+        blocks = _blocks(recording, reading)
         found, what = _moving(recording, sensor, blocks, sheets.get(sensor) or {}, rests_of[sensor])
         why = why or (what if found.any() else "")
         moving |= found
@@ -179,8 +186,8 @@ def _resting(recording: Recording, rests_of: Mapping[str, Array], sheets: Mappin
     parts = [(a * size, b * size if b < count else recording.samples) for a, b in runs(~moving)]
     start, stop = max(parts, key=lambda part: part[1] - part[0], default=(0, 0))
     start, stop = start + (size if start else 0), stop - (size if stop < recording.samples else 0)
-    length = (stop - start) * recording.interval
-    if stop - start < FEWEST_SAMPLES or length < SHORTEST_S:
+    left_out = recording.samples - (stop - start)
+    if stop - start < FEWEST_SAMPLES or (stop - start) * recording.interval < SHORTEST_S:
         raise refusal(
             recording,
             "not_at_rest",
@@ -189,31 +196,29 @@ def _resting(recording: Recording, rests_of: Mapping[str, Array], sheets: Mappin
             "remove it, the noise is then taken from the rests of the other recordings, or record it again",
         )
     t = recording.time
-    kept = replace(recording.select(slice(start, stop)), name=recording.name)
     detail = (
         f"only {place(recording, start, stop - 1)} are used of {t[0]:.6g} to {t[-1]:.6g} s: the rest of it moves; {why}"
     )
-    left_out = recording.samples - (stop - start)
     note = Note("N-MOVED", left_out, 0, 0, detail, float(t[0]), float(t[-1]))
-    return replace(kept, notes=(*recording.notes, note))
+    return replace(recording.select(slice(start, stop)), notes=(*recording.notes, note))
 
 
 def _moving(
     recording: Recording, sensor: str, blocks: Array, sheet: Mapping[str, Any], rests: Array
 ) -> tuple[NDArray[np.bool_], str]:
     """Return which blocks a sensor moves in, and the largest sign of it in words."""
-    unit = "g" if sensor == "accelerometer" else "deg/s"
+    unit = SENSOR_UNITS[sensor]
     means, scatter = blocks.mean(axis=1), blocks.std(axis=1, ddof=1)
     usual, middle = np.percentile(scatter, [25.0, 50.0], axis=0)
-    spread = np.minimum(np.log(middle / np.maximum(usual, np.finfo(float).tiny)) / QUARTER_SIZE, WIDEST)
+    tiny = np.finfo(float).tiny
+    spread = np.minimum(np.log(np.maximum(middle, tiny) / np.maximum(usual, tiny)) / QUARTER_SIZE, WIDEST)
     louder = np.maximum(LOUDER, np.exp((QUARTER_SIZE + UNUSUAL) * spread))
     white = float(sheet.get("noise_density") or 0.0) * np.sqrt(0.5 / recording.interval)
     if len(rests):
         usual = np.minimum(usual, OF_RESTS * np.maximum(np.median(rests[:, 0], axis=0), white))
     elif white:
         usual = np.minimum(usual, OF_SHEET * white)
-    step = np.abs(np.diff(blocks.reshape(-1, 3), axis=0))
-    usual = np.maximum(usual, 0.5 * np.where(step > 0.0, step, np.inf).min(axis=0, initial=np.inf))
+    usual = np.maximum(usual, 0.5 * _digit(blocks.reshape(-1, 3)))
     loud = scatter / usual
     away = np.abs(means - np.median(means, axis=0))
     change = UNKNOWN_DEGC if recording.temperature is None else float(np.ptp(recording.temperature))
@@ -283,18 +288,7 @@ def _moments(blocks: Array) -> Array:
 
 
 def check_axes(recordings: Sequence[Recording]) -> None:
-    """Refuse an axis that stays while the table turns, or that is a copy of another.
-
-    Parameters
-    ----------
-    recordings : sequence of Recording
-        All of a unit.
-
-    Raises
-    ------
-    IngestError
-        Naming file and channel.
-    """
+    """Refuse an axis that stays while the table turns, or that is a copy of another."""
     for recording in recordings:
         if recording.samples < FEWEST:
             continue
@@ -304,56 +298,51 @@ def check_axes(recordings: Sequence[Recording]) -> None:
 
 
 def _check_copies(recording: Recording) -> None:
-    for sensor in SENSORS:
+    for sensor, one, two in itertools.product(SENSORS, range(3), range(3)):
         reading = recording.reading(sensor)
-        if reading is None:
+        if reading is None or one >= two:
             continue
-        for one, two in ((0, 1), (0, 2), (1, 2)):
-            a, b = reading[:, one], reading[:, two]
-            changing = a[1:] != a[:-1]
-            if changing.sum() < FEWEST:
-                continue
-            for sign, what in ((1.0, "a copy"), (-1.0, "the negative")):
-                same = (a == sign * b)[1:][changing]
-                if same.mean() > COPIED:
-                    names = [f"{SHORT[sensor]}_{AXES[i]}" for i in (one, two)]
-                    raise refusal(
-                        recording,
-                        "copied_axis",
-                        f"{names[1]} is {what} of {names[0]} in {same.mean():.0%} of the rows in which it changes",
-                        f"correct ingest.csv.columns.{names[1]}.column",
-                    )
+        a, b = reading[:, one], reading[:, two]
+        changing = a[1:] != a[:-1]
+        if changing.sum() < FEWEST:
+            continue
+        for sign, what in ((1.0, "a copy"), (-1.0, "the negative")):
+            same = (a == sign * b)[1:][changing]
+            if same.mean() > COPIED:
+                names = [TRIADS[sensor][i] for i in (one, two)]
+                raise refusal(
+                    recording,
+                    "copied_axis",
+                    f"{names[1]} is {what} of {names[0]} in {same.mean():.0%} of the rows in which it changes",
+                    f"correct ingest.csv.columns.{names[1]}.column",
+                )
 
 
 def _check_spans(recording: Recording) -> None:
-    rate = rate_of_turn(recording)
-    axis = axis_index(recording)
+    rate, axis = rate_of_turn(recording), axis_index(recording)
     if rate is None:
         return
     if recording.gyroscope is not None:
-        required, spanned = _span(rate), _span(recording.gyroscope[:, axis])
-        if required > LEAST_RATE_DPS and spanned < SPANNED * required:
-            seen = np.array([_span(recording.gyroscope[:, i]) for i in range(3)])
-            if (
-                seen.max() < SPANNED * required or seen.argmax() == axis
-            ):  # else the axis is another: the mounting's matter
-                _refuse(recording, f"gyro_{AXES[axis]}", spanned, required, "deg/s")
+        required, spans = _span(rate), [_span(w) for w in recording.gyroscope.T]
+        turned_other = max(spans) >= SPANNED * required and int(np.argmax(spans)) != axis  # the mounting's matter
+        if required > LEAST_RATE_DPS and spans[axis] < SPANNED * required and not turned_other:
+            raise _stuck(recording, TRIADS["gyroscope"][axis], spans[axis], required, "deg/s")
     if recording.accelerometer is None or _turned(recording, rate) < HALF_TURN_DEG:
         return
+    spans = [_span(f) for f in recording.accelerometer.T]
     across = [(axis + 1) % 3, (axis + 2) % 3]
-    spans = [_span(recording.accelerometer[:, i]) for i in across]
-    if max(spans) < LEVEL_G or _span(recording.accelerometer[:, axis]) > LEVEL_G:
+    if max(spans[i] for i in across) < LEVEL_G or spans[axis] > LEVEL_G:
         return  # a turn about the vertical, or about another axis: the mounting's matter
-    for i, spanned in zip(across, spans, strict=True):
-        if spanned < SPANNED:
-            _refuse(recording, f"accel_{AXES[i]}", spanned, 1.0, "g")
+    for i in across:
+        if spans[i] < SPANNED:
+            raise _stuck(recording, TRIADS["accelerometer"][i], spans[i], 1.0, "g")
 
 
 def _turned(recording: Recording, rate: Array) -> float:
+    """Return the arc of a turn, deg."""
     if recording.table_angle is not None:
         return float(np.ptp(recording.table_angle))
-    turned = np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(recording.time))
-    return float(np.ptp(turned))
+    return float(np.ptp(np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(recording.time))))
 
 
 def _span(values: Array) -> float:
@@ -361,8 +350,8 @@ def _span(values: Array) -> float:
     return float(high - low)
 
 
-def _refuse(recording: Recording, channel: str, spanned: float, required: float, unit: str) -> None:
-    raise refusal(
+def _stuck(recording: Recording, channel: str, spanned: float, required: float, unit: str) -> IngestError:
+    return refusal(
         recording,
         "stuck",
         f"{channel} stays within {spanned:.3g} {unit} in nine tenths of the rows, while the table's motion about "

@@ -1,17 +1,8 @@
 """What the channels of a recording say of its rotation, in one form, so that they can be compared.
 
 A table's angle or attitude gives the mean rate over the interval between two samples, exactly. A logged rate and a
-gyroscope give the rate at the samples. The gyroscope is brought to the table's scale by
-
-    reading = b + K rate,    K = weighted median of (y - median y) / (r - median r),    b = median (y - K r)
-
-with weights ``|r - median r|``, cut off at their 99th percentile: some spikes in the table's rate do not move it.
-
-How far two of them may be apart without a contradiction follows from the configured limits of the effects that explain
-a difference: ``time_offset`` and ``low_pass_lag`` (s), ``table_rate_ripple``, ``table_encoder_error`` and
-``clock_rate`` (relative to a rate), ``table_encoder_error`` and ``table_backlash`` (deg), ``g_sensitivity``,
-``g_squared_sensitivity`` and the gyroscope's ``scale_factor`` and ``cross_axis``; and from three times the stated
-standard uncertainties of the table.
+gyroscope give the rate at the samples. Scales are compared by the weighted median of ratios, with weights that are cut
+off: some spikes do not move it.
 """
 
 from __future__ import annotations
@@ -46,35 +37,21 @@ LEAST_RATE_DPS = 1.0  # 90 % of the moving samples turn at least so fast where a
 
 @dataclass(frozen=True)
 class Limits:
-    """How far channels may be apart where an effect of the catalogue explains it.
+    """How far channels may be apart where an effect of the catalogue explains it, and how the files name channels."""
 
-    Attributes
-    ----------
-    late_s : float, s
-    clock : float, relative
-    rate : float, relative
-    rate_stated : float, relative
-        Three times the stated standard uncertainty of the table's rate.
-    angle_deg : float, deg
-    angle_stated_deg : float, deg
-    gain : float, relative
-        Of a gyroscope by its data sheet.
-    offset_dps : float, deg/s
-        What gravity adds to the gyroscope's reading.
-    """
-
-    late_s: float
-    clock: float
-    rate: float
-    rate_stated: float
+    late_s: float  # time_offset and low_pass_lag
+    clock: float  # relative
+    rate: float  # relative
+    rate_stated: float  # relative: three times the stated standard uncertainty of the table's rate
     angle_deg: float
     angle_stated_deg: float
-    gain: float
-    offset_dps: float
+    gain: float  # relative, of a gyroscope by its data sheet
+    offset_dps: float  # what gravity adds to the gyroscope's reading
+    columns: Mapping[str, Any]  # ingest.csv.columns
 
     @classmethod
     def of(cls, settings: Mapping[str, Any]) -> Limits:
-        """Return the limits that a unit's configuration states; what it does not state is 0."""
+        """Return what the sections ``sensor``, ``table`` and ``ingest`` state; what they do not state is 0."""
         sensor, table = settings.get("sensor") or {}, settings.get("table") or {}
         effects = [(sensor.get(s) or {}).get("effects") or {} for s in SENSORS]
         gyroscope = sensor.get("gyroscope") or {}
@@ -94,17 +71,25 @@ class Limits:
             angle_stated_deg=angle,
             gain=float(gyroscope.get("scale_factor") or 0.0) + float(gyroscope.get("cross_axis") or 0.0),
             offset_dps=most("g_sensitivity") + most("g_squared_sensitivity"),
+            columns=((settings.get("ingest") or {}).get("csv") or {}).get("columns") or {},
         )
+
+    def column(self, recording: Recording, channel: str) -> str:
+        """Return how the recording's file names a channel."""
+        if not str(recording.source.get("file", "")).endswith(".csv"):
+            return channel
+        ends = {"gyroscope": ("gyro_x", "gyro_z"), "table_attitude": ("table_qw", "table_qz")}.get(channel, (channel,))
+        entries = {c: self.columns.get(c) for c in ends}
+        names = {c: e.get("column") if isinstance(e, dict) else None for c, e in entries.items()}
+        return " .. ".join(c if name is None else str(name) for c, name in names.items())
 
 
 @dataclass(frozen=True)
 class Channel:
-    """A rotation as one channel tells it.
+    """A rotation as a channel of the table (``table_rate``, ``table_angle``, ``table_attitude``) or a sensor tells it.
 
     Attributes
     ----------
-    name : str
-        ``table_rate``, ``table_angle``, ``table_attitude`` or ``gyroscope``.
     low, high : (m,) array, deg/s
         The rate at the samples (m = n) or over the intervals between them (m = n - 1); infinite where it is not known.
     turned : (n - 1,) array, deg
@@ -127,8 +112,7 @@ class Channel:
 def quantiles(values: Array, *shares: float) -> Array:
     """Return values below which these shares of all lie, without interpolation: numpy's takes ten times as long."""
     places = [round(share * (len(values) - 1)) for share in shares]
-    found: Array = np.partition(values, places, axis=0)[places]
-    return found
+    return np.asarray(np.partition(values, places, axis=0)[places])
 
 
 def gaps(recording: Recording) -> NDArray[np.bool_]:
@@ -152,8 +136,7 @@ def spin(attitude: Array) -> Array:
     sine = conjugate_product(q[:-1], q[1:])
     size = np.linalg.norm(sine, axis=1, keepdims=True)
     angle = 2.0 * np.arcsin(np.minimum(size, 1.0))
-    vector: Array = np.degrees(np.where(size > 0, sine * angle / np.where(size > 0, size, 1.0), 0.0))
-    return vector
+    return np.asarray(np.degrees(np.where(size > 0, sine * angle / np.where(size > 0, size, 1.0), 0.0)))
 
 
 def _of_turned(name: str, recording: Recording, turned: Array) -> Channel:
@@ -176,9 +159,9 @@ def of_rate(recording: Recording, name: str, rate: Array, known: NDArray[np.bool
 
 def alike(channel: Channel, other: Channel) -> Channel:
     """Return a channel with the sign of another, where they are the same but for it: an angle counted left-handed."""
-    if not _alike(channel.turned, other.turned) < -OPPOSITE:
-        return channel
-    return replace(channel, low=-channel.high, high=-channel.low, turned=-channel.turned)
+    if _alike(channel.turned, other.turned) < -OPPOSITE:
+        return replace(channel, low=-channel.high, high=-channel.low, turned=-channel.turned)
+    return channel
 
 
 def _alike(one: Array, two: Array) -> float:
@@ -223,21 +206,33 @@ def of_gravity(recording: Recording, turned: Array, channels: Sequence[Channel])
     return replace(_of_turned("gravity", recording, sign * turned), noise=noise)
 
 
-def slope_of(y: Array, rate: Array) -> tuple[float, float] | None:
-    """Return gain and bias of a gyroscope's axis against a table's rate; None where the rate hardly changes."""
-    dr, dy = rate - np.median(rate), y - np.median(y)
-    size = np.abs(dr)
-    weight = np.minimum(size, np.partition(size, -max(len(size) // 100, 1))[-max(len(size) // 100, 1)])
-    if float(weight.max()) < LEAST_RATE_DPS:
-        return None
-    used = size > 0.1 * weight.max()
-    ratio, weight = dy[used] / dr[used], weight[used]
+def ratio_quartiles(one: Array, other: Array, cut: int, least: float) -> Array:
+    """Return the weighted quartiles of the ratios of two channels: (3,) array.
+
+    The weights ``|other|`` are cut off at their (1 / cut) largest value; ratios below ``least`` of that are left out.
+    """
+    size = np.abs(other)
+    largest = largest_but(size, cut)
+    used = size > least * largest
+    weight, ratio = np.minimum(size[used], largest), one[used] / other[used]
     order = np.argsort(ratio)
-    total = np.cumsum(weight[order])
-    gain = float(ratio[order[np.searchsorted(total, 0.5 * total[-1])]])
-    if gain == 0.0:
+    total = np.cumsum(weight[order]) / weight.sum()
+    return np.asarray(ratio[order[np.searchsorted(total, [0.25, 0.5, 0.75])]])
+
+
+def largest_but(size: Array, cut: int) -> float:
+    """Return the value that (1 / cut) of all reach."""
+    place = max(len(size) // cut, 1)
+    return float(np.partition(size, -place)[-place])
+
+
+def slope_of(y: Array, rate: Array) -> tuple[float, float] | None:
+    """Return K and b of ``y = K rate + b`` for a gyroscope's axis; None where the rate hardly changes."""
+    dr, dy = rate - np.median(rate), y - np.median(y)
+    if largest_but(np.abs(dr), 100) < LEAST_RATE_DPS:
         return None
-    return gain, float(np.median(y - gain * rate))
+    gain = float(ratio_quartiles(dy, dr, 100, 0.1)[1])
+    return (gain, float(np.median(y - gain * rate))) if gain != 0.0 else None
 
 
 def rate_of_turn(recording: Recording) -> Array | None:
@@ -246,8 +241,7 @@ def rate_of_turn(recording: Recording) -> Array | None:
         return recording.table_rate
     if recording.table_angle is None:
         return None
-    rate: Array = np.gradient(recording.table_angle, recording.time)
-    return rate
+    return np.asarray(np.gradient(recording.table_angle, recording.time))
 
 
 def axis_index(recording: Recording) -> int:
@@ -262,20 +256,6 @@ def place(recording: Recording, first: int, last: int) -> str:
     if first == last:
         return f"{what} {first + 1} ({t[first]:.9g} s)"
     return f"{what}s {first + 1} to {last + 1} ({t[first]:.9g} to {t[last]:.9g} s)"
-
-
-def column(recording: Recording, channel: str, settings: Mapping[str, Any]) -> str:
-    """Return how the file names a channel."""
-    if not str(recording.source.get("file", "")).endswith(".csv"):
-        return channel
-    columns = ((settings.get("ingest") or {}).get("csv") or {}).get("columns") or {}
-    if channel in ("gyroscope", "table_attitude"):
-        first = "gyro_x" if channel == "gyroscope" else "table_qw"
-        last = "gyro_z" if channel == "gyroscope" else "table_qz"
-        return f"{column(recording, first, settings)} .. {column(recording, last, settings)}"
-    entry = columns.get(channel)
-    name = entry.get("column") if isinstance(entry, dict) else None
-    return str(name) if name is not None else channel
 
 
 def refusal(recording: Recording, code: str, message: str, hint: str) -> IngestError:

@@ -10,22 +10,22 @@ where n is the number of steps and d_max the largest delay tried, in steps: a wi
 2 d_max differences at each end, whose sum of squares has the standard deviation ``sqrt(4 d_max)`` in units of S_min.
 A turn at one rate determines no delay: its interval covers every delay tried.
 
-The effects ``time_offset`` and ``low_pass_lag`` allow a delay, and ``clock_rate`` what the sensor's clock gains after
-power-on. All recordings of a unit have one offset and one clock. A recording is refused only where its whole interval
-contradicts this.
+The effects ``time_offset`` and ``low_pass_lag`` allow a delay, and of the sensor ``clock_rate`` what its clock gains
+after power-on. All recordings of a unit have one offset and one clock. A recording is refused only where its whole
+interval contradicts this.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.preprocessing.evidence import column, refusal
+from pipeline.preprocessing.evidence import refusal
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
@@ -42,17 +42,12 @@ QUARTER = 0.25  # of an interval, within which a delay between samples is known
 BETTER = 0.5  # share of its power that a signal has to keep where it is no other's
 NEARLY = 0.1  # share of the power by which one delay has to be better than a smaller one
 SURE = 5.0  # standard deviations of what the ends of the window add
+ALIGN = "align the table's log with the sensor's rows, or give it a time column of its own (ingest=table_log)"
 
 
 @dataclass(frozen=True)
 class Delay:
-    """Delay of the sensor against the table's log, and the interval of delays that the recording allows.
-
-    Attributes
-    ----------
-    best, low, high : float, s
-        Positive where the sensor is late.
-    """
+    """Delay of the sensor against the table's log, s, and the interval that the recording allows; positive: late."""
 
     best: float
     low: float
@@ -63,14 +58,8 @@ class Delay:
         return min(max(value, self.low), self.high)
 
 
-def delay_of(
-    recording: Recording, channels: Sequence[Channel], limits: Limits, settings: Mapping[str, Any]
-) -> Delay | None:
-    """Return the delay of the sensor against the table's log; refuse a delay that no effect explains.
-
-    Between two channels of the table ``time_offset`` and ``low_pass_lag`` allow a delay; the sensor's clock, which runs
-    off by ``clock_rate`` since power-on, adds to that of the sensor.
-    """
+def delay_of(recording: Recording, channels: Sequence[Channel], limits: Limits) -> Delay | None:
+    """Return the delay of the sensor against the table's log; refuse a delay that no effect explains."""
     first, *others = (c for c in channels if c.name != "gravity")
     found = None
     for other in others:
@@ -93,10 +82,10 @@ def delay_of(
             raise refusal(
                 recording,
                 "reference_contradiction",
-                f"{column(recording, first.name, settings)} runs {abs(best):.3g} s {'late' if best < 0 else 'early'} "
-                f"against {column(recording, other.name, settings)}; the limits of time_offset, low_pass_lag"
+                f"{limits.column(recording, first.name)} runs {abs(best):.3g} s {'late' if best < 0 else 'early'} "
+                f"against {limits.column(recording, other.name)}; the limits of time_offset, low_pass_lag"
                 f"{' and clock_rate' if of_sensor else ''} allow {allowed:.3g} s",
-                "align the table's log with the sensor's rows, or give it a time column of its own (ingest=table_log)",
+                ALIGN,
             )
         found = delay if of_sensor else found
     return found
@@ -125,18 +114,12 @@ def check_delays(found: Sequence[tuple[Recording, Delay]], limits: Limits) -> No
         f"{min(others):.3g} to {max(others):.3g} s in the other recordings of the unit; one offset of at most "
         f"{limits.late_s:.3g} s (time_offset, low_pass_lag) and one clock_rate of at most {limits.clock:.3g} do not "
         "explain both",
-        "align the table's log with the sensor's rows, or give it a time column of its own (ingest=table_log)",
+        ALIGN,
     )
 
 
 def _of_one_clock(intervals: Array, limits: Limits) -> bool:
-    """Return whether one offset and one clock within their limits explain all recordings.
-
-    Parameters
-    ----------
-    intervals : (r, 4) array, s
-        First and last time of each recording, least and largest delay. The delay is that of some time in between.
-    """
+    """Return whether one offset and one clock explain (r, 4) first and last times, least and largest delays, s."""
     start, end, low, high = intervals.T
     run_off = np.linspace(-limits.clock, limits.clock, CLOCKS)[:, None, None] * np.stack([start, end])
     least = np.maximum((low - run_off.max(axis=1)).max(axis=1), -limits.late_s)

@@ -17,11 +17,12 @@ what noise and the limits of the catalogue's effects allow. What exceeds noise a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+
+from pipeline.preprocessing.evidence import place
+from pipeline.records import Note
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -29,116 +30,47 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.preprocessing.evidence import Channel, Limits
+    from pipeline.records import Recording
 
     Array = NDArray[np.float64]
 
 BY_NOISE = 10.0  # standard deviations, as of disturbances (pipeline.io.disturbances)
 BENDS = 3.0  # of a move as long as one interval, whose second difference shows a quarter of its rate
 SHORT, LONG = 16, 12  # samples of a short stretch; long ones in a recording
+MANY = 20  # samples, more than a spike or a jump concerns
 RESOLVED_DEG = 1e-3  # of a logged angle: the tenth of a common encoder's 0.01 deg
 CURVED = 0.02  # relative: what nonlinearities leave of a gyroscope's gain that is fitted to the same turn
 OF_SENSOR = ("gyroscope", "gravity")
 PHASE = 0.2  # relative error of gravity's phase over some degrees: twice 0.1 g of bias
 
 
-@dataclass(frozen=True)
-class Contradiction:
-    """Samples in which a channel contradicts the others.
-
-    Attributes
-    ----------
-    claim : Channel
-    others : tuple of Channel
-    first, last : int
-        Samples.
-    claimed, seen : float
-        By the channel and by the nearest of the others: deg/s at a sample, deg over a stretch.
-    gross : bool
-        Whether it exceeds what an effect of the catalogue can explain.
-    stretch : bool
-        Whether a sum over the stretch shows it.
-    count : int
-        Samples or stretches concerned.
-    """
-
-    claim: Channel
-    others: tuple[Channel, ...]
-    first: int
-    last: int
-    claimed: float
-    seen: float
-    gross: bool
-    stretch: bool
-    count: int
-
-
 class Comparison:
-    """The channels of one recording, compared with each other.
+    """The channels of one recording, compared with each other."""
 
-    Parameters
-    ----------
-    channels : sequence of Channel
-    dt : (n - 1,) array, s
-    limits : Limits
-    """
-
-    def __init__(self, channels: Sequence[Channel], dt: Array, limits: Limits) -> None:
-        self.channels, self.dt, self.limits = channels, dt, limits
-        self.interval = float(np.median(dt))
-        n = len(dt)
-        self.sizes = sorted({SHORT, max(n // LONG, SHORT)})
-        self.starts = {size: np.arange(0, max(n - size // 2, 1), size) for size in self.sizes}
-
-    @cached_property
-    def known(self) -> NDArray[np.bool_]:
-        """Which intervals every channel knows: (n - 1,) array."""
-        known = np.ones(len(self.dt), bool)
-        for channel in self.channels:
+    def __init__(self, recording: Recording, channels: Sequence[Channel], limits: Limits) -> None:
+        self.recording, self.channels, self.limits = recording, channels, limits
+        self.dt = np.diff(recording.time)
+        self.interval = float(np.median(self.dt))
+        self.known = np.ones(len(self.dt), bool)  # intervals that every channel knows
+        for channel in channels:
             finite = np.isfinite(channel.low)
-            known &= finite if channel.of_intervals else finite[1:] & finite[:-1]
-        return known
+            self.known &= finite if channel.of_intervals else finite[1:] & finite[:-1]
 
-    @cached_property
-    def sums(self) -> dict[tuple[str, int], tuple[Array, Array, Array, Array]]:
-        """Angle turned, its total, the square of what bends leave and the range of the rate, in each stretch."""
-        out = {}
-        for channel in self.channels:
-            turned = np.where(self.known, channel.turned, 0.0)
-            rate = channel.low if channel.of_intervals else channel.low[1:]
-            rate = np.where(self.known, rate, 0.0)
-            bend = np.zeros(len(self.dt))
-            if not channel.of_intervals:
-                bend = np.where(self.known, 0.5 * np.diff(np.where(np.isfinite(channel.low), channel.low, 0.0)), 0.0)
-                bend = (bend * self.dt) ** 2
-            for size in self.sizes:
-                at = self.starts[size]
-                swing = np.maximum.reduceat(rate, at) - np.minimum.reduceat(rate, at)
-                out[channel.name, size] = (
-                    np.add.reduceat(turned, at),
-                    np.add.reduceat(np.abs(turned), at),
-                    np.add.reduceat(bend, at),
-                    swing,
-                )
-        return out
-
-    def find(self, claim: Channel) -> Contradiction | None:
-        """Return where a channel contradicts all others; None where it does nowhere."""
+    def find(self, claim: Channel) -> tuple[bool, Note] | None:
+        """Return where a channel contradicts all others, and whether no effect of the catalogue explains it."""
         others = [c for c in self.channels if c is not claim and (c.name != "gravity" or claim.name == "table_angle")]
         if not others or claim.name in OF_SENSOR:
             return None
         alone = all(w.name in OF_SENSOR for w in others)
-        rows = [self._rows(claim, w, alone=alone) for w in others]
-        gross = self._worst_row(claim, others, [r[0] for r in rows], gross=True)
-        return (
-            gross
-            or self._worst_stretch(claim, others)
-            or self._worst_row(claim, others, [r[1] for r in rows], gross=False)
-        )
+        gross, doubt = zip(*(self._rows(claim, w, alone=alone) for w in others), strict=True)
+        if (note := self._worst_row(claim, others, gross)) or (note := self._worst_stretch(claim, others)):
+            return True, note
+        note = self._worst_row(claim, others, doubt)
+        return (False, note) if note else None
 
     def _rows(self, claim: Channel, other: Channel, *, alone: bool) -> tuple[Array, Array]:
         """Return by how much each value is beyond what another channel allows, grossly and by noise: (m,) arrays."""
-        limits = self.limits
-        of_sensor = other.name in OF_SENSOR
+        limits, of_sensor = self.limits, other.name in OF_SENSOR
         reach = max(int(np.ceil(limits.late_s / self.interval)), 1) if of_sensor else 1
         low, high, bend = _near(other, claim, reach)
         if other.name == "gravity":  # a move between two samples of the angle may be shared by two of the sensor
@@ -148,76 +80,90 @@ class Comparison:
         noise = BY_NOISE * (claim.noise + other.noise) + RESOLVED_DEG / self.interval
         gross, stated = limits.rate * size, limits.rate_stated * size
         if claim.of_intervals:
-            gross = gross + limits.angle_deg / self.interval
-            stated = stated + limits.angle_stated_deg / self.interval
-        bend = bend if of_sensor else BENDS * bend
+            gross += limits.angle_deg / self.interval
+            stated += limits.angle_stated_deg / self.interval
         if of_sensor:
             share = limits.rate + limits.gain
-            sure = share if alone else CURVED
-            gross, stated = gross + share * size + limits.offset_dps, stated + sure * size + limits.offset_dps
+            gross += share * size + limits.offset_dps
+            stated += (share if alone else CURVED) * size + limits.offset_dps
         with np.errstate(invalid="ignore"):
-            off = np.maximum(claim.low - high, low - claim.high) - bend - noise
+            off = np.maximum(claim.low - high, low - claim.high) - (bend if of_sensor else BENDS * bend) - noise
             gross, stated = off - gross, off - stated
         return np.where(np.isfinite(gross), gross, -np.inf), np.where(np.isfinite(stated), stated, -np.inf)
 
-    def _worst_row(
-        self, claim: Channel, others: list[Channel], excess: list[Array], *, gross: bool
-    ) -> Contradiction | None:
+    def _worst_row(self, claim: Channel, others: list[Channel], excess: Sequence[Array]) -> Note | None:
         least = np.min(excess, axis=0)
         rows = np.flatnonzero(least > 0.0)
         if not rows.size:
             return None
         worst = int(np.argmax(least))
         group = rows[np.abs(rows - worst) <= SHORT]
-        nearest = others[int(np.argmin([e[worst] for e in excess]))]
-        seen = nearest.low[min(worst, len(nearest.low) - 1)]
-        last = int(group[-1]) + (1 if claim.of_intervals else 0)
-        return Contradiction(
-            claim,
-            tuple(others),
-            int(group[0]),
-            last,
-            float(claim.low[worst]),
-            float(seen),
-            gross,
-            stretch=False,
-            count=int(rows.size),
+        low = others[int(np.argmin([e[worst] for e in excess]))].low
+        first, last = int(group[0]), int(group[-1]) + (1 if claim.of_intervals else 0)
+        looks = "it looks like a spike or a jump"
+        if rows.size > MANY:
+            looks = "does it follow this motion, or is it frozen, reversed in time, or of another recording?"
+        name, names = self._names(claim, others)
+        message = (
+            f"{name} {'turns at' if claim.of_intervals else 'is'} {claim.low[worst]:.4g} deg/s in "
+            f"{place(self.recording, first, last)}, while {names} show {low[min(worst, len(low) - 1)]:.4g} deg/s "
+            f"({rows.size} such {'place' if rows.size == 1 else 'places'}): {looks}"
         )
+        return self._note(message, rows.size, first, last)
 
-    def _worst_stretch(self, claim: Channel, others: list[Channel]) -> Contradiction | None:
-        limits = self.limits
-        for size in self.sizes:
-            turned, total, bends, _ = self.sums[claim.name, size]
-            length = np.add.reduceat(np.where(self.known, self.dt, 0.0), self.starts[size])
-            excess = []
+    def _worst_stretch(self, claim: Channel, others: list[Channel]) -> Note | None:
+        limits, n = self.limits, len(self.dt)
+        for size in sorted({SHORT, max(n // LONG, SHORT)}):
+            starts = np.arange(0, max(n - size // 2, 1), size)
+            turned, total, bends, _ = self._sums(claim, starts)
+            length = np.add.reduceat(np.where(self.known, self.dt, 0.0), starts)
+            excess, sums = [], []
             for other in others:
-                seen, seen_total, seen_bends, swing = self.sums[other.name, size]
+                seen, seen_total, seen_bends, swing = self._sums(other, starts)
                 most = np.maximum(total, seen_total)
                 allowed = limits.rate * most + BENDS * np.sqrt(bends + seen_bends) + RESOLVED_DEG
                 if claim.of_intervals or other.of_intervals:
-                    allowed = allowed + limits.angle_deg
+                    allowed += limits.angle_deg
                 if other.name in OF_SENSOR:
                     share = PHASE if other.name == "gravity" else limits.gain
-                    noise = BY_NOISE * other.noise * self.interval * (np.sqrt(size) if not other.of_intervals else 1.0)
-                    allowed = allowed + share * most + limits.late_s * swing + limits.offset_dps * length + noise
+                    noise = BY_NOISE * other.noise * self.interval * (1.0 if other.of_intervals else np.sqrt(size))
+                    allowed += share * most + limits.late_s * swing + limits.offset_dps * length + noise
                 excess.append(np.abs(turned - seen) - allowed)
+                sums.append(seen)
             off = np.min(excess, axis=0)
             rows = np.flatnonzero(off > 0.0)
             if rows.size:
                 worst = int(np.argmax(off))
-                nearest = others[int(np.argmin([e[worst] for e in excess]))]
-                return Contradiction(
-                    claim,
-                    tuple(others),
-                    int(self.starts[size][rows[0]]),
-                    min(int(self.starts[size][rows[-1]]) + size, len(self.dt)),
-                    float(turned[worst]),
-                    float(self.sums[nearest.name, size][0][worst]),
-                    gross=True,
-                    stretch=True,
-                    count=int(rows.size),
+                seen = sums[int(np.argmin([e[worst] for e in excess]))]
+                first, last = int(starts[rows[0]]), min(int(starts[rows[-1]]) + size, n)
+                part = getattr(self.recording, claim.name)[first : last + 1]
+                name, names = self._names(claim, others)
+                message = (
+                    f"{name}{' stays the same and' if np.all(part == part[0]) else ''} contradicts {names} in "
+                    f"{place(self.recording, first, last)}: it turns by {turned[worst]:.4g} deg and they by "
+                    f"{seen[worst]:.4g} deg in one of {rows.size} such stretches"
                 )
+                return self._note(message, rows.size, first, last)
         return None
+
+    def _sums(self, channel: Channel, starts: NDArray[np.intp]) -> tuple[Array, Array, Array, Array]:
+        """Return the angle turned, its total, the square of what bends leave and the range of the rate, by stretch."""
+        turned, bend = np.where(self.known, channel.turned, 0.0), np.zeros(len(self.dt))
+        rate = np.where(self.known, channel.low if channel.of_intervals else channel.low[1:], 0.0)
+        if not channel.of_intervals:
+            steps = np.diff(np.where(np.isfinite(channel.low), channel.low, 0.0))
+            bend = (np.where(self.known, 0.5 * steps, 0.0) * self.dt) ** 2
+        swing = np.maximum.reduceat(rate, starts) - np.minimum.reduceat(rate, starts)
+        turns, total, bends = (np.add.reduceat(v, starts) for v in (turned, np.abs(turned), bend))
+        return turns, total, bends, swing
+
+    def _names(self, claim: Channel, others: list[Channel]) -> tuple[str, str]:
+        name, *names = (self.limits.column(self.recording, c.name) for c in (claim, *others))
+        return name, " and ".join(names)
+
+    def _note(self, message: str, count: int, first: int, last: int) -> Note:
+        t = self.recording.time
+        return Note("N-REFERENCE", count, 0, 0, message, float(t[first]), float(t[last]))
 
 
 def _near(other: Channel, claim: Channel, reach: int) -> tuple[Array, Array, Array]:
@@ -231,20 +177,14 @@ def _near(other: Channel, claim: Channel, reach: int) -> tuple[Array, Array, Arr
     bend = np.zeros(m)
     with np.errstate(invalid="ignore"):
         bend[1:-1] = np.abs(other.low[2:] - 2.0 * other.low[1:-1] + other.low[:-2])
+        mean = 0.5 * (other.low[1:] + other.low[:-1])
     bend[np.isnan(bend)] = np.inf
     bend = _slide(bend, before, after, n, np.maximum)
     if m == n or other.name in OF_SENSOR:
         low = _slide(other.low, before, after, n, np.minimum)
         return low, _slide(other.high, before, after, n, np.maximum), bend
-    middle = _middle(other, n)
+    middle = mean if len(mean) == n else np.concatenate([[np.inf], mean, [np.inf]])
     return middle, middle, bend
-
-
-def _middle(other: Channel, count: int) -> Array:
-    """Return the mean of the intervals about each sample, or of the samples at the ends of each interval."""
-    with np.errstate(invalid="ignore"):
-        mean = 0.5 * (other.low[1:] + other.low[:-1])
-    return mean if len(mean) == count else np.concatenate([[np.inf], mean, [np.inf]])
 
 
 def _slide(values: Array, before: int, after: int, count: int, better: np.ufunc) -> Array:

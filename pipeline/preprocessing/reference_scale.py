@@ -19,50 +19,51 @@ most, by some degrees.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from pipeline.preprocessing.evidence import (
     axis_index,
-    column,
     gaps,
     gravity_turned,
+    largest_but,
     of_angle,
     of_attitude,
     of_rate,
     place,
+    ratio_quartiles,
     refusal,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
+    from pipeline.errors import IngestError
     from pipeline.preprocessing.evidence import Limits
     from pipeline.records import Recording
 
     Array = NDArray[np.float64]
+    Units = Sequence[tuple[float, str]]
 
-BLOCKS = 96
+BLOCKS = 96  # of a recording, so that each holds a part of a turn
 GRAVITY_TOLERANCE = 0.2  # of a ratio to the angle by gravity: two times 6 deg in 60
+WRONG_FACTORS = ((0.5, "is half of what it should be"), (2.0, "is twice what it should be"))
 UNITS = (
     (np.pi / 180.0, "looks like rad/s declared as deg/s"),
     (180.0 / np.pi, "looks like deg/s declared as rad/s"),
     (1.0 / 6.0, "looks like rpm declared as deg/s"),
     (6.0, "looks like deg/s declared as rpm"),
     (1.0 / 360.0, "looks like turns per second declared as deg/s"),
-    (0.5, "is half of what it should be"),
-    (2.0, "is twice what it should be"),
+    *WRONG_FACTORS,
 )
 ANGLE_UNITS = (
     (np.pi / 180.0, "looks like rad declared as deg"),
     (180.0 / np.pi, "looks like deg declared as rad"),
     (1.0 / 360.0, "looks like turns declared as deg"),
-    (0.5, "is half of what it should be"),
-    (2.0, "is twice what it should be"),
+    *WRONG_FACTORS,
 )
 TIMES = ((1e3, "ms declared as s"), (1e6, "us declared as s"), (1e9, "ns declared as s"), (1e-3, "s declared as ms"))
 LEAST_TOTAL_DEG = 1.0  # over a recording, for a ratio
@@ -79,81 +80,100 @@ CURVED_PHASE = 1e-2  # relative: clocks without quartz, and what lever arms leav
 ALIKE = 0.1  # relative: how near a factor has to be to one of a unit to be called so
 
 
-def check_scale_of_turn(recording: Recording, limits: Limits, settings: Mapping[str, Any]) -> None:
-    """Refuse a turn in which angle, rate, gyroscope, gravity and time contradict each other in scale.
+class Ratio(NamedTuple):
+    """How many times as far one channel turns as another: weighted median over blocks, and whether all blocks agree."""
 
-    Raises
-    ------
-    IngestError
-    """
-    found = _turned(recording)
-    angle, rate, gyro, gravity = (found.get(k) for k in ("table_angle", "table_rate", "gyroscope", "gravity"))
+    value: float
+    even: bool
+
+    def off(self, tolerance: float) -> bool:
+        """Return whether it is not 1."""
+        return abs(self.value - 1.0) > tolerance
+
+    def agrees(self, tolerance: float) -> bool:
+        """Return whether it is 1 in all blocks."""
+        return self.even and not self.off(tolerance)
+
+    @property
+    def of_time(self) -> bool:
+        """Whether a wrong unit of the time makes it."""
+        return self.even and bool(_unit(self.value, TIMES))
+
+
+def check_scale_of_turn(recording: Recording, limits: Limits) -> None:
+    """Refuse a turn in which angle, rate, gyroscope, gravity and time contradict each other in scale."""
+    angle, rate, gyro, gravity = _turned(recording)
     true_angle, true_rate = _ratio(angle, gravity), _ratio(rate, gravity)
     ratio, by_gyro = _ratio(rate, angle), _ratio(rate, gyro)
+    gyro_agrees = by_gyro is not None and by_gyro.agrees(GRAVITY_TOLERANCE)
+    tolerance = limits.rate + GRAVITY_TOLERANCE
     if ratio is not None:
         if not ratio.off(limits.rate) or not ratio.even:
             return
-        if true_angle is None or true_rate is None:
-            angle_wrong = ratio.value > 1.0 and _agrees(by_gyro) and not _of_time(ratio)
-        else:
+        angle_wrong = ratio.value > 1.0 and gyro_agrees and not ratio.of_time
+        if true_angle is not None and true_rate is not None:
             angle_wrong = abs(true_rate.value - 1.0) < abs(true_angle.value - 1.0)
         if angle_wrong:
-            _refuse_angle(recording, settings, 1.0 / ratio.value, "the table's rate")
-        _refuse_rate(recording, settings, ratio, by_gyro, "the table's angle")
-    tolerance = limits.rate + GRAVITY_TOLERANCE
+            raise _wrong_angle(recording, limits, 1.0 / ratio.value, "the table's rate")
+        raise _wrong_rate(recording, limits, ratio, "the table's angle", gyro_agrees=gyro_agrees)
     if true_rate is not None and angle is None and true_rate.even and true_rate.off(tolerance):
-        _refuse_rate(recording, settings, true_rate, by_gyro, "gravity")
+        raise _wrong_rate(recording, limits, true_rate, "gravity", gyro_agrees=gyro_agrees)
     if angle is not None and rate is None:
         if true_angle is not None and true_angle.even and true_angle.off(tolerance):
-            _refuse_angle(recording, settings, true_angle.value, "gravity")
+            raise _wrong_angle(recording, limits, true_angle.value, "gravity")
         factor = _ratio(gyro, angle)
-        if factor is not None and _of_time(factor):
-            _refuse_time(recording, settings, factor, "the gyroscope's readings sum up to")
+        if factor is not None and factor.of_time:
+            raise _wrong_time(recording, limits, factor, "the gyroscope's readings sum up to")
 
 
-def check_scale_of_motion(
-    recording: Recording, size: Array | None, limits: Limits, settings: Mapping[str, Any]
-) -> None:
-    """Refuse held-out motion whose rate, attitude and gyroscope contradict each other in scale.
-
-    Parameters
-    ----------
-    recording : Recording
-    size : (n,) array or None, deg/s
-        Of the angular rate by the calibrated gyroscope.
-    limits : Limits
-    settings : mapping
-    """
-    found: dict[str, Array] = {}
+def _turned(recording: Recording) -> tuple[Array | None, ...]:
+    """Return the angle turned in each block of a turn by angle, rate, gyroscope and gravity: (96,) arrays, deg."""
+    axis = axis_index(recording)
+    angle = rate = gyro = None
+    if recording.table_angle is not None:
+        angle = of_angle(recording, recording.table_angle).turned
     if recording.table_rate is not None:
-        found["rate"] = of_rate(recording, "table_rate", np.abs(recording.table_rate)).turned
+        rate = of_rate(recording, "table_rate", recording.table_rate).turned
+    if recording.gyroscope is not None:
+        reading = still = recording.gyroscope[:, axis]
+        if recording.table_rate is not None:
+            still = reading[np.abs(recording.table_rate) <= np.min(np.abs(recording.table_rate))]
+        gyro = of_rate(recording, "gyroscope", reading - np.median(still), recording.valid).turned
+    found = (angle, rate, gyro, gravity_turned(recording, axis))
+    return tuple(None if turned is None else _in_blocks(turned) for turned in found)
+
+
+def check_scale_of_motion(recording: Recording, size: Array | None, limits: Limits) -> None:
+    """Refuse held-out motion whose rate, attitude and gyroscope (its calibrated ``size``) contradict each other."""
+    rate = attitude = gyro = None
+    if recording.table_rate is not None:
+        rate = _in_blocks(of_rate(recording, "table_rate", np.abs(recording.table_rate)).turned)
     if recording.table_attitude is not None:
-        found["attitude"] = of_attitude(recording, recording.table_attitude).turned
+        attitude = _in_blocks(of_attitude(recording, recording.table_attitude).turned)
     if size is not None:
-        found["gyro"] = of_rate(recording, "gyroscope", size, recording.valid).turned
-    blocks = {k: _in_blocks(v) for k, v in found.items()}
-    rate, attitude, gyro = (blocks.get(k) for k in ("rate", "attitude", "gyro"))
+        gyro = _in_blocks(of_rate(recording, "gyroscope", size, recording.valid).turned)
     tolerance = limits.rate + limits.gain
     by_gyro, ratio = _ratio(rate, gyro), _ratio(rate, attitude)
-    gyro_agrees = by_gyro is not None and by_gyro.even and not by_gyro.off(tolerance)
-    if ratio is not None and ratio.even and ratio.off(limits.rate):
-        if gyro_agrees and _of_time(ratio):
-            _refuse_time(recording, settings, ratio, "the table's rate sums up to")
-        if gyro_agrees:
-            raise refusal(
-                recording,
-                "reference_scale",
-                f"{column(recording, 'table_attitude', settings)} turns {1.0 / ratio.value:.4g} times as fast as "
-                f"{column(recording, 'table_rate', settings)} and the gyroscope say",
-                "is it the attitude of this recording, and is the time in s?",
-            )
-        _refuse_rate(recording, settings, ratio, None, "the table's attitude")
     if ratio is None and by_gyro is not None and by_gyro.even and by_gyro.off(tolerance):
-        _refuse_rate(recording, settings, by_gyro, None, "the gyroscope, as the unit's turns calibrate it")
+        against = "the gyroscope, as the unit's turns calibrate it"
+        raise _wrong_rate(recording, limits, by_gyro, against, gyro_agrees=False)
+    if ratio is None or not ratio.even or not ratio.off(limits.rate):
+        return
+    if by_gyro is None or not by_gyro.agrees(tolerance):
+        raise _wrong_rate(recording, limits, ratio, "the table's attitude", gyro_agrees=False)
+    if ratio.of_time:
+        raise _wrong_time(recording, limits, ratio, "the table's rate sums up to")
+    raise refusal(
+        recording,
+        "reference_scale",
+        f"{limits.column(recording, 'table_attitude')} turns {1.0 / ratio.value:.4g} times as fast as "
+        f"{limits.column(recording, 'table_rate')} and the gyroscope say",
+        "is it the attitude of this recording, and is the time in s?",
+    )
 
 
-def doubt_of_scale(recording: Recording, limits: Limits, settings: Mapping[str, Any]) -> tuple[float, str] | None:
-    """Return how many times a turn's rate is that of its angle, or of gravity, and a sentence, where that is not 1.
+def doubt_of_scale(recording: Recording, limits: Limits) -> str | None:
+    """Return a sentence where a turn's rate is not exactly that of its angle, or of gravity.
 
     At constant rate the angle's increment is the rate times the interval, exactly. Without an angle the sum of the rate
     is regressed on gravity's phase and its first two harmonics, in which biases and cross-axis sensitivity distort it.
@@ -168,103 +188,61 @@ def doubt_of_scale(recording: Recording, limits: Limits, settings: Mapping[str, 
     even[[0, -1]] = False
     if even.sum() < FEWEST:
         return None
-    name, time = (column(recording, c, settings) for c in ("table_rate", "time"))
     if recording.table_angle is not None:
         found = rate[1:][even] * dt[even] / np.diff(recording.table_angle)[even]
         ratio = float(np.median(found))
         spread = MEDIAN_SIZE * float(np.median(np.abs(found - ratio))) / np.sqrt(len(found))
-        against, least = column(recording, "table_angle", settings), QUARTZ
+        against, least = limits.column(recording, "table_angle"), QUARTZ
     else:
-        fit = _against_phase(recording, rate, dt, even)
+        fit = _against_phase(recording, 0.5 * (rate[1:] + rate[:-1]) * dt, even)
         if fit is None:
             return None
         (ratio, spread), against, least = fit, "gravity's direction", CURVED_PHASE
     if abs(ratio - 1.0) <= limits.rate_stated + least + SIGNIFICANT * spread:
         return None
-    return ratio, (
-        f"{name} is {ratio:.6g} times the rate at which {against} turns, over {int(even.sum())} samples at constant "
-        f"rate (standard uncertainty {spread:.2g}; the stated accuracy allows {limits.rate_stated:.2g}): one of "
-        f"them, or the clock of {time}, is wrong by that"
+    return (
+        f"{limits.column(recording, 'table_rate')} is {ratio:.6g} times the rate at which {against} turns, over "
+        f"{int(even.sum())} samples at constant rate (standard uncertainty {spread:.2g}; the stated accuracy allows "
+        f"{limits.rate_stated:.2g}): one of them, or the clock of {limits.column(recording, 'time')}, is wrong by that"
     )
 
 
-def _against_phase(recording: Recording, rate: Array, dt: Array, even: NDArray[np.bool_]) -> tuple[float, float] | None:
+def _against_phase(recording: Recording, steps: Array, even: NDArray[np.bool_]) -> tuple[float, float] | None:
     """Return the slope of the summed rate in gravity's phase, and its standard uncertainty."""
-    turned = gravity_turned(recording, axis_index(recording))
-    steps = np.abs(0.5 * (rate[1:] + rate[:-1]) * dt)
-    if turned is None or float(steps[even].sum()) < MOSTLY_EVEN * float(steps.sum()):
+    turned, sizes = gravity_turned(recording, axis_index(recording)), np.abs(steps)
+    if turned is None or float(sizes[even].sum()) < MOSTLY_EVEN * float(sizes.sum()):
         return None
-    phase, summed = (np.concatenate([[0.0], np.cumsum(v)]) for v in (turned, 0.5 * (rate[1:] + rate[:-1]) * dt))
+    phase, summed = (np.concatenate([[0.0], np.cumsum(v)]) for v in (turned, steps))
     if float(np.ptp(phase)) < WHOLE_TURN_DEG:
         return None
     a = np.radians(phase)
     A = np.column_stack([phase, np.ones_like(a), np.cos(a), np.sin(a), np.cos(2.0 * a), np.sin(2.0 * a)])
-    x, *_ = np.linalg.lstsq(A, summed, rcond=None)
+    x = np.linalg.lstsq(A, summed, rcond=None)[0]
     left = summed - A @ x
     spread = float(np.sqrt(np.mean(left**2) / np.sum((phase - phase.mean()) ** 2) * ALIKE_SAMPLES))
     return abs(float(x[0])), spread
 
 
-def check_intervals(recordings: list[Recording], settings: Mapping[str, Any]) -> None:
+def check_intervals(recordings: Sequence[Recording], limits: Limits) -> None:
     """Refuse a recording whose interval is a thousand or a million times that of the unit's others."""
-    usual = {r.name: r.interval for r in recordings if r.samples > 1}
-    if len(usual) < 3:
+    if len(recordings) < 3:
         return
-    middle = float(np.median(np.array(list(usual.values()))))
+    middle = float(np.median([r.interval for r in recordings]))
     for recording in recordings:
-        factor = usual.get(recording.name, middle) / middle
-        for unit, what in TIMES:
-            if abs(factor / unit - 1.0) <= ALIKE:
-                raise refusal(
-                    recording,
-                    "reference_time",
-                    f"{column(recording, 'time', settings)} looks like {what}: the interval between samples is "
-                    f"{usual[recording.name]:.6g} s, and {middle:.6g} s in the unit's other recordings",
-                    "correct ingest.csv.columns.time.unit",
-                )
-
-
-def _turned(recording: Recording) -> dict[str, Array]:
-    """Return the angle turned in each block of a turn, by each channel: (96,) arrays, deg."""
-    axis = axis_index(recording)
-    found: dict[str, Array] = {}
-    if recording.table_angle is not None:
-        found["table_angle"] = of_angle(recording, recording.table_angle).turned
-    if recording.table_rate is not None:
-        found["table_rate"] = of_rate(recording, "table_rate", recording.table_rate).turned
-    if recording.gyroscope is not None:
-        reading = recording.gyroscope[:, axis]
-        still = reading
-        if recording.table_rate is not None:
-            still = reading[np.abs(recording.table_rate) <= np.min(np.abs(recording.table_rate))]
-        found["gyroscope"] = of_rate(recording, "gyroscope", reading - np.median(still, axis=0), recording.valid).turned
-    phase = gravity_turned(recording, axis)
-    if phase is not None:
-        found["gravity"] = phase
-    return {k: _in_blocks(v) for k, v in found.items()}
+        if what := _unit(recording.interval / middle, TIMES):
+            raise refusal(
+                recording,
+                "reference_time",
+                f"{limits.column(recording, 'time')} looks like {what}: the interval between samples is "
+                f"{recording.interval:.6g} s, and {middle:.6g} s in the unit's other recordings",
+                "correct ingest.csv.columns.time.unit",
+            )
 
 
 def _in_blocks(turned: Array) -> Array:
-    count = min(BLOCKS, len(turned))
-    starts = np.linspace(0, len(turned), count, endpoint=False).astype(int)
-    sums: Array = np.add.reduceat(turned, starts)
-    return sums
-
-
-@dataclass(frozen=True)
-class Ratio:
-    """How many times as far one channel turns as another: weighted median over blocks, and whether all blocks agree."""
-
-    value: float
-    even: bool
-
-    def off(self, tolerance: float) -> bool:
-        """Return whether it is not 1."""
-        return abs(self.value - 1.0) > tolerance
-
-    def near(self, unit: float) -> bool:
-        """Return whether it is a factor, within a tenth."""
-        return self.even and abs(self.value / unit - 1.0) <= ALIKE
+    """Return the angle turned in each block of a recording: (96,) array, deg."""
+    starts = np.linspace(0, len(turned), min(BLOCKS, len(turned)), endpoint=False).astype(int)
+    return np.asarray(np.add.reduceat(turned, starts))
 
 
 def _ratio(one: Array | None, other: Array | None) -> Ratio | None:
@@ -272,70 +250,47 @@ def _ratio(one: Array | None, other: Array | None) -> Ratio | None:
     if one is None or other is None:
         return None
     size = np.abs(other)
-    largest = np.partition(size, -max(len(size) // 10, 1))[-max(len(size) // 10, 1)]
-    if not float(np.sum(np.minimum(size, largest))) > LEAST_TOTAL_DEG:
+    if not float(np.sum(np.minimum(size, largest_but(size, 10)))) > LEAST_TOTAL_DEG:
         return None
-    used = size > 0.3 * largest
-    weight = np.minimum(size[used], largest)
-    ratio = one[used] / other[used]
-    order = np.argsort(ratio)
-    total = np.cumsum(weight[order]) / weight.sum()
-    low, middle, high = np.abs(ratio[order[np.searchsorted(total, [0.25, 0.5, 0.75])]])
+    low, middle, high = np.abs(ratio_quartiles(one, other, 10, 0.3))
     return Ratio(float(middle), bool(middle > 0.0 and abs(high - low) <= SPREAD * middle))
 
 
-def _agrees(ratio: Ratio | None) -> bool:
-    return ratio is not None and ratio.even and not ratio.off(GRAVITY_TOLERANCE)
+def _unit(value: float, units: Units) -> str:
+    """Return which wrong unit makes a factor; empty for none."""
+    return next((what for factor, what in units if abs(value / factor - 1.0) <= ALIKE), "")
 
 
-def _of_time(ratio: Ratio) -> bool:
-    return any(ratio.near(f) for f, _ in TIMES)
+def _wrong(recording: Recording, name: str, what: str, seen: str, keys: str) -> IngestError:
+    whole = place(recording, 0, recording.samples - 1)
+    return refusal(recording, "reference_scale", f"{name} {what}: over {whole} {seen}", f"correct {keys}")
 
 
-def _whole(recording: Recording) -> str:
-    return place(recording, 0, recording.samples - 1)
+def _wrong_angle(recording: Recording, limits: Limits, factor: float, against: str) -> IngestError:
+    what = _unit(factor, ANGLE_UNITS) or f"is {factor:.4g} times what it should be"
+    seen = f"it turns {factor:.4g} times as far as {against} says"
+    name, key = limits.column(recording, "table_angle"), "ingest.csv.columns.table_angle.unit"
+    return _wrong(recording, name, what, seen, key)
 
 
-def _refuse_rate(
-    recording: Recording, settings: Mapping[str, Any], ratio: Ratio, of_gyro: Ratio | None, against: str
-) -> NoReturn:
+def _wrong_rate(recording: Recording, limits: Limits, ratio: Ratio, against: str, *, gyro_agrees: bool) -> IngestError:
     """Refuse the table's rate, or the time or both rates where the gyroscope agrees with it."""
-    gyro_agrees = _agrees(of_gyro)
-    if gyro_agrees and _of_time(ratio):
-        _refuse_time(recording, settings, ratio, "the table's rate sums up to")
-    name = column(recording, "table_rate", settings)
-    what = next((w for f, w in UNITS if ratio.near(f)), f"is {ratio.value:.4g} times what it should be")
-    keys = "ingest.csv.columns.table_rate.unit"
+    if gyro_agrees and ratio.of_time:
+        return _wrong_time(recording, limits, ratio, "the table's rate sums up to")
+    name, keys = limits.column(recording, "table_rate"), "ingest.csv.columns.table_rate.unit"
+    what = _unit(ratio.value, UNITS) or f"is {ratio.value:.4g} times what it should be"
     if gyro_agrees and what.startswith("looks"):
         keys += " and those of gyro_x, gyro_y, gyro_z"
-        name, what = f"{name} and {column(recording, 'gyroscope', settings)}", what.replace("looks", "look", 1)
-    raise refusal(
-        recording,
-        "reference_scale",
-        f"{name} {what}: over {_whole(recording)} the rate sums up to {ratio.value:.4g} times the angle by {against}",
-        f"correct {keys}",
-    )
+        name, what = f"{name} and {limits.column(recording, 'gyroscope')}", what.replace("looks", "look", 1)
+    return _wrong(recording, name, what, f"the rate sums up to {ratio.value:.4g} times the angle by {against}", keys)
 
 
-def _refuse_angle(recording: Recording, settings: Mapping[str, Any], factor: float, against: str) -> NoReturn:
-    name = column(recording, "table_angle", settings)
-    what = next(
-        (w for f, w in ANGLE_UNITS if abs(factor / f - 1.0) <= ALIKE), f"is {factor:.4g} times what it should be"
-    )
-    raise refusal(
-        recording,
-        "reference_scale",
-        f"{name} {what}: over {_whole(recording)} it turns {factor:.4g} times as far as {against} says",
-        "correct ingest.csv.columns.table_angle.unit",
-    )
-
-
-def _refuse_time(recording: Recording, settings: Mapping[str, Any], ratio: Ratio, seen: str) -> NoReturn:
-    what = next(w for f, w in TIMES if ratio.near(f))
-    raise refusal(
+def _wrong_time(recording: Recording, limits: Limits, ratio: Ratio, seen: str) -> IngestError:
+    name, what = limits.column(recording, "time"), _unit(ratio.value, TIMES)
+    return refusal(
         recording,
         "reference_time",
-        f"{column(recording, 'time', settings)} looks like {what}: {seen} {ratio.value:.4g} times the angle that the "
-        f"table turned over {_whole(recording)}",
+        f"{name} looks like {what}: {seen} {ratio.value:.4g} times the angle that the table turned over "
+        f"{place(recording, 0, recording.samples - 1)}",
         "correct ingest.csv.columns.time.unit",
     )
