@@ -14,7 +14,7 @@ from pipeline.diagnosis.findings import document_of
 from pipeline.diagnosis.verdict import evidence_of, judged
 from pipeline.errors import NotObservableError
 from pipeline.estimation.candidates import configured_effects
-from pipeline.estimation.multi_position.rests import is_multi_position
+from pipeline.estimation.rest_means import is_multi_position
 from pipeline.model.effects import catalogue
 
 if TYPE_CHECKING:

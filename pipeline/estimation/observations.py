@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.estimation.gauss_markov import Blocks, information
-from pipeline.estimation.sample_rows import Rows, followed, rows_of
 from pipeline.estimation.table_errors import between_stops
+from pipeline.estimation.turns import Rows, followed, rows_of
 from pipeline.model.effects.base import length, turning_direction
 from pipeline.model.kinematics import earth_of, table_motion
 from pipeline.signal.filters import apply_filter

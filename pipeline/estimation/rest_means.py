@@ -1,29 +1,33 @@
-"""The rests that a calibration without a table uses, those that are held out of it, and the mean reading of each.
+"""The rests that a calibration without a table uses, those that are held out of it, and their mean readings.
 
 A rest is one orientation: its mean reading is one equation, ``|matrix @ (mean - bias)| = G``. Where a unit has no
-recording for validation, every ``holdout_every``-th rest is kept out of the fit, and the fit is judged by it.
+recording for validation, every ``holdout_every``-th rest is kept out of the fit, and the fit is judged by it. The
+gyroscope is fitted to the rests of the accelerometer's method.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from pipeline.signal.creep import creep_in
+from pipeline.signal.creep import believed_rates, creep_in
+from pipeline.signal.filters import filter_autocovariance, variance_of_mean
 from pipeline.signal.rests import find_rests, rests_from_table
+from pipeline.signal.temperature import smooth_temperature
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from pipeline.records import Recording
+    from pipeline.records import Recording, SensorCalibration
     from pipeline.signal.rests import Rest
 
+    Values = NDArray[np.float64]
 
-BY_HAND = ("rests", "validation")
+ROLE, HELD_OUT = "rests", "validation"
 
 
 @dataclass(frozen=True)
@@ -132,7 +136,7 @@ def rest_means(
     means = np.full((len(rests), 3), np.nan)
     filled = counts > 0
     means[filled] = centre + sums[filled] / counts[filled, None]
-    if sensor == "accelerometer" and recording.role in BY_HAND and recording.table_angle is None:
+    if sensor == "accelerometer" and recording.role in (ROLE, HELD_OUT) and recording.table_angle is None:
         creeps = [creep_in(recording, rest.start, rest.stop) for rest in rests]
         means *= 1.0 + np.array([creep.shortening for creep in creeps])[:, None]
     return means, counts
@@ -144,3 +148,130 @@ def sound_samples(recording: Recording, sensor: str) -> NDArray[np.bool_]:
     if reading is None:
         return np.zeros(recording.samples, bool)
     return np.asarray(np.isfinite(reading).all(axis=1) & recording.valid)
+
+
+@dataclass(frozen=True)
+class Rests:
+    """Rests of all recordings, in order."""
+
+    reading: Values  # (m, 3), g or deg/s; means
+    count: NDArray[np.int64]  # (m,); samples of each
+    share: Values  # (m,); variance of each mean by white noise, over that of a raw sample
+    scatter: Values  # (m, 3); sums of squares about the means
+    # each (m,), s; when each begins, how long it is, and its mean time
+    start: Values
+    length: Values
+    time: Values
+    temperature: Values  # (m,), degC; NaN where none was recorded
+    recording: NDArray[np.intp]  # (m,); index of the recording that each belongs to
+    held_out: NDArray[np.bool_]  # (m,)
+    span: NDArray[np.intp]  # (m, 2); its first sample, and the one after its last
+    # (m, 3), deg/s; rate across gravity at which the unit tilts, by the readings of the accelerometer; 0 where it
+    # stands still
+    creep: Values
+    creep_error: Values  # (m,), deg/s; standard uncertainty of each of its two components
+    creep_about: Values  # (m,), deg/s; standard deviation of the rate about gravity
+    clock_shared: bool  # whether the time between the recordings is known
+
+    def select(self, index: NDArray[np.bool_]) -> Self:
+        """Return some of the rests."""
+        arrays = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "clock_shared"}
+        return replace(self, **{name: values[index] for name, values in arrays.items()})
+
+    @property
+    def white(self) -> Values:
+        """Standard deviation of a sample about the mean of its rest: (3,) array."""
+        return np.asarray(np.sqrt(self.scatter.sum(axis=0) / max(float(np.sum(self.count - 1)), 1.0)))
+
+    @property
+    def freedom(self) -> float:
+        """Degrees of freedom of the scatter within the rests."""
+        return float(3 * np.sum(self.count - 1))
+
+    @property
+    def joined(self) -> NDArray[np.bool_]:
+        """Whether the time from each rest to each other is known: (m, m) array."""
+        same: NDArray[np.bool_] = self.recording[:, None] == self.recording
+        return np.ones_like(same) if self.clock_shared else same
+
+
+def is_multi_position(sensor: str, recordings: Sequence[Recording]) -> bool:
+    """Return whether a sensor was recorded in rests and moves, without the motion of a table."""
+    own = [r for r in recordings if r.reading(sensor) is not None and r.role != HELD_OUT]
+    logged = any(r.table_angle is not None or r.table_attitude is not None for r in own)
+    return any(r.role == ROLE for r in own) and not logged
+
+
+def rests_of(
+    sensor: str,
+    recordings: Sequence[Recording],
+    settings: Mapping[str, Any],
+    accelerometer: SensorCalibration | None = None,
+    role: str = ROLE,
+) -> Rests | None:
+    """Return the rests of the recordings of a role, or None where there are none.
+
+    ``settings``: section ``procedure``: ``holdout_every``. ``accelerometer``: rests that its method left out are left
+    out here. ``role``: ``rests``, or ``validation``, whose rests are all held out.
+    """
+    every = holdout_interval(recordings, settings) if role == ROLE else 0
+    refused = _left_out(accelerometer)
+    chosen = [(i, r) for i, r in enumerate(recordings) if r.role == role and r.reading(sensor) is not None]
+    columns: dict[str, list[Any]] = {}
+    for index, recording in chosen:
+        split = split_rests(recording, every)
+        rests = sorted([*split.used, *split.held_out], key=lambda rest: rest.start)
+        rests = [r for r in rests if (recording.name, float(recording.time[r.start])) not in refused]
+        found = _of_recording(sensor, recording, rests)
+        out = [rest.start for rest in split.held_out]
+        found["held_out"] = np.isin(found["span"][:, 0], out) | (role == HELD_OUT)
+        found["recording"] = np.full(len(found["count"]), index)
+        for name, values in found.items():
+            columns.setdefault(name, []).append(values)
+    if not columns or sum(len(c) for c in columns["count"]) == 0:
+        return None
+    alone = len(np.unique(np.concatenate(columns["recording"]))) == 1
+    shared = alone or all(recording.clock_shared for _, recording in chosen)
+    return Rests(**{name: np.concatenate(values) for name, values in columns.items()}, clock_shared=shared)
+
+
+def _left_out(accelerometer: SensorCalibration | None) -> set[tuple[str, float]]:
+    return {
+        (rest["recording"], float(rest["time_s"]))
+        for stage in (accelerometer.stages if accelerometer else ())
+        for rest in stage.details.get("rests_left_out", ())
+    }
+
+
+def _of_recording(sensor: str, recording: Recording, rests: Sequence[Rest]) -> dict[str, Any]:
+    """Return the columns of ``Rests`` for one recording; rests without a sound sample are left out."""
+    means, counts = rest_means(recording, rests, sensor)
+    kept = counts > 0
+    span = np.array([[rest.start, rest.stop] for rest in rests], np.intp).reshape(-1, 2)[kept]
+    means, counts, time = means[kept], counts[kept], recording.time
+    reading, good = recording.reading(sensor), sound_samples(recording, sensor)
+    assert reading is not None  # noqa: S101
+    inside = [slice(a, b) for a, b in span]
+    scatter = [np.sum((reading[s][good[s]] - mean) ** 2, axis=0) for s, mean in zip(inside, means, strict=True)]
+    creeps = [creep_in(recording, a, b) for a, b in span.tolist()] if recording.accelerometer is not None else []
+    rate, error, about = believed_rates(creeps) if creeps else (np.zeros((len(span), 3)), np.zeros(len(span)), 0.0)
+    if sensor == "accelerometer":  # less the tilt of a unit that creeps
+        scatter = [c.squares * max(n - 1, 1) / max(c.freedom, 1) for c, n in zip(creeps, counts, strict=True)]
+    warmth = np.full(recording.samples, np.nan)
+    if recording.temperature is not None:
+        warmth = smooth_temperature(time, recording.temperature)
+    start = time[span[:, 0]]
+    return {
+        "reading": means,
+        "count": counts,
+        "share": variance_of_mean(filter_autocovariance(recording), counts) if len(counts) else np.zeros(0),
+        "scatter": np.array(scatter).reshape(-1, 3),
+        "start": start,
+        "length": time[span[:, 1] - 1] - start + recording.interval,
+        "time": np.array([time[s].mean() for s in inside]),
+        "temperature": np.array([warmth[s].mean() for s in inside]),
+        "span": span,
+        "creep": rate,
+        "creep_error": error,
+        "creep_about": np.full(len(span), about),
+    }

@@ -1,8 +1,17 @@
-"""Which function runs a stage of a fit.
+"""Which function runs a stage of a fit, and the correction of the readings that a stage leaves.
 
 A stage is a module ``pipeline/estimation/<sensor>/<stage>.py`` with ``fit(recordings, previous, settings)``: a new
 stage needs only such a module and its name in a method's list. The stages of the staged method are functions of one
 module for each sensor, and some stages are the same for both sensors.
+
+The correction by the stages so far is ``{"steps": [...]}``; each step acts on the output of the step before, on row
+vectors v:
+
+    {"subtract": b}                                          v - b
+    {"matrix": M}                                            v M^T, that is M v as a column
+    {"two_sided": {"positive": p, "negative": n, "switch_at": s}}   p_i v_i where v_i > s_i, else n_i v_i
+
+where b, p, n, s are (3,) and M is (3, 3).
 """
 
 from __future__ import annotations
@@ -10,10 +19,14 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from pipeline.errors import CannotCalibrateError, ConfigurationError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
 
     from pipeline.records import Recording, SensorCalibration
 
@@ -23,6 +36,7 @@ STAGED = {
 }
 OF_BOTH_SENSORS = ("reference_least_squares", "effects")
 NOT_WANTED = "not_wanted"  # the stage of a sensor whose method is null
+KINDS = "subtract, matrix, two_sided"
 
 
 def stage_module(sensor: str, stage: str) -> str:
@@ -63,3 +77,39 @@ def stages_before(sensor: str, previous: SensorCalibration | None, stages: Mappi
             f"the stages of the {sensor} are {', '.join(stages)}"
         )
     return [stage.name for stage in done]
+
+
+def apply_correction(correction: Mapping[str, Any] | None, readings: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Correct readings.
+
+    ``correction``: ``StageResult.correction``; None changes nothing. ``readings``: (n, 3), g or deg/s. Returns (n, 3),
+    same unit. Raises ``ConfigurationError`` if a step is of an unknown kind.
+    """
+    out = np.array(readings, float)
+    for step in (correction or {}).get("steps", []):
+        out = apply_step(step, out)
+    return out
+
+
+def apply_step(step: Mapping[str, Any], readings: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Apply one step to (n, 3) readings."""
+    out: NDArray[np.float64]
+    match dict(step):
+        case {"subtract": offset}:
+            out = readings - np.asarray(offset, float)
+        case {"matrix": matrix}:
+            out = readings @ np.asarray(matrix, float).T
+        case {"two_sided": sides}:
+            above = readings > np.asarray(sides["switch_at"], float)
+            out = readings * np.where(above, sides["positive"], sides["negative"])
+        case _:
+            raise ConfigurationError(f"a correction has a step {sorted(step)}; known kinds are {KINDS}")
+    return out
+
+
+def two_sided(
+    positive: NDArray[np.float64], negative: NDArray[np.float64], switch_at: NDArray[np.float64]
+) -> dict[str, Any]:
+    """Return a step that multiplies each axis by one of two factors."""
+    sides = {"positive": positive, "negative": negative, "switch_at": switch_at}
+    return {"two_sided": {name: np.asarray(value, float).tolist() for name, value in sides.items()}}

@@ -22,8 +22,8 @@ from pipeline.diagnosis.observability import at_its_limit, not_observable, not_o
 from pipeline.errors import NotObservableError
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.multi_position import selection as by_hand
-from pipeline.estimation.multi_position.rests import is_multi_position
 from pipeline.estimation.observations import observe
+from pipeline.estimation.rest_means import is_multi_position
 from pipeline.estimation.selection import unselected
 from pipeline.model.effects import effect
 from pipeline.model.effects.base import unit_of

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.estimation.correction import apply_correction
+from pipeline.estimation.stages import apply_correction
 from pipeline.records import SENSOR_UNITS
 from pipeline.report.chart import AXES_LEGEND, Figure, Panel, Samples, chart
 from pipeline.report.group_charts import Point, curves, stems

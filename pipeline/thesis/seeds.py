@@ -36,10 +36,9 @@ from pipeline.estimation.accelerometer.turn_extremes import (
     samples_of,
     sinusoids_of,
 )
-from pipeline.estimation.correction import apply_correction
-from pipeline.estimation.gyroscope import response
 from pipeline.estimation.gyroscope import staged as gyroscope
-from pipeline.estimation.gyroscope.integrated_turns import turns_of
+from pipeline.estimation.gyroscope.cholesky_lu import turns_of
+from pipeline.estimation.stages import apply_correction
 from pipeline.estimation.turns import parts_of
 from pipeline.model.measurement import linear_truth
 from pipeline.records import SENSORS
@@ -216,10 +215,10 @@ class Drawn:
         """Yield method and error of the staged method, and of Cholesky and LU as printed and inverted."""
         turns, table = self.turns(), read_config("table", self.own.unit.table)
         parts = parts_of(turns, "gyroscope", table, "the study")
-        samples = response.samples_of(parts, turns)
-        theta = response.weights_of(samples.rate, as_printed=False) @ samples.reading
+        samples = gyroscope.samples_of(parts, turns)
+        theta = gyroscope.weights_of(samples.rate, as_printed=False) @ samples.reading
         chain = gyroscope.follow(
-            response.Response(theta[0], theta[1:], samples.speed), list(gyroscope.STAGES), as_printed=False
+            gyroscope.Response(theta[0], theta[1:], samples.speed), list(gyroscope.STAGES), as_printed=False
         )
         integrated = turns_of(parts)
         U, Y = integrated.integral(integrated.rate), integrated.integral(integrated.reading - theta[0])

@@ -22,11 +22,10 @@ import numpy as np
 from pipeline.errors import InputError
 from pipeline.estimation.design import Term
 from pipeline.estimation.multi_position.faces_and_turns import turns_of
-from pipeline.estimation.multi_position.gravity import observed_rests
 from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
 from pipeline.estimation.multi_position.model import State
-from pipeline.estimation.multi_position.moves import moves_of
-from pipeline.estimation.multi_position.rests import HELD_OUT, ROLE, is_multi_position
+from pipeline.estimation.multi_position.moves import moves_of, observed_rests
+from pipeline.estimation.rest_means import HELD_OUT, ROLE, is_multi_position
 from pipeline.model.compensation import Compensation
 from pipeline.model.effects import effect
 from pipeline.records import continuous, level_in_body

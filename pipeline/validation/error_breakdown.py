@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import ConfigurationError
-from pipeline.estimation.correction import apply_correction
+from pipeline.estimation.stages import apply_correction
 from pipeline.model.effects import effect_of
 from pipeline.model.effects.base import truth
 from pipeline.model.log_motion import LogEnd, fields_used, log_motion

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import ConfigurationError
-from pipeline.estimation.correction import apply_correction, two_sided
+from pipeline.estimation.stages import apply_correction, two_sided
 
 READINGS = np.array([[1.0, -2.0, 0.5], [-1.0, 2.0, 0.1]])
 

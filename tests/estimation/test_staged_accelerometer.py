@@ -8,7 +8,7 @@ from table_turns import Bench, run_stages, settings, specific_force, stepped_ang
 
 from pipeline.errors import CannotCalibrateError, ConfigurationError, NotObservableError
 from pipeline.estimation.accelerometer.staged import fit as fit_stage
-from pipeline.estimation.correction import apply_correction
+from pipeline.estimation.stages import apply_correction
 from pipeline.records import SensorCalibration, StageResult, coverage_factor
 from pipeline.signal.filters import apply_filter
 

@@ -7,8 +7,8 @@ import pytest
 from table_turns import Bench, ramped_rate, run_stages, settings
 
 from pipeline.errors import CannotCalibrateError, ConfigurationError, NotObservableError
-from pipeline.estimation.correction import apply_correction
 from pipeline.estimation.gyroscope.staged import fit as fit_stage
+from pipeline.estimation.stages import apply_correction
 from pipeline.model.kinematics import earth_rate
 from pipeline.records import SensorCalibration, StageResult, coverage_factor
 from pipeline.signal.filters import apply_filter

@@ -8,7 +8,7 @@ orientations need not be known. See ``pipeline.estimation.accelerometer.ellipsoi
 
 A misalignment that the orientations do not determine, as in six positions, is left at zero, and the result says so. On
 a table the errors of the rows are correlated by the bias wander, whose covariance is that of
-``pipeline.estimation.engine``; by hand that of ``pipeline.estimation.accelerometer.rest_scatter``.
+``pipeline.estimation.engine``; by hand that of ``pipeline.estimation.accelerometer.orientations``.
 """
 
 from __future__ import annotations
@@ -26,8 +26,13 @@ from pipeline.estimation.accelerometer.ellipsoid_fit import (
     derivative_of,
     fit_ellipsoid,
 )
-from pipeline.estimation.accelerometer.orientations import orientations_of, without
-from pipeline.estimation.accelerometer.rest_scatter import RestErrors, rest_candidates, rest_scatter
+from pipeline.estimation.accelerometer.orientations import (
+    RestErrors,
+    orientations_of,
+    rest_candidates,
+    rest_scatter,
+    without,
+)
 from pipeline.estimation.engine import LinearMap, Posterior, assess_noise
 from pipeline.estimation.least_squares import ScaledColumns, certified
 from pipeline.estimation.monte_carlo import beside_trials, quadratic_results, through, trials_of, without_trials
@@ -75,13 +80,13 @@ def fit(
     ``recordings``: rests in many orientations (role ``rests``), or a table's turns (role ``accelerometer``).
     ``previous``: the result of the stage before; only its stages are kept. ``settings``: sections ``table``
     (``gravity_g``), ``procedure`` (``holdout_every``; ``faces``: the full matrix, by
-    ``pipeline.estimation.multi_position.faces_fit``) and ``sensor``. Raises ``CannotCalibrateError`` if there is no
+    ``pipeline.estimation.multi_position.result``) and ``sensor``. Raises ``CannotCalibrateError`` if there is no
     recording for it; ``NotObservableError`` if the orientations are too few or too much alike, or a stated face is
     missing.
     """
     if not settings["procedure"].get("faces"):
         return _fit_triangular(recordings, previous, settings)
-    from pipeline.estimation.multi_position.faces_fit import fit_faces, require_faces  # noqa: PLC0415  (needs this module)
+    from pipeline.estimation.multi_position.result import fit_faces, require_faces  # noqa: PLC0415  (needs this module)
 
     require_faces(recordings, settings)
     return fit_faces(_fit_triangular(recordings, previous, settings), recordings, settings)

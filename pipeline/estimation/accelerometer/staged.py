@@ -34,11 +34,10 @@ from pipeline.estimation.accelerometer.turn_extremes import (
     sinusoids_of,
     turns_of,
 )
-from pipeline.estimation.correction import apply_correction, two_sided
 from pipeline.estimation.engine import LinearMap, assess_noise
 from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.estimation.noise import prior_of
-from pipeline.estimation.stages import stages_before
+from pipeline.estimation.stages import apply_correction, stages_before, two_sided
 from pipeline.estimation.table_errors import Reference, disturbance
 from pipeline.estimation.turns import blocks_of_samples, parts_of
 from pipeline.estimation.uncertainty_budget import (
@@ -76,7 +75,7 @@ ASYMMETRY = "scale_factor_asymmetry"
 class Outcome:
     """What one stage found."""
 
-    steps: list[dict[str, Any]]  # its steps of the correction, see ``pipeline.estimation.correction``
+    steps: list[dict[str, Any]]  # its steps of the correction, see ``pipeline.estimation.stages``
     values: Quantities  # value and unit of each of its parameters
     # each (3,); its factors in the contract's form
     positive: Values = field(default_factory=lambda: np.ones(3))

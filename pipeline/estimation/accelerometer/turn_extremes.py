@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.correction import apply_step
 from pipeline.estimation.least_squares import certificate, certified
+from pipeline.estimation.stages import apply_step
 from pipeline.estimation.turns import filtered_alike, fit_sinusoid, wrap
 from pipeline.records import AXES
 

@@ -20,9 +20,9 @@ from pipeline.estimation.multi_position.fit import fit_robustly
 from pipeline.estimation.multi_position.gyroscope import FEWEST_MOVES, MOVED, model_of
 from pipeline.estimation.multi_position.likelihood import NEW, prior_hypotheses
 from pipeline.estimation.multi_position.model import State
-from pipeline.estimation.multi_position.rests import ROLE, is_multi_position
 from pipeline.estimation.multi_position.result import with_budget
 from pipeline.estimation.noise import noise_of, prior_of
+from pipeline.estimation.rest_means import ROLE, is_multi_position
 from pipeline.records import AXES, SensorCalibration, StageResult
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ import numpy as np
 
 from pipeline.estimation.multi_position.faces_and_turns import faces_of
 from pipeline.estimation.multi_position.model import Equations, State, effect_readings, motion_of
-from pipeline.estimation.multi_position.rests import HELD_OUT, rests_of
+from pipeline.estimation.rest_means import HELD_OUT, rests_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from pipeline.estimation.design import Term
     from pipeline.estimation.multi_position.faces_and_turns import Faces
-    from pipeline.estimation.multi_position.rests import Rests
+    from pipeline.estimation.rest_means import Rests
     from pipeline.records import Motion, Noise, Recording, SensorCalibration
 
     Values = NDArray[np.float64]

@@ -27,7 +27,7 @@ import numpy as np
 from pipeline.errors import NotObservableError
 from pipeline.estimation.multi_position.model import effect_readings, motion_of
 from pipeline.estimation.multi_position.moves import sound_span
-from pipeline.estimation.multi_position.rests import ROLE
+from pipeline.estimation.rest_means import ROLE
 from pipeline.records import AXES
 from pipeline.signal.hand_turns import ACROSS, multiples
 
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
     from pipeline.estimation.design import Term
     from pipeline.estimation.multi_position.model import State
-    from pipeline.estimation.multi_position.rests import Rests
+    from pipeline.estimation.rest_means import Rests
     from pipeline.records import Motion, Recording, SensorCalibration
 
     Values = NDArray[np.float64]

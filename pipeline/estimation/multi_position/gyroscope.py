@@ -32,9 +32,8 @@ from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.multi_position.accelerometer import SMALLEST_NOISE, white_of
 from pipeline.estimation.multi_position.faces_and_turns import require_turns, turns_of
-from pipeline.estimation.multi_position.gravity import observed_rests
 from pipeline.estimation.multi_position.model import Equations, State, effect_readings, motion_of
-from pipeline.estimation.multi_position.moves import moves_of, tangents, to_the_end
+from pipeline.estimation.multi_position.moves import moves_of, observed_rests, tangents, to_the_end
 from pipeline.model.kinematics import skew
 
 if TYPE_CHECKING:
@@ -45,9 +44,8 @@ if TYPE_CHECKING:
     from pipeline.estimation.design import Term
     from pipeline.estimation.multi_position.faces_and_turns import Turns
     from pipeline.estimation.multi_position.fit import Fit
-    from pipeline.estimation.multi_position.gravity import Gravity
-    from pipeline.estimation.multi_position.moves import Moves
-    from pipeline.estimation.multi_position.rests import Rests
+    from pipeline.estimation.multi_position.moves import Gravity, Moves
+    from pipeline.estimation.rest_means import Rests
     from pipeline.records import Motion, Noise, Recording, SensorCalibration
 
     Values = NDArray[np.float64]

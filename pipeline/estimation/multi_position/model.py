@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from pipeline.estimation.multi_position.accelerometer import AccelerometerModel
     from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
     from pipeline.estimation.multi_position.likelihood import NoiseHypothesis
-    from pipeline.estimation.multi_position.rests import Rests
+    from pipeline.estimation.rest_means import Rests
     from pipeline.model.effects.base import Effect
 
     Model: TypeAlias = AccelerometerModel | GyroscopeModel

@@ -3,6 +3,9 @@
 The Monte Carlo run of the budget is to second order of the model. The errors of the equations are drawn under every
 hypothesis of the noise by its weight, and solved for with the weights of that hypothesis, as the fit averages over
 them; the prior of the parameters is added as equations ``sqrt(P) p = 0 +- 1``.
+
+Where the procedure states faces, bias and full matrix of the accelerometer are fitted after the nine parameters of
+gravity's length, by the equations of ``accelerometer`` and ``faces_and_turns``. The matrix refers to the case.
 """
 
 from __future__ import annotations
@@ -17,13 +20,16 @@ from pipeline.estimation.engine import draw_normal
 from pipeline.estimation.least_squares import certified
 from pipeline.estimation.monte_carlo import beside_trials, quadratic_results, trials_of
 from pipeline.estimation.multi_position import accelerometer, gyroscope
-from pipeline.estimation.multi_position.fit import plausible, require_observable
-from pipeline.estimation.multi_position.likelihood import selection_hypotheses
-from pipeline.estimation.multi_position.model import parameter_places, refusal, stepped
+from pipeline.estimation.multi_position.faces_and_turns import DEPARTS, FACES, faces_of
+from pipeline.estimation.multi_position.fit import fit, plausible, require_observable
+from pipeline.estimation.multi_position.likelihood import prior_hypotheses, selection_hypotheses
+from pipeline.estimation.multi_position.model import State, parameter_places, refusal, stepped
 from pipeline.estimation.multi_position.selection import fit_configured, limits_of, select
+from pipeline.estimation.noise import noise_of, prior_of
+from pipeline.estimation.rest_means import rests_of
 from pipeline.estimation.uncertainty_budget import combined, gravity_contribution, scatter_contribution, type_b
 from pipeline.model.effects import effect
-from pipeline.records import NORMAL, FittedEffect, SensorCalibration, StageResult
+from pipeline.records import AXES, NORMAL, FittedEffect, SensorCalibration, StageResult
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -32,7 +38,7 @@ if TYPE_CHECKING:
 
     from pipeline.estimation.multi_position.fit import Fit
     from pipeline.estimation.multi_position.model import Model
-    from pipeline.records import Contribution, Noise, Recording
+    from pipeline.records import Contribution, Noise, Recording, SensorCalibration
 
     Values = NDArray[np.float64]
 
@@ -48,6 +54,7 @@ NOT_INCLUDED = {
     "temperature": "the parameters hold at the temperature of these recordings; no accuracy of the thermometer is "
     "stated",
 }
+NAME = "faces"
 
 
 def model_of(
@@ -218,3 +225,60 @@ def _curvature(model: Model, found: Fit, parameters: int) -> Values:
         slopes.append(change / (more[j] - less[j]) if step[j] > 0.0 else np.zeros_like(change))
     H = np.stack(slopes, axis=2)
     return np.asarray(0.5 * (H + H.transpose(0, 2, 1)))
+
+
+def require_faces(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> None:
+    """Raise ``NotObservableError`` that names the faces without a rest, by the readings as they are."""
+    rests = rests_of("accelerometer", recordings, settings)
+    if rests is not None:
+        used = rests.select(~rests.held_out)
+        faces_of(used, used.reading, settings)
+
+
+def fit_faces(
+    before: SensorCalibration, recordings: Sequence[Recording], settings: Mapping[str, Any]
+) -> SensorCalibration:
+    """Return the calibration of rests and their faces; ``before`` is that of the rests alone.
+
+    Raises ``NotObservableError`` if there is no rest on a face.
+    """
+    model = accelerometer.model_of(recordings, before, noise_of("accelerometer", recordings, settings), settings)
+    assert model is not None  # noqa: S101
+    assert model.faces is not None  # noqa: S101
+    prior = prior_of("accelerometer", recordings, settings)
+    noises = prior_hypotheses(prior, float(np.mean(model.white)), model.kinds)
+    found = fit(model, State(before.bias, before.matrix), noises, {})
+    names = [f"bias_{a}" for a in AXES] + [f"matrix_{a}{b}" for a in AXES for b in AXES]
+    values = np.concatenate([found.state.bias, found.state.matrix.ravel()])
+    parameters = {
+        name: {"value": float(v), "unit": "g" if i < 3 else "1", "standard_uncertainty": float(u)}
+        for i, (name, v, u) in enumerate(zip(names, values, np.sqrt(np.diag(found.covariance)), strict=True))
+    }
+    force, _ = model.specific_force(found.state, model.rests)
+    off = np.degrees(np.einsum("rmc,mc->r", model.faces.weights(), force) / model.gravity).reshape(-1, 2)
+    departs = zip(FACES, np.linalg.norm(off, axis=1), strict=True)
+    accuracy = float(settings["procedure"]["faces"]["accuracy_deg"])
+    details = {
+        "departures": [
+            f"face {name} is {angle:.1f} deg off what the others say, {angle / accuracy:.1f} times "
+            "procedure.faces.accuracy_deg"
+            for name, angle in departs
+            if angle > DEPARTS * accuracy
+        ],
+        "rests_on_faces": {name: int(np.count_nonzero(model.faces.face == i)) for i, name in enumerate(FACES)},
+        "face_off_deg": dict(zip(FACES, np.linalg.norm(off, axis=1).tolist(), strict=True)),
+        "scatter_of_rests": found.noise.scatter[0],
+        "condition": found.condition,
+        "degrees_of_freedom": float(found.degrees_of_freedom.min()),
+    }
+    at_rest = slice(0, model.rests_equations)
+    rms = float(np.sqrt(np.mean((found.residual[at_rest] * found.error[at_rest]) ** 2)))
+    calibration = replace(
+        before,
+        bias=found.state.bias,
+        matrix=found.state.matrix,
+        stages=(*before.stages, StageResult(NAME, parameters, rms, None, details)),
+        converged=found.converged,
+        convergence=certified(found.cosine, found.condition, found.rank, len(found.covariance)),
+    )
+    return with_budget(calibration, found.covariance, found.degrees_of_freedom, model, found, settings)

@@ -12,8 +12,8 @@ from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.accelerometer.ellipsoid_fit import derivative_of, error_of, fit_ellipsoid
 from pipeline.estimation.accelerometer.nonlinear_least_squares import fit
 from pipeline.estimation.accelerometer.orientations import Orientations
-from pipeline.estimation.correction import apply_correction
 from pipeline.estimation.rest_means import held_out_rests, rest_means
+from pipeline.estimation.stages import apply_correction
 from pipeline.records import Recording, SensorCalibration, StageResult, coverage_factor
 
 DATA = Path(__file__).parents[3] / "../shared/data"

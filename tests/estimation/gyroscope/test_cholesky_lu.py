@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from pipeline.errors import CannotCalibrateError, ConfigurationError, NotObservableError
-from pipeline.estimation.correction import apply_correction
 from pipeline.estimation.gyroscope.cholesky_lu import factorise, fit
 from pipeline.estimation.gyroscope.staged import fit as fit_stage
+from pipeline.estimation.stages import apply_correction
 from pipeline.records import Recording, SensorCalibration, coverage_factor
 
 INTERVAL = 0.12

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.estimation.multi_position.gravity import gravity_of
-from pipeline.estimation.multi_position.moves import clocks_of
-from pipeline.estimation.multi_position.rests import rests_of
+from pipeline.estimation.multi_position.moves import clocks_of, gravity_of
+from pipeline.estimation.rest_means import rests_of
 from pipeline.records import Recording, SensorCalibration
 
 NOISE = 5e-4
