@@ -19,7 +19,7 @@ from pipeline.diagnosis.verdict import verdict_of_selection
 from pipeline.diagnosis.words import FAR_OFF, plain
 from pipeline.estimation.candidates import turns_of
 from pipeline.estimation.design import Start
-from pipeline.estimation.generalized_least_squares import calibration_of, fit_terms
+from pipeline.estimation.generalized_least_squares import calibration_of, fit_in_mean_frame, fit_terms
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import FAR_ABOVE, select
 from pipeline.model.effects import catalogue
@@ -86,6 +86,8 @@ def findings(
         most = max((explained[j] for j in reported.first.indices(name)), default=0.0)
         return float(most) / reported.first.samples * white_square
 
+    final, _ = fit_in_mean_frame(reported.fit)
+
     def advice(verdict: str) -> str:
         if verdict == "unexplained":
             return FAR_OFF
@@ -105,8 +107,8 @@ def findings(
         verdict=verdict,
         steps=reported.steps,
         alone=reported.alone,
-        terms=reported.fit.terms,
-        covariance=reported.fit.covariance,
+        terms=final.terms,
+        covariance=final.covariance,
         limits=reported.limits,
         shares=lambda name: _shares(reported, name),
         left=left,
@@ -162,16 +164,19 @@ def _held_out(
     if not samples:
         return None, 0.0
     calibrations = [calibration_of(sensor, fit, selection.observations, None) for fit in fits]
-    errors = []
-    for calibration in calibrations:
+    corrected = [[with_known_effects(calibration, each, None) for each in samples] for calibration in calibrations]
+    directed = all(true is not None for each in corrected for _, _, true in each)
+    errors: list[float] = []
+    for found in corrected:
         squares = []
-        for each in samples:
-            vector, magnitude, true = with_known_effects(calibration, each, None)
-            off = np.linalg.norm(vector, axis=1) - magnitude if true is None else np.linalg.norm(vector - true, axis=1)
+        for each, (vector, magnitude, true) in zip(samples, found, strict=True):
+            off = np.linalg.norm(vector, axis=1) - magnitude
+            if directed and true is not None:
+                off = np.linalg.norm(vector - true, axis=1)
             squares.append(off[each.known] ** 2)
         errors.append(float(np.sqrt(np.nanmean(np.concatenate(squares)))))
     floor, vector_floor = noise_floors(calibrations[-1], samples)
-    return errors, floor if vector_floor is None else vector_floor
+    return errors, floor if vector_floor is None or not directed else vector_floor
 
 
 def _shares(selection: Selection, name: str) -> dict[str, float]:

@@ -327,14 +327,12 @@ def calibration_of(  # noqa: PLR0917  (what a fit with effects is)
     With ``settings``, the accuracies of their table are in the uncertainties, but for those that an effect of the fit
     estimates.
     """
-    fit = _in_mean_frame(fit)
+    fit, turned = fit_in_mean_frame(fit)
     matrix = np.asarray(np.linalg.solve(fit.K, np.eye(3)), np.float64)
     change = np.eye(len(fit.covariance))
     change[3:BASE, 3:BASE] = -np.kron(matrix, matrix.T)
-    for place, term in zip(_slices(fit), fit.terms, strict=True):
-        if isinstance(term.effect, Mounting):
-            change = change @ errors_in_mean_frame(fit.K, term.values, place, len(change))
     covariance = change @ fit.covariance @ change.T
+    change = change @ turned
     uncertainty = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
     effects, parameters, at = [], {}, BASE
     for term in fit.terms:
@@ -388,20 +386,18 @@ def calibration_of(  # noqa: PLR0917  (what a fit with effects is)
     return budgeted(found, reference, errors, lines, settings, results, names)
 
 
-def _in_mean_frame(fit: Fit) -> Fit:
-    """Return a fit in the frame of the mean of the mountings."""
+def fit_in_mean_frame(fit: Fit) -> tuple[Fit, NDArray[np.float64]]:
+    """Return a fit in the frame of the mean of the mountings, and the map of its errors to those there."""
+    at = BASE
     for place, term in enumerate(fit.terms):
+        own = slice(at, at + len(term.values))
+        at = own.stop
         if isinstance(term.effect, Mounting):
             K, theta = in_mean_frame(fit.K, term.values)
+            change = errors_in_mean_frame(K, theta, own, len(fit.covariance))
             terms = (*fit.terms[:place], replace(term, values=theta), *fit.terms[place + 1 :])
-            return replace(fit, K=K, terms=terms)
-    return fit
-
-
-def _slices(fit: Fit) -> list[slice]:
-    """Return the place of each effect's parameters."""
-    ends = BASE + np.cumsum([len(term.values) for term in fit.terms]).astype(int)
-    return [slice(int(end) - len(term.values), int(end)) for end, term in zip(ends, fit.terms, strict=True)]
+            return replace(fit, K=K, terms=terms, covariance=change @ fit.covariance @ change.T), change
+    return fit, np.eye(len(fit.covariance))
 
 
 def _with_matrix(values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from pipeline.preprocessing.bench import Bench, TurnFit
     from pipeline.records import Recording
 
+UNMAPPED = ["+x", "+y", "+z"]
 TOLERANCE_DEG = 5.0
 TIME_OFFSET_S = 0.04  # largest plausible one where the sensor's config states none: as in configs/sensor/*.yaml
 AGREES_G = 0.7  # of 1 g, within 45 deg of the axis
@@ -75,7 +76,9 @@ def check_mounting(recordings: Sequence[Recording], settings: Mapping[str, Any])
     departures = {t.name: d for t in known if (d := departure(t, tolerance)) is not None}
     refused = [d for d in departures.values() if d.bench is None]
     found = [replace(t, found=departures[t.name].bench) if t.name in departures else t for t in known]
-    if _negated(found, tolerance.angle_deg):
+    mapped = any(list(axes) != UNMAPPED for axes in maps.values())
+    turned = any(d.code in {"wrong_axis", "wrong_face"} for d in departures.values())
+    if _negated(found, tolerance.angle_deg) or (mapped and turned):  # an axis map that is stated may be wrong
         refused = list(departures.values())
     if refused:
         raise _refusal(refused, known, accelerometer, maps)

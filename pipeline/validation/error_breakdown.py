@@ -20,6 +20,7 @@ from pipeline.errors import ConfigurationError
 from pipeline.estimation.stages import apply_correction
 from pipeline.model.effects import effect_of
 from pipeline.model.effects.base import truth
+from pipeline.model.effects.mounting import Mounting
 from pipeline.model.log_motion import LogEnd, fields_used, log_motion
 from pipeline.model.measurement import Part, linear_truth, solve
 from pipeline.records import Motion
@@ -61,6 +62,8 @@ def error_breakdown(
             shown.append(fitted)
         figures.append(_figures(f"+ {fitted.name}", [_with_effects(calibration, shown, other, s) for s in samples]))
     raw = figures[0]["mean_abs_error"]
+    if not all(direction_known(calibration, s) for s in samples):
+        figures = [row | {"vector_rms_error": None} for row in figures]
     for row in figures:
         row["change_percent"] = 100.0 * (raw - row["mean_abs_error"]) / raw if raw else None
     return figures, notes
@@ -145,7 +148,14 @@ def _with_effects(
     rest = Part.of(calibration, own).take_off(samples.reading, motion)
     moved, logged = truth(samples.sensor, motion), truth(samples.sensor, samples.motion)
     change = np.linalg.norm(moved, axis=1) - np.linalg.norm(logged, axis=1)
-    return linear_truth(calibration, rest), samples.magnitude + change, moved
+    direction = moved if direction_known(calibration, samples) else None
+    return linear_truth(calibration, rest), samples.magnitude + change, direction
+
+
+def direction_known(calibration: SensorCalibration, samples: Samples) -> bool:
+    """Return whether the attitude log shows the direction: not where this recording may have another mounting."""
+    anew = [e for fitted in calibration.effects if isinstance(e := effect_of(fitted), Mounting)]
+    return samples.motion is not None and all(samples.motion.recording in e.recordings for e in anew)
 
 
 def _moved(motion: Motion, effects: Sequence[FittedEffect]) -> Motion:

@@ -21,7 +21,7 @@ from pipeline.estimation.rest_means import held_out_rests, split_rests
 from pipeline.model.effects.base import truth, unit_of
 from pipeline.model.kinematics import EARTH_RATE_DPS
 from pipeline.model.measurement import linear_truth
-from pipeline.validation.error_breakdown import error_breakdown, last_error_of_magnitude
+from pipeline.validation.error_breakdown import direction_known, error_breakdown, last_error_of_magnitude
 from pipeline.validation.expected_error import expected_rms_error, linearized
 from pipeline.validation.norm_error import squared_norm_errors
 from pipeline.validation.samples import samples_of_motion, samples_of_rests
@@ -169,7 +169,7 @@ def noise_floors(calibration: SensorCalibration, samples: Sequence[Samples]) -> 
         squared_norm_errors(_truth(calibration, s)[s.known], calibration.matrix, s.variance[s.known]) for s in samples
     ]
     floor = float(np.sqrt(np.mean(np.concatenate(squares))))
-    if any(s.motion is None for s in samples):
+    if not all(direction_known(calibration, s) for s in samples):
         return floor, None
     vectors = np.concatenate([s.variance[s.known] @ np.sum(calibration.matrix**2, axis=0) for s in samples])
     return floor, float(np.sqrt(np.mean(vectors)))
