@@ -236,7 +236,7 @@ def _residual_noise(design: Design, observations: Observations, settings: Sequen
     free = max(3.0 * observations.samples - design.count, 1.0)
     variance = np.maximum(rss / free, np.finfo(float).tiny)[:, None]
     logarithms = logarithms + np.linalg.slogdet(gram)[1]
-    found = ResidualNoise.of(observations.blocks, settings, logarithms, variance, free, observations.weight)
+    found = ResidualNoise.of(observations.blocks, settings, logarithms, variance, free, observations.noise_weight)
     return replace(found, white_variance=found.white_variance * design.scale**2)
 
 

@@ -53,6 +53,7 @@ class Part:
     scatter: NDArray[np.float64]  # (3,); sum of squares about the means, weighted
     clock_shared: bool
     interval: float  # s; between the recording's samples
+    noise_weight: NDArray[np.float64] | None = None  # (m,); weight by noise alone, where it differs
     moved: dict[tuple[tuple[str, bytes], ...], Motion] = field(default_factory=dict, compare=False, repr=False)
 
 
@@ -78,6 +79,11 @@ class Observations:
     def weight(self) -> NDArray[np.float64]:
         """All weights: (n,) array."""
         return np.concatenate([part.weight for part in self.parts])
+
+    @cached_property
+    def noise_weight(self) -> NDArray[np.float64]:
+        """All weights by noise alone, without errors of the angle: (n,) array."""
+        return np.concatenate([p.weight if p.noise_weight is None else p.noise_weight for p in self.parts])
 
     @cached_property
     def scatter(self) -> NDArray[np.float64]:
@@ -158,7 +164,7 @@ def _with_stops(part: Part, observations: Observations, white: float) -> Part:
     weight = part.weight / (1.0 + together[group])
     rests = ~moving
     share = float(weight[rests].sum() / part.weight[rests].sum()) if rests.any() else 1.0
-    return replace(part, weight=weight, scatter=share * part.scatter)
+    return replace(part, weight=weight, scatter=share * part.scatter, noise_weight=part.weight)
 
 
 def observe(sensor: str, recordings: Sequence[Recording], table: Mapping[str, Any]) -> Observations:
