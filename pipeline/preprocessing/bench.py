@@ -35,7 +35,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
     from pipeline.records import Recording
 
-FEWEST_AT_REST = 10
+FEWEST = 10  # samples, five times the unknowns of an angle
 ACROSS = np.cross(UP_AT_ZERO, np.eye(3))  # u x a: what points up at 90 deg
 # Smallest eigenvalue of the mean square of (cos A, sin A) beside a constant: reached by an arc of 110 deg. Below, a
 # nonlinearity of 0.5 % (MPU-6050 product specification 3.4) would turn p by more than 3 deg.
@@ -65,20 +65,10 @@ ALIKE = 0.9  # correlation of a gyroscope axis with the rate from which its gain
 
 @dataclass(frozen=True)
 class Bench:
-    """How a recording's bench holds the unit.
+    """How a recording's bench holds the unit, and how its table counts the angle."""
 
-    Attributes
-    ----------
-    axis : str
-        Body axis turned about.
-    up : str
-        Body axis, with its sign, that points up where the table logs ``zero_deg``.
-    sense : int
-    zero_deg : float, deg
-    """
-
-    axis: str
-    up: str
+    axis: str  # body axis turned about
+    up: str  # body axis, with its sign, that points up where the table logs ``zero_deg``
     sense: int = 1
     zero_deg: float = 0.0
 
@@ -95,24 +85,13 @@ class Bench:
     @property
     def offset(self) -> float:
         """What is added to ``sense * A`` for the convention's angle, deg."""
-        return self._face - self.sense * self.zero_deg
-
-    @property
-    def _face(self) -> float:
-        return 0.0 if self.vertical else float(np.degrees(angle_of(signed_axis(self.up), self.axis)))
+        a, up = AXES.index(self.axis), signed_axis(self.up)
+        face = 0.0 if self.vertical else float(np.degrees(np.arctan2(up @ ACROSS[a], up @ UP_AT_ZERO[a])))
+        return face - self.sense * self.zero_deg
 
 
 def stated_bench(entry: Mapping[str, Any], table: Mapping[str, Any], axis: str) -> Bench:
-    """Return what the configuration says of a recording's bench.
-
-    Parameters
-    ----------
-    entry : mapping
-        The recording's entry in the procedure: ``up``, ``sense``, ``zero_deg``; what is None is the table's.
-    table : mapping
-        ``sense`` and ``zero_deg``, for every recording that does not state its own.
-    axis : str
-    """
+    """Return what a recording's entry in the procedure says of its bench; sense and zero are the table's else."""
     own = {k: table.get(k) if entry.get(k) is None else entry[k] for k in ("sense", "zero_deg")}
     return Bench(axis, entry.get("up") or usual_up(axis), int(own["sense"] or 1), float(own["zero_deg"] or 0.0))
 
@@ -122,26 +101,18 @@ def found_bench(fit: TurnFit, axis: str) -> Bench | None:
 
     The sense is that of q x p along the axis, the zero what turns p and q onto the nearest face with least squares.
     """
-    if fit.turn_axis is None or fit.cosine is None or fit.sine is None:
+    if fit.gravity is None or fit.turn_axis is None:
         return None
     a = AXES.index(axis)
     sense = 1 if fit.turn_axis[a] > 0.0 else -1
-    up, across = UP_AT_ZERO[a], ACROSS[a]
-    along = fit.cosine @ up + sense * (fit.sine @ across)
-    beside = fit.cosine @ across - sense * (fit.sine @ up)
+    (_, cosine, sine), up, across = fit.gravity, UP_AT_ZERO[a], ACROSS[a]
+    along = cosine @ up + sense * (sine @ across)
+    beside = cosine @ across - sense * (sine @ up)
     return bench_of(axis, sense, float(np.degrees(np.arctan2(beside, along))))
 
 
 def bench_of(axis: str, sense: int, at_zero: float) -> Bench:
-    """Return the bench with the nearest face and the smallest zero.
-
-    Parameters
-    ----------
-    axis : str
-    sense : int
-    at_zero : float, deg
-        The convention's angle where the table logs 0.
-    """
+    """Return the bench with the nearest face and the smallest zero; ``at_zero``: convention's angle at table angle 0."""
     a, face = AXES.index(axis), 90.0 * round(at_zero / 90.0)
     up = nearest_axis(np.cos(np.radians(face)) * UP_AT_ZERO[a] + np.sin(np.radians(face)) * ACROSS[a])
     return Bench(axis, up, sense, sense * (face - at_zero))
@@ -156,27 +127,22 @@ def off_at_rest(recording: Recording, bench: Bench) -> float | None:
     if angle is None or force is None:
         return None
     still = still_samples(recording.time, np.gradient(angle, recording.time)) & recording.valid
-    if np.sum(still) < FEWEST_AT_REST:
+    if np.sum(still) < FEWEST:
         return None
-    up, across = UP_AT_ZERO[AXES.index(bench.axis)], ACROSS[AXES.index(bench.axis)]
+    a = AXES.index(bench.axis)
+    up, across = UP_AT_ZERO[a], ACROSS[a]
     A = np.radians(bench.sense * angle[still] + bench.offset)
     c, s, along, beside = np.cos(A), np.sin(A), force[still] @ up, force[still] @ across
     return float(np.degrees(np.arctan2(c @ beside - s @ along, c @ along + s @ beside)))
 
 
-def by_convention(fit: TurnFit, bench: Bench) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Return p and q of a turn against the convention's angle: two (3,) arrays, or None where gravity does not tell."""
-    if fit.cosine is None or fit.sine is None or bench.vertical or fit.vertical is not None:
+def by_convention(fit: TurnFit, bench: Bench) -> Gravity | None:
+    """Return c, p and q of a turn against the convention's angle; None where gravity does not tell."""
+    if fit.gravity is None or bench.vertical or fit.vertical is not None:
         return None
-    at_zero = np.radians(bench.offset)
-    c, s = np.cos(at_zero), np.sin(at_zero)
-    return c * fit.cosine - bench.sense * s * fit.sine, s * fit.cosine + bench.sense * c * fit.sine
-
-
-def angle_of(direction: NDArray[np.float64], axis: str) -> float:
-    """Return the convention's angle at which a body direction points up, rad."""
-    a = AXES.index(axis)
-    return float(np.arctan2(direction @ ACROSS[a], direction @ UP_AT_ZERO[a]))
+    c, s = np.cos(np.radians(bench.offset)), np.sin(np.radians(bench.offset))
+    constant, cosine, sine = fit.gravity
+    return Gravity(constant, c * cosine - bench.sense * s * sine, s * cosine + bench.sense * c * sine)
 
 
 def usual_up(axis: str) -> str:
@@ -202,89 +168,72 @@ def off_axis_deg(direction: NDArray[np.float64]) -> float:
     return float(np.degrees(np.arccos(np.clip(np.max(np.abs(direction)) / np.linalg.norm(direction), -1.0, 1.0))))
 
 
+class Gravity(NamedTuple):
+    """c, p and q above: (3,) arrays, g."""
+
+    constant: NDArray[np.float64]
+    cosine: NDArray[np.float64]
+    sine: NDArray[np.float64]
+
+
 @dataclass(frozen=True)
 class TurnFit:
-    """Evidence of one recording.
+    """Evidence of one recording."""
 
-    Attributes
-    ----------
-    constant, cosine, sine : (3,) array or None, g
-        c, p and q above; None where the angle does not cover enough.
-    gain : (3,) array or None
-        k above, deg/s per deg/s of the table's angle; None where the rate does not tell.
-    mean_rate : float, deg/s
-        Mean rate of the angle over the samples; with a time offset it is a part of the zero.
-    arc : float, deg
-        What the angle covers.
-    unknown : str
-        Why gravity tells nothing; empty where it does.
-    """
-
-    constant: NDArray[np.float64] | None
-    cosine: NDArray[np.float64] | None
-    sine: NDArray[np.float64] | None
-    gain: NDArray[np.float64] | None
-    mean_rate: float
-    arc: float
-    unknown: str = ""
+    gravity: Gravity | None  # None where the angle does not cover enough
+    gain: NDArray[np.float64] | None  # (3,), k above; None where the rate does not tell
+    mean_rate: float  # deg/s, of the angle over the samples; with a time offset it is a part of the zero
+    arc: float  # deg
+    unknown: str = ""  # why gravity tells nothing
 
     @cached_property
     def turn_axis(self) -> NDArray[np.float64] | None:
         """Unit vector about which the unit turns as the angle grows, by gravity: (3,) array, or None."""
-        if self.cosine is None or self.sine is None or self.vertical is not None:
+        if self.gravity is None or self.vertical is not None:
             return None
-        return _unit(np.cross(self.sine, self.cosine))
+        return unit(np.cross(self.gravity.sine, self.gravity.cosine))
 
     @cached_property
     def vertical(self) -> NDArray[np.float64] | None:
         """Direction of gravity's reaction where the turn leaves it as it is (a vertical axis): (3,) array, or None."""
-        if self.constant is None or self.cosine is None or self.sine is None:
+        if self.gravity is None:
             return None
-        turning = float(np.hypot(np.linalg.norm(self.cosine), np.linalg.norm(self.sine)))
-        staying = float(np.linalg.norm(self.constant))
-        return _unit(self.constant) if turning < 0.25 * staying else None
+        staying, cosine, sine = self.gravity
+        turning = float(np.hypot(np.linalg.norm(cosine), np.linalg.norm(sine)))
+        return unit(staying) if turning < 0.25 * float(np.linalg.norm(staying)) else None
 
 
 def fit_turn(recording: Recording) -> TurnFit:
-    """Return what the rows of a turn recording tell of its mounting.
-
-    Parameters
-    ----------
-    recording : Recording
-        In body axes, with the table's angle, its rate, or both.
-    """
-    angle = recording.table_angle
-    rate = recording.table_rate
+    """Return what the rows of a turn recording, with the table's angle, its rate, or both, tell of its mounting."""
+    angle, rate = recording.table_angle, recording.table_rate
     slope = None if angle is None or recording.samples < 2 else np.gradient(angle, recording.time)
-    gain = None
-    if rate is not None or slope is not None:
-        used = rate if rate is not None else slope
-        gain = _gain(recording, used)
-        if gain is not None and rate is not None and slope is not None and float(rate @ slope) < 0.0:
-            gain = -gain  # the rate counts against the angle: compared with gravity here, and refused as a reference
+    used = slope if rate is None else rate
+    gain = _gain(recording, used)
+    if gain is not None and rate is not None and slope is not None and float(rate @ slope) < 0.0:
+        gain = -gain  # the rate counts against the angle: compared with gravity here, and refused as a reference
     if angle is None or recording.accelerometer is None:
         missing = "angle of the table" if angle is None else "accelerometer"
-        return TurnFit(None, None, None, gain, 0.0, 0.0, f"the log holds no {missing}")
+        return TurnFit(None, gain, 0.0, 0.0, f"the log holds no {missing}")
     keep = recording.valid
     A, reading = np.radians(angle[keep]), recording.accelerometer[keep]
     arc = float(np.ptp(angle)) if len(angle) else 0.0
     mean_rate = 0.0 if slope is None else float(np.mean(slope))
-    other = _of_rate(rate if rate is not None else slope, keep)
+    other = _of_rate(used, keep)
     # Normal equations of both, those of the rate eliminated.
     columns = np.column_stack([other, np.cos(A), np.sin(A), reading])
     products, m = columns.T @ columns, other.shape[1]
     inverse = np.linalg.pinv(products[:m, :m], rcond=SMALLEST_SHARE, hermitian=True)
     left = products[m:, m:] - products[m:, :m] @ inverse @ products[:m, m:]
     normal = left[:2, :2]
-    if len(A) < 10 or np.linalg.eigvalsh(normal / len(A))[0] < LEAST_COVERAGE:
-        return TurnFit(None, None, None, gain, mean_rate, arc, f"the table angle covers {arc:.3g} deg only")
+    if len(A) < FEWEST or np.linalg.eigvalsh(normal / len(A))[0] < LEAST_COVERAGE:
+        return TurnFit(None, gain, mean_rate, arc, f"the table angle covers {arc:.3g} deg only")
     found = np.linalg.solve(normal, left[:2, 2:])
     residual = np.diag(left[2:, 2:] - left[2:, :2] @ found) / len(A)
     scatter = float(np.sqrt(np.max(residual.clip(0.0)) * np.max(np.diag(np.linalg.inv(normal)))))
     if scatter > LARGEST_UNCERTAINTY:
-        return TurnFit(None, None, None, gain, mean_rate, arc, "the accelerometer does not follow the table angle")
+        return TurnFit(None, gain, mean_rate, arc, "the accelerometer does not follow the table angle")
     constant = np.mean(reading, axis=0) - np.mean(columns[:, m : m + 2], axis=0) @ found
-    return TurnFit(constant, found[0], found[1], gain, mean_rate, arc)
+    return TurnFit(Gravity(constant, found[0], found[1]), gain, mean_rate, arc)
 
 
 def _of_rate(rate: NDArray[np.float64] | None, keep: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -298,6 +247,7 @@ def _of_rate(rate: NDArray[np.float64] | None, keep: NDArray[np.bool_]) -> NDArr
 
 
 def _gain(recording: Recording, rate: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+    """Return k above where a gyroscope axis follows the rate."""
     if recording.gyroscope is None or rate is None:
         return None
     keep = recording.valid
@@ -314,5 +264,6 @@ def _gain(recording: Recording, rate: NDArray[np.float64] | None) -> NDArray[np.
     return np.asarray(gain) if alike >= ALIKE else None
 
 
-def _unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+def unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a vector of length 1."""
     return np.asarray(vector / max(float(np.linalg.norm(vector)), 1e-30))

@@ -1,15 +1,10 @@
-"""Checks that need all recordings of a unit: their mounting, their reference, and whether they share samples.
+"""Checks that need all recordings of a unit: its rests, its reference, its mounting, and whether they share samples.
 
-Checks of a single file are in ``pipeline.io``. The order is: the reference of the turns (do angle, rate,
-gyroscope, gravity and time agree in size), mounting (which direction was up, which way the table turned), then the
-reference of held-out motion, then shared samples.
-
-Shared samples mean that held-out motion is not held out. The rows of all recordings are compared as the numbers of
-their sensor channels, rounded to ten digits so that another
-unit of the file does not hide them. Where recordings hold different numbers of decimals, they are compared again at the
-coarser ones, so that a rounded copy is found. A row counts where it occurs once in its own recording: rests of a
-coarse sensor repeat rows. Two recordings share samples where at least 20 such rows follow each other in both, each
-within 8 rows of the one before; by chance that is as improbable as
+Shared samples mean that held-out motion is not held out. The rows of all recordings are compared by the numbers of
+their sensor channels, rounded to ten digits so that another unit of the file does not hide them, and again at the
+coarser decimals of a rounded copy. A row counts where it occurs once in its own recording: rests of a coarse sensor
+repeat rows. Two recordings share samples where at least 20 such rows follow each other in both, each within 8 rows of
+the one before; by chance that is as improbable as
 
     (8 c / n)^19,   c : rows that occur in both,   n : rows of the longer recording
 
@@ -38,7 +33,7 @@ if TYPE_CHECKING:
 
     from pipeline.records import Recording
 
-FEWEST, APART = 20, 8
+FEWEST, APART = 20, 8  # rows, see above
 DIGITS = 10  # of 16 bits of counts in any unit, 5 are significant; twice that
 OF_DECIMALS = 200  # samples by which the decimals are told: a finer reading ends in a zero in a tenth of them
 MIX = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio (Knuth, TAOCP 3, 6.4): spreads sums of bit patterns
@@ -66,18 +61,7 @@ def check_recordings(recordings: Sequence[Recording], settings: Mapping[str, Any
 
 
 def check_shared_rows(recordings: Sequence[Recording]) -> None:
-    """Refuse two recordings that hold the same samples.
-
-    Parameters
-    ----------
-    recordings : sequence of Recording
-        All of a unit.
-
-    Raises
-    ------
-    IngestError
-        Naming both, and the rows.
-    """
+    """Refuse two recordings that hold the same samples, naming both and the rows."""
     decimals = [_decimals(r) for r in recordings]
     pairs = {tuple(min(a, b) for a, b in zip(x, y, strict=True)) for x, y in itertools.combinations(decimals, 2)}
     for coarse in sorted(pairs, reverse=True):

@@ -46,20 +46,7 @@ FEWEST_MISSED, CLEARLY_FEWER = 2, 4  # moves that gravity does not follow: one m
 def check_turns(
     turns: Sequence[tuple[Recording, TurnFit]], accelerometer: Matrix | None, maps: Mapping[str, Sequence[str]]
 ) -> None:
-    """Refuse turns in which gravity and the gyroscope turn about different axes.
-
-    Parameters
-    ----------
-    turns : sequence of (Recording, TurnFit)
-    accelerometer : (3, 3) array or None
-        M_a above.
-    maps : mapping
-        Axis map of each sensor.
-
-    Raises
-    ------
-    IngestError
-    """
+    """Refuse turns in which gravity and the gyroscope turn about different axes; ``accelerometer`` is M_a above."""
     seen: list[tuple[Recording, str, str]] = []
     for recording, fit in turns:
         n, k = fit.turn_axis, fit.gain
@@ -83,19 +70,7 @@ def check_turns(
 
 
 def check_moves(recording: Recording, maps: Mapping[str, Sequence[str]]) -> None:
-    """Refuse rests and moves in which gravity does not turn as the gyroscope says, but would with other axes.
-
-    Parameters
-    ----------
-    recording : Recording
-        Without a table.
-    maps : mapping
-        Axis map of each sensor.
-
-    Raises
-    ------
-    IngestError
-    """
+    """Refuse rests and moves by hand in which gravity turns as the gyroscope says only with other axes."""
     if recording.accelerometer is None or recording.gyroscope is None:
         return
     part = slice(0, MOST_SAMPLES)
@@ -144,23 +119,12 @@ def _between(seen: Sequence[tuple[Recording, str, str]]) -> Matrix | None:
 
 
 def nearest_permutation(total: Matrix) -> Matrix | None:
-    """Return the signed permutation that a matrix is nearest to, or None where none is near.
-
-    Parameters
-    ----------
-    total : (3, 3) array
-        Of the order of 1.
-    """
-    found = axis_matrix_or_none([nearest_axis(column) for column in total.T])
+    """Return the signed permutation that a matrix of the order of 1 is near to, or None."""
     scale = np.linalg.norm(total, axis=0)
-    if found is None or np.min(scale) < 0.25 or np.max(np.abs(total / scale - found)) > 0.5:
+    if np.min(scale) < 0.25:
         return None
-    return found
-
-
-def axis_matrix_or_none(entries: Sequence[str]) -> Matrix | None:
-    """Return the matrix of an axis map, or None where it names an axis twice."""
-    return axis_matrix(entries) if len({e[1] for e in entries}) == len(AXES) else None
+    near = [found for found in signed_permutations() if np.max(np.abs(total / scale - found)) <= 0.5]
+    return near[0] if near else None
 
 
 def as_map(matrix: Matrix) -> str:

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from pipeline.records import Recording
 
 UNMAPPED = ["+x", "+y", "+z"]
-TOLERANCE_DEG = 5.0
+TOLERANCE_DEG = 5.0  # default of procedure.mounting_tolerance_deg: beyond misalignments and seats of a careful bench
 TIME_OFFSET_S = 0.04  # largest plausible one where the sensor's config states none: as in configs/sensor/*.yaml
 AGREES_G = 0.7  # of 1 g, within 45 deg of the axis
 BIAS_DEG = 6.0  # zero that a bias of 0.1 g feigns where all rests are at one angle
@@ -66,23 +66,22 @@ def check_mounting(recordings: Sequence[Recording], settings: Mapping[str, Any])
     procedure, table, sensor = (settings.get(key) or {} for key in ("procedure", "table", "sensor"))
     turns = [_turn(r, procedure.get("recordings") or {}, table) for r in recordings]
     known = [t for t in turns if t is not None]
-    maps = axis_maps(sensor)
-    accelerometer = _accelerometer_axes(known)
+    maps, accelerometer = axis_maps(sensor), _accelerometer_axes(known)
     check_turns([(t.recording, t.fit) for t in known], accelerometer, maps)
     for recording in recordings:
         if recording.role == "rests":
             check_moves(recording, maps)
     tolerance = _tolerance(procedure, table, sensor)
-    departures = {t.name: d for t in known if (d := departure(t, tolerance)) is not None}
+    departures = {t.name: d for t in known if (d := _departure(t, tolerance)) is not None}
     refused = [d for d in departures.values() if d.bench is None]
     found = [replace(t, found=departures[t.name].bench) if t.name in departures else t for t in known]
     mapped = any(list(axes) != UNMAPPED for axes in maps.values())
     turned = any(d.code in {"wrong_axis", "wrong_face"} for d in departures.values())
     if _negated(found, tolerance.angle_deg) or (mapped and turned):  # an axis map that is stated may be wrong
         refused = list(departures.values())
+    hint = _hint(refused or list(departures.values()), known, accelerometer, maps) if departures else ""
     if refused:
-        raise _refusal(refused, known, accelerometer, maps)
-    hint = _hint(list(departures.values()), known, accelerometer, maps) if departures else ""
+        raise _refusal(refused, hint)
     zeros = refined_zeros(found) if departures and table.get("seat_deg") is None else {}
     used = {t.name: _as_found(t, departures.get(t.name), zeros) for t in known}
     recordings = [_turned_attitude(r) if departures else r for r in recordings]
@@ -93,9 +92,9 @@ def check_mounting(recordings: Sequence[Recording], settings: Mapping[str, Any])
     ]
 
 
-def _tolerance(procedure: Mapping[str, Any], table: Mapping[str, Any], sensor: Mapping[str, Any]) -> Tolerance:
+def _tolerance(procedure: Mapping[str, Any], table: Mapping[str, Any], sensor: Mapping[str, Any]) -> _Tolerance:
     limits = (sensor.get("accelerometer") or {}).get("effects") or {}
-    return Tolerance(
+    return _Tolerance(
         float(procedure.get("mounting_tolerance_deg") or TOLERANCE_DEG) + 3.0 * float(table.get("seat_deg") or 0.0),
         float(limits.get("time_offset") or TIME_OFFSET_S),
         float(table.get("rate_accuracy") or 0.0) if table.get("motion") == "commanded" else 0.0,
@@ -115,44 +114,33 @@ def _accelerometer_axes(turns: Sequence[Turn]) -> NDArray[np.float64] | None:
     total, count = np.zeros((3, 3)), np.zeros(3)
     seen = []
     for turn in turns:
-        both = by_convention(turn.fit, turn.stated)
-        if both is None:
+        gravity = by_convention(turn.fit, turn.stated)
+        if gravity is None:
             continue
-        cosine, sine = both
         a = AXES.index(turn.stated.axis)
-        up, across = UP_AT_ZERO[a], ACROSS[a]
-        total += np.outer(cosine, up) + np.outer(sine, across)
-        count += np.abs(up) + np.abs(across)
-        seen += [(cosine, up), (sine, across)]
+        for reading, true in ((gravity.cosine, UP_AT_ZERO[a]), (gravity.sine, ACROSS[a])):
+            total += np.outer(reading, true)
+            count += np.abs(true)
+            seen.append((reading, true))
     found = nearest_permutation(total / count) if np.all(count) else None
     if found is None or any(reading @ (found @ true) < AGREES_G for reading, true in seen):
         return None
     return found
 
 
-def _refusal(
-    departures: Sequence[Departure],
-    turns: Sequence[Turn],
-    accelerometer: NDArray[np.float64] | None,
-    maps: Mapping[str, Sequence[str]],
-) -> IngestError:
-    first = departures[0]
-    others = [d.turn.name for d in departures[1:]]
-    also = f"; likewise refused: {', '.join(others)}" if others else ""
-    return IngestError(
-        first.problem + also,
-        first.turn.recording.source.get("file"),
-        code=first.code,
-        hint=_hint(departures, turns, accelerometer, maps),
-    )
+def _refusal(departures: Sequence[_Departure], hint: str) -> IngestError:
+    first, *others = departures
+    also = f"; likewise refused: {', '.join(d.turn.name for d in others)}" if others else ""
+    return IngestError(first.problem + also, first.turn.recording.source.get("file"), code=first.code, hint=hint)
 
 
 def _hint(
-    departures: Sequence[Departure],
+    departures: Sequence[_Departure],
     turns: Sequence[Turn],
     accelerometer: NDArray[np.float64] | None,
     maps: Mapping[str, Sequence[str]],
 ) -> str:
+    """Return the settings that describe the bench as it is found, or the axis map under which it is as stated."""
     zeros = refined_zeros(turns)
     found = [
         d.settings | {k: f"{zeros[d.turn.name]:.2f}" for k in d.settings if k == "zero_deg" and d.turn.name in zeros}
@@ -183,9 +171,8 @@ def _hint(
 def _turned_attitude(recording: Recording) -> Recording:
     """Return held-out motion whose attitude log is turned to the body axes that gravity shows.
 
-    Where turns are mounted otherwise than stated, the table's attitude is that of the stated axes. ``R(q) F`` is that
-    of the unit, with the rotation F by multiples of 90 deg under which the predicted specific force is nearest to the
-    accelerometer's.
+    The table's attitude is that of the stated axes. ``R(q) F`` is that of the unit, with the rotation F by multiples of
+    90 deg under which the predicted specific force is nearest to the accelerometer's.
     """
     q, force = recording.table_attitude, recording.accelerometer
     if q is None or force is None or not recording.valid.any():
@@ -219,17 +206,15 @@ def _negated(turns: Sequence[Turn], tolerance: float) -> bool:
     )
 
 
-def _as_found(turn: Turn, departure: Departure | None, zeros: Mapping[str, float]) -> Turn:
+def _as_found(turn: Turn, departure: _Departure | None, zeros: Mapping[str, float]) -> Turn:
     """Return a turn with the mounting that is found in place of the stated one, its zero by all turns together."""
     if departure is None or departure.bench is None:
         return turn
-    bench, recording = departure.bench, replace(turn.recording, axis=departure.bench.axis)
-    if turn.name in zeros:
-        bench = replace(bench, zero_deg=zeros[turn.name])
-    return replace(turn, recording=recording, stated=bench)
+    bench = replace(departure.bench, zero_deg=zeros.get(turn.name, departure.bench.zero_deg))
+    return replace(turn, recording=replace(turn.recording, axis=bench.axis), stated=bench)
 
 
-def _applied(turn: Turn, doubts: Sequence[Note], departure: Departure | None, hint: str) -> Recording:
+def _applied(turn: Turn, doubts: Sequence[Note], departure: _Departure | None, hint: str) -> Recording:
     """Return the recording with angle and rate by the convention, a note where that changes them, and its doubts."""
     recording, bench = turn.recording, turn.stated
     notes = [*recording.notes, *doubts]
@@ -258,24 +243,13 @@ def _applied(turn: Turn, doubts: Sequence[Note], departure: Departure | None, hi
 
 @dataclass(frozen=True)
 class Turn:
-    """A turn recording, what its configuration says and what its rows tell.
-
-    Attributes
-    ----------
-    recording : Recording
-    stated : Bench
-    fit : TurnFit
-    found : Bench or None
-        None where gravity does not tell.
-    configurable : bool
-        Whether the procedure has an entry of the recording's name.
-    """
+    """A turn recording, what its configuration says and what its rows tell."""
 
     recording: Recording
     stated: Bench
     fit: TurnFit
-    found: Bench | None
-    configurable: bool
+    found: Bench | None  # None where gravity does not tell
+    configurable: bool  # whether the procedure has an entry of the recording's name
 
     @property
     def name(self) -> str:
@@ -284,58 +258,35 @@ class Turn:
 
 
 @dataclass(frozen=True)
-class Departure:
-    """What is otherwise than stated.
-
-    Attributes
-    ----------
-    turn : Turn
-    code : str
-        Code of the refusal.
-    problem : str
-    settings : dict of str to str
-        What describes it, by the key below the recording's entry in the procedure; empty where nothing does.
-    bench : Bench or None
-        The mounting by gravity, which is used; None: the turn is refused.
-    """
+class _Departure:
+    """What is otherwise than stated."""
 
     turn: Turn
-    code: str
+    code: str  # of the refusal
     problem: str
-    settings: dict[str, str]
-    bench: Bench | None = None
+    settings: dict[str, str]  # what describes it, by the key below the recording's entry in the procedure
+    bench: Bench | None = None  # the mounting by gravity, which is used; None: the turn is refused
 
 
 @dataclass(frozen=True)
-class Tolerance:
-    """What a turn may be off.
+class _Tolerance:
+    """What a turn may be off."""
 
-    Attributes
-    ----------
-    angle_deg : float, deg
-        Of the zero and of the direction of the turn axis.
-    offset_s : float, s
-        Largest plausible time offset: in turns one way it is a part of the zero.
-    lost : float, relative
-        Standard deviation of what a table without encoders loses of each turn; three of them, over half of the way.
-    """
-
-    angle_deg: float
-    offset_s: float
-    lost: float
+    angle_deg: float  # of the zero and of the direction of the turn axis
+    offset_s: float  # largest plausible time offset: in turns one way it is a part of the zero
+    lost: float  # relative standard deviation of what a table without encoders loses; three of them, over half of it
 
     def of_zero(self, fit: TurnFit) -> float:
         """Return how far the zero of a turn may be off, deg."""
         return self.angle_deg + self.offset_s * abs(fit.mean_rate) + 1.5 * self.lost * fit.arc
 
 
-def departure(turn: Turn, tolerance: Tolerance) -> Departure | None:
+def _departure(turn: Turn, tolerance: _Tolerance) -> _Departure | None:
     """Return what is otherwise than stated, or None."""
     if turn.fit.vertical is not None or turn.stated.vertical:
         return _upright(turn) or _gyroscope_sense(turn)
-    if turn.found is None:
-        return _axis(turn, tolerance.angle_deg) or _gyroscope_sense(turn)
-    return _axis(turn, tolerance.angle_deg) or _face(turn, tolerance)
+    by_gravity = _gyroscope_sense(turn) if turn.found is None else _face(turn, turn.found, tolerance)
+    return _axis(turn, tolerance.angle_deg) or by_gravity
 
 
 def words(bench: Bench) -> str:
@@ -347,7 +298,7 @@ def words(bench: Bench) -> str:
     )
 
 
-def _axis(turn: Turn, tolerance: float) -> Departure | None:
+def _axis(turn: Turn, tolerance: float) -> _Departure | None:
     axis, fit, name = turn.stated.axis, turn.fit, turn.name
     direction = fit.turn_axis if fit.turn_axis is not None else fit.gain
     if direction is None:
@@ -358,27 +309,26 @@ def _axis(turn: Turn, tolerance: float) -> Departure | None:
         listed = ", ".join(f"{b} {g:+.3g}" for b, g in zip(AXES, direction, strict=True))
         problem = f"in {name} the table is said to turn about {axis}, and {who} about {nearest[1]} ({listed})"
         bench = found_bench(fit, nearest[1]) if off <= tolerance else None
-        return Departure(turn, "wrong_axis", problem, {"axis": nearest[1]}, bench)
+        return _Departure(turn, "wrong_axis", problem, {"axis": nearest[1]}, bench)
     if fit.turn_axis is not None and off > tolerance:
         problem = (
             f"in {name} gravity turns about an axis that is {off:.1f} deg off body {axis}; {tolerance:g} deg are "
             "allowed (procedure.mounting_tolerance_deg)"
         )
-        return Departure(turn, "wrong_axis", problem, {})
+        return _Departure(turn, "wrong_axis", problem, {})
     return None
 
 
-def _gyroscope_sense(turn: Turn) -> Departure | None:
+def _gyroscope_sense(turn: Turn) -> _Departure | None:
     axis, gain = turn.stated.axis, turn.fit.gain
     if gain is None or gain[AXES.index(axis)] * turn.stated.sense > 0.0:
         return None
     problem = f"in {turn.name} the readings about {axis} have the sign opposite to the table's rate"
-    return Departure(turn, "wrong_sense", problem, {"sense": str(-turn.stated.sense)})
+    return _Departure(turn, "wrong_sense", problem, {"sense": str(-turn.stated.sense)})
 
 
-def _face(turn: Turn, tolerance: Tolerance) -> Departure | None:
-    found, stated = turn.found, turn.stated
-    assert found is not None  # noqa: S101
+def _face(turn: Turn, found: Bench, tolerance: _Tolerance) -> _Departure | None:
+    stated = turn.stated
     off = (found.offset - stated.offset + 180.0) % 360.0 - 180.0
     allowed = tolerance.of_zero(turn.fit)
     if found.sense == stated.sense:
@@ -394,35 +344,33 @@ def _face(turn: Turn, tolerance: Tolerance) -> Departure | None:
         f"{turn.name} is mounted otherwise than stated, which is {words(stated)}, to {allowed:.2g} deg "
         "(procedure.mounting_tolerance_deg)"
     )
-    settings = {}
-    if found.up != stated.up:
-        settings["up"] = found.up
-    if found.sense != stated.sense:
-        settings["sense"] = f"{found.sense}"
-    if abs(found.zero_deg - stated.zero_deg) > tolerance.angle_deg:
-        settings["zero_deg"] = f"{found.zero_deg:.1f}"
-    return Departure(turn, code, problem, settings, found)
+    differing = {
+        "up": (found.up != stated.up, found.up),
+        "sense": (found.sense != stated.sense, f"{found.sense}"),
+        "zero_deg": (abs(found.zero_deg - stated.zero_deg) > tolerance.angle_deg, f"{found.zero_deg:.1f}"),
+    }
+    return _Departure(turn, code, problem, {k: text for k, (differs, text) in differing.items() if differs}, found)
 
 
-def _upright(turn: Turn) -> Departure | None:
+def _upright(turn: Turn) -> _Departure | None:
     """Return what is otherwise than stated of a turn whose axis stands, or should stand, vertical."""
     stated, fit, name = turn.stated, turn.fit, turn.name
-    up = None if fit.vertical is None else nearest_axis(fit.vertical)
-    if up is None and fit.cosine is None:
+    if fit.gravity is None:
         return None
-    if up is None:
+    if fit.vertical is None:
         problem = f"in {name} the turn axis is stated to stand vertical ({stated.up} up), and gravity turns"
-        return Departure(turn, "wrong_face", problem, {"up": usual_up(stated.axis)})
+        return _Departure(turn, "wrong_face", problem, {"up": usual_up(stated.axis)})
+    up = nearest_axis(fit.vertical)
     if up[1] != stated.axis:
         problem = f"in {name} the table is said to turn about {stated.axis}, and gravity stays along body {up}"
-        return Departure(turn, "wrong_axis", problem, {"axis": up[1], "up": up})
+        return _Departure(turn, "wrong_axis", problem, {"axis": up[1], "up": up})
     if up != stated.up:
         problem = (
             f"in {name} gravity stays along body {up} while the table turns: the turn axis stands vertical, and stated "
             f"is {stated.up} up"
         )
-        return Departure(turn, "wrong_face", problem, {"up": up})
+        return _Departure(turn, "wrong_face", problem, {"up": up})
     if turn.recording.role == "accelerometer":
         problem = f"{name} is to calibrate the accelerometer, and about a vertical axis gravity does not turn"
-        return Departure(turn, "wrong_face", problem, {})
+        return _Departure(turn, "wrong_face", problem, {})
     return None

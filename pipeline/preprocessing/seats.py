@@ -23,25 +23,23 @@ Turns that do not fit together get the note ``N-SEATS``.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pipeline.model.kinematics import UP_AT_ZERO, level_at_zero, skew, turn_about_axis, turn_by_vector
-from pipeline.preprocessing.bench import ACROSS, by_convention
+from pipeline.preprocessing.bench import ACROSS, by_convention, unit
 from pipeline.records import AXES, Note
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    Vector = NDArray[np.float64]
-    from collections.abc import Mapping
-
-    from pipeline.preprocessing.bench import Bench
+    from pipeline.preprocessing.bench import Bench, Gravity
     from pipeline.preprocessing.mounting import Turn
+
+    Vector = NDArray[np.float64]
 
 # Seats smaller than this are left to the diagnosis: hidden table effects of the blind study (tilt 0.26 deg, leans 0.13
 # deg) reach 0.2 deg.
@@ -58,63 +56,41 @@ LIMITS = {"table_tilt": 1.0, "table_axis_nonorthogonality": 1.0, "time_offset": 
 
 
 @dataclass(frozen=True)
-class Conventional:
-    """A turn by the convention.
-
-    Attributes
-    ----------
-    name : str
-    axis : int
-    constant, cosine, sine : (3,) array, g
-        c, p and q above.
-    mean_rate : float, deg/s
-    """
+class _Conventional:
+    """A turn by the convention."""
 
     name: str
     axis: int
-    constant: Vector
-    cosine: Vector
-    sine: Vector
-    mean_rate: float
+    gravity: Gravity
+    mean_rate: float  # deg/s
 
-    @cached_property
-    def normal(self) -> Vector:
-        """``q x p``: (3,) array."""
-        return np.cross(self.sine, self.cosine)
+    @property
+    def ideal(self) -> tuple[Vector, Vector]:
+        """Vectors p and q of an ideal sensor: u and u x a."""
+        return UP_AT_ZERO[self.axis], ACROSS[self.axis]
+
+    def normal(self, K: Vector) -> Vector:
+        """Return the turn axis in the frame of K, ``K^T (q x p)`` with length 1: (3,) array."""
+        return unit(K.T @ np.cross(self.gravity.sine, self.gravity.cosine))
 
 
 @dataclass(frozen=True)
-class Seats:
-    """How the unit sits in the turns for the accelerometer.
+class _Seats:
+    """How the unit sits in the turns for the accelerometer."""
 
-    Attributes
-    ----------
-    K : (3, 3) array
-        With the common seat that is left where zeros explain the rest, else with the mean of the seats.
-    seats : (n, 3) array, deg
-        Rotation in each turn against the mean of all.
-    zeros : (n,) array or None, deg
-        Zero of each turn, where one common seat and the zeros explain the turns.
-    """
-
-    K: Vector
-    seats: Vector
-    zeros: Vector | None
-
-    @property
-    def largest(self) -> float:
-        """Largest component of a seat, deg."""
-        return float(np.max(np.abs(self.seats)))
+    K: Vector  # with the common seat that is left where zeros explain the rest, else with the mean of the seats
+    seats: Vector  # (n, 3), deg, rotation in each turn against the mean of all
+    zeros: Vector | None  # (n,), deg, of each turn, where one common seat and the zeros explain the turns
 
 
-def find_seats(turns: Sequence[Conventional]) -> Seats:
+def _find_seats(turns: Sequence[_Conventional]) -> _Seats:
     """Return K and the seats that explain p and q of turns about all three axes, by Gauss-Newton steps."""
     seats, K = np.zeros((len(turns), 3)), np.eye(3)
     for _ in range(4):
         R = turn_by_vector(np.radians(seats))
         rows, left = [], []
         for k, turn in enumerate(turns):
-            for ideal, found in zip(_ideal(turn.axis), (turn.cosine, turn.sine), strict=True):
+            for ideal, found in zip(turn.ideal, turn.gravity[1:], strict=True):
                 d = R[k].T @ ideal
                 row = np.zeros((3, 9 + seats.size))
                 row[0, :3] = row[1, 3:6] = row[2, 6:9] = d
@@ -122,16 +98,14 @@ def find_seats(turns: Sequence[Conventional]) -> Seats:
                 rows.append(row)
                 left.append(found - K @ d)
         gauge = GAUGE * np.eye(9 + seats.size)[9:]
-        step = np.linalg.lstsq(np.vstack([*rows, gauge]), np.concatenate([*left, -GAUGE * seats.ravel()]), rcond=None)[
-            0
-        ]
+        off = np.concatenate([*left, -GAUGE * seats.ravel()])
+        step = np.linalg.lstsq(np.vstack([*rows, gauge]), off, rcond=None)[0]
         K, seats = K + step[:9].reshape(3, 3), seats + step[9:].reshape(-1, 3)
     common, zeros = _zeros(turns, seats)
-    relative = seats - seats.mean(axis=0)
-    return Seats(K @ turn_by_vector(np.radians(common)).T, relative, zeros)
+    return _Seats(K @ turn_by_vector(np.radians(common)).T, seats - seats.mean(axis=0), zeros)
 
 
-def _zeros(turns: Sequence[Conventional], seats: Vector) -> tuple[Vector, Vector | None]:
+def _zeros(turns: Sequence[_Conventional], seats: Vector) -> tuple[Vector, Vector | None]:
     """Return a common seat and the zeros that explain the seats beside it, or their mean and None where none do."""
     design = np.zeros((seats.size, 3 + len(turns)))
     for k, turn in enumerate(turns):
@@ -144,27 +118,18 @@ def _zeros(turns: Sequence[Conventional], seats: Vector) -> tuple[Vector, Vector
     return np.asarray(seats.mean(axis=0), np.float64), None
 
 
-def zero_of(turn: Conventional, K: Vector) -> float:
+def _zero_of(turn: _Conventional, K: Vector) -> float:
     """Return the zero of a turn with K known, deg: the rotation of ``K^-1 (p, q)`` onto the face, turned back."""
-    p, q = np.linalg.solve(K, np.column_stack([turn.cosine, turn.sine])).T
-    up, across = _ideal(turn.axis)
+    (p, q), (up, across) = np.linalg.solve(K, np.column_stack(turn.gravity[1:])).T, turn.ideal
     return -float(np.degrees(np.arctan2(p @ across - q @ up, p @ up + q @ across)))
 
 
-def table_explains(turns: Sequence[Conventional], K: Vector, limits: Sequence[float]) -> bool:
-    """Return whether tilt, leaning axes and a time offset explain the turns, and level seats do not better.
-
-    Parameters
-    ----------
-    turns : sequence of Conventional
-    K : (3, 3) array
-    limits : sequence of float
-        Largest plausible tilt (deg), lean (deg) and time offset (s).
-    """
+def _table_explains(turns: Sequence[_Conventional], K: Vector, limits: Sequence[float]) -> bool:
+    """Return whether tilt, leaning axes and a time offset within limits explain the turns, and seats do not better."""
     tilt, lean, late = (np.vstack([one(t) for t in turns]) for one in (_tilt_columns, _lean_columns, _offset_columns))
     seat = np.zeros((9 * len(turns), 3 * len(turns)))
     for k, turn in enumerate(turns):
-        for row, ideal in enumerate(_ideal(turn.axis)):
+        for row, ideal in enumerate(turn.ideal):
             seat[9 * k + 3 * row : 9 * k + 3 * row + 3, 3 * k : 3 * k + 3] = np.radians(skew(ideal))
     level_seats = _fit(turns, K, seat, [np.inf] * seat.shape[1])
     of_tilt, of_lean = [limits[0]] * 2, [limits[1]] * 6
@@ -176,27 +141,23 @@ def table_explains(turns: Sequence[Conventional], K: Vector, limits: Sequence[fl
     return min(leaning, both + OF_TWO_MORE) < min(FITS, level_seats - CLEARLY)
 
 
-def _fit(turns: Sequence[Conventional], K: Vector, columns: Vector, limits: Sequence[float]) -> float:
+def _fit(turns: Sequence[_Conventional], K: Vector, columns: Vector, limits: Sequence[float]) -> float:
     """Return chi-square of K, b and parameters of further columns; infinity where one exceeds its limit."""
     n = len(turns)
     design = np.zeros((9 * n, 12 + columns.shape[1]))
     design[:, 12:] = (columns.reshape(3 * n, 3, -1).transpose(0, 2, 1) @ K.T).transpose(0, 2, 1).reshape(9 * n, -1)
     found = np.zeros(9 * n)
     for k, turn in enumerate(turns):
-        for row, ideal in enumerate(_ideal(turn.axis)):
+        for row, ideal in enumerate(turn.ideal):
             design[9 * k + 3 * row : 9 * k + 3 * row + 3, :9] = np.kron(np.eye(3), ideal)
         design[9 * k + 6 : 9 * k + 9, 9:12] = np.eye(3)
-        found[9 * k : 9 * k + 9] = np.concatenate([turn.cosine, turn.sine, turn.constant])
+        constant, cosine, sine = turn.gravity
+        found[9 * k : 9 * k + 9] = np.concatenate([cosine, sine, constant])
     weight = np.tile(np.repeat([1.0 / NOISE_PQ_G, 1.0 / NOISE_PQ_G, 1.0 / NOISE_C_G], 3), n)
     values = np.linalg.lstsq(weight[:, None] * design, weight * found, rcond=1e-9)[0]
     if np.any(np.abs(values[12:]) > np.array(limits)):
         return float("inf")
     return float(np.sum((weight * (found - design @ values)) ** 2))
-
-
-def _ideal(axis: int) -> tuple[Vector, Vector]:
-    """Return p and q of an ideal sensor: u and u x a."""
-    return UP_AT_ZERO[axis], ACROSS[axis]
 
 
 def _of_quarters(values: Vector) -> Vector:
@@ -205,13 +166,13 @@ def _of_quarters(values: Vector) -> Vector:
     return np.concatenate([(at_0 - at_180) / 2.0, (at_90 - at_270) / 2.0, values.mean(axis=0)])
 
 
-def _tilt_columns(turn: Conventional) -> Vector:
+def _tilt_columns(turn: _Conventional) -> Vector:
     """Return the derivative by the tilt about level x and y, 1/deg: (9, 2) array, as ``effects/table_tilt.py``."""
     level = turn_about_axis(level_at_zero(turn.axis), turn.axis, -QUARTERS)
     return _of_quarters(np.radians(np.stack([level[:, 1], -level[:, 0]], axis=2)))
 
 
-def _lean_columns(turn: Conventional) -> Vector:
+def _lean_columns(turn: _Conventional) -> Vector:
     """Return the derivative by six leans, 1/deg: (9, 6) array, as ``effects/table_axis_nonorthogonality.py``."""
     out = np.zeros((4, 3, 6))
     up = UP_AT_ZERO[turn.axis]
@@ -223,48 +184,28 @@ def _lean_columns(turn: Conventional) -> Vector:
     return _of_quarters(out)
 
 
-def _offset_columns(turn: Conventional) -> Vector:
+def _offset_columns(turn: _Conventional) -> Vector:
     """Return the derivative by a time offset, 1/s: (9, 1) array; the angle is ahead by offset times mean rate."""
-    up, across = _ideal(turn.axis)
-    column: Vector = np.radians(turn.mean_rate) * np.concatenate([across, -up, np.zeros(3)])[:, None]
-    return column
+    up, across = turn.ideal
+    return np.asarray(np.radians(turn.mean_rate) * np.concatenate([across, -up, np.zeros(3)])[:, None])
 
 
-def axis_off_deg(turn: Conventional, K: Vector, others: Sequence[Conventional]) -> Vector:
-    """Return by how much a turn axis is off, deg: its rotation across the body axis, (3,) array, the smaller of two.
+def _axis_off_deg(turn: _Conventional, K: Vector, others: Sequence[_Conventional]) -> Vector:
+    """Return the rotation of a turn axis against the body axis, or that of another turn about it: (3,) array, deg.
 
-    Parameters
-    ----------
-    turn : Conventional
-        For the gyroscope.
-    K : (3, 3) array
-    others : sequence of Conventional
-        Turns for the accelerometer, where the axes of the table lean: the gyroscope's lean with them.
+    The smaller of the two: where the axes of the table lean, the gyroscope's lean with the accelerometer's.
     """
-    direction = _unit(K.T @ turn.normal)
-    near = [np.eye(3)[turn.axis], *(_unit(K.T @ o.normal) for o in others if o.axis == turn.axis)]
-    return min((np.degrees(np.cross(direction, axis)) for axis in near), key=lambda v: float(np.linalg.norm(v)))
+    near = [np.eye(3)[turn.axis], *(o.normal(K) for o in others if o.axis == turn.axis)]
+    off = [np.degrees(np.cross(turn.normal(K), axis)) for axis in near]
+    return min(off, key=lambda v: float(np.linalg.norm(v)))
 
 
-def _unit(vector: Vector) -> Vector:
-    return np.asarray(vector / max(float(np.linalg.norm(vector)), 1e-30))
-
-
-def letters(vector: Vector) -> str:
-    """Return a rotation in words: its parts about x, y and z."""
+def _letters(vector: Vector) -> str:
     return ", ".join(f"{v:+.2f} deg about {a}" for a, v in zip(AXES, vector, strict=True))
 
 
 def seat_notes(turns: Sequence[Turn], table: Mapping[str, Any], sensor: Mapping[str, Any]) -> dict[str, list[Note]]:
-    """Return the doubts about each recording, by name.
-
-    Parameters
-    ----------
-    turns : sequence of Turn
-        Of one unit; those of one setup are compared.
-    table, sensor : mapping
-        Sections of the unit's configuration.
-    """
+    """Return the doubts about each recording of a unit, by name; the turns of one setup are compared."""
     orthogonality, angle = (float(table.get(k) or 0.0) for k in ("orthogonality_deg", "angle_accuracy_deg"))
     allowed = max(SMALLEST_DEG, TIMES_STATED * float(np.hypot(orthogonality, angle)))
     effects = (sensor.get("accelerometer") or {}).get("effects") or {}
@@ -276,12 +217,12 @@ def seat_notes(turns: Sequence[Turn], table: Mapping[str, Any], sensor: Mapping[
         if {c.axis for _, c in slow} != set(range(3)) or any(_in_doubt(t) for t, _ in slow):
             continue
         convention = [c for _, c in slow]
-        found = find_seats(convention)
-        doubt = found.largest > allowed and not table_explains(convention, found.K, limits)
+        found = _find_seats(convention)
+        doubt = np.max(np.abs(found.seats)) > allowed and not _table_explains(convention, found.K, limits)
         if doubt:
             notes |= {t.name: [_note(t, _seats_in_words(slow, found, allowed))] for t, _ in slow}
         for turn, fast in own.values():
-            off = axis_off_deg(fast, found.K, [] if doubt else convention)
+            off = _axis_off_deg(fast, found.K, [] if doubt else convention)
             if turn.recording.role == "gyroscope" and np.max(np.abs(off)) > allowed:
                 notes[turn.name] = [_note(turn, _axis_in_words(turn, off, allowed))]
     return notes
@@ -296,19 +237,18 @@ def refined_zeros(turns: Sequence[Turn]) -> dict[str, float]:
     slow = [c for t, _, c in own.values() if t.recording.role == "accelerometer"]
     if {c.axis for c in slow} != set(range(3)):
         return {}
-    found = find_seats(slow)
+    found = _find_seats(slow)
     if found.zeros is None:
         return {}
-    return {name: bench.zero_deg + bench.sense * zero_of(c, found.K) for name, (_, bench, c) in own.items()}
+    return {name: bench.zero_deg + bench.sense * _zero_of(c, found.K) for name, (_, bench, c) in own.items()}
 
 
-def _conventional(turn: Turn, bench: Bench | None = None) -> Conventional | None:
+def _conventional(turn: Turn, bench: Bench | None = None) -> _Conventional | None:
     bench = bench or turn.stated
-    both = by_convention(turn.fit, bench)
-    if both is None or turn.fit.constant is None:
+    gravity = by_convention(turn.fit, bench)
+    if gravity is None:
         return None
-    axis = AXES.index(bench.axis)
-    return Conventional(turn.name, axis, turn.fit.constant, *both, bench.sense * turn.fit.mean_rate)
+    return _Conventional(turn.name, AXES.index(bench.axis), gravity, bench.sense * turn.fit.mean_rate)
 
 
 def _in_doubt(turn: Turn) -> bool:
@@ -320,9 +260,9 @@ def _note(turn: Turn, detail: str) -> Note:
     return Note("N-SEATS", turn.recording.samples, 0, 0, detail)
 
 
-def _seats_in_words(slow: Sequence[tuple[Turn, Conventional]], found: Seats, allowed: float) -> str:
+def _seats_in_words(slow: Sequence[tuple[Turn, _Conventional]], found: _Seats, allowed: float) -> str:
     if found.zeros is None:
-        seats = "; ".join(f"{t.name} {letters(s)}" for (t, _), s in zip(slow, found.seats, strict=True))
+        seats = "; ".join(f"{t.name} {_letters(s)}" for (t, _), s in zip(slow, found.seats, strict=True))
         return (
             f"the unit does not sit alike in the turns, by more than {allowed:.2g} deg; its rotation against the mean "
             f"of the turns: {seats}; set table.seat_deg=1 to estimate them, or mount it once for all turns "
@@ -342,6 +282,6 @@ def _seats_in_words(slow: Sequence[tuple[Turn, Conventional]], found: Seats, all
 def _axis_in_words(turn: Turn, off: Any, allowed: float) -> str:  # noqa: ANN401  ((3,) array)
     return (
         f"the unit does not sit in {turn.name} as in the turns for the accelerometer, by more than {allowed:.2g} deg: "
-        f"by gravity it is rotated by {letters(off)}, and the gyroscope's matrix is off by as much; set "
+        f"by gravity it is rotated by {_letters(off)}, and the gyroscope's matrix is off by as much; set "
         "table.seat_deg=1 to estimate it (docs/mounting.md)"
     )
