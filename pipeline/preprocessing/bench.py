@@ -112,7 +112,7 @@ def found_bench(fit: TurnFit, axis: str) -> Bench | None:
 
 
 def bench_of(axis: str, sense: int, at_zero: float) -> Bench:
-    """Return the bench with the nearest face and the smallest zero; ``at_zero``: convention's angle at table angle 0."""
+    """Return the bench with the nearest face and the smallest zero; ``at_zero``: the convention's angle at angle 0."""
     a, face = AXES.index(axis), 90.0 * round(at_zero / 90.0)
     up = nearest_axis(np.cos(np.radians(face)) * UP_AT_ZERO[a] + np.sin(np.radians(face)) * ACROSS[a])
     return Bench(axis, up, sense, sense * (face - at_zero))
