@@ -438,8 +438,7 @@ class _Search:
         logarithm = float(np.log(self.ranking.samples))
         best: tuple[float, int, int] = (2.0 * GATE_BIC, -1, -1)
         for j, k in combinations(able, 2):
-            one, other = (self.ranking.candidates[i].effect.name for i in (j, k))
-            if one == other or self._overlaps(one, [other]) or self._overlaps(other, [one]):
+            if self.ranking.candidates[j].effect.name == self.ranking.candidates[k].effect.name:
                 continue
             found, count = self.ranking.pair(j, k)
             best = max(best, (2.0 * (found - before) - count * logarithm, j, k))
