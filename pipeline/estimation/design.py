@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from pipeline.model.effects.base import Effect
     from pipeline.records import Motion, Noise
 
+    Values = NDArray[np.float64]
+
 BASE = 12
 REMEMBERED = 4
 BASE_NAMES = [f"bias_{a}" for a in "xyz"] + [f"matrix_{a}{b}" for a in "xyz" for b in "xyz"]
@@ -41,8 +43,8 @@ BASE_NAMES = [f"bias_{a}" for a in "xyz"] + [f"matrix_{a}{b}" for a in "xyz" for
 class NormalPrior:
     """What is known of an effect's p parameters before the readings: ``N(mean, precision^-1)``."""
 
-    mean: NDArray[np.float64]  # (p,)
-    precision: NDArray[np.float64]  # (p, p)
+    mean: Values  # (p,)
+    precision: Values  # (p, p)
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,7 @@ class Term:
     """An effect at given values of its parameters, as columns."""
 
     effect: Effect
-    values: NDArray[np.float64]  # (p,); where its derivative is taken
+    values: Values  # (p,); where its derivative is taken
     full: bool = False  # whether the columns of its nonlinear parameters are among them
     prior: NormalPrior | None = None  # of the parameters; None: flat
 
@@ -58,9 +60,7 @@ class Term:
         """Return how its columns act on the axes."""
         return Layout.SHARED if self.full else self.effect.layout
 
-    def regressors(
-        self, sensor: str, motion: Motion, K: NDArray[np.float64], everything: Motion | None = None
-    ) -> NDArray[np.float64]:
+    def regressors(self, sensor: str, motion: Motion, K: Values, everything: Motion | None = None) -> Values:
         """Return its columns in the shape of its layout; ``everything`` is the motion after all effects of timing."""
         if everything is not None and self.effect.moves and np.any(self.values):
             slope = self.effect.slope(sensor, everything)
@@ -98,9 +98,9 @@ def motions_of(part: Part, terms: Sequence[Term]) -> list[Motion]:
 class Start:
     """The base by ordinary least squares."""
 
-    bias: NDArray[np.float64]  # (3,)
-    K: NDArray[np.float64]  # (3, 3)
-    scale: NDArray[np.float64]  # (3,); white noise of each axis, for the weights between the axes
+    bias: Values  # (3,)
+    K: Values  # (3, 3)
+    scale: Values  # (3,); white noise of each axis, for the weights between the axes
 
 
 def ordinary_base(observations: Observations, noise: Noise | None) -> Start:
@@ -154,11 +154,11 @@ class Design:
         self,
         observations: Observations,
         terms: Sequence[Term],
-        K: NDArray[np.float64],
-        scale: NDArray[np.float64],
+        K: Values,
+        scale: Values,
         *,
-        target: NDArray[np.float64] | None = None,
-        base: NDArray[np.float64] | None = None,
+        target: Values | None = None,
+        base: Values | None = None,
         project: bool = False,
     ) -> None:
         self.scale = scale
@@ -217,9 +217,7 @@ class Design:
         self._from = [np.add.outer(index * self._width, index).ravel() for index in self._local]
         self._to = [np.add.outer(index * (parameters + 1), index).ravel() for index in self._total]
 
-    def _fill(
-        self, A: NDArray[np.float64], sensor: str, part: Part, terms: Sequence[Term], K: NDArray[np.float64]
-    ) -> None:
+    def _fill(self, A: Values, sensor: str, part: Part, terms: Sequence[Term], K: Values) -> None:
         *motions, everything = motions_of(part, terms)
         A[:, 0] = 1.0
         A[:, 1:4] = truth(sensor, everything)
@@ -231,7 +229,7 @@ class Design:
                 for c in range(3):
                     A[:, places[c]] = regressors[:, c]
 
-    def of_axis(self, c: int) -> NDArray[np.float64]:
+    def of_axis(self, c: int) -> Values:
         """Return the columns of one axis, the readings last: (n, q + 1) array."""
         return self.columns.columns[:, self._local[c]]
 
@@ -239,7 +237,7 @@ class Design:
         """Return where the columns of one axis lie, and to which parameters they belong, the readings last."""
         return self._local[c], self._total[c]
 
-    def products(self, settings: Sequence[Setting]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def products(self, settings: Sequence[Setting]) -> tuple[Values, Values]:
         """Return all products of parameters' columns and, last, the readings, (g, p + 1, p + 1); and log det C, (g,).
 
         Those of the priors are added. The determinant is known up to a constant.
@@ -266,21 +264,21 @@ class Design:
         back = [inverse[:, index[:-1]] / s**2 for index, s in zip(self._total, self.scale, strict=True)]
         return LinearMap((weights[0], weights[1], weights[2]), (back[0], back[1], back[2]))
 
-    def prior_covariance(self, setting: Setting) -> NDArray[np.float64]:
+    def prior_covariance(self, setting: Setting) -> Values:
         """Return what the priors contribute to the covariance of the parameters: (p, p) array."""
         inverse, total = self._inverse(setting), np.zeros((self.count, self.count))
         for at, prior, _ in self._priors:
             total += inverse[:, at] @ prior.precision @ inverse[at]
         return total
 
-    def _inverse(self, setting: Setting) -> NDArray[np.float64]:
+    def _inverse(self, setting: Setting) -> Values:
         """Return the inverse of the products of the parameters' columns: (p, p) array."""
         gram = self.products([setting])[0][0, :-1, :-1]
         size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
         found = np.linalg.pinv(gram / np.outer(size, size), rcond=1e-12, hermitian=True) / np.outer(size, size)
         return np.asarray(found, np.float64)
 
-    def sizes(self) -> NDArray[np.float64]:
+    def sizes(self) -> Values:
         """Return the norm of each parameter's column before the base was taken out: (p + 1,) array."""
         squares = np.zeros(self.count + 1)
         for c in range(3):

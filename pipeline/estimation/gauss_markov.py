@@ -95,9 +95,7 @@ class Prior:
 
 
 def selection_grid(
-    noise: Noise | None,
-    ratios: Sequence[float] = (0.03, 0.1, 0.3, 1.0, 3.0),
-    times: Sequence[float] = (60.0, 600.0),
+    noise: Noise | None, ratios: Sequence[float] = (0.03, 0.1, 0.3, 1.0, 3.0), times: Sequence[float] = (60.0, 600.0)
 ) -> list[Setting]:
     """Return the hypotheses over which the likelihoods of models are maximised.
 

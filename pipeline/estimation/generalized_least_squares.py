@@ -49,6 +49,8 @@ if TYPE_CHECKING:
     from pipeline.estimation.observations import Observations
     from pipeline.records import Noise, Recording
 
+    Values = NDArray[np.float64]
+
 ROUNDS = 25
 SMALL_STEP = 1e-3  # of a standard uncertainty
 RATIOS = (0.01, 0.03, 0.1, 0.2, 0.3, 0.5, 1.0, 3.0)
@@ -61,11 +63,11 @@ LEAST_EIGENVALUE = 1e-7  # of the products of columns of unit norm: a column is 
 class Fit:
     """Base and effects that explain the readings best."""
 
-    bias: NDArray[np.float64]  # (3,)
-    K: NDArray[np.float64]  # (3, 3)
+    bias: Values  # (3,)
+    K: Values  # (3, 3)
     terms: tuple[Term, ...]  # the effects at their values
     # (12 + p, 12 + p); of bias, K (row by row) and the effects' parameters, as the noise settings of the fit weight it
-    covariance: NDArray[np.float64]
+    covariance: Values
     log_likelihood: float  # under the best noise setting, up to a constant of the readings
     setting: Setting  # that noise setting
     degrees_of_freedom: float
@@ -75,7 +77,7 @@ class Fit:
     condition: float  # of the scaled products of columns
     cosine: float  # largest between what is left of the readings and a column, both whitened
     rank: int  # parameters, or combinations of them, that the readings determine
-    scale: NDArray[np.float64]  # (3,); white noise of each axis, for the weights between the axes
+    scale: Values  # (3,); white noise of each axis, for the weights between the axes
 
 
 def fit_terms(observations: Observations, terms: Sequence[Term], start: Start, settings: Sequence[Setting]) -> Fit:
@@ -116,9 +118,7 @@ def fit_terms(observations: Observations, terms: Sequence[Term], start: Start, s
     )
 
 
-def _stepped(
-    bias: NDArray[np.float64], K: NDArray[np.float64], terms: Sequence[Term], step: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], list[Term], NDArray[np.float64]]:
+def _stepped(bias: Values, K: Values, terms: Sequence[Term], step: Values) -> tuple[Values, Values, list[Term], Values]:
     """Return bias, K and terms after a step, and what of the step was taken."""
     moved, taken, at = [], [step[:BASE]], BASE
     for term in terms:
@@ -130,20 +130,14 @@ def _stepped(
     return bias + step[:3], K + step[3:BASE].reshape(3, 3), moved, np.concatenate(taken)
 
 
-def _small(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+def _small(covariance: Values) -> Values:
     """Return the steps that no longer matter: (p,) array."""
     rounding = np.zeros(len(covariance))
     rounding[:BASE] = 1e-12
     return np.asarray(np.maximum(SMALL_STEP * np.sqrt(np.diag(covariance)), rounding), np.float64)
 
 
-def _at(
-    observations: Observations,
-    terms: Sequence[Term],
-    bias: NDArray[np.float64],
-    K: NDArray[np.float64],
-    scale: NDArray[np.float64],
-) -> Design:
+def _at(observations: Observations, terms: Sequence[Term], bias: Values, K: Values, scale: Values) -> Design:
     """Return the derivative of the model at some parameters, and its residual, as products."""
     residual, base = _residual(observations, terms, bias, K)
     return Design(observations, terms, K, scale, target=residual, base=base)
@@ -154,9 +148,7 @@ def design_at(observations: Observations, fit: Fit) -> Design:
     return _at(observations, fit.terms, fit.bias, fit.K, np.maximum(fit.scale, 1e-300))
 
 
-def _residual(
-    observations: Observations, terms: Sequence[Term], bias: NDArray[np.float64], K: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _residual(observations: Observations, terms: Sequence[Term], bias: Values, K: Values) -> tuple[Values, Values]:
     """Return the readings less the model, and what K acts on: the truth and the effects that the axes share."""
     sensor = observations.sensor
     predicted, base = [], []
@@ -180,9 +172,9 @@ def _residual(
 class _Solved:
     """A Gauss-Newton step under the likeliest setting, and the covariance under each."""
 
-    step: NDArray[np.float64]
+    step: Values
     posterior: Posterior
-    best_covariance: NDArray[np.float64]
+    best_covariance: Values
     log_likelihood: float
     setting: Setting
     condition: float
@@ -255,7 +247,7 @@ def fit_best(
     return fit_terms(observations, chosen, start, settings)
 
 
-def require_observable(observations: Observations, fit: Fit, scale: NDArray[np.float64]) -> None:
+def require_observable(observations: Observations, fit: Fit, scale: Values) -> None:
     """Refuse a fit that the recordings do not determine.
 
     Raises ``NotObservableError`` naming the parameters.
@@ -377,7 +369,7 @@ def calibration_of(  # noqa: PLR0917  (what a fit with effects is)
     values = np.concatenate([fit.bias, fit.K.ravel(), *(term.values for term in fit.terms)])
     of_channels = np.concatenate(first.derivative, axis=1)
 
-    def results(drawn: NDArray[np.float64]) -> NDArray[np.float64]:
+    def results(drawn: Values) -> Values:
         return _with_matrix(values + drawn @ of_channels.T)
 
     lines = [noise_contribution(errors, whole, prior)]
@@ -400,7 +392,7 @@ def fit_in_mean_frame(fit: Fit) -> tuple[Fit, NDArray[np.float64]]:
     return fit, np.eye(len(fit.covariance))
 
 
-def _with_matrix(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _with_matrix(values: Values) -> Values:
     """Return (t, 12 + p) parameters with the matrix in place of K."""
     K = values[:, 3:BASE].reshape(-1, 3, 3)
     matrix = np.linalg.solve(K, np.broadcast_to(np.eye(3), K.shape)).reshape(-1, 9)

@@ -65,6 +65,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    Values = NDArray[np.float64]
+
 TIMES = np.exp2(np.arange(-6.0, 4.0))  # correlation times tried, in those of the data sheet
 SHORTEST_BLOCK = 8
 FEWEST_SAMPLES = 60
@@ -187,9 +189,7 @@ def _noise_of_rests(
     return _best(found, sheet, source)
 
 
-def _nuisance(
-    blocks: RestBlocks, chosen: list[Recording], source: str, creeping: Sequence[int] = ()
-) -> NDArray[np.float64]:
+def _nuisance(blocks: RestBlocks, chosen: list[Recording], source: str, creeping: Sequence[int] = ()) -> Values:
     """Return a constant for each rest, and a line where the unit creeps; for a static one temperature and warm-up."""
     rest, centre = blocks.rest[blocks.cut], (blocks.start + blocks.length / 2.0)[blocks.cut]
     columns = [(rest == r).astype(float) for r in np.unique(rest)]
@@ -224,7 +224,7 @@ def _best(found: _Likelihood, sheet: dict[str, Any], source: str) -> Noise:
     return Noise(white, white * ratio, float(TIMES[row] * _wander_time(sheet)), source)
 
 
-def _peak(gain: NDArray[np.float64]) -> float:
+def _peak(gain: Values) -> float:
     """Return the ratio at the maximum, by a parabola through the three points about it."""
     k = int(np.argmax(gain))
     if k < 2 or k == len(gain) - 1:
@@ -248,12 +248,12 @@ def _wander_time(sheet: Mapping[str, Any]) -> float:
     return float(sheet.get("wander_time_s") or DEFAULT_TIME_S)
 
 
-def _with_sheet_wander(white: NDArray[np.float64], sheet: dict[str, Any], source: str) -> Noise:
+def _with_sheet_wander(white: Values, sheet: dict[str, Any], source: str) -> Noise:
     wander = np.full(3, float(sheet.get("bias_wander") or 0.0))
     return Noise(np.maximum(white, SMALLEST_WHITE), wander, _wander_time(sheet), source)
 
 
-def _white_of_turns(recordings: list[Recording], sensor: str) -> NDArray[np.float64] | None:
+def _white_of_turns(recordings: list[Recording], sensor: str) -> Values | None:
     """Return the white noise of short windows less a local polynomial, or None where there are too few."""
     squares, trace, nu = [], 0.0, 1.0
     x = np.linspace(-1.0, 1.0, WINDOW)
@@ -296,8 +296,8 @@ def _of_sheet(recordings: list[Recording], sheet: dict[str, Any]) -> Noise:
 class Rest:
     """Times, s, and readings of a rest, and the number of its clock: rests of one number share their time."""
 
-    time: NDArray[np.float64]
-    reading: NDArray[np.float64]
+    time: Values
+    reading: Values
     clock: int = 0
 
 
@@ -306,23 +306,23 @@ class RestBlocks:
     """Block means and scatter of rests."""
 
     # each (b,), s; first sample time and duration of each block
-    start: NDArray[np.float64]
-    length: NDArray[np.float64]
+    start: Values
+    length: Values
     count: NDArray[np.int64]  # (b,); samples of each
-    mean: NDArray[np.float64]  # (b, 3); less the mean of its rest
+    mean: Values  # (b, 3); less the mean of its rest
     rest: NDArray[np.int64]  # (b,); the rest that each belongs to
     clock: NDArray[np.int64]  # (b,); blocks of the same number have a known distance in time
     # (b,); whether its rest holds two blocks or more; the mean of a single one does not show the bias move
     cut: NDArray[np.bool_]
-    scatter: NDArray[np.float64]  # (3,); sum of squares about the block means
+    scatter: Values  # (3,); sum of squares about the block means
 
 
 @dataclass(frozen=True)
 class _Likelihood:
     """The likelihood over a grid, and white noise at each of its points."""
 
-    log_likelihood: NDArray[np.float64]  # (t, r, 3); at each correlation time, by ``RATIOS``, by axis
-    white: NDArray[np.float64]  # (t, r, 3); the estimate at each point
+    log_likelihood: Values  # (t, r, 3); at each correlation time, by ``RATIOS``, by axis
+    white: Values  # (t, r, 3); the estimate at each point
 
 
 def blocks_of(rests: Sequence[Rest], shortest: int) -> RestBlocks:
@@ -377,12 +377,7 @@ def with_scatter(blocks: RestBlocks, more: RestBlocks) -> RestBlocks:
     )
 
 
-def likelihood(
-    blocks: RestBlocks,
-    design: NDArray[np.float64],
-    covariance: NDArray[np.float64],
-    correlation_times: NDArray[np.float64],
-) -> _Likelihood:
+def likelihood(blocks: RestBlocks, design: Values, covariance: Values, correlation_times: Values) -> _Likelihood:
     """Return the likelihood of white noise and bias over the grid.
 
     ``design``: (c, p), the nuisance columns d, at the c blocks that are ``cut``. ``covariance``: (l,), the filter's

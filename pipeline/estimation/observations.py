@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
     from pipeline.records import Motion, Noise, Recording
 
+    Values = NDArray[np.float64]
+
 ROLES = ("accelerometer", "gyroscope", "static")
 BLOCKS = 300  # of the bias: their length is below a tenth of the shortest correlation time of the grid
 SHORTEST_BLOCK_S = 4.0
@@ -47,13 +49,13 @@ class Part:
     name: str
     role: str
     motion: Motion
-    reading: NDArray[np.float64]  # (m, 3), g or deg/s
+    reading: Values  # (m, 3), g or deg/s
     # (m,); samples of each row, less what a filter's correlation takes from their information
-    weight: NDArray[np.float64]
-    scatter: NDArray[np.float64]  # (3,); sum of squares about the means, weighted
+    weight: Values
+    scatter: Values  # (3,); sum of squares about the means, weighted
     clock_shared: bool
     interval: float  # s; between the recording's samples
-    noise_weight: NDArray[np.float64] | None = None  # (m,); weight by noise alone, where it differs
+    noise_weight: Values | None = None  # (m,); weight by noise alone, where it differs
     moved: dict[tuple[tuple[str, bytes], ...], Motion] = field(default_factory=dict, compare=False, repr=False)
 
 
@@ -71,22 +73,22 @@ class Observations:
     angle_deg: float = 0.0
 
     @cached_property
-    def reading(self) -> NDArray[np.float64]:
+    def reading(self) -> Values:
         """All readings: (n, 3) array."""
         return np.concatenate([part.reading for part in self.parts])
 
     @cached_property
-    def weight(self) -> NDArray[np.float64]:
+    def weight(self) -> Values:
         """All weights: (n,) array."""
         return np.concatenate([part.weight for part in self.parts])
 
     @cached_property
-    def noise_weight(self) -> NDArray[np.float64]:
+    def noise_weight(self) -> Values:
         """All weights by noise alone, without errors of the angle: (n,) array."""
         return np.concatenate([p.weight if p.noise_weight is None else p.noise_weight for p in self.parts])
 
     @cached_property
-    def scatter(self) -> NDArray[np.float64]:
+    def scatter(self) -> Values:
         """Sum of squares within the rows: (3,) array."""
         total = np.zeros(3)
         for part in self.parts:
@@ -284,7 +286,7 @@ def _remembered(motion: Motion, recording: Recording) -> NDArray[np.bool_]:
     return np.logical_and(sure, forgotten)
 
 
-def _impulse_response(recording: Recording) -> NDArray[np.float64]:
+def _impulse_response(recording: Recording) -> Values:
     """Return the size of a filter's answer to an impulse: (2 m + 1,) array, the impulse in the middle."""
     half = min(recording.samples, LONGEST_RESPONSE)
     impulse = np.zeros((2 * half + 1, 3))

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from pipeline.estimation.gauss_markov import Setting
     from pipeline.estimation.observations import Observations
 
+    Values = NDArray[np.float64]
+
 EXCITED = 1e-3  # share of a column's norm that the base leaves
 NEW = 1e-4  # share of the variance of a candidate's weakest direction that the chosen effects leave
 RIDGE = 1e-11
@@ -40,8 +42,8 @@ class Score:
     p_value: float
     parameters: int  # k above
     # each (p,); estimates and standard uncertainties, nonlinear parameters at their start
-    values: NDArray[np.float64]
-    uncertainty: NDArray[np.float64]
+    values: Values
+    uncertainty: Values
     log_likelihood: float
     setting: int  # index of its best noise setting
     admissible: bool = True  # whether it adds anything that the chosen effects cannot do
@@ -61,8 +63,8 @@ class Ranking:
         observations: Observations,
         configured: Sequence[Term],
         candidates: Sequence[Term],
-        K: NDArray[np.float64],
-        scale: NDArray[np.float64],
+        K: Values,
+        scale: Values,
         settings: Sequence[Setting],
     ) -> None:
         self.sensor = observations.sensor
@@ -77,7 +79,7 @@ class Ranking:
         products = without(stacked, np.arange(known))[:, known:, known:]
         self._reduce(products, design.sizes()[known:], [s.start - known for s in design.slices[len(configured) :]])
 
-    def _reduce(self, products: NDArray[np.float64], sizes: NDArray[np.float64], starts: Sequence[int]) -> None:
+    def _reduce(self, products: Values, sizes: Values, starts: Sequence[int]) -> None:
         """Keep of each candidate the directions that the motion excites, scaled to unit norm under white noise."""
         ends = [*starts[1:], len(sizes) - 1]
         size = np.where(sizes > 0, sizes, 1.0)
@@ -96,24 +98,24 @@ class Ranking:
             reduction[start:end, place] = block
         reduction[-1, -1] = 1.0
         self.blocks = blocks
-        self.products: NDArray[np.float64] = reduction.T @ products @ reduction
+        self.products: Values = reduction.T @ products @ reduction
         self.unreduced = products[:, :-1, :-1], starts, ends
 
     def indices(self, name: str) -> list[int]:
         """Return the candidates that are this effect and that the motion excites."""
         return [j for j, term in enumerate(self.candidates) if term.effect.name == name and len(self.places[j]) > 0]
 
-    def chosen(self, selected: Sequence[int]) -> NDArray[np.float64]:
+    def chosen(self, selected: Sequence[int]) -> Values:
         """Return the products without what base and selected candidates explain: (t, q + 1, q + 1) array."""
         return without(self.products, np.concatenate([np.zeros(0, int), *[self.places[j] for j in selected]]))
 
-    def log_likelihood(self, rss: NDArray[np.float64]) -> NDArray[np.float64]:
+    def log_likelihood(self, rss: Values) -> Values:
         """Return log L at each noise setting."""
         total = np.maximum(rss + self.within, 1e-300)
-        found: NDArray[np.float64] = -0.5 * self.samples * np.log(total / self.samples) - self.penalty
+        found: Values = -0.5 * self.samples * np.log(total / self.samples) - self.penalty
         return found
 
-    def log_likelihoods(self, selected: Sequence[int]) -> NDArray[np.float64]:
+    def log_likelihoods(self, selected: Sequence[int]) -> Values:
         """Return log L of base and selected candidates at each noise setting, the first white noise alone."""
         return self.log_likelihood(self.chosen(selected)[:, -1, -1])
 
@@ -122,7 +124,7 @@ class Ranking:
         found = self.log_likelihoods(selected)
         return float(found[1:].max()), int(np.argmax(found[1:])) + 1
 
-    def scores(self, selected: Sequence[int], limits: dict[str, NDArray[np.float64]]) -> list[Score]:
+    def scores(self, selected: Sequence[int], limits: dict[str, Values]) -> list[Score]:
         """Return what each candidate brings beside the selected ones, best first.
 
         ``selected``: indices of candidates. ``limits``: effect to (p,) array, limits of plausibility of the parameters'
@@ -144,11 +146,7 @@ class Ranking:
         return sorted(best.values(), key=lambda s: -s.delta_bic)
 
     def _scored(
-        self,
-        members: Sequence[int],
-        products: NDArray[np.float64],
-        before: float,
-        limits: dict[str, NDArray[np.float64]],
+        self, members: Sequence[int], products: Values, before: float, limits: dict[str, Values]
     ) -> Iterator[tuple[int, Score]]:
         """Yield the scores of candidates that have as many directions."""
         from scipy.special import chdtrc  # noqa: PLC0415  (0.1 s that only rankings pay)
@@ -187,9 +185,7 @@ class Ranking:
                 ),
             )
 
-    def _estimate(
-        self, j: int, solved: NDArray[np.float64], inner: NDArray[np.float64], rss: float
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _estimate(self, j: int, solved: Values, inner: Values, rss: float) -> tuple[Values, Values]:
         """Return the parameters and their standard uncertainties from the reduced coefficients."""
         term, block = self.candidates[j], self.blocks[j]
         variance = (max(rss, 0.0) + self.within) / self.samples
@@ -233,7 +229,7 @@ class Ranking:
             found[term.effect.name] = max(found.get(term.effect.name, 0.0), min(share, 1.0))
         return found
 
-    def explained(self, selected: Sequence[int]) -> NDArray[np.float64]:
+    def explained(self, selected: Sequence[int]) -> Values:
         """Return the whitened sum of squares that each candidate takes from base and selected, white noise: (c,)."""
         products = self.chosen(selected)[0]
         out = np.zeros(len(self.candidates))
@@ -243,7 +239,7 @@ class Ranking:
                 out[j] = float(products[place, -1] @ np.linalg.solve(inner, products[place, -1]))
         return out
 
-    def visibility(self, j: int, limits: NDArray[np.float64], setting: int) -> float:
+    def visibility(self, j: int, limits: Values, setting: int) -> float:
         """Return the expected gain in 2 log L of an effect whose parameters are all at their limits."""
         products, starts, ends = self.unreduced
         block = slice(starts[j], ends[j])
@@ -251,18 +247,18 @@ class Ranking:
         return float(np.sum(limits[:count] ** 2 * np.diag(products[setting, block, block])))
 
 
-def without(products: NDArray[np.float64], index: NDArray[np.intp]) -> NDArray[np.float64]:
+def without(products: Values, index: NDArray[np.intp]) -> Values:
     """Return products of columns after some of them are projected out of all: (t, p, p) array, zeros in theirs.
 
     ``products``: (t, p, p). ``index``: (q,).
     """
     if len(index) == 0:
         return products
-    rest: NDArray[np.float64] = products - products[:, index, :].transpose(0, 2, 1) @ projection(products, index)
+    rest: Values = products - products[:, index, :].transpose(0, 2, 1) @ projection(products, index)
     return rest
 
 
-def projection(products: NDArray[np.float64], index: NDArray[np.intp]) -> NDArray[np.float64]:
+def projection(products: Values, index: NDArray[np.intp]) -> Values:
     """Return the coefficients by which some of the columns come closest to each column: (t, q, p) array.
 
     ``products``: (t, p, p). ``index``: (q,).
@@ -270,5 +266,5 @@ def projection(products: NDArray[np.float64], index: NDArray[np.intp]) -> NDArra
     inner, cross = products[:, index[:, None], index], products[:, index, :]
     size = np.sqrt(np.maximum(np.einsum("tii->ti", inner), 1e-300))
     scaled = inner / (size[:, :, None] * size[:, None, :]) + RIDGE * np.eye(len(index))
-    found: NDArray[np.float64] = np.linalg.solve(scaled, cross / size[:, :, None]) / size[:, :, None]
+    found: Values = np.linalg.solve(scaled, cross / size[:, :, None]) / size[:, :, None]
     return found

@@ -49,6 +49,8 @@ if TYPE_CHECKING:
     from pipeline.estimation.turns import Part
     from pipeline.records import Recording
 
+    Values = NDArray[np.float64]
+
 NAME = "reference_least_squares"
 COLUMNS = ("bias", *(f"matrix column {axis}" for axis in AXES))
 WEAKEST_DIRECTION = 1e-3
@@ -107,7 +109,7 @@ def fit(
         convergence=certificate(X, residuals, condition, rank),
     )
 
-    def results(errors: NDArray[np.float64]) -> NDArray[np.float64]:
+    def results(errors: Values) -> Values:
         return inverted(beta.T.ravel() + errors)
 
     own = bench_effects(sensor, settings, recordings)
@@ -116,11 +118,11 @@ def fit(
     return budgeted(found, reference, noise, contributions, settings, results)
 
 
-def inverted(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def inverted(values: Values) -> Values:
     """Return bias and matrix, (t, 12), of bias and row of K of each channel, (t, 12)."""
     channels = values.reshape(len(values), 3, 4)
     matrix = np.linalg.solve(channels[:, :, 1:], np.broadcast_to(np.eye(3), (len(values), 3, 3)))
-    found: NDArray[np.float64] = np.concatenate([channels[:, :, 0], matrix.reshape(-1, 9)], axis=1)
+    found: Values = np.concatenate([channels[:, :, 0], matrix.reshape(-1, 9)], axis=1)
     return found
 
 
@@ -136,7 +138,7 @@ def _select(sensor: str, part: Part) -> Part:
     return replace(part, keep=part.keep & ~sharp)
 
 
-def _reference(sensor: str, part: Part) -> NDArray[np.float64]:
+def _reference(sensor: str, part: Part) -> Values:
     """Return what an ideal sensor would read behind the recording's filter: (n, 3) array."""
     recording, motion = part.recording, part.motion
     applied = recording.filter
@@ -157,7 +159,7 @@ def _reference(sensor: str, part: Part) -> NDArray[np.float64]:
     return filtered
 
 
-def _require_observable(sensor: str, X: NDArray[np.float64]) -> float:
+def _require_observable(sensor: str, X: Values) -> float:
     """Return the condition of the columns, all in units of the largest motion."""
     size = float(np.max(np.linalg.norm(X[:, 1:], axis=1), initial=0.0))
     if size == 0.0:
@@ -177,13 +179,13 @@ def _require_observable(sensor: str, X: NDArray[np.float64]) -> float:
     return float(singular[0] / singular[-1])
 
 
-def _linear_map(weights: NDArray[np.float64], matrix: NDArray[np.float64]) -> LinearMap:
+def _linear_map(weights: Values, matrix: Values) -> LinearMap:
     """Return the map from readings to bias and matrix."""
     x, y, z = (_derivative_of_matrix(matrix, channel) for channel in range(3))
     return LinearMap((weights, weights, weights), (x, y, z))
 
 
-def _derivative_of_matrix(matrix: NDArray[np.float64], channel: int) -> NDArray[np.float64]:
+def _derivative_of_matrix(matrix: Values, channel: int) -> Values:
     """Return the derivative of bias and matrix with respect to bias and row of K of a channel: (12, 4) array."""
     J = np.zeros((12, 4))
     J[channel, 0] = 1.0
@@ -191,9 +193,7 @@ def _derivative_of_matrix(matrix: NDArray[np.float64], channel: int) -> NDArray[
     return J
 
 
-def _parameters(
-    sensor: str, bias: NDArray[np.float64], matrix: NDArray[np.float64], covariance: NDArray[np.float64]
-) -> dict[str, dict[str, Any]]:
+def _parameters(sensor: str, bias: Values, matrix: Values, covariance: Values) -> dict[str, dict[str, Any]]:
     unit = "g" if sensor == "accelerometer" else "deg/s"
     names = [f"bias_{a}" for a in AXES] + [f"matrix_{a}{b}" for a in AXES for b in AXES]
     values, u = np.concatenate([bias, matrix.ravel()]), np.sqrt(np.diag(covariance))

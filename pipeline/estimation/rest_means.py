@@ -114,7 +114,7 @@ def _creep_rate(recording: Recording, rest: Rest) -> float:
 
 def rest_means(
     recording: Recording, rests: Sequence[Rest], sensor: str = "accelerometer"
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+) -> tuple[Values, NDArray[np.int64]]:
     """Return the mean reading of each rest, without clipped, stuck or missing samples.
 
     By hand a unit may creep: the mean over its directions is too short, and is made longer by that (see

@@ -41,6 +41,8 @@ if TYPE_CHECKING:
     from pipeline.estimation.observations import Observations
     from pipeline.records import Noise, SensorCalibration
 
+    Values = NDArray[np.float64]
+
 GATE_BIC = 10.0
 SLOW_GATE_BIC = 16.0
 SLOW_BIAS = ("bias_drift", "bias_temperature", "bias_temperature_quadratic", "warm_up")
@@ -75,7 +77,7 @@ class Selection:
     observations: Observations
     start: Start
     settings: list[Setting]
-    limits: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+    limits: dict[str, Values] = field(default_factory=dict)
 
     def chosen(self) -> list[int]:
         """Return the indices of the selected effects among the ranking's candidates."""
@@ -232,7 +234,7 @@ class _Search:
             plausible=self._plausible(score.name, values, uncertainty),
         )
 
-    def _plausible(self, name: str, values: NDArray[np.float64], uncertainty: NDArray[np.float64]) -> bool:
+    def _plausible(self, name: str, values: Values, uncertainty: Values) -> bool:
         limits = self.limits.get(name)
         return limits is None or bool(np.all(np.abs(values) - 2.0 * uncertainty <= limits))
 

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
     from pipeline.records import Recording, SensorCalibration
 
+    Values = NDArray[np.float64]
+
 STAGED = {
     "accelerometer": ("orthogonality", "misalignment", "bias", "scale_factor"),
     "gyroscope": ("bias", "orthogonality_and_misalignment", "scale_factor"),
@@ -79,7 +81,7 @@ def stages_before(sensor: str, previous: SensorCalibration | None, stages: Mappi
     return [stage.name for stage in done]
 
 
-def apply_correction(correction: Mapping[str, Any] | None, readings: NDArray[np.float64]) -> NDArray[np.float64]:
+def apply_correction(correction: Mapping[str, Any] | None, readings: Values) -> Values:
     """Correct readings.
 
     ``correction``: ``StageResult.correction``; None changes nothing. ``readings``: (n, 3), g or deg/s. Returns (n, 3),
@@ -91,9 +93,9 @@ def apply_correction(correction: Mapping[str, Any] | None, readings: NDArray[np.
     return out
 
 
-def apply_step(step: Mapping[str, Any], readings: NDArray[np.float64]) -> NDArray[np.float64]:
+def apply_step(step: Mapping[str, Any], readings: Values) -> Values:
     """Apply one step to (n, 3) readings."""
-    out: NDArray[np.float64]
+    out: Values
     match dict(step):
         case {"subtract": offset}:
             out = readings - np.asarray(offset, float)
@@ -107,9 +109,7 @@ def apply_step(step: Mapping[str, Any], readings: NDArray[np.float64]) -> NDArra
     return out
 
 
-def two_sided(
-    positive: NDArray[np.float64], negative: NDArray[np.float64], switch_at: NDArray[np.float64]
-) -> dict[str, Any]:
+def two_sided(positive: Values, negative: Values, switch_at: Values) -> dict[str, Any]:
     """Return a step that multiplies each axis by one of two factors."""
     sides = {"positive": positive, "negative": negative, "switch_at": switch_at}
     return {"two_sided": {name: np.asarray(value, float).tolist() for name, value in sides.items()}}

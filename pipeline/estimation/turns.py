@@ -40,6 +40,8 @@ if TYPE_CHECKING:
 
     from pipeline.records import Motion, Recording
 
+    Values = NDArray[np.float64]
+
 BLOCKS = 100  # of a fit's samples: enough to resolve correlation times down to a hundredth of the recordings
 DISTINCT_DIRECTION_G = 0.01
 ROUNDS = 12
@@ -76,7 +78,7 @@ class Part:
     motion: Motion
     keep: NDArray[np.bool_]  # (n,)
 
-    def reading(self, sensor: str) -> NDArray[np.float64]:
+    def reading(self, sensor: str) -> Values:
         """Return the readings that are used: (k, 3) array."""
         reading = self.recording.reading(sensor)
         assert reading is not None  # noqa: S101
@@ -157,14 +159,14 @@ class Sinusoid:
     """The sinusoid of one channel in one turn."""
 
     # (3,) or (4,), g; z, then the cosine's and the sine's coefficient, then c where both sides were fitted
-    coefficients: NDArray[np.float64]
-    columns: NDArray[np.float64]  # (n, p)
-    weights: NDArray[np.float64]  # (p, n); ``coefficients = weights @ readings``
-    residuals: NDArray[np.float64]  # (n,), g
+    coefficients: Values
+    columns: Values  # (n, p)
+    weights: Values  # (p, n); ``coefficients = weights @ readings``
+    residuals: Values  # (n,), g
     condition: float  # of the columns, scaled
 
 
-def fit_sinusoid(angle_deg: NDArray[np.float64], reading: NDArray[np.float64], *, sides: bool, where: str) -> Sinusoid:
+def fit_sinusoid(angle_deg: Values, reading: Values, *, sides: bool, where: str) -> Sinusoid:
     """Fit a sinusoid of the table angle.
 
     ``angle_deg``: (n,), deg. ``reading``: (n,), g. ``sides``: whether the two sides may differ. ``where``: channel and
@@ -184,12 +186,12 @@ def fit_sinusoid(angle_deg: NDArray[np.float64], reading: NDArray[np.float64], *
     return Sinusoid(coefficients, columns, factors.weights(), reading - columns @ coefficients, factors.condition)
 
 
-def wrap(angle_deg: NDArray[np.float64]) -> NDArray[np.float64]:
+def wrap(angle_deg: Values) -> Values:
     """Return angles in [-180, 180) deg."""
     return (angle_deg + 180.0) % 360.0 - 180.0
 
 
-def _factors(columns: NDArray[np.float64], where: str) -> ScaledColumns:
+def _factors(columns: Values, where: str) -> ScaledColumns:
     n, p = columns.shape
     if n >= p:
         factors = ScaledColumns.of(columns)
@@ -239,10 +241,10 @@ class Rows:
 
     kept: NDArray[np.intp]  # (k,); indices of the samples
     first: NDArray[np.intp]  # (m,); where in ``kept`` each group starts
-    count: NDArray[np.float64]  # (m,); samples of each group
+    count: Values  # (m,); samples of each group
     total: int  # samples of the recording
 
-    def settled(self, reading: NDArray[np.float64]) -> Rows:
+    def settled(self, reading: Values) -> Rows:
         """Return rows in which groups that scatter too much are taken apart into their samples.
 
         By the table's log they are at rest; where the sensor's clock is off, it still moves at their edge.
@@ -268,13 +270,13 @@ class Rows:
         first = np.flatnonzero(new)
         return replace(self, first=first, count=np.diff(np.append(first, len(kept))).astype(float))
 
-    def means(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def means(self, values: Values) -> Values:
         """Return the group means of (n, ...) values: (m, ...) array."""
         kept = values[self.kept]
         if len(self.first) == len(kept):
             return kept
         shape = (-1,) + (1,) * (values.ndim - 1)
-        means: NDArray[np.float64] = np.add.reduceat(kept, self.first, axis=0) / self.count.reshape(shape)
+        means: Values = np.add.reduceat(kept, self.first, axis=0) / self.count.reshape(shape)
         return means
 
     def motion(self, motion: Motion) -> Motion:
@@ -290,9 +292,7 @@ class Rows:
             at_lag=None if motion.at_lag is None else partial(self._at, motion.at_lag),
         )
 
-    def _at(
-        self, trajectory: Callable[..., Motion | None], offset: float | NDArray[np.float64] = 0.0, **lag: float
-    ) -> Motion:
+    def _at(self, trajectory: Callable[..., Motion | None], offset: float | Values = 0.0, **lag: float) -> Motion:
         """Return the motion at the rows' samples shifted in time; ``offset`` is that of the rows."""
         if isinstance(offset, np.ndarray):
             samples = np.zeros(self.total)

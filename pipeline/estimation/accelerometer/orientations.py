@@ -60,7 +60,7 @@ TIMES = (0.5, 1.0, 2.0)  # of the correlation time that is believed
 class Orientations:
     """Rows of mean readings."""
 
-    mean: NDArray[np.float64]  # (m, 3), g
+    mean: Values  # (m, 3), g
     count: NDArray[np.int64]  # (m,); samples of each row
     # g; standard deviation of a raw sample about the mean of its row, averaged over the axes; 0 where no row has two
     white: float
@@ -72,11 +72,11 @@ class Orientations:
     left_out: tuple[tuple[Recording, Rest], ...]
 
     @property
-    def variance(self) -> NDArray[np.float64]:
+    def variance(self) -> Values:
         """Variance of each row's mean by white noise, an axis: (m,) array, g^2."""
         return np.asarray(max(self.white, SMALLEST_NOISE) ** 2 / self.count)
 
-    def reading(self) -> NDArray[np.float64]:
+    def reading(self) -> Values:
         """Return the samples behind the rows: (k, 3) array, g."""
         readings = [np.asarray(recording.accelerometer)[keep] for recording, keep in self.parts]
         return np.concatenate(readings)

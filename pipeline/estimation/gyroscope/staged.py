@@ -221,9 +221,9 @@ def fit(
 class Response:
     """What the readings of rests and steady turns say."""
 
-    rest: NDArray[np.float64]  # (3,), deg/s; mean reading at rest
-    slope: NDArray[np.float64]  # (3, 3); row i: reading of x, y, z per deg/s about axis i
-    rate: NDArray[np.float64]  # (3,), deg/s; I: mean magnitude of the rate about each axis; 0 where none was recorded
+    rest: Values  # (3,), deg/s; mean reading at rest
+    slope: Values  # (3, 3); row i: reading of x, y, z per deg/s about axis i
+    rate: Values  # (3,), deg/s; I: mean magnitude of the rate about each axis; 0 where none was recorded
 
     def corrected(self, step: Mapping[str, Any]) -> Response:
         """Return the response of readings after a step of a correction."""
@@ -246,18 +246,18 @@ class Response:
 class Samples:
     """The samples that are used, stacked."""
 
-    reading: NDArray[np.float64]  # (n, 3), deg/s; less Earth's rotation where it is known
+    reading: Values  # (n, 3), deg/s; less Earth's rotation where it is known
     # (n, 3), deg/s; signed rate of the table about its turn axis, in that axis's column; 0 at rest
-    rate: NDArray[np.float64]
+    rate: Values
     blocks: Blocks
     total: int  # samples of the recordings
     motions: tuple[Motion, ...]  # by the table, at these samples; at rest in a static recording
 
     @property
-    def speed(self) -> NDArray[np.float64]:
+    def speed(self) -> Values:
         """I: mean magnitude of the rate about each axis, 0 where there is no steady turn: (3,) array, deg/s."""
         moving = np.count_nonzero(self.rate, axis=0)
-        mean: NDArray[np.float64] = np.abs(self.rate).sum(axis=0) / np.maximum(moving, 1)
+        mean: Values = np.abs(self.rate).sum(axis=0) / np.maximum(moving, 1)
         return mean
 
 
@@ -314,7 +314,7 @@ def _without_tails(part: Part, memory: float) -> NDArray[np.bool_]:
     return still
 
 
-def weights_of(rate: NDArray[np.float64], *, as_printed: bool) -> NDArray[np.float64]:
+def weights_of(rate: Values, *, as_printed: bool) -> Values:
     """Return the weights of the samples in (b, R_x, R_y, R_z): (4, n) array."""
     rest = np.all(rate == 0, axis=1)
     if not np.any(rest):

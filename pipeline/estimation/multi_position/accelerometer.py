@@ -175,10 +175,7 @@ def _directions(calibration: SensorCalibration) -> Values:
 
 
 def model_of(
-    recordings: Sequence[Recording],
-    calibration: SensorCalibration,
-    noise: Noise | None,
-    settings: Mapping[str, Any],
+    recordings: Sequence[Recording], calibration: SensorCalibration, noise: Noise | None, settings: Mapping[str, Any]
 ) -> AccelerometerModel | None:
     """Return the model of the recordings' rests, or None where they hold none.
 

@@ -153,8 +153,8 @@ def calibration_of(
 
 def with_budget(  # noqa: PLR0917  (what a fit by hand is)
     calibration: SensorCalibration,
-    covariance: NDArray[np.float64],
-    degrees_of_freedom: NDArray[np.float64],
+    covariance: Values,
+    degrees_of_freedom: Values,
     model: Model,
     found: Fit,
     settings: Mapping[str, Any],
