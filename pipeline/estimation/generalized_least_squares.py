@@ -33,13 +33,14 @@ from pipeline.estimation.table_errors import Reference
 from pipeline.estimation.uncertainty_budget import (
     budgeted,
     combined,
+    effect_parameters,
     mounting_contribution,
     noise_contribution,
     scatter_contribution,
 )
 from pipeline.model.effects.base import Layout, truth
 from pipeline.model.effects.mounting import Mounting, errors_in_mean_frame, in_mean_frame
-from pipeline.records import FittedEffect, SensorCalibration, StageResult
+from pipeline.records import SensorCalibration, StageResult
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -325,19 +326,7 @@ def calibration_of(  # noqa: PLR0917  (what a fit with effects is)
     change[3:BASE, 3:BASE] = -np.kron(matrix, matrix.T)
     covariance = change @ fit.covariance @ change.T
     change = change @ turned
-    uncertainty = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
-    effects, parameters, at = [], {}, BASE
-    for term in fit.terms:
-        described: dict[str, dict[str, Any]] = {}
-        for parameter, value in zip(term.effect.parameters(sensor), term.values, strict=True):
-            shared = {"value": float(value), "unit": parameter.unit}
-            described[parameter.name] = shared
-            parameters[f"{term.effect.name}.{parameter.name}"] = {
-                **shared,
-                "standard_uncertainty": float(uncertainty[at]),
-            }
-            at += 1
-        effects.append(FittedEffect(term.effect.name, described, term.effect.definition))
+    effects, parameters = effect_parameters(sensor, fit.terms, covariance)
     details: dict[str, Any] = {
         "samples": round(observations.samples),
         "rounds": fit.rounds,
@@ -353,7 +342,7 @@ def calibration_of(  # noqa: PLR0917  (what a fit with effects is)
         bias=fit.bias,
         matrix=matrix,
         stages=(*(before.stages if before else ()), stage),
-        effects=tuple(effects),
+        effects=effects,
         converged=fit.converged,
         convergence=certified(fit.cosine, fit.condition, fit.rank, len(covariance)),
     )
@@ -370,7 +359,7 @@ def calibration_of(  # noqa: PLR0917  (what a fit with effects is)
     of_channels = np.concatenate(first.derivative, axis=1)
 
     def results(drawn: Values) -> Values:
-        return _with_matrix(values + drawn @ of_channels.T)
+        return with_matrix(values + drawn @ of_channels.T)
 
     lines = [noise_contribution(errors, whole, prior)]
     if any(term.prior for term in fit.terms):
@@ -378,7 +367,7 @@ def calibration_of(  # noqa: PLR0917  (what a fit with effects is)
     return budgeted(found, reference, errors, lines, settings, results, names)
 
 
-def fit_in_mean_frame(fit: Fit) -> tuple[Fit, NDArray[np.float64]]:
+def fit_in_mean_frame(fit: Fit) -> tuple[Fit, Values]:
     """Return a fit in the frame of the mean of the mountings, and the map of its errors to those there."""
     at = BASE
     for place, term in enumerate(fit.terms):
@@ -392,7 +381,7 @@ def fit_in_mean_frame(fit: Fit) -> tuple[Fit, NDArray[np.float64]]:
     return fit, np.eye(len(fit.covariance))
 
 
-def _with_matrix(values: Values) -> Values:
+def with_matrix(values: Values) -> Values:
     """Return (t, 12 + p) parameters with the matrix in place of K."""
     K = values[:, 3:BASE].reshape(-1, 3, 3)
     matrix = np.linalg.solve(K, np.broadcast_to(np.eye(3), K.shape)).reshape(-1, 9)

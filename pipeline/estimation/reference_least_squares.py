@@ -32,12 +32,12 @@ import numpy as np
 from pipeline.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.candidates import bench_effects
 from pipeline.estimation.engine import LinearMap, assess_noise
-from pipeline.estimation.generalized_least_squares import fit_joint
+from pipeline.estimation.generalized_least_squares import fit_joint, with_matrix
 from pipeline.estimation.least_squares import ScaledColumns, certificate
 from pipeline.estimation.noise import noise_of, prior_of
 from pipeline.estimation.table_errors import Reference, disturbance
 from pipeline.estimation.turns import blocks_of_samples, parts_of, settled
-from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution
+from pipeline.estimation.uncertainty_budget import base_parameters, budgeted, noise_contribution
 from pipeline.model.effects.base import truth
 from pipeline.records import AXES, SensorCalibration, StageResult
 
@@ -89,7 +89,7 @@ def fit(
     contributions = [noise_contribution(noise, fit, prior)]
     result = StageResult(
         name=NAME,
-        parameters=_parameters(sensor, bias, matrix, contributions[0].covariance),
+        parameters=base_parameters(sensor, bias, matrix, contributions[0].covariance),
         residual_rms=float(np.sqrt(np.mean(residuals**2))),
         details={
             "condition": condition,
@@ -110,7 +110,7 @@ def fit(
     )
 
     def results(errors: Values) -> Values:
-        return inverted(beta.T.ravel() + errors)
+        return with_matrix(of_channels(beta.T.ravel() + errors))
 
     own = bench_effects(sensor, settings, recordings)
     if own and settings["table"].get("seat_deg") is None:  # mountings are fitted by the stage ``effects``
@@ -118,12 +118,10 @@ def fit(
     return budgeted(found, reference, noise, contributions, settings, results)
 
 
-def inverted(values: Values) -> Values:
-    """Return bias and matrix, (t, 12), of bias and row of K of each channel, (t, 12)."""
+def of_channels(values: Values) -> Values:
+    """Return bias and K, (t, 12), of bias and row of K of each channel, (t, 12)."""
     channels = values.reshape(len(values), 3, 4)
-    matrix = np.linalg.solve(channels[:, :, 1:], np.broadcast_to(np.eye(3), (len(values), 3, 3)))
-    found: Values = np.concatenate([channels[:, :, 0], matrix.reshape(-1, 9)], axis=1)
-    return found
+    return np.concatenate([channels[:, :, 0], channels[:, :, 1:].reshape(-1, 9)], axis=1)
 
 
 def _select(sensor: str, part: Part) -> Part:
@@ -180,24 +178,9 @@ def _require_observable(sensor: str, X: Values) -> float:
 
 
 def _linear_map(weights: Values, matrix: Values) -> LinearMap:
-    """Return the map from readings to bias and matrix."""
-    x, y, z = (_derivative_of_matrix(matrix, channel) for channel in range(3))
-    return LinearMap((weights, weights, weights), (x, y, z))
-
-
-def _derivative_of_matrix(matrix: Values, channel: int) -> Values:
-    """Return the derivative of bias and matrix with respect to bias and row of K of a channel: (12, 4) array."""
-    J = np.zeros((12, 4))
-    J[channel, 0] = 1.0
-    J[3:, 1:] = -np.einsum("i,bj->ijb", matrix[:, channel], matrix).reshape(9, 3)
-    return J
-
-
-def _parameters(sensor: str, bias: Values, matrix: Values, covariance: Values) -> dict[str, dict[str, Any]]:
-    unit = "g" if sensor == "accelerometer" else "deg/s"
-    names = [f"bias_{a}" for a in AXES] + [f"matrix_{a}{b}" for a in AXES for b in AXES]
-    values, u = np.concatenate([bias, matrix.ravel()]), np.sqrt(np.diag(covariance))
-    return {
-        name: {"value": float(v), "unit": unit if j < 3 else "1", "standard_uncertainty": float(s)}
-        for j, (name, v, s) in enumerate(zip(names, values, u, strict=True))
-    }
+    """Return the map from readings to bias and matrix: ``dM = -M dK M``."""
+    J = np.zeros((3, 12, 4))
+    for channel in range(3):
+        J[channel, channel, 0] = 1.0
+        J[channel, 3:, 1:] = -np.einsum("i,bj->ijb", matrix[:, channel], matrix).reshape(9, 3)
+    return LinearMap((weights, weights, weights), (J[0], J[1], J[2]))

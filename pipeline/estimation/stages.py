@@ -22,12 +22,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import CannotCalibrateError, ConfigurationError
+from pipeline.records import StageResult
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
+    from pipeline.estimation.engine import ResidualNoise
     from pipeline.records import Recording, SensorCalibration
 
     Values = NDArray[np.float64]
@@ -67,6 +69,26 @@ def fit_stage(
     named = (stage,) if stage in STAGED[sensor] else (sensor,) if stage in OF_BOTH_SENSORS else ()
     found: SensorCalibration = fit(*named, recordings, previous, settings)
     return found
+
+
+def staged_result(  # noqa: PLR0917  (what a stage of the staged method tells)
+    name: str,
+    steps: Sequence[Mapping[str, Any]],
+    parameters: dict[str, dict[str, Any]],
+    error: Values,
+    samples: tuple[int, int],
+    noise: ResidualNoise,
+    degrees_of_freedom: Values,
+) -> StageResult:
+    """Return the result of a stage; ``error``: of the magnitude of each sample; ``samples``: used, and of all."""
+    details = {
+        "samples_used": samples[0],
+        "samples_left_out": samples[1] - samples[0],
+        "white_noise": noise.white.tolist(),
+        "bias_wander": noise.wander.tolist(),
+        "degrees_of_freedom": float(degrees_of_freedom.min()),
+    }
+    return StageResult(name, parameters, float(np.sqrt(np.mean(error**2))), {"steps": list(steps)}, details)
 
 
 def stages_before(sensor: str, previous: SensorCalibration | None, stages: Mapping[str, Any]) -> list[str]:

@@ -24,10 +24,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.estimation.engine import derivative
+from pipeline.estimation.design import BASE, BASE_NAMES
 from pipeline.estimation.monte_carlo import beside_trials, through, trials_of
 from pipeline.estimation.table_errors import table_errors
-from pipeline.records import NORMAL, RECTANGULAR, SENSOR_UNITS, Contribution, coverage_factor, finite
+from pipeline.records import NORMAL, RECTANGULAR, SENSOR_UNITS, Contribution, FittedEffect, coverage_factor, finite
 from pipeline.signal.temperature import temperature_of
 
 if TYPE_CHECKING:
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike, NDArray
 
+    from pipeline.estimation.design import Term
     from pipeline.estimation.engine import LinearMap, ResidualNoise
     from pipeline.estimation.gauss_markov import Prior
     from pipeline.estimation.table_errors import Reference
@@ -50,17 +51,6 @@ TEMPERATURE = "the parameters hold at the temperature of these recordings; no ac
 TIME_BASE = "the table logs angle and rate itself, so that a wrong clock changes neither"
 FITTED = {"bias": ("bias_temperature", "bias_temperature_quadratic"), "scale_factor": ("scale_factor_temperature",)}
 ACCURACY = "temperature_accuracy_degc"
-
-
-def propagate(
-    function: Callable[[Values], Values], inputs: ArrayLike, covariance: ArrayLike
-) -> tuple[Values, Values, Values]:
-    """Return value, covariance ``C U C^T`` and sensitivity C of a function of (m,) inputs (JCGM 100:2008, 5.2.2)."""
-    x, U = np.asarray(inputs, float), np.asarray(covariance, float)
-    # a ten-thousandth of each uncertainty, or the cube root of rounding, where central differences are best
-    step = np.maximum(1e-4 * np.sqrt(np.diag(U)), 6e-6 * np.maximum(np.abs(x), 1e-300))
-    C = derivative(lambda at: np.asarray(function(at), float), x, step)
-    return np.asarray(function(x), float), C @ U @ C.T, C
 
 
 def effective_degrees_of_freedom(contributions: ArrayLike, degrees_of_freedom: ArrayLike) -> Values:
@@ -300,6 +290,28 @@ def stage_parameters(values: Mapping[str, tuple[float, str]], covariance: Values
         name: {"value": value, "unit": unit, "standard_uncertainty": float(u)}
         for (name, (value, unit)), u in zip(values.items(), own, strict=True)
     }
+
+
+def base_parameters(sensor: str, bias: Values, matrix: Values, covariance: Values) -> dict[str, dict[str, Any]]:
+    """Return bias and matrix as the parameters of a stage."""
+    units = [SENSOR_UNITS[sensor]] * 3 + ["1"] * 9
+    values = zip(np.concatenate([bias, matrix.ravel()]).tolist(), units, strict=True)
+    return stage_parameters(dict(zip(BASE_NAMES, values, strict=True)), covariance)
+
+
+def effect_parameters(
+    sensor: str, terms: Sequence[Term], covariance: Values
+) -> tuple[tuple[FittedEffect, ...], dict[str, dict[str, Any]]]:
+    """Return effects as fitted, and their parameters as those of a stage; they follow bias and matrix."""
+    u = iter(np.sqrt(np.clip(np.diag(covariance)[BASE:], 0.0, None)).tolist())
+    effects, parameters = [], {}
+    for term in terms:
+        pairs = zip(term.effect.parameters(sensor), term.values.tolist(), strict=True)
+        described: dict[str, dict[str, Any]] = {p.name: {"value": value, "unit": p.unit} for p, value in pairs}
+        for name, shared in described.items():
+            parameters[f"{term.effect.name}.{name}"] = {**shared, "standard_uncertainty": next(u)}
+        effects.append(FittedEffect(term.effect.name, described, term.effect.definition))
+    return tuple(effects), parameters
 
 
 def _with_uncertainty(

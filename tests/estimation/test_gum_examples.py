@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
+from pipeline.estimation.engine import derivative
 from pipeline.estimation.least_squares import solve_linear
 from pipeline.estimation.monte_carlo import compare, distribution_of, numerical_tolerance
-from pipeline.estimation.uncertainty_budget import effective_degrees_of_freedom, propagate
+from pipeline.estimation.uncertainty_budget import effective_degrees_of_freedom
 from pipeline.records import coverage_factor
+
+Function = Callable[[np.ndarray], np.ndarray]
 
 # H.2: five simultaneous observations of V (V), I (mA) and phase angle (rad).
 VOLTAGE = [5.007, 4.994, 5.005, 4.990, 4.999]
@@ -24,6 +29,11 @@ def correlation(covariance: np.ndarray) -> np.ndarray:
     return covariance / np.outer(u, u)
 
 
+def propagate(function: Function, x: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    C = derivative(function, x, 1e-4 * np.sqrt(np.diag(covariance)))
+    return function(x), C @ covariance @ C.T
+
+
 def impedance(x: np.ndarray) -> np.ndarray:
     z = x[0] / x[1]
     return np.array([z * np.cos(x[2]), z * np.sin(x[2]), z])
@@ -37,7 +47,7 @@ def test_h2_resistance_reactance_and_impedance_with_their_correlations() -> None
     assert [round(s, d) for s, d in zip(u, (4, 7, 5), strict=True)] == [0.0032, 0.0000095, 0.00075]
     r = correlation(covariance)
     assert [round(r[i, j], 2) for i, j in ((0, 1), (0, 2), (1, 2))] == [-0.36, 0.86, -0.65]
-    value, result, _ = propagate(impedance, mean, covariance)
+    value, result = propagate(impedance, mean, covariance)
     assert np.round(value, 3).tolist() == [127.732, 219.847, 254.260]
     u = np.sqrt(np.diag(result))
     assert [round(u[0], 3), round(u[2], 3)] == [0.071, 0.236]
@@ -55,7 +65,7 @@ def test_h3_calibration_line_of_a_thermometer() -> None:
     assert [round(found.x[1], 5), round(u[1], 5)] == [0.00218, 0.00067]
     assert round(correlation(found.covariance)[0, 1], 3) == -0.930
     assert round(float(np.sqrt(found.residual @ found.residual / found.degrees_of_freedom)), 4) == 0.0035
-    value, covariance, _ = propagate(lambda y: np.array([y[0] + 10.0 * y[1]]), found.x, found.covariance)
+    value, covariance = propagate(lambda y: np.array([y[0] + 10.0 * y[1]]), found.x, found.covariance)
     assert [round(value[0], 4), round(float(np.sqrt(covariance[0, 0])), 4)] == [-0.1494, 0.0041]
     assert found.degrees_of_freedom == 9
 

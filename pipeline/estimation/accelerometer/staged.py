@@ -37,7 +37,7 @@ from pipeline.estimation.accelerometer.turn_extremes import (
 from pipeline.estimation.engine import LinearMap, assess_noise
 from pipeline.estimation.least_squares import ScaledColumns
 from pipeline.estimation.noise import prior_of
-from pipeline.estimation.stages import apply_correction, stages_before, two_sided
+from pipeline.estimation.stages import apply_correction, staged_result, stages_before, two_sided
 from pipeline.estimation.table_errors import Reference, disturbance
 from pipeline.estimation.turns import blocks_of_samples, parts_of
 from pipeline.estimation.uncertainty_budget import (
@@ -48,7 +48,7 @@ from pipeline.estimation.uncertainty_budget import (
     stage_parameters,
 )
 from pipeline.model.effects import effect
-from pipeline.records import AXES, FittedEffect, SensorCalibration, StageResult
+from pipeline.records import AXES, FittedEffect, SensorCalibration
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -285,12 +285,14 @@ def fit(
     else:
         scatter = noise_contribution(noise, map_, prior)
     after = apply_correction({"steps": found.steps}, np.concatenate([turn.reading for turn in turns]))
-    result = StageResult(
-        name=name,
-        parameters=stage_parameters(found.values, scatter.covariance[15:, 15:]),
-        residual_rms=float(np.sqrt(np.mean((np.linalg.norm(after, axis=1) - gravity_g) ** 2))),
-        correction={"steps": found.steps},
-        details=_details(turns, noise, float(scatter.degrees_of_freedom.min())),
+    result = staged_result(
+        name,
+        found.steps,
+        stage_parameters(found.values, scatter.covariance[15:, 15:]),
+        np.linalg.norm(after, axis=1) - gravity_g,
+        (len(after), sum(recording.samples for turn in turns for recording, _ in turn.used)),
+        noise,
+        scatter.degrees_of_freedom,
     )
     last = name == "scale_factor"
     calibration = SensorCalibration(
@@ -311,18 +313,6 @@ def fit(
         return np.array([chain(theta + e).vector()[kept] for e in errors])
 
     return budgeted(calibration, reference, noise, [scatter.of(kept)], settings, results)
-
-
-def _details(turns: Sequence[Turn], noise: ResidualNoise, freedom: float) -> dict[str, Any]:
-    used = sum(len(turn.angle) for turn in turns)
-    total = sum(recording.samples for turn in turns for recording, _ in turn.used)
-    return {
-        "samples_used": used,
-        "samples_left_out": total - used,
-        "white_noise": noise.white.tolist(),
-        "bias_wander": noise.wander.tolist(),
-        "degrees_of_freedom": freedom,
-    }
 
 
 def _asymmetry(found: Corrected) -> FittedEffect:

@@ -38,9 +38,10 @@ import numpy as np
 
 from pipeline.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.engine import LinearMap, assess_noise, derivative
+from pipeline.estimation.generalized_least_squares import with_matrix
 from pipeline.estimation.least_squares import certified, solve_linear
 from pipeline.estimation.noise import prior_of
-from pipeline.estimation.reference_least_squares import inverted
+from pipeline.estimation.reference_least_squares import of_channels
 from pipeline.estimation.table_errors import Reference, disturbance
 from pipeline.estimation.turns import blocks_of_samples, parts_of
 from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, scatter_contribution, stage_parameters
@@ -136,10 +137,8 @@ def fit(
     theta = np.column_stack([previous.bias, A])
 
     def results(errors: Values) -> Values:
-        values = theta.ravel() + errors
-        channels = values.reshape(len(values), 3, 4)
-        plain = np.concatenate([channels[:, :, 0], channels[:, :, 1:].reshape(-1, 9)], axis=1)
-        return plain if as_printed else inverted(values)
+        plain = of_channels(theta.ravel() + errors)
+        return plain if as_printed else with_matrix(plain)
 
     return budgeted(found, reference, noise, lines, settings, results)
 

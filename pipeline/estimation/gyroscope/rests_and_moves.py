@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import CannotCalibrateError, NotObservableError
+from pipeline.estimation.design import BASE_NAMES
 from pipeline.estimation.least_squares import certified
 from pipeline.estimation.multi_position.fit import fit as fit_by_hand
 from pipeline.estimation.multi_position.fit import fit_robustly
@@ -23,7 +24,8 @@ from pipeline.estimation.multi_position.model import State
 from pipeline.estimation.multi_position.result import with_budget
 from pipeline.estimation.noise import noise_of, prior_of
 from pipeline.estimation.rest_means import ROLE, is_multi_position
-from pipeline.records import AXES, SensorCalibration, StageResult
+from pipeline.estimation.uncertainty_budget import base_parameters
+from pipeline.records import SensorCalibration, StageResult
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -31,6 +33,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.records import Recording
+
+    Values = NDArray[np.float64]
 
 NAME = "rests_and_moves"
 MOVED_TIMES = 2  # an error of 0.7 deg squared is 0.01 deg, as large as the noise of a move; a second time 1e-4 deg
@@ -75,14 +79,8 @@ def fit(
         assert model is not None  # noqa: S101
         model, found, outlying = fit_robustly(model, partial(fitted, start=found.state), recordings)
     moves = model.moves.count if model.moves else 0
-    names = [f"bias_{a}" for a in AXES] + [f"matrix_{a}{b}" for a in AXES for b in AXES]
-    _require_known(names, np.sqrt(np.diag(found.covariance)), moves)
-    values = np.concatenate([found.state.bias, found.state.matrix.ravel()])
-    uncertainty = np.sqrt(np.diag(found.covariance))
-    parameters = {
-        name: {"value": float(v), "unit": "deg/s" if i < 3 else "1", "standard_uncertainty": float(u)}
-        for i, (name, v, u) in enumerate(zip(names, values, uncertainty, strict=True))
-    }
+    _require_known(found.covariance, moves)
+    parameters = base_parameters("gyroscope", found.state.bias, found.state.matrix, found.covariance)
     apart = found.residual[model.of_moves] * found.error[model.of_moves]
     at_rest = found.residual[: model.rests_equations] * found.error[: model.rests_equations]
     details: dict[str, Any] = {
@@ -115,9 +113,10 @@ def fit(
     return with_budget(calibration, found.covariance, found.degrees_of_freedom, model, found, settings)
 
 
-def _require_known(names: list[str], u: NDArray[np.float64], moves: int) -> None:
+def _require_known(covariance: Values, moves: int) -> None:
     """Refuse a matrix of which only the noise of the readings says something: no sensor is so far off."""
-    weak = [name for name, one in zip(names[3:], u[3:], strict=True) if one > UNKNOWN]
+    u = np.sqrt(np.diag(covariance))
+    weak = [name for name, one in zip(BASE_NAMES[3:], u[3:], strict=True) if one > UNKNOWN]
     if weak:
         raise NotObservableError(
             f"the {moves} moves are nearly degenerate: they leave {', '.join(weak)} open to {float(u[3:].max()):.2g} "
@@ -125,7 +124,7 @@ def _require_known(names: list[str], u: NDArray[np.float64], moves: int) -> None
         )
 
 
-def _require_determined(base: NDArray[np.float64]) -> None:
+def _require_determined(base: Values) -> None:
     size = np.linalg.norm(base, axis=0)
     s = np.linalg.svd(base / np.where(size > 0.0, size, 1.0), compute_uv=False)
     if s[-1] < NEW * s[0]:

@@ -30,11 +30,11 @@ from pipeline.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.engine import LinearMap, assess_noise, derivative
 from pipeline.estimation.least_squares import ScaledColumns, certified
 from pipeline.estimation.noise import prior_of
-from pipeline.estimation.stages import apply_correction, stages_before
+from pipeline.estimation.stages import apply_correction, staged_result, stages_before
 from pipeline.estimation.table_errors import Reference, disturbance
 from pipeline.estimation.turns import blocks_of_samples, parts_of, steady_turns
 from pipeline.estimation.uncertainty_budget import budgeted, noise_contribution, stage_parameters
-from pipeline.records import AXES, SensorCalibration, StageResult, motion_at_rest
+from pipeline.records import AXES, SensorCalibration, motion_at_rest
 from pipeline.signal.rests import runs
 
 if TYPE_CHECKING:
@@ -186,18 +186,14 @@ def fit(
     scatter = noise_contribution(noise, map_, prior)
     after = apply_correction({"steps": found.steps}, samples.reading)
     error = np.linalg.norm(after, axis=1) - np.linalg.norm(samples.rate, axis=1)
-    result = StageResult(
-        name=name,
-        parameters=stage_parameters(found.values, scatter.covariance[12:, 12:]),
-        residual_rms=float(np.sqrt(np.mean(error**2))),
-        correction={"steps": found.steps},
-        details={
-            "samples_used": len(samples.reading),
-            "samples_left_out": samples.total - len(samples.reading),
-            "white_noise": noise.white.tolist(),
-            "bias_wander": noise.wander.tolist(),
-            "degrees_of_freedom": float(scatter.degrees_of_freedom.min()),
-        },
+    result = staged_result(
+        name,
+        found.steps,
+        stage_parameters(found.values, scatter.covariance[12:, 12:]),
+        error,
+        (len(after), samples.total),
+        noise,
+        scatter.degrees_of_freedom,
     )
     offset, matrix = found.contract()
     condition, columns = ScaledColumns.of(design).condition, design.shape[1]

@@ -27,9 +27,16 @@ from pipeline.estimation.multi_position.model import State, parameter_places, re
 from pipeline.estimation.multi_position.selection import fit_configured, limits_of, select
 from pipeline.estimation.noise import noise_of, prior_of
 from pipeline.estimation.rest_means import rests_of
-from pipeline.estimation.uncertainty_budget import combined, gravity_contribution, scatter_contribution, type_b
+from pipeline.estimation.uncertainty_budget import (
+    base_parameters,
+    combined,
+    effect_parameters,
+    gravity_contribution,
+    scatter_contribution,
+    type_b,
+)
 from pipeline.model.effects import effect
-from pipeline.records import AXES, NORMAL, FittedEffect, SensorCalibration, StageResult
+from pipeline.records import NORMAL, SensorCalibration, StageResult
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -116,17 +123,7 @@ def calibration_of(
     place = parameter_places(model, len(found.covariance))
     covariance = place @ found.covariance @ place.T
     freedom = np.min(np.where(place != 0.0, found.degrees_of_freedom, np.inf), axis=1)
-    uncertainty = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
-    effects, parameters, at = [], {}, 12
-    for term in found.state.terms:
-        described: dict[str, dict[str, Any]] = {}
-        for parameter, value in zip(term.effect.parameters(model.sensor), term.values, strict=True):
-            shared = {"value": float(value), "unit": parameter.unit}
-            described[parameter.name] = shared
-            own = {**shared, "standard_uncertainty": float(uncertainty[at])}
-            parameters[f"{term.effect.name}.{parameter.name}"] = own
-            at += 1
-        effects.append(FittedEffect(term.effect.name, described, term.effect.definition))
+    effects, parameters = effect_parameters(model.sensor, found.state.terms, covariance)
     details = {
         "samples": round(model.samples()),
         "rests": len(model.rests.time),
@@ -144,7 +141,7 @@ def calibration_of(
         bias=found.state.bias,
         matrix=found.state.matrix,
         stages=(*before.stages, StageResult("effects", parameters, rms, None, details)),
-        effects=tuple(effects),
+        effects=effects,
         converged=found.converged,
         convergence=certified(found.cosine, found.condition, found.rank, len(found.covariance)),
     )
@@ -248,12 +245,7 @@ def fit_faces(
     prior = prior_of("accelerometer", recordings, settings)
     noises = prior_hypotheses(prior, float(np.mean(model.white)), model.kinds)
     found = fit(model, State(before.bias, before.matrix), noises, {})
-    names = [f"bias_{a}" for a in AXES] + [f"matrix_{a}{b}" for a in AXES for b in AXES]
-    values = np.concatenate([found.state.bias, found.state.matrix.ravel()])
-    parameters = {
-        name: {"value": float(v), "unit": "g" if i < 3 else "1", "standard_uncertainty": float(u)}
-        for i, (name, v, u) in enumerate(zip(names, values, np.sqrt(np.diag(found.covariance)), strict=True))
-    }
+    parameters = base_parameters("accelerometer", found.state.bias, found.state.matrix, found.covariance)
     force, _ = model.specific_force(found.state, model.rests)
     off = np.degrees(np.einsum("rmc,mc->r", model.faces.weights(), force) / model.gravity).reshape(-1, 2)
     departs = zip(FACES, np.linalg.norm(off, axis=1), strict=True)
