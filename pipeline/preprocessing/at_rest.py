@@ -69,19 +69,9 @@ FEWEST = 32  # samples, of which an axis is copied or stays
 
 
 def check_static(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> list[Recording]:
-    """Return the recordings, of a static one only the part that rests, with the note ``N-MOVED``.
+    """Return the recordings of a unit, of a static one only the part that rests, with the note ``N-MOVED``.
 
-    Parameters
-    ----------
-    recordings : sequence of Recording
-        All of a unit.
-    settings : mapping
-        Section ``sensor``.
-
-    Raises
-    ------
-    IngestError
-        If too little of it rests.
+    ``settings`` holds the section ``sensor``. ``IngestError``: too little of a static recording rests.
     """
     if all(r.role != "static" for r in recordings):
         return list(recordings)

@@ -45,7 +45,7 @@ def check_recordings(recordings: Sequence[Recording], settings: Mapping[str, Any
     Parameters
     ----------
     recordings : sequence of Recording
-        All of one unit, in body axes, not filtered.
+        In body axes, not filtered.
     settings : mapping
         The unit's configuration: sections ``procedure``, ``sensor``, ``table`` and ``ingest``.
 

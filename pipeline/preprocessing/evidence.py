@@ -120,14 +120,20 @@ def gaps(recording: Recording) -> NDArray[np.bool_]:
     return np.asarray(np.diff(recording.time_ns) > GAP * recording.interval * 1e9)
 
 
-def of_angle(recording: Recording, angle: Array) -> Channel:
-    """Return what a table's angle says."""
-    return _of_turned("table_angle", recording, np.diff(angle))
+def of_table(recording: Recording) -> list[Channel]:
+    """Return what the table's log says: its rate, and the angle of a turn or the attitude of held-out motion.
 
-
-def of_attitude(recording: Recording, attitude: Array) -> Channel:
-    """Return what a table's attitude says of the size of the rate."""
-    return _of_turned("table_attitude", recording, np.linalg.norm(spin(attitude), axis=1))
+    Of held-out motion it is the size of the rate.
+    """
+    channels, turns = [], recording.axis is not None
+    rate, angle, attitude = recording.table_rate, recording.table_angle, recording.table_attitude
+    if rate is not None:
+        channels.append(of_rate(recording, "table_rate", rate if turns else np.abs(rate)))
+    if turns and angle is not None:
+        channels.append(_of_turned("table_angle", recording, np.diff(angle)))
+    if not turns and attitude is not None:
+        channels.append(_of_turned("table_attitude", recording, np.linalg.norm(spin(attitude), axis=1)))
+    return channels
 
 
 def spin(attitude: Array) -> Array:
@@ -157,11 +163,13 @@ def of_rate(recording: Recording, name: str, rate: Array, known: NDArray[np.bool
     return Channel(name, low, high, turned, noise)
 
 
-def alike(channel: Channel, other: Channel) -> Channel:
-    """Return a channel with the sign of another, where they are the same but for it: an angle counted left-handed."""
-    if _alike(channel.turned, other.turned) < -OPPOSITE:
-        return replace(channel, low=-channel.high, high=-channel.low, turned=-channel.turned)
-    return channel
+def alike(channels: list[Channel]) -> list[Channel]:
+    """Return channels with the sign of the first, where they are the same but for it: an angle counted left-handed."""
+    first = channels[0]
+    return [
+        replace(c, low=-c.high, high=-c.low, turned=-c.turned) if _alike(c.turned, first.turned) < -OPPOSITE else c
+        for c in channels
+    ]
 
 
 def _alike(one: Array, two: Array) -> float:

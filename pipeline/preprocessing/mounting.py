@@ -49,19 +49,10 @@ UNLIKE = 0.5  # gain of the stated axis over that of another one, below which th
 
 
 def check_mounting(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> list[Recording]:
-    """Return the recordings with the table's angle and rate by the convention.
+    """Return the recordings of a unit, in body axes, with the table's angle and rate by the convention.
 
-    Parameters
-    ----------
-    recordings : sequence of Recording
-        All of one unit, in body axes.
-    settings : mapping
-        Sections ``procedure``, ``table`` and ``sensor`` of the unit's configuration.
-
-    Raises
-    ------
-    IngestError
-        If a turn is mounted otherwise than stated, or accelerometer and gyroscope contradict each other.
+    ``settings``: sections ``procedure``, ``table`` and ``sensor``. ``IngestError``: a turn is mounted otherwise
+    than stated, or accelerometer and gyroscope contradict each other.
     """
     procedure, table, sensor = (settings.get(key) or {} for key in ("procedure", "table", "sensor"))
     turns = [_turn(r, procedure.get("recordings") or {}, table) for r in recordings]

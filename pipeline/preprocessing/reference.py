@@ -18,10 +18,9 @@ from pipeline.preprocessing.evidence import (
     alike,
     axis_index,
     gravity_turned,
-    of_angle,
-    of_attitude,
     of_gravity,
     of_rate,
+    of_table,
     quantiles,
     rate_of_turn,
     refusal,
@@ -57,21 +56,10 @@ SAME = 0.1  # relative: gains of two turns that are of one gyroscope
 def check_turns(
     recordings: Sequence[Recording], settings: Mapping[str, Any]
 ) -> tuple[list[Recording], dict[str, Delay]]:
-    """Return the recordings with notes on the reference of their turns, and how late the sensor is in each.
+    """Return the recordings of a unit with notes on the reference of their turns, and how late the sensor is in each.
 
-    Signs and directions do not count: this goes before the mounting, which wrong units would hide.
-
-    Parameters
-    ----------
-    recordings : sequence of Recording
-        All of a unit.
-    settings : mapping
-        Sections ``sensor``, ``table`` and ``ingest``.
-
-    Raises
-    ------
-    IngestError
-        If channels of a turn contradict each other beyond what an effect of the catalogue explains.
+    Signs and directions do not count: this goes before the mounting, which wrong units would hide. ``IngestError``:
+    channels of a turn contradict each other beyond what an effect of the catalogue explains.
     """
     limits, turns = Limits.of(settings), _turns(recordings)
     for recording in turns:
@@ -90,21 +78,10 @@ def _turns(recordings: Sequence[Recording]) -> list[Recording]:
 def check_motion(
     recordings: Sequence[Recording], delays: Mapping[str, Delay], settings: Mapping[str, Any]
 ) -> list[Recording]:
-    """Return the recordings with notes on the reference of held-out motion.
+    """Return the recordings of a unit with notes on the reference of held-out motion.
 
-    Parameters
-    ----------
-    recordings : sequence of Recording
-        All of a unit, their turns as they are mounted.
-    delays : mapping of str to Delay
-        Of the turns.
-    settings : mapping
-        Sections ``sensor``, ``table`` and ``ingest``.
-
-    Raises
-    ------
-    IngestError
-        If its channels contradict each other, or a recording is late otherwise than all others.
+    The turns are as they are mounted, with their ``delays``. ``IngestError``: channels of held-out motion contradict
+    each other, or a recording is late otherwise than all others.
     """
     limits, gyroscope = Limits.of(settings), _Gyroscope(_turns(recordings))
     moved = [r for r in recordings if r.samples >= FEWEST and r.role != "static" and r.axis is None]
@@ -168,12 +145,7 @@ class _Gyroscope:
 
 
 def _check_turn(recording: Recording, gyroscope: _Gyroscope, limits: Limits) -> tuple[list[Note], Delay | None]:
-    channels, axis = [], axis_index(recording)
-    if recording.table_rate is not None:
-        channels.append(of_rate(recording, "table_rate", recording.table_rate))
-    if recording.table_angle is not None:
-        angle = of_angle(recording, recording.table_angle)
-        channels.append(alike(angle, channels[0]) if channels else angle)
+    channels, axis = alike(of_table(recording)), axis_index(recording)
     seen = gyroscope.along(recording, axis)
     if seen is not None:
         channels.append(of_rate(recording, "gyroscope", seen, recording.valid))
@@ -192,11 +164,7 @@ def _check_motion(recording: Recording, gyroscope: _Gyroscope, limits: Limits) -
     vector = gyroscope.vector(recording)
     size = None if vector is None else np.linalg.norm(vector, axis=1)
     check_scale_of_motion(recording, size, limits)
-    channels = []
-    if recording.table_rate is not None:
-        channels.append(of_rate(recording, "table_rate", np.abs(recording.table_rate)))
-    if recording.table_attitude is not None:
-        channels.append(of_attitude(recording, recording.table_attitude))
+    channels = of_table(recording)
     if size is not None:
         channels.append(of_rate(recording, "gyroscope", size, recording.valid))
     found = _compare(recording, channels, limits)

@@ -28,9 +28,8 @@ from pipeline.preprocessing.evidence import (
     gaps,
     gravity_turned,
     largest_but,
-    of_angle,
-    of_attitude,
     of_rate,
+    of_table,
     place,
     ratio_quartiles,
     refusal,
@@ -129,29 +128,22 @@ def check_scale_of_turn(recording: Recording, limits: Limits) -> None:
 def _turned(recording: Recording) -> tuple[Array | None, ...]:
     """Return the angle turned in each block of a turn by angle, rate, gyroscope and gravity: (96,) arrays, deg."""
     axis = axis_index(recording)
-    angle = rate = gyro = None
-    if recording.table_angle is not None:
-        angle = of_angle(recording, recording.table_angle).turned
-    if recording.table_rate is not None:
-        rate = of_rate(recording, "table_rate", recording.table_rate).turned
+    found = {c.name: c.turned for c in of_table(recording)}
+    gyro = None
     if recording.gyroscope is not None:
         reading = still = recording.gyroscope[:, axis]
         if recording.table_rate is not None:
             still = reading[np.abs(recording.table_rate) <= np.min(np.abs(recording.table_rate))]
         gyro = of_rate(recording, "gyroscope", reading - np.median(still), recording.valid).turned
-    found = (angle, rate, gyro, gravity_turned(recording, axis))
-    return tuple(None if turned is None else _in_blocks(turned) for turned in found)
+    every = (found.get("table_angle"), found.get("table_rate"), gyro, gravity_turned(recording, axis))
+    return tuple(map(_in_blocks, every))
 
 
 def check_scale_of_motion(recording: Recording, size: Array | None, limits: Limits) -> None:
     """Refuse held-out motion whose rate, attitude and gyroscope (its calibrated ``size``) contradict each other."""
-    rate = attitude = gyro = None
-    if recording.table_rate is not None:
-        rate = _in_blocks(of_rate(recording, "table_rate", np.abs(recording.table_rate)).turned)
-    if recording.table_attitude is not None:
-        attitude = _in_blocks(of_attitude(recording, recording.table_attitude).turned)
-    if size is not None:
-        gyro = _in_blocks(of_rate(recording, "gyroscope", size, recording.valid).turned)
+    found = {c.name: _in_blocks(c.turned) for c in of_table(recording)}
+    rate, attitude = found.get("table_rate"), found.get("table_attitude")
+    gyro = None if size is None else _in_blocks(of_rate(recording, "gyroscope", size, recording.valid).turned)
     tolerance = limits.rate + limits.gain
     by_gyro, ratio = _ratio(rate, gyro), _ratio(rate, attitude)
     if ratio is None and by_gyro is not None and by_gyro.even and by_gyro.off(tolerance):
@@ -239,8 +231,10 @@ def check_intervals(recordings: Sequence[Recording], limits: Limits) -> None:
             )
 
 
-def _in_blocks(turned: Array) -> Array:
+def _in_blocks(turned: Array | None) -> Array | None:
     """Return the angle turned in each block of a recording: (96,) array, deg."""
+    if turned is None:
+        return None
     starts = np.linspace(0, len(turned), min(BLOCKS, len(turned)), endpoint=False).astype(int)
     return np.asarray(np.add.reduceat(turned, starts))
 
