@@ -85,21 +85,20 @@ class _Seats:
 
 def _find_seats(turns: Sequence[_Conventional]) -> _Seats:
     """Return K and the seats that explain p and q of turns about all three axes, by Gauss-Newton steps."""
-    seats, K = np.zeros((len(turns), 3)), np.eye(3)
+    n = len(turns)
+    seats, K = np.zeros((n, 3)), np.eye(3)
+    gauge = GAUGE * np.eye(9 + seats.size)[9:]
     for _ in range(4):
         R = turn_by_vector(np.radians(seats))
-        rows, left = [], []
+        design, left = np.zeros((n, 2, 3, 9 + seats.size)), np.zeros((n, 2, 3))
         for k, turn in enumerate(turns):
-            for ideal, found in zip(turn.ideal, turn.gravity[1:], strict=True):
+            for row, ideal in enumerate(turn.ideal):
                 d = R[k].T @ ideal
-                row = np.zeros((3, 9 + seats.size))
-                row[0, :3] = row[1, 3:6] = row[2, 6:9] = d
-                row[:, 9 + 3 * k : 12 + 3 * k] = np.radians(K @ skew(d))
-                rows.append(row)
-                left.append(found - K @ d)
-        gauge = GAUGE * np.eye(9 + seats.size)[9:]
-        off = np.concatenate([*left, -GAUGE * seats.ravel()])
-        step = np.linalg.lstsq(np.vstack([*rows, gauge]), off, rcond=None)[0]
+                design[k, row, :, :9] = np.kron(np.eye(3), d)
+                design[k, row, :, 9 + 3 * k : 12 + 3 * k] = np.radians(K @ skew(d))
+                left[k, row] = turn.gravity[1 + row] - K @ d
+        rows, off = design.reshape(6 * n, -1), np.append(left, -GAUGE * seats)
+        step = np.linalg.lstsq(np.vstack([rows, gauge]), off, rcond=None)[0]
         K, seats = K + step[:9].reshape(3, 3), seats + step[9:].reshape(-1, 3)
     common, zeros = _zeros(turns, seats)
     return _Seats(K @ turn_by_vector(np.radians(common)).T, seats - seats.mean(axis=0), zeros)
@@ -126,54 +125,52 @@ def _zero_of(turn: _Conventional, K: Vector) -> float:
 
 def _table_explains(turns: Sequence[_Conventional], K: Vector, limits: Sequence[float]) -> bool:
     """Return whether tilt, leaning axes and a time offset within limits explain the turns, and seats do not better."""
-    tilt, lean, late = (np.vstack([one(t) for t in turns]) for one in (_tilt_columns, _lean_columns, _offset_columns))
-    seat = np.zeros((9 * len(turns), 3 * len(turns)))
+    tilt, lean, late = (np.stack([one(t) for t in turns]) for one in (_tilt_columns, _lean_columns, _offset_columns))
+    seat = np.zeros((len(turns), 3, 3, 3 * len(turns)))
     for k, turn in enumerate(turns):
-        for row, ideal in enumerate(turn.ideal):
-            seat[9 * k + 3 * row : 9 * k + 3 * row + 3, 3 * k : 3 * k + 3] = np.radians(skew(ideal))
-    level_seats = _fit(turns, K, seat, [np.inf] * seat.shape[1])
+        seat[k, 1:, :, 3 * k : 3 * k + 3] = [np.radians(skew(ideal)) for ideal in turn.ideal]
+    level_seats = _fit(turns, K, seat, [np.inf] * 3 * len(turns))
     of_tilt, of_lean = [limits[0]] * 2, [limits[1]] * 6
-    tilted = _fit(turns, K, np.hstack([tilt, late]), [*of_tilt, limits[2]])
+    tilted = _fit(turns, K, np.concatenate([tilt, late], axis=3), [*of_tilt, limits[2]])
     if tilted < min(FITS, level_seats):
         return True
-    leaning = _fit(turns, K, np.hstack([lean, late]), [*of_lean, limits[2]])
-    both = _fit(turns, K, np.hstack([tilt, lean, late]), [*of_tilt, *of_lean, limits[2]])
+    leaning = _fit(turns, K, np.concatenate([lean, late], axis=3), [*of_lean, limits[2]])
+    both = _fit(turns, K, np.concatenate([tilt, lean, late], axis=3), [*of_tilt, *of_lean, limits[2]])
     return min(leaning, both + OF_TWO_MORE) < min(FITS, level_seats - CLEARLY)
 
 
 def _fit(turns: Sequence[_Conventional], K: Vector, columns: Vector, limits: Sequence[float]) -> float:
-    """Return chi-square of K, b and parameters of further columns; infinity where one exceeds its limit."""
-    n = len(turns)
-    design = np.zeros((9 * n, 12 + columns.shape[1]))
-    design[:, 12:] = (columns.reshape(3 * n, 3, -1).transpose(0, 2, 1) @ K.T).transpose(0, 2, 1).reshape(9 * n, -1)
-    found = np.zeros(9 * n)
+    """Return chi-square of K, b and parameters of further columns; infinity where one exceeds its limit.
+
+    ``columns`` is (n, 3, 3, m): of each turn c, p and q with K the unit matrix.
+    """
+    design = np.zeros((*columns.shape[:3], 12 + columns.shape[3]))
     for k, turn in enumerate(turns):
-        for row, ideal in enumerate(turn.ideal):
-            design[9 * k + 3 * row : 9 * k + 3 * row + 3, :9] = np.kron(np.eye(3), ideal)
-        design[9 * k + 6 : 9 * k + 9, 9:12] = np.eye(3)
-        constant, cosine, sine = turn.gravity
-        found[9 * k : 9 * k + 9] = np.concatenate([cosine, sine, constant])
-    weight = np.tile(np.repeat([1.0 / NOISE_PQ_G, 1.0 / NOISE_PQ_G, 1.0 / NOISE_C_G], 3), n)
-    values = np.linalg.lstsq(weight[:, None] * design, weight * found, rcond=1e-9)[0]
-    if np.any(np.abs(values[12:]) > np.array(limits)):
-        return float("inf")
-    return float(np.sum((weight * (found - design @ values)) ** 2))
+        design[k, 1:, :, :9] = [np.kron(np.eye(3), ideal) for ideal in turn.ideal]
+    design[:, 0, :, 9:12] = np.eye(3)
+    design[..., 12:] = K @ columns
+    weight = 1.0 / np.array([[NOISE_C_G], [NOISE_PQ_G], [NOISE_PQ_G]])
+    A = (weight[..., None] * design).reshape(9 * len(turns), -1)
+    y = (weight * np.array([turn.gravity for turn in turns])).ravel()
+    values = np.linalg.lstsq(A, y, rcond=1e-9)[0]
+    exceeded = np.any(np.abs(values[12:]) > np.array(limits))
+    return float("inf") if exceeded else float(np.sum((y - A @ values) ** 2))
 
 
 def _of_quarters(values: Vector) -> Vector:
-    """Return p, q and c of a function of the angle at 0, 90, 180 and 270 deg: (4, 3, m) array to (9, m)."""
+    """Return c, p and q of a function of the angle at 0, 90, 180 and 270 deg: (4, 3, m) array to (3, 3, m)."""
     at_0, at_90, at_180, at_270 = values
-    return np.concatenate([(at_0 - at_180) / 2.0, (at_90 - at_270) / 2.0, values.mean(axis=0)])
+    return np.stack([values.mean(axis=0), (at_0 - at_180) / 2.0, (at_90 - at_270) / 2.0])
 
 
 def _tilt_columns(turn: _Conventional) -> Vector:
-    """Return the derivative by the tilt about level x and y, 1/deg: (9, 2) array, as ``effects/table_tilt.py``."""
+    """Return the derivative by the tilt about level x and y, 1/deg: (3, 3, 2) array, as ``effects/table_tilt.py``."""
     level = turn_about_axis(level_at_zero(turn.axis), turn.axis, -QUARTERS)
     return _of_quarters(np.radians(np.stack([level[:, 1], -level[:, 0]], axis=2)))
 
 
 def _lean_columns(turn: _Conventional) -> Vector:
-    """Return the derivative by six leans, 1/deg: (9, 6) array, as ``effects/table_axis_nonorthogonality.py``."""
+    """Return the derivative by six leans, 1/deg: (3, 3, 6) array, as ``effects/table_axis_nonorthogonality.py``."""
     out = np.zeros((4, 3, 6))
     up = UP_AT_ZERO[turn.axis]
     force = turn_about_axis(up, turn.axis, -QUARTERS)
@@ -185,9 +182,9 @@ def _lean_columns(turn: _Conventional) -> Vector:
 
 
 def _offset_columns(turn: _Conventional) -> Vector:
-    """Return the derivative by a time offset, 1/s: (9, 1) array; the angle is ahead by offset times mean rate."""
+    """Return the derivative by a time offset, 1/s: (3, 3, 1) array; the angle is ahead by offset times mean rate."""
     up, across = turn.ideal
-    return np.asarray(np.radians(turn.mean_rate) * np.concatenate([across, -up, np.zeros(3)])[:, None])
+    return np.asarray(np.radians(turn.mean_rate) * np.stack([np.zeros(3), across, -up])[..., None])
 
 
 def _axis_off_deg(turn: _Conventional, K: Vector, others: Sequence[_Conventional]) -> Vector:

@@ -15,14 +15,14 @@ from pipeline.io.mcap_reader import McapReader
 from pipeline.io.message_decoder import object_decoder, ros_layouts
 from pipeline.io.message_layout import short_name
 from pipeline.io.quality_flags import CLIPPED, GAP, STUCK, equal_share
+from pipeline.io.units import TRIADS
 from pipeline.profile_detection.unit_guesses import BURSTS, FEWEST_RESTS_FOR_A_SPHERE, sphere
 from pipeline.records import AXES, SENSOR_UNITS, SENSORS
-from pipeline.signal.rests import rests_from_table
+from pipeline.signal.rests import rests_from_table, runs
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
-    from typing import Any
 
     from mcap.records import Channel, Schema
     from numpy.typing import NDArray
@@ -160,9 +160,8 @@ def _clipping(recording: Recording, sensor: Mapping[str, Any]) -> str:
             largest = float(np.abs(readings).max())
             found.append(f"{name} up to {_number(largest)} of {known[name]:g} {SENSOR_UNITS[name]}")
             continue
-        for axis, values in zip(AXES, readings.T, strict=True):
-            short = "accel" if name == "accelerometer" else "gyro"
-            found += [f"{short}_{axis} stays at {t}: clipped?" for t in plateaus(values)]
+        for channel, values in zip(TRIADS[name], readings.T, strict=True):
+            found += [f"{channel} stays at {text}: clipped?" for text in _plateaus(values)]
     marked = 0 if flags is None else int(np.count_nonzero(flags & CLIPPED))
     stuck = 0 if flags is None else int(np.count_nonzero(flags & STUCK))
     if all(known.values()):
@@ -172,7 +171,7 @@ def _clipping(recording: Recording, sensor: Mapping[str, Any]) -> str:
     return "; ".join([*found, *([f"{stuck} rows stuck"] if stuck else [])])
 
 
-def plateaus(values: NDArray[np.float64]) -> list[str]:
+def _plateaus(values: NDArray[np.float64]) -> list[str]:
     """Return in words where a channel stays at its largest or smallest value, as one that is clipped does."""
     same = values[1:] == values[:-1]
     if same.mean() > 0.5 or equal_share(same) > 0.5:
@@ -180,15 +179,10 @@ def plateaus(values: NDArray[np.float64]) -> list[str]:
     found = []
     for extreme in (values.max(), values.min()):
         at = values == extreme
-        longest = _longest_run(at)
+        longest = max((b - a for a, b in runs(at)), default=0)
         if longest >= PLATEAU:
             found.append(f"{_number(float(extreme))} for {longest} samples ({int(at.sum())} in all)")
     return found
-
-
-def _longest_run(mask: NDArray[np.bool_]) -> int:
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
-    return int((edges[1::2] - edges[::2]).max()) if edges.size else 0
 
 
 def _units(recording: Recording, rests: Sequence[tuple[int, int]]) -> list[Line]:
