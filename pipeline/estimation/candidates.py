@@ -23,9 +23,7 @@ if TYPE_CHECKING:
 
 AUTO = "auto"  # in place of a list of effects: what the diagnosis selects
 MOUNTING, ZERO = "mounting", "encoder_zero"
-SEAT_DEG = (
-    5.0  # deg, where the mountings are fitted and the table's config states none: the default tolerance of ingest
-)
+SEAT_DEG = 5.0  # where mountings are fitted and the table's config states no size: the default tolerance of ingest
 SECOND = {"accelerometer": (), "gyroscope": ("table_encoder_error",)}  # exact look-alikes of a likelier effect
 
 
@@ -110,6 +108,8 @@ def prior_of(this: Effect, observed: Observations, accelerometer: SensorCalibrat
     theirs, names = found.definition["recordings"], accelerometer.parameter_names()
     first = names.index(f"{MOUNTING}.{next(iter(found.parameters))}")
     mine = [(k, theirs.index(name)) for k, name in enumerate(recordings) if name in theirs]
+    if not mine:
+        return NormalPrior(mean, np.eye(size) / seat_deg**2)
     here = np.concatenate([np.arange(3 * k, 3 * k + 3) for k, _ in mine])
     there = np.concatenate([np.arange(3 * k, 3 * k + 3) for _, k in mine])
     mean[here] = found.values[there]
