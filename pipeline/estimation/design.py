@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 
     Values = NDArray[np.float64]
 
-BASE = 12
-REMEMBERED = 4
+BASE = 12  # bias and matrix
+REMEMBERED = 4  # motions of a part after effects of timing: base and as many terms without themselves
 BASE_NAMES = [f"bias_{a}" for a in "xyz"] + [f"matrix_{a}{b}" for a in "xyz" for b in "xyz"]
 
 

@@ -52,10 +52,10 @@ if TYPE_CHECKING:
 
     Values = NDArray[np.float64]
 
-ROUNDS = 25
+ROUNDS = 25  # of Gauss-Newton
 SMALL_STEP = 1e-3  # of a standard uncertainty
-RATIOS = (0.01, 0.03, 0.1, 0.2, 0.3, 0.5, 1.0, 3.0)
-TIMES = (30.0, 100.0, 300.0, 1000.0)
+RATIOS = (0.01, 0.03, 0.1, 0.2, 0.3, 0.5, 1.0, 3.0)  # of bias to white noise: the grid of a fit
+TIMES = (30.0, 100.0, 300.0, 1000.0)  # s, correlation times of that grid
 RANK = 1e-12  # of the products' eigenvalues: the rounding of a double, with a margin
 LEAST_EIGENVALUE = 1e-7  # of the products of columns of unit norm: a column is 3e-4 new
 

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     Values = NDArray[np.float64]
     Draw = Callable[[np.random.Generator, int], Values]
 
-SEED = 101
+SEED = 101  # any number
 BATCH = 500  # trials drawn at a time, which bounds the memory
 TWO_DIGITS = 1_000_000  # trials
 KEY = "monte_carlo"

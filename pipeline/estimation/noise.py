@@ -68,13 +68,13 @@ if TYPE_CHECKING:
     Values = NDArray[np.float64]
 
 TIMES = np.exp2(np.arange(-6.0, 4.0))  # correlation times tried, in those of the data sheet
-SHORTEST_BLOCK = 8
-FEWEST_SAMPLES = 60
+SHORTEST_BLOCK = 8  # samples of a block
+FEWEST_SAMPLES = 60  # which tell white noise to a tenth
 WINDOW, WINDOW_DEGREE, WINDOW_ARC_DEG = 16, 4, 60.0
-WARM_UP_S = (60.0, 180.0, 500.0)
+WARM_UP_S = (60.0, 180.0, 500.0)  # time constants of warm-up that are regressed out
 SMALLEST_WHITE = 1e-9  # keeps the weights of a noise-free recording finite
 SEEN, AGREES = 6.0, 4.0  # twice the gain in log-likelihood
-BLOCKS = 60
+BLOCKS = 60  # of all rests together
 RATIOS = np.concatenate([[0.0], np.geomspace(2e-3, 5.0, 40)])  # of the bias to white noise: a step is 22 %
 WEAKEST_DIRECTION = 1e-3  # of unit columns, below which two nuisance columns count as one
 

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 ROLES = ("accelerometer", "gyroscope", "static")
 BLOCKS = 300  # of the bias: their length is below a tenth of the shortest correlation time of the grid
-SHORTEST_BLOCK_S = 4.0
+SHORTEST_BLOCK_S = 4.0  # a fraction of the shortest correlation time of the grid
 FORGOTTEN, FORGOTTEN_DPS = 1e-5, 1e-4  # share of the largest rate that a filter may still hold of a doubtful one
 LONGEST_RESPONSE = 400  # samples
 

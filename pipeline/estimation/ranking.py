@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 EXCITED = 1e-3  # share of a column's norm that the base leaves
 NEW = 1e-4  # share of the variance of a candidate's weakest direction that the chosen effects leave
-RIDGE = 1e-11
+RIDGE = 1e-11  # of unit columns: 1e5 times the rounding of a double
 
 
 @dataclass(frozen=True)

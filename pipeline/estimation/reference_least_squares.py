@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
 NAME = "reference_least_squares"
 COLUMNS = ("bias", *(f"matrix column {axis}" for axis in AXES))
-WEAKEST_DIRECTION = 1e-3
+WEAKEST_DIRECTION = 1e-3  # smallest singular value of unit columns that still counts as determined
 SHARP_CHANGE = 1e-3  # of the largest rate between two samples, where the rate is not logged
 ADVICE = {
     "accelerometer": "turns about at least two axes bring gravity along all three",

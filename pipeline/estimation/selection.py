@@ -43,21 +43,21 @@ if TYPE_CHECKING:
 
     Values = NDArray[np.float64]
 
-GATE_BIC = 10.0
-SLOW_GATE_BIC = 16.0
+GATE_BIC = 10.0  # "very strong" evidence (Raftery, Sociological Methodology 25, 1995)
+SLOW_GATE_BIC = 16.0  # for a bias that follows time or temperature, see above
 SLOW_BIAS = ("bias_drift", "bias_temperature", "bias_temperature_quadratic", "warm_up")
-GATE_P = 0.01
-MOST = 5
-INFLATED = 3.0
+GATE_P = 0.01  # of a false selection, over all candidates (Bonferroni)
+MOST = 5  # effects that one selection adds
+INFLATED = 3.0  # times the expected wander, see above
 EVIDENCE = 5.0  # difference in log L: a Bayes factor of 150, "very strong" (Kass and Raftery, JASA 90, 1995)
 ALIKE = 0.8  # share of an effect's signal that another reproduces, from which on it is a look-alike
 MOVER_SHARE = 0.1  # of the best candidate's delta BIC above which an effect of timing is fitted to its own optimum
 CONSTANT_SHARE = 0.6  # the same for an effect with a time constant, whose start is near its optimum
 DELAYS = ("time_offset", "low_pass_lag")  # of the two the first is taken unless the second is clearly better
-CLEARLY = 6.0
-TIE = 0.5
+CLEARLY = 6.0  # delta BIC: "strong" evidence (Raftery 1995)
+TIE = 0.5  # delta BIC below which the catalogue's order decides
 SECOND_ORDER = 2e-4  # of the gain in 2 log L by what is selected: what equations of first order may leave of it
-HIGHEST_GATE = 30.0
+HIGHEST_GATE = 30.0  # of the gate beside large effects, see above
 FAR_ABOVE = 2.0  # times the noise: the residual of a model that misses more than the catalogue holds
 WORTH_NAMING = 0.05  # share of such a residual's excess that an effect must explain
 ANOTHER_K = 2e-3  # change of K that changes the columns of effects that the axes share

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
     Values = NDArray[np.float64]
 
-SAME_STOP_DEG = 0.02
+SAME_STOP_DEG = 0.02  # by which angles of one stop may differ
 COUNTED_STOPS = 4  # rests of a recording from which on it stops and goes: its steps are counted, whatever their rate
 FIELDS = {
     "table angle": ("angle_accuracy_deg", "deg"),

@@ -43,19 +43,19 @@ if TYPE_CHECKING:
     Values = NDArray[np.float64]
 
 BLOCKS = 100  # of a fit's samples: enough to resolve correlation times down to a hundredth of the recordings
-DISTINCT_DIRECTION_G = 0.01
-ROUNDS = 12
+DISTINCT_DIRECTION_G = 0.01  # attitudes 0.6 deg apart differ
+ROUNDS = 12  # of the phase
 SAME_PHASE = 1e-12  # rad
 SLOWEST_SHARE = 0.02  # of the largest rate, below which a turn is not called one
 CHANGE_PER_SECOND = 0.25  # of the rate, above which a turn is not steady
-EDGE_S = 0.15
+EDGE_S = 0.15  # left out at either end of a steady turn, where the table still accelerates
 LONGEST_TAIL = 0.4  # of a steady turn
 DELAYS_TO_FOLLOW = 5.0  # after which an RC filter holds less than 1 % of a change of rate
 WEAKEST_DIRECTION = 1e-3  # smallest singular value of unit columns that still counts as determined
 MEAN_S = 1.0  # a mean hides no motion at rest, and keeps the readings' change with temperature
 MEDIAN_OF_DIFFERENCES = 0.9099  # median of (w[n+1] - w[n])^2 of white noise of variance 1: 2 times that of chi-square
 SCATTERED = 6.0  # standard deviations of a chi-square above its mean, and half its square for the tail of few samples
-BEND_DPS, BEND_SHARE = 0.05, 1e-3
+BEND_DPS, BEND_SHARE = 0.05, 1e-3  # see ``followed``
 ARRAYS = (
     "time",
     "specific_force",

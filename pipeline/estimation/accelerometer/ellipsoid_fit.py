@@ -44,7 +44,7 @@ NAMES = [f"bias_{axis}" for axis in "xyz"] + [
     for i, j in zip(ROWS, COLUMNS, strict=True)
 ]
 MISALIGNMENT = np.concatenate([np.zeros(3, bool), ROWS != COLUMNS])
-ROUNDS = 20
+ROUNDS = 20  # of s_r^2 and the fit, one after the other
 
 
 @dataclass(frozen=True)

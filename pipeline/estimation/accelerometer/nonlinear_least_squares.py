@@ -66,9 +66,9 @@ NAME = "nonlinear_least_squares"
 MISALIGNMENT_UNKNOWN = 0.05  # rad, standard uncertainty above which the rests do not determine a misalignment
 UNKNOWN = 0.05  # g of a bias, relative of a scale factor: beyond it nothing of them is known
 FALSE_ALARM = 1e-3  # probability of calling one of the rests of a sound recording an outlier
-SMALLEST_OUTLIER_G = 1e-6
+SMALLEST_OUTLIER_G = 1e-6  # rests of a noise-free recording are no outliers
 FEWEST_TO_JUDGE = 18  # rests, two a parameter
-OUTLIER_SHARE = 0.2
+OUTLIER_SHARE = 0.2  # of the rests: where more are off, none can be called wrong
 MOST_ROWS = 600  # of which a covariance is drawn
 
 

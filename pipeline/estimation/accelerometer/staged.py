@@ -65,7 +65,7 @@ if TYPE_CHECKING:
     Quantities = dict[str, tuple[float, str]]
 
 REPLICATES = 60  # synthetic turns: their covariance is known to a tenth
-SEED = 20190508
+SEED = 20190508  # any number
 AS_PRINTED = "the printed variant takes single samples, through which no error of the table can be followed"
 STEP = 1e-7  # g, of the differences: truncation and rounding are then both about 1e-8 of the derivative
 ASYMMETRY = "scale_factor_asymmetry"

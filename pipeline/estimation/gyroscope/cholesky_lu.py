@@ -61,9 +61,9 @@ if TYPE_CHECKING:
 NAME = "cholesky_lu"
 STEP = 1e-6  # of the central differences: truncation and rounding are below 1e-9 of the derivative
 MOTION_SHARE = 0.01  # of the largest rate, above which the table turns
-SLOWEST_DPS = 0.02
-DELAYS_TO_SETTLE = 5.0
-SMALLEST_ANGLE_DEG = 1.0
+SLOWEST_DPS = 0.02  # five times Earth's rotation, which a log may contain
+DELAYS_TO_SETTLE = 5.0  # after which an RC filter holds less than 1 % of a change of rate
+SMALLEST_ANGLE_DEG = 1.0  # a shorter move says little of a matrix
 
 
 @dataclass(frozen=True)

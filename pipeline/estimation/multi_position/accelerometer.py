@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     Values = NDArray[np.float64]
 
-ROUNDS = 12
+ROUNDS = 12  # of effects that depend on the force
 SETTLED = 1e-12  # g
 SMALLEST_NOISE = 1e-9  # g
 

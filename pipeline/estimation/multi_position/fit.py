@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     Values = NDArray[np.float64]
     Limits = Mapping[str, Values]  # effect to the limits of its parameters, infinite where there are none
 
-ROUNDS, HALVINGS = 60, 12
+ROUNDS, HALVINGS = 60, 12  # of Gauss-Newton; of a step that raises the sum of squares
 SMALL_STEP = 3e-3  # of a standard uncertainty: the last step taken
 STALLED = 0.1  # of a standard uncertainty: a fit whose steps stay larger has not converged
 ROUNDING = 1e-9  # relative, of a sum of squares

@@ -51,8 +51,8 @@ if TYPE_CHECKING:
     Values = NDArray[np.float64]
 
 FEWEST_MOVES = 6  # two equations each, for the nine of the matrix
-ROUNDS = 6
-SETTLED_DPS = 1e-7
+ROUNDS = 6  # of effects that depend on the rate
+SETTLED_DPS = 1e-7  # change of the rate that ends these rounds
 MOVED = "accelerometer_moved"
 
 

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 NEW = 1e-3  # share of a column's norm below which it adds no direction: rounding of the columns is below 1e-8
 # The grids below were chosen by the study of 500 recordings (tests/study/test_hand_held_study.py); ``fit.refined``
 # closes their steps where the data say more.
-UNLIKELY = -4.0
+UNLIKELY = -4.0  # prior log weight of a setting, e^-4 of the likeliest
 FACTORS = 3.0 ** np.arange(-2.0, 3.0)  # of the bias instability of the prior
 RATIOS = (0.1, 0.3, 1.0)  # of bias instability to white noise where none is stated
 SCATTER = (0.0, 1.0, 3.0, 9.0, 27.0)  # of rests, of moves and of directions, for a covariance

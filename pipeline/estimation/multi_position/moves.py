@@ -60,19 +60,18 @@ if TYPE_CHECKING:
 
     Values = NDArray[np.float64]
 
-LONGEST_S = 60.0
+LONGEST_S = 60.0  # see ``moves_of``
 GAP = 3.5  # intervals without a sample, over which a rate is not interpolated
-LEAST_TURN_DEG = 5.0
 ENVELOPE = 10  # samples, of which one at least is stamped without delay
 DROPPED = 0.5  # of an interval, by which a dropped sample makes at least one half of the stamps late
 ROUNDED = 0.1  # of an interval, by which digits of a file take stamps off a regular clock
 CLEAR = 20.0  # gain of twice a log likelihood by another clock
-SMOOTH = 4
-UNTOLD = 0.12
+SMOOTH = 4  # bends in a row, see above
+UNTOLD = 0.12  # rms, see above
 BENT = 8.0  # second difference over white noise, 2.4 of which is the noise's own
-NEAR_S = 0.5
+NEAR_S = 0.5  # see above
 FEWEST_NEAR = 10  # samples
-SIGNIFICANT = 4.0
+SIGNIFICANT = 4.0  # standard deviations, see above
 
 
 @dataclass(frozen=True)
