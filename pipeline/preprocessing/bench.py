@@ -105,10 +105,13 @@ def found_bench(fit: TurnFit, axis: str) -> Bench | None:
         return None
     a = AXES.index(axis)
     sense = 1 if fit.turn_axis[a] > 0.0 else -1
-    (_, cosine, sine), up, across = fit.gravity, UP_AT_ZERO[a], ACROSS[a]
-    along = cosine @ up + sense * (sine @ across)
-    beside = cosine @ across - sense * (sine @ up)
-    return bench_of(axis, sense, float(np.degrees(np.arctan2(beside, along))))
+    return bench_of(axis, sense, angle_ahead(a, fit.gravity.cosine, sense * fit.gravity.sine))
+
+
+def angle_ahead(axis: int, p: NDArray[np.float64], q: NDArray[np.float64]) -> float:
+    """Return the angle of the rotation that turns u and u x a onto p and q with least squares, deg."""
+    up, across = UP_AT_ZERO[axis], ACROSS[axis]
+    return float(np.degrees(np.arctan2(p @ across - q @ up, p @ up + q @ across)))
 
 
 def bench_of(axis: str, sense: int, at_zero: float) -> Bench:
@@ -129,11 +132,8 @@ def off_at_rest(recording: Recording, bench: Bench) -> float | None:
     still = still_samples(recording.time, np.gradient(angle, recording.time)) & recording.valid
     if np.sum(still) < FEWEST:
         return None
-    a = AXES.index(bench.axis)
-    up, across = UP_AT_ZERO[a], ACROSS[a]
     A = np.radians(bench.sense * angle[still] + bench.offset)
-    c, s, along, beside = np.cos(A), np.sin(A), force[still] @ up, force[still] @ across
-    return float(np.degrees(np.arctan2(c @ beside - s @ along, c @ along + s @ beside)))
+    return angle_ahead(AXES.index(bench.axis), np.cos(A) @ force[still], np.sin(A) @ force[still])
 
 
 def by_convention(fit: TurnFit, bench: Bench) -> Gravity | None:

@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.model.kinematics import UP_AT_ZERO, level_at_zero, skew, turn_about_axis, turn_by_vector
-from pipeline.preprocessing.bench import ACROSS, by_convention, unit
+from pipeline.preprocessing.bench import ACROSS, angle_ahead, by_convention, unit
 from pipeline.records import AXES, Note
 
 if TYPE_CHECKING:
@@ -115,12 +115,6 @@ def _zeros(turns: Sequence[_Conventional], seats: Vector) -> tuple[Vector, Vecto
     if np.max(np.abs(left)) < SMALLEST_DEG / 3.0:
         return np.asarray(found[:3], np.float64), np.asarray(-found[3:], np.float64)
     return np.asarray(seats.mean(axis=0), np.float64), None
-
-
-def _zero_of(turn: _Conventional, K: Vector) -> float:
-    """Return the zero of a turn with K known, deg: the rotation of ``K^-1 (p, q)`` onto the face, turned back."""
-    (p, q), (up, across) = np.linalg.solve(K, np.column_stack(turn.gravity[1:])).T, turn.ideal
-    return -float(np.degrees(np.arctan2(p @ across - q @ up, p @ up + q @ across)))
 
 
 def _table_explains(turns: Sequence[_Conventional], K: Vector, limits: Sequence[float]) -> bool:
@@ -237,7 +231,11 @@ def refined_zeros(turns: Sequence[Turn]) -> dict[str, float]:
     found = _find_seats(slow)
     if found.zeros is None:
         return {}
-    return {name: bench.zero_deg + bench.sense * _zero_of(c, found.K) for name, (_, bench, c) in own.items()}
+    zeros = {}
+    for name, (_, bench, turn) in own.items():
+        p, q = np.linalg.solve(found.K, np.column_stack(turn.gravity[1:])).T
+        zeros[name] = bench.zero_deg - bench.sense * angle_ahead(turn.axis, p, q)
+    return zeros
 
 
 def _conventional(turn: Turn, bench: Bench | None = None) -> _Conventional | None:
