@@ -179,9 +179,8 @@ def _csv_section(layout: TextLayout) -> dict[str, Any]:
 def _time(parts: list[Columns], proposal: Proposal) -> NDArray[np.float64] | None:
     """Propose where the time comes from, and return it in s; None where it is not known."""
     first = parts[0].layout
-    count = len(next(iter(first.numbers.values())))
-    if parts[0].arrival is not None:
-        return _counted(parts[0], proposal)
+    if parts[0].arrival is not None and parts[0].counter is not None:
+        return _counted(parts[0], parts[0].counter, proposal)
     if parts[0].time is not None:
         values, name = first.numbers[parts[0].time], first.names[parts[0].time]
         guess = time_unit(values, *stated_unit(name, "time"))
@@ -196,35 +195,29 @@ def _time(parts: list[Columns], proposal: Proposal) -> NDArray[np.float64] | Non
             entries["time"] = {"column": columns.layout.key(columns.time), **guess.entry}
         return None if guess.second_s is None else values * guess.second_s
     if parts[0].counter is not None and first.rate_hz is None:
-        key = first.key(parts[0].counter)
-        proposal.csv["rate_hz"] = None
-        proposal.columns[0]["time"] = {"column": key, "unit": COUNTS, "counts_per_unit": UNKNOWN}
-        proposal.evidence["time"] = f"{key} counts samples: counts_per_unit is the sampling rate in Hz"
-        return None
+        return _counted(parts[0], parts[0].counter, proposal)
     if first.rate_hz is not None:
-        return np.arange(count) / first.rate_hz
+        return np.arange(len(next(iter(first.numbers.values())))) / first.rate_hz
     proposal.csv["rate_hz"] = UNKNOWN
     proposal.evidence["rate_hz"] = "there is no time column: the sampling rate in Hz"
     return None
 
 
-def _counted(columns: Columns, proposal: Proposal) -> NDArray[np.float64] | None:
-    """Propose a counter without a gap as time, at the mean rate of the times of arrival beside it."""
-    layout = columns.layout
-    assert columns.counter is not None  # noqa: S101
-    assert columns.arrival is not None  # noqa: S101
-    arrival, count, name = (
-        layout.numbers[columns.arrival],
-        layout.numbers[columns.counter],
-        layout.names[columns.arrival],
-    )
-    second = time_unit(arrival, *stated_unit(name, "time")).second_s
-    rate = None if second is None else float(f"{(count[-1] - count[0]) / ((arrival[-1] - arrival[0]) * second):.6g}")
-    key = layout.key(columns.counter)
+def _counted(columns: Columns, counter: int, proposal: Proposal) -> NDArray[np.float64] | None:
+    """Propose a counter of samples as time, at the mean rate of times of arrival that scatter beside it."""
+    layout, rate = columns.layout, None
+    key, count = layout.key(counter), layout.numbers[counter]
+    evidence = f"{key} counts samples: counts_per_unit is the sampling rate in Hz"
+    if columns.arrival is not None:
+        arrival, name = layout.numbers[columns.arrival], layout.names[columns.arrival]
+        second = time_unit(arrival, *stated_unit(name, "time")).second_s
+        if second is not None:
+            rate = float(f"{(count[-1] - count[0]) / ((arrival[-1] - arrival[0]) * second):.6g}")
+        said = "the sampling rate in Hz" if rate is None else f"{rate:g} Hz on average by {name}"
+        evidence = f"{key} counts samples without a gap, and the intervals of {name} scatter; {said}"
     proposal.csv["rate_hz"] = None
     proposal.columns[0]["time"] = {"column": key, "unit": COUNTS, "counts_per_unit": UNKNOWN if rate is None else rate}
-    said = "the sampling rate in Hz" if rate is None else f"{rate:g} Hz on average by {name}"
-    proposal.evidence["time"] = f"{key} counts samples without a gap, and the intervals of {name} scatter; {said}"
+    proposal.evidence["time"] = evidence
     return None if rate is None else (count - count[0]) / rate
 
 
