@@ -88,8 +88,7 @@ class LinearMap:
     def of(self, change: Values) -> Values:
         """Return the change of the parameters by a change of the readings, (n, 3): (p,) array."""
         channels = zip(self.derivative, self.weights, change.T, strict=True)
-        total: Values = np.sum([J @ (A @ dy) for J, A, dy in channels], axis=0)
-        return total
+        return np.asarray(np.sum([J @ (A @ dy) for J, A, dy in channels], axis=0))
 
     def of_groups(self, change: Values, group: NDArray[np.intp], count: int) -> Values:
         """Return the change of the parameters by the change of each of ``count`` groups of readings: (p, count) array.
@@ -141,8 +140,7 @@ def draw_normal(rng: np.random.Generator, covariance: Values, count: int) -> Val
     """Return (count, p) normal errors, also of a singular covariance."""
     values, vectors = np.linalg.eigh(covariance)
     root: Values = vectors * np.sqrt(np.clip(values, 0.0, None))
-    drawn: Values = rng.standard_normal((count, len(values))) @ root.T
-    return drawn
+    return rng.standard_normal((count, len(values))) @ root.T
 
 
 def _within(weight: Values, sigma: Values, probability: float) -> Values:

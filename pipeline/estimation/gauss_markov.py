@@ -136,15 +136,13 @@ def variance_of_average(length: Values, tau: float | Values) -> Values:
     """Return the variance of a unit Gauss-Markov process averaged over ``length``: ``2 (x - 1 + exp(-x)) / x^2``."""
     x = length / tau
     large = np.where(x < 1e-3, 1.0, x)  # the series errs by x^3 / 60, the closed form by rounding / x^2
-    variance: Values = np.where(x < 1e-3, 1.0 - x / 3.0 + x * x / 12.0, 2.0 * (large + np.expm1(-large)) / large**2)
-    return variance
+    return np.where(x < 1e-3, 1.0 - x / 3.0 + x * x / 12.0, 2.0 * (large + np.expm1(-large)) / large**2)
 
 
 def _half_average(length: Values, tau: float | Values) -> Values:
     """Return ``h(x) = (1 - exp(-x)) / x`` with ``x = length / tau``."""
     x = np.maximum(length / tau, 1e-12)
-    half: Values = -np.expm1(-x) / x
-    return half
+    return -np.expm1(-x) / x
 
 
 def block_covariance(start: Values, length: Values, tau: float) -> Values:
@@ -179,13 +177,11 @@ class Blocks:
 
     def sums(self, columns: Values) -> Values:
         """Return the sums of (n, p) columns over each block: (m, p) array."""
-        total: Values = np.add.reduceat(columns, self.first, axis=0)
-        return total
+        return np.add.reduceat(columns, self.first, axis=0)
 
     def covariance(self, tau: float) -> Values:
         """Return B: (m, m) array."""
-        covariance: Values = block_covariance(self.start, self.length, tau) * (self.clock[:, None] == self.clock)
-        return covariance
+        return np.asarray(block_covariance(self.start, self.length, tau) * (self.clock[:, None] == self.clock))
 
 
 class GaussMarkov:
@@ -225,13 +221,11 @@ class GaussMarkov:
             z[k] -= below[k - 1] * z[k - 1]
         z /= np.sqrt(np.ascontiguousarray(self._d.reshape(self._half.shape).T))[:, None, :]
         whitened = np.ascontiguousarray(z.transpose(2, 1, 0))
-        found: Values = whitened @ whitened.transpose(0, 2, 1)
-        return found
+        return np.asarray(whitened @ whitened.transpose(0, 2, 1))
 
     def _e_by_setting(self) -> Values:
         """Return the subdiagonal of L at every setting: (g, m - 1) array."""
-        below: Values = np.append(self._e, 0.0).reshape(self._half.shape)[:, :-1]
-        return below
+        return np.append(self._e, 0.0).reshape(self._half.shape)[:, :-1]
 
     def solve(self, columns: Values) -> Values:
         """Return ``C^-1 A`` of (m, p) columns: (g, m, p) array."""
@@ -321,14 +315,12 @@ class Products:
         """Return ``A^T C^-1``: (p, n) array."""
         label = self.blocks.label(len(self.weight))
         solved = GaussMarkov(self.blocks, [setting]).solve(self.means)[0] / self.blocks.weight[:, None]
-        rows: Values = (self.weight[:, None] * (self.columns + (solved - self.means)[label])).T
-        return rows
+        return np.asarray((self.weight[:, None] * (self.columns + (solved - self.means)[label])).T)
 
     def bias(self, setting: Setting) -> Values:
         """Return ``E[bias | columns]`` of each row: (n, p) array."""
         solved = GaussMarkov(self.blocks, [setting]).solve(self.means)[0]
-        told: Values = (self.means - solved / self.blocks.weight[:, None])[self.blocks.label(len(self.weight))]
-        return told
+        return np.asarray((self.means - solved / self.blocks.weight[:, None])[self.blocks.label(len(self.weight))])
 
 
 def orthonormal(design: Values, variance: Values, tolerance: float) -> Values:
@@ -339,5 +331,4 @@ def orthonormal(design: Values, variance: Values, tolerance: float) -> Values:
     root = np.sqrt(variance)[:, None]
     scaled = design / root
     u, s, _ = np.linalg.svd(scaled / np.maximum(np.linalg.norm(scaled, axis=0), 1e-300), full_matrices=False)
-    basis: Values = root * u[:, : int(np.sum(s > tolerance * s[0]))]
-    return basis
+    return np.asarray(root * u[:, : int(np.sum(s > tolerance * s[0]))])

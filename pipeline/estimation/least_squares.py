@@ -80,8 +80,7 @@ class ScaledColumns:
 
     def weights(self) -> Values:
         """Return the pseudo-inverse for full rank, ``solve(y) = weights @ y``: (p, n) array."""
-        inverse: Values = (self.Vt.T / self.singular / self.scale[:, None]) @ self.basis.T
-        return inverse
+        return (self.Vt.T / self.singular / self.scale[:, None]) @ self.basis.T
 
     def covariance(self) -> Values:
         """Return ``(A^T A)^-1``, for full rank: (p, p) array."""

@@ -86,8 +86,7 @@ def numerical_tolerance(standard_uncertainty: ArrayLike, digits: int = 2) -> Val
     u = np.atleast_1d(np.asarray(standard_uncertainty, float))
     exponent = np.floor(np.log10(np.maximum(u, np.finfo(float).tiny))) - digits + 1.0
     exponent += np.round(u / 10.0**exponent) >= 10.0**digits  # 0.0996 is 10 x 10^-2 to two digits
-    delta: Values = 0.5 * 10.0**exponent
-    return delta
+    return np.asarray(0.5 * 10.0**exponent)
 
 
 def compare(

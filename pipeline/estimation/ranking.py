@@ -112,8 +112,7 @@ class Ranking:
     def log_likelihood(self, rss: Values) -> Values:
         """Return log L at each noise setting."""
         total = np.maximum(rss + self.within, 1e-300)
-        found: Values = -0.5 * self.samples * np.log(total / self.samples) - self.penalty
-        return found
+        return np.asarray(-0.5 * self.samples * np.log(total / self.samples) - self.penalty)
 
     def log_likelihoods(self, selected: Sequence[int]) -> Values:
         """Return log L of base and selected candidates at each noise setting, the first white noise alone."""
@@ -254,8 +253,7 @@ def without(products: Values, index: NDArray[np.intp]) -> Values:
     """
     if len(index) == 0:
         return products
-    rest: Values = products - products[:, index, :].transpose(0, 2, 1) @ projection(products, index)
-    return rest
+    return products - products[:, index, :].transpose(0, 2, 1) @ projection(products, index)
 
 
 def projection(products: Values, index: NDArray[np.intp]) -> Values:
@@ -266,5 +264,4 @@ def projection(products: Values, index: NDArray[np.intp]) -> Values:
     inner, cross = products[:, index[:, None], index], products[:, index, :]
     size = np.sqrt(np.maximum(np.einsum("tii->ti", inner), 1e-300))
     scaled = inner / (size[:, :, None] * size[:, None, :]) + RIDGE * np.eye(len(index))
-    found: Values = np.linalg.solve(scaled, cross / size[:, :, None]) / size[:, :, None]
-    return found
+    return np.asarray(np.linalg.solve(scaled, cross / size[:, :, None]) / size[:, :, None])

@@ -276,8 +276,7 @@ class Rows:
         if len(self.first) == len(kept):
             return kept
         shape = (-1,) + (1,) * (values.ndim - 1)
-        means: Values = np.add.reduceat(kept, self.first, axis=0) / self.count.reshape(shape)
-        return means
+        return np.add.reduceat(kept, self.first, axis=0) / self.count.reshape(shape)
 
     def motion(self, motion: Motion) -> Motion:
         """Return the motion at the rows."""
@@ -345,5 +344,4 @@ def followed(motion: Motion) -> NDArray[np.bool_]:
         bend[2:-2] = np.abs(guess - rate[2:-2]).max(axis=1)
     bends = bend > np.maximum(BEND_DPS, BEND_SHARE * np.abs(rate).max(axis=1))
     near = np.convolve(bends, np.ones(3), "same") > 0.5
-    sure: NDArray[np.bool_] = np.logical_not(near)
-    return sure
+    return np.logical_not(near)

@@ -63,8 +63,7 @@ def effective_degrees_of_freedom(contributions: ArrayLike, degrees_of_freedom: A
     nu = np.asarray(degrees_of_freedom, float)
     share = np.sum(u**4 / np.broadcast_to(nu[:, None] if nu.ndim == 1 else nu, u.shape), axis=0)
     total = np.sum(u**2, axis=0) ** 2
-    nu_eff: Values = np.divide(total, share, out=np.full(u.shape[1], np.inf), where=share > 0.0)
-    return nu_eff
+    return np.asarray(np.divide(total, share, out=np.full(u.shape[1], np.inf), where=share > 0.0))
 
 
 def type_b(  # noqa: PLR0917  (the columns of a budget's line)

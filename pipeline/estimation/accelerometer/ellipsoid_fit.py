@@ -85,8 +85,7 @@ def triangle(values: Values) -> Values:
 
 def error_of(y: Values, target: Values, values: Values) -> Values:
     """Return |L (y - b)| less its target: (m,) array, g."""
-    error: Values = np.linalg.norm((y - values[:3]) @ triangle(values).T, axis=1) - target
-    return error
+    return np.asarray(np.linalg.norm((y - values[:3]) @ triangle(values).T, axis=1) - target)
 
 
 def derivative_of(y: Values, values: Values) -> Values:

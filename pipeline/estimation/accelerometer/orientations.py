@@ -251,5 +251,4 @@ def _restricted_likelihood(z: Values, D: Values, E: Values, variances: Values) -
     y = U.T @ np.linalg.solve(root, z)
     spectrum = 1.0 + np.outer(variances, np.clip(e, 0.0, None))
     logarithm = 2.0 * float(np.sum(np.log(np.diag(root))))
-    score: Values = -0.5 * (np.sum(np.log(spectrum) + y**2 / spectrum, axis=1) + logarithm)
-    return score
+    return np.asarray(-0.5 * (np.sum(np.log(spectrum) + y**2 / spectrum, axis=1) + logarithm))

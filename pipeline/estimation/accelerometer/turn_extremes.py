@@ -56,20 +56,17 @@ class Extremes:
     @property
     def a_max(self) -> Values:
         """Largest reading of each axis, g."""
-        mean: Values = self.high.mean(axis=1)
-        return mean
+        return np.asarray(self.high.mean(axis=1))
 
     @property
     def a_min(self) -> Values:
         """Smallest reading of each axis, g."""
-        mean: Values = self.low.mean(axis=1)
-        return mean
+        return np.asarray(self.low.mean(axis=1))
 
     @property
     def a_zero(self) -> Values:
         """Level reading of each axis, g."""
-        mean: Values = self.level.mean(axis=1)
-        return mean
+        return np.asarray(self.level.mean(axis=1))
 
     @property
     def excess_high(self) -> Values:

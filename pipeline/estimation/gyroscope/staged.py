@@ -253,8 +253,7 @@ class Samples:
     def speed(self) -> Values:
         """I: mean magnitude of the rate about each axis, 0 where there is no steady turn: (3,) array, deg/s."""
         moving = np.count_nonzero(self.rate, axis=0)
-        mean: Values = np.abs(self.rate).sum(axis=0) / np.maximum(moving, 1)
-        return mean
+        return np.asarray(np.abs(self.rate).sum(axis=0) / np.maximum(moving, 1))
 
 
 def samples_of(parts: Sequence[Part], recordings: Sequence[Recording]) -> Samples:

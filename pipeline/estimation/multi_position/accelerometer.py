@@ -108,12 +108,14 @@ class AccelerometerModel:
             return np.asarray(np.einsum("rmc,mcp->rp", -WM, Z) / wide[:, None])
 
         return equations.followed_by(
-            residual=-np.einsum("rmc,mc->r", W, force) / wide,
-            base=np.concatenate([-WM.sum(axis=1), moved], axis=1) @ self.directions / wide[:, None],
-            effects=[of_faces(term) for term in state.terms],
-            candidates=[of_faces(term) for term in candidates],
-            bias=np.einsum("rmc,c->crm", WM, self.white) / wide[:, None],
-            error=self.gravity * wide,
+            {
+                "residual": -np.einsum("rmc,mc->r", W, force) / wide,
+                "base": np.concatenate([-WM.sum(axis=1), moved], axis=1) @ self.directions / wide[:, None],
+                "effects": [of_faces(term) for term in state.terms],
+                "candidates": [of_faces(term) for term in candidates],
+                "bias": np.einsum("rmc,c->crm", WM, self.white) / wide[:, None],
+                "error": self.gravity * wide,
+            }
         )
 
     def specific_force(self, state: State, rests: Rests) -> tuple[Values, Values]:

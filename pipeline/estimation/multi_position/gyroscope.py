@@ -135,7 +135,7 @@ class GyroscopeModel:
         if self.turns is None:
             return equations
         of_turns = self.turns.equations(state, candidates, self.white, self.directions)
-        return equations.followed_by(**of_turns, bias=np.zeros((3, len(self.turns.value), column)))
+        return equations.followed_by({**of_turns, "bias": np.zeros((3, len(self.turns.value), column))})
 
     def samples(self) -> float:
         """Return how many samples are behind the equations."""
@@ -280,8 +280,7 @@ class GyroscopeModel:
         directions = np.einsum("kij,kjmc->kimc", W, directions)
         means = np.einsum("kimc,mcd->kimd", directions, self.spread).reshape(n, -1)
         apart = np.kron(np.eye(len(W)), np.ones((2, 2))) == 0.0
-        common: Values = np.where(apart, means @ means.T, 0.0)
-        return common
+        return np.where(apart, means @ means.T, 0.0)
 
     def accelerometer_errors(self, found: Fit) -> Values:
         """Return the errors of the accelerometer's bias and matrix, as the moves tell them: (12,) array."""
@@ -294,8 +293,7 @@ class GyroscopeModel:
     def _of_directions(self, W: Values, directions: Values, error: Values) -> Values:
         """Return what errors of the rests' directions, as large as a typical white error, share: (2 k, 2 k) array."""
         each = np.einsum("kij,kjmc,mcd->kimd", W, directions, self.across).reshape(2 * len(W), -1)
-        shared: Values = float(np.median(error)) ** 2 * each @ each.T
-        return shared
+        return np.asarray(float(np.median(error)) ** 2 * each @ each.T)
 
     def _turned(self, state: State) -> tuple[Motion, Values, Values]:
         """Return the motion of all samples of the moves, ``v = y - b - z`` and A."""

@@ -108,8 +108,7 @@ def prior_hypotheses(prior: Prior, white: float, kinds: int) -> list[NoiseHypoth
 def log_likelihood(rss: Values, n: int, log_determinant: Values) -> Values:
     """Return log L of sums of squares of n equations, with ``log det C`` less twice the prior."""
     k = np.maximum(1.0, rss / n)
-    found: Values = -0.5 * (rss / k + n * np.log(k) + log_determinant)
-    return found
+    return np.asarray(-0.5 * (rss / k + n * np.log(k) + log_determinant))
 
 
 @dataclass(frozen=True)
@@ -170,8 +169,7 @@ def _orthonormalizers(columns: Values, sizes: Values) -> Values:
     products = columns.transpose(0, 2, 1) @ columns / (size[:, :, None] * size[:, None, :])
     values, vectors = np.linalg.eigh(products)
     kept = values > NEW**2
-    found: Values = vectors * (kept / np.sqrt(np.where(kept, values, 1.0)))[:, None, :] / size[:, :, None]
-    return found
+    return vectors * (kept / np.sqrt(np.where(kept, values, 1.0)))[:, None, :] / size[:, :, None]
 
 
 def project_out(equations: Equations, hypotheses: Sequence[NoiseHypothesis]) -> ProjectedCandidates:

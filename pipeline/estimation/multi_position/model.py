@@ -25,7 +25,7 @@ Both sensors' models have: ``kinds`` of scatter (1: rests; 2: rests and moves), 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -36,7 +36,7 @@ from pipeline.model.effects.base import Owner
 from pipeline.records import Motion
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -106,37 +106,23 @@ class Equations:
             _kernels={},
         )
 
-    def followed_by(
-        self,
-        *,
-        residual: Values,
-        base: Values,
-        effects: list[Values],
-        candidates: list[Values],
-        bias: Values,
-        error: Values,
-    ) -> Equations:
-        """Return these equations and further ones, of stated faces or turns, that no scatter adds to."""
-        more = len(residual)
+    def followed_by(self, more: Mapping[str, Any]) -> Equations:
+        """Return these equations and further ones, of stated faces or turns, that no scatter adds to.
 
-        def padded(block: Values | None) -> Values | None:
-            return None if block is None else np.pad(block, ((0, more), (0, more)))
-
-        pairs = ((self.effects, effects), (self.candidates, candidates))
-        both = [[np.concatenate(z) for z in zip(own, new, strict=True)] for own, new in pairs]
-        return replace(
-            self,
-            residual=np.concatenate([self.residual, residual]),
-            base=np.concatenate([self.base, base]),
-            effects=both[0],
-            candidates=both[1],
-            scatter=np.pad(self.scatter, ((0, 0), (0, more))),
-            bias=np.concatenate([self.bias, bias], axis=1),
-            error=np.concatenate([self.error, error]),
-            common=padded(self.common),
-            direction=padded(self.direction),
-            _kernels={},
-        )
+        ``more``: residual, base, effects, candidates, bias and error.
+        """
+        count = len(more["residual"])
+        known: dict[str, Any] = {
+            name: np.concatenate([getattr(self, name), more[name]]) for name in ("residual", "base", "error")
+        }
+        for name in ("effects", "candidates"):
+            known[name] = [np.concatenate(z) for z in zip(getattr(self, name), more[name], strict=True)]
+        for name in ("common", "direction"):
+            block = getattr(self, name)
+            known[name] = None if block is None else np.pad(block, ((0, count), (0, count)))
+        scatter = np.pad(self.scatter, ((0, 0), (0, count)))
+        bias = np.concatenate([self.bias, more["bias"]], axis=1)
+        return replace(self, **known, scatter=scatter, bias=bias, _kernels={})
 
     def covariance(self, noise: NoiseHypothesis) -> Values:
         """Return C: (n, n) array."""

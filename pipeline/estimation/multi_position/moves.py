@@ -320,8 +320,7 @@ def _force(reading: Values, rests: Rests, accelerometer: SensorCalibration) -> V
 
 
 def _unit(force: Values) -> Values:
-    unit: Values = force / np.linalg.norm(force, axis=1, keepdims=True)
-    return unit
+    return np.asarray(force / np.linalg.norm(force, axis=1, keepdims=True))
 
 
 def _near(recordings: Sequence[Recording], rests: Rests, *, at_start: bool) -> tuple[Values, Values]:
@@ -343,5 +342,4 @@ def _root(accelerometer: SensorCalibration) -> Values:
     if accelerometer.covariance is None:
         return np.zeros((12, 12))
     values, vectors = np.linalg.eigh(accelerometer.covariance[:12, :12])
-    root: Values = vectors * np.sqrt(np.clip(values, 0.0, None))
-    return root
+    return np.asarray(vectors * np.sqrt(np.clip(values, 0.0, None)))
