@@ -37,7 +37,7 @@ with ``nu`` degrees of freedom of S. White noise is at its maximum at every rati
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -362,19 +362,10 @@ def with_scatter(blocks: RestBlocks, more: RestBlocks) -> RestBlocks:
     if np.any(np.abs(log_ratio) > 3.0 * np.sqrt(2.0 / nu[0] + 2.0 / nu[1])):
         return blocks
 
-    def joined(name: str) -> NDArray[Any]:
-        return np.concatenate([getattr(blocks, name), getattr(more, name)])
-
-    return RestBlocks(
-        start=joined("start"),
-        length=joined("length"),
-        count=joined("count"),
-        mean=joined("mean"),
-        rest=np.concatenate([blocks.rest, blocks.rest.max() + 1 + more.rest]),
-        clock=joined("clock"),
-        cut=np.concatenate([blocks.cut, np.zeros(len(more.cut), bool)]),
-        scatter=blocks.scatter + more.scatter,
-    )
+    stacked = {f.name: np.concatenate([getattr(blocks, f.name), getattr(more, f.name)]) for f in fields(RestBlocks)}
+    stacked["rest"][len(blocks.rest) :] += blocks.rest.max() + 1
+    stacked["cut"][len(blocks.cut) :] = False
+    return RestBlocks(**{**stacked, "scatter": blocks.scatter + more.scatter})
 
 
 def likelihood(blocks: RestBlocks, design: Values, covariance: Values, correlation_times: Values) -> _Likelihood:

@@ -25,7 +25,7 @@ from pipeline.estimation.engine import LinearMap
 from pipeline.model.effects import effect
 from pipeline.model.effects.base import truth
 from pipeline.model.kinematics import ABOUT, earth_rate
-from pipeline.records import noise_of_steps
+from pipeline.records import NORMAL, Contribution, noise_of_steps
 from pipeline.signal.rests import RATE_AT_REST_DPS
 
 if TYPE_CHECKING:
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
     Values = NDArray[np.float64]
 
+ROUNDING = 1e-10  # of the largest effect of an input: a hundred thousand times the rounding of a double
 SAME_STOP_DEG = 0.02  # by which angles of one stop may differ
 COUNTED_STOPS = 4  # rests of a recording from which on it stops and goes: its steps are counted, whatever their rate
 FIELDS = {
@@ -91,17 +92,17 @@ class Reference:
         return total
 
 
-@dataclass(frozen=True)
-class StatedError:
-    """A stated accuracy: ``uncertainty`` of each independent error, and its ``effect``, (p, m), on the parameters."""
+def type_b(  # noqa: PLR0917  (the columns of a budget's line)
+    source: str, distribution: str, u: float, unit: str, effect: Values, remark: str = ""
+) -> Contribution:
+    """Return the contribution of m independent inputs of standard uncertainty u; ``effect``: (p, m) array."""
+    effect = np.where(np.abs(effect) > ROUNDING * np.abs(effect).max(initial=0.0), effect, 0.0)
+    covariance = u**2 * effect @ effect.T
+    freedom = np.full(len(effect), np.inf)
+    return Contribution(source, "B", distribution, covariance, freedom, u, unit, effect.shape[1], remark=remark)
 
-    source: str
-    uncertainty: float
-    unit: str
-    effect: Values
 
-
-def table_errors(reference: Reference, estimated: Sequence[str] = ()) -> tuple[list[StatedError], dict[str, str]]:
+def table_errors(reference: Reference, estimated: Sequence[str] = ()) -> tuple[list[Contribution], dict[str, str]]:
     """Return each stated accuracy with its effect, and why the others are not included.
 
     ``estimated``: effects of the fit: what one of them estimates is no input any more.
@@ -125,7 +126,7 @@ def table_errors(reference: Reference, estimated: Sequence[str] = ()) -> tuple[l
         if reason:
             missing[source] = reason
         elif u:
-            found.append(StatedError(source, float(u), unit, effects[source](reference)))
+            found.append(type_b(source, NORMAL, float(u), unit, effects[source](reference)))
     return found, missing
 
 
@@ -140,7 +141,7 @@ def disturbance(reference: Reference, residuals: Values, blocks: Blocks) -> Valu
     sums = np.zeros((len(blocks.weight), len(residuals)))
     sums[blocks.label(len(residuals)), np.arange(len(residuals))] = 1.0
     errors, _ = table_errors(replace(reference, fit=LinearMap((sums, sums, sums), _places(len(sums)))))
-    return np.sum([e.uncertainty**2 * e.effect @ e.effect.T for e in errors], axis=0) if errors else None
+    return np.sum([e.covariance for e in errors], axis=0) if errors else None
 
 
 def _places(count: int) -> tuple[Values, Values, Values]:

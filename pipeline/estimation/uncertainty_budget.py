@@ -26,7 +26,7 @@ import numpy as np
 
 from pipeline.estimation.design import BASE, BASE_NAMES
 from pipeline.estimation.monte_carlo import beside_trials, through, trials_of
-from pipeline.estimation.table_errors import table_errors
+from pipeline.estimation.table_errors import table_errors, type_b
 from pipeline.records import NORMAL, RECTANGULAR, SENSOR_UNITS, Contribution, FittedEffect, coverage_factor, finite
 from pipeline.signal.temperature import temperature_of
 
@@ -43,7 +43,6 @@ if TYPE_CHECKING:
 
     Values = NDArray[np.float64]
 
-ROUNDING = 1e-10  # of the largest effect of an input: a hundred thousand times the rounding of a double
 DITHERED = 0.5  # counts of white noise above which rounding errors are independent (Widrow & Kollar 2008)
 NOISE, QUANTISATION = "noise of the readings", "quantisation"
 NOT_STATED = "one calibration does not tell it: calibrate the unit again after switching it off"
@@ -64,16 +63,6 @@ def effective_degrees_of_freedom(contributions: ArrayLike, degrees_of_freedom: A
     share = np.sum(u**4 / np.broadcast_to(nu[:, None] if nu.ndim == 1 else nu, u.shape), axis=0)
     total = np.sum(u**2, axis=0) ** 2
     return np.asarray(np.divide(total, share, out=np.full(u.shape[1], np.inf), where=share > 0.0))
-
-
-def type_b(  # noqa: PLR0917  (the columns of a budget's line)
-    source: str, distribution: str, u: float, unit: str, effect: Values, remark: str = ""
-) -> Contribution:
-    """Return the contribution of m independent inputs of standard uncertainty u; ``effect``: (p, m) array."""
-    effect = np.where(np.abs(effect) > ROUNDING * np.abs(effect).max(initial=0.0), effect, 0.0)
-    covariance = u**2 * effect @ effect.T
-    freedom = np.full(len(effect), np.inf)
-    return Contribution(source, "B", distribution, covariance, freedom, u, unit, effect.shape[1], remark=remark)
 
 
 def noise_contribution(noise: ResidualNoise, fit: LinearMap, prior: Prior) -> Contribution:
@@ -131,14 +120,6 @@ def gravity_contribution(sensor: str, matrix: Values, table: Mapping[str, Any], 
     return type_b("local gravity", NORMAL, float(u), "g", effect)
 
 
-def _table_contributions(
-    reference: Reference, estimated: Sequence[str] = ()
-) -> tuple[list[Contribution], dict[str, str]]:
-    """Return the contribution of each stated accuracy of the table, and why the others are not included."""
-    errors, missing = table_errors(reference, estimated)
-    return [type_b(e.source, NORMAL, e.uncertainty, e.unit, e.effect) for e in errors], missing
-
-
 def combined(
     calibration: SensorCalibration, contributions: Sequence[Contribution], not_included: Mapping[str, str]
 ) -> SensorCalibration:
@@ -181,7 +162,7 @@ def budgeted(  # noqa: PLR0917  (what a fit on a table is)
     """
     sensor = calibration.sensor
     counts = ((settings.get("sensor") or {}).get(sensor) or {}).get("counts_per_unit")
-    found, absent = _table_contributions(reference, estimated)
+    found, absent = table_errors(reference, estimated)
     lines, missing = list(contributions), {"temperature": TEMPERATURE, "time base": TIME_BASE}
     if noise.row_weight is None:
         rounded = quantisation(noise, reference.fit, counts, SENSOR_UNITS[sensor])
@@ -196,7 +177,7 @@ def budgeted(  # noqa: PLR0917  (what a fit on a table is)
     if not trials:
         return complete
     first = reference.fit.first()
-    stated, _ = _table_contributions(replace(reference, fit=first), estimated)
+    stated, _ = table_errors(replace(reference, fit=first), estimated)
     again = None if isinstance(rounded, str) else quantisation(noise, first, counts, SENSOR_UNITS[sensor])
     covariances = [c.covariance for c in (*stated, again) if isinstance(c, Contribution)]
     draw = through(noise.posterior(first), covariances, results)

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from pipeline.estimation.least_squares import certified
-from pipeline.estimation.uncertainty_budget import combined, scatter_contribution, type_b
+from pipeline.estimation.table_errors import type_b
+from pipeline.estimation.uncertainty_budget import combined, scatter_contribution
 from pipeline.records import SensorCalibration
 from pipeline.report.parameters import convergence_of
 from pipeline.report.unit_page import render

@@ -27,13 +27,13 @@ from pipeline.estimation.multi_position.model import State, parameter_places, re
 from pipeline.estimation.multi_position.selection import fit_configured, limits_of, select
 from pipeline.estimation.noise import noise_of, prior_of
 from pipeline.estimation.rest_means import rests_of
+from pipeline.estimation.table_errors import type_b
 from pipeline.estimation.uncertainty_budget import (
     base_parameters,
     combined,
     effect_parameters,
     gravity_contribution,
     scatter_contribution,
-    type_b,
 )
 from pipeline.model.effects import effect
 from pipeline.records import NORMAL, SensorCalibration, StageResult
