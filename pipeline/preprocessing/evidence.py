@@ -180,18 +180,18 @@ def _alike(one: Array, two: Array) -> float:
     return float(a @ b) / size if size > 0.0 else 0.0
 
 
-def gravity_turned(recording: Recording, axis: int) -> Array | None:
-    """Return the angle by which gravity turned about an axis in each interval, deg; None where it does not turn."""
-    if recording.accelerometer is None:
-        return None
-    key = ("gravity_turned", axis)
-    if key not in recording.cache:
-        recording.cache[key] = _gravity_turned(recording, recording.accelerometer, axis)
-    found: Array | None = recording.cache[key]
+def gravity_turned(recording: Recording) -> Array | None:
+    """Return the angle by which gravity turned about the turn axis in each interval, deg; None where it does not."""
+    if "gravity_turned" not in recording.cache:
+        recording.cache["gravity_turned"] = _gravity_turned(recording)
+    found: Array | None = recording.cache["gravity_turned"]
     return found
 
 
-def _gravity_turned(recording: Recording, force: Array, axis: int) -> Array | None:
+def _gravity_turned(recording: Recording) -> Array | None:
+    force, axis = recording.accelerometer, axis_index(recording)
+    if force is None:
+        return None
     across = force[:, [(axis + 1) % 3, (axis + 2) % 3]]
     low, high = quantiles(across, 0.01, 0.99)
     centred = across - np.where(high - low > 3.0 * LEAST_SWING_G, (low + high) / 2.0, 0.0)

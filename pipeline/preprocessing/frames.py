@@ -43,7 +43,7 @@ CLEAR_DEG = 30.0
 FEWEST_MISSED, CLEARLY_FEWER = 2, 4  # moves that gravity does not follow: one may be a knock
 
 
-def check_turns(
+def check_frames(
     turns: Sequence[tuple[Recording, TurnFit]], accelerometer: Matrix | None, maps: Mapping[str, Sequence[str]]
 ) -> None:
     """Refuse turns in which gravity and the gyroscope turn about different axes; ``accelerometer`` is M_a above."""
@@ -69,7 +69,7 @@ def check_turns(
     )
 
 
-def check_moves(recording: Recording, maps: Mapping[str, Sequence[str]]) -> None:
+def check_frames_by_hand(recording: Recording, maps: Mapping[str, Sequence[str]]) -> None:
     """Refuse rests and moves by hand in which gravity turns as the gyroscope says only with other axes."""
     if recording.accelerometer is None or recording.gyroscope is None:
         return

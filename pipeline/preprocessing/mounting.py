@@ -28,7 +28,13 @@ from pipeline.preprocessing.bench import (
     stated_bench,
     usual_up,
 )
-from pipeline.preprocessing.frames import as_map, check_moves, check_turns, nearest_permutation, signed_permutations
+from pipeline.preprocessing.frames import (
+    as_map,
+    check_frames,
+    check_frames_by_hand,
+    nearest_permutation,
+    signed_permutations,
+)
 from pipeline.preprocessing.seats import refined_zeros, seat_notes
 from pipeline.records import AXES, Note, level_in_body
 
@@ -58,10 +64,10 @@ def check_mounting(recordings: Sequence[Recording], settings: Mapping[str, Any])
     turns = [_turn(r, procedure.get("recordings") or {}, table) for r in recordings]
     known = [t for t in turns if t is not None]
     maps, accelerometer = axis_maps(sensor), _accelerometer_axes(known)
-    check_turns([(t.recording, t.fit) for t in known], accelerometer, maps)
+    check_frames([(t.recording, t.fit) for t in known], accelerometer, maps)
     for recording in recordings:
         if recording.role == "rests":
-            check_moves(recording, maps)
+            check_frames_by_hand(recording, maps)
     tolerance = _tolerance(procedure, table, sensor)
     departures = {t.name: d for t in known if (d := _departure(t, tolerance)) is not None}
     refused = [d for d in departures.values() if d.bench is None]
@@ -78,7 +84,7 @@ def check_mounting(recordings: Sequence[Recording], settings: Mapping[str, Any])
     recordings = [_turned_attitude(r) if departures else r for r in recordings]
     doubts = seat_notes(list(used.values()), table, sensor) if table.get("seat_deg") is None else {}
     return [
-        r if t is None else _applied(used[t.name], doubts.get(r.name, []), departures.get(t.name), hint)
+        r if t is None else _applied(used[t.name], doubts.get(r.name), departures.get(t.name), hint)
         for r, t in zip(recordings, turns, strict=True)
     ]
 
@@ -205,10 +211,10 @@ def _as_found(turn: Turn, departure: _Departure | None, zeros: Mapping[str, floa
     return replace(turn, recording=replace(turn.recording, axis=bench.axis), stated=bench)
 
 
-def _applied(turn: Turn, doubts: Sequence[Note], departure: _Departure | None, hint: str) -> Recording:
-    """Return the recording with angle and rate by the convention, a note where that changes them, and its doubts."""
+def _applied(turn: Turn, doubt: Note | None, departure: _Departure | None, hint: str) -> Recording:
+    """Return the recording with angle and rate by the convention, a note where that changes them, and its doubt."""
     recording, bench = turn.recording, turn.stated
-    notes = [*recording.notes, *doubts]
+    notes = [*recording.notes, *([doubt] if doubt else [])]
     logged = recording.table_angle is not None and recording.accelerometer is not None
     if turn.fit.unknown and logged and recording.role != "gyroscope":  # that needs neither face nor zero
         detail = f"upward face, turn axis and zero are taken as stated: {turn.fit.unknown}"

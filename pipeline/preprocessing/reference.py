@@ -149,7 +149,7 @@ def _check_turn(recording: Recording, gyroscope: _Gyroscope, limits: Limits) -> 
     seen = gyroscope.along(recording, axis)
     if seen is not None:
         channels.append(of_rate(recording, "gyroscope", seen, recording.valid))
-    phase = gravity_turned(recording, axis)
+    phase = gravity_turned(recording)
     if phase is not None and recording.table_angle is not None:
         channels.append(of_gravity(recording, phase, channels))
     notes, delay = _compare(recording, channels, limits)

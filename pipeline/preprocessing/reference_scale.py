@@ -79,18 +79,16 @@ CURVED_PHASE = 1e-2  # relative: clocks without quartz, and what lever arms leav
 ALIKE = 0.1  # relative: how near a factor has to be to one of a unit to be called so
 
 
-class Ratio(NamedTuple):
+class _Ratio(NamedTuple):
     """How many times as far one channel turns as another: weighted median over blocks, and whether all blocks agree."""
 
     value: float
     even: bool
 
     def off(self, tolerance: float) -> bool:
-        """Return whether it is not 1."""
         return abs(self.value - 1.0) > tolerance
 
     def agrees(self, tolerance: float) -> bool:
-        """Return whether it is 1 in all blocks."""
         return self.even and not self.off(tolerance)
 
     @property
@@ -127,15 +125,14 @@ def check_scale_of_turn(recording: Recording, limits: Limits) -> None:
 
 def _turned(recording: Recording) -> tuple[Array | None, ...]:
     """Return the angle turned in each block of a turn by angle, rate, gyroscope and gravity: (96,) arrays, deg."""
-    axis = axis_index(recording)
     found = {c.name: c.turned for c in of_table(recording)}
     gyro = None
     if recording.gyroscope is not None:
-        reading = still = recording.gyroscope[:, axis]
+        reading = still = recording.gyroscope[:, axis_index(recording)]
         if recording.table_rate is not None:
             still = reading[np.abs(recording.table_rate) <= np.min(np.abs(recording.table_rate))]
         gyro = of_rate(recording, "gyroscope", reading - np.median(still), recording.valid).turned
-    every = (found.get("table_angle"), found.get("table_rate"), gyro, gravity_turned(recording, axis))
+    every = (found.get("table_angle"), found.get("table_rate"), gyro, gravity_turned(recording))
     return tuple(map(_in_blocks, every))
 
 
@@ -201,7 +198,7 @@ def doubt_of_scale(recording: Recording, limits: Limits) -> str | None:
 
 def _against_phase(recording: Recording, steps: Array, even: NDArray[np.bool_]) -> tuple[float, float] | None:
     """Return the slope of the summed rate in gravity's phase, and its standard uncertainty."""
-    turned, sizes = gravity_turned(recording, axis_index(recording)), np.abs(steps)
+    turned, sizes = gravity_turned(recording), np.abs(steps)
     if turned is None or float(sizes[even].sum()) < MOSTLY_EVEN * float(sizes.sum()):
         return None
     phase, summed = (np.concatenate([[0.0], np.cumsum(v)]) for v in (turned, steps))
@@ -239,7 +236,7 @@ def _in_blocks(turned: Array | None) -> Array | None:
     return np.asarray(np.add.reduceat(turned, starts))
 
 
-def _ratio(one: Array | None, other: Array | None) -> Ratio | None:
+def _ratio(one: Array | None, other: Array | None) -> _Ratio | None:
     """Return the ratio of two channels over the blocks in which the other turned; None where it did not."""
     if one is None or other is None:
         return None
@@ -247,7 +244,7 @@ def _ratio(one: Array | None, other: Array | None) -> Ratio | None:
     if not float(np.sum(np.minimum(size, largest_but(size, 10)))) > LEAST_TOTAL_DEG:
         return None
     low, middle, high = np.abs(ratio_quartiles(one, other, 10, 0.3))
-    return Ratio(float(middle), bool(middle > 0.0 and abs(high - low) <= SPREAD * middle))
+    return _Ratio(float(middle), bool(middle > 0.0 and abs(high - low) <= SPREAD * middle))
 
 
 def _unit(value: float, units: Units) -> str:
@@ -267,7 +264,7 @@ def _wrong_angle(recording: Recording, limits: Limits, factor: float, against: s
     return _wrong(recording, name, what, seen, key)
 
 
-def _wrong_rate(recording: Recording, limits: Limits, ratio: Ratio, against: str, *, gyro_agrees: bool) -> IngestError:
+def _wrong_rate(recording: Recording, limits: Limits, ratio: _Ratio, against: str, *, gyro_agrees: bool) -> IngestError:
     """Refuse the table's rate, or the time or both rates where the gyroscope agrees with it."""
     if gyro_agrees and ratio.of_time:
         return _wrong_time(recording, limits, ratio, "the table's rate sums up to")
@@ -279,7 +276,7 @@ def _wrong_rate(recording: Recording, limits: Limits, ratio: Ratio, against: str
     return _wrong(recording, name, what, f"the rate sums up to {ratio.value:.4g} times the angle by {against}", keys)
 
 
-def _wrong_time(recording: Recording, limits: Limits, ratio: Ratio, seen: str) -> IngestError:
+def _wrong_time(recording: Recording, limits: Limits, ratio: _Ratio, seen: str) -> IngestError:
     name, what = limits.column(recording, "time"), _unit(ratio.value, TIMES)
     return refusal(
         recording,

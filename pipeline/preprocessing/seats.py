@@ -57,12 +57,16 @@ LIMITS = {"table_tilt": 1.0, "table_axis_nonorthogonality": 1.0, "time_offset": 
 
 @dataclass(frozen=True)
 class _Conventional:
-    """A turn by the convention."""
+    """A turn by the convention of its bench."""
 
-    name: str
-    axis: int
+    turn: Turn
+    bench: Bench
     gravity: Gravity
-    mean_rate: float  # deg/s
+
+    @property
+    def axis(self) -> int:
+        """Index of the turn axis."""
+        return AXES.index(self.bench.axis)
 
     @property
     def ideal(self) -> tuple[Vector, Vector]:
@@ -177,8 +181,8 @@ def _lean_columns(turn: _Conventional) -> Vector:
 
 def _offset_columns(turn: _Conventional) -> Vector:
     """Return the derivative by a time offset, 1/s: (3, 3, 1) array; the angle is ahead by offset times mean rate."""
-    up, across = turn.ideal
-    return np.asarray(np.radians(turn.mean_rate) * np.stack([np.zeros(3), across, -up])[..., None])
+    (up, across), mean_rate = turn.ideal, turn.bench.sense * turn.turn.fit.mean_rate
+    return np.asarray(np.radians(mean_rate) * np.stack([np.zeros(3), across, -up])[..., None])
 
 
 def _axis_off_deg(turn: _Conventional, K: Vector, others: Sequence[_Conventional]) -> Vector:
@@ -195,28 +199,31 @@ def _letters(vector: Vector) -> str:
     return ", ".join(f"{v:+.2f} deg about {a}" for a, v in zip(AXES, vector, strict=True))
 
 
-def seat_notes(turns: Sequence[Turn], table: Mapping[str, Any], sensor: Mapping[str, Any]) -> dict[str, list[Note]]:
-    """Return the doubts about each recording of a unit, by name; the turns of one setup are compared."""
+def seat_notes(turns: Sequence[Turn], table: Mapping[str, Any], sensor: Mapping[str, Any]) -> dict[str, Note]:
+    """Return the doubt about each recording of a unit, by name; the turns of one setup are compared."""
     orthogonality, angle = (float(table.get(k) or 0.0) for k in ("orthogonality_deg", "angle_accuracy_deg"))
     allowed = max(SMALLEST_DEG, TIMES_STATED * float(np.hypot(orthogonality, angle)))
     effects = (sensor.get("accelerometer") or {}).get("effects") or {}
     limits = [float(effects.get(name) or limit) for name, limit in LIMITS.items()]
-    notes: dict[str, list[Note]] = {}
+    details: dict[str, str] = {}
     for setup in dict.fromkeys(t.recording.setup for t in turns):
-        own = {t.name: (t, c) for t in turns if t.recording.setup == setup and (c := _conventional(t)) is not None}
-        slow = [pair for pair in own.values() if pair[0].recording.role == "accelerometer"]
-        if {c.axis for _, c in slow} != set(range(3)) or any(_in_doubt(t) for t, _ in slow):
-            continue
-        convention = [c for _, c in slow]
-        found = _find_seats(convention)
-        doubt = np.max(np.abs(found.seats)) > allowed and not _table_explains(convention, found.K, limits)
+        own, slow = _conventional([(t, t.stated) for t in turns if t.recording.setup == setup])
+        in_doubt = any(note.code == "N-REFERENCE" for c in slow for note in c.turn.recording.notes)
+        if in_doubt or {c.axis for c in slow} != set(range(3)):
+            continue  # an angle that is in doubt already tells nothing of seats
+        found = _find_seats(slow)
+        doubt = np.max(np.abs(found.seats)) > allowed and not _table_explains(slow, found.K, limits)
         if doubt:
-            notes |= {t.name: [_note(t, _seats_in_words(slow, found, allowed))] for t, _ in slow}
-        for turn, fast in own.values():
-            off = _axis_off_deg(fast, found.K, [] if doubt else convention)
-            if turn.recording.role == "gyroscope" and np.max(np.abs(off)) > allowed:
-                notes[turn.name] = [_note(turn, _axis_in_words(turn, off, allowed))]
-    return notes
+            details |= dict.fromkeys((c.turn.name for c in slow), _seats_in_words(slow, found, allowed))
+        for fast in own:
+            off = _axis_off_deg(fast, found.K, [] if doubt else slow)
+            if fast.turn.recording.role == "gyroscope" and np.max(np.abs(off)) > allowed:
+                details[fast.turn.name] = (
+                    f"the unit does not sit in {fast.turn.name} as in the turns for the accelerometer, by more than "
+                    f"{allowed:.2g} deg: by gravity it is rotated by {_letters(off)}, and the gyroscope's matrix is "
+                    "off by as much; set table.seat_deg=1 to estimate it (docs/mounting.md)"
+                )
+    return {t.name: Note("N-SEATS", t.recording.samples, 0, 0, details[t.name]) for t in turns if t.name in details}
 
 
 def refined_zeros(turns: Sequence[Turn]) -> dict[str, float]:
@@ -224,59 +231,40 @@ def refined_zeros(turns: Sequence[Turn]) -> dict[str, float]:
 
     The zero of one turn by itself is uncertain by the misalignment of the axes.
     """
-    own = {t.name: (t, t.found, c) for t in turns if t.found and (c := _conventional(t, t.found)) is not None}
-    slow = [c for t, _, c in own.values() if t.recording.role == "accelerometer"]
+    own, slow = _conventional([(t, t.found) for t in turns])
     if {c.axis for c in slow} != set(range(3)):
         return {}
     found = _find_seats(slow)
     if found.zeros is None:
         return {}
     zeros = {}
-    for name, (_, bench, turn) in own.items():
-        p, q = np.linalg.solve(found.K, np.column_stack(turn.gravity[1:])).T
-        zeros[name] = bench.zero_deg - bench.sense * angle_ahead(turn.axis, p, q)
+    for c in own:
+        p, q = np.linalg.solve(found.K, np.column_stack(c.gravity[1:])).T
+        zeros[c.turn.name] = c.bench.zero_deg - c.bench.sense * angle_ahead(c.axis, p, q)
     return zeros
 
 
-def _conventional(turn: Turn, bench: Bench | None = None) -> _Conventional | None:
-    bench = bench or turn.stated
-    gravity = by_convention(turn.fit, bench)
-    if gravity is None:
-        return None
-    return _Conventional(turn.name, AXES.index(bench.axis), gravity, bench.sense * turn.fit.mean_rate)
+def _conventional(turns: list[tuple[Turn, Bench | None]]) -> tuple[list[_Conventional], list[_Conventional]]:
+    """Return the turns of which gravity tells, and those of them for the accelerometer."""
+    known = [(t, bench, by_convention(t.fit, bench)) for t, bench in turns if bench is not None]
+    own = [_Conventional(t, bench, gravity) for t, bench, gravity in known if gravity is not None]
+    return own, [c for c in own if c.turn.recording.role == "accelerometer"]
 
 
-def _in_doubt(turn: Turn) -> bool:
-    """Return whether the angle of a turn is in doubt already, so that it tells nothing of seats."""
-    return any(note.code == "N-REFERENCE" for note in turn.recording.notes)
-
-
-def _note(turn: Turn, detail: str) -> Note:
-    return Note("N-SEATS", turn.recording.samples, 0, 0, detail)
-
-
-def _seats_in_words(slow: Sequence[tuple[Turn, _Conventional]], found: _Seats, allowed: float) -> str:
+def _seats_in_words(slow: Sequence[_Conventional], found: _Seats, allowed: float) -> str:
     if found.zeros is None:
-        seats = "; ".join(f"{t.name} {_letters(s)}" for (t, _), s in zip(slow, found.seats, strict=True))
+        seats = "; ".join(f"{c.turn.name} {_letters(s)}" for c, s in zip(slow, found.seats, strict=True))
         return (
             f"the unit does not sit alike in the turns, by more than {allowed:.2g} deg; its rotation against the mean "
             f"of the turns: {seats}; set table.seat_deg=1 to estimate them, or mount it once for all turns "
             "(docs/mounting.md)"
         )
     settings = ", ".join(
-        f"procedure.recordings.{t.name}.zero_deg={t.stated.zero_deg + t.stated.sense * z:.2f}"
-        for (t, _), z in zip(slow, found.zeros, strict=True)
+        f"procedure.recordings.{c.turn.name}.zero_deg={c.bench.zero_deg + c.bench.sense * z:.2f}"
+        for c, z in zip(slow, found.zeros, strict=True)
         if abs(z) > SMALLEST_DEG / 3.0
     )
     return (
         f"the zeros of the turns do not fit together, by more than {allowed:.2g} deg; gravity fits with {settings} "
         "(docs/mounting.md)"
-    )
-
-
-def _axis_in_words(turn: Turn, off: Any, allowed: float) -> str:  # noqa: ANN401  ((3,) array)
-    return (
-        f"the unit does not sit in {turn.name} as in the turns for the accelerometer, by more than {allowed:.2g} deg: "
-        f"by gravity it is rotated by {_letters(off)}, and the gyroscope's matrix is off by as much; set "
-        "table.seat_deg=1 to estimate it (docs/mounting.md)"
     )
