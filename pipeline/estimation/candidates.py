@@ -56,8 +56,8 @@ def starts_of(
     """Return the terms from which a fit starts, every combination of the effects' starts.
 
     ``observed``: the sensor alone for recordings by hand. ``known``: its fitted effects start where they are.
-    ``accelerometer``: for the gyroscope: gravity determines the mountings. Raises ``ConfigurationError`` if an effect
-    is unknown, named twice, contained in another, or not one of this sensor.
+    ``accelerometer``, for the gyroscope: its mountings. Raises ``ConfigurationError`` if an effect is unknown, named
+    twice, contained in another, or not one of this sensor.
     """
     sensor = observed if isinstance(observed, str) else observed.sensor
     recordings = [] if isinstance(observed, str) else turns_of(observed)

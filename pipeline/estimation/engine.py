@@ -53,8 +53,7 @@ AVERAGED_OUT = 1e-3  # share of a column's size in block means, below which it d
 class LinearMap:
     """What small changes of the readings do to the parameters of a solved fit."""
 
-    # each (q, n): A, weights of the readings of each channel in what is fitted of it; may be one array for
-    # all
+    # each (q, n): A, weights of the readings of a channel in what is fitted of it; may be one array for all
     weights: tuple[Values, Values, Values]
     # each (p, q): J, derivative of the parameters with respect to that
     derivative: tuple[Values, Values, Values]

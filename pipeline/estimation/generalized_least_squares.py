@@ -293,8 +293,8 @@ def fit_joint(  # noqa: PLR0917  (the interface that the stages and the diagnosi
 
     ``recordings``: all of a unit; those held out are left aside. ``effects``: in the order in which they are reported.
     ``noise``: pins the bias wander where it comes from a static recording. ``start``: the calibration so far: its
-    stages are kept, its effects are starts. ``accelerometer``: for the gyroscope: gravity determines the mountings.
-    Raises ``NotObservableError`` if the recordings do not determine a parameter; ``ConfigurationError`` if an effect is
+    stages are kept, its effects are starts. ``accelerometer``, for the gyroscope: its mountings. Raises
+    ``NotObservableError`` if the recordings do not determine a parameter; ``ConfigurationError`` if an effect is
     unknown or not one of this sensor.
     """
     observations = weighted(observe(sensor, recordings, settings["table"]), noise)

@@ -163,8 +163,8 @@ def solve_nonlinear(
     ``residuals``: (p,) to (n,). ``start``: (p,). ``jacobian``: (p,) to (n, p). None differentiates by a complex step,
     for which ``residuals`` must be analytic. ``sigma``, ``names``: as in ``solve_linear``. ``iterations``: limit on the
     number of Gauss-Newton steps. ``far``: whether the start may be far off, so that a trust region is tried where
-    Gauss-Newton steps fail. Returns ``converged`` is False where the certificate fails; that is an outcome, no
-    exception. Raises ``NotObservableError`` if the data do not determine all parameters.
+    Gauss-Newton steps fail. Where the certificate fails, ``converged`` is False; that is an outcome, no exception.
+    Raises ``NotObservableError`` if the data do not determine all parameters.
     """
     jacobian = jacobian or complex_step_jacobian(residuals)
     with np.errstate(all="ignore"):  # steps that overflow do not lower the sum of squares

@@ -182,7 +182,7 @@ def quadratic_results(columns: Values, curvature: Values, inverse: Values) -> Ca
         g(d) = (X + H d)^T W (X d + d^T H d / 2 - e) = 0
 
     ``columns``: (n, p), X. ``curvature``: (n, p, p), H, symmetric in its last two. ``inverse``: (n, n), W, the weights
-    of the fit. Returns (t, n) errors e to (t, p) steps d, by Gauss-Newton.
+    of the fit. The function takes (t, n) errors e to (t, p) steps d, by Gauss-Newton steps.
     """
     size = np.sqrt(np.einsum("np,nm,mp->p", columns, inverse, columns))
     size = np.where(size > 0.0, size, 1.0)

@@ -66,9 +66,9 @@ def split_rests(recording: Recording, every: int) -> RestSplit:
 def held_out_rests(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> dict[str, list[Rest]]:
     """Return the rests that no fit uses, by the name of their recording.
 
-    ``recordings``: those of role ``rests`` count. ``settings``: section ``procedure``: ``holdout_every``. Returns empty
-    where there is a recording for validation. The move before a rest ends with it: it begins where the rest before,
-    held out or not, stops.
+    ``recordings``: those of role ``rests`` count. ``settings``: ``procedure.holdout_every``. Empty where there is a
+    recording for validation. The move before a rest ends with it: it begins where the rest before, held out or not,
+    stops.
     """
     every = holdout_interval(recordings, settings)
     if not every:
@@ -79,8 +79,8 @@ def held_out_rests(recordings: Sequence[Recording], settings: Mapping[str, Any])
 def rests_by_use(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> dict[str, list[dict[str, Any]]]:
     """Return the rests of the recordings of role ``rests``: which a fit would use, and which not, with the reason.
 
-    ``settings``: section ``procedure``: ``holdout_every``. Returns ``rests_used``, ``rests_held_out``,
-    ``rests_left_out``, each as of ``describe_rests``; what a fit itself leaves out counts as used here.
+    ``settings``: ``procedure.holdout_every``. The keys are ``rests_used``, ``rests_held_out`` and ``rests_left_out``,
+    the values as of ``describe_rests``; what a fit itself leaves out counts as used here.
     """
     every = holdout_interval(recordings, settings)
     found: dict[str, list[dict[str, Any]]] = {"rests_used": [], "rests_held_out": [], "rests_left_out": []}

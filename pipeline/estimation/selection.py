@@ -96,8 +96,7 @@ def select(
     """Select effects.
 
     ``configured``: effects that are in the model already. ``sheet``: the sensor's section of the configuration.
-    ``known``: its effects are starts for the configured ones. ``accelerometer``: for the gyroscope: gravity determines
-    the mountings.
+    ``known``: its effects are starts for the configured ones. ``accelerometer``, for the gyroscope: its mountings.
     """
     return _Search(observations, configured, noise, sheet, known, accelerometer=accelerometer).run()
 

@@ -106,8 +106,8 @@ def stages_before(sensor: str, previous: SensorCalibration | None, stages: Mappi
 def apply_correction(correction: Mapping[str, Any] | None, readings: Values) -> Values:
     """Correct readings.
 
-    ``correction``: ``StageResult.correction``; None changes nothing. ``readings``: (n, 3), g or deg/s. Returns (n, 3),
-    same unit. Raises ``ConfigurationError`` if a step is of an unknown kind.
+    ``correction``: ``StageResult.correction``; None changes nothing. ``readings``: (n, 3), g or deg/s. Raises
+    ``ConfigurationError`` if a step is of an unknown kind.
     """
     out = np.array(readings, float)
     for step in (correction or {}).get("steps", []):

@@ -133,7 +133,7 @@ def table_errors(reference: Reference, estimated: Sequence[str] = ()) -> tuple[l
 def disturbance(reference: Reference, residuals: Values, blocks: Blocks) -> Values | None:
     """Return the covariance that the stated accuracies give the sums over blocks, or None where noise hides it.
 
-    ``reference``: its linear map is not used. ``residuals``: (n, 3). Returns (3 b, 3 b): channel by channel.
+    ``reference``: its linear map is not used. ``residuals``: (n, 3). The covariance is (3 b, 3 b), channel by channel.
     """
     white = float(noise_of_steps(np.abs(np.diff(residuals, axis=0))).min())
     if not 0.0 < white < _largest(reference) * np.sqrt(blocks.weight.max()):

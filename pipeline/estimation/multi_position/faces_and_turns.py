@@ -187,8 +187,8 @@ def turns_of(
     one move as a whole where two rests bound none.
 
     ``rests``: all of the gyroscope. A move that ends at one that is held out is left out. ``turns``: section
-    ``procedure.turns``. ``role``: of the recordings that may be a turn as a whole; empty for none. Returns list of
-    (Recording, float, (3,) array): recording, start in s and integrated readings in deg of each move.
+    ``procedure.turns``. ``role``: of the recordings that may be a turn as a whole; empty for none. Of each move:
+    recording, start in s and integrated readings in deg.
     """
     spans = [
         (int(rests.recording[j]), slice(int(rests.span[i, 1]) - 1, int(rests.span[j, 0]) + 1))

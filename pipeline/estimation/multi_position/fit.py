@@ -295,8 +295,8 @@ def fit_robustly(
 ) -> tuple[GyroscopeModel, Fit, list[dict[str, Any]]]:
     """Fit rests and moves with weights of Student's t where a move is outlying.
 
-    ``fitted``: fits a model. Returns ``GyroscopeModel, Fit`` with the variance that the weights add; ``list of dict``
-    the outlying moves: ``recording, time_s, error_deg, over_noise, weight``.
+    ``fitted``: fits a model. Returns model and fit with the variance that the weights add, and the outlying moves:
+    ``recording, time_s, error_deg, over_noise, weight``.
     """
     found, moves = fitted(model), model.moves
     if moves is None:

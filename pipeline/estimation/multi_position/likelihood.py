@@ -115,8 +115,8 @@ def log_likelihood(rss: Values, n: int, log_determinant: Values) -> Values:
 class ProjectedCandidates:
     """Whitened candidates and residual with the model's columns projected out, under each of t hypotheses."""
 
-    raw: list[Values]  # list of (t, n, p); projected columns of each candidate
-    # list of (t, p, p); ``raw @ orthonormal`` are orthonormal directions; zeros where a candidate has fewer than
+    raw: list[Values]  # each (t, n, p); projected columns of each candidate
+    # each (t, p, p); ``raw @ orthonormal`` are orthonormal directions; zeros where a candidate has fewer than
     # columns
     orthonormal: list[Values]
     residual: Values  # (t, n)

@@ -70,7 +70,7 @@ class Equations:
 
     residual: Values  # (n,)
     base: Values  # (n, b); columns of bias and matrix
-    # each list of (n, p); columns of the effects of the model, and of effects that are not in it
+    # lists of (n, p); columns of the effects of the model, and of effects that are not in it
     effects: list[Values]
     candidates: list[Values]
     scatter: Values  # (s, n); the g_j
