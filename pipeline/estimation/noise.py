@@ -177,9 +177,9 @@ def _noise_of_rests(
     covariance = filter_autocovariance(chosen[0])
     memory = int(np.searchsorted(-np.abs(covariance), -0.01 * covariance[0]))
     shortest = max(SHORTEST_BLOCK, 4 * memory)
-    blocks = blocks_of(rests, shortest)
+    blocks = _blocks_of(rests, shortest)
     if more and len(covariance) == 1:  # a filter still settles in a short rest after a move
-        blocks = with_scatter(blocks, blocks_of(more, shortest))
+        blocks = _with_scatter(blocks, _blocks_of(more, shortest))
     passed = (2.0 * covariance.sum() - covariance[0]) > 0.5  # at 0 Hz; a high-pass lets no wander through
     told = blocks.cut & ~np.isin(blocks.rest, creeping)
     if told.sum() - len(np.unique(blocks.rest[told])) < 3 or not passed:
@@ -189,7 +189,7 @@ def _noise_of_rests(
     return _best(found, sheet, source)
 
 
-def _nuisance(blocks: RestBlocks, chosen: list[Recording], source: str, creeping: Sequence[int] = ()) -> Values:
+def _nuisance(blocks: _RestBlocks, chosen: list[Recording], source: str, creeping: Sequence[int] = ()) -> Values:
     """Return a constant for each rest, and a line where the unit creeps; for a static one temperature and warm-up."""
     rest, centre = blocks.rest[blocks.cut], (blocks.start + blocks.length / 2.0)[blocks.cut]
     columns = [(rest == r).astype(float) for r in np.unique(rest)]
@@ -302,7 +302,7 @@ class Rest:
 
 
 @dataclass(frozen=True)
-class RestBlocks:
+class _RestBlocks:
     """Block means and scatter of rests."""
 
     # each (b,), s; first sample time and duration of each block
@@ -325,7 +325,7 @@ class _Likelihood:
     white: Values  # (t, r, 3); the estimate at each point
 
 
-def blocks_of(rests: Sequence[Rest], shortest: int) -> RestBlocks:
+def _blocks_of(rests: Sequence[Rest], shortest: int) -> _RestBlocks:
     """Cut rests into blocks.
 
     ``shortest``: fewest samples of a block in a rest that is cut.
@@ -347,10 +347,10 @@ def blocks_of(rests: Sequence[Rest], shortest: int) -> RestBlocks:
     mean = np.add.reduceat(values, first) / counts[:, None]
     scatter = np.maximum(np.sum(values * values, axis=0) - np.sum(counts[:, None] * mean * mean, axis=0), 0.0)
     length = (time[first + counts - 1] - time[first]) * counts / np.maximum(counts - 1, 1)
-    return RestBlocks(time[first], length, counts, mean, rest, clock, pieces[rest] > 1, scatter)
+    return _RestBlocks(time[first], length, counts, mean, rest, clock, pieces[rest] > 1, scatter)
 
 
-def with_scatter(blocks: RestBlocks, more: RestBlocks) -> RestBlocks:
+def _with_scatter(blocks: _RestBlocks, more: _RestBlocks) -> _RestBlocks:
     """Return the blocks with the scatter of others added where it agrees with theirs; nothing else of them counts.
 
     Scatters agree where the estimates of white noise differ by less than 3 standard deviations on every axis.
@@ -362,13 +362,13 @@ def with_scatter(blocks: RestBlocks, more: RestBlocks) -> RestBlocks:
     if np.any(np.abs(log_ratio) > 3.0 * np.sqrt(2.0 / nu[0] + 2.0 / nu[1])):
         return blocks
 
-    stacked = {f.name: np.concatenate([getattr(blocks, f.name), getattr(more, f.name)]) for f in fields(RestBlocks)}
+    stacked = {f.name: np.concatenate([getattr(blocks, f.name), getattr(more, f.name)]) for f in fields(_RestBlocks)}
     stacked["rest"][len(blocks.rest) :] += blocks.rest.max() + 1
     stacked["cut"][len(blocks.cut) :] = False
-    return RestBlocks(**{**stacked, "scatter": blocks.scatter + more.scatter})
+    return _RestBlocks(**{**stacked, "scatter": blocks.scatter + more.scatter})
 
 
-def likelihood(blocks: RestBlocks, design: Values, covariance: Values, correlation_times: Values) -> _Likelihood:
+def likelihood(blocks: _RestBlocks, design: Values, covariance: Values, correlation_times: Values) -> _Likelihood:
     """Return the likelihood of white noise and bias over the grid.
 
     ``design``: (c, p), the nuisance columns d, at the c blocks that are ``cut``. ``covariance``: (l,), the filter's

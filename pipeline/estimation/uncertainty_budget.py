@@ -93,7 +93,7 @@ def mounting_contribution(covariance: Values) -> Contribution:
     return Contribution("mounting", "B", NORMAL, covariance, np.full(len(covariance), np.inf))
 
 
-def quantisation(noise: ResidualNoise, fit: LinearMap, counts_per_unit: float | None, unit: str) -> Contribution | str:
+def _quantisation(noise: ResidualNoise, fit: LinearMap, counts_per_unit: float | None, unit: str) -> Contribution | str:
     """Return what rounding to whole counts contributes, or why it has no line of its own.
 
     With white noise of half a count and more, the rounding errors of the samples are independent, of variance 1/12
@@ -165,7 +165,7 @@ def budgeted(  # noqa: PLR0917  (what a fit on a table is)
     found, absent = table_errors(reference, estimated)
     lines, missing = list(contributions), {"temperature": TEMPERATURE, "time base": TIME_BASE}
     if noise.row_weight is None:
-        rounded = quantisation(noise, reference.fit, counts, SENSOR_UNITS[sensor])
+        rounded = _quantisation(noise, reference.fit, counts, SENSOR_UNITS[sensor])
     else:
         rounded = f"contained in the {NOISE}"
     if isinstance(rounded, str):
@@ -178,7 +178,7 @@ def budgeted(  # noqa: PLR0917  (what a fit on a table is)
         return complete
     first = reference.fit.first()
     stated, _ = table_errors(replace(reference, fit=first), estimated)
-    again = None if isinstance(rounded, str) else quantisation(noise, first, counts, SENSOR_UNITS[sensor])
+    again = None if isinstance(rounded, str) else _quantisation(noise, first, counts, SENSOR_UNITS[sensor])
     covariances = [c.covariance for c in (*stated, again) if isinstance(c, Contribution)]
     draw = through(noise.posterior(first), covariances, results)
     return beside_trials(complete, draw, trials, contributions[1:])

@@ -66,7 +66,7 @@ class Ellipsoid:
     @property
     def matrix(self) -> Values:
         """L = T S: (3, 3) array."""
-        return triangle(self.values)
+        return _triangle(self.values)
 
     @property
     def standard_uncertainty(self) -> Values:
@@ -76,7 +76,7 @@ class Ellipsoid:
         return out
 
 
-def triangle(values: Values) -> Values:
+def _triangle(values: Values) -> Values:
     """Return L of the nine values: (3, 3) array."""
     L = np.zeros((3, 3))
     L[ROWS, COLUMNS] = values[3:]
@@ -85,7 +85,7 @@ def triangle(values: Values) -> Values:
 
 def error_of(y: Values, target: Values, values: Values) -> Values:
     """Return |L (y - b)| less its target: (m,) array, g."""
-    return np.asarray(np.linalg.norm((y - values[:3]) @ triangle(values).T, axis=1) - target)
+    return np.asarray(np.linalg.norm((y - values[:3]) @ _triangle(values).T, axis=1) - target)
 
 
 def derivative_of(y: Values, values: Values) -> Values:
@@ -93,7 +93,7 @@ def derivative_of(y: Values, values: Values) -> Values:
 
     ``d/db = -L^T n`` and ``d/dL_ij = n_i (y - b)_j``, with ``n = u / |u|``.
     """
-    L, centred = triangle(values), y - values[:3]
+    L, centred = _triangle(values), y - values[:3]
     u = centred @ L.T
     n = u / np.linalg.norm(u, axis=1, keepdims=True)
     return np.concatenate([-n @ L, n[:, ROWS] * centred[:, COLUMNS]], axis=1)

@@ -179,7 +179,6 @@ def _rows(
 
 def _samples(recording: Recording, rests: Sequence[Rest]) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
     """Return which samples of a recording belong to its rests, and the row of each of these."""
-    label = np.full(recording.samples, -1, np.intp)
     edges = np.array([[rest.start, rest.stop] for rest in rests])
     inside = np.zeros(recording.samples + 1, np.intp)
     np.add.at(inside, edges[:, 0], 1)
