@@ -43,7 +43,7 @@ NOT_WANTED = "not_wanted"  # the stage of a sensor whose method is null
 KINDS = "subtract, matrix, two_sided"
 
 
-def _stage_module(sensor: str, stage: str) -> str:
+def stage_module(sensor: str, stage: str) -> str:
     """Return the module that holds a stage."""
     if stage in STAGED[sensor]:
         return f"pipeline.estimation.{sensor}.staged"
@@ -65,7 +65,7 @@ def fit_stage(
     """
     if stage == NOT_WANTED:
         raise CannotCalibrateError(f"method.{sensor} is null: the configuration leaves this sensor uncalibrated")
-    fit = import_module(_stage_module(sensor, stage)).fit
+    fit = import_module(stage_module(sensor, stage)).fit
     named = (stage,) if stage in STAGED[sensor] else (sensor,) if stage in OF_BOTH_SENSORS else ()
     found: SensorCalibration = fit(*named, recordings, previous, settings)
     return found
