@@ -126,13 +126,13 @@ def held_out_of(part: Mapping[str, Any] | None) -> HeldOut | None:
     return HeldOut(float(part["steps"][-1]["rms_error"]), *map(float, part["expected_rms_error"]))
 
 
-def doubts_of(sensor: str, recordings: Sequence[Recording], effects: Sequence[str] = ()) -> list[str]:
+def doubts_of(sensor: str, recordings: Sequence[Recording], *, seats: bool = True) -> list[str]:
     """Return what the notes on the recordings say of the reference of a sensor.
 
-    A note on turns of the other sensor concerns that one alone. Mountings or zeros that are fitted or selected explain
-    the note that one mounting does not explain the turns.
+    A note on turns of the other sensor concerns that one alone. ``seats``: whether the note counts that one mounting
+    does not explain the turns.
     """
-    codes = {IN_DOUBT} if set(effects) & set(OF_SEATS) else {IN_DOUBT, SEATS}
+    codes = {IN_DOUBT, SEATS} if seats else {IN_DOUBT}
     own = [r for r in recordings if r.role not in {"accelerometer", "gyroscope"} or r.role == sensor]
     return [f"{r.name}: {note.detail}" for r in own for note in r.notes if note.code in codes]
 
@@ -177,7 +177,7 @@ def evidence_of(
         free=error_of(free, smoothed=True) if contradicted else None,
         full=error_of(full, smoothed=True) if contradicted else None,
         doubts=[
-            *doubts_of(sensor, recordings, [*document["configured"], *document["selected"]]),
+            *doubts_of(sensor, recordings, seats=not _seats_explained(document, sensor, found)),
             *(found.departures if found else ()),
         ],
         approximations=[error["name"] for error in document["method_errors"] if error["name"] in COMPARED],
@@ -189,6 +189,18 @@ def evidence_of(
         filtered=any(r.filter["name"] != "none" for r in recordings if r.role == "validation"),
         on_table=found is None or found.on_table,
     )
+
+
+def _seats_explained(document: Mapping[str, Any], sensor: str, found: Findings | None) -> bool:
+    """Return whether the fit explains that turns look as if they were mounted differently.
+
+    Mountings or zeros are in the model or selected. Or they were candidates of the accelerometer, were not selected,
+    and what is left is noise: an effect that the checks of the recordings do not know looked like a mounting.
+    """
+    if set(OF_SEATS) & {*document["configured"], *document["selected"]}:
+        return True
+    left = None if found is None else found.left_over_noise
+    return sensor == "accelerometer" and left is not None and left <= EXPLAINED
 
 
 def decide(e: Evidence) -> tuple[str, str]:
