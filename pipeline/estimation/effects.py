@@ -38,7 +38,7 @@ def fit(
 
         return fit_effects_by_rests(before, recordings, noise, settings)
     names = configured_effects(sensor, settings, recordings)
-    accelerometer = _mountings_by_gravity(recordings, settings) if sensor == "gyroscope" and MOUNTING in names else None
+    accelerometer = mountings_by_gravity(recordings, settings) if sensor == "gyroscope" and MOUNTING in names else None
     if settings["effects"][sensor] == AUTO:
         observations = observe(sensor, recordings, settings["table"])
         if not observations.parts:
@@ -50,7 +50,7 @@ def fit(
     return fit_joint(sensor, recordings, names, noise, settings, before, accelerometer)
 
 
-def _mountings_by_gravity(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> SensorCalibration | None:
+def mountings_by_gravity(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> SensorCalibration | None:
     """Return the accelerometer with the mountings of its turns; None where the recordings do not determine them."""
     listed = settings["effects"]["accelerometer"]
     wanted = AUTO if listed == AUTO else [MOUNTING, *(name for name in listed if name != MOUNTING)]
