@@ -230,10 +230,20 @@ class Composer:
         if sensor not in applies:
             raise Problem(f"effects.{sensor}: {name} applies to the {' and '.join(applies)} only")
 
+    def _check_contained(self, sensor: str, name: str, names: list[str]) -> None:
+        own = self.user_effects.effects.get(name)
+        known = own is None and name in self.effects
+        contains = own.contains if own else read_option("effect", name, ()).get("contains", []) if known else []
+        within = [other for other in names if other in contains]
+        if within:
+            raise Problem(f"effects.{sensor} names {name} and {within[0]}, which it contains: name one of them")
+
     def _check_meaning(self, config: dict[str, Any]) -> None:
         for sensor, names in config["effects"].items():
             for name in [] if names == "auto" else names:
                 self._check_effect(sensor, name, config["procedure"])
+            for name in [] if names == "auto" else names:
+                self._check_contained(sensor, name, names)
         ingest = repr((config["ingest"], config["procedure"]))
         if ingest not in self._valid_ingest:
             try:

@@ -162,9 +162,11 @@ def _remarks(
         absent = [s for s in SENSORS if not document.get(s)]
         lines += [f"Left out: the {s} is not calibrated: {reasons.get(s, 'no reason given')}." for s in absent]
     carried = [*declared.holds, *declared.approximates]
+    partly = any(kind != "full" for kind in declared.matrix.values())
     for s, sensor in sensors.items():
         lost = [] if "any" in declared.holds else [name for name in sensor.effects if name not in carried]
         lines += [f"Left out of this format, {s}: {', '.join(lost)}."] if lost else []
+        partly = partly or bool(lost)
         lines += [f"Of the bench, not of the {s}: {', '.join(sensor.bench_effects)}."] if sensor.bench_effects else []
     for s, sensor in sensors.items():
         partial = [name for name in sensor.effects if name in declared.approximates]
@@ -173,7 +175,6 @@ def _remarks(
     lines += declared.adds + (
         declared.adds_with_temperature if any(x.follows_temperature for x in sensors.values()) else []
     )
-    partly = any(kind != "full" for kind in declared.matrix.values())
     errors = declared.errors or ("With all of the calibration: {}." if partly else "The {}.")
     of_these = [line for s in SENSORS for line in final_errors(validation, s) if s in declared.units]
     return lines + [errors.format(line) for line in of_these]

@@ -1,7 +1,8 @@
 """Held-out errors: what a calibration leaves on samples that no fit has seen, and what noise alone would leave.
 
 Held out are the recordings of role ``validation``; without one, every third rest (``procedure.holdout_every``). Where
-nothing is held out, the samples of the fit are judged, and the result says so. With D the variance of a sample's noise,
+nothing is held out, the samples of the fit are judged, and the result says so. With t the truth, M the matrix, n the
+noise of a sample (white noise after the filter, and bias wander) and D its covariance, which is diagonal,
 
     noise_floor = sqrt(mean E(|t + M n| - |t|)^2),    vector_noise_floor = sqrt(mean tr(M D M^T))
 
