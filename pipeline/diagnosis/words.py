@@ -101,7 +101,8 @@ def _selected(entry: Mapping[str, Any], sensor: str, *, with_form: bool) -> list
     if before is not None and after is not None:
         given = ", with the functional form below fitted too" if with_form else ""
         lines.append(
-            f"It changes the rms error on held-out motion (of the vector, where its direction is logged) from {before:.4g} to {after:.4g} {unit_of(sensor)}{given}."
+            "It changes the rms error on held-out motion (of the vector, where its direction is logged) "
+            f"from {before:.4g} to {after:.4g} {unit_of(sensor)}{given}."
         )
     return lines
 
