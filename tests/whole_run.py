@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.config import load_campaign, settings_file
 from pipeline.model.effects import forget
+from pipeline.results_folder import HELD
 from pipeline.stages import batch, verdict
 
 if TYPE_CHECKING:
@@ -57,6 +58,8 @@ def run_jobs(campaign: Campaign) -> int:
             assert batch.main(stage, ["--config", file.write(), *given, *options, "--output", str(output)]) == 0
         finally:
             forget()  # a job is a process of its own
+            while HELD:
+                HELD.pop().close()
     mark, failures = campaign.results / "complete.json", batches / "gathered.json"
     return verdict.main(["--results", str(campaign.results), "--output", str(mark), "--failures", str(failures)])
 
