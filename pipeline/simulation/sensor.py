@@ -1,4 +1,4 @@
-"""A simulated sensor, how its parameters are drawn, and the temperature of the unit.
+"""A simulated sensor, and how its parameters are drawn.
 
     reading = clip(round(c (bias + K truth + effects + noise)) / c),   noise[n] = white w[n] + wander m[n]
     m[n+1] = r m[n] + sqrt(1 - r^2) w'[n],   r = exp(-(t[n+1] - t[n]) / T)
@@ -118,47 +118,6 @@ def bias_wander(sessions: list[Values], correlation_time: float, rng: np.random.
         out.append(process)
         last, before = process[-1], time[-1]
     return out
-
-
-@dataclass(frozen=True)
-class Environment:
-    """Temperature over time: degC, s and rad, as in the equation above; ``noise``: of the thermometer."""
-
-    ambient: float
-    warm_up: float
-    warm_up_time: float
-    drift: float
-    periods: Values
-    phases: Values
-    ramp: float = 0.0
-    ramp_period: float = 3600.0
-    noise: float = 0.03
-
-    def temperature(self, time: Values) -> Values:
-        """Return the true temperature: (n,) array, degC; time in s since power-on."""
-        room = np.sin(2.0 * np.pi * time[:, None] / self.periods + self.phases).sum(1) / 2.0
-        triangle = 2.0 / np.pi * np.arcsin(np.sin(2.0 * np.pi * time / self.ramp_period))
-        warm = self.warm_up * (1.0 - np.exp(-time / self.warm_up_time))
-        total: Values = self.ambient + warm + self.drift * room + self.ramp * triangle
-        return total
-
-    def reading(self, time: Values, rng: np.random.Generator) -> Values:
-        """Return the thermometer's reading: (n,) array, degC."""
-        return self.temperature(time) + self.noise * rng.standard_normal(len(time))
-
-
-def random_environment(rng: np.random.Generator, *, ramp: float = 0.0, ramp_period: float = 3600.0) -> Environment:
-    """Return a room at about 25 degC (Sudsanguan 2019, 5.1) in which the unit warms up by a few degrees."""
-    return Environment(
-        ambient=25.0 + rng.uniform(-1.0, 1.0),
-        warm_up=rng.uniform(3.0, 6.0),
-        warm_up_time=rng.uniform(200.0, 400.0),
-        drift=0.3,
-        periods=rng.uniform(1800.0, 7200.0, 2),
-        phases=rng.uniform(0.0, 2.0 * np.pi, 2),
-        ramp=ramp,
-        ramp_period=ramp_period,
-    )
 
 
 def drawn_sensors(
