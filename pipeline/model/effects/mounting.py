@@ -56,6 +56,24 @@ def rotated(motion: Motion, rotation: Values) -> Motion:
     return replace(motion, **found)
 
 
+def rotation_columns(
+    sensor: str, motion: Motion, K: Values, rotation: Callable[[Values], Values], values: Values
+) -> Values:
+    """Return the derivative of ``K R(p) u`` with respect to p angles, deg, by central differences: (n, 3, p) array.
+
+    ``rotation``: (p, p) rows of angles to (p, 3, 3) rotations R.
+    """
+    steps = STEP_DEG * np.eye(len(values))
+    slopes = (rotation(values + steps) - rotation(values - steps)) / (2.0 * STEP_DEG)
+    u = truth(sensor, motion)
+    return np.stack([u @ (K @ slope).T for slope in slopes], axis=2)
+
+
+def turned_back(values: Values) -> Values:
+    """Return ``exp([theta]x)^T`` of rotation vectors, deg: (..., 3) to (..., 3, 3) array."""
+    return np.asarray(np.swapaxes(turn_by_vector(np.radians(values)), -1, -2))
+
+
 def _rotated_at(trajectory: Callable[..., Motion | None], rotation: Values, **at: Any) -> Motion | None:  # noqa: ANN401
     there = trajectory(**at)
     return there and rotated(there, rotation)
@@ -100,10 +118,7 @@ class _OfRecordings(DeclaredEffect):
         columns = np.zeros((len(motion.time), 3, len(values)))
         own = self._own(motion)
         if own.stop:
-            steps = STEP_DEG * np.eye(len(self.suffixes))
-            ahead, behind = (self.rotation(motion, values[own] + sign * steps) for sign in (1.0, -1.0))
-            slopes, u = (ahead - behind) / (2.0 * STEP_DEG), truth(sensor, motion)
-            columns[:, :, own] = np.stack([u @ (K @ slope).T for slope in slopes], axis=2)
+            columns[:, :, own] = rotation_columns(sensor, motion, K, partial(self.rotation, motion), values[own])
         return columns
 
     def reading(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
@@ -128,7 +143,7 @@ class Mounting(_OfRecordings):
     def rotation(self, motion: Motion, values: Values) -> Values:
         """Return ``exp([theta]x)^T``."""
         del motion
-        return np.asarray(np.swapaxes(turn_by_vector(np.radians(values)), -1, -2))
+        return turned_back(values)
 
 
 def in_mean_frame(K: Values, values: Values) -> tuple[Values, Values]:

@@ -20,7 +20,7 @@ import numpy as np
 
 from pipeline.errors import ConfigurationError
 from pipeline.model.effects.base import Effect, Layout, Owner, Parameter, truth, unit_of
-from pipeline.model.kinematics import turn_by_vector
+from pipeline.model.effects.mounting import rotation_columns, turned_back
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     Values = NDArray[np.float64]
 
 SEPARATOR = "@"
-STEP_DEG = 1e-3  # of the central difference of a rotation: its error is (step^2 / 6) rad = 5e-11
 EXPERIMENT = "the same turns in another setup"
 AS_THE_BASE = (
     *("owner", "layout", "sensors", "unseen", "needs", "needs_clock", "needs_motion", "needs_both_directions"),
@@ -56,14 +55,11 @@ class _Mounting(Effect):
 
     def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
         """Return the derivative by differences that are exact to 1e-8."""
-        steps = STEP_DEG * np.eye(3)
-        change = turn_by_vector(np.radians(values + steps)) - turn_by_vector(np.radians(values - steps))
-        slopes, u = change / (2.0 * STEP_DEG), truth(sensor, motion)
-        return np.stack([u @ (K @ slope.T).T for slope in slopes], axis=2)
+        return rotation_columns(sensor, motion, K, turned_back, values)
 
     def reading(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
         """Return what the turn adds, however large it is."""
-        return np.asarray(truth(sensor, motion) @ (K @ (turn_by_vector(np.radians(values)).T - np.eye(3))).T)
+        return np.asarray(truth(sensor, motion) @ (K @ (turned_back(values) - np.eye(3))).T)
 
 
 class _Bias(Effect):
