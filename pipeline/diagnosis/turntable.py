@@ -19,7 +19,6 @@ from pipeline.diagnosis.verdict import verdict_of_selection
 from pipeline.diagnosis.words import FAR_OFF, plain
 from pipeline.estimation.candidates import turns_of
 from pipeline.estimation.design import Start
-from pipeline.estimation.effects import mountings_by_gravity
 from pipeline.estimation.generalized_least_squares import calibration_of, fit_in_mean_frame, fit_terms
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import FAR_ABOVE, select
@@ -59,8 +58,6 @@ def findings(
     """
     sensor, sheet = calibration.sensor, settings["sensor"][calibration.sensor]
     observations = observe(sensor, recordings, settings["table"])
-    if sensor == "gyroscope" and observations.mounting_in_doubt:  # the calibration may be without mountings
-        accelerometer = mountings_by_gravity(recordings, settings)
     selection = select(observations, configured, noise, sheet, calibration, accelerometer=accelerometer)
     unknown = unexplained(selection)
     reported = select_with_form(selection, unknown, configured, noise, sheet, accelerometer=accelerometer)

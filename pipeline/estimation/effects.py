@@ -11,6 +11,7 @@ from pipeline.estimation.noise import noise_of
 from pipeline.estimation.observations import observe
 from pipeline.estimation.rest_means import is_multi_position
 from pipeline.estimation.selection import select
+from pipeline.model.effects import effect
 from pipeline.records import SensorCalibration
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ def fit(
 
         return fit_effects_by_rests(before, recordings, noise, settings)
     names = configured_effects(sensor, settings, recordings)
-    accelerometer = mountings_by_gravity(recordings, settings) if sensor == "gyroscope" and MOUNTING in names else None
+    accelerometer = _mountings_by_gravity(recordings, settings) if sensor == "gyroscope" and MOUNTING in names else None
     if settings["effects"][sensor] == AUTO:
         observations = observe(sensor, recordings, settings["table"])
         if not observations.parts:
@@ -50,10 +51,11 @@ def fit(
     return fit_joint(sensor, recordings, names, noise, settings, before, accelerometer)
 
 
-def mountings_by_gravity(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> SensorCalibration | None:
+def _mountings_by_gravity(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> SensorCalibration | None:
     """Return the accelerometer with the mountings of its turns; None where the recordings do not determine them."""
     listed = settings["effects"]["accelerometer"]
-    wanted = AUTO if listed == AUTO else [MOUNTING, *(name for name in listed if name != MOUNTING)]
+    within = (MOUNTING, *effect(MOUNTING).contains)
+    wanted = AUTO if listed == AUTO else [MOUNTING, *(name for name in listed if name not in within)]
     both = {**settings, "effects": {**settings["effects"], "accelerometer": wanted}}
     try:
         return fit("accelerometer", recordings, None, both)

@@ -64,6 +64,12 @@ def test_mountings_are_named_for_both_sensors_and_explain_the_error_once_added()
         assert "table_axis_nonorthogonality" in hidden  # the mountings contain it
 
 
+def test_a_zero_in_the_accelerometers_model_leaves_the_gyroscope_its_diagnosis() -> None:
+    recordings, settings = simulated(zero_deg={"accel_y": 1.5})
+    found = judged(recordings, {**settings, "effects": {"accelerometer": ["encoder_zero"], "gyroscope": []}})
+    assert {sensor: said["verdict"] for sensor, (said, _) in found.items()} == dict.fromkeys(SENSORS, "nothing_missing")
+
+
 @pytest.mark.parametrize("turn", [(0.0, 90.0, 0.0), (0.0, 0.0, 180.0)])
 def test_a_unit_on_another_face_is_calibrated_and_its_attitude_log_turned(turn: tuple[float, float, float]) -> None:
     everywhere = {name: list(turn) for name in [*TURNS, "static", "validation"]}
