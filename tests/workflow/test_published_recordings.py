@@ -1,6 +1,8 @@
 """Recordings that others have published, calibrated by every stage, against what is known of their sensors."""
 
+import hashlib
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +22,15 @@ xsens-all,multi_position,generic,xsens_mti_multi_position,\
 procedure.folder={DATA}/xsens_mti_multi_position;procedure.holdout_every=0
 xsens-moves,multi_position,generic,xsens_mti_multi_position,\
 procedure.folder={DATA}/xsens_mti_multi_position;method.gyroscope=rests_and_moves
-mpu6050,multi_position,mpu6050,mpu6050_multi_position,procedure.folder={DATA}/mpu6050_multi_position;\
-procedure.recordings.recording.file=example_data_calibration.csv;procedure.holdout_every=0
 """
+SHIPPED = ROOT / "data" / "published"
+# The results of its authors (github.com/tomisuarez2/ImuCalibration, optmization result data): counts, and relative to
+# 16384 counts a g, 131 counts per deg/s
+AUTHORS = {
+    "bias": np.array([711.5, -358.5, -1840.1]),
+    "accelerometer": np.array([6.0201e-4, 5.9684e-4, 5.8592e-4]) * 16384 / 9.80665,
+    "gyroscope": np.array([1.3737e-4, 1.3292e-4, 1.3394e-4]) * np.degrees(131.0),
+}
 
 
 @pytest.fixture(scope="module")
@@ -35,6 +43,13 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> Bench:
     gravity = {unit: [f"table.gravity_g={GRAVITY}"] for unit in ("xsens", "xsens-all", "xsens-moves")}
     assert run_campaign(directory / "published", unit_overrides=gravity)[1] == 0
     return Bench(directory, directory / "published")
+
+
+@pytest.fixture(scope="module")
+def shipped(tmp_path_factory: pytest.TempPathFactory) -> Bench:
+    directory = tmp_path_factory.mktemp("shipped")
+    assert run_campaign(SHIPPED, results=directory / "results")[1] == 0
+    return Bench(directory, SHIPPED)
 
 
 def document(bench: Bench, kind: str, unit: str) -> dict[str, Any]:
@@ -64,7 +79,7 @@ def test_a_third_of_the_rests_is_held_out_and_predicted(published: Bench) -> Non
     assert part["steps"][-1]["rms_error"] < 0.18e-3
 
 
-@pytest.mark.parametrize("unit", ["xsens", "xsens-all", "mpu6050"])
+@pytest.mark.parametrize("unit", ["xsens", "xsens-all"])
 def test_the_gyroscope_that_hand_held_rests_do_not_give_is_null_with_the_reason(published: Bench, unit: str) -> None:
     found = document(published, "calibrations", unit)
     assert found["gyroscope"] is None
@@ -86,12 +101,6 @@ def test_nothing_is_claimed_of_an_accelerometer_whose_rests_are_at_the_noise(pub
         assert part["residual_over_noise"] < 1.5
 
 
-def test_ten_rests_are_not_enough_to_tell_an_effect(published: Bench) -> None:
-    part = document(published, "diagnoses", "mpu6050")["accelerometer"]
-    assert part["verdict"] == "not_enough_data"
-    assert "10 rests are too few" in " ".join(entry["reason"] for entry in part["not_observable"])
-
-
 def test_the_g_sensitivity_of_a_vibrating_gyroscope_is_named_and_mends_held_out_rests(published: Bench) -> None:
     part = document(published, "diagnoses", "xsens-moves")["gyroscope"]
     assert part["selected"] == ["g_sensitivity"]
@@ -100,11 +109,60 @@ def test_the_g_sensitivity_of_a_vibrating_gyroscope_is_named_and_mends_held_out_
     assert 0.02 < np.max([abs(p["value"]) for p in best["parameters"].values()]) < 0.3  # deg/s/g, as such sensors have
 
 
-def test_no_moving_sample_is_averaged_into_a_rest(published: Bench) -> None:
-    stage = document(published, "calibrations", "mpu6050")["accelerometer"]["stages"][-1]
+def test_the_shipped_recordings_are_those_of_the_authors() -> None:
+    text = (SHIPPED / "README.md").read_text()
+    stated = dict(re.findall(r"^\| `([^`]*)` \| `[^`]*` \| `(\w{64})` \|$", text, re.MULTILINE))
+    files = {str(f.relative_to(SHIPPED / "raw")): f for f in SHIPPED.glob("raw/*/*.csv")}
+    assert stated == {name: hashlib.sha256(file.read_bytes()).hexdigest() for name, file in files.items()}
+    for file in SHIPPED.glob("raw/*"):
+        assert (file / "LICENSE").read_text().startswith("MIT License")
+
+
+def test_the_page_of_evidence_tells_what_the_shipped_campaign_gives(shipped: Bench) -> None:
+    text = (ROOT / "docs" / "evidence.md").read_text()
+    rows = re.findall(r"^\| `(\w+)` \| (\w+), ([\w/]+) \| (.*) \|$", text, re.MULTILINE)
+    assert len(rows) == 6
+    for unit, quantity, measured_in, cells in rows:
+        samples, *said, verdict = (cell.strip(" `") for cell in cells.split("|"))
+        validation, scale = document(shipped, "validations", unit), 1000.0 if measured_in == "mg" else 1.0
+        if quantity == "move":
+            found = validation["gravity_direction"]
+            values = [found["rms_deg"]["before"], found["rms_deg"]["after"], found["noise_floor_deg"]]
+            assert int(samples) == found["moves"]
+            assert [*said[3:], verdict] == ["", ""]
+        else:
+            found = validation[quantity]
+            errors = [found["steps"][0]["rms_error"], found["steps"][-1]["rms_error"]]
+            values = [*errors, found["noise_floor"], *found["expected_rms_error"]]
+            said[3:] = said[3].split(" to ")
+            assert found["held_out"]
+            assert int(samples) == found["samples"]
+            assert values[3] < values[1] < values[4]  # in the interval in which it is expected
+            assert verdict == document(shipped, "diagnoses", unit)[quantity]["verdict"]
+        for stated, value in zip(said, values, strict=False):
+            last = 10.0 ** -len(stated.partition(".")[2])
+            assert abs(float(stated) - scale * value) < max(0.02 * scale * value, last), (unit, quantity, stated)
+
+
+def test_ten_rests_are_not_enough_to_tell_an_effect(shipped: Bench) -> None:
+    part = document(shipped, "diagnoses", "mpu6050")["accelerometer"]
+    assert "10 rests are too few" in " ".join(entry["reason"] for entry in part["not_observable"])
+
+
+def test_bias_and_scale_agree_with_those_that_the_authors_published(shipped: Bench) -> None:
+    found = document(shipped, "calibrations", "mpu6050")
+    assert np.abs(16384 * np.array(found["accelerometer"]["bias"]) - AUTHORS["bias"]).max() < 21
+    force, rate = (np.diag(found[name]["matrix"]) / AUTHORS[name] - 1 for name in ("accelerometer", "gyroscope"))
+    assert np.abs(force).max() < 6e-4
+    assert np.abs(rate[1:]).max() < 7e-4
+    assert rate[0] == pytest.approx(-0.017, abs=1e-3)  # their moves hold clipped readings of x
+
+
+def test_no_moving_sample_is_averaged_into_a_rest(shipped: Bench) -> None:
+    stage = document(shipped, "calibrations", "mpu6050")["accelerometer"]["stages"][-1]
     rests = stage["details"]["rests_used"]
     assert len(rests) == 10
-    counts = np.loadtxt(DATA / "mpu6050_multi_position" / "example_data_calibration.csv", delimiter=",", skiprows=5)
+    counts = np.loadtxt(SHIPPED / "raw" / "mpu6050" / "recording.csv", delimiter=",", skiprows=5)
     for rest in rests:
         first = round(rest["time_s"] * 100)
         inside = counts[first : first + round(rest["duration_s"] * 100) + 1, 3:] / 131
@@ -113,7 +171,7 @@ def test_no_moving_sample_is_averaged_into_a_rest(published: Bench) -> None:
 
 
 def test_a_file_that_is_shared_is_named_with_its_hash(published: Bench) -> None:
-    inputs = document(published, "calibrations", "mpu6050")["inputs"]
-    assert [Path(i["file"]).name for i in inputs] == ["example_data_calibration.csv"]
-    assert inputs[0]["rows"] == 10245
+    inputs = document(published, "calibrations", "xsens")["inputs"]
+    assert {Path(i["file"]).name for i in inputs} == {"accelerometer.txt"}
+    assert inputs[0]["rows"] == 51175
     assert len(inputs[0]["sha256"]) == 64
