@@ -115,7 +115,7 @@ def prior_of(this: Effect, observed: Observations, accelerometer: SensorCalibrat
     mean[here] = found.values[there]
     covariance = seat_deg**2 * np.eye(size)
     covariance[np.ix_(here, here)] = accelerometer.covariance[np.ix_(first + there, first + there)]
-    covariance += np.kron(np.full((len(recordings), len(recordings)), seat_deg**2 / len(recordings)), np.eye(3))
+    covariance += np.kron(np.full((len(recordings),) * 2, np.diag(covariance)[here].mean()), np.eye(3))
     return NormalPrior(mean, np.asarray(np.linalg.inv(covariance), np.float64))
 
 

@@ -298,14 +298,35 @@ def assess_noise(
         return ResidualNoise(blocks, found.settings, found.weight, found.white_variance, spare)
     white = noise_of_steps(np.abs(np.diff(residuals, axis=0)))
     settings = prior.grid(float(np.sqrt(np.mean(white**2))))
-    every, scale = np.asarray(np.kron(np.eye(3), U[:, rank:]), np.float64), np.outer(white, np.sqrt(count)).ravel()
-    variances, directions = np.linalg.eigh(every.T @ (disturbance / np.outer(scale, scale)) @ every)
-    basis = every @ directions[:, : max(int(np.sum(variances <= 1.0)), 1)]
+    complement = np.asarray(np.kron(np.eye(3), U[:, rank:]), np.float64)
+    return noise_beside(complement, means, blocks, settings, white, disturbance)
+
+
+def noise_beside(  # noqa: PLR0917  (what a restricted likelihood beside known errors is)
+    complement: Values,
+    means: Values,
+    blocks: Blocks,
+    settings: Sequence[Setting],
+    white: Values,
+    disturbance: Values,
+    row_weight: Values | None = None,
+) -> ResidualNoise:
+    """Weight hypotheses about the noise by the residuals' block means in the directions that known errors leave free.
+
+    ``complement``: (3 m, r), orthonormal directions beside the fitted columns, in means times ``sqrt(samples) /
+    white``, channel by channel. ``means``: (m, 3). ``white``: (3,), noise of a sample. ``disturbance``: see
+    ``assess_noise``; directions in which it exceeds white noise are left out. ``row_weight``: (n,), samples of each
+    row.
+    """
+    count = blocks.weight[:, None]
+    scale = np.outer(white, np.sqrt(count)).ravel()
+    variances, directions = np.linalg.eigh(complement.T @ (disturbance / np.outer(scale, scale)) @ complement)
+    basis = complement @ directions[:, : max(int(np.sum(variances <= 1.0)), 1)]
     z = basis.T @ (np.sqrt(count) * means / white).T.ravel()
     logarithm, squares = _in_subspace(basis, z, blocks, settings)
     variance = np.maximum(squares / len(z), np.finfo(float).tiny)[:, None]
     found = ResidualNoise.of(blocks, settings, logarithm, variance, len(z))
-    return ResidualNoise(blocks, found.settings, found.weight, found.white_variance * white**2, len(z))
+    return ResidualNoise(blocks, found.settings, found.weight, found.white_variance * white**2, len(z), row_weight)
 
 
 def _in_subspace(basis: Values, z: Values, blocks: Blocks, settings: Sequence[Setting]) -> tuple[Values, Values]:

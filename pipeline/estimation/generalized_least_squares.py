@@ -24,12 +24,12 @@ import numpy as np
 from pipeline.errors import NotObservableError
 from pipeline.estimation.candidates import parameter_names, require_available, starts_of
 from pipeline.estimation.design import BASE, BASE_NAMES, Design, Start, Term, motions_of, ordinary_base
-from pipeline.estimation.engine import Posterior, ResidualNoise
+from pipeline.estimation.engine import AVERAGED_OUT, Posterior, ResidualNoise, noise_beside
 from pipeline.estimation.gauss_markov import WHITE, Setting, selection_grid
 from pipeline.estimation.least_squares import certified
 from pipeline.estimation.noise import static_or_sheet
 from pipeline.estimation.observations import observe, weighted
-from pipeline.estimation.table_errors import Reference
+from pipeline.estimation.table_errors import Reference, disturbance
 from pipeline.estimation.uncertainty_budget import (
     budgeted,
     combined,
@@ -218,8 +218,23 @@ def _solve(design: Design, observations: Observations, settings: Sequence[Settin
     )
 
 
-def _residual_noise(design: Design, observations: Observations, settings: Sequence[Setting]) -> ResidualNoise:
+def _residual_noise(
+    design: Design, observations: Observations, settings: Sequence[Setting], reference: Reference
+) -> ResidualNoise:
     """Weight hypotheses about the noise by their restricted likelihood, given a design of full rank at its solution."""
+    own = observations.by_noise
+    blocks, white = own.blocks, design.scale
+    disturbed = disturbance(reference, observations.reading, blocks, own.weight, white)
+    if disturbed is not None:
+        columns = np.zeros((3, len(blocks.weight), design.count + 1))
+        for c in range(3):
+            columns[c][:, design.places(c)[1]] = blocks.sums(own.weight[:, None] * design.of_axis(c))
+        means = columns[:, :, -1].T / blocks.weight[:, None]
+        columns /= (np.sqrt(blocks.weight) * white[:, None])[:, :, None]
+        X = columns[:, :, :-1].reshape(-1, design.count)
+        U, s, _ = np.linalg.svd(X / np.maximum(np.linalg.norm(X, axis=0), 1e-300))
+        rank = int(np.sum(s > AVERAGED_OUT * s[0]))
+        return noise_beside(U[:, rank:], means, blocks, settings, white, disturbed, own.weight)
     size = np.where(design.sizes()[:-1] > 0, design.sizes()[:-1], 1.0)
     products, logarithms = design.products(settings)
     gram, rhs = products[:, :-1, :-1] / np.outer(size, size), products[:, :-1, -1] / size
@@ -229,7 +244,7 @@ def _residual_noise(design: Design, observations: Observations, settings: Sequen
     free = max(3.0 * observations.samples - design.count, 1.0)
     variance = np.maximum(rss / free, np.finfo(float).tiny)[:, None]
     logarithms = logarithms + np.linalg.slogdet(gram)[1]
-    found = ResidualNoise.of(observations.blocks, settings, logarithms, variance, free, observations.noise_weight)
+    found = ResidualNoise.of(observations.blocks, settings, logarithms, variance, free, observations.weight)
     return replace(found, white_variance=found.white_variance * design.scale**2)
 
 
@@ -352,9 +367,10 @@ def calibration_of(  # noqa: PLR0917  (what a fit with effects is)
     design = design_at(observations, fit)
     first = design.linear_map(fit.setting)
     prior = static_or_sheet(noise, (settings.get("sensor") or {}).get(sensor) or {})
-    errors = _residual_noise(design, observations, prior.grid(float(np.sqrt(np.mean(design.scale**2)))))
     whole = first.then(change)
     reference = Reference(sensor, [part.motion for part in observations.parts], whole, fit.K, settings["table"])
+    grid = prior.grid(float(np.sqrt(np.mean(design.scale**2))))
+    errors = _residual_noise(design, observations, grid, reference)
     values = np.concatenate([fit.bias, fit.K.ravel(), *(term.values for term in fit.terms)])
     of_channels = np.concatenate(first.derivative, axis=1)
 

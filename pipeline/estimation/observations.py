@@ -55,7 +55,7 @@ class Part:
     scatter: Values  # (3,); sum of squares about the means, weighted
     clock_shared: bool
     interval: float  # s; between the recording's samples
-    noise_weight: Values | None = None  # (m,); weight by noise alone, where it differs
+    by_noise: Part | None = None  # weighted by noise alone, where errors of the angle take information from it
     moved: dict[tuple[tuple[str, bytes], ...], Motion] = field(default_factory=dict, compare=False, repr=False)
 
 
@@ -83,9 +83,9 @@ class Observations:
         return np.concatenate([part.weight for part in self.parts])
 
     @cached_property
-    def noise_weight(self) -> Values:
-        """All weights by noise alone, without errors of the angle: (n,) array."""
-        return np.concatenate([p.weight if p.noise_weight is None else p.noise_weight for p in self.parts])
+    def by_noise(self) -> Observations:
+        """The same observations, weighted by noise alone, without errors of the angle."""
+        return replace(self, parts=tuple(part.by_noise or part for part in self.parts))
 
     @cached_property
     def scatter(self) -> Values:
@@ -166,7 +166,7 @@ def _with_stops(part: Part, observations: Observations, white: float) -> Part:
     weight = part.weight / (1.0 + together[group])
     rests = ~moving
     share = float(weight[rests].sum() / part.weight[rests].sum()) if rests.any() else 1.0
-    return replace(part, weight=weight, scatter=share * part.scatter, noise_weight=part.weight)
+    return replace(part, weight=weight, scatter=share * part.scatter, by_noise=part)
 
 
 def observe(sensor: str, recordings: Sequence[Recording], table: Mapping[str, Any]) -> Observations:

@@ -130,16 +130,21 @@ def table_errors(reference: Reference, estimated: Sequence[str] = ()) -> tuple[l
     return found, missing
 
 
-def disturbance(reference: Reference, residuals: Values, blocks: Blocks) -> Values | None:
+def disturbance(
+    reference: Reference, residuals: Values, blocks: Blocks, weight: Values | None = None, white: Values | None = None
+) -> Values | None:
     """Return the covariance that the stated accuracies give the sums over blocks, or None where noise hides it.
 
-    ``reference``: its linear map is not used. ``residuals``: (n, 3). The covariance is (3 b, 3 b), channel by channel.
+    ``reference``: its linear map is not used. ``residuals``: (n, 3). ``weight``: (n,), samples of each row; None: rows
+    are samples. ``white``: (3,), noise of a sample; None: as the residuals show it. The covariance is (3 b, 3 b),
+    channel by channel.
     """
-    white = float(noise_of_steps(np.abs(np.diff(residuals, axis=0))).min())
-    if not 0.0 < white < _largest(reference) * np.sqrt(blocks.weight.max()):
+    if white is None:
+        white = noise_of_steps(np.abs(np.diff(residuals, axis=0)))
+    if not 0.0 < white.min() < _largest(reference) * np.sqrt(blocks.weight.max()):
         return None
     sums = np.zeros((len(blocks.weight), len(residuals)))
-    sums[blocks.label(len(residuals)), np.arange(len(residuals))] = 1.0
+    sums[blocks.label(len(residuals)), np.arange(len(residuals))] = 1.0 if weight is None else weight
     errors, _ = table_errors(replace(reference, fit=LinearMap((sums, sums, sums), _places(len(sums)))))
     return np.sum([e.covariance for e in errors], axis=0) if errors else None
 

@@ -71,6 +71,20 @@ def test_gravity_determines_the_mountings_of_both_sensors_to_their_uncertainty()
         assert np.abs(z).max() < 4.0
 
 
+def test_a_mounting_is_as_uncertain_for_the_gyroscope_as_gravity_leaves_it() -> None:
+    recordings, _ = seated_anew(0, 3.0)
+    by_gravity = fit("accelerometer", recordings, None, settings())
+    found = fit("gyroscope", recordings, None, settings())
+    assert by_gravity.covariance is not None
+    assert found.budget is not None
+    of_turns = np.sqrt(np.diag(by_gravity.covariance)[12:]).reshape(6, 3)[3:]
+    across = ~np.eye(3, dtype=bool)  # a rotation about the turn axis does not change the rate
+    (line,) = (entry for entry in found.budget["contributions"] if entry["source"] == "mounting")
+    of_matrix = np.array(line["contribution"][3:12]).reshape(3, 3)[across]
+    assert of_matrix.max() < 1.2 * np.radians(of_turns[across].max())
+    assert of_matrix.min() > 0.5 * np.radians(of_turns[across].min())
+
+
 def test_without_mountings_the_same_turns_leave_a_wrong_matrix() -> None:
     recordings, seats = seated_anew(0, 1.0)
     plain = settings()

@@ -4,6 +4,7 @@
 
 Each unit goes through the checks of its recordings, noise, fit, held-out error and diagnosis, as in a run. The line of
 a unit holds the error of each parameter over its expanded uncertainty, in the frame of the mean of the mountings. A
+unit of one number is the same sensor with the same hidden effect on every bench, so that benches compare in pairs. A
 unit that is in the file is not run again. Without --units the table of the file is printed.
 """
 
@@ -41,14 +42,18 @@ COURSE: dict[str, Any] = {
     "rates_dps": (30.0, 100.0), "both_directions": True,
 }  # fmt: skip
 FACES = Rotation.create_group("O")
-KINDS = ("plain", "remounted", "seats", "seats_remounted")
+# each with the bench that it is compared with: the same table, all by the convention
+KINDS = {
+    "plain": "plain", "remounted": "plain", "single": "single", "seats": "single", "seats_remounted": "single",
+}  # fmt: skip
 LARGEST_SEAT_DEG = 5.0
 NOT_HIDDEN = {"mounting", "encoder_zero", "table_axis_nonorthogonality", "earth_rotation", "table_tilt"}
 
 
-def drawn(kind: str, seed: int, number: int) -> tuple[UnitDescription, dict[str, Any]]:
+def drawn(kind: str, seed: int, number: int, hidden: float) -> tuple[UnitDescription, dict[str, Any]]:
     """Return a unit and what is departed from: the rotation of each recording and the hidden effect."""
-    rng = np.random.default_rng([seed, number, KINDS.index(kind)])
+    rng = np.random.default_rng([seed, number, 1 + list(KINDS).index(kind)])
+    of_unit = np.random.default_rng([seed, number, 0])
     face = FACES[int(rng.integers(24))] if "remounted" in kind else Rotation.identity()
     seats = {name: np.zeros(3) for name in [*TURNS, "validation"]}
     if "seats" in kind:
@@ -58,7 +63,7 @@ def drawn(kind: str, seed: int, number: int) -> tuple[UnitDescription, dict[str,
             seats[name] = size * rng.uniform(0.0, 1.0) * direction / np.linalg.norm(direction)
     bench: dict[str, Any] = {
         "direction_deg": np.zeros((3, 2)).tolist() if "seats" in kind else None,
-        "rate_error": [0.0, 0.0, 0.0],  # encoders keep the angle over any number of turns
+        "rate_error": [0.0, 0.0, 0.0],  # encoders keep the angle over any number of turns; see ``judged``
         "mounting_deg": {n: (face * Rotation.from_rotvec(s, degrees=True)).as_rotvec(degrees=True).tolist()
                          for n, s in seats.items()},
     }  # fmt: skip
@@ -68,29 +73,38 @@ def drawn(kind: str, seed: int, number: int) -> tuple[UnitDescription, dict[str,
             "sense": int(rng.choice([-1, 1])),
             "zero_deg": dict.fromkeys(TURNS, float(rng.uniform(-180.0, 180.0))),
         }
-    sensor = str(rng.choice(SENSORS))
+    sensor = str(of_unit.choice(SENSORS))
     names = [n for n, e in built_in().items() if sensor in e.sensors and sensor not in e.unseen and n not in NOT_HIDDEN]
-    effect = str(rng.choice(names)) if rng.random() < 0.4 else ""
+    effect = str(of_unit.choice(names)) if of_unit.random() < hidden else ""
+    table = "acutronic" if KINDS[kind] == "plain" else "single_axis"
     description = UnitDescription(
         f"u{number}",
-        sensor=("mpu6050", "stim300")[number // len(KINDS) % 2],
-        table="single_axis" if "seats" in kind else "acutronic",
+        sensor=("mpu6050", "stim300")[number % 2],
+        table=table,
         course=COURSE,
         imperfections=bench,
         effects={f"{sensor}.{effect}": None} if effect else {},
     )
-    return description, {"seats": seats, "face": face, "hidden": f"{sensor}.{effect}" if effect else ""}
+    rate_error = rng.normal(0.0, float(read_config("table", table)["rate_accuracy"]), 3)
+    departure = {"seats": seats, "face": face, "rate_error": rate_error}
+    return description, {**departure, "hidden": f"{sensor}.{effect}" if effect else ""}
 
 
-def judged(kind: str, seed: int, number: int) -> dict[str, Any]:
-    """Return what is said of one unit, by the functions that the stages of a run call, in their order."""
-    description, bench = drawn(kind, seed, number)
+def judged(kind: str, seed: int, number: int, hidden: float) -> dict[str, Any]:
+    """Return what is said of one unit, by the functions that the stages of a run call, in their order.
+
+    The rate of each turn axis has an error as its table states, without one of the angle, as by a wrong clock of the
+    table: the true matrix of the gyroscope is ``diag(1 + error)`` times that of the simulation.
+    """
+    description, bench = drawn(kind, seed, number, hidden)
     recordings, truth = simulate_unit(description, seed, number)
     nominal = {r.name: _nominal(r, description.imperfections) for r in recordings if r.name in TURNS}
     if bench["face"].magnitude() > 0.0 or "seats" in kind:
         recordings = [_without_attitude(r) for r in recordings]
     settings = settings_of(description.sensor, "reference_least_squares")
     settings = {**settings, "table": {"name": description.table, **read_config("table", description.table)}}
+    if kind == "single":
+        settings["table"]["seat_deg"] = None
     line: dict[str, Any] = {"kind": kind, "seed": seed, "number": number, "model": description.sensor}
     line |= {"hidden": bench["hidden"], "refused": None, "sensors": {}}
     try:
@@ -108,6 +122,8 @@ def judged(kind: str, seed: int, number: int) -> dict[str, Any]:
     for sensor in SENSORS:
         found = fits[sensor]
         matrix = mean.as_matrix() @ np.array(truth[sensor]["matrix"])
+        if sensor == "gyroscope":
+            matrix = np.diag(1.0 + bench["rate_error"]) @ matrix
         error = np.concatenate([found.bias - truth[sensor]["bias"], (found.matrix - matrix).ravel()])
         U = coverage_factor(found.freedom[:12]) * np.sqrt(np.diag(found.covariance)[:12])
         held = validate(found, recordings, noises[sensor], settings)
@@ -162,8 +178,7 @@ def table(lines: list[dict[str, Any]]) -> str:
         rows.append(f"{kind}: {len(chosen)} units, {len(refused)} refused")
         for sensor in SENSORS:
             plain = [line["sensors"][sensor] for line in fine if not line["hidden"].startswith(sensor)]
-            hidden = [(line["hidden"].partition(".")[2], line["sensors"][sensor]) for line in fine
-                      if line["hidden"].startswith(sensor)]  # fmt: skip
+            hidden = [line for line in fine if line["hidden"].startswith(sensor)]
             if plain:
                 covered = np.abs([p["error_over_U"] for p in plain]) <= 1.0
                 low, high = wilson(int(covered.sum()), covered.size)
@@ -176,9 +191,29 @@ def table(lines: list[dict[str, Any]]) -> str:
                     f"held-out inside {inside} of {len(plain)}; {dict(silent)}"
                 )
             if hidden:
-                named = sum(name in said["selected"][:1] for name, said in hidden)
-                rows.append(f"  {sensor}: hidden effect named first {named} of {len(hidden)}")
+                rows.append(f"  {sensor}: hidden effect named first {sum(map(_named, hidden))} of {len(hidden)}")
+        rows += _in_pairs(kind, fine, lines)
     return "\n".join(rows) + "\n"
+
+
+def _named(line: dict[str, Any]) -> bool:
+    sensor, _, effect = line["hidden"].partition(".")
+    return effect in line["sensors"][sensor]["selected"][:1]
+
+
+def _in_pairs(kind: str, lines: list[dict[str, Any]], every: list[dict[str, Any]]) -> list[str]:
+    """Return how often the hidden effect is named here and on the bench by the convention, for the same units."""
+    plain = {(o["seed"], o["number"]): o for o in every if o["kind"] == KINDS[kind] != kind and not o["refused"]}
+    pairs = [(_named(line), _named(plain[line["seed"], line["number"]])) for line in lines
+             if line["hidden"] and (line["seed"], line["number"]) in plain]  # fmt: skip
+    if not pairs:
+        return []
+    here, there = (sum(side) for side in zip(*pairs, strict=True))
+    change = np.diff(np.array(pairs, float), axis=1)
+    error = 1.96 * change.std(ddof=1) / np.sqrt(len(pairs)) if len(pairs) > 1 else np.inf
+    return [
+        f"  named {here} of {len(pairs)}, on {KINDS[kind]} {there}: {-100 * change.mean():+.1f} +- {100 * error:.1f} %"
+    ]
 
 
 def main() -> None:
@@ -186,17 +221,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--units", type=int, default=0)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--kinds", nargs="+", default=KINDS)
+    parser.add_argument("--kinds", nargs="+", default=list(KINDS))
+    parser.add_argument("--hidden", type=float, default=0.4, help="share of units with a hidden effect")
     parser.add_argument("--out", required=True)
     options = parser.parse_args()
     file = Path(options.out)
     lines = [json.loads(text) for text in file.read_text(encoding="utf-8").splitlines()] if file.exists() else []
     known = {(line["kind"], line["seed"], line["number"]) for line in lines}
-    for number in range(options.units):
-        kind = options.kinds[number % len(options.kinds)]
+    for place in range(options.units):
+        number, kind = place // len(options.kinds), options.kinds[place % len(options.kinds)]
         if (kind, options.seed, number) in known:
             continue
-        lines.append(judged(kind, options.seed, number))
+        lines.append(judged(kind, options.seed, number, options.hidden))
         with file.open("a", encoding="utf-8") as stream:
             stream.write(json.dumps(lines[-1]) + "\n")
     sys.stdout.write(table(lines))
