@@ -113,7 +113,7 @@ def _parser() -> argparse.ArgumentParser:
 def _readings(files: Sequence[Path], profile: str | None, sensor: str | None) -> list[Reading]:
     """Return how each file, or the files of one recording, are to be read."""
     as_campaigns_say = profile is None and sensor is None
-    directories = {_campaign_of(f) for f in files} - {None} if as_campaigns_say else set()
+    directories = {campaign_of(f) for f in files} - {None} if as_campaigns_say else set()
     known: dict[Path, Reading] = {}
     for reading in (r for directory in directories for r in _of_campaign(directory)):
         for file in reading.files:
@@ -126,9 +126,10 @@ def _readings(files: Sequence[Path], profile: str | None, sensor: str | None) ->
         elif found not in readings:
             readings.append(found)
     if others:
-        campaign = _campaign_of(others[0])
-        chosen = _named(profile, others[0], campaign) if profile else DEFAULT_PROFILE
-        ingest, sheet = _composed(chosen, sensor, campaign)
+        campaign = campaign_of(others[0])
+        chosen = named(profile, others[0], campaign) if profile else DEFAULT_PROFILE
+        config = composed(chosen, sensor, campaign)
+        ingest, sheet = config["ingest"], config["sensor"]
         said = f"ingest={ingest['name']}" + (f", sensor={sensor}" if sensor else "")
         parts = [p["file"] for p in (ingest["csv"] or {}).get("parts") or []]
         readings += [_reading_of_file(g, ingest, sheet if sensor else {}, said) for g in _grouped(others, parts)]
@@ -151,7 +152,8 @@ def _grouped(files: Sequence[Path], parts: Sequence[str]) -> list[list[Path]]:
     return list(groups.values())
 
 
-def _campaign_of(file: Path) -> Path | None:
+def campaign_of(file: Path) -> Path | None:
+    """Return the campaign that a file lies in, None where it lies in none."""
     return next((d for d in file.resolve().parents if (d / "units.csv").is_file()), None)
 
 
@@ -172,7 +174,7 @@ def _of_campaign(directory: Path | None) -> list[Reading]:
     return readings
 
 
-def _named(profile: str, file: Path, campaign: Path | None) -> str:
+def named(profile: str, file: Path, campaign: Path | None) -> str:
     """Return a profile as it is to be read: a name that is known, or the only saved file of that name.
 
     A file is looked for in the working directory, in the folders about the log, and in ``configs/ingest`` of each of
@@ -195,10 +197,10 @@ def _named(profile: str, file: Path, campaign: Path | None) -> str:
     return str(next(iter(found), profile))
 
 
-def _composed(profile: str, sensor: str | None, campaign: Path | None) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the sections ingest and sensor of a configuration with a profile."""
+def composed(profile: str, sensor: str | None, campaign: Path | None, more: Sequence[str] = ()) -> dict[str, Any]:
+    """Return a configuration with a profile, and with ``more`` overrides."""
     path = Path(profile)
-    layers = ["procedure=multi_position", *([f"sensor={sensor}"] if sensor else [])]
+    layers = ["procedure=multi_position", *([f"sensor={sensor}"] if sensor else []), *more]
     with tempfile.TemporaryDirectory() as folder:
         own = campaign or Path(folder)
         if path.suffix in (".yaml", ".yml"):
@@ -208,10 +210,9 @@ def _composed(profile: str, sensor: str | None, campaign: Path | None) -> tuple[
             (own / "configs" / "ingest").mkdir(parents=True)
             copyfile(path, own / "configs" / "ingest" / f"{path.stem}.yaml")
         try:
-            config = Composer(own).unit("check", [*layers, f"ingest={path.stem}"])
+            return Composer(own).unit("check", [*layers, f"ingest={path.stem}"])
         except Problem as problem:
             raise ConfigurationError(str(problem), profile if own == Path(folder) else None) from None
-    return config["ingest"], config["sensor"]
 
 
 def _print_facts(reading: Reading) -> PipelineError | None:

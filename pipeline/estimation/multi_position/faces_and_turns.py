@@ -76,11 +76,7 @@ def faces_of(rests: Rests, force: Values, settings: Mapping[str, Any]) -> Faces 
     stated = settings["procedure"].get("faces")
     if not stated:
         return None
-    u = force / np.linalg.norm(force, axis=1, keepdims=True)
-    axis = np.argmax(np.abs(u), axis=1)
-    along = u[np.arange(len(u)), axis]
-    tilt = np.degrees(np.arccos(np.clip(np.abs(along), 0.0, 1.0)))
-    face = np.where(tilt <= NEAR_DEG, 2 * axis + (along < 0.0), -1)
+    face, axis, along, tilt = face_of(force)
     missing = [name for i, name in enumerate(FACES) if not np.any(face == i)]
     if missing:
         rows = zip(axis, along, rests.start, tilt, strict=True)
@@ -90,6 +86,15 @@ def faces_of(rests: Rests, force: Values, settings: Mapping[str, Any]) -> Faces 
             f"more on each of its six faces. Nearest to up in the rests found: {found}"
         )
     return Faces(face, float(np.radians(stated["accuracy_deg"])))
+
+
+def face_of(force: Values) -> tuple[NDArray[np.intp], NDArray[np.intp], Values, Values]:
+    """Return the face of each force (m, 3), -1 for none; its nearest axis, component along it, and tilt, deg."""
+    u = force / np.linalg.norm(force, axis=1, keepdims=True)
+    axis = np.argmax(np.abs(u), axis=1)
+    along = u[np.arange(len(u)), axis]
+    tilt = np.degrees(np.arccos(np.clip(np.abs(along), 0.0, 1.0)))
+    return np.where(tilt <= NEAR_DEG, 2 * axis + (along < 0.0), -1), axis, along, tilt
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,245 @@
+"""Propose the next rest or turn of a recording by hand, from what is recorded so far, and say when it is enough."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from pipeline.commands.check import DEFAULT_PROFILE, campaign_of, composed, named
+from pipeline.config.campaign import load_campaign
+from pipeline.errors import CannotCalibrateError, ConfigurationError, PipelineError
+from pipeline.io.files import candidate_files, recording_files
+from pipeline.io.ingest_settings import checks_of
+from pipeline.io.read import read_table, to_recording
+from pipeline.planning.next_rest import MOST, in_words, progress_of, propose
+from pipeline.planning.next_turn import next_face_or_turn
+from pipeline.preprocessing.checks import check_recordings
+from pipeline.signal.rests import WINDOW_S, find_rests
+from pipeline.simulation.description import BY_HAND
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.planning.next_rest import Progress
+    from pipeline.records import Recording
+    from pipeline.signal.rests import Rest
+
+POLL_S = 1.0  # between two looks at a growing log: short against a rest
+STILL_RESTING_S = 1.0  # from a rest's end to that of the log, below which the rest may go on
+WANDERS = 2.0  # bias wanders in the default goal: a calibration says nothing of the bias of another hour to less (95 %)
+EPILOG = """\
+The rests are found as a run finds them. The next rest is the one by which the accelerometer's calibration gains most;
+the largest expanded uncertainty (95 %) of bias, in mg, and of the matrix, in mg at 1 g, is compared with --goal. With
+--procedure ferraris the next missing face or turn is named. How attitudes are named: docs/record.md.
+
+A recording of a campaign is read by the campaign's configuration, together with the unit's other recordings. Any other
+file is read by --sensor, --ingest and --procedure.
+
+examples:
+  python -m pipeline guide data/my_bench/raw/U1/recording.csv --follow
+  python -m pipeline guide log.csv --sensor mpu6050 --goal 0.3
+  python -m pipeline guide log.mcap --sensor mpu6050 --ingest mcap --follow
+"""
+
+
+@dataclass(frozen=True)
+class Source:
+    """The files of a unit's recordings, and the configuration by which they are read."""
+
+    config: dict[str, Any]
+    folder: Path | None  # of a campaign's unit
+    files: tuple[Path, ...]  # that were named
+
+    def entries(self) -> dict[str, tuple[dict[str, Any], list[Path]]]:
+        """Return role and files of each recording that exists."""
+        if self.folder is not None:
+            procedure = self.config["procedure"]
+            found = recording_files(procedure, self.config["ingest"], self.folder)
+            return {name: (procedure["recordings"][name], files) for name, files in found.items()}
+        return {f.stem: ({"role": "rests", "axis": None}, [f]) for f in self.files if f.exists()}
+
+    def read(self, *, growing: bool) -> list[Recording]:
+        """Return the recordings; of a growing log the complete rows or chunks."""
+        entries, ingest = self.entries(), self.config["ingest"]
+        if growing and ingest.get("mcap"):
+            ingest = {**ingest, "mcap": {**ingest["mcap"], "allow_truncated": True}}
+        procedure = {**self.config["procedure"], "recordings": {n: entry for n, (entry, _) in entries.items()}}
+        settings = {**self.config, "ingest": ingest, "procedure": procedure}
+        recordings = []
+        with tempfile.TemporaryDirectory() as folder:
+            for name, (entry, files) in entries.items():
+                whole = [_complete_rows(f, Path(folder)) for f in files] if growing else files
+                table = read_table(whole, ingest)
+                recordings.append(to_recording(name, entry, table, self.config["sensor"], checks_of(ingest)))
+        return check_recordings(recordings, settings) if recordings else []
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run ``python -m pipeline guide RECORDING...``."""
+    arguments = _parser().parse_args(argv)
+    source = _source(arguments)
+    sheet = source.config["sensor"]["accelerometer"]
+    goal = 1e-3 * arguments.goal if arguments.goal is not None else WANDERS * float(sheet["bias_wander"])
+    if not arguments.follow:
+        missing = [str(f) for f in source.files if not f.exists()]
+        if missing:
+            raise ConfigurationError(f"there is no file {', '.join(missing)}; --follow waits for one")
+        advice = _advice(source.read(growing=False), source.config, goal, arguments.dwell)
+        print("\n".join([*advice.rests, *advice.words]))
+        return 0
+    try:
+        _follow(source, goal, arguments.dwell)
+    except KeyboardInterrupt:
+        print()
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m pipeline guide",
+        description=__doc__,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("files", type=Path, nargs="+", metavar="RECORDING", help="of one unit by hand: .csv or other text, .mcap")
+    add("--follow", action="store_true", help="read a growing log until the goal is reached (Ctrl-C ends it)")
+    wanted = "largest expanded uncertainty, mg (default: twice the bias wander that the sensor's file states)"
+    add("--goal", type=float, metavar="MG", help=wanted)
+    add("--dwell", type=float, metavar="S", default=BY_HAND.dwell_s, help="of a rest (default: %(default)g)")
+    add("--sensor", metavar="NAME", help="name in configs/sensor (default: generic)")
+    add("--procedure", metavar="NAME", help="multi_position (default), orientations_24, six_positions or ferraris")
+    add("--ingest", metavar="PROFILE", help="name in configs/ingest or of a saved profile, or its file")
+    return parser
+
+
+def _source(arguments: argparse.Namespace) -> Source:
+    """Return where the recordings lie and how they are read."""
+    for option in ("goal", "dwell"):
+        value = getattr(arguments, option)
+        if value is not None and not value > 0.0:
+            raise ConfigurationError(f"--{option} is {value:g}; it must be above 0")
+    first, campaign = arguments.files[0], campaign_of(arguments.files[0])
+    files = tuple(arguments.files)
+    if campaign is not None and not (arguments.sensor or arguments.procedure or arguments.ingest):
+        loaded = load_campaign({"campaign": str(campaign)})
+        for name, unit in loaded.units.items():
+            folder, candidates = loaded.folder(name), candidate_files(unit.config["procedure"], unit.config["ingest"])
+            own = {(folder / f).resolve() for files in candidates.values() for parts in files for f in parts}
+            if first.resolve() in own:
+                return Source(_by_hand(unit.config), folder, files)
+    profile = named(arguments.ingest, first, campaign) if arguments.ingest else DEFAULT_PROFILE
+    more = [f"procedure={arguments.procedure}"] if arguments.procedure else []
+    return Source(_by_hand(composed(profile, arguments.sensor, campaign, more)), None, files)
+
+
+def _by_hand(config: dict[str, Any]) -> dict[str, Any]:
+    """Return a configuration whose procedure is recorded by hand."""
+    procedure = config["procedure"]
+    if not any(entry["role"] == "rests" for entry in procedure["recordings"].values()):
+        raise ConfigurationError(
+            f"procedure {procedure['name']} is recorded on a table; guide is for those recorded by hand: "
+            "multi_position, orientations_24, six_positions, ferraris (docs/record.md)"
+        )
+    return config
+
+
+def _complete_rows(file: Path, folder: Path) -> Path:
+    """Return a copy of a text log up to its last complete row; other logs as they are."""
+    if file.suffix == ".mcap":
+        return file
+    copy = folder / file.name
+    copy.write_bytes(file.read_bytes().rpartition(b"\n")[0] + b"\n")
+    return copy
+
+
+class Advice(NamedTuple):
+    """What to tell of the recordings so far."""
+
+    enough: bool
+    rests: list[str]  # a line each
+    words: list[str]
+
+
+def _advice(recordings: Sequence[Recording], config: dict[str, Any], goal: float, dwell: float) -> Advice:
+    if config["procedure"].get("faces"):
+        done, words = next_face_or_turn(recordings, config["procedure"])
+        return Advice(done, [], words)
+    progress = progress_of(recordings, config, dwell)
+    rows = zip(progress.rests, progress.up, progress.held_out, strict=True)
+    lines = [f"{k:>4}  {_described(*pair, up, held=held)}" for k, (pair, up, held) in enumerate(rows, start=1)]
+    lines += [f"   -  {r.name} {r.time[rest.start]:.1f} s: left out: {rest.reason}" for r, rest in progress.left_out]
+    return Advice(*_next(progress, goal, dwell, lines))
+
+
+def _described(recording: Recording, rest: Rest, up: Any, *, held: bool) -> str:  # noqa: ANN401  (an array)
+    start, stop = recording.time[rest.start], recording.time[rest.stop - 1]
+    return f"{recording.name} {start:.1f} to {stop:.1f} s: {in_words(up)}{' (held out)' if held else ''}"
+
+
+def _next(progress: Progress, goal: float, dwell: float, rests: list[str]) -> tuple[bool, list[str], list[str]]:
+    """Return whether the goal is reached, and the next rest in words."""
+    held = sum(progress.held_out)
+    count = f"{progress.used} rests of the fit, {held} held out"
+    now = f"not determined yet: {progress.reason}" if progress.reason else f"{1e3 * progress.expanded:.3g} mg"
+    lines = [f"expanded uncertainty: {now} ({count}; goal {1e3 * goal:.3g} mg)"]
+    proposal = propose(progress, goal)
+    if not proposal.further:
+        return True, rests, [*lines, "enough: the goal is reached"]
+    lines.append(f"next: {in_words(proposal.up)}; rest it for {dwell:g} s or more")
+    if progress.next_is_held_out:
+        lines.append("      (held out of the fit, to judge it: an attitude far from all others)")
+    if proposal.expected > goal:
+        lines.append(
+            f"expected: {1e3 * proposal.expected:.3g} mg after {MOST} more rests, so the goal is out of reach: rest "
+            "longer (--dwell) and more firmly, or choose a larger --goal"
+        )
+    else:
+        lines.append(f"expected: {1e3 * proposal.expected:.3g} mg after {proposal.further} more rests of the fit")
+    return False, rests, lines
+
+
+def _follow(source: Source, goal: float, dwell: float) -> None:
+    """Look at a growing log again and again, and tell what is new, until it is enough."""
+    told: Advice | None = None
+    waiting = ""
+    bell = "\a" if sys.stdout.isatty() else ""
+    while True:
+        try:
+            recordings = [_without_last_rest(r, dwell) for r in source.read(growing=True)]
+            problem = "" if recordings else f"there is no file {source.files[0]} yet"
+            advice = _advice(recordings, source.config, goal, dwell) if recordings else None
+        except CannotCalibrateError:
+            raise
+        except PipelineError as error:
+            advice, problem = None, error.message
+        if problem and problem != waiting:
+            print(f"waiting: {problem}", flush=True)
+        waiting = problem
+        if advice is not None and (told is None or len(advice.rests) != len(told.rests) or _new(advice, told)):
+            known = len(told.rests) if told is not None and len(told.rests) <= len(advice.rests) else 0
+            print("\n".join([*advice.rests[known:], *advice.words]) + bell, flush=True)
+            told = advice
+            if advice.enough:
+                return
+        time.sleep(POLL_S)
+
+
+def _new(advice: Advice, told: Advice) -> bool:
+    """Return whether there is something to tell beside rests: of faces and turns."""
+    return not advice.rests and advice.words != told.words
+
+
+def _without_last_rest(recording: Recording, dwell: float) -> Recording:
+    """Return a recording without the rest at its end, where that is still shorter than a rest is to be."""
+    rests = find_rests(recording) if recording.role == "rests" else []
+    if not rests:
+        return recording
+    start, stop, end = recording.time[[rests[-1].start, rests[-1].stop - 1, -1]]
+    goes_on = end - stop < STILL_RESTING_S and stop - start < dwell - WINDOW_S
+    return recording.select(slice(0, max(rests[-1].start, 1))) if goes_on else recording

@@ -1,0 +1,259 @@
+"""The rest by which a calibration of the accelerometer by hand gains most, and how many more rests a goal needs.
+
+    F = P + sum_i J_i^T J_i / s_i^2,    U_p = k_p sqrt(g_p (F^-1)_pp)
+
+where
+
+    J_i : (9,) derivative of the length of gravity at rest i (``estimation.accelerometer.ellipsoid_fit``)
+    s_i : g; standard deviation of that length: white noise of the mean, and the scatter between rests
+    P   : precision by the data sheet's limits, taken for two standard deviations; F is regular by it from the start
+    g_p : variance of the fit over ``(F^-1)_pp``: bias wander, and a scatter that a few rests show only roughly; 1
+          before there is a fit
+    k_p : coverage factor, with one more degree of freedom for each further rest
+
+The rests that are still needed are planned together, since the best set of n rests does not contain the best set of
+n - 1: rests are added one by one, and each planned rest is exchanged for a better attitude while the largest U falls
+(Fedorov, Theory of Optimal Experiments, 1972). Next goes the planned rest with the largest gain in log det F,
+``log(1 + J F^-1 J^T / s^2)``. The attitudes are the 26 in which a face, an edge or a corner of the case points up,
+since a person finds them by a few words.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from itertools import product
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.errors import CannotCalibrateError, NotObservableError
+from pipeline.estimation.accelerometer import nonlinear_least_squares
+from pipeline.estimation.accelerometer.ellipsoid_fit import COLUMNS, ROWS, derivative_of
+from pipeline.estimation.accelerometer.orientations import orientations_of
+from pipeline.estimation.rest_means import holdout_interval
+from pipeline.records import AXES, coverage_factor
+from pipeline.signal.rests import WINDOW_S
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.estimation.accelerometer.orientations import Orientations
+    from pipeline.records import Recording, SensorCalibration
+    from pipeline.signal.rests import Rest
+
+    Values = NDArray[np.float64]
+
+SHARPNESS = 8  # of the norm that stands for the largest U: within 32 % of it for nine parameters, smooth
+SWEEPS = 10  # of the exchange; it ends by itself after two or three
+MOST = 60  # rests that are planned ahead: some 7 min
+FEWEST = 9  # rests of the fit, one a parameter
+IDEAL = np.concatenate([np.zeros(3), np.eye(3)[ROWS, COLUMNS]])
+PLACE = np.array([0, 1, 2, *(3 + 3 * ROWS + COLUMNS)])  # of the nine among bias and full matrix
+LEVEL_DEG = 3.0  # a tilt that is not worth a word: units are set down by hand to about 1 deg
+BETWEEN_SIDES = np.tan(np.radians(22.5))  # ratio of two components above which a corner is raised, not a side
+
+
+@cache
+def attitudes() -> Values:
+    """Return the attitudes that are proposed, faces first, as the body's direction of the vertical: (26, 3) array."""
+    up = np.array(sorted(filter(any, product((1, 0, -1), repeat=3)), key=lambda p: sum(map(abs, p))), float)
+    return np.asarray(up / np.linalg.norm(up, axis=1, keepdims=True))
+
+
+def in_words(up: Sequence[float] | Values) -> str:
+    """Return an attitude in plain words: the axis that points up, then the side or corner that is raised from there.
+
+    >>> in_words([0.0, 0.0, 1.0])
+    '+z up'
+    >>> in_words([0.447, 0.0, 0.894])
+    '+z up, then the +x side raised by 27 deg'
+    """
+    n = np.asarray(up, float) / float(np.linalg.norm(up))
+    first = max((2, 1, 0), key=lambda i: round(abs(float(n[i])), 6))
+    tilt = float(np.degrees(np.arccos(min(abs(n[first]), 1.0))))
+    if tilt < LEVEL_DEG:
+        return f"{_axis(n, first)} up"
+    large, small = sorted((i for i in range(3) if i != first), key=lambda i: -abs(float(n[i])))
+    side = f"the {_axis(n, large)} side"
+    if abs(n[small]) > BETWEEN_SIDES * abs(n[large]):
+        side = f"the corner between its {' and '.join(_axis(n, i) for i in sorted((large, small)))} sides"
+    return f"{_axis(n, first)} up, then {side} raised by {tilt:.0f} deg"
+
+
+def _axis(n: Values, i: int) -> str:
+    return f"{'+' if n[i] > 0 else '-'}{AXES[i]}"
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What the rests recorded so far tell."""
+
+    rests: tuple[tuple[Recording, Rest], ...]  # in order of time in each recording
+    held_out: tuple[bool, ...]  # of each
+    up: Values  # (m, 3); direction of the vertical in the body at each
+    left_out: tuple[tuple[Recording, Rest], ...]
+    next_is_held_out: bool
+    information: Values  # (9, 9); F
+    values: Values  # (9,); bias and the lower triangle of the matrix
+    error: float  # g; s of a rest to come
+    inflation: Values  # (9,); g
+    freedom: Values  # (9,); degrees of freedom
+    expanded: float  # g; largest U of the fit, infinite before there is one
+    reason: str  # why there is none
+
+    @property
+    def used(self) -> int:
+        """Number of rests of the fit."""
+        return self.held_out.count(False)
+
+    def largest(self, information: Values, further: int) -> float:
+        """Return the largest expected U after further rests, g (of the matrix at 1 g)."""
+        variance = self.inflation * np.diag(np.linalg.inv(information))
+        return float(np.max(coverage_factor(self.freedom + further) * np.sqrt(variance)))
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """What to record next."""
+
+    up: Values  # (3,)
+    further: int  # rests of the fit that are still needed; 0: the goal is reached
+    expected: float  # g; largest U then
+
+
+def progress_of(recordings: Sequence[Recording], settings: Mapping[str, Any], dwell: float) -> Progress:
+    """Return what the rests so far determine.
+
+    ``settings``: sections ``sensor``, ``table`` and ``procedure``. ``dwell``: s, of a rest to come. Raises
+    ``CannotCalibrateError`` if no recording holds readings of the accelerometer.
+    """
+    orientations = orientations_of(recordings, settings)
+    fitted: SensorCalibration | None = None
+    reason, values, scatter = "", IDEAL, 0.0
+    try:
+        fitted = nonlinear_least_squares.fit(recordings, None, settings)
+    except (NotObservableError, CannotCalibrateError) as lack:
+        reason = lack.message
+    if fitted is not None:
+        values = np.concatenate([fitted.bias, fitted.matrix.ravel()])[PLACE]
+        reason = _open(fitted)
+        scatter = 0.0 if reason else float(fitted.stages[-1].details["scatter_between_rests"])
+    sheet, gravity = settings["sensor"]["accelerometer"], float(settings["table"].get("gravity_g") or 1.0)
+    white = _white_of_rest(orientations, sheet, dwell)
+    error = float(np.hypot(white, scatter))
+    F = _precision(sheet, gravity)
+    J = derivative_of(orientations.mean, values) if len(orientations.mean) else np.zeros((0, 9))
+    F = F + (J / (orientations.variance + scatter**2)[:, None]).T @ J
+    inflation, freedom, expanded = np.ones(9), np.full(9, np.inf), np.inf
+    if fitted is not None and not reason:
+        assert fitted.covariance is not None  # noqa: S101
+        assert fitted.freedom is not None  # noqa: S101
+        own = np.diag(fitted.covariance)[PLACE]
+        freedom, inflation = fitted.freedom[PLACE], own / np.diag(np.linalg.inv(F))
+        expanded = float(np.max(coverage_factor(freedom) * np.sqrt(own)))
+    of_both = [(pair, held) for held in (False, True) for pair in (orientations.rests, orientations.held_out)[held]]
+    of_both.sort(key=lambda entry: (recordings.index(entry[0][0]), entry[0][1].start))
+    pairs = [pair for pair, _ in of_both]
+    last = sum(pair[0] is pairs[-1][0] for pair in pairs) if pairs else 0
+    every = holdout_interval(recordings, settings)
+    return Progress(
+        rests=tuple(pairs),
+        held_out=tuple(held for _, held in of_both),
+        up=_directions(pairs, values),
+        left_out=orientations.left_out,
+        next_is_held_out=bool(every) and last % every == every // 2,
+        information=F,
+        values=values,
+        error=error,
+        inflation=inflation,
+        freedom=freedom,
+        expanded=expanded,
+        reason=reason,
+    )
+
+
+def _open(fitted: SensorCalibration) -> str:
+    """Return what the rests do not determine yet; empty where they determine everything."""
+    fixed = fitted.stages[-1].details["fixed"]
+    count = fitted.stages[-1].details["orientations_used"]
+    if fixed:
+        return f"{count} orientations leave {', '.join(fixed)} open"
+    return f"{count} orientations determine nine parameters without a check" if count <= FEWEST else ""
+
+
+def _white_of_rest(orientations: Orientations, sheet: Mapping[str, Any], dwell: float) -> float:
+    """Return the standard deviation by white noise of the mean of a rest to come, an axis, g."""
+    if orientations.white > 0.0:
+        (recording, _), *_ = orientations.rests
+        return orientations.white / float(np.sqrt(max((dwell - WINDOW_S) / recording.interval, 1.0)))
+    return float(sheet["noise_density"]) / float(np.sqrt(2.0 * dwell))
+
+
+def _precision(sheet: Mapping[str, Any], gravity: float) -> Values:
+    """Return P: (9, 9) array."""
+    limits = {True: float(sheet["scale_factor"]), False: float(sheet["cross_axis"])}
+    matrix = [limits[bool(i == j)] for i, j in zip(ROWS, COLUMNS, strict=True)]
+    return np.diag(np.square(2.0 / np.array([float(sheet["bias"]) / gravity] * 3 + matrix)))
+
+
+def _directions(pairs: Sequence[tuple[Recording, Rest]], values: Values) -> Values:
+    """Return the direction of the vertical in the body at each rest: (m, 3) array."""
+    readings = [np.asarray(r.accelerometer)[rest.start : rest.stop] for r, rest in pairs]
+    mean = np.array([np.nanmean(values, axis=0) for values in readings]).reshape(-1, 3)
+    L = np.zeros((3, 3))
+    L[ROWS, COLUMNS] = values[3:]
+    force = (mean - values[:3]) @ L.T
+    return np.asarray(force / np.linalg.norm(force, axis=1, keepdims=True))
+
+
+def propose(progress: Progress, goal: float) -> Proposal:
+    """Return the next rest, and how many rests of the fit are expected to reach the goal, g; at most ``MOST``."""
+    up = attitudes()
+    L = np.zeros((3, 3))
+    L[ROWS, COLUMNS] = progress.values[3:]
+    X = derivative_of(progress.values[:3] + up @ np.linalg.inv(L).T, progress.values) / progress.error
+    planned, F = _planned(progress, X, goal)
+    expected = progress.largest(F, len(planned))
+    if progress.next_is_held_out:  # as far as it can be from all rests, so that it judges the fit between them
+        at = int(np.argmin(np.max(up @ progress.up.T, axis=1)))
+        return Proposal(up[at], len(planned), expected)
+    rows = planned or range(len(up))
+    gain = np.einsum("ni,ij,nj->n", X[rows], np.linalg.inv(progress.information), X[rows])
+    return Proposal(up[rows[int(np.argmax(gain))]], len(planned), expected)
+
+
+def _planned(progress: Progress, X: Values, goal: float) -> tuple[list[int], Values]:
+    """Return the attitudes of the fewest further rests that reach the goal, and F with them."""
+    planned: list[int] = []
+    F = progress.information
+    if progress.expanded <= goal:
+        return planned, F
+
+    def best(information: Values) -> tuple[int, Values]:
+        """Return the attitude to add, and the score with each: the smaller the better."""
+        inverse = np.linalg.inv(information)
+        V = X @ inverse
+        left = np.diag(inverse) - V**2 / (1.0 + np.sum(V * X, axis=1))[:, None]
+        U = progress.inflation * left
+        score = np.sum((U / U.max()) ** SHARPNESS, axis=1)
+        return int(np.argmin(score)), score
+
+    while len(planned) < MOST:
+        at, _ = best(F)
+        planned.append(at)
+        F = F + np.outer(X[at], X[at])
+        for _ in range(SWEEPS):
+            before = list(planned)
+            for i, old in enumerate(before):
+                without = F - np.outer(X[old], X[old])
+                at, score = best(without)
+                if score[at] < score[old] * (1.0 - 1e-9):
+                    planned[i], F = at, without + np.outer(X[at], X[at])
+            if planned == before:
+                break
+        if progress.used + len(planned) > FEWEST and progress.largest(F, len(planned)) <= goal:
+            break
+    return planned, F

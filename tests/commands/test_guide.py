@@ -1,0 +1,107 @@
+"""``python -m pipeline guide``: the next rest or turn by hand, from files and from a log that grows."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from pipeline.__main__ import main
+from pipeline.commands import guide
+from pipeline.simulation.campaign import write_campaign
+from pipeline.simulation.description import description_from
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def campaign(directory: Path, procedure: str, **course: object) -> Path:
+    """Write a campaign with one unit and return its recording."""
+    unit = {"unit": "U1", "table": "hand", "procedure": procedure, "interval_s": 0.05, "course": course}
+    directory.mkdir()
+    write_campaign(description_from({"seed": 5, "units": [unit]}, "test"), directory)
+    return directory / "raw" / "U1" / "recording.csv"
+
+
+@pytest.fixture(scope="module")
+def rests(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return campaign(tmp_path_factory.mktemp("a") / "bench", "orientations_24", static_s=0.0, warm_up_rest_s=4.0)
+
+
+def test_of_few_rests_it_says_what_they_leave_open_and_what_comes_next(
+    rests: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = rests.read_text().splitlines()
+    part = tmp_path / "log.csv"
+    part.write_text("\n".join(text[:700]) + "\n")
+    assert main(["guide", str(part), "--sensor", "mpu6050", "--goal", "0.5"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("   1  log ")
+    assert "+z up" in lines[0]
+    assert any(line.startswith("expanded uncertainty: not determined yet") and "goal 0.5 mg" in line for line in lines)
+    assert any(line.startswith("next: ") and "rest it for 4 s" in line for line in lines)
+    assert "more rests of the fit" in lines[-1]
+
+
+def test_a_recording_of_a_campaign_is_read_by_its_configuration(
+    rests: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["guide", str(rests), "--goal", "1"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert sum("held out)" in line for line in lines) == 8
+    assert "16 rests of the fit, 8 held out; goal 1 mg" in lines[-2]
+    assert lines[-1] == "enough: the goal is reached"
+    assert main(["guide", str(rests), "--goal", "0.001"]) == 0
+    assert "the goal is out of reach" in capsys.readouterr().out
+
+
+def test_a_growing_log_is_followed_until_it_is_enough(
+    rests: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data, log = rests.read_bytes(), tmp_path / "log.csv"
+    sizes = iter(range(0, len(data) + 1, len(data) // 14))  # a log is cut anywhere, within a row too
+
+    def grow(_: float) -> None:
+        log.write_bytes(data[: next(sizes)])
+
+    monkeypatch.setattr(guide.time, "sleep", grow)
+    assert main(["guide", str(log), "--sensor", "mpu6050", "--goal", "0.8", "--follow"]) == 0
+    out = capsys.readouterr().out
+    lines = out.splitlines()
+    assert lines[0].startswith("waiting: there is no file")
+    assert lines[-1] == "enough: the goal is reached"
+    assert next(sizes, None) is not None  # before the log was complete
+    numbers = [int(line.split()[0]) for line in lines if line.startswith("   ") and line.split()[0].isdigit()]
+    assert numbers == sorted(set(numbers))  # each rest once
+    assert out.count("next: ") > 3
+
+
+def test_faces_and_turns_that_lack_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    whole = campaign(tmp_path / "faces", "ferraris", static_s=0.0)
+    assert main(["guide", str(whole)]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "enough: all faces and turns are there"
+    rows = whole.read_text().splitlines()
+    seen = []
+    for share in (0.2, 0.7):
+        part = tmp_path / "part.csv"
+        part.write_text("\n".join(rows[: int(share * len(rows))]) + "\n")
+        assert main(["guide", str(part), "--procedure", "ferraris", "--sensor", "mpu6050"]) == 0
+        seen.append(capsys.readouterr().out.splitlines()[-1])
+    assert "up; rest it" in seen[0]
+    assert all(line.startswith("next: +") and "about the vertical" in line for line in seen[1:])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["none.csv"], "there is no file none.csv; --follow waits for one"),
+        (["none.csv", "--procedure", "three_axis_turns"], "recorded on a table"),
+        (["none.csv", "--goal", "0"], "--goal is 0; it must be above 0"),
+    ],
+)
+def test_what_cannot_be_guided_is_refused(
+    arguments: list[str], said: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["guide", *arguments]) == 2
+    assert said in capsys.readouterr().err

@@ -1,0 +1,102 @@
+"""The next rest by hand: attitudes in words, plans against known optimal designs, and what the fit then states."""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from pipeline.planning.next_rest import attitudes, in_words, progress_of, propose
+from pipeline.records import Recording
+from pipeline.simulation.description import read_config
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+SETTINGS: dict[str, Any] = {
+    "sensor": read_config("sensor", "mpu6050"),
+    "table": read_config("table", "hand"),
+    "procedure": {"holdout_every": 0},
+}
+WHITE, RATE, DWELL = 8e-4, 20.0, 4.0
+AXES = {f"{s}{a}": sign * np.eye(3)[i] for i, a in enumerate("xyz") for s, sign in (("+", 1.0), ("-", -1.0))}
+
+
+def recorded(attitudes: Sequence[Any], rng: np.random.Generator) -> Recording:
+    """Return rests in the attitudes, of a sensor with a bias and scale factors, and quick moves between them."""
+    force = []
+    for up in attitudes:
+        shaken = rng.standard_normal((10, 3))
+        still = np.tile(np.asarray(up) / np.linalg.norm(up), (int((DWELL + 0.5) * RATE), 1))
+        force.append(np.concatenate([shaken, still]))
+    reading = np.array([0.03, -0.02, 0.01]) + np.concatenate(force) * [1.01, 0.99, 1.005]
+    reading += WHITE * rng.standard_normal(reading.shape)
+    time = np.round(np.arange(len(reading)) / RATE * 1e9).astype(np.int64)
+    return Recording("recording", "rests", None, time, accelerometer=reading)
+
+
+@pytest.mark.parametrize(("first", "side"), [("+z", "+x"), ("-z", "+y"), ("+x", "-z"), ("-y", "-x")])
+def test_a_side_that_is_raised_is_named_with_its_angle(first: str, side: str) -> None:
+    for angle in (12.0, 27.0, 44.0):
+        axis = np.cross(AXES[side], AXES[first])  # by the right hand the side rises about this axis
+        turned = Rotation.from_rotvec(np.radians(angle) * axis)
+        assert (turned.apply(AXES[side]) @ AXES[first]) == pytest.approx(np.sin(np.radians(angle)))
+        vertical = turned.inv().apply(AXES[first])  # the vertical as the body sees it
+        assert in_words(vertical) == f"{first} up, then the {side} side raised by {angle:.0f} deg"
+
+
+def test_faces_and_corners_have_names() -> None:
+    assert in_words([0.01, -0.02, 0.98]) == "+z up"
+    assert in_words([1, -1, 1]) == "+z up, then the corner between its +x and -y sides raised by 55 deg"
+    assert len({in_words(up) for up in attitudes()}) == 26
+
+
+def _largest(up: Any) -> float:
+    """Return the largest standard uncertainty of the nine parameters by rests of unit noise, from first principles."""
+    n = np.asarray(up) / np.linalg.norm(up, axis=1, keepdims=True)
+    columns = [-n, *(n[:, [i]] * n[:, [j]] for i, j in zip(*np.tril_indices(3), strict=True))]
+    J = np.concatenate(columns, axis=1)
+    return float(np.sqrt(np.diag(np.linalg.inv(J.T @ J)).max()))
+
+
+def test_a_plan_is_as_good_as_a_design_that_is_known_to_be_optimal() -> None:
+    golden = (1 + 5**0.5) / 2  # the icosahedron is a spherical 5-design: moments up to order 4 as of the whole sphere
+    icosahedron = [np.roll([0, a, b * golden], k) for k, a, b in product(range(3), (1, -1), (1, -1))]
+    rng, start = np.random.default_rng(1), [np.array([0.0, 0.0, 1.0])]
+    done: list[Any] = list(start)
+    while len(done) < 12:
+        progress = progress_of([recorded(done, rng)], SETTINGS, DWELL)
+        done.append(propose(progress, 0.9e-3 * 0.35).up)
+    assert _largest(done) < 1.3 * _largest(icosahedron)
+    random = [_largest(rng.standard_normal((12, 3))) for _ in range(200)]
+    assert _largest(done) < np.quantile(random, 0.02)
+
+
+def test_the_number_of_rests_and_the_uncertainty_come_true() -> None:
+    rng = np.random.default_rng(2)
+    done = list(attitudes()[:10])
+    goal = 0.25e-3
+    progress = progress_of([recorded(done, rng)], SETTINGS, DWELL)
+    assert progress.reason.startswith("10 orientations leave")
+    promised = propose(progress, goal)
+    while progress.expanded > goal and len(done) < 60:
+        done.append(propose(progress, goal).up)
+        progress = progress_of([recorded(done, rng)], SETTINGS, DWELL)
+    assert progress.expanded <= goal
+    assert abs(len(done) - 10 - promised.further) <= 4
+    assert propose(progress, goal).further == 0
+
+
+def test_the_rest_that_is_held_out_is_far_from_the_others() -> None:
+    rng = np.random.default_rng(3)
+    settings = {**SETTINGS, "procedure": {"holdout_every": 3}}
+    for count in range(1, 8):
+        progress = progress_of([recorded(attitudes()[:count], rng)], settings, DWELL)
+        after = progress_of([recorded(attitudes()[: count + 1], rng)], settings, DWELL)
+        assert progress.next_is_held_out == (after.used == progress.used)
+        if progress.next_is_held_out:
+            near = np.max(attitudes() @ progress.up.T, axis=1)
+            assert np.max(progress.up @ propose(progress, 1e-4).up) == pytest.approx(near.min())
