@@ -22,6 +22,7 @@ _PACKAGE = Path(__file__).resolve().parent
 INSTALLED = (_PACKAGE / "shipped").is_dir()  # from a wheel, not from a clone
 SHIPPED = _PACKAGE / "shipped" if INSTALLED else _PACKAGE.parent  # holds Snakefile, workflow, configs, data
 CONFIGS = SHIPPED / "configs"
+_encoded = json.JSONEncoder(ensure_ascii=False, allow_nan=False).encode
 _flushed_at_end: list[Path] = []  # folders whose files are flushed together
 
 
@@ -64,9 +65,21 @@ def read_json(path: Path) -> Any:  # noqa: ANN401  (any JSON value)
         raise DamagedFileError(reason, str(path)) from None
 
 
-def json_text(value: Any) -> str:  # noqa: ANN401
-    """Return a value as JSON with indents; raises ``ValueError`` for a number that is not finite."""
-    return json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False)
+def json_text(value: Any, levels: int = 3, indent: str = "\n") -> str:  # noqa: ANN401
+    """Return a value as JSON; raises ``ValueError`` for a number that is not finite.
+
+    Down to some levels, containers of containers are indented. The others stand on one line each: that is read well,
+    and written by C.
+    """
+    if levels and isinstance(value, dict | list) and value:
+        members = list(value.values() if isinstance(value, dict) else value)
+        if any(isinstance(member, dict | list | tuple) for member in members):
+            names = [f"{_encoded(str(name))}: " for name in value] if isinstance(value, dict) else [""] * len(members)
+            inner = indent + " "
+            lines = [name + json_text(m, levels - 1, inner) for name, m in zip(names, members, strict=True)]
+            opening, closing = "{}" if isinstance(value, dict) else "[]"
+            return f"{opening}{inner}{f',{inner}'.join(lines)}{indent}{closing}"
+    return _encoded(value)
 
 
 def write_json(path: Path, value: Any) -> None:  # noqa: ANN401

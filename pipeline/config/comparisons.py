@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.config.options import GROUPS, Problem, nearest
 from pipeline.errors import ConfigurationError
+from pipeline.history import SENSORS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
 
 JSON = dict[str, Any]
 KEYS = ("title", "units", "groups", "by", "where", "pairs", "against", "x", "sensors")
-SENSORS = ("accelerometer", "gyroscope")
 TABLE_TIME = "table_time"
 FORM = "a list of units, or a mapping with units, groups or by"
 

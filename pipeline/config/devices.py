@@ -16,7 +16,7 @@ import yaml
 from pipeline.config.layers import DEVICES, key_of
 from pipeline.config.options import Problem, nearest, parse
 from pipeline.errors import ConfigurationError
-from pipeline.records import SENSORS
+from pipeline.history import SENSORS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

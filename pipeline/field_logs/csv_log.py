@@ -28,7 +28,6 @@ from pipeline.io.units import (
     SINCE_1970_NS,
     TRIADS,
     UNITS,
-    decode,
     to_house_unit,
 )
 from pipeline.records import SENSORS, Encoding
@@ -198,7 +197,7 @@ def _index(column: Column, names: list[str]) -> int | None:
 def _in_house_unit(column: Column, numbers: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return values in g, deg/s, degC or s."""
     if column.unit == COUNTS:
-        return decode(numbers, Encoding(1.0 / column.counts_per_unit, column.offset))
+        return Encoding(1.0 / column.counts_per_unit, column.offset).decode(numbers)
     if column.channel == "time":
         multiplier, divisor = UNITS["time"][column.unit]
         return numbers / (SECOND_NS * divisor / multiplier)

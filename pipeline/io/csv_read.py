@@ -18,7 +18,7 @@ from pipeline.io.channel_table import ChannelTable
 from pipeline.io.csv_rows import read_rows
 from pipeline.io.csv_times import in_order, times_of
 from pipeline.io.ingest_settings import Checks
-from pipeline.io.units import COUNTS, decode, to_house_unit
+from pipeline.io.units import COUNTS, to_house_unit
 from pipeline.records import Encoding, Note
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ def _channel(column: Column, numbers: NDArray[np.float64]) -> tuple[NDArray[np.f
         return to_house_unit(column.channel, numbers, column.unit), None
     encoding = Encoding(scale=1.0 / column.counts_per_unit, offset=column.offset)
     whole = bool(np.all(numbers == np.rint(numbers)))
-    return decode(numbers, encoding), encoding if whole else None
+    return encoding.decode(numbers), encoding if whole else None
 
 
 def _joined(tables: Sequence[ChannelTable]) -> ChannelTable:

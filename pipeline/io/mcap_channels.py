@@ -20,7 +20,7 @@ from pipeline.io.ingest_settings import HEADER, TIME, MappedField
 from pipeline.io.message_decoder import Batch, ChannelDecoder, Wanted
 from pipeline.io.message_layout import short_name
 from pipeline.io.ros2_messages import IMU, JOINT_STATE, QUATERNION_STAMPED, TEMPERATURE
-from pipeline.io.units import ACCELEROMETER, ATTITUDE, COUNTS, GYROSCOPE, decode, to_house_unit
+from pipeline.io.units import ACCELEROMETER, ATTITUDE, COUNTS, GYROSCOPE, to_house_unit
 from pipeline.records import Encoding
 
 if TYPE_CHECKING:
@@ -120,7 +120,7 @@ class TopicDecoder:
 
     def _in_unit(self, channel: str, numbers: NDArray[np.float64]) -> NDArray[np.float64]:
         if channel in self.encodings:
-            return decode(numbers, self.encodings[channel])
+            return self.encodings[channel].decode(numbers)
         return to_house_unit(channel, numbers, self.fields[channel].unit)
 
 

@@ -23,7 +23,7 @@ from pyarrow import parquet
 
 from pipeline.errors import DamagedFileError, InputError
 from pipeline.io.arrow import to_arrow, to_numpy
-from pipeline.io.units import ACCELEROMETER, ATTITUDE, CHANNELS, GYROSCOPE, decode, encode
+from pipeline.io.units import ACCELEROMETER, ATTITUDE, CHANNELS, GYROSCOPE
 from pipeline.records import Encoding, Note, Recording
 
 if TYPE_CHECKING:
@@ -134,7 +134,7 @@ class _StoredColumns:
         if len(part) != rows or zlib.crc32(part.view(np.uint8).data) != entry["crc32"][name]:
             raise self.damaged(f"{name} of the recording {entry['name']} does not match its checksum")
         if name in entry["encodings"]:
-            return decode(part.astype(np.float64), Encoding(**entry["encodings"][name]))
+            return Encoding(**entry["encodings"][name]).decode(part.astype(np.float64))
         return part
 
     def damaged(self, reason: str) -> DamagedFileError:
@@ -197,7 +197,7 @@ def _encode_counts(recordings: Sequence[Recording], stored: list[dict[str, NDArr
         holders = [(r, s) for r, s in zip(recordings, stored, strict=True) if channel in s]
         if not holders or any(channel not in r.encodings for r, _ in holders):
             continue
-        counts = [encode(s[channel], r.encodings[channel]) for r, s in holders]
+        counts = [r.encodings[channel].encode(s[channel]) for r, s in holders]
         if all(c is not None for c in counts):
             encoded.add(channel)
             for (_, columns), values in zip(holders, counts, strict=True):

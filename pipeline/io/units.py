@@ -11,12 +11,9 @@ import math
 import re
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
-
-    from pipeline.records import Encoding
 
 STANDARD_GRAVITY = 9.80665  # m/s^2
 SECOND_NS = 1_000_000_000
@@ -85,17 +82,3 @@ def to_house_unit(channel: str, values: NDArray[np.float64], unit: str) -> NDArr
     if multiplier != 1.0:
         values = values * multiplier
     return values / divisor if divisor != 1.0 else values
-
-
-def decode(counts: NDArray[np.float64], encoding: Encoding) -> NDArray[np.float64]:
-    """Return ``(count - offset) * scale``: the one formula by which counts become values, to the last bit."""
-    values: NDArray[np.float64] = (counts - encoding.offset) * encoding.scale
-    return values
-
-
-def encode(values: NDArray[np.float64], encoding: Encoding) -> NDArray[np.int64] | None:
-    """Return the counts that decode to exactly these values, or None where there are none."""
-    with np.errstate(invalid="ignore", over="ignore"):
-        counts = np.rint(values / encoding.scale + encoding.offset)
-        exact = np.array_equal(decode(counts, encoding), values) and bool(np.all(np.abs(counts) < 2**53))
-    return counts.astype(np.int64) if exact else None

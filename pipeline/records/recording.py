@@ -58,6 +58,18 @@ class Encoding:
     scale: float
     offset: float = 0.0
 
+    def decode(self, counts: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the values of counts: the one formula by which counts become values, to the last bit."""
+        values: NDArray[np.float64] = (counts - self.offset) * self.scale
+        return values
+
+    def encode(self, values: NDArray[np.float64]) -> NDArray[np.int64] | None:
+        """Return the counts that decode to exactly these values, or None where there are none."""
+        with np.errstate(invalid="ignore", over="ignore"):
+            counts = np.rint(values / self.scale + self.offset)
+            exact = np.array_equal(self.decode(counts), values) and bool(np.all(np.abs(counts) < 2**53))
+        return counts.astype(np.int64) if exact else None
+
 
 @dataclass(frozen=True)
 class Recording:
