@@ -38,6 +38,9 @@ EFFECTS = (
     "effect", "delta_bic", "p_value", "explained_share", "held_out_error_before", "held_out_error_after", "plausible",
     "selected", "look_alikes",
 )  # fmt: skip
+NOISE = (
+    "axis", "term", "value", "value_unit", "low", "high", "upper_limit", "correlation_time_s", "frequency_hz", "reason",
+)  # fmt: skip
 FIGURES = ("_before", "_after", "_floor")  # endings of the columns of summary.csv that hold numbers
 
 
@@ -157,6 +160,26 @@ class CampaignResults:
             for entry in part.get("ranking") or []
         )
         return pd.DataFrame(rows, columns=["unit", "sensor", *EFFECTS])
+
+    @cached_property
+    def noise(self) -> pd.DataFrame:
+        """The noise at rest, one row for each unit, sensor, axis and term (docs/noise.md).
+
+        Columns: ``unit, sensor, axis, term`` ("white", "random_walk" ...), ``value, value_unit, low, high`` (95 %),
+        ``upper_limit`` and ``reason`` of a term that was not seen, ``correlation_time_s, frequency_hz``.
+        """
+        rows = (
+            {"unit": unit.name, "sensor": sensor, "axis": axis, "term": name, "value_unit": part["unit"]}
+            | {key: part.get(key) for key in ("value", "upper_limit", "reason")}
+            | {key: (part.get(key) or {}).get("value") for key in ("correlation_time_s", "frequency_hz")}
+            | dict(zip(("low", "high"), part["interval"] or (None, None), strict=True))
+            for unit in map(self.unit, self.units)
+            for sensor, noise in (unit.calibration.get("noise") or {}).items()
+            for axis, found in (noise["axes"] or {}).items()
+            for name, parts in (found["terms"] or {}).items()
+            for part in (parts if isinstance(parts, list) else [parts])
+        )
+        return pd.DataFrame(rows, columns=["unit", "sensor", *NOISE])
 
     def unit(self, name: str) -> UnitResults:
         """Return the documents of one unit; ``InputError`` where the campaign has no such unit."""

@@ -107,7 +107,17 @@ class Band:
     colour: int = 5
 
 
-Layer = Line | Samples | Dots | Band
+@dataclass(frozen=True)
+class Area:
+    """The area between two curves."""
+
+    x: Values
+    low: Values
+    high: Values
+    colour: int = 0
+
+
+Layer = Line | Samples | Dots | Band | Area
 
 
 @dataclass(frozen=True)
@@ -208,6 +218,8 @@ def _heights(layer: Layer) -> list[Values]:
     """Return the values of a layer along axis y."""
     if isinstance(layer, Band):
         return [np.array([layer.low, layer.high])]
+    if isinstance(layer, Area):
+        return [layer.low, layer.high]
     ends = (layer.low, layer.high) if isinstance(layer, Dots) else ()
     return [layer.y, *(end for end in ends if end is not None)]
 
@@ -218,6 +230,10 @@ def _draw(layer: Layer, x: Axis, y: Axis) -> str:
         low, high = y.units(np.array([layer.low, layer.high]))
         left, right = SUBDIVISION * x.start, SUBDIVISION * x.stop
         return f'<path class="band c{layer.colour}" d="M{left:g} {low}H{right:g}V{high}H{left:g}z"/>'
+    if isinstance(layer, Area):
+        there = x.units(np.concatenate([layer.x, layer.x[::-1]]))
+        path = _line(there, y.units(np.concatenate([layer.low, layer.high[::-1]])))
+        return f'<path class="band c{layer.colour}" d="{path}z"/>'
     if isinstance(layer, Samples):
         columns = enumerate(np.atleast_2d(layer.y.T), layer.colour)
         return "".join(_samples(layer, column, f"c{colour}", x, y) for colour, column in columns)

@@ -21,7 +21,7 @@ from pipeline.report.held_out_section import (
     passes,
     step_label,
 )
-from pipeline.report.noise_section import allan
+from pipeline.report.noise_section import allan, remarks, term_rows
 from pipeline.report.pages import template
 from pipeline.report.parameters import fitted_parameters, parameter_rows
 from pipeline.report.recording_section import environment, recording_rows, rest_rows, rests_logged, segments
@@ -95,6 +95,7 @@ def _sensor(
     part, sheet, table = calibration[sensor], (settings.get("sensor") or {}).get(sensor) or {}, settings["table"]
     noise, traces = found.get("noise") or held_out.get("noise"), residuals(sensor, part, recordings, table)
     first, last = first_and_last_step(held_out)
+    at_rest = (calibration.get("noise") or {}).get(sensor)
     steps = [error_steps(sensor, held_out, found, vector=vector) for vector in (False, True)]
     return {
         "held_out": held_out,
@@ -106,7 +107,9 @@ def _sensor(
         "model_figures": [measurement_and_model(sensor, r, noise) for r in traces],
         "held_out_figures": held_out_figures(sensor, calibration, held_out, recordings, table),
         "residual_figures": residual_figures(sensor, traces, noise),
-        "noise_figure": allan(sensor, recordings, noise, sheet, found.get("wander")),
+        "noise_figure": allan(sensor, at_rest, sheet, found.get("wander")),
+        "noise_terms": term_rows(at_rest),
+        "noise_remarks": remarks(at_rest),
         "matrix": fitted_parameters(part)[3:12],
         "parameters": parameter_rows(part, sheet),
         "rests": rest_rows(part),

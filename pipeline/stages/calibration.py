@@ -1,4 +1,4 @@
-"""Stage calibration: both sensors' fits, the inputs and the software in one document.
+"""Stage calibration: both sensors' fits, the noise at rest, the inputs and the software in one document.
 
 A calibration that makes held-out motion significantly worse than the raw readings is null, with the reason; a unit
 without any calibrated sensor has failed.
@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline import __version__
 from pipeline.errors import CannotCalibrateError
+from pipeline.estimation.noise_identification import identify_noise
 from pipeline.files import read_json, write_json
 from pipeline.io.channel_table import axis_maps
 from pipeline.io.parquet import load_recordings
@@ -20,8 +21,9 @@ from pipeline.model.plausible import implausible
 from pipeline.records import SENSORS
 
 if TYPE_CHECKING:
-    from pathlib import Path
+    from collections.abc import Sequence
 
+    from pipeline.records import Recording
     from pipeline.stages.batch import Job
 
 LIBRARIES = ("numpy", "scipy", "pyarrow", "mcap")
@@ -39,12 +41,14 @@ def process_unit(job: Job, unit: str, settings: dict[str, Any]) -> None:
         told = "; ".join(f"{sensor}: {reason}" for sensor, reason in reasons.items())
         raise CannotCalibrateError(f"no sensor could be calibrated. {told}")
     axes = {s: list(m) for s, m in axis_maps(settings["sensor"]).items()}
+    recordings = load_recordings(job.inputs["ingest"] / f"{unit}.parquet")
     document = header(unit, settings) | {
         "status": "ok",
         "error": None,
         "log": {"ingest": settings["ingest"], "axis_map": axes},
-        "inputs": inputs(job.inputs["ingest"] / f"{unit}.parquet"),
+        "inputs": inputs(recordings),
         "not_calibrated": reasons,
+        "noise": {sensor: identify_noise(sensor, recordings) for sensor in SENSORS},
     }
     for sensor, fit in fits.items():
         document[sensor] = None if sensor in reasons else judged(sensor, fit, settings["sensor"][sensor])
@@ -79,7 +83,7 @@ def _software() -> dict[str, str]:
     return {"imu-calibration": __version__, "python": platform.python_version(), **libraries}
 
 
-def inputs(path: Path) -> list[dict[str, Any]]:
+def inputs(recordings: Sequence[Recording]) -> list[dict[str, Any]]:
     """Return file, hash, rows and notes of each input of a unit."""
     return [
         {
@@ -92,5 +96,5 @@ def inputs(path: Path) -> list[dict[str, Any]]:
             "duration_s": round(float(r.time[-1] - r.time[0]), 6) if r.samples else 0.0,
             "notes": [vars(n) for n in r.notes],
         }
-        for r in load_recordings(path)
+        for r in recordings
     ]

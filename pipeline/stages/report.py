@@ -53,6 +53,6 @@ def _page_of_failed(document: dict[str, Any], settings: dict[str, Any], file: Pa
     """Add what was ingested before the failure to a unit's document, and return its page."""
     recordings = load_recordings(file) if file.is_file() else []
     if recordings:
-        document["inputs"] = inputs(file)
+        document["inputs"] = inputs(recordings)
         document["rests"] = rests_by_use(recordings, settings)
     return render(document, None, None, recordings, settings)

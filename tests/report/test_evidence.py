@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pipeline.estimation.noise_identification import identify_noise
 from pipeline.records import Recording
 from pipeline.report.axis import scaled
 from pipeline.report.diagnosis_section import _column_unit, added_variable, ranking, unexplained
 from pipeline.report.held_out_section import error_steps
-from pipeline.report.noise_section import _longest_rest, allan, deviations, expected
+from pipeline.report.noise_section import allan, remarks, term_rows
+from pipeline.report.numbers import number
 from pipeline.report.residual_section import harmonic_noise, harmonics, residual_figures, residuals
 from pipeline.report.unit_page import render
 
@@ -142,62 +144,50 @@ def test_the_unexplained_is_drawn_with_its_shape_and_says_where_the_points_leave
         assert ("do not follow" not in figure.caption) is follows
 
 
-def test_the_allan_deviation_of_white_noise_falls_with_the_root_of_the_samples() -> None:
-    sigma, interval = 0.02, 0.01
-    white = sigma * np.random.default_rng(5).standard_normal((20_000, 3))
-    tau, found = deviations(white, interval)
-    samples = tau / interval
-    assert samples[0] == 1.0
-    assert samples[-1] > 2000
-    short = samples < 400
-    np.testing.assert_allclose(found[short].mean(axis=1), sigma / np.sqrt(samples[short]), rtol=0.08)
-    np.testing.assert_allclose(expected(sigma * np.sqrt(interval), 0.0, 100.0, tau), sigma / np.sqrt(samples))
-
-
-def test_the_allan_deviation_of_a_wander_is_that_of_a_simulated_one() -> None:
-    interval, time, s = 0.1, 5.0, 0.3
-    rng, keep = np.random.default_rng(8), np.exp(-interval / time)
-    drive = np.sqrt(1.0 - keep**2) * rng.standard_normal((40_000, 3))
-    wander = np.empty_like(drive)
-    wander[0] = rng.standard_normal(3)
-    for n in range(1, len(drive)):
-        wander[n] = keep * wander[n - 1] + drive[n]
-    tau, found = deviations(s * wander[:4000], interval)
-    model = expected(0.0, s, time, tau)
-    assert tau[int(np.argmax(model))] == pytest.approx(1.89 * time, rel=0.2)
-    late_tau, late = deviations(s * wander, interval)
-    close = (late_tau > 2.0) & (late_tau < 60.0)
-    np.testing.assert_allclose(late[close].mean(axis=1), expected(0.0, s, time, late_tau[close]), rtol=0.2)
-    assert found.shape == (len(tau), 3)
-
-
-def rest(name: str, role: str, samples: int) -> Recording:
-    rng = np.random.default_rng(samples)
-    time_ns = (np.arange(samples) * 120_000_000).astype(np.int64)
-    reading = 0.003 * rng.standard_normal((samples, 3)) + [0.0, 0.0, 1.0]
-    return Recording(name, role, None, time_ns, accelerometer=reading)
+def noise_at_rest(samples: int, sigma: float = 0.003, interval: float = 0.12) -> dict[str, Any]:
+    time_ns = np.rint(np.arange(samples) * interval * 1e9).astype(np.int64)
+    reading = sigma * np.random.default_rng(samples).standard_normal((samples, 3)) + [0.0, 0.0, 1.0]
+    return identify_noise("accelerometer", [Recording("static", "static", None, time_ns, accelerometer=reading)])
 
 
 def test_the_words_beside_the_allan_deviation_say_what_was_found_and_whether_it_is_inflated() -> None:
-    recordings = [rest("static", "static", 900), rest("validation", "validation", 5000)]
-    noise = {"white": [0.003] * 3, "wander": [1e-4] * 3, "correlation_time_s": 100.0, "source": "static"}
+    noise = noise_at_rest(900)
     sheet = {"noise_density": 0.003 * np.sqrt(2 * 0.12), "bias_wander": 1e-4, "wander_time_s": 100.0}
     wander = {"ratio": 0.3, "time_s": 50.0, "standard_deviation": 9e-4, "expected": 1e-4, "inflated": True}
-    figure = allan("accelerometer", recordings, noise, sheet, wander)
+    figure = allan("accelerometer", noise, sheet, wander)
     assert figure is not None
-    assert figure.finding == "White noise 0.00300 g a sample, as the data sheet says"
-    assert "static, 108 s at rest" in figure.caption
+    density = np.sqrt(np.mean([part["terms"]["white"]["value"] ** 2 for part in noise["axes"].values()]))
+    assert density == pytest.approx(0.003 * np.sqrt(0.12), rel=0.05)
+    assert figure.finding == f"White noise N = {density:.5f} g/sqrt(Hz), as the data sheet says"
+    assert "static, 108 s at rest, before any filter" in figure.caption
     assert (
         "needs a wander of 0.000900 g, correlation time 50.0 s, against 0.000100 expected: it is inflated"
         in figure.caption
     )
-    assert [text for _, text in figure.legend[3:]] == ["noise model", "its white noise alone", "data sheet"]
-    calm = allan("accelerometer", recordings, noise, sheet | {"noise_density": 1e-3}, wander | {"inflated": False})
+    assert [text for _, text in figure.legend[3:]] == ["data sheet"]
+    assert figure.svg.count('class="band') == 3
+    calm = allan("accelerometer", noise, sheet | {"noise_density": 1e-3}, wander | {"inflated": False})
     assert calm is not None
     assert "inflated" not in calm.caption
     assert "1.5 × that of the data sheet" in calm.finding
-    assert allan("accelerometer", recordings[1:], noise, sheet, wander) is None
-    assert _longest_rest("gyroscope", recordings) is None
+    assert allan("accelerometer", noise_at_rest(50), sheet, wander) is None
+    assert allan("accelerometer", None, sheet, wander) is None
+
+
+def test_the_rows_of_the_noise_give_intervals_or_upper_limits_and_say_what_is_too_short() -> None:
+    noise = noise_at_rest(900)
+    rows = {row["name"]: row for row in term_rows(noise)}
+    x = noise["axes"]["x"]["terms"]
+    assert rows["white N"]["unit"] == "g/sqrt(Hz)"
+    value, (low, high) = x["white"]["value"], x["white"]["interval"]
+    assert rows["white N"]["axes"][0] == f"{number(value)} ({number(low)} to {number(high)})"
+    assert rows["random walk K"]["axes"][0] == f"< {number(x['random_walk']['upper_limit'])}"
+    assert any(
+        line.startswith("x, y, z: bias instability and random walk: the recording is too") for line in remarks(noise)
+    )
+    assert remarks(noise_at_rest(50)) == [
+        "Not identified: the rests hold 50 evenly sampled readings; 60 are needed: record static."
+    ]
 
 
 def test_noise_alone_stays_below_the_dashes_of_the_harmonics(unit: Unit) -> None:
@@ -284,11 +274,8 @@ def test_every_figure_of_the_page_says_its_finding(unit: Unit) -> None:
     ("factor", "cause"), [(1.0, "as the data sheet says"), (6.0, "vibration at rest"), (0.1, "a filter")]
 )
 def test_white_noise_far_from_the_data_sheet_gets_a_likely_cause(factor: float, cause: str) -> None:
-    white = factor * 1e-3 * np.sqrt(0.5 / 0.01)
-    reading = white * np.random.default_rng(1).standard_normal((2000, 3)) + [0.0, 0.0, 1.0]
-    rest = Recording("static", "static", None, 10_000_000 * np.arange(2000), accelerometer=reading)
-    noise = {"white": [white] * 3, "wander": [0.0] * 3, "correlation_time_s": 100.0, "source": "static"}
-    figure = allan("accelerometer", [rest], noise, {"noise_density": 1e-3}, None)
+    noise = noise_at_rest(2000, factor * 1e-3 * np.sqrt(0.5 / 0.01), 0.01)
+    figure = allan("accelerometer", noise, {"noise_density": 1e-3}, None)
     assert figure is not None
     assert cause in figure.finding
     assert ("filter" in figure.finding) == (factor < 1.0)

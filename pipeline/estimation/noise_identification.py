@@ -1,0 +1,236 @@
+"""The noise of a sensor at rest, identified: the part ``noise`` of ``calibrations/<unit>.json``.
+
+For each axis, the terms of ``noise_terms`` with 95 % intervals, null with a reason and an upper limit where the
+recording does not show a term; the compositions by probability (``noise_search``); and how well the best one fits. The
+readings are those of the static recording before any filter, else those of the rests. A ramp, sinusoids and, where it
+changed, the temperature are regressed out (``noise_regression``).
+
+That the fit holds is tested by the bins of the spectrum: the cube root of a chi-square variable over its degrees of
+freedom m is normal with mean 1 - 2/(9m) and variance 2/(9m) (Wilson & Hilferty, PNAS 17, 1931).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.estimation.noise_regression import Regression, Stretch
+from pipeline.estimation.noise_search import QUANTILE, fitted, intervals, ranked, upper_limits
+from pipeline.estimation.noise_terms import MARKOV, SINGLE, STOCHASTIC, WHITE, allan_variance, each_term, unit_of
+from pipeline.records import AXES, SENSOR_UNITS
+from pipeline.signal.allan import allan_deviation
+from pipeline.signal.rests import rest_readings, usable
+from pipeline.signal.temperature import temperature_of
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.estimation.noise_likelihood import Fits, Spectrum
+    from pipeline.estimation.noise_search import Candidate
+    from pipeline.records import Recording
+
+    Values = NDArray[np.float64]
+    JSON = dict[str, Any]
+
+FEWEST = 60  # samples, which tell white noise to a tenth
+SHORTEST = 16  # samples of a stretch
+GAP = 1.5  # intervals from which a step of time is a gap
+FILLED = 10  # samples that are missing or marked in a row, up to which a straight line takes their place
+IMPLAUSIBLE = 1e-4  # probability of the bins under the fit, below which the composition is in doubt
+COARSE = 0.4  # standard deviation, in counts, below which rounding is no longer white noise (Widrow & Kollar 2008)
+SHOWN = 0.25  # longest averaging time that the Allan deviation shows with some confidence, in lengths of the recording
+PER_DECADE = 8  # averaging times
+STEP = 1.01  # of a correlation time, for a derivative
+OF_RESTS = "no static recording: what is slower than a rest is not seen, and in rests by hand the unit moves"
+
+
+def identify_noise(sensor: str, recordings: Sequence[Recording]) -> JSON:
+    """Return the noise of a sensor, from its recordings before any filter: see the schema of calibrations."""
+    known = [r for r in recordings if r.role != "validation" and r.reading(sensor) is not None and r.samples > 1]
+    empty: JSON = {"unit": SENSOR_UNITS[sensor], "source": None, "reason": None, "axes": None}
+    if not known:
+        return empty | {"reason": f"the recordings hold no readings of the {sensor}"}
+    static, others = ([r for r in known if (r.role == "static") == is_static] for is_static in (True, False))
+    source, chosen, stretches = "static", static, [s for r in static for s in static_stretches(sensor, r)]
+    if _samples(stretches) < FEWEST and others:
+        source, chosen, stretches = "rests", others, [s for r in others for s in _rests(sensor, r)]
+    if _samples(stretches) < FEWEST:
+        reason = f"the rests hold {_samples(stretches)} evenly sampled readings; {FEWEST} are needed: record static"
+        return empty | {"reason": reason}
+    rates = [(s.time[-1] - s.time[0]) / (len(s.time) - 1) for s in stretches]
+    interval = float(np.median(rates))
+    single = source == "static" and len(chosen) == 1
+    return empty | {
+        "source": source,
+        "recordings": [r.name for r in chosen],
+        "samples": _samples(stretches),
+        "sampling_interval_s": interval,
+        "length_s": float(interval * max(len(s.time) for s in stretches)),
+        "axes": {a: _axis(SENSOR_UNITS[sensor], stretches, c, interval, single=single) for c, a in enumerate(AXES)},
+        "doubts": [OF_RESTS] if source == "rests" else [],
+    }
+
+
+def _samples(stretches: Sequence[Stretch]) -> int:
+    return sum(len(s.time) for s in stretches)
+
+
+def static_stretches(sensor: str, recording: Recording) -> list[Stretch]:
+    """Return the evenly sampled stretches of a static recording; a straight line fills gaps of up to ``FILLED``."""
+    values = recording.reading(sensor)
+    assert values is not None  # noqa: S101
+    good = np.flatnonzero(usable(recording, values))
+    warm = recording.temperature
+    warm = temperature_of(recording) if warm is not None and np.isfinite(warm).all() else None
+    step = np.diff(recording.time[good]) / recording.interval
+    steps = np.where(step > GAP, np.rint(step), 1).astype(int)
+    out = []
+    for index in np.split(np.arange(len(good)), np.flatnonzero(steps > FILLED) + 1):
+        if len(index) < SHORTEST:
+            continue
+        place = np.concatenate([[0], np.cumsum(steps[index[:-1]])])
+        grid, rows = np.arange(place[-1] + 1), good[index]
+        reading = np.stack([np.interp(grid, place, values[rows, c]) for c in range(3)], axis=1)
+        time = np.linspace(recording.time[rows[0]], recording.time[rows[-1]], len(grid))
+        out.append(Stretch(time, reading, None if warm is None else np.interp(grid, place, warm[rows])))
+    return out
+
+
+def _rests(sensor: str, recording: Recording) -> list[Stretch]:
+    """Return the rests of a recording that have ``SHORTEST`` samples."""
+    found = rest_readings(recording, sensor, everything=False)
+    return [Stretch(time, reading) for time, reading in found if len(time) >= SHORTEST]
+
+
+def _axis(unit: str, stretches: list[Stretch], column: int, interval: float, *, single: bool) -> JSON:
+    """Return the noise of one axis."""
+    steps = np.concatenate([np.abs(np.diff(s.reading[:, column])) for s in stretches])
+    scale = float(np.sqrt(np.mean(steps**2) / 2.0))  # the standard deviation, if it is white
+    if scale == 0.0:
+        return {"terms": None, "reason": "the readings do not change: the noise is below one count"}
+    regression = Regression(stretches, column, interval, scale, single=single)
+    search, best, spectrum = regression.solve()
+    fit = fitted(spectrum, best)
+    p_value = _p_value(spectrum, fit)
+    doubts = []
+    if p_value < IMPLAUSIBLE:
+        doubts.append(f"no composition fits the spectrum (p = {p_value:.1g}): a filter, vibration or a disturbance")
+    count = float(steps[steps > 1e-9 * scale].min())
+    if scale < COARSE * count:
+        doubts.append(f"the readings are rounded to {count:.3g} {unit}, which is coarser than their noise")
+    terms = _terms(unit, spectrum, best, scale) | regression.terms(unit, best, fit)
+    longest = max(stretches, key=lambda s: len(s.time))
+    return {
+        "terms": terms,
+        "reason": None,
+        "ranking": [
+            {"terms": regression.names(c), "delta_bic": c.bic - best.bic, "probability": probability}
+            for c, probability in ranked(search)
+        ],
+        "p_value": p_value,
+        "allan": _allan(longest.reading[:, column], interval, terms, fit, spectrum),
+        "doubts": doubts,
+    }
+
+
+def _allan(values: Values, interval: float, terms: JSON, fit: Fits, spectrum: Spectrum) -> JSON:
+    """Return the Allan deviation of the readings, and that of the terms with its 95 % band.
+
+    The band is that of the logarithm, from the covariance of the terms: the parameters of the stochastic ones are
+    logarithms of squared coefficients, in which the derivative of the variance is the part of the term itself.
+    """
+    tau, measured = allan_deviation(values, interval, PER_DECADE)
+    tau, measured = (v[tau <= SHOWN * len(values) * interval] for v in (tau, measured))
+    parts = [(name, term, allan_variance(name, term, tau)) for name, term in each_term(terms)]
+    total = np.sum([part for _, _, part in parts], axis=0)
+    kinds, times = fit.kinds[0], fit.parameters[0, fit.kinds.shape[1] :]
+    # each kind's terms in the order in which they are published
+    waiting = {kind: [(t, v) for name, t, v in parts if name == STOCHASTIC[kind]] for kind in set(kinds.tolist())}
+    by_size, by_time = np.zeros((2, len(kinds), len(tau)))
+    for j in np.argsort(times, kind="stable"):
+        term, by_size[j] = waiting[int(kinds[j])].pop(0)
+        if kinds[j] == MARKOV:
+            longer = {"value": STEP * term["correlation_time_s"]["value"]}
+            changed = allan_variance(STOCHASTIC[MARKOV], {**term, "correlation_time_s": longer}, tau)
+            by_time[j] = (changed - by_size[j]) / np.log(STEP)
+    jacobian = np.concatenate([by_size, by_time]) / total
+    covariance = fit.covariance(spectrum.count)[0]
+    variance = np.maximum(np.einsum("it,ij,jt->t", jacobian, covariance, jacobian), 0.0)
+    for name, term, part in parts:
+        if name not in STOCHASTIC:  # ramp and sinusoid: their square by their own interval
+            variance += (part / total * np.diff(term["interval"])[0] / term["value"] / QUANTILE) ** 2
+    half = QUANTILE * np.sqrt(variance)
+    deviation = np.sqrt(total)
+    return {
+        "tau_s": _short(tau),
+        "deviation": _short(measured),
+        "fit": _short(deviation),
+        "low": _short(deviation * np.exp(-0.5 * half)),
+        "high": _short(deviation * np.exp(0.5 * half)),
+    }
+
+
+def _short(values: Values) -> list[float]:
+    """Return values to five digits, enough for a curve."""
+    return [float(f"{v:.5g}") for v in values]
+
+
+def _p_value(spectrum: Spectrum, fit: Fits) -> float:
+    """Return the probability of a spectrum that departs as much from the fit."""
+    from scipy.special import chdtrc  # noqa: PLC0415  (0.1 s)
+
+    spread = 2.0 / (9.0 * spectrum.count)
+    z = (np.cbrt(fit.power[0] / fit.total[0] / spectrum.count) - 1.0 + spread) / np.sqrt(spread)
+    return float(chdtrc(max(len(z) - fit.kinds.shape[1], 1), float(z @ z)))
+
+
+def _terms(unit: str, spectrum: Spectrum, best: Candidate, scale: float) -> JSON:
+    """Return the stochastic terms."""
+    within, limits = intervals(spectrum, best), upper_limits(spectrum, best)
+    kinds, n = best.kinds, len(best.kinds)
+    out: JSON = {}
+    for kind in SINGLE:
+        name = STOCHASTIC[kind]
+        term: JSON = {"value": None, "unit": unit_of(name, unit), "interval": None}
+        if kind in kinds:
+            j = kinds.index(kind)
+            out[name] = term | _coefficient(best.parameters[j], within[:, j], scale)
+        else:
+            reason = _reason(kind, kinds, spectrum)
+            out[name] = term | {"reason": reason, "upper_limit": scale * float(np.sqrt(limits[kind]))}
+    out[STOCHASTIC[MARKOV]] = [
+        {"unit": unit}
+        | _coefficient(best.parameters[j], within[:, j], scale)
+        | {
+            "correlation_time_s": {
+                "value": float(np.exp(best.parameters[n + j])),
+                "interval": np.exp(within[:, n + j]).tolist(),
+            }
+        }
+        for j in sorted(range(n), key=lambda j: float(best.parameters[n + j]))
+        if kinds[j] == MARKOV
+    ]
+    return out
+
+
+def _coefficient(logarithm: float, within: Values, scale: float) -> JSON:
+    """Return a coefficient and its interval, from the logarithms of their squares."""
+    return {
+        "value": scale * float(np.exp(0.5 * logarithm)),
+        "interval": (scale * np.exp(0.5 * within)).tolist(),
+    }
+
+
+def _reason(kind: int, kinds: Sequence[int], spectrum: Spectrum) -> str:
+    """Return why a term is not in the composition."""
+    slow = [STOCHASTIC[k].replace("_", " ") for k in kinds if k > WHITE]
+    if kind < WHITE or slow:
+        others = " and ".join(dict.fromkeys(slow if kind > WHITE else [STOCHASTIC[k].replace("_", " ") for k in kinds]))
+        return f"not seen beside {others}"
+    return (
+        f"the recording is too short: over its {spectrum.length:.3g} s the Allan deviation falls like that of white "
+        f"noise up to averaging times of {SHOWN * spectrum.length:.3g} s"
+    )

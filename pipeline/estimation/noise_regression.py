@@ -1,0 +1,204 @@
+"""What is deterministic in readings at rest, regressed out beside the noise: ramp, temperature, sinusoids.
+
+    reading = c + R t + k temperature + sum_i (a_i cos(2 pi f_i t) + b_i sin(2 pi f_i t)) + noise
+
+Ramp and temperature are in the composition where they lower its criterion. A sinusoid is a line of the periodogram with
+a Hann window, ``LINE ln(n)`` times the level around it; a column with its derivative by f refines f and gives its
+uncertainty. It stays where it raises twice the log-likelihood by ``3 ln(n)``, the penalty of its three parameters.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.estimation.noise_likelihood import spectrum_of
+from pipeline.estimation.noise_search import ONE_SIDED, QUANTILE, Search, best_of, fitted
+from pipeline.estimation.noise_terms import STOCHASTIC, unit_of
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pipeline.estimation.noise_likelihood import Fits, Spectrum
+    from pipeline.estimation.noise_search import Candidate
+
+    Values = NDArray[np.float64]
+
+STEADY_DEGC = 0.1  # a temperature that changes less is no regressor: the noise of thermometers on the chip
+LINES = 5  # sinusoids
+# Power of a line over the level around it, in ln(n): of n independent exponential values one exceeds it with a
+# probability of 1 / sqrt(n).
+LINE = 1.5
+SLOWEST = 16  # periods in the recording: slower sinusoids look like the slow terms
+WIDTH = 1.1  # ratio of the edges of the bins over which the level is a median
+FEWEST_OF_LEVEL = 16  # values of such a bin
+NEAR = 4  # lines of the periodogram that a Hann window spreads a sinusoid over
+# Change of a frequency, in widths of a line, at which it is found, and at which its power is right to 2 %.
+SETTLED, NEARLY = 0.01, 0.1
+ROUNDS = 6  # at most
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Evenly sampled readings at rest: times (n,) in s, readings (n, 3), smoothed temperature (n,) or None."""
+
+    time: Values
+    reading: Values
+    temperature: Values | None = None
+
+
+@dataclass
+class _Sinusoid:
+    """A line: frequency, Hz, and the parts in phase and in quadrature."""
+
+    frequency: float
+    a: float
+    b: float
+
+
+class Regression:
+    """The deterministic columns of one axis, and its best composition beside them.
+
+    ``scale``: the unit in which the readings are fitted. ``single``: one recording, in which a ramp and sinusoids show.
+    """
+
+    def __init__(self, stretches: list[Stretch], column: int, interval: float, scale: float, *, single: bool) -> None:
+        self.stretches, self.column, self.interval, self.scale = stretches, column, interval, scale
+        start, end = stretches[0].time[0], stretches[-1].time[-1]
+        self.middle, self.span = float(0.5 * (start + end)), float(end - start)
+        warm = [s.temperature for s in stretches if s.temperature is not None]
+        changed = len(warm) == len(stretches) and np.ptp(np.concatenate(warm)) > STEADY_DEGC
+        self.optional = (["ramp"] + ["temperature"] * bool(changed)) if single else []
+        self.lines = self._found() if single else []
+        self.spectrum: Spectrum
+
+    def solve(self) -> tuple[Search, Candidate, Spectrum]:
+        """Return all compositions, the best one, and the spectrum with its columns."""
+        for last in (*[False] * ROUNDS, True):
+            self.spectrum = spectrum = spectrum_of([self._columns(s) for s in self.stretches], self.interval)
+            first = 1 + len(self.optional)
+            required = tuple(range(first, first + 3 * len(self.lines)))
+            search = Search(spectrum)
+            best = search.run(required)
+            if self.lines and not last and not self._settled(fitted(spectrum.with_columns(required), best)):
+                continue
+            best = best_of(search, required, list(range(1, first)))
+            break
+        return search, best, spectrum.with_columns(best.columns)
+
+    def names(self, candidate: Candidate) -> list[str]:
+        """Return the terms of a composition."""
+        known = [*self.optional, *["sinusoid", "", ""] * len(self.lines)]
+        deterministic = [known[c - 1] for c in sorted(candidate.columns)]
+        return [STOCHASTIC[k] for k in candidate.kinds] + [name for name in deterministic if name]
+
+    def terms(self, unit: str, best: Candidate, fit: Fits) -> dict[str, Any]:
+        """Return ramp, temperature and sinusoids, as published."""
+        beta, covariance = self.scale * fit.beta[0], self.scale**2 * fit.beta_covariance[0]
+        out: dict[str, Any] = {
+            "ramp": self._slope(best, "ramp", unit_of("ramp", unit), self.span),
+            "temperature": self._slope(best, "temperature", f"{unit}/degC", 1.0),
+            "sinusoid": [],
+        }
+        for i, line in enumerate(self.lines):
+            j = best.columns.index(1 + len(self.optional) + 3 * i)
+            size = float(np.hypot(line.a, line.b))
+            direction = np.array([line.a, line.b]) / size
+            half = QUANTILE * np.sqrt(
+                [direction @ covariance[j : j + 2, j : j + 2] @ direction, covariance[j + 2, j + 2]]
+            )
+            amplitude = float(np.hypot(*beta[j : j + 2]))
+            of_frequency = float(half[1]) / (self.scale * self.span * size)
+            out["sinusoid"].append(
+                {
+                    "value": amplitude,
+                    "unit": unit,
+                    "interval": [amplitude - float(half[0]), amplitude + float(half[0])],
+                    "frequency_hz": {
+                        "value": line.frequency,
+                        "interval": [line.frequency - of_frequency, line.frequency + of_frequency],
+                    },
+                }
+            )
+        return out
+
+    def _slope(self, best: Candidate, name: str, unit: str, per: float) -> dict[str, Any]:
+        """Return the coefficient of a column as published; the column is ``per`` times its unit."""
+        if name not in self.optional:
+            reason = "only a static recording shows it" if name == "ramp" else "the temperature did not change"
+            return {"value": None, "unit": unit, "interval": None, "reason": reason, "upper_limit": None}
+        column = 1 + self.optional.index(name)
+        columns = (*(c for c in best.columns if c != column), column)
+        fit = fitted(self.spectrum.with_columns(columns), best)
+        value = self.scale / per * float(fit.beta[0, -1])
+        spread = self.scale / per * float(np.sqrt(fit.beta_covariance[0, -1, -1]))
+        if column in best.columns:
+            return {"value": value, "unit": unit, "interval": [value - QUANTILE * spread, value + QUANTILE * spread]}
+        limit = abs(value) + ONE_SIDED * spread
+        return {"value": None, "unit": unit, "interval": None, "reason": "not seen", "upper_limit": limit}
+
+    def _columns(self, stretch: Stretch) -> Values:
+        """Return readings and columns of a stretch: (n, 1 + d) array."""
+        t = stretch.time - self.middle
+        columns = [stretch.reading[:, self.column] / self.scale]
+        columns += [t / self.span] if "ramp" in self.optional else []
+        columns += [stretch.temperature] if "temperature" in self.optional and stretch.temperature is not None else []
+        for line in self.lines:
+            phase = 2.0 * np.pi * line.frequency * t
+            cosine, sine = np.cos(phase), np.sin(phase)
+            size = np.hypot(line.a, line.b)
+            slope = 2.0 * np.pi * t / self.span * (line.b * cosine - line.a * sine) / size
+            columns += [cosine, sine, slope]
+        return np.stack(columns, axis=1)
+
+    def _settled(self, fit: Fits) -> bool:
+        """Refine the sinusoids, drop those that are not significant, and return whether nothing changed."""
+        settled, kept = True, []
+        penalty = 3.0 * np.log(sum(len(s.time) for s in self.stretches))
+        for i, line in enumerate(self.lines):
+            a, b, change = fit.beta[0, 3 * i : 3 * i + 3].tolist()
+            shift = change / np.hypot(line.a, line.b)  # in widths of a line, 1 / span
+            inner = fit.beta_covariance[0, 3 * i : 3 * i + 2, 3 * i : 3 * i + 2]
+            if abs(shift) < NEARLY and np.array([a, b]) @ np.linalg.solve(inner, [a, b]) < penalty:
+                settled = False
+                continue
+            settled &= bool(abs(shift) < SETTLED)
+            kept.append(_Sinusoid(line.frequency + float(np.clip(shift, -0.5, 0.5)) / self.span, a, b))
+        self.lines = kept
+        return settled
+
+    def _found(self) -> list[_Sinusoid]:
+        """Return the lines of the longest stretch, strongest first."""
+        stretch = max(self.stretches, key=lambda s: len(s.time))
+        t, y = stretch.time - self.middle, stretch.reading[:, self.column] / self.scale
+        n = len(y)
+        y = y - np.polynomial.Polynomial.fit(t, y, 1)(t)
+        power = np.abs(np.fft.rfft(y * np.hanning(n))) ** 2
+        k = np.arange(len(power))
+        usable = (k >= SLOWEST) & (k < n // 2)
+        if usable.sum() < 2 * FEWEST_OF_LEVEL:
+            return []
+        number = np.floor(np.log(np.maximum(k[usable], 1) / SLOWEST) / np.log(WIDTH)).astype(int)
+        first = np.flatnonzero(np.diff(number, prepend=-1))
+        ends = np.append(first, usable.sum())
+        pieces, begin = [], 0
+        for end in ends[1:]:  # bins of few lines join the next
+            if end - begin >= FEWEST_OF_LEVEL or end == ends[-1]:
+                pieces.append((begin, end))
+                begin = end
+        level = np.concatenate(
+            [np.full(stop - start, np.median(power[usable][start:stop]) / np.log(2.0)) for start, stop in pieces]
+        )
+        ratio = np.zeros(len(power))
+        ratio[usable] = power[usable] / np.maximum(level, 1e-300)
+        found: list[_Sinusoid] = []
+        while len(found) < LINES and ratio.max() > LINE * np.log(n):
+            peak = int(np.argmax(ratio))
+            ratio[max(peak - NEAR, 0) : peak + NEAR + 1] = 0.0
+            frequency = float(peak / (n * self.interval))
+            phase = 2.0 * np.pi * frequency * t
+            a, b = (2.0 / n * float(y @ wave) for wave in (np.cos(phase), np.sin(phase)))
+            found.append(_Sinusoid(frequency, a, b))
+        return found
