@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from pipeline.errors import ConfigurationError, InputError
 from pipeline.field_logs.compensate import LogProfile, compensate_log
 from pipeline.field_logs.output import Progress, require_apart
+from pipeline.io.files import MESSAGE_FORMATS
 from pipeline.model.calibration_file import read_calibration
 from pipeline.model.compensation import SMOOTHING_S, load
 
@@ -65,9 +66,16 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    add("log", type=Path, metavar="LOG", help="the log: .mcap, or text")
+    add("log", type=Path, metavar="LOG", help=f"the log: .mcap, {', '.join(MESSAGE_FORMATS)}, or text")
     add("--calibration", type=Path, required=True, metavar="C.json", help="calibrations/<unit>.json")
-    add("-o", "--output", type=Path, required=True, metavar="OUT", help="file to write, of the same kind; - for stdout")
+    add(
+        "-o",
+        "--output",
+        type=Path,
+        required=True,
+        metavar="OUT",
+        help="file to write: MCAP of an MCAP log, else text; - for stdout",
+    )
     add("--ingest", metavar="NAME", help="ingest profile of the log, for example canonical_csv (that of the unit)")
     add("--topic", metavar="TOPIC", help="topic of the calibrated messages (that of the readings + _calibrated)")
     add(

@@ -1,4 +1,4 @@
-"""Print the content, notes and refusals of a file at ingest; propose a profile for an unknown text log."""
+"""Print the content, notes and refusals of a file at ingest; propose a profile for an unknown log."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ from pipeline.config.compose import Composer
 from pipeline.config.options import Problem
 from pipeline.errors import ConfigurationError, IngestError, PipelineError
 from pipeline.files import CONFIGS, write_atomically
-from pipeline.io.files import FILE, candidate_files
+from pipeline.io.files import FILE, MESSAGE_FORMATS, SUFFIXES, candidate_files
 from pipeline.io.ingest_settings import checks_of
 from pipeline.io.read import read_table, to_recording
 from pipeline.preprocessing.checks import check_recordings
 from pipeline.profile_detection.columns import find_layout
 from pipeline.profile_detection.proposal import as_yaml, propose
 from pipeline.profile_detection.recording_facts import as_text, facts, topic_lines
+from pipeline.profile_detection.topics import topics_of
 from pipeline.profile_detection.unit_guesses import UNKNOWN
 from pipeline.signal.segments import cut
 
@@ -37,12 +38,12 @@ if TYPE_CHECKING:
 DEFAULT_PROFILE = "canonical_csv"
 SEARCHED_BYTES = 1 << 25  # of a log, for its layout
 SEARCHED_FOLDERS = 4  # the log's, and a campaign's above raw/<unit>/
-UNKNOWN_LAYOUT = ("missing_column", "no_header")
+UNKNOWN_LAYOUT = ("missing_column", "no_header", "missing_topic")
 EPILOG = """\
 A file of a campaign is read by the campaign's configuration. Any other file is read by the profile --ingest (default:
 canonical_csv) and, with --sensor, the full scale of that sensor. Only --save writes a file.
 
-For a text log that the profile does not describe, a profile is proposed, with the evidence for each line and ??? where
+For a log that the profile does not describe, a profile is proposed, with the evidence for each line and ??? where
 you must decide. A run uses it only after you save it and name it in the configuration.
 
 examples:
@@ -65,9 +66,9 @@ class Reading:
     said: str
 
     @property
-    def is_mcap(self) -> bool:
-        """Whether the recording is an MCAP file."""
-        return self.files[0].suffix == ".mcap"
+    def has_topics(self) -> bool:
+        """Whether the recording is a log of messages: MCAP, or a format that an extra reads."""
+        return self.files[0].suffix.lower() in (".mcap", *MESSAGE_FORMATS)
 
 
 def _reading_of_file(files: list[Path], ingest: dict[str, Any], sensor: dict[str, Any], said: str) -> Reading:
@@ -103,7 +104,13 @@ def _parser() -> argparse.ArgumentParser:
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("files", type=Path, nargs="+", metavar="FILE", help=".csv or other text, .gcsv, .mcap")
+    parser.add_argument(
+        "files",
+        type=Path,
+        nargs="+",
+        metavar="FILE",
+        help=f"a text log, or {', '.join(SUFFIXES[1:-1])}",
+    )
     parser.add_argument("--ingest", metavar="PROFILE", help="name in configs/ingest or of a saved profile, or its file")
     parser.add_argument("--sensor", metavar="NAME", help="name in configs/sensor, for full scale and counts")
     parser.add_argument("--save", type=Path, metavar="FILE", help="write the proposed profile there")
@@ -140,7 +147,7 @@ def _grouped(files: Sequence[Path], parts: Sequence[str]) -> list[list[Path]]:
     """Return the files of each recording: one, or one for each part of the profile."""
     groups: dict[Path, list[Path]] = {}
     for file in files:
-        if not parts or file.suffix in (".mcap", ".gcsv"):
+        if not parts or file.suffix.lower() in SUFFIXES[1:]:
             groups[file] = [file]
             continue
         patterns = [re.escape(p).replace(re.escape(FILE), "(.+)") for p in parts]
@@ -227,11 +234,11 @@ def _print_facts(reading: Reading) -> PipelineError | None:
         checked = check_recordings(parts or [recording], settings)
         parts, recording = (checked, recording) if parts else ([], checked[0])
     except PipelineError as error:
-        topics = topic_lines(reading.files[0], fields=error.code == "missing_topic") if reading.is_mcap else []
+        topics = topic_lines(reading.files[0], fields=error.code == "missing_topic") if reading.has_topics else []
         place = _place(error.file, reading.files)
         print(as_text([("REFUSED", f"{place}{error.message}"), ("code", error.code), *topics]) + "\n")
         return error
-    topics = topic_lines(reading.files[0], fields=False) if reading.is_mcap else []
+    topics = topic_lines(reading.files[0], fields=False) if reading.has_topics else []
     segments = [("segments" if i == 0 else "", f"{p.name}: {_segment(p)}") for i, p in enumerate(parts)]
     print(as_text([*topics, *facts(recording, settings["sensor"]), *segments]) + "\n")
     return None
@@ -250,18 +257,21 @@ def _place(file: str | None, files: Sequence[Path]) -> str:
 
 
 def _layouts(reading: Reading, error: PipelineError) -> list[TextLayout]:
-    """Return the layout of each text log that the profile does not describe."""
+    """Return the layout of each log that the profile does not describe; of a log of messages, that of one topic."""
     if not isinstance(error, IngestError) or error.code not in UNKNOWN_LAYOUT:
         return []
     found = []
     for file in reading.files:
-        with file.open("rb") as stream:
-            data = stream.read(SEARCHED_BYTES)
         try:
-            found.append(find_layout(data, str(file)))
+            found.append(topics_of(file)[0] if reading.has_topics else _text_layout(file))
         except IngestError as none:
             print(f"{file}: {none.message}\n")
     return found
+
+
+def _text_layout(file: Path) -> TextLayout:
+    with file.open("rb") as stream:
+        return find_layout(stream.read(SEARCHED_BYTES), str(file))
 
 
 def _print_proposals(proposals: Sequence[Proposal], sensor: dict[str, Any], save: Path | None) -> None:

@@ -99,7 +99,12 @@ def _ranges(name: str, sensor: dict[str, Any]) -> str:
 
 
 def _recordings(name: str, procedure: dict[str, Any]) -> str:
-    lines = [f"# Recordings of the procedure {name}", "", "`.mcap` in place of `.csv` works for each.", ""]
+    lines = [
+        f"# Recordings of the procedure {name}",
+        "",
+        "`.mcap` in place of `.csv` works for each, and so do the formats of docs/formats.md.",
+        "",
+    ]
     for recording in procedure["recordings"].values():
         axis = f", turns about {recording['axis']}" if recording["axis"] else ""
         optional = " (optional)" if recording["optional"] else ""

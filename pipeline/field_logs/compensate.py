@@ -15,6 +15,7 @@ from pipeline.errors import ConfigurationError, InputError, PipelineError
 from pipeline.field_logs.log_checks import LogChecks
 from pipeline.field_logs.output import replacing, require_apart
 from pipeline.io.channel_table import STRAIGHT, axis_matrix, maps_of_log
+from pipeline.io.files import MESSAGE_FORMATS
 from pipeline.io.units import ACCELEROMETER, CANONICAL, GYROSCOPE, UNITS
 from pipeline.model.compensation import SMOOTHING_S
 from pipeline.records import SENSORS
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
     from pipeline.field_logs.csv_log import CsvLog
     from pipeline.field_logs.mcap_log import McapLog
+    from pipeline.field_logs.message_log import MessageLog
     from pipeline.model.compensation import Compensation
 
     Readings = dict[str, NDArray[Any]]
@@ -120,7 +122,7 @@ def compensate_log(
     block_bytes: int = BLOCK_BYTES,
     progress: Callable[[int, int], None] | None = None,
 ) -> Result:
-    """Compensate a log: MCAP by its suffix ``.mcap``, else text.
+    """Compensate a log: MCAP by its suffix ``.mcap``, the formats of ``MESSAGE_FORMATS`` by theirs, else text.
 
     Parameters
     ----------
@@ -143,11 +145,15 @@ def compensate_log(
     checks, result = LogChecks(), Result(compensation.unit)
     calibrated = {s for s in SENSORS if compensation.calibration(s) is not None}
     with replacing(target) as out:
-        log: CsvLog | McapLog
+        log: CsvLog | McapLog | MessageLog
         if source.suffix.lower() == ".mcap":
             from pipeline.field_logs.mcap_log import McapLog  # noqa: PLC0415  (each log needs one of the two)
 
             log = McapLog(source, out, profile, topic, smoothing)
+        elif source.suffix.lower() in MESSAGE_FORMATS:
+            from pipeline.field_logs.message_log import MessageLog  # noqa: PLC0415
+
+            log = MessageLog(source, out, profile, smoothing)
         else:
             from pipeline.field_logs.csv_log import CsvLog  # noqa: PLC0415
 

@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from typing import IO, TYPE_CHECKING
 
 from pipeline.errors import InputError, MissingInputError
-from pipeline.io.files import not_regular
+from pipeline.io.files import MESSAGE_FORMATS, not_regular
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -41,7 +41,9 @@ def require_apart(source: Path, target: Path) -> None:
         raise InputError("the directory of the output does not exist; make it first", str(target))
     kinds = [KINDS.get(file.suffix.lower(), "text" if file is source else None) for file in (source, target)]
     if kinds[1] is not None and kinds[0] != kinds[1]:
-        message = f"the log is {kinds[0]}, and so is the output, but its name ends in {target.suffix}"
+        is_text = source.suffix.lower() in MESSAGE_FORMATS
+        log = f"of a {source.suffix} log text is made" if is_text else f"the log is {kinds[0]}, and so is the output"
+        message = f"{log}, but its name ends in {target.suffix}"
         raise InputError(f"{message}: choose another name", str(target))
 
 

@@ -41,7 +41,7 @@ def write_canonical_csv(path: Path, recording: Recording, decimals: Mapping[str,
         raise ConfigurationError(f"decimals of unknown columns {', '.join(unknown)}; known are {known}")
     columns = columns_of(recording)
     time = columns.pop("time_ns")
-    arrays = {CANONICAL["time"]: _decimal(time, 9).cast(pa.decimal128(38, _time_digits(time)))}
+    arrays = {CANONICAL["time"]: times_as_decimals(time, _time_digits(time))}
     for channel, name in CANONICAL.items():
         if channel in columns and name in decimals:
             values = np.rint(columns[channel] * 10.0 ** decimals[name]).astype(np.int64)
@@ -53,6 +53,11 @@ def write_canonical_csv(path: Path, recording: Recording, decimals: Mapping[str,
         stream.write((",".join(arrays) + "\n").encode())
         csv.write_csv(pa.table(arrays), stream, csv.WriteOptions(include_header=False))
     temporary.replace(path)
+
+
+def times_as_decimals(time_ns: NDArray[np.int64], digits: int = 9) -> pa.Array:
+    """Return times in s as decimals with ``digits`` after the point, which have to hold them exactly."""
+    return _decimal(time_ns, 9).cast(pa.decimal128(38, digits))
 
 
 def _time_digits(time_ns: NDArray[np.int64]) -> int:

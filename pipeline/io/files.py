@@ -1,7 +1,7 @@
 """Files of users: which ones hold a unit's recordings, what their names may be, and safe access to them.
 
-A procedure names a recording's file without suffix; the first kind of file that exists is taken, ``.csv`` before
-``.gcsv`` before ``.mcap``. A name with a suffix is taken as it is. Where the ingest profile has ``parts`` (files of one
+A procedure names a recording's file without suffix; the first kind of file that exists is taken, in the order of
+``SUFFIXES``. A name with a suffix is taken as it is. Where the ingest profile has ``parts`` (files of one
 logger, joined on time), these stand in place of the ``.csv``. Only regular files are opened: opening a FIFO would wait
 forever.
 
@@ -15,14 +15,34 @@ import re
 import stat
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pipeline.errors import ConfigurationError, IngestError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-SUFFIXES = (".csv", ".gcsv", ".mcap")
+
+class MessageFormat(NamedTuple):
+    """A kind of log other than text and MCAP: its name, and library, extra and module that read it."""
+
+    kind: str
+    library: str
+    extra: str
+    module: str
+
+
+_ARRAYS = ("h5py", "hdf5", "pipeline.io.array_file")
+MESSAGE_FORMATS = {
+    ".bag": MessageFormat("ROS 1 bag", "rosbags.rosbag1", "ros", "pipeline.io.ros_bag"),
+    ".db3": MessageFormat("ROS 2 bag (SQLite)", "rosbags.rosbag2", "ros", "pipeline.io.ros_bag"),
+    ".ulg": MessageFormat("ULog", "pyulog", "ulog", "pipeline.io.ulog"),
+    ".bin": MessageFormat("DataFlash", "pymavlink.DFReader", "ardupilot", "pipeline.io.dataflash"),
+    ".h5": MessageFormat("HDF5", *_ARRAYS),
+    ".hdf5": MessageFormat("HDF5", *_ARRAYS),
+    ".mat": MessageFormat("MATLAB", *_ARRAYS),
+}
+SUFFIXES = (".csv", ".gcsv", ".mcap", *MESSAGE_FORMATS, ".BIN")  # .BIN: as ArduPilot names its logs
 FILE = "{file}"
 UNIT_NAME = re.compile(r"[A-Za-z0-9._-]+")
 LONGEST_NAME = 200  # a file name has at most 255 bytes; the longest of a unit's adds 41 (_accelerometer_unknown.yaml)
@@ -44,11 +64,13 @@ FOREIGN = {
     b"\xfd7zXZ": "an xz file: decompress it first",
     b"PK\x03\x04": "a zip or Excel file: export it as text",
     b"\xd0\xcf\x11\xe0": "an Excel file of the old kind: export it as text",
-    b"SQLite format 3": "an SQLite database (a ROS 2 bag of the old kind): convert it to MCAP",
-    b"#ROSBAG": "a ROS 1 bag: convert it to MCAP",
-    b"\x89HDF": "an HDF5 or MATLAB file: export it as text",
-    b"MATLAB 7.3": "an HDF5 file (MATLAB 7.3): export it as text",
-    b"MATLAB 5.0": "a MATLAB file: export it as text",
+    b"SQLite format 3": "an SQLite database: give a ROS 2 bag the suffix .db3",
+    b"#ROSBAG": "a ROS 1 bag: give it the suffix .bag",
+    b"\x89HDF": "an HDF5 file: give it the suffix .h5",
+    b"MATLAB 7.3": "a MATLAB file: give it the suffix .mat",
+    b"MATLAB 5.0": "a MATLAB file: give it the suffix .mat",
+    b"ULog\x01\x12\x35": "a ULog file: give it the suffix .ulg",
+    b"\xa3\x95\x80\x80": "a DataFlash log: give it the suffix .bin",
     b"PAR1": "a Parquet file: export it as text",
     b"\xff\xfe": UTF_16,
     b"\xfe\xff": UTF_16,
@@ -83,10 +105,15 @@ def candidate_files(procedure: Mapping[str, Any], ingest: Mapping[str, Any]) -> 
         elif not parts:
             out[name] = [[file + suffix] for suffix in SUFFIXES]
         elif owner in (None, name):
-            out[name] = [[str(part["file"]).replace(FILE, file) for part in parts], [file + ".mcap"]]
+            out[name] = [[str(part["file"]).replace(FILE, file) for part in parts], *_message_files(file)]
         else:
-            out[name] = [[file + ".mcap"]]
+            out[name] = _message_files(file)
     return out
+
+
+def _message_files(file: str) -> list[list[str]]:
+    """Return the names of a recording as a log of messages."""
+    return [[file + suffix] for suffix in SUFFIXES[2:]]
 
 
 def _owner_of_parts(recordings: Mapping[str, Mapping[str, Any]], parts: Sequence[Mapping[str, Any]]) -> str | None:

@@ -1,4 +1,4 @@
-"""Logs in MCAP files to channels.
+"""Logs of messages to channels: MCAP files, and the formats of ``pipeline.io.message_logs``.
 
 Times are the stamps in the messages' headers, integer ns: the sensor's clock, not the recorder's. The rows are the Imu
 messages, or the messages of the first topic of ``ingest.mcap.topics`` with an accelerometer or a gyroscope. Table
@@ -18,6 +18,7 @@ from pipeline.io.files import unchanged
 from pipeline.io.ingest_settings import HEADER, OWN
 from pipeline.io.mcap_channels import MAPPED, TopicDecoder, kind_of, listed_topics, topic_of
 from pipeline.io.mcap_reader import McapReader
+from pipeline.io.message_logs import open_log
 from pipeline.io.ros2_messages import IMU, JOINT_STATE, QUATERNION_STAMPED, TEMPERATURE
 from pipeline.io.timestamps import check_fine, check_plausible, in_order
 from pipeline.io.units import ACCELEROMETER, GYROSCOPE, TABLE_CHANNELS
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.io.ingest_settings import McapFormat
+    from pipeline.io.mcap_channels import AnyReader
     from pipeline.io.mcap_chunk import Rows
 
     Columns = dict[str, NDArray[Any]]
@@ -47,6 +49,12 @@ def read_stream(stream: BinaryIO, path: str, settings: McapFormat) -> ChannelTab
     return _Log(reader, settings).table()
 
 
+def read_log(path: Path, settings: McapFormat) -> ChannelTable:
+    """Read a log of another format by the same settings (``pipeline.io.message_logs``)."""
+    with unchanged(path):
+        return _Log(open_log(path), settings).table()
+
+
 @dataclass(frozen=True)
 class _Series:
     """The messages of one topic: times, increasing, and channels."""
@@ -62,11 +70,12 @@ class _Topic:
 
     decoder: TopicDecoder
     error: IngestError | None = None
+    recorder: bool = True  # whether the messages have times of the logger
     times: list[NDArray[np.int64]] = field(default_factory=list)
     recorded: list[NDArray[np.int64]] = field(default_factory=list)
     values: dict[str, list[NDArray[Any]]] = field(default_factory=dict)
 
-    def read(self, rows: Rows, reader: McapReader) -> None:
+    def read(self, rows: Rows, reader: AnyReader) -> None:
         """Decode the messages of a run."""
         if self.error is not None:
             return
@@ -76,6 +85,7 @@ class _Topic:
             self.error = error
             return
         self.recorded.append(rows.heads["log_time"].astype(np.int64))
+        self.recorder = reader.has_recorder
         if batch.time_ns is not None:
             self.times.append(batch.time_ns)
         for name, column in batch.values.items():
@@ -89,12 +99,15 @@ class _Topic:
         values = {n: np.concatenate(self.values.pop(n)) for n in list(self.values)}
         recorded = np.concatenate(self.recorded)
         time = np.concatenate(self.times) if self.times else recorded
+        if not self.times and not self.recorder:
+            message = f"topic {topic}: the format has no times of a recorder, which ingest.mcap.time_source asks for"
+            raise IngestError(message, path, code="bad_time", hint="name the field of the time")
         if self.times:
             if not time.any() and len(time) > 1:
                 message = f"topic {topic}: all header stamps are 0; the sensor's own times are needed"
                 hint = "if the recorder's times are good enough, set ingest.mcap.time_source=log_time"
                 raise IngestError(message, path, code="bad_time", hint=hint)
-            check_plausible(topic, time, recorded, settings.clock_difference_s, path)
+            check_plausible(topic, time, recorded, settings.clock_difference_s if self.recorder else None, path)
         order, found = in_order(topic, time, list(values.values()), settings.reorder_s, path)
         notes += found
         if order is not None:
@@ -111,7 +124,7 @@ class _Topic:
 class _Log:
     """One file, and what of it becomes channels."""
 
-    def __init__(self, reader: McapReader, settings: McapFormat) -> None:
+    def __init__(self, reader: AnyReader, settings: McapFormat) -> None:
         self.reader, self.path, self.settings = reader, reader.path, settings
         self.topics: dict[str, _Topic] = {}
         self.notes: list[Note] = []
@@ -246,6 +259,7 @@ class _Log:
                 raise IngestError(message, self.path, code="bad_message")
 
     def _note_container(self) -> None:
+        self.notes += self.reader.notes
         if not self.reader.verified:
             detail = "integrity: not_verifiable; written without checksums: damage cannot be told from data"
             self.notes.append(Note("N-NOCRC", 1, 0, 0, detail))

@@ -10,7 +10,7 @@ A covariance whose first element is -1 says that the quantity is absent (sensor_
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -20,20 +20,26 @@ from pipeline.io.ingest_settings import HEADER, TIME, MappedField
 from pipeline.io.message_decoder import Batch, ChannelDecoder, Wanted
 from pipeline.io.message_layout import short_name
 from pipeline.io.ros2_messages import IMU, JOINT_STATE, QUATERNION_STAMPED, TEMPERATURE
-from pipeline.io.units import ACCELEROMETER, ATTITUDE, COUNTS, GYROSCOPE, to_house_unit
+from pipeline.io.units import ACCELEROMETER, ATTITUDE, COUNTS, GYROSCOPE, SPELLINGS, UNITS, to_house_unit
 from pipeline.records import Encoding
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from mcap.records import Schema
     from numpy.typing import NDArray
 
     from pipeline.io.ingest_settings import McapFormat
     from pipeline.io.mcap_chunk import Rows
     from pipeline.io.mcap_reader import McapReader
+    from pipeline.io.message_logs import LogReader
+
+    AnyReader: TypeAlias = McapReader | LogReader
 
 MAPPED = "mapped"  # the kind of a topic whose fields the profile names; other kinds are ROS types
 KINDS = {short_name(kind): kind for kind in (IMU, TEMPERATURE, JOINT_STATE, QUATERNION_STAMPED)}
 VECTORS = {"linear_acceleration": (ACCELEROMETER, "m/s^2"), "angular_velocity": (GYROSCOPE, "rad/s")}
+STATED = "unit of "  # before a field's name in the metadata of a channel: the unit that the file states
 LARGEST_NS = np.iinfo(np.int64).max
 
 
@@ -54,7 +60,7 @@ def topic_of(kind: str, settings: McapFormat) -> str | None:
     }[kind]
 
 
-def listed_topics(reader: McapReader) -> list[tuple[str, str]]:
+def listed_topics(reader: AnyReader) -> list[tuple[str, str]]:
     """Return all topics of a file, each with its type in words."""
     found = set()
     for number, channel in reader.channels.items():
@@ -84,7 +90,7 @@ class TopicDecoder:
         self.count = 0
         self._absent: dict[str, bool] = {}  # columns, by the first message
 
-    def read(self, rows: Rows, reader: McapReader) -> Batch:
+    def read(self, rows: Rows, reader: AnyReader) -> Batch:
         """Return time and channels of some messages; channels that are absent are left out."""
         recorded = rows.heads["log_time"]
         if (recorded > LARGEST_NS).any():
@@ -94,6 +100,7 @@ class TopicDecoder:
         if rows.channel not in self.decoders:
             channel = reader.channels[rows.channel]
             schema = reader.schemas.get(channel.schema_id)
+            self._check_units(channel.metadata)
             self.decoders[rows.channel] = ChannelDecoder(channel, schema, self.wanted, self.path)
         batch = self.decoders[rows.channel].read(rows)
         present = np.zeros(len(recorded), np.bool_)
@@ -107,6 +114,17 @@ class TopicDecoder:
             raise IngestError(message, self.path, code="absent")
         values = {c: self._in_unit(c, batch.values[c]) for c in self.fields if c not in absent}
         return Batch(batch.time_ns, values)
+
+    def _check_units(self, stated: Mapping[str, str]) -> None:
+        """Refuse a unit of the profile that is not the one which the file states (``STATED``)."""
+        for channel, source in self.fields.items():
+            text = stated.get(f"{STATED}{source.field.base}", "")
+            unit = SPELLINGS.get(text.lower().replace(" ", ""))
+            if unit in UNITS[channel] and source.unit not in (unit, COUNTS):
+                message = (
+                    f"topic {self.topic}: the file states {text} for {source.field.text}, the profile {source.unit}"
+                )
+                raise IngestError(message, self.path, code="other_unit", hint=f"write unit: {unit} for {channel}")
 
     def _note_absent(self, name: str, absent: NDArray[np.bool_]) -> None:
         """Refuse a quantity that some messages lack."""

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from pipeline.io.mcap_chunk import Rows
+    from pipeline.records import Note
 
 DEFINITIONS = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel}
 ONLY_IN_DATA = frozenset({
@@ -69,6 +70,9 @@ class McapReader:
     sha256 : str
         Of the whole file; set when the iteration has ended.
     """
+
+    has_recorder = True  # of the reader's interface, as ``pipeline.io.message_logs.LogReader``
+    notes: tuple[Note, ...] = ()
 
     def __init__(self, stream: BinaryIO, path: str, *, allow_truncated: bool = False) -> None:
         self.stream, self.path, self.allow_truncated = stream, path, allow_truncated

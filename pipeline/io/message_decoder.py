@@ -1,6 +1,7 @@
 """Messages of one channel to columns of numbers.
 
     cdr with ros2msg definitions, ros1 with ros1msg   columns of a whole chunk at once, as views on its bytes
+    arrays (of other formats: ``message_logs``)       likewise
     protobuf, json                                    message by message
 
 Where the ROS messages of a chunk differ in layout (a text or a list changes its length), the layout of each message is
@@ -20,7 +21,15 @@ import numpy as np
 
 from pipeline.errors import IngestError
 from pipeline.io.field_path import STAMPS, FieldPath, number_at, place_of, stamp_at
-from pipeline.io.message_layout import ROS1_TIME, ROS2_TIME, MessageLayout, find_layout, parse_definition, short_name
+from pipeline.io.message_layout import (
+    ROS1_TIME,
+    ROS2_TIME,
+    MessageLayout,
+    Place,
+    find_layout,
+    parse_definition,
+    short_name,
+)
 from pipeline.io.timestamps import nanoseconds, of_number, of_pair
 
 if TYPE_CHECKING:
@@ -35,6 +44,7 @@ T = TypeVar("T")
 SUPPORTED = "cdr with ros2msg, ros1 with ros1msg, protobuf with protobuf, and json are supported"
 ROS_TIMES = {("cdr", "ros2msg"): ROS2_TIME, ("ros1", "ros1msg"): ROS1_TIME}
 SECONDS, NANOSECONDS = "\0seconds", "\0nanoseconds"  # columns of a moment; no channel has such a name
+ARRAYS = "arrays"  # encoding of messages made of arrays; the definition is JSON: name, byte, type, count of each
 FindLayout = Callable[[bytes], MessageLayout]
 
 
@@ -178,7 +188,10 @@ class ChannelDecoder:
 
 
 def ros_layouts(channel: Channel, schema: Schema | None) -> FindLayout | None:
-    """Return the function that finds the layout of a channel's ROS messages; None for other encodings."""
+    """Return the function that finds the layout of a channel's ROS messages, or arrays; None for other encodings."""
+    if schema is not None and schema.encoding == ARRAYS:
+        places = {name: Place(byte, code, count) for name, byte, code, count in json.loads(schema.data)}
+        return lambda payload: MessageLayout(payload, places)
     if schema is None or (channel.message_encoding, schema.encoding) not in ROS_TIMES:
         return None
     times, cdr = ROS_TIMES[channel.message_encoding, schema.encoding], channel.message_encoding == "cdr"

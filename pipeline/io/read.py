@@ -18,7 +18,7 @@ from pipeline.errors import IngestError, MissingInputError
 from pipeline.io.channel_table import STRAIGHT, axis_maps, to_body_axes
 from pipeline.io.disturbances import leave_out_disturbances, leave_out_shaken_rests
 from pipeline.io.encoder_log import unwrapped
-from pipeline.io.files import candidate_files, recording_files
+from pipeline.io.files import MESSAGE_FORMATS, candidate_files, recording_files
 from pipeline.io.ingest_settings import checks_of, csv_formats, mcap_format
 from pipeline.io.quality_flags import examine
 from pipeline.io.units import ATTITUDE, SINCE_1970_NS, TABLE_CHANNELS, TRIADS
@@ -78,6 +78,10 @@ def read_table(
         from pipeline.io.mcap import read_mcap  # noqa: PLC0415  (the decoder costs what a text log need not pay)
 
         return read_mcap(paths[0], mcap_format(ingest))
+    if paths[0].suffix.lower() in MESSAGE_FORMATS:
+        from pipeline.io.mcap import read_log  # noqa: PLC0415  (as above)
+
+        return read_log(paths[0], mcap_format(ingest))
     if paths[0].suffix == ".gcsv":
         from pipeline.io.gcsv import read_gcsv  # noqa: PLC0415  (few units need it)
 
@@ -95,7 +99,7 @@ def _check_complete(
     for name, candidates in wanted.items():
         if name not in files:
             if not procedure["recordings"][name].get("optional", False):
-                missing.append(f"{name} (tried {', or '.join(' with '.join(c) for c in candidates)})")
+                missing.append(f"{name} (tried {_tried(candidates)})")
             continue
         taken = next(c for c in candidates if any(folder / f in files[name] for f in c))
         missing += [f"{name} ({f})" for f in taken if folder / f not in files[name]]
@@ -103,6 +107,17 @@ def _check_complete(
         reason = "" if folder.is_dir() else "; the folder does not exist"
         message = f"missing recordings: {'; '.join(missing)}{reason}{_of_one_sensor(procedure, files)}"
         raise MissingInputError(message, str(folder))
+
+
+def _tried(candidates: Sequence[Sequence[str]]) -> str:
+    """Return the names that a recording may have; of names that differ in the suffix alone, the first in full."""
+    stems: set[str] = set()
+    texts = []
+    for names in candidates:
+        stem, _, suffix = names[0].rpartition(".")
+        texts.append(f".{suffix}" if len(names) == 1 and stem in stems else " with ".join(names))
+        stems.add(stem)
+    return ", ".join(texts)
 
 
 def _of_one_sensor(procedure: Mapping[str, Any], files: Mapping[str, list[Path]]) -> str:

@@ -36,13 +36,27 @@ SENSOR_WORDS = {
 }
 NO_SENSOR = {"mag", "magnetometer", "magnetic", "gravity", "table", "encoder", "user", "variance", "covariance", "bias"}
 TIME_FIRST = {"t", "ts", "sec", "secs", "tow", "utc", "epoch", "elapsed", "date"}
-TIME_WORDS = {"time", "timestamp", "datetime", "millis", "micros", "seconds", "ticks", "zeit", "tiempo", "temps"}
+TIME_WORDS = {
+    "time",
+    "timestamp",
+    "stamp",
+    "datetime",
+    "millis",
+    "micros",
+    "seconds",
+    "ticks",
+    "zeit",
+    "tiempo",
+    "temps",
+}
 TABLE_WORDS = {"table", "turntable", "encoder", "enc"}
 TEMPERATURE_WORDS = {"temp", "temperature", "tmp"}
+OTHER_TEMPERATURES = {"baro", "barometer", "battery", "cpu"}
 TABLE_CHANNEL_WORDS = {
     "table_rate": {"rate", "speed", "velocity", "vel", "dps"},
     "table_angle": {"angle", "position", "pos", "deg", "encoder", "enc"},
 }
+SQUARED = (["s"], ["ms"], ["mps"])  # before a 2 that is a power, not an axis
 UNIT_ENDINGS = (
     ("m/s^2", ("m s 2", "mps 2", "ms 2")), ("deg/s", ("dps", "deg s", "degps")),
     ("rad/s", ("rad s", "rads", "radps", "rad")), ("degC", ("degc", "deg c", "c")), ("mg", ("mg",)), ("g", ("g",)),
@@ -92,7 +106,7 @@ def stated_unit(name: str, channel: str) -> tuple[str | None, str]:
     """Return the unit of a channel that a name states, in brackets or in its last words, and the evidence."""
     unit = unit_in_brackets(name)
     words = [w.lower() for w in WORD.findall(name)]
-    while words and words[-1] in ("x", "y", "z", "0", "1", "3"):
+    while words and (words[-1] in ("x", "y", "z", "0", "1", "3") or (words[-1] == "2" and words[-2:-1] not in SQUARED)):
         words = words[:-1]
     ending = " ".join(words)
     if unit not in UNITS[channel]:
@@ -159,7 +173,7 @@ def _other_channel(name: str, words: list[str]) -> str:
     canonical = [c for c in CHANNELS[6:] if name.lower().startswith(c)]
     if canonical:
         return canonical[0]
-    if set(words) & TEMPERATURE_WORDS:
+    if set(words) & TEMPERATURE_WORDS and not set(words) & OTHER_TEMPERATURES:
         return "temperature"
     if set(words) & TABLE_WORDS:
         return next((c for c, known in TABLE_CHANNEL_WORDS.items() if set(words) & known), "")

@@ -1,4 +1,4 @@
-"""A profile proposed for unknown text logs, each guess with its evidence; it is never applied unasked.
+"""A profile proposed for unknown logs, each guess with its evidence; it is never applied unasked.
 
 The names of columns tell which channel they may hold. Units follow from what a name states, else from physics
 (``unit_guesses``). Two files with the same times, one with the accelerometer and one with the gyroscope, are parts of
@@ -19,6 +19,7 @@ import numpy as np
 from pipeline.io.gravity_rotation import moves_of
 from pipeline.io.units import COUNTS, GYROSCOPE, TRIADS, UNITS
 from pipeline.profile_detection.columns import Columns, find_columns, stated_unit, words_of
+from pipeline.profile_detection.topics import TopicLayout
 from pipeline.profile_detection.unit_guesses import (
     ASSUMED_HZ,
     UNKNOWN,
@@ -65,6 +66,12 @@ class Proposal:
         return [Path(s.path).name for s in self.layouts] if len(self.layouts) > 1 else []
 
     @property
+    def topic(self) -> str | None:
+        """The topic of a log of messages; None of a text log."""
+        layout = self.layouts[0]
+        return layout.topic if isinstance(layout, TopicLayout) else None
+
+    @property
     def complete(self) -> bool:
         """Whether nothing is left to be filled in."""
         channels = {c for entries in self.columns for c in entries}
@@ -77,6 +84,8 @@ class Proposal:
 
     def ingest(self, name: str) -> dict[str, Any]:
         """Return the proposal as the section ``ingest`` of a configuration."""
+        if self.topic is not None:
+            return {"name": name, "csv": {}, "mcap": {"topics": {self.topic: _fields(self.columns[0])}}}
         if not self.parts:
             return {"name": name, "csv": {**self.csv, "columns": self.columns[0]}, "mcap": {}}
         parts = [{"file": f, "columns": c} for f, c in zip(self.parts, self.columns, strict=True)]
@@ -141,6 +150,8 @@ def _proposal(parts: list[Columns]) -> Proposal:
         proposal.evidence["rate_hz"] = f"the file states {layouts[0].rate_line!r}"
     for columns in parts:
         proposal.remarks += columns.remarks
+        if proposal.topic is not None and columns.time is None:
+            proposal.remarks.append("no field of the topic is a time, which each topic needs")
         if columns.layout.odd_rows:
             proposal.remarks.append(f"{columns.layout.odd_rows} rows have another number of fields than the others")
     time_s = _time(parts, proposal)
@@ -286,7 +297,13 @@ def as_yaml(proposal: Proposal, name: str) -> str:
     lines = _comment(f"Proposed by python -m pipeline check for {files}. Read each line: nothing of it is certain.")
     for remark in proposal.remarks:
         lines += _comment(f"To decide: {remark}.")
-    lines += [f"name: {_scalar(name)} # name of the profile, for the report", "", "csv:"]
+    if proposal.topic is not None:
+        lines += ["defaults:", "  - canonical_csv", "  - _self_", ""]
+    lines += [f"name: {_scalar(name)} # name of the profile, for the report", ""]
+    if proposal.topic is not None:
+        lines += ["mcap: # logs of messages of every format", "  topics:", f"    {_scalar(proposal.topic)}:"]
+        return "\n".join([*lines, *_entries(_fields(proposal.columns[0]), proposal.evidence, "      ")]) + "\n"
+    lines += ["csv:"]
     for key, value in proposal.csv.items():
         if key in proposal.evidence:
             lines += _comment(proposal.evidence[key], "  ")
@@ -300,6 +317,14 @@ def as_yaml(proposal: Proposal, name: str) -> str:
         lines += ["  columns: # channel: the column's name (or index from 0) and its unit"]
         lines += _entries(proposal.columns[0], proposal.evidence, "    ")
     return "\n".join([*lines, "", "mcap: {}"]) + "\n"
+
+
+def _fields(columns: Entries) -> Entries:
+    """Return entries of columns as those of a topic's fields."""
+    return {
+        c: {"field": e["column"], **{k: v for k, v in e.items() if k not in ("column", "optional")}}
+        for c, e in columns.items()
+    }
 
 
 def _entries(entries: Entries, evidence: dict[str, str], indent: str) -> list[str]:

@@ -11,9 +11,9 @@ import numpy as np
 from pipeline.errors import IngestError
 from pipeline.io.gravity_rotation import misfit_deg, moves_of, rests_of
 from pipeline.io.mcap_channels import KINDS
-from pipeline.io.mcap_reader import McapReader
 from pipeline.io.message_decoder import object_decoder, ros_layouts
 from pipeline.io.message_layout import short_name
+from pipeline.io.message_logs import LogReader, open_reader
 from pipeline.io.quality_flags import CLIPPED, GAP, STUCK, equal_share
 from pipeline.io.units import TRIADS
 from pipeline.profile_detection.unit_guesses import BURSTS, FEWEST_RESTS_FOR_A_SPHERE, sphere
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from mcap.records import Channel, Schema
     from numpy.typing import NDArray
 
+    from pipeline.io.mcap_channels import AnyReader
     from pipeline.records import Note, Recording
 
 ENOUGH = 500_000  # samples that rests and moves are looked for in
@@ -39,6 +40,7 @@ LISTED_NOTES = 20  # the rest is counted; they fit one screen
 
 Line = tuple[str, str]
 MOST_FIELDS = 24  # listed of a message
+MOST_TOPICS = 20  # listed one a line
 LONGEST_LIST = 4  # elements listed of an array
 
 
@@ -222,23 +224,21 @@ def _number(value: float, digits: int = 4) -> str:
 
 
 def topic_lines(path: Path, *, fields: bool) -> list[tuple[str, str]]:
-    """Return what an MCAP file holds, as pairs of label and text; nothing where it cannot be walked through.
+    """Return what a log of messages holds, as pairs of label and text; nothing where it cannot be walked through.
 
     ``fields``: whether the fields of messages of types that ingest does not know are listed.
     """
     first: dict[int, bytes] = {}
     try:
-        with path.open("rb") as stream:
-            found = McapReader(stream, str(path))
+        with open_reader(path) as found:
             for rows in found.rows():
                 if rows.channel not in first:
                     first[rows.channel] = rows.payload(0)
     except (IngestError, OSError):
         return []
-    library = f", written by {found.header.library}" if found.header and found.header.library else ""
-    proof = "every checksum and count verified" if found.verified else "integrity: not_verifiable, without checksums"
-    size = f"{counted(found.count, 'message')} in {counted(len(found.chunks), 'chunk')}"
-    lines = [("container", f"{size}{library}; {proof}")]
+    lines = [("container", _container(found))]
+    if len(found.channels) > MOST_TOPICS:
+        return [*lines, ("topics", ", ".join(f"{c.topic} ({found.counts[n]})" for n, c in found.channels.items()))]
     for number, channel in found.channels.items():
         schema = found.schemas.get(channel.schema_id)
         kind = f"{schema.name}, {channel.message_encoding}" if schema else channel.message_encoding or "no encoding"
@@ -247,6 +247,16 @@ def topic_lines(path: Path, *, fields: bool) -> list[tuple[str, str]]:
             text += _fields(channel, schema, first[number])
         lines.append(("topic", text))
     return lines
+
+
+def _container(reader: AnyReader) -> str:
+    """Return the size of a log of messages, and whether it proves to be complete."""
+    size, proof = counted(reader.count, "message"), "integrity: not_verifiable, without checksums"
+    if isinstance(reader, LogReader):
+        return f"{reader.kind} with {size}; {proof}"
+    library = f", written by {reader.header.library}" if reader.header and reader.header.library else ""
+    proof = "every checksum and count verified" if reader.verified else proof
+    return f"{size} in {counted(len(reader.chunks), 'chunk')}{library}; {proof}"
 
 
 def counted(number: int, what: str) -> str:

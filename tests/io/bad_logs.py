@@ -193,7 +193,7 @@ def cases() -> dict[str, Case]:
         "04 gzip": one(gzip.compress(whole), fault="foreign", says="a gzip file: decompress it first"),
         "04 excel": one(b"PK\x03\x04" + whole, fault="foreign", says="a zip or Excel file"),
         "04 mcap": one(b"\x89MCAP0\r\n", fault="foreign", says="give it the suffix .mcap"),
-        "04 sqlite": one(b"SQLite format 3\0" + whole, fault="foreign", says="convert it to MCAP"),
+        "04 sqlite": one(b"SQLite format 3\0" + whole, fault="foreign", says="give a ROS 2 bag the suffix .db3"),
         "05": one(b"\xef\xbb\xbf" + whole, notes=("N-BOM",), kept=ALL),
         "06": one(text().decode().encode("utf-16"), fault="utf16", says="UTF-16 text: save it as UTF-8"),
         "06 without mark": one(text().decode().encode("utf-16-le"), fault="utf16", says="UTF-16 text"),

@@ -72,15 +72,14 @@ def parts(*files: str) -> dict[str, Any]:
 
 def test_parts_with_fixed_names_belong_to_the_required_recording() -> None:
     wanted = candidate_files(procedure("recording", optional=("static",)), parts("a.txt", "b.txt"))
-    assert wanted == {"recording": [["a.txt", "b.txt"], ["recording.mcap"]], "static": [["static.mcap"]]}
+    assert wanted["recording"][:3] == [["a.txt", "b.txt"], ["recording.mcap"], ["recording.bag"]]
+    assert wanted["static"][0] == ["static.mcap"]
 
 
 def test_parts_named_after_the_recording_belong_to_each() -> None:
     wanted = candidate_files(procedure("r", optional=("s",)), parts("{file}_acc.txt", "{file}_gyr.txt"))
-    assert wanted == {
-        "r": [["r_acc.txt", "r_gyr.txt"], ["r.mcap"]],
-        "s": [["s_acc.txt", "s_gyr.txt"], ["s.mcap"]],
-    }
+    assert wanted["r"][:2] == [["r_acc.txt", "r_gyr.txt"], ["r.mcap"]]
+    assert wanted["s"][:2] == [["s_acc.txt", "s_gyr.txt"], ["s.mcap"]]
 
 
 def test_parts_that_do_not_suit_the_procedure_are_refused() -> None:

@@ -156,7 +156,7 @@ def test_missing_files_are_named_together_with_what_was_tried(tmp_path: Path, ca
     write_canonical_csv(tmp_path / "b.csv", make_recording())
     with pytest.raises(MissingInputError) as caught:
         read_recordings(procedure("a", "b", "c", optional=("d",)), canonical, SENSOR, tmp_path)
-    tried = "{0} (tried {0}.csv, or {0}.gcsv, or {0}.mcap)"
+    tried = "{0} (tried {0}.csv, .gcsv, .mcap, .bag, .db3, .ulg, .bin, .h5, .hdf5, .mat, .BIN)"
     assert caught.value.message == f"missing recordings: {tried.format('a')}; {tried.format('c')}"
     assert caught.value.file == str(tmp_path)
 

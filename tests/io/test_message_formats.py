@@ -1,0 +1,227 @@
+"""Logs of ROS, PX4, ArduPilot, HDF5 and MATLAB: the readings that were written, by the rules of MCAP; or refused."""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import TYPE_CHECKING, Any
+
+import h5py
+import numpy as np
+import pytest
+import yaml
+from foreign_logs import GRAVITY, Truth, write_arrays, write_bag, write_dataflash, write_matlab73, write_ulog
+from pymavlink.DFReader import DFReader_binary
+from pyulog import ULog
+from sample_logs import SENSOR, procedure, profile
+
+from pipeline.commands.apply import main as apply
+from pipeline.commands.check import main as check
+from pipeline.errors import IngestError
+from pipeline.io.files import MESSAGE_FORMATS
+from pipeline.io.ingest_settings import mcap_format
+from pipeline.io.mcap import read_log
+from pipeline.io.read import read_recordings
+from pipeline.records import SensorCalibration
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from pipeline.io.channel_table import ChannelTable
+
+WRITERS: dict[str, tuple[Callable[..., Path], str]] = {
+    "log.bag": (write_bag, "mcap"),
+    "log.db3": (write_bag, "mcap"),
+    "log.ulg": (write_ulog, "px4_ulog"),
+    "log.bin": (write_dataflash, "ardupilot"),
+    "log.h5": (write_arrays, "array_file"),
+    "log.hdf5": (write_arrays, "array_file"),
+    "log.mat": (write_arrays, "array_file"),
+    "log73.mat": (write_matlab73, "array_file"),
+}
+
+
+def read(path: Path, ingest: str, **settings: Any) -> ChannelTable:
+    return read_log(path, mcap_format({"mcap": {**profile(ingest)["mcap"], **settings}}))
+
+
+def assert_is(table: ChannelTable, truth: Truth) -> None:
+    assert table.time_ns.tolist() == (truth.time_us * 1000).tolist()
+    force = np.column_stack([table.values[f"accel_{a}"] for a in "xyz"])
+    rate = np.column_stack([table.values[f"gyro_{a}"] for a in "xyz"])
+    np.testing.assert_allclose(force, truth.force / GRAVITY, rtol=1e-15)
+    np.testing.assert_allclose(rate, np.degrees(truth.rate), rtol=1e-15)
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_each_format_gives_the_readings_that_were_written(name: str, tmp_path: Path) -> None:
+    truth = Truth()
+    write, ingest = WRITERS[name]
+    table = read(write(tmp_path / name, truth), ingest)
+    assert_is(table, truth)
+    if name == "log.bin":
+        np.testing.assert_array_equal(table.values["temperature"], truth.warmth)
+
+
+@pytest.mark.parametrize("name", [n for n in WRITERS if n != "log73.mat"])
+def test_a_procedure_finds_the_file_in_place_of_a_csv(name: str, tmp_path: Path) -> None:
+    write, ingest = WRITERS[name]
+    write(tmp_path / name, Truth())
+    recording = read_recordings(procedure("log"), profile(ingest), SENSOR, tmp_path)[0]
+    assert recording.samples == 300
+    assert {"N-NOCRC"} <= {n.code for n in recording.notes}
+
+
+def test_other_instances_are_topics_of_their_own(tmp_path: Path) -> None:
+    truth = Truth()
+    for path, ingest, topic in (
+        (write_ulog(tmp_path / "log.ulg", truth, instances=2), "px4_ulog", "sensor_combined"),
+        (write_dataflash(tmp_path / "log.bin", truth), "ardupilot", "IMU"),
+    ):
+        fields = profile(ingest)["mcap"]["topics"][topic]
+        table = read(path, ingest, topics={f"{topic}[1]": fields})
+        expected = np.float32(truth.force[:, 0] + 1).astype(np.float64) / GRAVITY
+        np.testing.assert_allclose(table.values["accel_x"], expected, rtol=1e-15)
+
+
+def test_dataflash_agrees_with_pymavlink_message_by_message(tmp_path: Path) -> None:
+    path = write_dataflash(tmp_path / "log.bin", Truth())
+    with DFReader_binary(str(path)) as log:
+        messages = [m for m in iter(lambda: log.recv_match(type="IMU"), None) if m.I == 0]
+    table = read(path, "ardupilot")
+    assert table.time_ns.tolist() == [m.TimeUS * 1000 for m in messages]
+    assert table.values["accel_y"].tolist() == [m.AccY / GRAVITY for m in messages]
+    assert table.values["temperature"].tolist() == [m.T for m in messages]
+
+
+def test_ulog_agrees_with_pyulog(tmp_path: Path) -> None:
+    path = write_ulog(tmp_path / "log.ulg", Truth())
+    data = ULog(str(path)).get_dataset("sensor_combined").data
+    np.testing.assert_array_equal(
+        read(path, "px4_ulog").values["accel_z"], data["accelerometer_m_s2[2]"].astype(float) / GRAVITY
+    )
+
+
+def test_a_unit_other_than_the_file_states_is_refused(tmp_path: Path) -> None:
+    hdf5 = write_arrays(tmp_path / "log.h5", Truth(), units=("m/s^2", "deg/s"))
+    with pytest.raises(IngestError, match=r"the file states deg/s for gyr\[0\], the profile rad/s") as caught:
+        read(hdf5, "array_file")
+    assert caught.value.code == "other_unit"
+    fields = profile("ardupilot")["mcap"]["topics"]["IMU"] | {"accel_x": {"field": "AccX", "unit": "g"}}
+    with pytest.raises(IngestError, match="the file states m/s/s for AccX, the profile g"):
+        read(write_dataflash(tmp_path / "log.bin", Truth()), "ardupilot", topics={"IMU": fields})
+
+
+def test_two_imus_in_a_bag_are_chosen_by_their_topic(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "log.bag", Truth(), ("/imu0", "/imu1"))
+    with pytest.raises(IngestError, match="2 topics are of type") as caught:
+        read(path, "mcap")
+    assert caught.value.code == "ambiguous"
+    assert_is(read(path, "mcap", imu_topic="/imu1"), Truth())
+
+
+@pytest.mark.parametrize("suffix", MESSAGE_FORMATS)
+def test_a_missing_library_names_the_extra(suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    known = MESSAGE_FORMATS[suffix]
+    parts = known.library.split(".")
+    for depth in range(1, len(parts) + 1):
+        monkeypatch.setitem(sys.modules, ".".join(parts[:depth]), None)
+    path = tmp_path / f"log{suffix}"
+    path.write_bytes(b"MATLAB 7.3")
+    with pytest.raises(IngestError, match=rf"pip install 'imu-calibration\[{known.extra}\]'") as caught:
+        read(path, "mcap")
+    assert caught.value.code == "missing_extra"
+
+
+def damaged(kind: str, data: bytes) -> bytes:
+    """Return a log cut at a third, another file, or one with zeros over a fifth of it."""
+    at = len(data) // 2
+    zeros = data[:at] + bytes(at // 5) + data[at + at // 5 :]
+    return {"cut": data[: len(data) // 3], "other": b"no log" * 100, "zeros": zeros}[kind]
+
+
+DAMAGED = [(n, "other") for n in WRITERS]
+DAMAGED += [(n, "cut") for n in ("log.bag", "log.db3", "log.h5", "log.mat", "log73.mat")]
+DAMAGED += [(n, "zeros") for n in ("log.ulg", "log.bin", "log.db3")]
+
+
+@pytest.mark.parametrize(("name", "kind"), DAMAGED)
+def test_a_damaged_file_is_refused(name: str, kind: str, tmp_path: Path) -> None:
+    write, ingest = WRITERS[name]
+    path = write(tmp_path / name, Truth())
+    path.write_bytes(damaged(kind, path.read_bytes()))
+    with pytest.raises(IngestError):
+        read(path, ingest)
+
+
+def test_a_log_that_ends_with_the_power_gives_what_was_written_before(tmp_path: Path) -> None:
+    """Neither format marks its end."""
+    truth = Truth()
+    for path, ingest in (
+        (write_dataflash(tmp_path / "log.bin", truth), "ardupilot"),
+        (write_ulog(tmp_path / "log.ulg", truth), "px4_ulog"),
+    ):
+        path.write_bytes(path.read_bytes()[:-20])
+        table = read(path, ingest)
+        assert table.time_ns.tolist()[:290] == (truth.time_us * 1000).tolist()[:290]
+        assert 290 < len(table.time_ns) <= 300
+        assert path.suffix == ".ulg" or "N-TRUNCATED" in {n.code for n in table.notes}
+
+
+@pytest.mark.parametrize("name", ["log.bag", "log.bin", "log.mat"])
+def test_apply_writes_the_calibrated_readings_as_canonical_csv(name: str, tmp_path: Path) -> None:
+    write, ingest = WRITERS[name]
+    truth = Truth()
+    bias, matrix = np.array([0.01, -0.02, 0.03]), np.diag([1.1, 0.9, 1.0]) + 0.01
+    fits = {s: SensorCalibration(s, bias, matrix).to_json() for s in ("accelerometer", "gyroscope")}
+    head = {"schema_version": 1, "unit": "U1", "status": "ok", "error": None, "sensor": "generic"}
+    (tmp_path / "U1.json").write_text(json.dumps({**head, **fits}))
+    log, out = write(tmp_path / name, truth), tmp_path / "out.csv"
+    assert apply([str(log), "--calibration", str(tmp_path / "U1.json"), "-o", str(out), "--ingest", ingest]) == 0
+    found = np.genfromtxt(out, delimiter=",", names=True)
+    np.testing.assert_allclose(found["time_s"], truth.time_us / 1e6, rtol=0, atol=1e-9)
+    for prefix, unit, given in (("accel", "g", truth.force / GRAVITY), ("gyro", "dps", np.degrees(truth.rate))):
+        columns = np.column_stack([found[f"{prefix}_{a}_{unit}"] for a in "xyz"])
+        np.testing.assert_allclose(columns, (given - bias) @ matrix.T, rtol=0, atol=1e-11)
+
+
+PROPOSED = {
+    "log.ulg": ("sensor_combined", "timestamp", "us"),
+    "log.bin": ("IMU", "TimeUS", "us"),
+    "log.h5": ("/imu", "t", "s"),
+    "log.mat": ("/imu", "t", "s"),
+}
+
+
+@pytest.mark.parametrize("name", PROPOSED)
+def test_check_proposes_a_profile_that_reads_the_log(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    truth, profile_file = Truth(1200), tmp_path / "own.yaml"
+    log = WRITERS[name][0](tmp_path / name, truth)
+    assert check([str(log), "--save", str(profile_file)]) == 2
+    saved = yaml.safe_load(profile_file.read_text())
+    topic, time, unit = PROPOSED[name]
+    assert saved["mcap"]["topics"][topic]["time"] == {"field": time, "unit": unit}
+    assert_is(read_log(log, mcap_format(saved)), truth)
+    assert "PROPOSED PROFILE" in capsys.readouterr().out
+
+
+def test_arrays_of_several_lengths_are_topics_by_their_first_array(tmp_path: Path) -> None:
+    truth, path = Truth(), tmp_path / "log.h5"
+    with h5py.File(path, "w") as file:
+        file["acc"], file["acc_t"] = truth.force, truth.time_us
+        file["gyr"], file["gyr_t"] = truth.rate[:-5], truth.time_us[:-5]
+        file["table"] = np.array(
+            [(t, *f) for t, f in zip(truth.time_us, truth.force, strict=True)],
+            [("t", "<i8"), ("x", "<f4"), ("y", "<f4"), ("z", "<f4")],
+        )
+    axes = {f"accel_{a}": {"field": f"acc[{i}]", "unit": "m/s^2"} for i, a in enumerate("xyz")}
+    table = read(path, "array_file", topics={"/acc": {"time": {"field": "acc_t", "unit": "us"}, **axes}})
+    np.testing.assert_allclose(table.values["accel_y"], truth.force[:, 1] / GRAVITY, rtol=1e-15)
+    axes = {f"accel_{a}": {"field": a, "unit": "m/s^2"} for a in "xyz"}
+    table = read(path, "array_file", topics={"/table": {"time": {"field": "t", "unit": "us"}, **axes}})
+    np.testing.assert_allclose(table.values["accel_y"], truth.force[:, 1] / GRAVITY, rtol=1e-15)
+    with pytest.raises(IngestError, match="has no times of a recorder"):
+        read(path, "array_file", topics={"/table": axes}, time_source="log_time")
