@@ -14,6 +14,7 @@ from pipeline.config.comparisons import resolve_comparisons
 from pipeline.config.compose import Composer
 from pipeline.config.layers import as_list, load_layers
 from pipeline.config.options import Problem, default_of_run, nearest, parse
+from pipeline.config.schema import OF_BENCH
 from pipeline.config.sheet import read_sheet
 from pipeline.config.stage_settings import config_sha256
 from pipeline.config.user_effects import PYTHON
@@ -199,8 +200,8 @@ def cut_batches(
             batch = f"{chain}-{number:04d}"
             batches[batch] = names[start:stop]
             configs = [units[n].config for n in batches[batch]]
-            seated = any(c["table"]["seat_deg"] is not None for c in configs)
-            effects = {sensor: seated or any(c["effects"][sensor] for c in configs) for sensor in SENSORS}
+            of_bench = any(c["table"].get(key) for c in configs for key in OF_BENCH)
+            effects = {sensor: of_bench or any(c["effects"][sensor] for c in configs) for sensor in SENSORS}
             stages = configs[0]["method"]["stages"]
             chains[batch] = {sensor: stages[sensor] + ["effects"] * effects[sensor] for sensor in SENSORS}
             start = stop

@@ -33,7 +33,7 @@ from pipeline.config.options import (
     read_option,
     with_references,
 )
-from pipeline.config.schema import SECTIONS, Unit
+from pipeline.config.schema import OF_BENCH, SECTIONS, Unit
 from pipeline.config.user_effects import ONLY_FROM_THE_COMMAND_LINE, PYTHON, UserEffects, load_user_effects
 from pipeline.errors import ConfigurationError
 from pipeline.files import CONFIGS
@@ -239,10 +239,12 @@ class Composer:
             raise Problem(f"effects.{sensor} names {name} and {within[0]}, which it contains: name one of them")
 
     def _check_meaning(self, config: dict[str, Any]) -> None:
+        stated = {key for key in OF_BENCH if config["table"].get(key)}
+        of_bench = [name for name in self.effects if stated and read_option("effect", name, ()).get("prior") in stated]
         for sensor, names in config["effects"].items():
             for name in [] if names == "auto" else names:
                 self._check_effect(sensor, name, config["procedure"])
-            for name in [] if names == "auto" else names:
+            for name in [] if names == "auto" else [*of_bench, *names]:
                 self._check_contained(sensor, name, names)
         ingest = repr((config["ingest"], config["procedure"]))
         if ingest not in self._valid_ingest:

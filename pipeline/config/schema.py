@@ -53,6 +53,9 @@ class Sensor(Section):
     gyroscope: DataSheet
 
 
+OF_BENCH = ("seat_deg", "time_offset_s", "clock_accuracy_ppm", "lag_s")  # of a table: the priors in configs/effect
+
+
 class Table(Section):
     """A rate table, or none."""
 
@@ -71,6 +74,8 @@ class Table(Section):
     gravity_accuracy_g: NonNegative | None = None
     azimuth_accuracy_deg: NonNegative | None = None
     clock_accuracy_ppm: NonNegative | None = None
+    time_offset_s: Positive | None = None
+    lag_s: Positive | None = None
     seat_deg: Annotated[float, Field(gt=0, le=10)] | None = None
 
 

@@ -16,6 +16,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pipeline.config.schema import OF_BENCH
 from pipeline.config.user_effects import effects_for
 from pipeline.files import CONFIGS, write_atomically
 
@@ -36,8 +37,7 @@ NOISE = ("noise_density", "bias_wander", "wander_time_s")
 BY_HAND = tuple(f"procedure.{key}" for key in ("holdout_every", "faces", "turns"))
 FIT_OF_TABLE = (
     "motion", "gravity_g", "latitude_deg", "azimuth_deg", "angle_accuracy_deg", "rate_accuracy", "orthogonality_deg",
-    "wobble_deg", "levelling_deg", "gravity_accuracy_g", "azimuth_accuracy_deg", "clock_accuracy_ppm",
-    "seat_deg",
+    "wobble_deg", "levelling_deg", "gravity_accuracy_g", "azimuth_accuracy_deg", *OF_BENCH,
 )  # fmt: skip
 FIT_OF_SENSOR = (
     "full_scale", "counts_per_unit", *NOISE, "effects.bias_temperature", "effects.scale_factor_temperature",

@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.design import NormalPrior, Term
-from pipeline.model.effects import catalogue, effect
+from pipeline.model.effects import bench_priors, catalogue, effect
 from pipeline.model.effects.base import parameter_limits
 from pipeline.model.effects.sessions import OWN
 
@@ -40,11 +40,13 @@ def configured_effects(sensor: str, settings: Mapping[str, Any], recordings: Seq
 
 
 def bench_effects(sensor: str, settings: Mapping[str, Any], recordings: Sequence[Recording]) -> list[str]:
-    """Return the effects of the bench: mountings where the table's config has them, else zeros that were found."""
-    if settings["table"].get("seat_deg") is not None:
-        return [MOUNTING]
+    """Return the effects of the bench: those that the table's config states, and zeros that were found."""
+    table = settings["table"]
+    stated = [name for name, key in bench_priors().items() if table.get(key) and table.get("motion") != "none"]
+    own_clocks = not all(recording.clock_shared for recording in recordings)
+    names = [name for name in stated if not (effect(name).needs_clock and own_clocks)]
     found = any(note.code == "N-FOUND" for recording in recordings for note in recording.notes)
-    return [ZERO] if found and sensor == "accelerometer" else []
+    return [*names, ZERO] if found and sensor == "accelerometer" and MOUNTING not in names else names
 
 
 def starts_of(
@@ -78,7 +80,8 @@ def starts_of(
                 f"effects.{sensor} names {name}, which is an effect of the {this.sensors[0]} alone"
             )
         prior = None if isinstance(observed, str) else prior_of(this, observed, accelerometer)
-        values = [fitted[name]] if name in fitted else this.starts(sensor) if prior is None else [prior.mean]
+        starts = this.starts(sensor) if prior is None or this.nonlinear else [prior.mean]
+        values = [fitted[name]] if name in fitted else starts
         values = [v for v in values if len(v) == len(this.parameters(sensor))] or this.starts(sensor)
         combinations = [[*before, Term(this, v, prior=prior)] for before in combinations for v in values]
     return combinations
@@ -90,16 +93,17 @@ def turns_of(observations: Observations) -> list[str]:
 
 
 def prior_of(this: Effect, observed: Observations, accelerometer: SensorCalibration | None) -> NormalPrior | None:
-    """Return what is known of the rotations of the unit before the fit; None for other effects.
+    """Return what is known of an effect of the bench before the fit; None for other effects.
 
-    ``theta_k ~ N(0, s^2)`` where gravity does not determine them. Where the accelerometer was fitted with the
-    mountings, its estimate: both sensors share the rotation that is common to all recordings, a part of their matrices.
+    Each parameter is ``N(0, s^2)``, s as the table's config states it. For the rotations of the unit, where the
+    accelerometer was fitted with them, its estimate: both sensors share the frame of the mean of the mountings.
 
     ``accelerometer``: for the gyroscope.
     """
     if this.name != MOUNTING:
-        return None
-    recordings, seat_deg = turns_of(observed), observed.seat_deg or SEAT_DEG
+        stated = observed.bench.get(this.name)
+        return None if stated is None else NormalPrior(np.zeros(1), np.full((1, 1), stated**-2))
+    recordings, seat_deg = turns_of(observed), observed.bench.get(MOUNTING, SEAT_DEG)
     size = 3 * len(recordings)
     mean = np.zeros(size)
     found = None if accelerometer is None else next((e for e in accelerometer.effects if e.name == MOUNTING), None)

@@ -163,7 +163,7 @@ class Design:
     ) -> None:
         self.scale = scale
         self._place(observations.sensor, terms)
-        self._priors = [(at, t.prior, t.values) for at, t in zip(self.slices, terms, strict=True) if t.prior]
+        self._priors = [(at, t) for at, t in zip(self.slices, terms, strict=True) if t.prior]
         weight = observations.weight
         A = np.zeros((len(weight), self._width))
         A[:, self._readings] = observations.reading if target is None else target
@@ -248,8 +248,10 @@ class Design:
         for c in range(3):
             total[:, self._to[c]] += flat[:, self._from[c]] / self.scale[c] ** 2
         square = total.reshape(-1, self.count + 1, self.count + 1)
-        for at, prior, values in self._priors:  # as readings of the parameters themselves
-            rest = prior.mean - values
+        for at, term in self._priors:  # as readings of the parameters themselves
+            prior = term.prior
+            assert prior is not None  # noqa: S101
+            rest = prior.mean - term.values
             square[:, at, at] += prior.precision
             square[:, at, -1] += prior.precision @ rest
             square[:, -1, at] += prior.precision @ rest
@@ -264,12 +266,10 @@ class Design:
         back = [inverse[:, index[:-1]] / s**2 for index, s in zip(self._total, self.scale, strict=True)]
         return LinearMap((weights[0], weights[1], weights[2]), (back[0], back[1], back[2]))
 
-    def prior_covariance(self, setting: Setting) -> Values:
-        """Return what the priors contribute to the covariance of the parameters: (p, p) array."""
-        inverse, total = self._inverse(setting), np.zeros((self.count, self.count))
-        for at, prior, _ in self._priors:
-            total += inverse[:, at] @ prior.precision @ inverse[at]
-        return total
+    def prior_covariances(self, setting: Setting) -> dict[str, Values]:
+        """Return what the prior of each effect contributes to the covariance of the parameters: (p, p) arrays."""
+        inverse = self._inverse(setting)
+        return {t.effect.name: inverse[:, at] @ t.prior.precision @ inverse[at] for at, t in self._priors if t.prior}
 
     def _inverse(self, setting: Setting) -> Values:
         """Return the inverse of the products of the parameters' columns: (p, p) array."""

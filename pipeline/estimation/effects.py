@@ -11,7 +11,7 @@ from pipeline.estimation.noise import noise_of
 from pipeline.estimation.observations import observe
 from pipeline.estimation.rest_means import is_multi_position
 from pipeline.estimation.selection import select
-from pipeline.model.effects import effect
+from pipeline.model.effects import bench_priors, effect
 from pipeline.records import SensorCalibration
 
 if TYPE_CHECKING:
@@ -30,8 +30,9 @@ def fit(
     """
     before = previous or SensorCalibration(sensor)
     by_hand = is_multi_position(sensor, recordings)
-    seated_anew = not by_hand and (settings.get("table") or {}).get("seat_deg") is not None
-    if not settings["effects"][sensor] and not seated_anew:
+    table = settings.get("table") or {}
+    of_bench = not by_hand and any(table.get(key) for key in bench_priors().values())
+    if not settings["effects"][sensor] and not of_bench:
         return before
     noise = noise_of(sensor, recordings, settings)
     if by_hand:

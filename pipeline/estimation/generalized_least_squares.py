@@ -31,10 +31,10 @@ from pipeline.estimation.noise import static_or_sheet
 from pipeline.estimation.observations import observe, weighted
 from pipeline.estimation.table_errors import Reference, disturbance
 from pipeline.estimation.uncertainty_budget import (
+    bench_contribution,
     budgeted,
     combined,
     effect_parameters,
-    mounting_contribution,
     noise_contribution,
     scatter_contribution,
 )
@@ -378,8 +378,8 @@ def calibration_of(  # noqa: PLR0917  (what a fit with effects is)
         return with_matrix(values + drawn @ of_channels.T)
 
     lines = [noise_contribution(errors, whole, prior)]
-    if any(term.prior for term in fit.terms):
-        lines.append(mounting_contribution(change @ design.prior_covariance(fit.setting) @ change.T))
+    for name, prior_part in design.prior_covariances(fit.setting).items():
+        lines.append(bench_contribution(name, change @ prior_part @ change.T))
     return budgeted(found, reference, errors, lines, settings, results, names)
 
 

@@ -22,6 +22,7 @@ import numpy as np
 from pipeline.estimation.gauss_markov import Blocks, information
 from pipeline.estimation.table_errors import between_stops
 from pipeline.estimation.turns import Rows, followed, rows_of
+from pipeline.model.effects import bench_priors
 from pipeline.model.effects.base import length, turning_direction
 from pipeline.model.kinematics import earth_of, table_motion
 from pipeline.signal.filters import apply_filter
@@ -66,8 +67,8 @@ class Observations:
     sensor: str
     parts: tuple[Part, ...]  # in the order of time where the clock is shared
     earth: bool  # whether Earth's rotation is in the motion
-    # standard deviation of the rotation of the unit in each recording; None: one mounting for all
-    seat_deg: float | None = None
+    # standard deviations of what the bench adds, by effect (``bench_priors``)
+    bench: Mapping[str, float] = field(default_factory=dict)
     mounting_in_doubt: bool = False  # whether one mounting does not explain all turns (note ``N-SEATS``)
     # deg; standard uncertainty of the angle at each stop, where the unit is mounted anew for each turn; else 0
     angle_deg: float = 0.0
@@ -172,8 +173,8 @@ def _with_stops(part: Part, observations: Observations, white: float) -> Part:
 def observe(sensor: str, recordings: Sequence[Recording], table: Mapping[str, Any]) -> Observations:
     """Return what a fit sees of one sensor: every recording with its readings and a table's motion.
 
-    ``recordings``: those held out are left aside. ``table``: ``gravity_g``, ``latitude_deg``, ``azimuth_deg``,
-    ``seat_deg``.
+    ``recordings``: those held out are left aside. ``table``: ``gravity_g``, ``latitude_deg``, ``azimuth_deg``, those of
+    ``bench_priors``.
     """
     parts = []
     for recording in recordings:
@@ -183,9 +184,9 @@ def observe(sensor: str, recordings: Sequence[Recording], table: Mapping[str, An
                 parts.append(part)
     parts.sort(key=_in_time)
     doubt = any(note.code == "N-SEATS" for recording in recordings for note in recording.notes)
-    seat = table.get("seat_deg")
-    angle = 0.0 if seat is None else float(table.get("angle_accuracy_deg") or 0.0)
-    return Observations(sensor, tuple(parts), earth_of(table) is not None, seat, doubt, angle)
+    bench = {name: float(table[key]) for name, key in bench_priors().items() if table.get(key)}
+    angle = float(table.get("angle_accuracy_deg") or 0.0) if "mounting" in bench else 0.0
+    return Observations(sensor, tuple(parts), earth_of(table) is not None, bench, doubt, angle)
 
 
 def _in_time(part: Part) -> tuple[bool, str, float]:

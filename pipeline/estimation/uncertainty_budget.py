@@ -88,9 +88,10 @@ def scatter_contribution(
     return Contribution(NOISE, "A", "Student's t", covariance, freedom, parts=dict(parts or {}), remark=remark)
 
 
-def mounting_contribution(covariance: Values) -> Contribution:
-    """Return what the priors of the mountings contribute, in the frame of their mean."""
-    return Contribution("mounting", "B", NORMAL, covariance, np.full(len(covariance), np.inf))
+def bench_contribution(name: str, covariance: Values) -> Contribution:
+    """Return what the prior of an effect of the bench contributes."""
+    source = name.replace("_", " ")
+    return Contribution(source, "B", NORMAL, covariance, np.full(len(covariance), np.inf))
 
 
 def _quantisation(noise: ResidualNoise, fit: LinearMap, counts_per_unit: float | None, unit: str) -> Contribution | str:

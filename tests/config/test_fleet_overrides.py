@@ -137,7 +137,7 @@ def test_config_prints_the_resolved_configuration_and_the_origin_of_each_value(
         for key in (
             "unit", "sensor.name", "sensor.gyroscope.bias", "sensor.gyroscope.full_scale", "table.name",
             "table.gravity_g", "filter.name", "filter.cutoff_hz", "filter.order", "method.name", "ingest.name",
-            "limits.gyroscope.bias", "table.clock_accuracy_ppm",
+            "limits.gyroscope.bias", "sensor.gyroscope.repeatability_bias",
         )
     } == {
         "unit": "units.csv",
@@ -152,7 +152,7 @@ def test_config_prints_the_resolved_configuration_and_the_origin_of_each_value(
         "method.name": "default of table acutronic with procedure three_axis_turns",
         "ingest.name": "default, configs/config.yaml",
         "limits.gyroscope.bias": "configs/config.yaml",
-        "table.clock_accuracy_ppm": "not set anywhere: the default",
+        "sensor.gyroscope.repeatability_bias": "not set anywhere: the default",
     }  # fmt: skip
     (weaker,) = re.findall(r"campaign.yaml, models, stim300 +filter.cutoff_hz=2 +(.*)", text)
     assert weaker == "(a stronger one stands below)"

@@ -35,6 +35,12 @@ def catalogue() -> dict[str, Effect]:
     return {name: this for name, this in every.items() if name not in _left_out}
 
 
+@cache
+def bench_priors() -> dict[str, str]:
+    """Return the effects of the bench, each with the table's setting that states its standard deviation."""
+    return {name: this.prior for name, this in built_in().items() if this.prior}
+
+
 @contextmanager
 def leaving_out(names: Iterable[str]) -> Iterator[None]:
     """Take effects out of the catalogue within a ``with`` block, as unknown effects in studies of the diagnosis."""

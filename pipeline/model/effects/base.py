@@ -74,6 +74,7 @@ class Effect(abc.ABC):
     needs_both_directions: bool = False  # turns in one direction show it as a part of bias and matrix
     of_turns: bool = False  # it has parameters of its own for each recording of a turn
     nonlinear: tuple[str, ...] = ()  # parameters in which the reading is not linear
+    prior: str = ""  # setting of the table that puts it into the model: standard deviation of its parameters
     contains: tuple[str, ...] = ()  # effects of which this is a generalisation; the two are never fitted together
     unseen: Mapping[str, str] = MappingProxyType({})  # sensor to the reason why its readings never change
     meaning: str  # one sentence for the reader of a report

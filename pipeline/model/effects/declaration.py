@@ -79,6 +79,7 @@ class Declaration:
     adds_to: str = "reading"
     limits: dict[str, float | dict[str, float]] = field(default_factory=dict)
     contains: tuple[str, ...] = ()
+    prior: str = ""
     needs_both_directions: bool = False
     excitation: str = ""
     experiment: str = ""
@@ -222,6 +223,7 @@ CHECKS: dict[str, Check] = {
 }
 BUILT_IN_CHECKS: dict[str, Check] = {
     "built_in": flag,
+    "prior": TEXT,
     "python": TEXT,
     "parameters": each(lambda given: Term(**fields(TERM_CHECKS, ("unit",))(given))),
 }

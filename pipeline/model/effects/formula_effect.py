@@ -45,7 +45,7 @@ class DeclaredEffect(Effect):
 
     def __init__(self, declared: Declaration, definition: dict[str, Any] | None = None) -> None:
         self.declared, self.definition = declared, definition
-        for name in ("name", "owner", "sensors", "contains", "needs_both_directions", "meaning"):
+        for name in ("name", "owner", "sensors", "contains", "prior", "needs_both_directions", "meaning"):
             setattr(self, name, getattr(declared, name))
         self.excitation, self.experiment, self.source = declared.excitation, declared.experiment, declared.source
         self._parameters = {sensor: declared.parameters_of(sensor) for sensor in declared.sensors}

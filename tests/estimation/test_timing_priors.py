@@ -1,0 +1,95 @@
+"""Offset, rate and lag between table and sensor as parameters with priors, on simulated units whose truth is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from pipeline.config.schema import OF_BENCH
+from pipeline.diagnosis.diagnose import diagnose
+from pipeline.estimation.noise import noise_of
+from pipeline.estimation.stages import fit_stage
+from pipeline.model.effects import bench_priors
+from pipeline.preprocessing.checks import check_recordings
+from pipeline.simulation.campaign import simulate_unit
+from pipeline.simulation.description import UnitDescription, read_config
+from pipeline.study.run import settings_of
+from pipeline.validation.heldout import validate
+
+if TYPE_CHECKING:
+    from pipeline.records import Recording, SensorCalibration
+
+COURSE: dict[str, Any] = {
+    "validation_s": 40.0, "static_s": 30.0, "warm_up_rest_s": 15.0, "step_deg": 30.0, "dwell_s": 1.5,
+    "rates_dps": (60.0,), "both_directions": True,
+}  # fmt: skip
+HIDDEN = {"time_offset": [0.008], "low_pass_lag": [0.004], "clock_rate": [90.0]}
+STATED = {"time_offset_s": 0.005, "lag_s": 0.005, "clock_accuracy_ppm": 100.0}
+UNIT = UnitDescription(
+    "u", course=COURSE, effects={f"{s}.{n}": v for s in ("accelerometer", "gyroscope") for n, v in HIDDEN.items()}
+)
+
+
+def logged(recording: Recording, rate: bool) -> Recording:  # noqa: FBT001  (a case of a test)
+    """Return a turn whose table logs the angle, with its rate or without; held-out motion has an attitude."""
+    return recording if rate or recording.role == "validation" else replace(recording, table_rate=None)
+
+
+def fitted(sensor: str, recordings: list[Recording], settings: dict[str, Any]) -> SensorCalibration:
+    found = None
+    for stage in ("reference_least_squares", "effects"):
+        found = fit_stage(sensor, stage, recordings, found, settings)
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize(("sensor", "rate"), [("gyroscope", False), ("accelerometer", True)])
+def test_stated_timing_is_estimated_whatever_the_table_logs(sensor: str, rate: bool) -> None:  # noqa: FBT001
+    recordings, truth = simulate_unit(UNIT, 3, 0)
+    base = settings_of("mpu6050", "reference_least_squares")
+    table = {"name": "acutronic", **read_config("table", "acutronic"), **STATED}
+    settings = {**base, "table": table}
+    checked = check_recordings([logged(r, rate) for r in recordings], settings)
+    settings["noise"] = {sensor: noise_of(sensor, checked, settings)}
+    found = fitted(sensor, checked, settings)
+    assert found.covariance is not None
+    u = np.sqrt(np.diag(found.covariance))
+    assert {e.name for e in found.effects} == set(HIDDEN)
+    error = np.concatenate([found.bias - truth[sensor]["bias"], (found.matrix - truth[sensor]["matrix"]).ravel()])
+    assert np.abs(error / u[:12]).max() < 4.0
+    size = np.concatenate([HIDDEN[e.name] for e in found.effects])
+    values = np.concatenate([e.values for e in found.effects])
+    assert np.abs((values - size) / u[12:]).max() < 4.0
+    held = validate(found, checked, settings["noise"][sensor], settings)
+    low, high = held["expected_rms_error"]
+    assert low <= held["steps"][-1]["rms_error"] <= high
+    if sensor == "accelerometer":
+        said = diagnose(found, checked, settings["noise"][sensor], settings, None, validation=held)
+        assert said["verdict"] == "nothing_missing"
+        assert not set(HIDDEN) & {entry["effect"] for entry in said["ranking"]}
+
+
+def test_rests_leave_the_offset_as_uncertain_as_its_prior() -> None:
+    recordings, _ = simulate_unit(replace(UNIT, effects={}), 3, 0)
+    base = settings_of("mpu6050", "reference_least_squares")
+    table = {"name": "acutronic", **read_config("table", "acutronic"), "time_offset_s": 0.005}
+    settings = {**base, "table": table}
+    checked = check_recordings(recordings, settings)
+    rests = []
+    for recording in (r for r in checked if r.role == "accelerometer"):
+        assert recording.accelerometer is not None
+        assert recording.table_rate is not None
+        moving = np.abs(recording.table_rate)[:, None] > 1e-9
+        rests.append(replace(recording, accelerometer=np.where(moving, np.nan, recording.accelerometer)))
+    settings["noise"] = {"accelerometer": noise_of("accelerometer", checked, settings)}
+    found = fitted("accelerometer", rests, settings)
+    assert found.covariance is not None
+    assert np.sqrt(found.covariance[12, 12]) == pytest.approx(0.005, rel=0.02)
+
+
+def test_priors_of_the_catalogue_are_settings_of_a_table() -> None:
+    assert sorted(bench_priors().values()) == sorted(OF_BENCH)
+    assert set(OF_BENCH) <= set(read_config("table", "acutronic"))
