@@ -50,8 +50,9 @@ def diagnose(
     Returns
     -------
     dict
-        ``verdict, reason`` (``pipeline.diagnosis.verdict``), ``residual_over_noise, selected, ranking, not_observable,
-        unexplained, next_experiment, override``; in addition ``configured, suggested_effect``
+        ``verdict, reason`` (``pipeline.diagnosis.verdict``), ``residual_over_noise, selected, ranking, probability,
+        answer_set, upper_limit`` (``pipeline.estimation.posterior``), ``to_distinguish, not_observable, unexplained,
+        next_experiment, override``; in addition ``configured, suggested_effect``
         (``pipeline.diagnosis.functional_form_search``), ``wander`` (``ratio, time_s, standard_deviation, expected,
         inflated``), ``pictures`` (``...residual_plots``), ``method_errors`` (``...method_errors``), on a table
         ``held_out`` (``error_before, error_after, floor``), without one ``cross_validation``.
@@ -78,6 +79,10 @@ def _not_enough_data(sensor: str, configured: list[str], reason: str, needed: st
         "residual_over_noise": None,
         "selected": [],
         "ranking": [],
+        "probability": {},
+        "answer_set": [],
+        "upper_limit": {},
+        "to_distinguish": "",
         "not_observable": [{"effect": name, "reason": reason} for name in names],
         "unexplained": [],
         "suggested_effect": None,

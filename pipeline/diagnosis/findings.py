@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.diagnosis.words import next_experiment
+from pipeline.diagnosis.words import next_experiment, to_distinguish
+from pipeline.estimation.posterior import CERTAIN
 from pipeline.estimation.selection import ALIKE, EVIDENCE, GATE_BIC, INFLATED
 from pipeline.model.effects import effect
 
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.estimation.design import Term
+    from pipeline.estimation.posterior import Answers
     from pipeline.estimation.ranking import Score
     from pipeline.records import SensorCalibration
 
@@ -43,6 +45,7 @@ class Findings:
     terms: Sequence[Term]  # configured and selected effects at their values in the fit of all
     covariance: Values  # of that fit; the effects' parameters come last
     limits: Mapping[str, Values]  # of plausibility
+    answers: Answers  # how sure each effect is
     shares: Callable[[str], Mapping[str, float]]  # of an effect's fitted signal that each other one reproduces
     left: Sequence[float]  # residual sum or mean of squares of the base, and with each further selected effect
     drop_alone: Callable[[str], float]  # by how much an effect that was not selected would lower the first
@@ -88,6 +91,7 @@ def document_of(found: Findings, configured: list[str], wanted: Sequence[str] | 
         "residual_over_noise": found.over_noise,
         "selected": list(found.selected),
         "ranking": ranking,
+        **_how_sure(found),
         "not_observable": [{"effect": name, "reason": reason} for name, reason in found.hidden.items()],
         "unexplained": found.unknown,
         "suggested_effect": None,
@@ -97,6 +101,27 @@ def document_of(found: Findings, configured: list[str], wanted: Sequence[str] | 
         "wander": _wander(found),
         "method_errors": [],
         **found.more,
+    }
+
+
+def _how_sure(found: Findings) -> dict[str, Any]:
+    """Return probabilities, the answer set, what would make it smaller, and upper limits of what was not selected."""
+    answers = found.answers
+    sets = [
+        {"effects": list(names), "probability": min(probability, CERTAIN)}
+        for names, probability in answers.answer_set()
+    ]
+    limits = {}
+    for name, values in answers.upper_limit.items():
+        this = effect(name).of_recordings(found.turns)
+        linear = [p for p in this.parameters(found.sensor) if p.name not in this.nonlinear or this.moves]
+        if name not in found.selected:
+            limits[name] = {p.name: {"value": float(v), "unit": p.unit} for p, v in zip(linear, values, strict=True)}
+    return {
+        "probability": {name: min(answers.probability(name), CERTAIN) for name in answers.upper_limit},
+        "answer_set": sets,
+        "upper_limit": limits,
+        "to_distinguish": to_distinguish(sets, on_table=found.on_table),
     }
 
 

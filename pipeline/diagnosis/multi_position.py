@@ -22,7 +22,7 @@ import numpy as np
 
 from pipeline.diagnosis import functional_forms as forms
 from pipeline.diagnosis.findings import Findings
-from pipeline.diagnosis.observability import MORE, not_observable_by_hand
+from pipeline.diagnosis.observability import MORE, never_shown, not_observable_by_hand
 from pipeline.diagnosis.residual_dependence import GATE_P
 from pipeline.diagnosis.residual_plots import added_variable_of_rests
 from pipeline.diagnosis.words import listed, plain
@@ -31,6 +31,7 @@ from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.design import Term
 from pipeline.estimation.multi_position.fit import fit
 from pipeline.estimation.multi_position.likelihood import NoiseHypothesis, project_out
+from pipeline.estimation.multi_position.posterior import posterior
 from pipeline.estimation.multi_position.result import calibration_of, model_of
 from pipeline.estimation.multi_position.selection import FAR, select
 from pipeline.estimation.selection import GATE_BIC
@@ -105,6 +106,7 @@ def findings(
         terms=selection.fits[-1].state.terms,
         covariance=selection.fits[-1].covariance,
         limits=selection.limits,
+        answers=posterior(selection, never_shown(hidden, selection.names)),
         shares=lambda name: _shares(selection, name),
         left=chi,
         drop_alone=lambda name: float(signal[name] @ signal[name]) if name in signal else 0.0,

@@ -65,6 +65,11 @@ def _hidden(sensor: str, held: Collection[str], reason: Callable[[Effect], str])
     return found
 
 
+def never_shown(hidden: Collection[str], selected: Collection[str]) -> list[str]:
+    """Return the effects that the recordings cannot show, whatever is selected."""
+    return [name for name in hidden if not any(name in effect(other).contains for other in selected)]
+
+
 def one_way(observations: Observations) -> bool:
     """Return whether the table turns, about no axis in both directions."""
     ways: dict[int, set[float]] = {}

@@ -13,7 +13,7 @@ import numpy as np
 from pipeline.diagnosis.findings import Findings
 from pipeline.diagnosis.functional_form_search import select_with_form, suggested_effect, unexplained
 from pipeline.diagnosis.method_errors import method_errors
-from pipeline.diagnosis.observability import not_observable, one_way
+from pipeline.diagnosis.observability import never_shown, not_observable, one_way
 from pipeline.diagnosis.residual_plots import plots
 from pipeline.diagnosis.verdict import verdict_of_selection
 from pipeline.diagnosis.words import FAR_OFF, plain
@@ -21,6 +21,7 @@ from pipeline.estimation.candidates import turns_of
 from pipeline.estimation.design import Start
 from pipeline.estimation.generalized_least_squares import calibration_of, fit_in_mean_frame, fit_terms
 from pipeline.estimation.observations import observe
+from pipeline.estimation.posterior_turns import posterior
 from pipeline.estimation.selection import FAR_ABOVE, select
 from pipeline.model.effects import catalogue
 from pipeline.records import Noise
@@ -110,6 +111,7 @@ def findings(
         terms=final.terms,
         covariance=final.covariance,
         limits=reported.limits,
+        answers=posterior(selection, never_shown(hidden, reported.names)),
         shares=lambda name: _shares(reported, name),
         left=left,
         drop_alone=drop_alone,

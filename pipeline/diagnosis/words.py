@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 
     from pipeline.diagnosis.findings import Findings
 
+MOST_ANSWERS = 4  # of an answer set in a sentence
 STAYS = 1.15  # times the noise floor: two standard deviations of the rms of 100 samples, 1 / sqrt(200) each
 UNKNOWN = {
     "temperature": "repeat the sequence at two steady temperatures, and while it heats and cools",
@@ -57,6 +58,7 @@ def in_words(part: Mapping[str, Any] | None, sensor: str) -> list[str]:
             f"The fitted bias wander is {wander['standard_deviation']:.2g} {unit_of(sensor)}, against "
             f"{wander['expected']:.2g} expected: it may include a slow effect that is missing in the model."
         )
+    lines += _how_sure(part)
     lines += [_method_error(error, sensor) for error in part.get("method_errors") or []]
     if part["not_observable"]:
         lines.append(_hidden(part))
@@ -145,6 +147,44 @@ def _held_out(part: Mapping[str, Any], sensor: str) -> list[str]:
     if held["error_after"] > held["error_before"]:
         return [line, "It is larger than without the selected effects: they are not the missing ones."]
     return [line, "Either another effect is missing too, or an effect with a similar signal is the right one."]
+
+
+def _how_sure(part: Mapping[str, Any]) -> list[str]:
+    """Return the answer set, what would make it smaller, and the upper limits, as sentences."""
+    sets, lines = part.get("answer_set") or [], []
+    if sets:
+        said = [f"{answer_text(each['effects'])} ({each['probability']:.2g})" for each in sets[:MOST_ANSWERS]]
+        more = [f"{len(sets) - MOST_ANSWERS} more"] if len(sets) > MOST_ANSWERS else []
+        lines.append(f"What is missing, with 95 % probability: {listed([*said, *more], 'or')}.")
+    if part.get("to_distinguish"):
+        lines.append(f"These recordings cannot distinguish them; this one would: {part['to_distinguish']}.")
+    if part.get("upper_limit"):
+        each = "; ".join(f"{plain(name)} {limit_text(limits)}" for name, limits in part["upper_limit"].items())
+        lines.append(f"Upper limits (95 %), were the effect there: {each}.")
+    return lines
+
+
+def answer_text(effects: Sequence[str]) -> str:
+    """Return one answer in words."""
+    return " + ".join(plain(name) for name in effects) or "nothing"
+
+
+def limit_text(limits: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return the largest upper limit of an effect's parameters of each unit: ``0.0031 deg/s/g``."""
+    largest: dict[str, float] = {}
+    for limit in limits.values():
+        largest[limit["unit"]] = max(limit["value"], largest.get(limit["unit"], 0.0))
+    return ", ".join(f"{value:.2g}{'' if unit == '1' else ' ' + unit}" for unit, value in largest.items())
+
+
+def to_distinguish(sets: Sequence[Mapping[str, Any]], *, on_table: bool) -> str:
+    """Return the experiment that would distinguish the two most probable answers; empty where there is one."""
+    if len(sets) < 2:
+        return ""
+    first, second = (each["effects"] for each in sets[:2])
+    apart = [name for name in first if name not in second] or [name for name in second if name not in first]
+    experiment = catalogue()[apart[0]].experiment
+    return experiment if on_table else BY_HAND.get(apart[0], experiment)
 
 
 def _method_error(error: Mapping[str, Any], sensor: str) -> str:

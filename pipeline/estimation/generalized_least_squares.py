@@ -149,6 +149,12 @@ def design_at(observations: Observations, fit: Fit) -> Design:
     return _at(observations, fit.terms, fit.bias, fit.K, np.maximum(fit.scale, 1e-300))
 
 
+def design_beside(observations: Observations, fit: Fit, terms: Sequence[Term]) -> Design:
+    """Return columns of further terms at a fit, its residual in place of the readings, and the base taken out."""
+    residual, base = _residual(observations, fit.terms, fit.bias, fit.K)
+    return Design(observations, terms, fit.K, fit.scale, target=residual, base=base, project=True)
+
+
 def _residual(observations: Observations, terms: Sequence[Term], bias: Values, K: Values) -> tuple[Values, Values]:
     """Return the readings less the model, and what K acts on: the truth and the effects that the axes share."""
     sensor = observations.sensor

@@ -1,0 +1,160 @@
+"""The posterior over effects in turns on a table: the linear problem at a fit, and one for each set of timing effects.
+
+Columns are taken at the fit of what was selected. What its equations hold beyond the first order is taken out of the
+readings, ``y = r + Z p`` with the residual r, the columns Z and the values p of the selected effects. An effect of
+timing moves the motion for all columns; where a set with other ones has weight, the fit is repeated with it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.estimation.design import BASE, Start, Term
+from pipeline.estimation.gauss_markov import WHITE, random_walks
+from pipeline.estimation.generalized_least_squares import design_beside, fit_terms
+from pipeline.estimation.posterior import (
+    Answers,
+    Problem,
+    Search,
+    Version,
+    answers,
+    excited,
+    excluded,
+    limits_or_noise,
+    log_sum,
+    time_constants,
+)
+from pipeline.estimation.ranking import EXCITED, without
+from pipeline.estimation.selection import DELAYS
+from pipeline.model.effects import effect
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.estimation.design import NormalPrior
+    from pipeline.estimation.generalized_least_squares import Fit
+    from pipeline.estimation.selection import Selection
+    from pipeline.model.effects.base import Effect
+
+    Values = NDArray[np.float64]
+
+WORTH_A_FIT = 0.01  # share of the probability of sets with other effects of timing, from which on they are fitted
+MOST_FITS = 3  # of them
+LEAST_LAG_S = 1e-4  # below it a lag has the column of a time offset, and no sign of its own
+
+
+def posterior(selection: Selection, hidden: Collection[str]) -> Answers:
+    """Return probabilities, answer set and upper limits.
+
+    ``hidden``: effects that the recordings cannot show.
+    """
+    names = list(dict.fromkeys(t.effect.name for t in selection.first.candidates if t.effect.name not in hidden))
+    own = frozenset(selection.names)
+    searches: list[Search | None] = []
+    first = Search(_problem(selection, selection.fit, names), seeds=[own])
+    movers = [_movers(own)]
+    best = first.best()
+    if best != own and _movers(best) == movers[0] and any(effect(n).nonlinear for n in best ^ own):
+        first = Search(_problem(selection, _fit(selection, best), names), seeds=[own, best])
+    searches.append(first)
+    for other in _worth_a_fit(first, movers[0]):
+        fit = _fit(selection, first.best([key for key in first.pool if _movers(key) == other]))
+        movers.append(other)
+        lag = next((t.values[0] for t in fit.terms if t.effect.name == DELAYS[1]), np.inf)
+        possible = DELAYS[1] not in other or lag > LEAST_LAG_S  # a lag cannot be negative
+        still = [n for n in names if not effect(n).moves or n in other]
+        searches.append(Search(_problem(selection, fit, still), other) if possible else None)
+
+    def owner(key: frozenset[str]) -> int:
+        return movers.index(_movers(key)) if _movers(key) in movers else 0
+
+    return answers(searches, owner, names)
+
+
+def _movers(names: Collection[str]) -> frozenset[str]:
+    return frozenset(name for name in names if effect(name).moves)
+
+
+def _worth_a_fit(search: Search, own: frozenset[str]) -> list[frozenset[str]]:
+    """Return the sets of timing effects, other than those of the fit, whose sets have weight; the likeliest first."""
+    pool = search.pool
+    total = float(log_sum(np.array([found.score for found in pool.values()])))
+    shares: dict[frozenset[str], float] = {}
+    for names, found in pool.items():
+        key = _movers(names)
+        shares[key] = shares.get(key, 0.0) + float(np.exp(found.score - total))
+    other = [key for key, share in shares.items() if key and key != own and share > WORTH_A_FIT]
+    return sorted(other, key=lambda key: -shares[key])[:MOST_FITS]
+
+
+def _fit(selection: Selection, names: Collection[str]) -> Fit:
+    """Fit base, configured effects and a set of others."""
+    fitted = {term.effect.name: term for term in selection.fit.terms}
+    terms = list(selection.base.terms)
+    for name in sorted(names):
+        this, prior = _candidate(selection, name)
+        values = (selection.steps.get(name) or selection.alone[name]).values
+        if name == DELAYS[1]:
+            values = np.maximum(values, this.starts(selection.observations.sensor)[0])
+        terms.append(fitted.get(name) or Term(this, values, prior=prior))
+    start = Start(selection.fit.bias, selection.fit.K, selection.start.scale)
+    return fit_terms(selection.observations, terms, start, selection.settings)
+
+
+def _candidate(selection: Selection, name: str) -> tuple[Effect, NormalPrior | None]:
+    """Return an effect that was a candidate, with what is known of it beforehand."""
+    term = next(t for t in selection.first.candidates if t.effect.name == name)
+    return term.effect, term.prior
+
+
+def _versions(selection: Selection, fit: Fit, name: str) -> list[tuple[Term, float]]:
+    """Return the terms of an effect and their prior log weights."""
+    this, prior = _candidate(selection, name)
+    held, width = next((t for t in fit.terms if t.effect.name == name), None), None
+    if held is not None and this.nonlinear:
+        last = BASE + sum(len(t.values) for t in fit.terms[: fit.terms.index(held) + 1]) - 1
+        width = float(np.sqrt(fit.covariance[last, last]) / max(abs(held.values[-1]), 1e-300))
+    found = time_constants(this, selection.observations.sensor, held, width)
+    return [(replace(term, full=False, prior=prior), weight) for term, weight in found]
+
+
+def _problem(selection: Selection, fit: Fit, names: Sequence[str]) -> Problem:
+    """Return the linear problem at a fit."""
+    observations = selection.observations
+    configured = fit.terms[: len(selection.base.terms)]
+    fitted = {t.effect.name: t for t in fit.terms[len(configured) :]}
+    listed = [(name, term, weight) for name in names for term, weight in _versions(selection, fit, name)]
+    design = design_beside(observations, fit, [*configured, *(term for _, term, _ in listed)])
+    settings = [WHITE, *selection.settings, *random_walks(selection.settings)]
+    stacked, logarithms = design.products(settings)
+    known = BASE + sum(s.stop - s.start for s in design.slices[: len(configured)])
+    size = np.where(design.sizes() > 0.0, design.sizes(), 1.0)
+    base = stacked[:, :known, :known] / np.outer(size[:known], size[:known])
+    prior = np.array([s.prior for s in settings]) - 0.5 * (logarithms + np.linalg.slogdet(base)[1])
+    products = without(stacked, np.arange(known))[:, known:, known:]
+    change = np.zeros((products.shape[1], products.shape[1]))
+    moved = np.zeros(products.shape[1])
+    moved[-1] = change[-1, -1] = 1.0
+    versions: dict[str, list[Version]] = {}
+    limits: dict[str, Values] = {}
+    for (name, _, weight), at in zip(listed, design.slices[len(configured) :], strict=True):
+        own = slice(at.start - known, at.stop - known)
+        limit = (
+            limits[name]
+            if name in limits
+            else limits_or_noise(selection.limits.get(name), products[0, own, own], 3.0 * observations.samples)
+        )
+        change[own, own] = excited(products[0, own, own], size[at], limit, EXCITED)
+        if name in fitted and name not in versions:
+            moved[own] = fitted[name].values[: at.stop - at.start]
+        limits.setdefault(name, limit)
+        versions.setdefault(name, []).append(Version(np.arange(own.start, own.stop), weight))
+    change[:, -1] = moved
+    free = 3.0 * observations.samples - known
+    within = float(np.sum(observations.scatter / fit.scale**2))
+    return Problem((change.T @ products @ change)[1:], prior[1:], within, free, versions, limits, excluded(names))
