@@ -39,6 +39,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.estimation.gauss_markov import Blocks, GaussMarkov, Setting
+from pipeline.estimation.selection import GATE_BIC
+from pipeline.model.effects import effect
 from pipeline.model.effects.base import truth
 from pipeline.model.kinematics import reference_motion
 from pipeline.records import SENSORS
@@ -224,6 +226,21 @@ def signals_left(case: Case) -> dict[str, float]:
             left += _beside(products, own, others)
         found[name] = max(0.0, left - rounding)
     return found
+
+
+def at_detection(case: Case) -> Case:
+    """Return a case of a family ``limit`` with its effect at a share of the detection size: lambda is that of a gate.
+
+    lambda grows as the square of the size, but for a time constant, which stays as it is.
+    """
+    if case.kind != "limit":
+        return case
+    ((name, values),) = case.hidden.items()
+    count = len(values)
+    gate = count * np.log(3.0 * sum(r.samples for r in _used(case))) + GATE_BIC
+    share = int(case.family.partition("_")[2]) / 100.0 * np.sqrt(gate / signals_left(case)[name])
+    kept = [p.name == "time_constant" for p in effect(name).parameters(case.sensor)]
+    return replace(case, hidden={name: np.where(kept, values, share * np.array(values)).tolist()})
 
 
 def _beside(products: Values, own: int, others: list[int]) -> float:

@@ -13,6 +13,7 @@ Every case follows from its family, number and the study's seed. Families:
     lost, coarse, cold   one effect; a tenth of the samples lost, temperature in steps of 0.5 degC, no temperature
     cycle_<shape>        a form of the temperature's, in a room that warms and cools by some degrees
     staged               one effect, in a unit whose base is calibrated stage by stage
+    limit_<percent>      one effect at 30, 60 or 100 % of its detection size (``pipeline.study.bench.at_detection``)
 
 Effects have the size of the data sheet. Sizes of the MPU-6050 are those of the MPU-6000/6050 product specification 3.4,
 of the STIM300 those of its data sheet TS1524 and of the STIM210's gyroscopes, where they state them; the others, like
@@ -39,7 +40,7 @@ OF_TEMPERATURE = ("temperature_step", "saturation", "exponential")
 FAMILIES = (
     "single", "small", "tiny", "pairs", "pairs_wander", "triples", *(f"null_{noise}" for noise in NOISES), "unseen",
     "removed", "one_axis", *(f"shape_{shape}" for shape in SHAPES), "lost", "coarse", "cold",
-    *(f"cycle_{shape}" for shape in OF_TEMPERATURE), "staged",
+    *(f"cycle_{shape}" for shape in OF_TEMPERATURE), "staged", "limit_30", "limit_60", "limit_100",
 )  # fmt: skip  # a new one goes last: its place is part of every case's random numbers
 # Long recordings at several rates, so that each observable effect can be detected.
 LONG: dict[str, Any] = {"rates_dps": (20.0, 60.0, 100.0, 200.0), "static_s": 300.0}

@@ -30,7 +30,7 @@ from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.stages import fit_stage
 from pipeline.model.effects import leaving_out
 from pipeline.records import SENSORS
-from pipeline.study.bench import recordings_of, signals_left
+from pipeline.study.bench import at_detection, recordings_of, signals_left
 from pipeline.study.cases import REFERENCE, draw
 from pipeline.validation.heldout import validate
 
@@ -99,7 +99,7 @@ def _judged(planned: Sequence[_Planned], processes: int) -> Iterator[tuple[JSON,
 
 def _judged_or_fault(planned: _Planned) -> tuple[JSON, list[JSON]]:
     """Return the truth of a case and what was said of it; a fault is a result, not the end of the study."""
-    case = draw(*planned)
+    case = at_detection(draw(*planned))
     hidden = {**case.to_json(), "signal_left": signals_left(case)}
     try:
         return hidden, judge(case)
@@ -155,6 +155,7 @@ def say(
         "not_observable": [entry["effect"] for entry in document["not_observable"]],
         "unexplained": [entry["covariate"] for entry in document["unexplained"]],
         "residual_over_noise": document["residual_over_noise"],
+        **{key: document[key] for key in ("probability", "answer_set", "upper_limit")},
         "delta_bic": [entry["delta_bic"] for entry in selected],
     }
 
