@@ -41,7 +41,7 @@ EFFECTS = (
 NOISE = (
     "axis", "term", "value", "value_unit", "low", "high", "upper_limit", "correlation_time_s", "frequency_hz", "reason",
 )  # fmt: skip
-FIGURES = ("_before", "_after", "_floor")  # endings of the columns of summary.csv that hold numbers
+FIGURES = ("_before", "_after", "_floor", "_answers")  # endings of the columns of summary.csv that hold numbers
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,8 @@ class CampaignResults:
 
         Columns: ``unit, serial, lot, date, status`` ("ok", "failed"), ``error, sensor, method``; for each sensor
         ``<sensor>_error_before``, ``_error_after`` (rms), ``_mean_abs_before``, ``_mean_abs_after``, ``_noise_floor``
-        (g or deg/s), ``_verdict``, ``_selected`` (missing, joined by ";"), ``_reason``, ``_implausible``; ``pass``;
+        (g or deg/s), ``_verdict``, ``_selected`` (missing, joined by ";"), ``_reason``, ``_answers`` (how many are in
+        the answer set), ``_implausible``; ``pass``;
         and the user's own columns of ``units.csv``.
         """
         kinds = {name: "float" if name.endswith(FIGURES) else "str" for name in COLUMNS} | {"pass": "boolean"}

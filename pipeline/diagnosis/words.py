@@ -5,13 +5,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from pipeline.model.effects import catalogue
-from pipeline.model.effects.base import unit_of
+from pipeline.model.effects.base import largest_by_unit, unit_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.diagnosis.findings import Findings
 
+IN_DOUBT = "If effects of the catalogue alone were the cause, these would be missing"
 MOST_ANSWERS = 4  # of an answer set in a sentence
 STAYS = 1.15  # times the noise floor: two standard deviations of the rms of 100 samples, 1 / sqrt(200) each
 UNKNOWN = {
@@ -153,28 +154,26 @@ def _how_sure(part: Mapping[str, Any]) -> list[str]:
     """Return the answer set, what would make it smaller, and the upper limits, as sentences."""
     sets, lines = part.get("answer_set") or [], []
     if sets:
-        said = [f"{answer_text(each['effects'])} ({each['probability']:.2g})" for each in sets[:MOST_ANSWERS]]
+        said = [f"{_answer(each['effects'])} ({each['probability']:.2g})" for each in sets[:MOST_ANSWERS]]
         more = [f"{len(sets) - MOST_ANSWERS} more"] if len(sets) > MOST_ANSWERS else []
-        lines.append(f"What is missing, with 95 % probability: {listed([*said, *more], 'or')}.")
+        head = IN_DOUBT if part["verdict"] in ("unexplained", "reference_in_doubt") else "What is missing"
+        lines.append(f"{head}, with 95 % probability: {listed([*said, *more], 'or')}.")
     if part.get("to_distinguish"):
         lines.append(f"These recordings cannot distinguish them; this one would: {part['to_distinguish']}.")
     if part.get("upper_limit"):
-        each = "; ".join(f"{plain(name)} {limit_text(limits)}" for name, limits in part["upper_limit"].items())
+        each = "; ".join(f"{plain(name)} {_limit(limits)}" for name, limits in part["upper_limit"].items())
         lines.append(f"Upper limits (95 %), were the effect there: {each}.")
     return lines
 
 
-def answer_text(effects: Sequence[str]) -> str:
+def _answer(effects: Sequence[str]) -> str:
     """Return one answer in words."""
     return " + ".join(plain(name) for name in effects) or "nothing"
 
 
-def limit_text(limits: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return the largest upper limit of an effect's parameters of each unit: ``0.0031 deg/s/g``."""
-    largest: dict[str, float] = {}
-    for limit in limits.values():
-        largest[limit["unit"]] = max(limit["value"], largest.get(limit["unit"], 0.0))
-    return ", ".join(f"{value:.2g}{'' if unit == '1' else ' ' + unit}" for unit, value in largest.items())
+def _limit(limits: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return the upper limits of an effect's parameters, the largest of each unit: ``0.0031 deg/s/g``."""
+    return ", ".join(f"{v:.2g}{'' if unit == '1' else ' ' + unit}" for unit, v in largest_by_unit(limits).items())
 
 
 def to_distinguish(sets: Sequence[Mapping[str, Any]], *, on_table: bool) -> str:

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.model.effects import catalogue
+from pipeline.model.effects.base import largest_by_unit, parameter_limits
 from pipeline.records import AXES, SENSOR_UNITS
 from pipeline.report.axis import LINEAR_TO
 from pipeline.report.chart import Dots, Figure, Layer, Line, Panel, chart
@@ -27,6 +29,7 @@ JSON = dict[str, Any]
 GATE = LINEAR_TO  # delta BIC, strong evidence: A. E. Raftery, Sociological Methodology 25 (1995) 139, table 6
 CLOSE = 0.8  # share of the selected effect's delta BIC from which another effect is named as a rival
 MOST, FEWEST, MOST_HIDDEN, BRACKETS = 9, 3, 6, 2  # effects and brackets that a chart has room for
+MOST_LIMITS = 8  # upper limits that a chart has room for
 COLOURS = {2: "selected", 4: "above the threshold", 3: "below the threshold"}
 ON_THE_LINE = 3.0  # mean square of the points about the line, in standard errors: 1 for noise, bins being correlated
 MOST_EXPLAINED = 0.97  # share of the points' variance that a line must explain where they leave it by more
@@ -45,6 +48,46 @@ def evidence_figures(sensor: str, found: JSON) -> list[Figure]:
     """Return the charts of a sensor's diagnosis."""
     first = [f for f in (ranking(sensor, found), added_variable(sensor, found)) if f]
     return first + unexplained(sensor, found)
+
+
+def limit_rows(sensor: str, found: JSON, sheet: JSON) -> list[JSON]:
+    """Return for each effect that was not selected its upper limits as text, and the largest share of the data sheet's.
+
+    ``share`` is None where the data sheet has no limit; the largest come first.
+    """
+    rows = []
+    for name, limits in (found.get("upper_limit") or {}).items():
+        this = catalogue().get(name)
+        stated: dict[str, float] = {}
+        if this is not None:
+            values = parameter_limits(this, sensor, sheet.get("effects") or {}).tolist()
+            stated = dict(zip((p.name for p in this.parameters(sensor)), values, strict=True))
+        text = ", ".join(f"{number(v, 2)} {unit_text(unit)}".rstrip() for unit, v in largest_by_unit(limits).items())
+        shares = {key: v["value"] / stated[key] for key, v in limits.items() if np.isfinite(stated.get(key, np.inf))}
+        row: JSON = {"effect": name, "text": text, "share": max(shares.values(), default=None)}
+        if shares:
+            most = limits[max(shares, key=lambda key: shares[key])]
+            row["label"] = f"{plain(name)}: below {number(most['value'], 2)} {unit_text(most['unit'])}".rstrip()
+        rows.append(row)
+    return sorted(rows, key=lambda row: -(row["share"] or 0.0))
+
+
+def upper_limits(sensor: str, rows: Sequence[JSON]) -> Figure | None:
+    """Draw upper limits as shares of the data sheet's limits; None where there is none."""
+    shown = [row for row in rows if row["share"]]
+    if not shown:
+        return None
+    count, beyond = len(shown), sum(row["share"] >= 1.0 for row in shown)
+    finding = f"{count - beyond} of {count} effects that were not selected are excluded at the data sheet's limit"
+    caption = (
+        "Upper limits (95 %) of the largest parameter of each effect, were it there, over the data sheet's limit: left "
+        "of the line the recordings exclude an effect of that size."
+    )
+    if rest := count - MOST_LIMITS:
+        caption += f" {rest} more are lower, listed below." if rest > 0 else ""
+    points = [Point(row["label"], row["share"], 3) for row in shown[:MOST_LIMITS]]
+    figure = Figure(f"{sensor}-limits", finding, caption)
+    return bars(figure, points, "upper limit over the data sheet's limit", levels={"data sheet": 1.0})
 
 
 def ranking_rows(found: JSON) -> list[JSON]:

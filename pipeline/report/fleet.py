@@ -231,7 +231,8 @@ def write_parameters(path: Path, rows: Sequence[JSON], fitted: Mapping[str, Mapp
     for column in dict.fromkeys(key for row in rows for key in row):
         values = [row.get(column) for row in rows]
         kinds = {type(value) for value in values if value is not None}
-        kind = {frozenset([bool]): pa.bool_(), frozenset([float]): pa.float64()}.get(frozenset(kinds), pa.string())
+        known = {bool: pa.bool_(), int: pa.int64(), float: pa.float64()}
+        kind = known.get(kinds.pop(), pa.string()) if len(kinds) == 1 else pa.string()
         arrays.append(pa.array(values, kind))
         fields.append(pa.field(column, kind))
     units = {name: p.unit for each in fitted.values() for name, p in each.items()}

@@ -19,6 +19,7 @@ JSON = dict[str, Any]
 UNIT_COLUMNS = ("unit", "serial", "lot", "date", "status", "error", "sensor", "method")
 SENSOR_COLUMNS = (
     "error_before", "error_after", "mean_abs_before", "mean_abs_after", "noise_floor", "verdict", "selected", "reason",
+    "answers",
 )  # fmt: skip
 IMPLAUSIBLE = tuple(f"{s}_implausible" for s in SENSORS)
 COLUMNS = (*UNIT_COLUMNS, *(f"{s}_{c}" for s in SENSORS for c in SENSOR_COLUMNS), "pass", *IMPLAUSIBLE)
@@ -49,6 +50,7 @@ def summary_row(
         selected = found.get("selected") if found.get("verdict") == "missing_effect" else None
         errors = [step.get(error) for error in ("rms_error", "mean_abs_error") for step in (raw, final)]
         texts = [found.get("verdict"), ";".join(selected or []) or None, found.get("reason") or None]
+        texts.append(len(found.get("answer_set") or []) or None)
         values = [*errors, held_out.get("noise_floor"), *texts]
         row |= {f"{sensor}_{column}": value for column, value in zip(SENSOR_COLUMNS, values, strict=True)}
         implausible = (calibration.get(sensor) or {}).get("implausible") or []

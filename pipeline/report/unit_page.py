@@ -11,7 +11,7 @@ from pipeline.files import json_text
 from pipeline.model.plausible import sentences
 from pipeline.outcome import VERDICTS, commands_of, place, run_command
 from pipeline.records import SENSOR_UNITS, SENSORS
-from pipeline.report.diagnosis_section import evidence_figures, ranking_rows
+from pipeline.report.diagnosis_section import evidence_figures, limit_rows, ranking_rows, upper_limits
 from pipeline.report.held_out_section import (
     attitude_over_time,
     checks,
@@ -96,6 +96,7 @@ def _sensor(
     noise, traces = found.get("noise") or held_out.get("noise"), residuals(sensor, part, recordings, table)
     first, last = first_and_last_step(held_out)
     at_rest = (calibration.get("noise") or {}).get(sensor)
+    limits = limit_rows(sensor, found, sheet)
     steps = [error_steps(sensor, held_out, found, vector=vector) for vector in (False, True)]
     return {
         "held_out": held_out,
@@ -116,6 +117,8 @@ def _sensor(
         "diagnosis": found,
         "ranking": ranking_rows(found),
         "evidence_figures": evidence_figures(sensor, found),
+        "limits": limits,
+        "limit_figures": [figure for figure in [upper_limits(sensor, limits)] if figure],
         "implausible": sentences(sensor, part),
         "kind": VERDICTS.get(found.get("verdict", ""), ""),
         "commands": commands_of(found, sensor, str(calibration.get("unit")), settings.get("run") or {}),

@@ -38,6 +38,9 @@ KEYS = {
     "residual_over_noise",
     "selected",
     "ranking",
+    "probability",
+    "answer_set",
+    "upper_limit",
     "not_observable",
     "unexplained",
     "next_experiment",
@@ -88,6 +91,10 @@ def test_an_effect_of_data_sheet_size_is_named_alone_and_mended(sensor: str, nam
     mended = diagnosed(sensor, hidden(sensor, name), [name])
     assert mended["verdict"] == "nothing_missing"
     assert 0.85 < mended["residual_over_noise"] < 1.05 < part["residual_over_noise"]
+    assert [name] in [answer["effects"] for answer in part["answer_set"]]
+    assert part["probability"][name] > 0.02
+    assert mended["answer_set"][0]["effects"] == []
+    assert name not in {**mended["probability"], **mended["upper_limit"], **part["upper_limit"]}
 
 
 @pytest.mark.parametrize("sensor", SIZE)

@@ -49,6 +49,8 @@ def test_an_effect_of_data_sheet_size_is_named_alone_and_mended(model: str, sens
     assert part["verdict"] == "missing_effect"
     assert part["selected"] == [name]
     assert part["override"] == f"effects.{sensor}=[{name}]"
+    assert [name] in [answer["effects"] for answer in part["answer_set"]]
+    assert name not in part["upper_limit"]
     best = part["ranking"][0]
     assert best["effect"] == name
     assert best["plausible"]
@@ -57,6 +59,8 @@ def test_an_effect_of_data_sheet_size_is_named_alone_and_mended(model: str, sens
     assert best["held_out_error_after"] < best["held_out_error_before"]
     mended = unit.diagnosed(sensor, [name], before)
     assert mended["selected"] == []
+    assert [] in [answer["effects"] for answer in mended["answer_set"]]
+    assert name not in mended["probability"]
     assert mended["residual_over_noise"] < 1.5 < part["residual_over_noise"]
 
 

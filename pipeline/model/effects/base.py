@@ -243,6 +243,14 @@ def unit_of(sensor: str) -> str:
     return SENSOR_UNITS[sensor]
 
 
+def largest_by_unit(limits: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
+    """Return the largest of some limits ``{parameter: {value, unit}}`` of each unit."""
+    found: dict[str, float] = {}
+    for limit in limits.values():
+        found[limit["unit"]] = max(limit["value"], found.get(limit["unit"], 0.0))
+    return found
+
+
 def parameter_limits(effect: Effect, sensor: str, limits: Mapping[str, float]) -> Values:
     """Return the limit of each parameter's absolute value: (p,) array, infinite where there is none.
 

@@ -1,0 +1,146 @@
+"""The posterior over effects: against dense evidence, full enumeration, draws, and units with known truth."""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from scipy.linalg import null_space
+from scipy.special import logsumexp
+
+from pipeline.estimation.posterior import (
+    ODDS,
+    SCALE_PRIOR,
+    SCALES,
+    Answers,
+    Problem,
+    Search,
+    Version,
+    answers,
+    excited,
+    quantile,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from numpy.typing import NDArray
+
+    Values = NDArray[np.float64]
+
+NAMES = {"a": 2, "b": 1, "c": 3}
+
+
+class Dense:
+    """Readings of a base and three effects under two noises, and their evidence by the definition."""
+
+    def __init__(self, seed: int, sizes: dict[str, float]) -> None:
+        rng = np.random.default_rng(seed)
+        n = 40
+        self.X = np.column_stack([np.ones(n), rng.standard_normal(n)])
+        self.Z = {name: rng.standard_normal((n, k)) * 8.0 for name, k in NAMES.items()}
+        self.Z["b"] += 0.7 * self.Z["a"][:, :1]
+        walk = np.minimum.outer(np.arange(n), np.arange(n)) + 1.0
+        self.C = [np.eye(n), np.eye(n) + 0.02 * walk]
+        self.prior = np.log([0.7, 0.3])
+        self.y = self.X @ [3.0, -1.0] + np.linalg.cholesky(self.C[1]) @ rng.standard_normal(n)
+        for name, size in sizes.items():
+            self.y += self.Z[name] @ (size * rng.choice([-1.0, 1.0], NAMES[name]))
+
+    def log_evidence(self, scales: dict[str, float], theta: int) -> float:
+        """Return log p of the contrasts of the readings, sigma integrated with the prior 1 / sigma."""
+        A = null_space(self.X.T)
+        V = self.C[theta] + sum((s**2 * self.Z[n] @ self.Z[n].T for n, s in scales.items()), np.zeros_like(self.C[0]))
+        V, z = A.T @ V @ A, A.T @ self.y
+        return float(
+            self.prior[theta] - 0.5 * np.linalg.slogdet(V)[1] - 0.5 * len(z) * np.log(z @ np.linalg.solve(V, z))
+        )
+
+    def averaged(self, names: Iterable[str]) -> float:
+        """Return log p of a set, all scales and noises enumerated, with its prior odds."""
+        names = tuple(names)
+        terms = [
+            self.log_evidence({n: float(SCALES[s]) for n, s in zip(names, picks, strict=True)}, theta)
+            + sum(float(SCALE_PRIOR[s]) for s in picks)
+            for picks in product(range(len(SCALES)), repeat=len(names))
+            for theta in range(2)
+        ]
+        return float(logsumexp(terms)) + ODDS * len(names)
+
+    def problem(self) -> Problem:
+        """Return the same as products under each noise."""
+        columns = np.column_stack([*self.Z.values(), self.y])
+        products, prior = [], []
+        for C, log_prior in zip(self.C, self.prior, strict=True):
+            inverse = np.linalg.inv(C)
+            XtX = self.X.T @ inverse @ self.X
+            M = inverse - inverse @ self.X @ np.linalg.solve(XtX, self.X.T @ inverse)
+            products.append(columns.T @ M @ columns)
+            prior.append(log_prior - 0.5 * np.linalg.slogdet(C)[1] - 0.5 * np.linalg.slogdet(XtX)[1])
+        edges = np.cumsum([0, *NAMES.values()])
+        versions = {
+            name: [Version(np.arange(start, stop), 0.0)]
+            for name, start, stop in zip(NAMES, edges[:-1], edges[1:], strict=True)
+        }
+        limits = {name: np.ones(k) for name, k in NAMES.items()}
+        return Problem(np.array(products), np.array(prior), 0.0, len(self.y) - 2.0, versions, limits)
+
+
+@pytest.mark.parametrize("sizes", [{}, {"a": 0.1}, {"a": 0.3, "c": 0.05}], ids=["nothing", "weak", "two"])
+def test_the_score_of_every_set_is_its_evidence_by_the_definition(sizes: dict[str, float]) -> None:
+    dense = Dense(3, sizes)
+    search = Search(dense.problem())
+    zero = search.pool[frozenset()].score - dense.averaged(())
+    for names, found in search.pool.items():
+        expected = dense.averaged(sorted(names)) + zero
+        assert found.score == pytest.approx(expected, abs=1e-8 if len(names) < 2 else 0.15), names
+    assert search.best() == frozenset(sizes)
+
+
+def test_an_upper_limit_is_the_quantile_of_draws_from_the_posterior() -> None:
+    rng = np.random.default_rng(8)
+    weight, mean = np.array([0.7, 0.2, 0.1]), np.array([[0.1], [-1.0], [2.0]])
+    deviation = np.array([[0.5], [0.1], [1.0]])
+    pick = rng.choice(3, 400_000, p=weight)
+    drawn = np.abs(mean[pick, 0] + deviation[pick, 0] * rng.standard_normal(len(pick)))
+    assert quantile(weight, mean, deviation)[0] == pytest.approx(np.quantile(drawn, 0.95), rel=0.01)
+
+
+def test_limits_of_absent_effects_cover_the_true_size_as_often_as_they_say() -> None:
+    rng, covered, n = np.random.default_rng(21), 0, 60
+    for k in range(n):  # sizes drawn from the prior at its second scale
+        size = abs(0.06 * rng.standard_normal())
+        dense = Dense(1000 + k, {"b": size})
+        covered += answers([Search(dense.problem())], lambda _: 0, NAMES).upper_limit["b"][0] >= size
+    assert covered >= 54  # 3 % point of a binomial of 60 and 0.95
+
+
+def test_effects_that_exclude_each_other_are_never_together() -> None:
+    dense = Dense(5, {"a": 0.3, "b": 0.3})
+    free = dense.problem()
+    apart = Problem(
+        free.products, free.prior, free.within, free.free, free.versions, free.limits,
+        {"a": frozenset("b"), "b": frozenset("a")},
+    )  # fmt: skip
+    assert frozenset("ab") in Search(free).pool
+    found = Search(apart)
+    assert not any({"a", "b"} <= names for names in found.pool)
+    assert set(answers([found], lambda _: 0, NAMES).upper_limit) == set(NAMES)
+
+
+def test_an_answer_set_holds_the_fewest_sets_with_95_percent() -> None:
+    sets = [(("a",), 0.6), (("b",), 0.3), ((), 0.06), (("a", "b"), 0.04)]
+    found = Answers(sets, {})
+    assert found.answer_set() == sets[:3]
+    assert found.probability("a") == pytest.approx(0.64)
+
+
+def test_directions_without_excitation_are_left_out() -> None:
+    column = np.random.default_rng(1).standard_normal((30, 1))
+    Z = np.column_stack([column, column])  # only the sum of both parameters shows
+    size = np.linalg.norm(Z, axis=0)
+    change = excited(Z.T @ Z, size, np.array([2.0, 2.0]), 1e-3)
+    assert np.linalg.matrix_rank(Z @ change, tol=1e-9) == 1
+    np.testing.assert_allclose(Z @ change, 2.0 * Z, atol=1e-12)
