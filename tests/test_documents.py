@@ -1,6 +1,7 @@
 """The documents name files and functions that exist."""
 
 import re
+import runpy
 from pathlib import Path
 
 import pytest
@@ -35,3 +36,10 @@ def test_functions_that_the_architecture_names_exist() -> None:
     ]
     assert len(named) > 20
     assert not missing
+
+
+def test_drawings_are_those_of_the_geometry() -> None:
+    script = runpy.run_path(str(ROOT / "docs" / "images" / "draw.py"))
+    for name, text in script["drawings"]().items():
+        found = (ROOT / "docs" / "images" / name).read_text()
+        assert found == text, f"docs/images/{name}: run python docs/images/draw.py"

@@ -1,8 +1,9 @@
-"""Create an empty campaign with comments."""
+"""Create an empty campaign with comments, and a README that says how to record it."""
 
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,11 +12,15 @@ import yaml
 from pipeline.errors import ConfigurationError, InputError
 from pipeline.files import CONFIGS
 from pipeline.outcome import run_command
+from pipeline.planning.instructions import readme
+from pipeline.simulation.description import UnitDescription
+from pipeline.simulation.procedures import TABLE_PROCEDURES
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
 GROUPS = ("sensor", "table", "procedure", "method", "filter", "ingest", "certificate")
+UNITS = {"accelerometer": "g", "gyroscope": "deg/s"}
 HEADER = "unit,serial,lot,date,sensor,table,procedure,overrides"
 SETTINGS = """\
 # Hydra overrides for all units of this campaign; units.csv and the command line are stronger.
@@ -34,27 +39,43 @@ def main(argv: Sequence[str]) -> int:
     """Run ``python -m pipeline new DIR``."""
     parser = argparse.ArgumentParser(prog="python -m pipeline new", description=__doc__)
     parser.add_argument("directory", type=Path, metavar="DIR", help="the campaign's directory (created if need be)")
-    parser.add_argument("--sensor", default="generic", help="sensor model of the example row (default: generic)")
-    parser.add_argument("--table", help="table of the example row (default: that of the procedure)")
-    parser.add_argument("--procedure", default="three_axis_turns", help="procedure (default: three_axis_turns)")
-    parser.add_argument("--unit", default="U1", help="name of the example unit (default: U1)")
+    parser.add_argument("--sensor", metavar="NAME", help="sensor model of the example row (default: generic)")
+    parser.add_argument("--range", type=float, nargs="+", metavar="RANGE", help="of the accelerometer in g, and of the "
+                        "gyroscope in deg/s (default: those of the sensor's file)")  # fmt: skip
+    parser.add_argument("--procedure", metavar="NAME", help="how it is recorded (default: three_axis_turns)")
+    parser.add_argument("--table", metavar="NAME", help="table of the example row (default: that of the procedure)")
+    parser.add_argument("--unit", default="U1", metavar="NAME", help="name of the example unit (default: U1)")
     arguments = parser.parse_args(argv)
     sheet = arguments.directory / "units.csv"
     if sheet.exists():
         raise InputError("exists already; choose a directory without a campaign", str(sheet))
-    sensor = _option("sensor", arguments.sensor)
-    procedure = _option("procedure", arguments.procedure)
-    table_name = arguments.table or procedure["table"]
+    sensor_name = _chosen("sensor", arguments.sensor, "generic")
+    sensor = _option("sensor", sensor_name)
+    ranges = _chosen_ranges(sensor, arguments.range)
+    procedure_name = _chosen("procedure", arguments.procedure, "three_axis_turns")
+    procedure = _option("procedure", procedure_name)
+    table_name = _chosen("table", arguments.table, procedure["table"])
     table = _option("table", table_name)
+    if (table["motion"] == "none") == (procedure_name in TABLE_PROCEDURES):
+        known = ", ".join(TABLE_PROCEDURES)
+        raise ConfigurationError(
+            f"procedure {procedure_name} does not fit table {table_name}: {known} need a table, the others go without "
+            "one (table hand); docs/record.md shows both"
+        )
+    unit = UnitDescription(arguments.unit, sensor=sensor_name, table=table_name, procedure=procedure_name)
+    text = readme(unit, arguments.directory.resolve().name)
+    if ranges != _ranges_of(sensor):
+        text += "\nThe sizes hold for the ranges of the sensor's file; campaign.yaml states the ranges of this bench.\n"
     folder = arguments.directory / procedure["folder"].replace("{unit}", arguments.unit)
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "README.md").write_text(_recordings(arguments.procedure, procedure), encoding="utf-8")
+    (arguments.directory / "README.md").write_text(text, encoding="utf-8")
     (arguments.directory / "campaign.yaml").write_text(
-        SETTINGS + _ranges(arguments.sensor, sensor) + _options(), encoding="utf-8"
+        SETTINGS + _ranges(sensor_name, sensor, ranges) + _options(), encoding="utf-8"
     )
-    row = f"{arguments.unit},,,,{arguments.sensor},{table_name},{arguments.procedure},"
+    row = f"{arguments.unit},,,,{sensor_name},{table_name},{procedure_name},"
     sheet.write_text(f"{HEADER}\n{row}\n", encoding="utf-8")
-    print(f"{sheet}: one row for each unit; put the recordings into {folder} (its README.md lists them)")
+    print(f"{sheet}: one row for each unit; put the recordings into {folder}")
+    print(f"{arguments.directory / 'README.md'}: how to mount and record this bench, and what the recordings determine")
     print(_accuracy(table_name, table))
     print(f"then: {run_command({'campaign': str(arguments.directory)})}")
     return 0
@@ -81,40 +102,50 @@ def _accuracy(name: str, table: dict[str, Any]) -> str:
     )
 
 
-def _ranges(name: str, sensor: dict[str, Any]) -> str:
-    """Return comments that show how to set other ranges than those of the sensor's file."""
-    units = {"accelerometer": "g", "gyroscope": "deg/s"}
-    held = ", ".join(f"{s} +-{sensor[s]['full_scale']:g} {unit}" for s, unit in units.items())
-    lines = [
-        "",
-        f"# The file of the sensor {name} states the ranges {held}. Example for ranges twice as large:",
-        "# models:",
-    ]
-    lines.append(f"#   {name}:")
-    for part in units:
-        full_scale, counts = (float(sensor[part][key]) for key in ("full_scale", "counts_per_unit"))
-        lines.append(f"#     - sensor.{part}.full_scale={2 * full_scale:g}")
-        lines.append(f"#     - sensor.{part}.counts_per_unit={counts / 2:.10g}")
+def _chosen(group: str, given: str | None, default: str) -> str:
+    """Return the option of a group: as given, as answered on a terminal, or the default."""
+    if given is not None or not sys.stdin.isatty():
+        return given or default
+    files = sorted((CONFIGS / group).glob("*.yaml"))
+    print(f"{group}:")
+    for file in files:
+        print(f"  {file.stem:<18}{file.read_text(encoding='utf-8').splitlines()[0].removeprefix('# ')}")
+    return input(f"{group} [{default}]: ").strip() or default
+
+
+def _chosen_ranges(sensor: dict[str, Any], given: list[float] | None) -> list[float]:
+    """Return the range of each sensor: as given, as answered on a terminal, or those of the sensor's file."""
+    held = _ranges_of(sensor)
+    if given is None and sys.stdin.isatty():
+        shown = " ".join(f"{value:g}" for value in held)
+        try:
+            given = [float(word) for word in input(f"ranges, g and deg/s [{shown}]: ").split()]
+        except ValueError:
+            raise ConfigurationError(f"ranges: expected two numbers such as {shown}") from None
+    wanted = [*(given or []), *held[len(given or []) :]]
+    if len(wanted) > len(held) or not all(value > 0.0 for value in wanted):
+        raise ConfigurationError("--range takes that of the accelerometer in g, then that of the gyroscope in deg/s")
+    return wanted
+
+
+def _ranges_of(sensor: dict[str, Any]) -> list[float]:
+    return [float(sensor[name]["full_scale"]) for name in UNITS]
+
+
+def _ranges(name: str, sensor: dict[str, Any], wanted: list[float]) -> str:
+    """Return the settings of the ranges, as comments where they are those of the sensor's file."""
+    held = ", ".join(f"{s} +-{sensor[s]['full_scale']:g} {unit}" for s, unit in UNITS.items())
+    pairs = list(zip(UNITS, wanted, strict=True))
+    other = [(part, value) for part, value in pairs if value != float(sensor[part]["full_scale"])]
+    mark = "" if other else "# "
+    lines = ["", f"# The file of the sensor {name} states the ranges {held}."]
+    lines += [] if other else ["# Example for ranges twice as large:"]
+    lines += [f"{mark}models:", f"{mark}  {name}:"]
+    for part, value in other or [(part, 2.0 * value) for part, value in pairs]:
+        counts = float(sensor[part]["counts_per_unit"]) * float(sensor[part]["full_scale"]) / value
+        lines.append(f"{mark}    - sensor.{part}.full_scale={value:g}")
+        lines.append(f"{mark}    - sensor.{part}.counts_per_unit={counts:.10g}")
     return "\n".join(lines) + "\n"
-
-
-def _recordings(name: str, procedure: dict[str, Any]) -> str:
-    lines = [
-        f"# Recordings of the procedure {name}",
-        "",
-        "`.mcap` in place of `.csv` works for each, and so do the formats of docs/formats.md.",
-        "",
-    ]
-    for recording in procedure["recordings"].values():
-        axis = f", turns about {recording['axis']}" if recording["axis"] else ""
-        optional = " (optional)" if recording["optional"] else ""
-        lines.append(f"- `{recording['file']}.csv`: {recording['role']}{axis}{optional}")
-    columns = "time_s, accel_x_g, accel_y_g, accel_z_g, gyro_x_dps, gyro_y_dps, gyro_z_dps"
-    optional = "temperature_degc, table_angle_deg, table_rate_dps, table_qw, table_qx, table_qy, table_qz"
-    lines += ["", f"Columns of a canonical CSV: {columns}, and optionally {optional}.", ""]
-    lines += ["Other columns, units and raw counts: describe them in an ingest config.", ""]
-    lines += ["Face that points up at table angle 0, and direction in which the angle counts: docs/mounting.md.", ""]
-    return "\n".join(lines)
 
 
 def _options() -> str:

@@ -52,6 +52,7 @@ MOST = 60  # rests that are planned ahead: some 7 min
 FEWEST = 9  # rests of the fit, one a parameter
 IDEAL = np.concatenate([np.zeros(3), np.eye(3)[ROWS, COLUMNS]])
 PLACE = np.array([0, 1, 2, *(3 + 3 * ROWS + COLUMNS)])  # of the nine among bias and full matrix
+SAME = 0.08  # of two components of the vertical: 5 deg from the edge between their sides, so that its name stays
 LEVEL_DEG = 3.0  # a tilt that is not worth a word: units are set down by hand to about 1 deg
 BETWEEN_SIDES = np.tan(np.radians(22.5))  # ratio of two components above which a corner is raised, not a side
 
@@ -72,7 +73,7 @@ def in_words(up: Sequence[float] | Values) -> str:
     '+z up, then the +x side raised by 27 deg'
     """
     n = np.asarray(up, float) / float(np.linalg.norm(up))
-    first = max((2, 1, 0), key=lambda i: round(abs(float(n[i])), 6))
+    first = next(i for i in (2, 1, 0) if abs(n[i]) > np.max(np.abs(n)) - SAME)
     tilt = float(np.degrees(np.arccos(min(abs(n[first]), 1.0))))
     if tilt < LEVEL_DEG:
         return f"{_axis(n, first)} up"
@@ -218,8 +219,9 @@ def propose(progress: Progress, goal: float) -> Proposal:
     planned, F = _planned(progress, X, goal)
     expected = progress.largest(F, len(planned))
     if progress.next_is_held_out:  # as far as it can be from all rests, so that it judges the fit between them
-        at = int(np.argmin(np.max(up @ progress.up.T, axis=1)))
-        return Proposal(up[at], len(planned), expected)
+        free = np.setdiff1d(np.arange(len(up)), planned) if len(set(planned)) < len(up) else np.arange(len(up))
+        near = np.max(up[free] @ progress.up.T, axis=1, initial=-1.0)
+        return Proposal(up[free[int(np.argmin(near))]], len(planned), expected)
     rows = planned or range(len(up))
     gain = np.einsum("ni,ij,nj->n", X[rows], np.linalg.inv(progress.information), X[rows])
     return Proposal(up[rows[int(np.argmax(gain))]], len(planned), expected)

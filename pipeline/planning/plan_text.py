@@ -49,8 +49,8 @@ def _row(entry: Mapping[str, Any]) -> list[str]:
     alike = ", ".join(f"{a['effect']} {a['share']:.2f}" for a in entry["look_alikes"][:2])
     return [
         entry["effect"],
-        _size(entry["smallest"], entry["unit"]),
-        _share(entry["share_of_limit"]),
+        size_text(entry["smallest"], entry["unit"]),
+        share_text(entry["share_of_limit"]),
         alike,
         _note(entry),
     ]
@@ -62,18 +62,18 @@ def _note(entry: Mapping[str, Any]) -> str:
     limit = None if entry["share_of_limit"] is None else smallest / entry["share_of_limit"]
     never = named is None or (limit is not None and named > limit)
     if taken:
-        return f"named as {taken}" + ("" if never else f" below {_size(named, entry['unit'])}")
+        return f"named as {taken}" + ("" if never else f" below {size_text(named, entry['unit'])}")
     if never:
         return "not distinguishable from those"
-    return f"named from {_size(named, entry['unit'])}" if named > CLEARLY_LARGER * smallest else ""
+    return f"named from {size_text(named, entry['unit'])}" if named > CLEARLY_LARGER * smallest else ""
 
 
-def _size(value: float, unit: str) -> str:
+def size_text(value: float, unit: str) -> str:
     """Return a size with its unit."""
     return f"{value:.2g}" + ("" if unit == "1" else f" {unit}")
 
 
-def _share(value: float | None) -> str:
+def share_text(value: float | None) -> str:
     """Return a share of a limit in per cent."""
     if value is None:
         return "no limit"
@@ -100,7 +100,11 @@ def _compared(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]:
     for name in sorted(a.keys() | b.keys() | hidden):
         cells = [name]
         for found in (a.get(name), b.get(name)):
-            cells += [_size(found["smallest"], found["unit"]), _share(found["share_of_limit"])] if found else ["-", ""]
+            cells += (
+                [size_text(found["smallest"], found["unit"]), share_text(found["share_of_limit"])]
+                if found
+                else ["-", ""]
+            )
         both = name in a and name in b
         rows.append([*cells, f"{b[name]['smallest'] / a[name]['smallest']:.2f}" if both else ""])
     return [*reasons, *(_aligned(rows) if len(rows) > 1 else [])]
