@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from pipeline.commands.check import DEFAULT_PROFILE, campaign_of, composed, named
 from pipeline.config.campaign import load_campaign
 from pipeline.errors import CannotCalibrateError, ConfigurationError, PipelineError
-from pipeline.io.files import candidate_files, recording_files
+from pipeline.io.files import MESSAGE_FORMATS, candidate_files, recording_files
 from pipeline.io.ingest_settings import checks_of
 from pipeline.io.read import read_table, to_recording
 from pipeline.planning.next_rest import MOST, in_words, progress_of, propose
@@ -150,8 +150,8 @@ def _by_hand(config: dict[str, Any]) -> dict[str, Any]:
 
 
 def _complete_rows(file: Path, folder: Path) -> Path:
-    """Return a copy of a text log up to its last complete row; other logs as they are."""
-    if file.suffix == ".mcap":
+    """Return a copy of a text log up to its last complete row; logs of messages as they are."""
+    if file.suffix.lower() in (".mcap", *MESSAGE_FORMATS):
         return file
     copy = folder / file.name
     copy.write_bytes(file.read_bytes().rpartition(b"\n")[0] + b"\n")
