@@ -1,4 +1,4 @@
-"""Print a diagnosis in plain words."""
+"""Print a diagnosis in plain words, or the equation of a calibration with its numbers and a worked sample."""
 
 from __future__ import annotations
 
@@ -9,8 +9,11 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from pipeline.commands.convert import sheets_of
 from pipeline.diagnosis.words import in_words
 from pipeline.errors import InputError, MissingInputError
+from pipeline.exports.explanation import explain_calibration
+from pipeline.exports.reading import format_of, read_any
 from pipeline.history import read_history
 from pipeline.model.plausible import sentences
 from pipeline.outcome import Finding, commands_of, next_commands, read_summary, verdict_lines
@@ -34,10 +37,20 @@ class Selection(NamedTuple):
 def main(argv: Sequence[str]) -> int:
     """Run ``python -m pipeline explain C [UNIT ...]``."""
     parser = argparse.ArgumentParser(prog="python -m pipeline explain", description=__doc__)
-    parser.add_argument("campaign", metavar="C", help="a campaign's name or results folder, or one diagnosis (JSON)")
+    parser.add_argument("campaign", metavar="C", help="a campaign, its results, a diagnosis (JSON), or a calibration")
     parser.add_argument("units", metavar="UNIT", nargs="*", help="units to explain (default: all)")
+    parser.add_argument("--from", dest="format", metavar="FORMAT", help="format of a calibration, if nothing tells it")
+    parser.add_argument("--sensor", metavar="NAME", help="config of its sensor, if its format is in counts")
     parser.add_argument("--results", type=Path, default=Path("results"), help="where results are (default: results)")
     arguments = parser.parse_args(argv)
+    file = Path(arguments.campaign)
+    if file.is_file() and not _is_diagnosis(file):
+        counts = {s: sheet.get("counts_per_unit") for s, sheet in sheets_of(arguments.sensor).items()}
+        try:
+            sys.stdout.write(explain_calibration(read_any(file, format_of(arguments.format), counts)))
+        except InputError as error:
+            raise InputError(f"is no diagnosis, and no calibration: {error.message}", error.file) from error
+        return 0
     selection = find(arguments.campaign, arguments.units, arguments.results)
     documents = {unit: _diagnosis(file) for unit, file in selection.files.items()}
     texts = [
@@ -152,6 +165,15 @@ def _beside(diagnosis: Path, folder: str) -> JSON:
     file = diagnosis.parent.parent / folder / diagnosis.name
     found: JSON = _json(file, "result of a run") if file.is_file() else {}
     return found
+
+
+def _is_diagnosis(file: Path) -> bool:
+    """Return whether a file is a diagnosis: JSON of both sensors without the status that a calibration has."""
+    try:
+        document = json.loads(file.read_text(encoding="utf-8"))
+    except (UnicodeDecodeError, json.JSONDecodeError):
+        return False
+    return isinstance(document, dict) and set(SENSORS) <= set(document) and "status" not in document
 
 
 def _diagnosis(file: Path) -> JSON:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.config.comparisons import resolve_comparisons
 from pipeline.config.compose import Composer
+from pipeline.config.given import GIVEN
 from pipeline.config.layers import as_list, load_layers
 from pipeline.config.options import Problem, default_of_run, nearest, parse
 from pipeline.config.schema import OF_BENCH
@@ -201,7 +202,8 @@ def cut_batches(
             batches[batch] = names[start:stop]
             configs = [units[n].config for n in batches[batch]]
             of_bench = any(c["table"].get(key) for c in configs for key in OF_BENCH)
-            effects = {sensor: of_bench or any(c["effects"][sensor] for c in configs) for sensor in SENSORS}
+            asked = {sensor: of_bench or any(c["effects"][sensor] for c in configs) for sensor in SENSORS}
+            effects = {sensor: asked[sensor] and configs[0]["method"][sensor] != GIVEN for sensor in SENSORS}
             stages = configs[0]["method"]["stages"]
             chains[batch] = {sensor: stages[sensor] + ["effects"] * effects[sensor] for sensor in SENSORS}
             start = stop

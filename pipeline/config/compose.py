@@ -22,6 +22,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from pydantic import ValidationError
 
+from pipeline.config.given import GIVEN, with_given
 from pipeline.config.options import (
     GROUPS,
     RUN_SETTINGS,
@@ -89,7 +90,8 @@ class Composer:
         resolved = self._resolved[key]
         procedure = resolved["procedure"]
         folder = procedure["folder"].replace("{unit}", name)
-        return {**resolved, "unit": name, "procedure": {**procedure, "folder": folder}}
+        given = with_given(resolved, self.campaign, name) if GIVEN in resolved["method"].values() else {}
+        return {**resolved, **given, "unit": name, "procedure": {**procedure, "folder": folder}}
 
     def split(self, layers: Sequence[str]) -> tuple[dict[str, str], list[tuple[str, Any]]]:
         """Return the choice of each group that is chosen, and the values in the order of the layers.
@@ -213,7 +215,8 @@ class Composer:
                 fit = [m for m in self.options["method"] if self._read("method", m)["stages"].get(sensor)]
                 raise Problem(f"method.{sensor}={name}: {name} has no stages for the {sensor}{nearest(name, fit)}")
             stages[sensor] = list(own[sensor])
-        return {**method, "stages": stages}
+        own_only = ("file", "format") if GIVEN not in method.values() else ()
+        return {**{key: value for key, value in method.items() if key not in own_only}, "stages": stages}
 
     def _check_effect(self, sensor: str, whole: str, procedure: dict[str, Any]) -> None:
         name, separator, setup = whole.partition("@")

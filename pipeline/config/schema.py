@@ -167,6 +167,8 @@ class Method(Section):
     accelerometer: str | None
     gyroscope: str | None
     as_printed: bool
+    file: Annotated[str, Field(min_length=1)] | None = None
+    format: Annotated[str, Field(min_length=1)] | None = None
     stages: Stages
 
 

@@ -46,7 +46,8 @@ FIT_OF_SENSOR = (
 FIT = (
     *(f"table.{key}" for key in FIT_OF_TABLE),
     *(f"sensor.{{sensor}}.{key}" for key in FIT_OF_SENSOR),
-    "sensor.temperature_accuracy_degc", *BY_HAND, "method.{sensor}", "method.as_printed", "uncertainty.monte_carlo",
+    "sensor.temperature_accuracy_degc", *BY_HAND, "method.{sensor}", "method.as_printed", "method.given",
+    "uncertainty.monte_carlo",
 )  # fmt: skip
 # Effects that explain a departure of table, clock or gyroscope: the checks of the recordings read their limits.
 LIMITS_OF_CHECKS = (
@@ -104,7 +105,7 @@ def select_settings(config: Mapping[str, Any], stage: str, sensor: str = "") -> 
         for step in branch:
             source = source[step]
             target = target.setdefault(step, {})
-        if leaf in source or branch[-1:] != ["effects"]:  # a data sheet need not limit every effect
+        if leaf in source or (branch[-1:] != ["effects"] and leaf != "given"):  # a data sheet limits some effects
             target[leaf] = source[leaf]
     return out
 

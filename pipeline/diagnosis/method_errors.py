@@ -77,6 +77,7 @@ PLAIN = {
     "rotation": "the method leaves the sensor turned against the body",
     "two_sided": "the method fits a scale factor for each side, which these recordings do not ask for",
 }
+GIVEN = "the given calibration differs by it from a free fit of these recordings"
 PRINTED = "; the equations are taken as printed (as_printed), errata included"
 FORWARD = (
     "as printed, the forward matrix is applied as if it were the correction (Sudsanguan 2019, tables 5.25 and 5.26)"
@@ -265,6 +266,8 @@ def _meaning(name: str, sensor: str, stages: Sequence[str], recordings: Sequence
             f"the filter {used} delays readings by {delay:.2g} s and smooths them, so that in a continuous turn the "
             "angle is late by rate times delay (Sudsanguan 2019, eqs 3.3-3.14)"
         )
+    if "given" in stages:
+        return GIVEN
     if printed and "cholesky_lu" in stages:
         return FORWARD
     text = next((MEANINGS[sensor, s, name] for s in stages if (sensor, s, name) in MEANINGS), PLAIN[name])

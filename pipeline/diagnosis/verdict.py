@@ -41,6 +41,7 @@ WORSE = 0.3  # of the noise's mean square, by which what was selected may raise 
 HELPFUL = 0.1  # share of the held-out error's mean square that each effect worth a try takes away
 QUIET = 0.6  # times the noise: a residual below it contradicts the noise of the rests
 COMPARED = ("bias", "scale_factor", "non_orthogonality", "rotation")  # parts compared with the uncertainty of both fits
+GIVEN = "given"  # the method that takes an existing calibration; nothing is fitted, and effects cannot be added to it
 FREE = ("reference_least_squares", "nonlinear_least_squares", "cholesky_lu")  # methods that leave bias and matrix free
 
 
@@ -271,6 +272,9 @@ def _within(e: Evidence) -> tuple[str, str]:
             f"The residual of the fit is {e.over_noise:.2g} times the noise estimate. Noise cannot be larger at "
             "rest than in turns: check that the unit did not move in the static recording, and record it again."
         )
+    if e.found == "nothing_missing" and e.approximations and e.method == GIVEN:
+        differs = listed([name.replace("_", " ") for name in e.approximations])
+        return "left_by_method", f"The given calibration differs from a free fit of these recordings in {differs}."
     if e.found == "nothing_missing" and e.approximations:
         return "left_by_method", (
             f"The method {e.method} causes errors that a free fit of the same recordings does not have: "
@@ -312,6 +316,8 @@ def _of_method(e: Evidence) -> str:
     if e.free is None:
         return f"The method {e.method} causes it."
     found = f"The error of a free fit of the same recordings is {e.free.error:.3g} {unit_of(e.sensor)}"
+    if e.method == GIVEN:
+        return f"{found}: the given calibration causes the rest."
     if e.filtered and e.method in FREE:
         return f"{found} against the filtered reference: delay and smoothing by the filter cause the rest."
     causes = f"the method {e.method} and the filter cause" if e.filtered else f"the method {e.method} causes"
@@ -322,12 +328,17 @@ def _of_method(e: Evidence) -> str:
 def judged(document: dict[str, Any], e: Evidence) -> dict[str, Any]:
     """Return the diagnosis of a selection with the verdict by the evidence, its reason, and what to do next."""
     verdict, reason = decide(e)
-    return document | {
+    given, step = {"given": True} if e.method == GIVEN else {}, _next_step(verdict, document, e)
+    if given and verdict == "missing_effect":
+        effects = ", ".join(document["selected"])
+        step = f"calibrate these recordings by a method that fits, with effects.{e.sensor}=[{effects}]"
+    decided = {
         "verdict": verdict,
         "reason": reason,
-        "next_experiment": _next_step(verdict, document, e) or document["next_experiment"],
+        "next_experiment": step or document["next_experiment"],
         "override": document["override"] if _offered(verdict, document, e) else "",
     }
+    return document | given | decided
 
 
 def _offered(verdict: str, document: Mapping[str, Any], e: Evidence) -> bool:
@@ -335,6 +346,8 @@ def _offered(verdict: str, document: Mapping[str, Any], e: Evidence) -> bool:
 
     Where the verdict is ``unexplained``, only plausible effects are offered that each reduce the held-out error.
     """
+    if e.method == GIVEN:
+        return False
     if verdict != "unexplained" or e.implausible or len(e.selected) > BELIEVED:
         return verdict == "missing_effect"
     entries = [entry for entry in document["ranking"] if entry["effect"] in document["selected"]]

@@ -42,6 +42,8 @@ VERDICTS = {
     "left_by_method": "The model explains the {sensor}; approximations of method or filter cause errors above noise.",
 }
 
+GIVEN_DIFFERS = "The model explains the {sensor}; the given calibration is not that of these recordings."
+
 
 def in_words(part: Mapping[str, Any] | None, sensor: str) -> list[str]:
     """Return a sensor's part of ``diagnoses/<unit>.json``, None where it was not calibrated, as sentences."""
@@ -60,7 +62,8 @@ def in_words(part: Mapping[str, Any] | None, sensor: str) -> list[str]:
             f"{wander['expected']:.2g} expected: it may include a slow effect that is missing in the model."
         )
     lines += _how_sure(part)
-    lines += [_method_error(error, sensor) for error in part.get("method_errors") or []]
+    whose = "the given calibration" if part.get("given") else "the method"
+    lines += [_method_error(error, sensor, whose) for error in part.get("method_errors") or []]
     if part["not_observable"]:
         lines.append(_hidden(part))
     if part["next_experiment"]:
@@ -69,7 +72,8 @@ def in_words(part: Mapping[str, Any] | None, sensor: str) -> list[str]:
 
 
 def _verdict(part: Mapping[str, Any], sensor: str) -> str:
-    text = VERDICTS[part["verdict"]].format(sensor=sensor, effects=listed([plain(n) for n in part["selected"]]))
+    form = GIVEN_DIFFERS if part.get("given") and part["verdict"] == "left_by_method" else VERDICTS[part["verdict"]]
+    text = form.format(sensor=sensor, effects=listed([plain(n) for n in part["selected"]]))
     ratio = part["residual_over_noise"]
     if ratio is None:
         return text
@@ -186,16 +190,16 @@ def to_distinguish(sets: Sequence[Mapping[str, Any]], *, on_table: bool) -> str:
     return experiment if on_table else BY_HAND.get(apart[0], experiment)
 
 
-def _method_error(error: Mapping[str, Any], sensor: str) -> str:
+def _method_error(error: Mapping[str, Any], sensor: str, whose: str) -> str:
     """Return one of ``pipeline.diagnosis.method_errors`` as a sentence."""
     size = f"{error['size']:.2g} {error['unit']}" if error["unit"] != "1" else f"{100 * error['size']:.2g} %"
-    share = f"{100 * error['share']:.0f} % of what the method leaves"
+    share = f"{100 * error['share']:.0f} % of what {whose} leaves"
     magnitude = error.get("held_out_magnitude_share")
     if magnitude is not None:
         share += f", {100 * magnitude:.0f} % of its error of the magnitude on held-out motion"
     rms = f"{error['rms']:.2g} {unit_of(sensor)} rms"
     name = plain(error["name"].replace("non_", "non-"))
-    return f"An error of the method, not of the sensor: {name} ({size}; {rms}; {share}): {error['meaning']}."
+    return f"An error of {whose}, not of the sensor: {name} ({size}; {rms}; {share}): {error['meaning']}."
 
 
 def _hidden(part: Mapping[str, Any]) -> str:

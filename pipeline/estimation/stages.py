@@ -38,7 +38,7 @@ STAGED = {
     "accelerometer": ("orthogonality", "misalignment", "bias", "scale_factor"),
     "gyroscope": ("bias", "orthogonality_and_misalignment", "scale_factor"),
 }
-OF_BOTH_SENSORS = ("reference_least_squares", "effects")
+OF_BOTH_SENSORS = ("reference_least_squares", "effects", "given")
 NOT_WANTED = "not_wanted"  # the stage of a sensor whose method is null
 KINDS = "subtract, matrix, two_sided"
 

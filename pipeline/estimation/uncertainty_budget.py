@@ -128,11 +128,14 @@ def combined(
 
     ``contributions``: of all of its parameters. ``not_included``: source to the reason why it is not among them.
     """
-    covariance = np.sum([c.covariance for c in contributions], axis=0)
-    freedom = effective_degrees_of_freedom(
-        np.array([c.standard_uncertainty for c in contributions]),
-        np.array([c.degrees_of_freedom for c in contributions]),
-    )
+    size = len(calibration.parameter_names())
+    covariance, freedom = np.zeros((size, size)), np.full(size, np.inf)
+    if contributions:
+        covariance = np.sum([c.covariance for c in contributions], axis=0)
+        freedom = effective_degrees_of_freedom(
+            np.array([c.standard_uncertainty for c in contributions]),
+            np.array([c.degrees_of_freedom for c in contributions]),
+        )
     unit = SENSOR_UNITS[calibration.sensor]
     own = [str(p.get("unit", "")) for effect in calibration.effects for p in effect.parameters.values()]
     head = {

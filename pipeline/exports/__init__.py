@@ -56,6 +56,8 @@ class Format:
         How the held-out errors are introduced; by default as those of the export, or of the full calibration.
     files : dict
         Sensor to file name, where each sensor has a file of its own.
+    reads : dict
+        How the file is read back (``pipeline.exports.reading``); empty where it holds no calibration.
     """
 
     consumer: str
@@ -72,6 +74,7 @@ class Format:
     adds_with_temperature: list[str] = field(default_factory=list)
     errors: str | None = None
     files: dict[str, str] = field(default_factory=dict)
+    reads: JSON = field(default_factory=dict)
 
 
 @cache

@@ -123,7 +123,7 @@ class ExportedSensor:
         for i, power in enumerate(powers):
             for j in range(min(3, ORDER - i)):
                 added[:, i + j] -= power @ offset[:, j]
-        return _of_temperature(np.stack(powers, axis=2)), _of_temperature(added)
+        return shifted(np.stack(powers, axis=2), REFERENCE_TEMPERATURE, 0.0), shifted(added, REFERENCE_TEMPERATURE, 0.0)
 
     def left_by_matrix(self, held: str) -> list[str]:
         """Return a sentence on the error that a format leaves which holds the diagonal of the matrix, or none of it."""
@@ -136,10 +136,10 @@ class ExportedSensor:
         return [f"{what} left out: that leaves about {left}."]
 
 
-def _of_temperature(coefficients: Values) -> Values:
-    """Turn coefficients in T - 25 degC into those in T, along the last axis: ``(T - 25)^k`` is binomial in T."""
-    orders = range(ORDER)
-    change = [[comb(k, j) * (-REFERENCE_TEMPERATURE) ** (k - j) if j <= k else 0.0 for j in orders] for k in orders]
+def shifted(coefficients: Values, before: float, after: float) -> Values:
+    """Turn coefficients in T - before, low orders first along the last axis, into those in T - after."""
+    step, orders = after - before, range(coefficients.shape[-1])
+    change = [[comb(k, j) * step ** (k - j) if j <= k else 0.0 for j in orders] for k in orders]
     return np.asarray(coefficients @ np.array(change), np.float64)
 
 

@@ -35,7 +35,8 @@ def process_unit(job: Job, unit: str, settings: dict[str, Any]) -> None:
     noises = load_noises(job.inputs["filter"], unit)
     try:
         found = fit_stage(sensor, stage, recordings, fitted, settings | {"noise": noises})
-        if job.run["last"] != NOT_LAST:  # else the next stage would take it over, and it would count twice
+        # not before the last stage, which would take it over and count it twice; a given calibration states its own
+        if job.run["last"] != NOT_LAST and stage != "given":
             found = with_stated(found, recordings, settings)
         write_json(target, found.to_json())
     except CannotCalibrateError as reason:

@@ -1,0 +1,83 @@
+"""Convert a calibration into the format of another program, and state what is lost."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.config.options import LARGEST_CONFIG
+from pipeline.errors import ConfigurationError
+from pipeline.exports import formats
+from pipeline.exports.conversion import convert
+from pipeline.exports.reading import CALIBRATION, FoundCalibration, format_of, read_any
+from pipeline.files import CONFIGS
+from pipeline.io.yaml_file import read_yaml
+from pipeline.records import SENSORS
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+EPILOG = """\
+The format of IN is told by its name and content, that of OUT by its name: kalibr.yaml, px4.params, calibration.json ...
+The terminal states what is lost: what is written is read back and compared with IN.
+
+examples:
+  python -m pipeline convert results/demo/calibrations/mpu6050-1.json px4.params
+  python -m pipeline convert my_kalibr.yaml calibration.json
+  python -m pipeline convert rig_acc.calib out/d435i.json --to realsense
+  python -m pipeline convert inav.txt kalibr.yaml --sensor mpu6050
+"""
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run ``python -m pipeline convert``."""
+    arguments = _parser().parse_args(argv)
+    counts = {s: sheet.get("counts_per_unit") for s, sheet in sheets_of(arguments.sensor).items()}
+    found = read_any(arguments.source, format_of(arguments.source_format), counts)
+    sheets = sheets_of(arguments.sensor, found)
+    name = format_of(arguments.target_format) or format_of(arguments.target.name)
+    if arguments.target.exists() and arguments.target.samefile(arguments.source):
+        raise ConfigurationError("OUT is the file IN: choose another name", str(arguments.target))
+    assert name is not None  # noqa: S101  (OUT has a name)
+    files, lost = convert(found, name, arguments.target, sheets)
+    print(f"{arguments.source} ({found.name}): {' and '.join(found.sensors)}")
+    for note in found.notes:
+        print(f"  {note}")
+    print(f"written: {', '.join(map(str, files))}")
+    print("lost: nothing" if not lost else "lost:")
+    for line in lost:
+        print(f"  {line}")
+    if name == CALIBRATION and found.document is None:
+        stated = [s for s, c in found.sensors.items() if c.covariance is not None]
+        print(f"uncertainty: {f'of the bias of the {stated}' if stated else 'none'} is known; zeros stand for it")
+    return 0
+
+
+def sheets_of(sensor: str | None, found: FoundCalibration | None = None) -> dict[str, Any]:
+    """Return the parts of a sensor's configuration: of the one that is named, or that a calibration was made with."""
+    name = sensor or (found.document or {}).get("sensor") if found else sensor
+    file = CONFIGS / "sensor" / f"{name}.yaml"
+    if name is None or (sensor is None and not file.is_file()):
+        return {}
+    if not file.is_file():
+        known = ", ".join(sorted(path.stem for path in file.parent.glob("*.yaml")))
+        raise ConfigurationError(f"--sensor {name}: no such sensor; known: {known}")
+    content = read_yaml(file, LARGEST_CONFIG)
+    return {s: content[s] for s in SENSORS if content.get(s)}
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m pipeline convert",
+        description=__doc__,
+        epilog=EPILOG + f"\nformats: {', '.join([CALIBRATION, *formats()])}\n",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("source", type=Path, metavar="IN", help="a calibration in any of the formats")
+    add("target", type=Path, metavar="OUT", help="the file to write")
+    add("--from", dest="source_format", metavar="FORMAT", help="format of IN, where name and content do not tell it")
+    add("--to", dest="target_format", metavar="FORMAT", help="format of OUT, where its name does not tell it")
+    add("--sensor", metavar="NAME", help="config of the sensor, for formats in counts and for noise densities")
+    return parser

@@ -1,0 +1,259 @@
+"""The texts of other programs' calibrations as trees of values, and the mathematics that the ``reads`` of formats use.
+
+json, yaml   : as they are; a list of mappings becomes a mapping by ``SensorType``, or by number
+parameters   : a line a parameter: ``NAME value``, ``NAME,value``, ``set NAME = a,b``, or PX4's five columns
+c            : initialised arrays of C by name, ``NAME ... = {...};``, flat
+xml          : ``<define name= value=>`` by name
+numbers      : the numbers before the first word that is none, as ``numbers``
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import yaml
+from jinja2 import Environment, StrictUndefined
+
+from pipeline.exports.sensors import FACTORS, shifted
+from pipeline.model.effects.base import REFERENCE_TEMPERATURE
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from numpy.typing import NDArray
+
+    Values = NDArray[np.float64]
+
+NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+ARRAY = re.compile(r"(\w+)\s*(?:\[\d*\]\s*)*=\s*(\{[^;]*\})\s*;")
+DEFINE = re.compile(r'<define\s+name="(\w+)"\s+value="([^"]*)"')
+
+
+class Node(dict[str, Any]):
+    """A mapping of a file that knows its place in it and which of its values were used."""
+
+    def __init__(self, content: dict[Any, Any], place: str = "", used: set[str] | None = None) -> None:
+        self.place, self.used = place, set() if used is None else used
+        super().__init__({str(key): self._of(str(key), value) for key, value in content.items()})
+
+    def _of(self, key: str, value: Any) -> Any:  # noqa: ANN401
+        place = f"{self.place}.{key}" if self.place else key
+        if isinstance(value, list) and value and all(isinstance(each, dict) for each in value):
+            value = {each.get("SensorType", number): each for number, each in enumerate(value)}
+        if isinstance(value, dict):
+            return Node(value, place, self.used)
+        numeric = isinstance(value, list) and value and not isinstance(value[0], str)
+        return np.array(value, float) if numeric else value
+
+    def __getitem__(self, key: str) -> Any:  # noqa: ANN401
+        place = f"{self.place}.{key}" if self.place else key
+        if key not in self:
+            raise KeyError(f"{place} is missing")
+        self.used.add(place)
+        return super().__getitem__(key)
+
+    def get(self, key: str, default: Any = None) -> Any:  # noqa: ANN401
+        """Return a value, or a default where there is none."""
+        try:
+            return self[key]
+        except KeyError:
+            return default
+
+    def at(self, path: str) -> Any:  # noqa: ANN401
+        """Return the value at a dotted path."""
+        found: Any = self
+        for key in path.split("."):
+            found = found[key]
+        return found
+
+    def has(self, path: str) -> bool:
+        """Return whether there is a value at a dotted path."""
+        found: Any = self
+        for key in path.split("."):
+            if not isinstance(found, Node) or key not in found:
+                return False
+            found = dict.__getitem__(found, key)
+        return True
+
+    def leaves(self) -> Iterator[str]:
+        """Yield the place of every value."""
+        for key in self:
+            value, place = dict.__getitem__(self, key), f"{self.place}.{key}" if self.place else key
+            if isinstance(value, Node):
+                yield from value.leaves()
+            else:
+                yield place
+
+    def unread(self) -> list[str]:
+        """Return the keys of the values that were not used, of parameters those of the same families."""
+        families = {place.partition("_")[0] for place in self.used}
+        nested = any(isinstance(value, Node) for value in self.values())
+        left = [p for p in self.leaves() if p not in self.used and (nested or p.partition("_")[0] in families)]
+        return list(dict.fromkeys(place.rpartition(".")[2] for place in left))
+
+
+class Expressions(Environment):
+    """Jinja2's expressions over a tree, whose missing values are named by their place."""
+
+    def __init__(self, known: dict[str, Any]) -> None:
+        super().__init__(undefined=StrictUndefined, autoescape=False)  # no HTML
+        self.globals |= FUNCTIONS | known
+
+    def getattr(self, obj: Any, attribute: str) -> Any:  # noqa: ANN401
+        """Return a value of a mapping, or an attribute."""
+        return obj[attribute] if isinstance(obj, dict) else super().getattr(obj, attribute)
+
+    def value(self, expression: object) -> Any:  # noqa: ANN401
+        """Return the value of an expression."""
+        return self.compile_expression(str(expression), undefined_to_none=False)()
+
+
+def parsed(kind: str, text: str) -> Node:
+    """Return the tree of a text; ``ValueError`` or ``yaml.YAMLError`` where it is not of that kind."""
+    content = PARSERS[kind](text)
+    if not isinstance(content, dict):
+        raise ValueError(f"{kind} with keys is expected")  # noqa: TRY004  (a text of another kind)
+    only = next(iter(content.values())) if list(content) == ["value0"] else content  # cereal's root, in Basalt's files
+    return Node(only)
+
+
+def _yaml(text: str) -> Any:  # noqa: ANN401
+    """Return YAML; OpenCV writes ``%YAML:1.0``, which YAML itself does not know."""
+    return yaml.safe_load(text.removeprefix("%YAML:1.0"))
+
+
+def _parameters(text: str) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for line in text.splitlines():
+        words = re.split(r"[\s,=]+", line.partition("#")[0].strip().removeprefix("set ").strip())
+        if len(words) == 5 and words[0].isdigit() and words[1].isdigit():
+            words = words[2:4]
+        if len(words) < 2 or not re.match(r"[A-Za-z]", words[0]):
+            continue
+        values = [float(w) if re.fullmatch(NUMBER, w) else w for w in words[1:]]
+        found[words[0]] = values[0] if len(values) == 1 else values
+    return found
+
+
+def _c_arrays(text: str) -> dict[str, Any]:
+    bare = re.sub(r"//[^\n]*|/\*.*?\*/", "", text, flags=re.DOTALL)
+    found = {}
+    for name, body in ARRAY.findall(bare):
+        numbers = [float(x) for x in re.findall(rf"(?<![\w.]){NUMBER}", body)]
+        if numbers:
+            found[name] = numbers
+    return found
+
+
+def _numbers(text: str) -> dict[str, Any]:
+    found: list[float] = []
+    for word in text.split():
+        if not re.fullmatch(NUMBER, word):
+            break
+        found.append(float(word))
+    return {"numbers": found} if len(found) == 21 else {}
+
+
+PARSERS: dict[str, Callable[[str], Any]] = {
+    "json": json.loads,
+    "yaml": _yaml,
+    "parameters": _parameters,
+    "c": _c_arrays,
+    "xml": lambda text: {name: float(value) for name, value in DEFINE.findall(text)},
+    "numbers": _numbers,
+}
+
+
+def product(*matrices: Any) -> Values:  # noqa: ANN401
+    """Return the product of 3x3 matrices, however nested or flat they are written."""
+    out = np.eye(3)
+    for matrix in matrices:
+        out = out @ square(matrix)
+    return out
+
+
+def square(values: Any) -> Values:  # noqa: ANN401
+    """Return a 3x3 matrix."""
+    return np.asarray(values, float).reshape(3, 3)
+
+
+def rotation(node: Node, key: str) -> Values:
+    """Return the rotation of a file's 4x4 or 3x3 transformation; the identity where it has none."""
+    return np.asarray(node[key], float)[:3, :3] if key in node else np.eye(3)
+
+
+def axes(file: Node, name: str, letters: str = "XYZ", default: float | None = None) -> Values:
+    """Return three values by their names, in which ``{}`` is the axis."""
+    names = [name.format(letter) for letter in letters]
+    return np.array([default if default is not None and n not in file else file[n] for n in names], float)
+
+
+def thermal(  # noqa: PLR0917  (what a thermal calibration of an autopilot is)
+    file: Node,
+    offset: Values,
+    name: str,
+    letters: str,
+    reference: float,
+    unit: float = 1.0,
+    *,
+    zero: float | None = None,
+    on: float,
+) -> Values:
+    """Return ``offset + p(T)`` in powers of T - 25 degC: (3, 4) array, ``p = unit sum_k c_k (T - reference)^k``.
+
+    ``name`` names ``c_k``, with ``{order}`` and ``{axis}``; coefficients that a file lacks are 0. ``zero``: the
+    temperature at which p is defined as 0, where it is not that of the reference. ``on``: 0 where p is switched off.
+    """
+    names = [[name.format(order=k, axis=a) for k in range(4)] for a in letters]
+    coefficients = unit * np.array([[float(file[n]) if n in file and on else 0.0 for n in row] for row in names])
+    out = shifted(coefficients, reference, REFERENCE_TEMPERATURE)
+    out[:, 0] += offset
+    if zero is not None:
+        out[:, 0] -= np.sum(coefficients * (zero - reference) ** np.arange(4), axis=1)
+    return out
+
+
+def temperature_model(sensor: Node) -> dict[str, Values]:
+    """Return the model of an Azure Kinect's sensor: ``M(T) raw + B(T)``, of third order in T, degC, low orders first.
+
+    With ``K(T) = M(T)^-1`` and ``b(T) = -K(T) B(T)`` about 25 degC, d the difference to it:
+    ``K1 = -K0 M1 K0``, ``K2 = -K0 (M1 K1 + M2 K0)``, ``b_n = -sum_k K_k B_(n-k)``. The diagonal of K1 is the change of
+    the scale factor; its other elements and K2 are in no effect.
+    """
+    mixing = sensor["MixingMatrixTemperatureModel"].reshape(3, 3, 4)
+    M = np.moveaxis(shifted(mixing, 0.0, REFERENCE_TEMPERATURE), 2, 0)
+    B = shifted(sensor["BiasTemperatureModel"].reshape(3, 4), 0.0, REFERENCE_TEMPERATURE)
+    K = [np.linalg.inv(M[0])]
+    K.append(-K[0] @ M[1] @ K[0])
+    K.append(-K[0] @ (M[1] @ K[1] + M[2] @ K[0]))
+    bias = np.stack([-sum(K[k] @ B[:, n - k] for k in range(n + 1)) for n in range(3)], axis=1)
+    left_out = K[1] - np.diag(np.diag(K[1]))
+    deviation = sensor["BiasUncertainty"]
+    return {"K": K[0], "scale": np.diag(K[1]), "bias": bias, "deviation": deviation, "left_out": left_out}
+
+
+def lower(values: Any) -> Values:  # noqa: ANN401
+    """Return the lower triangular matrix of six values, column by column."""
+    out = np.zeros((3, 3))
+    out[np.triu_indices(3)[::-1]] = values
+    return out
+
+
+FUNCTIONS: dict[str, Any] = {
+    "axes": axes,
+    "diagonal": np.diag,
+    "given": lambda node, key, default: node.get(key, default),
+    "in_dps": lambda unit: 1.0 / FACTORS[unit],
+    "in_g": lambda unit: 1.0 / FACTORS[unit],
+    "lower": lower,
+    "product": product,
+    "rotation": rotation,
+    "square": square,
+    "temperature_model": temperature_model,
+    "thermal": thermal,
+    "times": lambda matrix, vector: square(matrix) @ np.asarray(vector, float),
+    "ones": np.ones(3),
+}

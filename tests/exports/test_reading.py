@@ -1,0 +1,217 @@
+"""Formats of other programs read back: what they hold arrives to 1e-9, and what they do not hold is stated."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from test_consumer_formats import BIAS, COUNTS, MATRIX, SCALED, SENSITIVE, SETTINGS, WARM, WARMER
+
+from pipeline import load_calibration
+from pipeline.commands.convert import main
+from pipeline.errors import ConfigurationError, InputError
+from pipeline.exports import export_all, formats
+from pipeline.exports.explanation import SAMPLE, explain_calibration
+from pipeline.exports.reading import read_any
+from pipeline.records import SENSORS, SensorCalibration
+
+G0, RADIAN = 9.80665, np.pi / 180.0
+EFFECTS = {"accelerometer": (WARMER, SCALED), "gyroscope": (SENSITIVE, WARM)}
+WHOLE = {  # formats that hold the whole matrix of both sensors
+    *("azure_kinect.json", "basalt_imu.json", "calibration.h", "fusion_calibration.h", "imu_calib_toolkit.json"),
+    *("imu_tk_acc.calib", "imucal.json", "kalibr.yaml", "realsense_calibration.json"),
+}
+SENSITIVE_TO_G = {"imu_calib_toolkit.json", "imucal.json", "kalibr.yaml", "kalibr_imu_chain.yaml"}
+WARMED = {"azure_kinect.json", "ardupilot.param", "px4.params"}
+
+
+def document(**effects: Any) -> dict[str, Any]:
+    made: dict[str, Any] = {"unit": "U1", "schema_version": 1, "status": "ok", "error": None, "sensor": "mpu6050"}
+    made["inputs"] = [{"rate_hz": 100.0}]
+    for s in SENSORS:
+        covariance = np.eye(12 + sum(len(e.parameters) for e in effects.get(s, ()))) * 1e-8
+        calibration = SensorCalibration(s, BIAS[s], MATRIX[s], effects=effects.get(s, ()), covariance=covariance)
+        made[s] = calibration.to_json()
+    return made
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    found = tmp_path_factory.mktemp("exports")
+    (found / "calibration.json").write_text(json.dumps(document(**EFFECTS)))
+    export_all(document(**EFFECTS), SETTINGS, found)
+    return found
+
+
+@pytest.mark.parametrize("name", sorted(WHOLE))
+def test_a_format_that_holds_the_whole_matrix_gives_it_back(folder: Path, name: str) -> None:
+    found = read_any(folder / name, counts=COUNTS)
+    assert set(found.sensors) == set(SENSORS)
+    for s, c in found.sensors.items():
+        np.testing.assert_allclose(c.bias, BIAS[s], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(c.matrix, MATRIX[s], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", sorted(SENSITIVE_TO_G | WARMED))
+def test_effects_that_a_format_holds_arrive_too(folder: Path, name: str) -> None:
+    found = read_any(folder / name).sensors
+    wanted = {e.name: e.values for of in EFFECTS.values() for e in of}
+    arrived = {e.name: e.values for c in found.values() for e in c.effects}
+    expected = {"g_sensitivity"} if name in SENSITIVE_TO_G else {"bias_temperature", "bias_temperature_quadratic"}
+    assert set(arrived) == expected | ({"scale_factor_temperature"} if name == "azure_kinect.json" else set())
+    for effect, values in arrived.items():
+        np.testing.assert_allclose(values, wanted[effect], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["px4.params", "ardupilot.param", "paparazzi_imu.xml"])
+def test_a_format_axis_by_axis_gives_back_its_offsets_and_scale_factors(folder: Path, name: str) -> None:
+    found = read_any(folder / name, counts=COUNTS).sensors
+    K = np.linalg.inv(MATRIX["accelerometer"])
+    scale = np.diag(K) / np.sum(K**2, axis=1)
+    np.testing.assert_allclose(found["accelerometer"].matrix, np.diag(scale), atol=1e-9)
+    np.testing.assert_allclose(found["accelerometer"].bias, BIAS["accelerometer"], atol=1e-9)
+    np.testing.assert_allclose(found["gyroscope"].bias * RADIAN, BIAS["gyroscope"] * RADIAN, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["inav.txt", "betaflight.txt", "paparazzi_imu.xml"])
+def test_a_format_in_counts_asks_for_the_sensor(folder: Path, name: str) -> None:
+    with pytest.raises(InputError, match="in counts"):
+        read_any(folder / name)
+    if name != "paparazzi_imu.xml":
+        bias = read_any(folder / name, counts=COUNTS).sensors["accelerometer"].bias
+        np.testing.assert_allclose(bias, BIAS["accelerometer"], rtol=0, atol=0.5 / COUNTS["accelerometer"])
+
+
+def test_the_content_tells_the_format_whatever_the_file_is_called(folder: Path, tmp_path: Path) -> None:
+    for file in sorted(folder.iterdir()):
+        if file.name == "kalibr_imu.yaml":
+            continue
+        copy = tmp_path / ("x_acc.calib" if file.suffix == ".calib" else "x")
+        shutil.copy(file, copy)
+        told = read_any(copy, counts=COUNTS).name
+        assert told == ("imu_tk.calib" if file.suffix == ".calib" else file.name)
+
+
+def test_imu_tk_in_raw_counts_is_told_by_its_scale_factors(tmp_path: Path) -> None:
+    """Tedaldi's program takes counts: x = T K (raw - B) in m/s^2 with K near 9.8 / 16384."""
+    T = np.array([[1.0, -0.01, 0.02], [0.0, 1.0, 0.003], [0.0, 0.0, 1.0]])
+    K, B = np.array([1.01, 0.99, 1.002]) * G0 / 16384.0, np.array([120.0, -340.0, 55.0])
+    rows = [*T, *np.diag(K), *B[:, None]]
+    (tmp_path / "test_acc.calib").write_text("\n".join(" ".join(f"{x:.17g}" for x in row) for row in rows))
+    with pytest.raises(InputError, match="are not in m/s"):
+        read_any(tmp_path / "test_acc.calib")
+    found = read_any(tmp_path / "test_acc.calib", counts=COUNTS)
+    raw = np.array([1000.0, -2000.0, 16000.0])
+    c = found.sensors["accelerometer"]
+    np.testing.assert_allclose(c.matrix @ (raw / 16384.0 - c.bias), T @ (K * (raw - B)) / G0, atol=1e-14)
+    assert "in counts, 16384 per unit" in found.notes[0]
+
+
+def test_a_kalibr_result_of_its_own_program_predicts_the_reading(tmp_path: Path) -> None:
+    """Keys as Kalibr writes them; its equation: a = M f + b, w = M (C w) + A (C f) + b."""
+    imu = {
+        "model": "scale-misalignment",
+        "accelerometer_noise_density": 1e-3,
+        "accelerometer_random_walk": 1e-4,
+        "gyroscope_noise_density": 1e-4,
+        "gyroscope_random_walk": 1e-5,
+        "T_i_b": np.eye(4).tolist(),
+        "accelerometers": {"M": [[1.01, 0.0, 0.0], [0.002, 0.99, 0.0], [-0.003, 0.004, 1.02]]},
+        "gyroscopes": {
+            "M": [[0.98, 0.0, 0.0], [0.001, 1.03, 0.0], [0.002, -0.004, 1.01]],
+            "A": [[1e-4, 2e-4, 0.0], [0.0, -3e-4, 1e-4], [5e-5, 0.0, 2e-4]],
+            "C_gyro_i": [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]],
+        },
+    }
+    file = tmp_path / "imu-results.yaml"
+    file.write_text(yaml.safe_dump({"imu0": imu}))
+    found = read_any(file)
+    f, w = np.array([0.5, -2.0, 9.5]), np.array([0.3, -0.4, 0.5])  # m/s^2, rad/s
+    M, C = np.array(imu["gyroscopes"]["M"]), np.array(imu["gyroscopes"]["C_gyro_i"])
+    read_f = np.array(imu["accelerometers"]["M"]) @ f
+    read_w = M @ C @ w + np.array(imu["gyroscopes"]["A"]) @ C @ f
+    (tmp_path / "c.json").write_text("")
+    assert main([str(file), str(tmp_path / "c.json"), "--to", "calibration.json"]) == 0
+    unit = load_calibration(tmp_path / "c.json")
+    out = unit.apply(read_f / G0, read_w / RADIAN)
+    np.testing.assert_allclose(out.accelerometer, f / G0, atol=1e-12)
+    np.testing.assert_allclose(out.gyroscope, w / RADIAN, atol=1e-10)
+    assert "accelerometer: the file states no bias; it counts as 0" in found.notes
+    assert found.noise["gyroscope_random_walk"] == 1e-5
+
+
+def test_a_chain_of_conversions_keeps_every_parameter(folder: Path, tmp_path: Path) -> None:
+    chain = ["kalibr.yaml", "imucal.json", "imu_calib_toolkit.json", "calibration.json", "kalibr.yaml"]
+    before = folder / "kalibr.yaml"
+    for step, name in enumerate(chain[1:]):
+        after = tmp_path / str(step) / name
+        after.parent.mkdir()
+        assert main([str(before), str(after), "--sensor", "mpu6050"]) == 0
+        before = after
+    first, last = (read_any(file).sensors for file in (folder / "kalibr.yaml", before))
+    for s in SENSORS:
+        np.testing.assert_allclose(last[s].bias, first[s].bias, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(last[s].matrix, first[s].matrix, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(last["gyroscope"].effects[0].values, SENSITIVE.values, rtol=0, atol=1e-9)
+
+
+def test_convert_states_what_is_lost(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source = str(folder / "calibration.json")
+    main([source, str(tmp_path / "px4.params")])
+    told = capsys.readouterr().out
+    for line in (
+        "accelerometer: elements of the matrix change by up to 0.021",
+        "accelerometer: the effect scale_factor_temperature",
+        "gyroscope: the effect g_sensitivity",
+        "gyroscope: The matrix of the gyroscope is left out: that leaves about 2.1 % of the rate.",
+        "expanded uncertainties, covariances and uncertainty budgets",
+    ):
+        assert f"  {line}\n" in told
+    assert "bias_temperature" not in told
+    main([source, str(tmp_path / "kalibr_imu_chain.yaml")])
+    assert "gyroscope: the bias\n" in capsys.readouterr().out
+    main([source, str(tmp_path / "imu_calib.yaml")])
+    assert "gyroscope: all of it" in capsys.readouterr().out
+    main([str(folder / "realsense_calibration.json"), str(tmp_path / "rig.calib"), "--to", "imu_tk"])
+    told = capsys.readouterr().out
+    assert "lost: nothing" in told
+    assert (tmp_path / "rig_acc.calib").is_file()
+    assert (tmp_path / "rig_gyro.calib").is_file()
+
+
+def test_what_a_conversion_cannot_do_is_refused(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match="--sensor NAME"):
+        main([str(folder / "imucal.json"), str(tmp_path / "kalibr.yaml")])
+    with pytest.raises(ConfigurationError, match="--sensor mpu9999: no such sensor"):
+        main([str(folder / "imucal.json"), str(tmp_path / "kalibr.yaml"), "--sensor", "mpu9999"])
+    with pytest.raises(ConfigurationError, match=r"several formats: calibration.json, calibration.h"):
+        main([str(folder / "imucal.json"), str(tmp_path / "x"), "--to", "calibration"])
+    with pytest.raises(ConfigurationError, match="OUT is the file IN"):
+        main([str(folder / "imucal.json"), str(folder / "imucal.json")])
+    with pytest.raises(InputError, match="noise only"):
+        read_any(folder / "kalibr_imu.yaml")
+    imu = yaml.safe_load((folder / "kalibr.yaml").read_text())
+    del imu["imu0"]["gyroscopes"]["C_gyro_i"]
+    (tmp_path / "k.yaml").write_text(yaml.safe_dump(imu))
+    with pytest.raises(InputError, match=r"imu0.gyroscopes.C_gyro_i is missing"):
+        read_any(tmp_path / "k.yaml")
+    (tmp_path / "x.txt").write_text("hello")
+    with pytest.raises(InputError, match="the file has the keys of no format"):
+        read_any(tmp_path / "x.txt")
+
+
+def test_every_format_with_a_calibration_can_be_read() -> None:
+    assert [name for name, (declared, _) in formats().items() if not declared.reads] == ["kalibr_imu.yaml"]
+
+
+def test_the_worked_sample_of_an_explanation_is_what_apply_gives(folder: Path) -> None:
+    text = explain_calibration(read_any(folder / "calibration.json"))
+    expected = load_calibration(folder / "calibration.json").apply(**SAMPLE, smoothing=0.0)
+    shown = [line.partition("[")[2].partition("]")[0] for line in text.splitlines() if "matrix times that" in line]
+    for s, numbers in zip(SENSORS, shown, strict=True):
+        np.testing.assert_allclose([float(x) for x in numbers.split(",")], getattr(expected, s), rtol=1e-8)
+    assert "calibrated = matrix (reading - bias - g_sensitivity - bias_temperature), deg/s" in text
+    assert "x: 0.1 * f[0] + -0.02 * f[1] + 0.03 * f[2]" in text
