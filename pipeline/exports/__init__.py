@@ -1,7 +1,7 @@
 """Exports: a calibration in the formats of the programs that use it. One template in ``templates/`` is one format.
 
 A template has two parts, separated by a line ``---``: a declaration (``Format``: what the format can hold, in which
-units), and the text of the file in Jinja2. The text sees
+units, and how ``reading`` reads it back), and the text of the file in Jinja2. The text sees
 
     accelerometer, gyroscope   ``sensors.ExportedSensor`` in the units of the format, None where it is not calibrated
     sensors                    those of the two that are calibrated, by name
