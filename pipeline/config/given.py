@@ -9,6 +9,7 @@ import hashlib
 from typing import TYPE_CHECKING, Any
 
 from pipeline.config.options import Problem
+from pipeline.config.schema import OF_BENCH
 from pipeline.errors import PipelineError
 from pipeline.model.effects.base import Owner
 
@@ -33,8 +34,8 @@ def with_given(config: Mapping[str, Any], campaign: Path, unit: str) -> dict[str
     method, effects = dict(config["method"]), dict(config["effects"])
     if not method["file"]:
         raise Problem("method=given: method.file is not set; name the calibration, in any format of docs/exports.md")
-    if config["table"].get("seat_deg") is not None:
-        raise Problem("method=given: table.seat_deg is set, and the rotation of each mounting needs a fit; set it null")
+    if stated := [f"table.{key}" for key in OF_BENCH if config["table"].get(key)]:
+        raise Problem(f"method=given: {stated[0]} is set, which a fit would estimate; nothing is fitted: set it null")
     file = campaign / method["file"].replace("{unit}", unit)
     counts = {s: config["sensor"][s]["counts_per_unit"] for s in SENSORS}
     try:
