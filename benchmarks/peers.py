@@ -127,7 +127,8 @@ def imucal(sections: dict[str, Recording], rate_hz: float) -> Estimate:
     )
     turned = [sections[f"{a}_rot"].gyroscope[:, i].sum() for i, a in enumerate("xyz")]
     signs = np.sign(turned)
-    assert abs(signs.sum()) == 3  # noqa: PLR2004  (imucal has one sign for all)
+    if abs(signs.sum()) < 3:
+        raise ValueError("imucal has one sign for all turns; these differ")
     began = time.process_time()
     found = FerrarisCalibration(grav=1.0, expected_angle=360.0 * signs[0]).compute(regions, rate_hz, "g", "deg/s")
     cpu = time.process_time() - began
@@ -144,11 +145,16 @@ def build_imu_tk(source: Path, folder: Path) -> Path:
     # three setters are declared to return a value and return none, at which optimised code ends
     head = re.sub(r"\b(?:_T|int|bool) ((?:set|enable)\w+ ?\([^)]*\) ?\{ \w+ = \w+; \})", r"void \1", head)
     (folder / "imu_tk" / "calibration.h").write_text(head)
-    sources = [folder / "main.cpp", *(source / "src" / f"{name}.cpp" for name in ("calibration", "filters", "io_utils"))]
+    sources = [
+        folder / "main.cpp",
+        *(source / "src" / f"{name}.cpp" for name in ("calibration", "filters", "io_utils")),
+    ]
     include = [f"-I{folder}", f"-I{source / 'include'}", "-I/usr/include/eigen3"]
     program = folder / "imu_tk_calibrate"
     flags = ["-std=c++17", "-O2", "-w", *include]
-    subprocess.run(["g++", *flags, *map(str, sources), "-lceres", "-lglog", "-o", str(program)], check=True)
+    subprocess.run(
+        ["/usr/bin/env", "g++", *flags, *map(str, sources), "-lceres", "-lglog", "-o", str(program)], check=True
+    )
     return program
 
 
@@ -271,7 +277,12 @@ def table(title: str, pairs: list[tuple[Any, Any]], hidden: tuple[str, ...] = ()
 
 
 def public(title: str, recordings: list[Recording], estimates: dict[str, Estimate | None]) -> list[str]:
-    lines = [f"{title}, held out", "", "| program | rests | rms, mg | moves | mean, deg | largest, deg |", "|---|---|---|---|---|---|"]
+    lines = [
+        f"{title}, held out",
+        "",
+        "| program | rests | rms, mg | moves | mean, deg | largest, deg |",
+        "|---|---|---|---|---|---|",
+    ]
     errors = {name: held_out(found, recordings) for name, found in estimates.items() if found is not None}
     for name in estimates:
         if name not in errors:
@@ -292,7 +303,9 @@ def read(folder: Path, ingest: dict[str, Any], sensor: str) -> list[Recording]:
 
 
 def wearable(program: Path | None) -> list[str]:
-    (whole,) = read(PUBLISHED / "raw" / "wearable", profile("imucal_session", PUBLISHED / "configs" / "ingest"), "generic")
+    (whole,) = read(
+        PUBLISHED / "raw" / "wearable", profile("imucal_session", PUBLISHED / "configs" / "ingest"), "generic"
+    )
     own = yaml.safe_load((PUBLISHED / "configs" / "procedure" / "ferraris_held_out.yaml").read_text())
     parts = cut(whole, own["recordings"]["recording"]["windows"])
     fitted, kept = ([p for p in parts if (p.role == "validation") == out] for out in (False, True))
@@ -306,7 +319,9 @@ def wearable(program: Path | None) -> list[str]:
 
 
 def mpu6050(program: Path | None) -> list[str]:
-    recordings = read(PUBLISHED / "raw" / "mpu6050", profile("mpu6050_multi_position", ROOT / "configs" / "ingest"), "mpu6050")
+    recordings = read(
+        PUBLISHED / "raw" / "mpu6050", profile("mpu6050_multi_position", ROOT / "configs" / "ingest"), "mpu6050"
+    )
     kept = [r for r in recordings if r.role == "validation"]
     fitted = [r for r in recordings if r.role != "validation"]
     found: dict[str, Estimate | None] = {"this product": ours(fitted, settings_of("multi_position", "mpu6050"))}
