@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 PUBLISHED = (
-    "calibrations", "validations", "diagnoses", "reports", "certificates", "exports",
+    "calibrations", "validations", "diagnoses", "reports", "certificates", "exports", "combined",
     "index.html", "summary.csv", "failures.json", "parameters.parquet", "fleet.json",
 )  # fmt: skip
 RUN_LOCK, JOBS_LOCK = ".run.lock", ".jobs.lock"

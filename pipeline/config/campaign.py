@@ -68,6 +68,8 @@ class Campaign:
         What ``snakemake --config`` gave.
     page : str or None
         A page that the campaign asks for beside its own.
+    combine : str or None
+        ``serial``: a joint estimate of units that share a serial.
     """
 
     name: str
@@ -80,6 +82,7 @@ class Campaign:
     simulation: Path | None
     settings: Mapping[str, Any]
     page: str | None
+    combine: str | None = None
 
     @property
     def recorded(self) -> Path:
@@ -139,11 +142,14 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
                 problems.setdefault(line, []).append(name)
     if problems:
         raise ConfigurationError(_one_message(problems), str(directory / "units.csv"))
-    batches, chains = cut_batches(units, batch_size(layers.of_run))
+    batches, chains = cut_batches(units, _batch_size(layers.of_run))
     results = Path(str(settings.get("results", "results"))) / directory.name
     compare = resolve_comparisons(layers.campaign.compare, units, str(directory / "campaign.yaml"))
     page, simulation = layers.campaign.page, layers.simulation
-    return Campaign(directory.name, directory, results, units, batches, chains, compare, simulation, settings, page)
+    combine = _combine(layers.of_run)
+    return Campaign(
+        directory.name, directory, results, units, batches, chains, compare, simulation, settings, page, combine
+    )
 
 
 def read_layers(directory: Path, settings: Mapping[str, Any]) -> tuple[Composer, Layers]:
@@ -163,14 +169,29 @@ def find_campaign(name: str) -> Path:
     )
 
 
-def batch_size(overrides: Sequence[str]) -> int | None:
-    """Return the batch size that the run's overrides ask for, None for ``auto``."""
-    size = default_of_run("batch_size")
+def _of_run(name: str, overrides: Sequence[str]) -> Any:  # noqa: ANN401  (a setting's type is its own)
+    """Return a setting of the run."""
+    value = default_of_run(name)
     for text in overrides:
         try:
-            size = parse(text)[1]
+            key, given = parse(text)
         except Problem as problem:
             raise ConfigurationError(str(problem)) from problem
+        value = given if key == name else value
+    return value
+
+
+def _combine(overrides: Sequence[str]) -> str | None:
+    """Return by which column of the sheet calibrations are combined; None: not at all."""
+    combine = _of_run("combine", overrides)
+    if combine not in (None, "serial"):
+        raise ConfigurationError(f"combine={combine}: serial or null is expected")
+    return "serial" if combine else None
+
+
+def _batch_size(overrides: Sequence[str]) -> int | None:
+    """Return the batch size that the run's overrides ask for, None for ``auto``."""
+    size = _of_run("batch_size", overrides)
     if size == "auto":
         return None
     if not isinstance(size, int) or isinstance(size, bool) or size < 1:

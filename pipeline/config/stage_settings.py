@@ -198,6 +198,7 @@ def _of_gather(campaign: Campaign) -> dict[str, Any]:
         "run": campaign.run_settings(),
         "compare": campaign.compare,
         "page": campaign.page,
+        "combine": campaign.combine,
         "truths": {u: str(campaign.truth(u)) for u in sorted(compared)},
     }
 

@@ -16,6 +16,7 @@ from pipeline.errors import PipelineError
 from pipeline.files import flushed_together, read_json, write_atomically, write_json
 from pipeline.history import of_units, record, unit_state
 from pipeline.report.campaign_page import render
+from pipeline.report.combined import combined_calibrations
 from pipeline.report.comparison_section import section, unit_figures
 from pipeline.report.fleet import fleet_statistics, unit_parameters, write_parameters
 from pipeline.report.pages import failure_page
@@ -134,6 +135,11 @@ def _write_campaign(job: Job, units: Mapping[str, Gathered], new: Path) -> None:
     run, rows = job.run, [u.row for u in units.values()]
     fitted = {name: u.fitted for name, u in units.items()}
     failures, statistics = [u.failure for u in units.values() if u.failure], fleet_statistics(rows, fitted)
+    if run["combine"]:
+        joint, told = combined_calibrations(rows, {name: u.calibration for name, u in units.items()})
+        statistics["combined"] = told
+        for serial, document in joint.items():
+            write_json(new / "combined" / f"{serial}.json", document)
     write_summary(new / "summary.csv", rows)
     write_json(new / "failures.json", failures)
     write_parameters(new / "parameters.parquet", rows, fitted)
