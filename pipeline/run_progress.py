@@ -142,6 +142,43 @@ def duration(seconds: float) -> str:
     return f"{seconds / 3600:.1f} h"
 
 
+class Countdown:
+    """How far a command of one process is, and how long it will take: a line that is redrawn on a terminal.
+
+    Elsewhere a line is printed each half minute. ``total``: of what is counted, such as units, or bytes of a log.
+    """
+
+    def __init__(self, total: float) -> None:
+        self.total = total
+        self.began = time.monotonic()
+        self.told = float("-inf") if sys.stderr.isatty() else self.began
+        self.drawn = False
+
+    def left(self, done: float) -> str:
+        """Return the time left in words; empty in the first second and at the end."""
+        elapsed = time.monotonic() - self.began
+        if not 0.0 < done < self.total or elapsed < 1.0:
+            return ""
+        return f"about {duration(elapsed * (self.total / done - 1.0))} left"
+
+    def __call__(self, done: float, words: str) -> None:
+        """Tell how much is done, in words, and how long the rest will take."""
+        now, terminal = time.monotonic(), sys.stderr.isatty()
+        if now - self.told < INTERVAL[terminal]:
+            return
+        self.told, self.drawn = now, terminal
+        text = " | ".join(filter(None, [f"{100.0 * done / max(self.total, 1):.0f} %", words, self.left(done)]))
+        sys.stderr.write(f"{CLEAR_LINE}{text}" if terminal else f"{text}\n")
+        sys.stderr.flush()
+
+    def end(self) -> None:
+        """Clear the line."""
+        if self.drawn:
+            sys.stderr.write(CLEAR_LINE)
+            sys.stderr.flush()
+            self.drawn = False
+
+
 class Monitor(logging.Handler):
     """Follows the log records of Snakemake and prints the progress of a run in ``results``.
 

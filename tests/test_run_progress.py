@@ -1,11 +1,12 @@
 """What a person is told of a run: units done, the unit at work, the time left, one run at a time."""
 
+import io
 import time
 from pathlib import Path
 
 import pytest
 
-from pipeline import results_folder
+from pipeline import results_folder, run_progress
 from pipeline.results_folder import BusyError, hold_as_job, jobs_at_work, take_run
 from pipeline.run_progress import Progress, _cause, duration
 
@@ -73,3 +74,27 @@ def test_results_are_held_by_one_run_and_jobs_are_seen(tmp_path: Path, monkeypat
     results_folder.HELD.clear()
     take_run(tmp_path)
     results_folder.HELD[0].close()
+
+
+def test_a_command_tells_the_time_left_on_a_terminal_and_each_half_minute_elsewhere(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now, stream = [100.0], io.StringIO()
+    monkeypatch.setattr(run_progress.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(run_progress.sys, "stderr", stream)
+    for terminal, told in ((True, [0, 1, 2]), (False, [])):
+        monkeypatch.setattr(stream, "isatty", lambda terminal=terminal: terminal, raising=False)
+        countdown, lines = run_progress.Countdown(40), []
+        for done in range(3):
+            countdown(done, f"{done} of 40 cases")
+            now[0] += 1.0
+            lines += [done] * bool(stream.getvalue())
+            text = stream.getvalue()
+            stream.seek(0), stream.truncate()
+        assert lines == told
+        if terminal:
+            assert text == "\r\x1b[K5 % | 2 of 40 cases | about 40 s left"  # two in two seconds
+    now[0] += 40.0
+    countdown(20, "20 of 40 cases")
+    assert stream.getvalue() == "50 % | 20 of 40 cases | about 45 s left\n"  # 43 s since it began, to 5 s
+    assert countdown.left(40) == ""

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING
 
 from pipeline.errors import ConfigurationError, InputError
 from pipeline.field_logs.compensate import LogProfile, compensate_log
-from pipeline.field_logs.output import Progress, require_apart
+from pipeline.field_logs.output import require_apart
 from pipeline.io.files import MESSAGE_FORMATS
 from pipeline.model.calibration_file import read_calibration
 from pipeline.model.compensation import SMOOTHING_S, load
+from pipeline.run_progress import Countdown
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -43,12 +44,13 @@ def main(argv: Sequence[str]) -> int:
         message = "the output would overwrite the calibration; choose another file for -o"
         raise InputError(message, str(arguments.output))
     profile = _profile(arguments.calibration, arguments.ingest)
-    progress = Progress(arguments.log)
+    countdown = Countdown(arguments.log.stat().st_size if arguments.log.is_file() else 0)
     result = compensate_log(
         compensation, arguments.log, arguments.output, profile,
-        topic=arguments.topic, smoothing=arguments.smoothing, progress=progress,
+        topic=arguments.topic, smoothing=arguments.smoothing,
+        progress=lambda rows, read: countdown(read, f"{rows} samples"),
     )  # fmt: skip
-    progress.end()
+    countdown.end()
     for warning in result.warnings:
         print(f"warning: {warning}", file=sys.stderr)
     for note in result.notes:

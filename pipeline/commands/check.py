@@ -26,6 +26,7 @@ from pipeline.profile_detection.proposal import as_yaml, propose
 from pipeline.profile_detection.recording_facts import as_text, facts, topic_lines
 from pipeline.profile_detection.topics import topics_of
 from pipeline.profile_detection.unit_guesses import UNKNOWN
+from pipeline.run_progress import Countdown
 from pipeline.signal.segments import cut
 
 if TYPE_CHECKING:
@@ -82,8 +83,12 @@ def main(argv: Sequence[str]) -> int:
     """Run ``python -m pipeline check FILE...``."""
     arguments = _parser().parse_args(argv)
     refused: list[tuple[Reading, PipelineError]] = []
-    for reading in _readings(arguments.files, arguments.ingest, arguments.sensor):
-        error = _print_facts(reading)
+    readings = _readings(arguments.files, arguments.ingest, arguments.sensor)
+    sizes = [sum(f.stat().st_size for f in reading.files if f.is_file()) for reading in readings]
+    countdown = Countdown(sum(sizes))
+    for number, reading in enumerate(readings):
+        countdown(sum(sizes[:number]), f"reading {reading.files[0]} ({number + 1} of {len(readings)})")
+        error = _print_facts(reading, countdown)
         if error is not None:
             refused.append((reading, error))
     unknown = [layout for reading, error in refused for layout in _layouts(reading, error)]
@@ -222,11 +227,11 @@ def composed(profile: str, sensor: str | None, campaign: Path | None, more: Sequ
             raise ConfigurationError(str(problem), profile if own == Path(folder) else None) from None
 
 
-def _print_facts(reading: Reading) -> PipelineError | None:
+def _print_facts(reading: Reading, countdown: Countdown | None = None) -> PipelineError | None:
     """Print content and notes of a recording, or its refusal, which is returned."""
     settings = reading.settings
     ((name, entry),) = settings["procedure"]["recordings"].items()
-    print(f"{', '.join(map(str, reading.files))}\n  {'read with':<16}{reading.said}")
+    refused: PipelineError | None = None
     try:
         table = read_table(reading.files, settings["ingest"])
         recording = to_recording(name, entry, table, settings["sensor"], checks_of(settings["ingest"]))
@@ -234,10 +239,15 @@ def _print_facts(reading: Reading) -> PipelineError | None:
         checked = check_recordings(parts or [recording], settings)
         parts, recording = (checked, recording) if parts else ([], checked[0])
     except PipelineError as error:
-        topics = topic_lines(reading.files[0], fields=error.code == "missing_topic") if reading.has_topics else []
-        place = _place(error.file, reading.files)
-        print(as_text([("REFUSED", f"{place}{error.message}"), ("code", error.code), *topics]) + "\n")
-        return error
+        refused = error
+    if countdown is not None:
+        countdown.end()
+    print(f"{', '.join(map(str, reading.files))}\n  {'read with':<16}{reading.said}")
+    if refused is not None:
+        topics = topic_lines(reading.files[0], fields=refused.code == "missing_topic") if reading.has_topics else []
+        place = _place(refused.file, reading.files)
+        print(as_text([("REFUSED", f"{place}{refused.message}"), ("code", refused.code), *topics]) + "\n")
+        return refused
     topics = topic_lines(reading.files[0], fields=False) if reading.has_topics else []
     segments = [("segments" if i == 0 else "", f"{p.name}: {_segment(p)}") for i, p in enumerate(parts)]
     print(as_text([*topics, *facts(recording, settings["sensor"]), *segments]) + "\n")

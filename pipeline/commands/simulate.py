@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,7 @@ from pipeline.errors import ConfigurationError
 from pipeline.model.effects import register
 from pipeline.model.effects.files import read_effect_files
 from pipeline.outcome import run_command
+from pipeline.run_progress import Countdown
 from pipeline.simulation.campaign import write_campaign
 from pipeline.simulation.description import (
     FORMATS,
@@ -68,7 +70,15 @@ def main(argv: Sequence[str]) -> int:
     beside = directory if source is None else source.parent
     for own in read_effect_files(sorted((beside / "effects").glob("*.yaml"))).values():
         register(own)
-    write_campaign(description, directory, (lambda _: None) if quiet else print, sheet_only=sheet_only)
+    total = len(description.units)
+    countdown, done = Countdown(total), count(1)
+
+    def tell(text: str) -> None:
+        number = next(done)
+        left = countdown.left(number)
+        print(f"{text} ({number} of {total}{', ' * bool(left)}{left})", flush=True)
+
+    write_campaign(description, directory, (lambda _: None) if quiet else tell, sheet_only=sheet_only)
     print(f"then: {run_command({'campaign': str(directory)})}")
     return 0
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.errors import ConfigurationError
+from pipeline.run_progress import Countdown
 from pipeline.study.cases import FAMILIES
 from pipeline.study.page import page
 from pipeline.study.run import RESULTS, TRUTH, read_lines, run_study
@@ -45,9 +45,16 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--table", type=Path, metavar="FILE", help="write the study as a Markdown page")
     arguments = parser.parse_args(argv)
     families = _families(arguments.families)
+    countdown = Countdown(0)
+
+    def progress(done: int, total: int) -> None:
+        countdown.total = total
+        countdown(done, f"{done} of {total} cases")
+
     run_study(
-        arguments.directory, families, arguments.n, arguments.seed, processes=arguments.processes, progress=_progress
+        arguments.directory, families, arguments.n, arguments.seed, processes=arguments.processes, progress=progress
     )
+    countdown.end()
     cases = cases_of(read_lines(arguments.directory / TRUTH), read_lines(arguments.directory / RESULTS))
     for figure in all_figures(cases):
         low, high = figure.interval
@@ -76,8 +83,3 @@ def _families(text: str) -> list[str]:
             raise ConfigurationError(f"no family is called {name!r}; known: {', '.join(FAMILIES)}")
         found += [family for family in these if family not in found]
     return found
-
-
-def _progress(done: int, total: int) -> None:
-    if done % 10 == 0 or done == total:
-        print(f"\r{done} of {total}", end="\n" if done == total else "", file=sys.stderr, flush=True)

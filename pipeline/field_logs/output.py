@@ -6,7 +6,6 @@ import os
 import re
 import shutil
 import sys
-import time
 from contextlib import contextmanager, suppress
 from typing import IO, TYPE_CHECKING
 
@@ -106,27 +105,3 @@ def _named(target: Path) -> Iterator[None]:
         raise InputError("the output was closed before it was complete", str(target)) from None
     except OSError as error:
         raise InputError(f"the output cannot be written: {error.strerror}", str(target)) from None
-
-
-class Progress:
-    """A line on a terminal that says how far the log is read, and how long it will take; silent elsewhere."""
-
-    def __init__(self, source: Path) -> None:
-        self.size = source.stat().st_size if source.is_file() else 0
-        self.began = self.said = time.monotonic()
-
-    def __call__(self, rows: int, read: int) -> None:
-        """Say that so many rows are done and so many bytes read."""
-        now = time.monotonic()
-        if not sys.stderr.isatty() or now - self.said < 0.5:
-            return
-        self.said = now
-        share = read / max(self.size, 1)
-        left = (now - self.began) * (1.0 / share - 1.0) if share > 0 else 0.0
-        sys.stderr.write(f"\r{100 * share:3.0f} %, {rows} samples, {left:.0f} s left ")
-        sys.stderr.flush()
-
-    def end(self) -> None:
-        """Leave the line."""
-        if self.said != self.began:
-            sys.stderr.write("\r" + " " * 60 + "\r")
