@@ -15,6 +15,7 @@ from markupsafe import Markup
 
 from pipeline.outcome import run_command
 from pipeline.records import SENSORS
+from pipeline.report.dcc import missing_for_dcc
 from pipeline.report.held_out_section import first_and_last_step
 from pipeline.report.pages import template
 from pipeline.report.parameters import fitted_parameters
@@ -157,6 +158,7 @@ def _result(sensor: str, calibration: JSON, held_out: JSON, settings: JSON, temp
         "beforeAdjustment": {k: first.get(k) for k in ERRORS} if first else None,
         "afterAdjustment": {k: last.get(k) for k in ERRORS} if last else None,
         "noiseFloor": held_out.get("noise_floor"),
+        "residualsOverTemperature": held_out.get("over_temperature"),
         "conformity": {
             **stated["conformity"],
             "checks": held_out.get("limits") or [],
@@ -216,9 +218,10 @@ def certificate_page(unit: str, report: JSON) -> str:
     """Return the report of ``certificate`` as a page that prints well: its identification is on every sheet."""
     core = report["administrativeData"]["coreData"]
     sheet = f"{core['title']} {core['uniqueIdentifier'] or unit}"
+    lacking = missing_for_dcc(report)
     if report["stamp"]:
         sheet += " \N{MIDDLE DOT} NOT A CALIBRATION CERTIFICATE"
-    page: str = template("certificate.html").render(unit=unit, report=report, sheet=_css_text(sheet))
+    page: str = template("certificate.html").render(unit=unit, report=report, sheet=_css_text(sheet), lacking=lacking)
     return page
 
 

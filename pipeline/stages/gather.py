@@ -97,7 +97,9 @@ def _read_unit(job: Job, batch: Path, sheet_row: dict[str, str]) -> Gathered:
         parts = [part for part in (found.diagnosis or {}).values() if isinstance(part, dict)]
         suggested = [name for part in parts if (name := part.get("suggested_file"))]
         found.files += [(batch / "diagnose" / name, f"diagnoses/{name}") for name in suggested]
-        certificates = (f"certificates/{unit}.{kind}" for kind in ("json", "html"))
+        certificates = [f"certificates/{unit}.{kind}" for kind in ("json", "html", "xml")]
+        if not (batch / "report" / certificates[-1]).is_file():  # where what its schema demands was not stated
+            del certificates[-1]
         found.files += [(batch / "report" / name, name) for name in certificates]
         found.files += [(file, f"exports/{unit}/{file.name}") for file in sorted((batch / "export" / unit).iterdir())]
     missing = [str(source) for source, _ in found.files if not source.is_file()]

@@ -11,6 +11,7 @@ from pipeline.files import read_json, write_atomically, write_json
 from pipeline.io.parquet import load_recordings
 from pipeline.records import SENSORS
 from pipeline.report.certificate import certificate, certificate_page
+from pipeline.report.dcc import digital_certificate
 from pipeline.report.pages import failure_page
 from pipeline.report.recording_section import sensor_temperature
 from pipeline.report.unit_page import render
@@ -34,6 +35,8 @@ def process_unit(job: Job, unit: str, settings: dict[str, Any]) -> None:
     report = certificate(calibration, validation, settings, sensor_temperature(recordings))
     write_json(job.output / "certificates" / f"{unit}.json", report)
     write_atomically(job.output / "certificates" / f"{unit}.html", certificate_page(unit, report))
+    if xml := digital_certificate(unit, report):
+        write_atomically(job.output / "certificates" / f"{unit}.xml", xml)
 
 
 def process_failed(job: Job, unit: str, settings: dict[str, Any], failure: dict[str, Any]) -> None:

@@ -25,6 +25,7 @@ from pipeline.model.measurement import linear_truth
 from pipeline.validation.error_breakdown import direction_known, error_breakdown, last_error_of_magnitude
 from pipeline.validation.expected_error import expected_rms_error, linearized
 from pipeline.validation.norm_error import squared_norm_errors
+from pipeline.validation.over_temperature import residuals_over_temperature
 from pipeline.validation.samples import samples_of_motion, samples_of_rests
 
 if TYPE_CHECKING:
@@ -67,7 +68,8 @@ def validate(
         ``unit, samples, expected_rms_error`` (None where an effect is left out), ``noise_floor, vector_noise_floor,
         steps`` of the published file, and ``held_out`` (false: judged on the samples of the fit), ``reason`` (why),
         ``reference_rms`` (of the reference's magnitude), ``noise``, ``notes``, ``worse_than_raw`` (why the
-        calibration does harm, or None), ``limits`` and ``pass``. ``vector_rms_error`` is the root of the mean squared
+        calibration does harm, or None), ``over_temperature`` (``pipeline.validation.over_temperature``; only where the
+        temperature was swept), ``limits`` and ``pass``. ``vector_rms_error`` is the root of the mean squared
         length of the difference to the reference.
 
     Raises
@@ -107,6 +109,13 @@ def validate(
         part["notes"] += lack
         if part["held_out"] and expected is not None:
             part["worse_than_raw"] = _worse_than_raw(calibration, samples, expected[1], other)
+        swept = residuals_over_temperature(calibration, samples, other)
+        if swept is None and reason is None:
+            fitted, reason = _choose(sensor, recordings, noise, settings, of_fit=True)
+            swept = residuals_over_temperature(calibration, fitted, other)
+        if swept:
+            whose = "the held-out samples" if reason is None else "the samples of the fit"
+            part["over_temperature"] = {"samples_of": whose, "bins": swept}
     limits = (settings.get("limits") or {}).get(sensor) or {}
     part["limits"], part["pass"] = _check_limits(calibration, part["steps"][-1], limits)
     return part
@@ -190,9 +199,15 @@ def _truth(calibration: SensorCalibration, samples: Samples) -> NDArray[np.float
 
 
 def _choose(
-    sensor: str, recordings: Sequence[Recording], noise: Noise, settings: Mapping[str, Any], *, smoothed: bool = False
+    sensor: str,
+    recordings: Sequence[Recording],
+    noise: Noise,
+    settings: Mapping[str, Any],
+    *,
+    smoothed: bool = False,
+    of_fit: bool = False,
 ) -> tuple[list[Samples], str | None]:
-    """Return the samples to judge on, and why they are not held out where they are not."""
+    """Return the samples to judge on, and why they are not held out where they are not (``of_fit``: asked for)."""
     table = settings["table"]
     by_rests = any(r.role == "rests" for r in recordings)
 
@@ -211,8 +226,8 @@ def _choose(
     def rests_of(role: str) -> dict[str, Sequence[Rest]]:
         return {r.name: split_rests(r, 0).used for r in recordings if r.role == role}
 
-    held_out = moving("validation")
-    if not held_out and by_rests:
+    held_out = [] if of_fit else moving("validation")
+    if not held_out and by_rests and not of_fit:
         held_out = resting(held_out_rests(recordings, settings)) or resting(rests_of("validation"))
     if held_out:
         return held_out, None
