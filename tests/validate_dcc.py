@@ -22,7 +22,7 @@ def main() -> int:
     parser.add_argument("files", nargs="+", type=Path)
     parser.add_argument("--schemas", type=Path, help="folder with the schemas")
     given = parser.parse_args()
-    folder = given.schemas
+    folder = given.schemas and given.schemas.resolve()
     locations = {space: str(folder / name) for space, name in IMPORTED.items()} if folder else None
     schema = xmlschema.XMLSchema(str(folder / "dcc.xsd") if folder else SOURCE, locations=locations)
     faults = 0
