@@ -2,7 +2,7 @@
 
 ``python -m pytest -m documents tests/test_documented_commands.py`` takes some minutes. It runs the commands of the code
 blocks, document by document, in a copy of the repository where the files that a reader would have are laid out. The
-tutorial has a test of its own (``tests/workflow/test_tutorial.py``), and ``.ci/run`` runs the second block of the README.
+tutorial has a test of its own (``tests/workflow/test_tutorial.py``). ``.ci/run`` runs the second block of the README.
 """
 
 import argparse

@@ -5,6 +5,7 @@ import runpy
 from pathlib import Path
 
 import pytest
+import yaml
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = [
@@ -14,6 +15,7 @@ DOCUMENTS = [
 PATH = re.compile(r"`((?:pipeline|configs|tests|workflow|benchmarks|docs)/[^`\s]*)`")
 PLACEHOLDER = re.compile(r"<|[A-Z]{4}|/my_")  # configs/effect/NAME.yaml, configs/effect/<name>.yaml, my_laboratory
 LINK = re.compile(r"\]\((?!http|#)([^)#]+)")
+ANCHOR = re.compile(r"\]\((?!http)([^)#]*)#([^)]+)\)")
 FUNCTION = re.compile(r"`([\w.]+)`\s+(?:in|\()\s*`(pipeline/[\w/]+\.py)`")
 
 
@@ -24,6 +26,65 @@ def test_files_that_a_document_names_exist(document: Path) -> None:
     missing = [path for path in named if not list(ROOT.glob(path.rstrip("/")))]
     missing += [link for link in LINK.findall(text) if not (document.parent / link).exists()]
     assert not missing
+
+
+def headings(document: Path) -> set[str]:
+    """Return the anchors of the headings of a document, as GitHub forms them."""
+    found = re.findall(r"^#+ (.*)$", document.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in found}
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda file: file.name)
+def test_headings_that_a_link_names_exist(document: Path) -> None:
+    linked = ANCHOR.findall(document.read_text())
+    assert not [
+        (file, anchor)
+        for file, anchor in linked
+        if anchor not in headings(document.parent / file if file else document)
+    ]
+
+
+def test_every_document_is_in_the_index() -> None:
+    index = (ROOT / "docs" / "README.md").read_text()
+    assert not [
+        file.name for file in (ROOT / "docs").glob("*.md") if file.name != "README.md" and f"({file.name}" not in index
+    ]
+
+
+def test_the_readme_is_short() -> None:
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 150
+
+
+def test_the_table_of_effects_is_the_catalogue() -> None:
+    rows = re.findall(
+        r"^\| `(\w+)` \| (\w+) \| .* \| (\w+) \|$", (ROOT / "docs" / "theory.md").read_text(), re.MULTILINE
+    )
+    catalogue = [yaml.safe_load(file.read_text()) for file in (ROOT / "configs" / "effect").glob("*.yaml")]
+    sensors = {("accelerometer", "gyroscope"): "both"}
+    assert sorted(rows) == sorted(
+        (e["name"], sensors.get(tuple(e["sensors"]), e["sensors"][0]), e["owner"]) for e in catalogue
+    )
+
+
+def test_figures_of_the_blind_study_are_those_of_its_table() -> None:
+    table = (ROOT / "docs" / "blind_study.md").read_text()
+    counts = {}
+    for figure, n, share in re.findall(r"^\| ([^|]*) \| (\d+) \| ([\d.]+) % \|", table, re.MULTILINE):
+        counts.setdefault(figure.partition(",")[0].partition(":")[0], []).append(
+            (round(int(n) * float(share) / 100), int(n))
+        )
+    null = counts["nothing hidden"]
+    stated = {
+        "one": counts["one effect at its data sheet's size"][0],
+        "two": counts["two effects"][0],
+        "wander": counts["two effects"][1],
+        "removed": counts["taken out of the catalogue"][0],
+        "null": (sum(found for found, _ in null), sum(n for _, n in null)),
+    }
+    for name in ("README.md", "docs/evidence.md"):
+        text = " ".join((ROOT / name).read_text().split())
+        for found, n in stated.values():
+            assert re.search(rf"\b{found:,} of {n:,}\b|\b{found:,} of (the )?{n:,}\b", text), (name, found, n)
 
 
 def test_functions_that_the_architecture_names_exist() -> None:
