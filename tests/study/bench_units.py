@@ -62,7 +62,7 @@ def drawn(kind: str, seed: int, number: int, hidden: float) -> tuple[UnitDescrip
             direction = rng.standard_normal(3)
             seats[name] = size * rng.uniform(0.0, 1.0) * direction / np.linalg.norm(direction)
     bench: dict[str, Any] = {
-        "direction_deg": np.zeros((3, 2)).tolist() if "seats" in kind else None,
+        "direction_deg": np.zeros((3, 2)).tolist() if KINDS[kind] == "single" else None,
         "rate_error": [0.0, 0.0, 0.0],  # encoders keep the angle over any number of turns; see ``judged``
         "mounting_deg": {n: (face * Rotation.from_rotvec(s, degrees=True)).as_rotvec(degrees=True).tolist()
                          for n, s in seats.items()},
