@@ -60,7 +60,7 @@ class Source:
         if self.folder is not None:
             procedure = self.config["procedure"]
             found = recording_files(procedure, self.config["ingest"], self.folder)
-            return {name: (procedure["recordings"][name], files) for name, files in found.items()}
+            return {name: (_whole(procedure["recordings"][name]), files) for name, files in found.items()}
         return {f.stem: ({"role": "rests", "axis": None}, [f]) for f in self.files if f.exists()}
 
     def read(self, *, growing: bool) -> list[Recording]:
@@ -141,12 +141,17 @@ def _source(arguments: argparse.Namespace) -> Source:
 def _by_hand(config: dict[str, Any]) -> dict[str, Any]:
     """Return a configuration whose procedure is recorded by hand."""
     procedure = config["procedure"]
-    if not any(entry["role"] == "rests" for entry in procedure["recordings"].values()):
+    if config["table"]["motion"] != "none":
         raise ConfigurationError(
             f"procedure {procedure['name']} is recorded on a table; guide is for those recorded by hand: "
             "multi_position, orientations_24, six_positions, ferraris (docs/record.md)"
         )
     return config
+
+
+def _whole(entry: dict[str, Any]) -> dict[str, Any]:
+    """Return a recording that a run cuts into parts as one of rests: what is missing is looked for in all of it."""
+    return {**entry, "role": "rests"} if entry["role"] == "session" else entry
 
 
 def _complete_rows(file: Path, folder: Path) -> Path:

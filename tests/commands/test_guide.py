@@ -8,6 +8,7 @@ import pytest
 
 from pipeline.__main__ import main
 from pipeline.commands import guide
+from pipeline.files import CONFIGS
 from pipeline.simulation.campaign import write_campaign
 from pipeline.simulation.description import description_from
 
@@ -78,6 +79,14 @@ def test_a_growing_log_is_followed_until_it_is_enough(
 
 def test_faces_and_turns_that_lack_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     whole = campaign(tmp_path / "faces", "ferraris", static_s=0.0)
+    assert main(["guide", str(whole)]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "enough: all faces and turns are there"
+    cut = whole.parents[2] / "configs" / "procedure" / "cut.yaml"  # a run cuts this recording into parts
+    cut.parent.mkdir(parents=True)
+    plain = (CONFIGS / "procedure" / "ferraris.yaml").read_text()
+    cut.write_text(plain.replace("recording, role: rests,", "recording, role: session,"))
+    sheet = whole.parents[2] / "units.csv"
+    sheet.write_text(sheet.read_text().replace("ferraris", "cut"))
     assert main(["guide", str(whole)]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == "enough: all faces and turns are there"
     rows = whole.read_text().splitlines()
