@@ -17,6 +17,7 @@ from pipeline.config.options import GROUPS, Problem, default_option, nearest, pa
 from pipeline.config.user_effects import PYTHON
 from pipeline.errors import ConfigurationError
 from pipeline.files import CONFIGS
+from pipeline.model.data_sheet import NEEDED, range_settings
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -100,14 +101,16 @@ def _origins(composer: Composer, layers: Sequence[Layer]) -> dict[Key, str]:
         option = chosen.get(group) or default_option(group)
         for key, value in _leaves(read_option(group, option, tuple(composer.searchpath)), (group,)):
             reference = f", {value}" if isinstance(value, str) and "${" in value else ""
-            origins[key] = _file(composer, group, option) + reference
+            unknown = group == "sensor" and value is None and key[-1] in NEEDED
+            origins[key] = _file(composer, group, "generic" if unknown else option) + reference
         origins[group, "name"] = chosen_by.get(group, "default, configs/config.yaml")
     defaults = read_option("", "config", ())
     origins |= {key: "configs/config.yaml" for key, _ in _leaves(defaults, ()) if key[0] != "defaults"}
+    sensor = read_option("sensor", chosen.get("sensor") or default_option("sensor"), tuple(composer.searchpath))
     for origin, text in layers:
-        name, value = parse(text)
-        path = (name, "name") if name in GROUPS and isinstance(value, str) else tuple(name.split("."))
-        origins = {k: o for k, o in origins.items() if k[: len(path)] != path} | {path: origin}
+        for name, value in range_settings(*parse(text), sensor):
+            path = (name, "name") if name in GROUPS and isinstance(value, str) else tuple(name.split("."))
+            origins = {k: o for k, o in origins.items() if k[: len(path)] != path} | {path: origin}
     return origins
 
 

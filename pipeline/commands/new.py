@@ -11,6 +11,7 @@ import yaml
 
 from pipeline.errors import ConfigurationError, InputError
 from pipeline.files import CONFIGS
+from pipeline.model.data_sheet import range_settings
 from pipeline.outcome import run_command
 from pipeline.planning.instructions import readme
 from pipeline.simulation.description import UnitDescription
@@ -129,23 +130,38 @@ def _chosen_ranges(sensor: dict[str, Any], given: list[float] | None) -> list[fl
 
 
 def _ranges_of(sensor: dict[str, Any]) -> list[float]:
-    return [float(sensor[name]["full_scale"]) for name in UNITS]
+    return [float(sensor[name]["full_scale"]) for name in UNITS if sensor.get(name)]
 
 
 def _ranges(name: str, sensor: dict[str, Any], wanted: list[float]) -> str:
     """Return the settings of the ranges, as comments where they are those of the sensor's file."""
-    held = ", ".join(f"{s} +-{sensor[s]['full_scale']:g} {unit}" for s, unit in UNITS.items())
-    pairs = list(zip(UNITS, wanted, strict=True))
-    other = [(part, value) for part, value in pairs if value != float(sensor[part]["full_scale"])]
+    sheets = {s: sensor[s] for s in UNITS if sensor.get(s)}
+    held = ", ".join(f"{s} +-{sheet['full_scale']:g} {UNITS[s]}" for s, sheet in sheets.items())
+    pairs = list(zip(sheets, wanted, strict=True))
+    other = [(part, value) for part, value in pairs if value != float(sheets[part]["full_scale"])]
     mark = "" if other else "# "
     lines = ["", f"# The file of the sensor {name} states the ranges {held}."]
-    lines += [] if other else ["# Example for ranges twice as large:"]
+    lines += [] if other else ["# Example for larger ones:"]
     lines += [f"{mark}models:", f"{mark}  {name}:"]
-    for part, value in other or [(part, 2.0 * value) for part, value in pairs]:
-        counts = float(sensor[part]["counts_per_unit"]) * float(sensor[part]["full_scale"]) / value
-        lines.append(f"{mark}    - sensor.{part}.full_scale={value:g}")
-        lines.append(f"{mark}    - sensor.{part}.counts_per_unit={counts:.10g}")
+    for part, value in other or [(part, _larger(sheets[part])) for part in sheets]:
+        lines += [f"{mark}    - {setting}" for setting in _settings_of_range(part, sheets[part], value)]
     return "\n".join(lines) + "\n"
+
+
+def _larger(sheet: dict[str, Any]) -> float:
+    """Return the next larger range of a sensor, or twice that of its file."""
+    full_scale = float(sheet["full_scale"])
+    listed = [float(r) for r in sheet.get("ranges") or ()] or [2.0 * full_scale]
+    return min((r for r in listed if r > full_scale), default=full_scale)
+
+
+def _settings_of_range(part: str, sheet: dict[str, Any], value: float) -> list[str]:
+    """Return the overrides that set a range: ``range`` of those that the file lists, else full scale and counts."""
+    if sheet.get("ranges"):
+        range_settings(f"sensor.{part}.range", value, {part: sheet})  # refuses what the file does not list
+        return [f"sensor.{part}.range={value:g}"]
+    counts = float(sheet["counts_per_unit"]) * float(sheet["full_scale"]) / value
+    return [f"sensor.{part}.full_scale={value:g}", f"sensor.{part}.counts_per_unit={counts:.10g}"]
 
 
 def _options() -> str:

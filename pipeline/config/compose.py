@@ -39,6 +39,7 @@ from pipeline.config.user_effects import ONLY_FROM_THE_COMMAND_LINE, PYTHON, Use
 from pipeline.errors import ConfigurationError
 from pipeline.files import CONFIGS
 from pipeline.io.ingest_settings import check_ingest
+from pipeline.model.data_sheet import completed, range_settings, without_overridden
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -116,13 +117,18 @@ class Composer:
                 raise Problem(f"{text}: stages are what a method is; write a method of your own in configs/method/")
             else:
                 values.append((key, value))
-        return groups, values
+        sensor = self._read("sensor", groups.get("sensor") or default_option("sensor"))
+        try:
+            return groups, [found for key, value in values for found in range_settings(key, value, sensor)]
+        except ConfigurationError as error:
+            raise Problem(error.message) from None
 
     def _resolve(self, groups: dict[str, str], values: list[tuple[str, Any]]) -> dict[str, Any]:
         base, has_references = self._base(self.complete(groups))
         merged = dict(base)
         for key, value in values:
             _set(merged, key.split("."), value)
+        merged["sensor"] = without_overridden(merged["sensor"], {key for key, _ in values})
         if has_references or "${" in repr(values):
             try:
                 merged = with_references(merged, merged)
@@ -194,6 +200,7 @@ class Composer:
             for group in GROUPS:
                 option = groups.get(group) or default_option(group)
                 plain[group] = {"name": option, **plain[group]}
+            plain["sensor"] = completed(plain["sensor"], self._read("sensor", "generic"))
             self._bases[key] = plain, "${" in repr(plain)
         return self._bases[key]
 

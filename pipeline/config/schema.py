@@ -37,6 +37,8 @@ class DataSheet(Section):
     scale_factor: Positive
     cross_axis: Positive
     effects: dict[str, Positive]
+    ranges: dict[float, Positive] = {}
+    assumed: list[str] = []
     axis_map: AxisMap | None = None
     repeatability_bias: NonNegative | None = None
     repeatability_scale_factor: NonNegative | None = None

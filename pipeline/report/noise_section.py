@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.estimation.noise_terms import UNITS, allan_variance, each_term
+from pipeline.model.data_sheet import as_stated
 from pipeline.records import AXES, SENSOR_UNITS
 from pipeline.report.chart import AXES_LEGEND, Area, Dots, Figure, Layer, Line, Panel, chart
 from pipeline.report.numbers import number, percent, plain
@@ -33,7 +34,7 @@ def allan(sensor: str, noise: JSON | None, sheet: JSON, wander: JSON | None) -> 
     axes = {a: part for a, part in ((noise or {}).get("axes") or {}).items() if part["terms"]}
     if not noise or not axes:
         return None
-    unit, layers = SENSOR_UNITS[sensor], list[Layer]()
+    unit, layers, sheet = SENSOR_UNITS[sensor], list[Layer](), as_stated(sheet)
     for axis, part in axes.items():
         curve, colour = {k: np.array(v) for k, v in part["allan"].items()}, AXES.index(axis)
         layers += [

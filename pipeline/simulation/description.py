@@ -27,6 +27,7 @@ from pipeline.errors import ConfigurationError, MissingInputError
 from pipeline.files import CONFIGS
 from pipeline.io.files import wrong_name
 from pipeline.io.yaml_file import read_yaml
+from pipeline.model.data_sheet import completed
 from pipeline.simulation.procedures import FERRARIS, ONE_RECORDING, TABLE_PROCEDURES, Course, fit_to_samples
 
 if TYPE_CHECKING:
@@ -189,7 +190,7 @@ def _read_mapping(path: Path) -> dict[str, Any]:
 
 @cache
 def read_config(group: str, name: str) -> dict[str, Any]:
-    """Read one configuration of a group as plain YAML, without composing it.
+    """Read one configuration of a group as plain YAML, without composing it; of a sensor, ``completed``.
 
     Raises
     ------
@@ -200,7 +201,8 @@ def read_config(group: str, name: str) -> dict[str, Any]:
     if not path.is_file():
         known = ", ".join(sorted(p.stem for p in path.parent.glob("*.yaml")))
         raise ConfigurationError(f"no {group} is called {name!r}; known: {known}")
-    return _read_mapping(path)
+    found = _read_mapping(path)
+    return completed(found, _read_mapping(path.with_name("generic.yaml"))) if group == "sensor" else found
 
 
 def _counted(entry: dict[str, Any]) -> list[UnitDescription]:

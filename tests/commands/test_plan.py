@@ -103,7 +103,7 @@ def test_a_campaigns_description_is_planned(capsys: pytest.CaptureFixture[str], 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--sensor", "mpu9999"], "no sensor is called 'mpu9999'; known: generic, mpu6050, stim300"),
+        (["--sensor", "mpu9999"], "no sensor is called 'mpu9999'; known: adis16448, adis16470"),
         (["--procedure", "dance"], "no procedure is called 'dance'"),
         (["--rate", "0"], "rates_dps is (0.0,); it must be above 0"),
         (["--samples", "100"], "cannot be recorded in 100 samples"),

@@ -1,0 +1,66 @@
+"""The figures of a sensor's file (``configs/sensor``): those of a range, and those that its data sheet does not state.
+
+``ranges`` maps a full scale to counts per unit; the override ``sensor.accelerometer.range=6`` stands for ``full_scale``
+and ``counts_per_unit`` of one of them. A figure that is null, or left out, is that of ``generic``, and its name stands
+in ``assumed``; so is the whole sheet of a sensor that the chip does not have. Full scale and counts are never assumed.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from pipeline.errors import ConfigurationError
+from pipeline.records import SENSORS
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+NEEDED = ("noise_density", "bias_wander", "wander_time_s", "bias", "scale_factor", "cross_axis", "effects")
+
+
+def completed(sensor: Mapping[str, Any], generic: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a sensor in which the figures of ``generic`` stand for those that are not stated."""
+    out = dict(sensor)
+    for part in SENSORS:
+        sheet = dict(sensor.get(part) or {k: generic[part][k] for k in ("full_scale", "counts_per_unit")})
+        missing = [key for key in NEEDED if sheet.get(key) is None]
+        if missing:
+            out[part] = sheet | {key: generic[part][key] for key in missing} | {"assumed": missing}
+    return out
+
+
+def range_settings(key: str, value: Any, sensor: Mapping[str, Any]) -> list[tuple[str, Any]]:  # noqa: ANN401  (the user's)
+    """Return what an override stands for: itself, or the figures of the range that it chooses.
+
+    Raises
+    ------
+    ConfigurationError
+        If the sensor's file does not list the range.
+    """
+    group, _, rest = key.partition(".")
+    part, _, leaf = rest.partition(".")
+    if group != "sensor" or part not in SENSORS or leaf != "range":
+        return [(key, value)]
+    ranges = {float(full): counts for full, counts in ((sensor.get(part) or {}).get("ranges") or {}).items()}
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not number or float(value) not in ranges:
+        known = ", ".join(f"{full:g}" for full in sorted(ranges)) or "none: set full_scale and counts_per_unit"
+        raise ConfigurationError(f"{key}={value}: the sensor's file lists the ranges {known}")
+    return [(f"sensor.{part}.full_scale", float(value)), (f"sensor.{part}.counts_per_unit", ranges[float(value)])]
+
+
+def as_stated(sheet: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the figures that the sensor's file states; None for those of ``generic``."""
+    return {**sheet, **dict.fromkeys(sheet.get("assumed") or ())}
+
+
+def without_overridden(sensor: dict[str, Any], keys: set[str]) -> dict[str, Any]:
+    """Return a sensor in which what an override states (``sensor.gyroscope.bias``) is not assumed."""
+    for part in SENSORS:
+        sheet = sensor.get(part) if isinstance(sensor, dict) else None
+        sheet = sheet if isinstance(sheet, dict) else {}
+        assumed = sheet.get("assumed")
+        left = [key for key in assumed or () if f"sensor.{part}.{key}" not in keys]
+        if assumed and len(left) < len(assumed):
+            sensor = {**sensor, part: {**sheet, "assumed": left}}
+    return sensor
