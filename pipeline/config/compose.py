@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
+INSTANCE = "${ingest.instance}"
 NOT_WANTED = "not_wanted"  # stage of a sensor whose method is null
 OF_A_SETUP = ("mounting", "bias")  # effects that exist as one setup's own alone (pipeline.model.effects.sessions)
 
@@ -129,6 +130,9 @@ class Composer:
         for key, value in values:
             _set(merged, key.split("."), value)
         merged["sensor"] = without_overridden(merged["sensor"], {key for key, _ in values})
+        if merged["ingest"].get("instance") is not None and INSTANCE not in repr(merged["ingest"]):
+            profile = merged["ingest"]["name"]
+            raise Problem(f"ingest.instance is set, and no name in the profile {profile} contains {INSTANCE}")
         if has_references or "${" in repr(values):
             try:
                 merged = with_references(merged, merged)

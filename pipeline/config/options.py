@@ -134,7 +134,7 @@ def with_references(node: Any, root: dict[str, Any]) -> Any:  # noqa: ANN401  (d
     too.
     """
     if isinstance(node, dict):
-        return {key: with_references(below, root) for key, below in node.items()}
+        return {with_references(key, root): with_references(below, root) for key, below in node.items()}
     if isinstance(node, list):
         return [with_references(below, root) for below in node]
     if not isinstance(node, str) or "${" not in node:
@@ -145,6 +145,8 @@ def with_references(node: Any, root: dict[str, Any]) -> Any:  # noqa: ANN401  (d
         return _named(whole.group(2), root, node)
     text, end = "", 0
     for token in TOKEN.finditer(node):
+        if token.group(2) and _named(token.group(2), root, node) is None:
+            raise ConfigurationError(f"{node[:200]!r}: {token.group(2)} is null; set it")
         text += node[end : token.start()] + ("${" if token.group(1) else str(_named(token.group(2), root, node)))
         end = token.end()
         if len(text) > LONGEST:

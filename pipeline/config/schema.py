@@ -217,9 +217,13 @@ class Limits(Section):
 
 
 class Ingest(Section):
-    """How files become recordings; ``pipeline.io`` documents the keys of ``csv``, ``mcap`` and ``checks``."""
+    """How files become recordings; ``pipeline.io`` documents the keys of ``csv``, ``mcap`` and ``checks``.
+
+    ``instance``: which sensor of a log that holds several; names in ``csv`` and ``mcap`` refer to it.
+    """
 
     name: str
+    instance: str | int | None = None
     csv: dict[str, Any]
     mcap: dict[str, Any]
     checks: dict[str, Any] = {}

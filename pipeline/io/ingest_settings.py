@@ -30,6 +30,7 @@ DELIMITER_NAMES = {"comma": ",", "semicolon": ";", "tab": "\t", "pipe": "|", "sp
 Share = Annotated[float, Field(ge=0, le=1, description="a share between 0 and 1")]
 Rate = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 HEADER, OWN, TIME = "header", "own", "time"
+FIRST = "[0]"  # of a topic's name: the first instance, which has the name alone
 ONLY_ONE = "a name, or null for the only one"
 Name = Annotated[str | None, Field(description=ONLY_ONE)]
 Duration = Annotated[float, Field(ge=0)]
@@ -328,7 +329,7 @@ def _topics(topics: Mapping[str, Any], source: str) -> dict[str, dict[str, Mappe
         if twice:
             raise ConfigurationError(f"ingest.mcap.topics: {', '.join(sorted(twice))} stands in two topics")
         seen |= set(fields)
-        found[str(topic)] = fields
+        found[str(topic).removesuffix(FIRST)] = fields
     for triad in (*TRIADS.values(), ATTITUDE):
         missing = [c for c in triad if c not in seen]
         if 0 < len(missing) < len(triad):

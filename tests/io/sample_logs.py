@@ -23,7 +23,8 @@ SENSOR = {
 
 def profile(name: str) -> dict[str, Any]:
     """Return an ingest profile that ships, without Hydra."""
-    loaded: dict[str, Any] = yaml.safe_load((REPOSITORY / "configs" / "ingest" / f"{name}.yaml").read_text())
+    text = (REPOSITORY / "configs" / "ingest" / f"{name}.yaml").read_text()
+    loaded: dict[str, Any] = yaml.safe_load(text.replace("${ingest.instance}", "0"))
     if "defaults" in loaded:
         return {**profile("canonical_csv"), **{k: v for k, v in loaded.items() if k != "defaults"}}
     return loaded
