@@ -196,7 +196,8 @@ def settings_of(procedure: str, sensor: str) -> dict[str, Any]:
     return {
         "sensor": read_config("sensor", sensor),
         "table": read_config("table", "hand"),
-        "procedure": read_config("procedure", procedure),
+        "procedure": read_config("procedure", procedure)
+        | {"holdout_every": 0},  # all rests are for the fit, as for peers
         "method": {"as_printed": False},
         "effects": {"accelerometer": [], "gyroscope": []},
     }
