@@ -241,7 +241,7 @@ def held_out(found: Estimate, recordings: list[Recording]) -> tuple[np.ndarray, 
         sizes += list(1000.0 * np.abs(np.linalg.norm(force, axis=1) - 1.0))
         rate = np.radians(found.rate(part.gyroscope, found.force(part.accelerometer)))
         for k, (before, after) in enumerate(pairwise(rests)):
-            span = slice((before.start + before.stop) // 2, (after.start + after.stop) // 2 + 1)
+            span = slice(before.stop - 1, after.start + 1)
             mean, step = (rate[span][1:] + rate[span][:-1]) / 2.0, np.diff(part.time[span])[:, None]
             g = force[k] / np.linalg.norm(force[k])
             for turn in Rotation.from_rotvec(mean * step):
@@ -325,7 +325,7 @@ def mpu6050(program: Path | None) -> list[str]:
     )
     kept = [r for r in recordings if r.role == "validation"]
     fitted = [r for r in recordings if r.role != "validation"]
-    found: dict[str, Estimate | None] = {"this product": ours(fitted, settings_of("multi_position", "mpu6050"))}
+    found: dict[str, Estimate | None] = {"this product": ours(recordings, settings_of("multi_position", "mpu6050"))}
     if program:
         found["imu_tk"] = imu_tk(program, fitted[0], 36.0)
     return public("`mpu6050` (published)", kept, found)
@@ -342,18 +342,18 @@ def xsens(folder: Path, program: Path) -> list[str]:
 def main() -> None:
     """Compare."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--units", type=int, default=60)
-    parser.add_argument("--imu-tk", type=Path, help="folder of its source")
+    parser.add_argument("--units", type=int, default=60, help="simulated; 0: the public recordings alone")
+    parser.add_argument("--imu-tk", type=Path, help="folder of its source; without it, imu_tk is left out")
     parser.add_argument("--xsens", type=Path, help="folder of the recording")
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         program = build_imu_tk(options.imu_tk, Path(folder)) if options.imu_tk else None
-        lines = table(
-            "imucal, simulated faces and turns",
-            simulated(options.units, "ferraris", lambda r: imucal(sections_of(r), 50.0)),
-        )
-        if program:
+        lines = []
+        if options.units:
+            pairs = simulated(options.units, "ferraris", lambda r: imucal(sections_of(r), 50.0))
+            lines += table("imucal, simulated faces and turns", pairs)
+        if options.units and program:
             pairs = simulated(options.units, "multi_position", lambda r: imu_tk(program, r, 28.0))
             lines += table("imu_tk, simulated rests in 40 attitudes", pairs, hidden=("case, deg",))
         lines += [*wearable(program), *mpu6050(program)]

@@ -40,7 +40,7 @@ BEFORE = {  # what a reader would have at that command
     "cp imu_tk_acc.calib ../../../../rig_acc.calib; cp imu_tk_gyro.calib ../../../../rig_gyro.calib; "
     "cp inav.txt ../../../..",
     "fleet.md": "printf 'unit,sensor\\nU0123,mpu6050\\n' > my_fleet/units.csv",
-    "record.md": "rm -r my_bench",
+    "record.md": "rm -rf my_bench",
     "your_bench.md": "sed '1s/time_s/Time (s)/; 1s/accel_\\(.\\)_g/A\\1 (g)/g; 1s/gyro_\\(.\\)_dps/G\\1 (deg\\/s)/g' "
     "log.csv > my_log.csv; rm -rf my_bench; python -m pipeline new my_bench --sensor mpu6050; " + U1.format("my_bench"),
 }
