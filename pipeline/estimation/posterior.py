@@ -156,7 +156,7 @@ class Search:
     def _beam(self) -> None:
         level = [self.required]
         while level and max(map(len, level)) < MOST + len(self.required):
-            children = {child for names in level for child in self._extend(names)}
+            children = dict.fromkeys(child for names in level for child in self._extend(names))
             level = sorted(children, key=lambda names: -self.pool[names].score)[:BEAM]
             for names in level:
                 self._finish(names)
@@ -167,7 +167,7 @@ class Search:
         """Replace each member of the best set by every other effect."""
         for _ in range(EXCHANGES):
             best = self.best()
-            for name in best - self.required:
+            for name in sorted(best - self.required):  # the order of a set differs from process to process
                 self._extend(best - {name})
             for names in self._best(BEAM, NEAR):
                 self._finish(names)
