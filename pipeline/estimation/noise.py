@@ -54,7 +54,7 @@ from pipeline.estimation.gauss_markov import (
     orthonormal,
     variance_of_average,
 )
-from pipeline.records import Noise, Recording
+from pipeline.records import Noise, Recording, median
 from pipeline.signal.creep import along_gravity, creep_of
 from pipeline.signal.filters import filter_autocovariance, variance_of_mean
 from pipeline.signal.rests import rest_readings, stretches_of, usable
@@ -278,7 +278,7 @@ def _white_of_turns(recordings: list[Recording], sensor: str) -> Values | None:
     found = np.concatenate(squares) if squares else np.empty((0, 3))
     if len(found) < 5:
         return None
-    return np.sqrt(np.median(found, axis=0) / (1.0 - 2.0 / (9.0 * nu)) ** 3)
+    return np.sqrt(median(found) / (1.0 - 2.0 / (9.0 * nu)) ** 3)
 
 
 def _of_sheet(recordings: list[Recording], sheet: dict[str, Any]) -> Noise:

@@ -33,7 +33,7 @@ import numpy as np
 
 from pipeline.io.quality_flags import GAP
 from pipeline.io.units import STANDARD_GRAVITY
-from pipeline.records import SENSOR_UNITS, conjugate_product, continuous, level_in_body, noise_of_steps
+from pipeline.records import SENSOR_UNITS, conjugate_product, continuous, level_in_body, median, noise_of_steps
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -138,7 +138,7 @@ def disturbed(recording: Recording) -> tuple[Array, list[tuple[str, str]]]:
         for n in np.unique(np.clip(np.concatenate([jumps, jumps + 1]), 0, recording.samples - 1)):  # on either side
             window, resting = motion.around(n)
             around = values[window, column]
-            middle = float(np.median(around))
+            middle = float(median(around))
             scatter = usual if resting and usual is not None else _scatter(around)
             scatter = max(float(noise[column]), scatter)
             off = abs(float(values[n, column]) - middle) - BEYOND * scatter - ALLOWED * float(allowed[n])
@@ -155,7 +155,7 @@ def _noise(step: Array) -> Array:
 
 
 def _scatter(values: Array) -> float:
-    return MEDIAN_SIZE * float(np.median(np.abs(values - np.median(values))))
+    return MEDIAN_SIZE * float(median(np.abs(values - median(values))))
 
 
 def _widened(excess: Array) -> Array:
@@ -205,7 +205,7 @@ class _Motion:
             return np.append(rate, rate[-1])[:, None]
         if r.role == "static":
             return np.zeros((r.samples, 1))
-        return None if r.gyroscope is None else r.gyroscope - np.median(r.gyroscope, axis=0)
+        return None if r.gyroscope is None else r.gyroscope - median(r.gyroscope)
 
     def unexplained(self, sensor: str, reading: Array) -> Array:
         """Return what the log does not explain of a sensor's readings: (n, 3) array."""
@@ -317,7 +317,7 @@ def _excess(reading: Array, pieces: Index) -> tuple[Array, Array]:
     left = np.maximum(squares - sums**2 / count[:, None], 0.0)
     step = np.abs(np.diff(reading, axis=0))
     rounding = np.where(step > 0.0, step, np.inf).min(axis=0) ** 2 / 4.0  # between two counts
-    usual = np.maximum(np.median(left / (count - 1.0)[:, None], axis=0), rounding)
+    usual = np.maximum(median(left / (count - 1.0)[:, None]), rounding)
     chi = np.sum(left / usual, axis=1)
     freedom = 3.0 * (count - 1.0)
     most = np.maximum(RATIO * freedom, freedom + SIGNIFICANT * np.sqrt(2.0 * freedom) + TAIL)

@@ -97,7 +97,8 @@ class _StoredColumns:
     def __init__(self, path: Path) -> None:
         self.path = str(path)
         with self._guarded():
-            self._file = parquet.ParquetFile(path, page_checksum_verification=True)
+            # a file of some MB is read fastest by the thread that needs it
+            self._file = parquet.ParquetFile(path, page_checksum_verification=True, pre_buffer=False)
             metadata, self.rows = self._file.schema_arrow.metadata or {}, self._file.metadata.num_rows
         self._columns: dict[str, Any] = {}
         text = metadata.get(KEY)

@@ -19,6 +19,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.records import median
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -60,7 +62,7 @@ class EncoderTrajectory:
         self._step = np.diff(time)
         self._mean = np.diff(rate) / self._step
         excess = np.diff(angle) - 0.5 * (rate[1:] + rate[:-1]) * self._step
-        self._tolerance = float(np.clip(10.0 * np.median(np.abs(excess)), TIGHTEST_DEG, LOOSEST_DEG))
+        self._tolerance = float(np.clip(10.0 * median(np.abs(excess)), TIGHTEST_DEG, LOOSEST_DEG))
         even = np.abs(excess) <= self._tolerance
         self._bend, self._before, self._after, bent = self._bends(even)
         slope = nearest_slope(time, rate)
@@ -124,7 +126,7 @@ class EncoderTrajectory:
     def _smooth(self, miss: Values) -> NDArray[np.bool_]:
         moving = np.abs(self._mean) + np.abs(self.rate[1:]) + np.abs(self.rate[:-1]) > MOVING_DPS
         inside = np.convolve(moving, np.ones(7), "same") > 6.5
-        noise = 4.0 * float(np.median(miss[inside])) if inside.sum() > 20 else 0.0
+        noise = 4.0 * float(median(miss[inside])) if inside.sum() > 20 else 0.0
         smooth: NDArray[np.bool_] = miss <= max(LOOSEST_DEG, noise)
         return smooth
 

@@ -37,7 +37,7 @@ import numpy as np
 from pipeline.io.units import TRIADS
 from pipeline.model.kinematics import EARTH_RATE_DPS
 from pipeline.preprocessing.evidence import LEAST_RATE_DPS, axis_index, place, quantiles, rate_of_turn, refusal
-from pipeline.records import SENSOR_UNITS, SENSORS, Note
+from pipeline.records import SENSOR_UNITS, SENSORS, Note, median
 from pipeline.signal.rests import RATE_AT_REST_DPS, rests_from_table, runs
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ def _doubted(
         if reading is None or not len(rests) or not len(blocks := _blocks(recording, reading)):
             continue
         step = _digit(reading)
-        own, usual = np.median(_moments(blocks), axis=0), np.median(rests, axis=0)
+        own, usual = median(_moments(blocks)), median(rests)
         louder = float(np.max(own[0] / np.maximum(usual[0], step)))
         quieter = float(np.min(usual[1] / np.maximum(own[1], step)))
         if louder > OF_RESTS * faster:
@@ -210,7 +210,7 @@ def _moving(
         usual = np.minimum(usual, OF_SHEET * white)
     usual = np.maximum(usual, 0.5 * _digit(blocks.reshape(-1, 3)))
     loud = scatter / usual
-    away = np.abs(means - np.median(means, axis=0))
+    away = np.abs(means - median(means))
     change = UNKNOWN_DEGC if recording.temperature is None else float(np.ptp(recording.temperature))
     allowed = _slow(sheet, change, float(recording.time[-1] - recording.time[0])) + SIGNIFICANT * usual
     moving = np.any(loud > louder, axis=1) | np.any(away > allowed, axis=1)

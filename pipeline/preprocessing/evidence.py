@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import IngestError
-from pipeline.records import AXES, SENSORS, conjugate_product, continuous, noise_of_steps
+from pipeline.records import AXES, SENSORS, conjugate_product, continuous, median, noise_of_steps
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -195,7 +195,7 @@ def _gravity_turned(recording: Recording) -> Array | None:
     across = force[:, [(axis + 1) % 3, (axis + 2) % 3]]
     low, high = quantiles(across, 0.01, 0.99)
     centred = across - np.where(high - low > 3.0 * LEAST_SWING_G, (low + high) / 2.0, 0.0)
-    if float(np.median(np.hypot(*centred.T))) < LEAST_SWING_G:
+    if float(median(np.hypot(*centred.T))) < LEAST_SWING_G:
         return None
     phase = np.degrees(np.unwrap(np.arctan2(centred[:, 1], centred[:, 0])))
     turned = np.diff(phase)
@@ -215,17 +215,18 @@ def of_gravity(recording: Recording, turned: Array, channels: Sequence[Channel])
 
 
 def ratio_quartiles(one: Array, other: Array, cut: int, least: float) -> Array:
-    """Return the weighted quartiles of the ratios of two channels: (3,) array.
+    """Return the weighted quartiles of the ratios of (n,) or (n, k) values to a channel: (3,) or (3, k) array.
 
     The weights ``|other|`` are cut off at their (1 / cut) largest value; ratios below ``least`` of that are left out.
     """
     size = np.abs(other)
     largest = largest_but(size, cut)
     used = size > least * largest
-    weight, ratio = np.minimum(size[used], largest), one[used] / other[used]
-    order = np.argsort(ratio)
-    total = np.cumsum(weight[order]) / weight.sum()
-    return np.asarray(ratio[order[np.searchsorted(total, [0.25, 0.5, 0.75])]])
+    weight, ratio = np.minimum(size[used], largest), (one[used].T / other[used]).T
+    order = np.argsort(ratio, axis=0)
+    total = np.cumsum(weight[order], axis=0) / weight.sum()
+    places = np.stack([np.count_nonzero(total < share, axis=0) for share in (0.25, 0.5, 0.75)])
+    return np.take_along_axis(ratio, np.take_along_axis(order, places, axis=0), axis=0)
 
 
 def largest_but(size: Array, cut: int) -> float:
@@ -234,13 +235,14 @@ def largest_but(size: Array, cut: int) -> float:
     return float(np.partition(size, -place)[-place])
 
 
-def slope_of(y: Array, rate: Array) -> tuple[float, float] | None:
-    """Return K and b of ``y = K rate + b`` for a gyroscope's axis; None where the rate hardly changes."""
-    dr, dy = rate - np.median(rate), y - np.median(y)
+def slopes_of(y: Array, rate: Array) -> list[tuple[float, float] | None]:
+    """Return K and b of ``y = K rate + b`` for each axis of a gyroscope; None where the rate hardly changes."""
+    dr = rate - median(rate)
     if largest_but(np.abs(dr), 100) < LEAST_RATE_DPS:
-        return None
-    gain = float(ratio_quartiles(dy, dr, 100, 0.1)[1])
-    return (gain, float(np.median(y - gain * rate))) if gain != 0.0 else None
+        return [None] * 3
+    gain = ratio_quartiles(y - median(y), dr, 100, 0.1)[1]
+    bias = median(y - gain * rate[:, None])
+    return [(K, b) if K != 0.0 else None for K, b in zip(gain.tolist(), bias.tolist(), strict=True)]
 
 
 def rate_of_turn(recording: Recording) -> Array | None:

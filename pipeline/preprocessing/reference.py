@@ -24,7 +24,7 @@ from pipeline.preprocessing.evidence import (
     quantiles,
     rate_of_turn,
     refusal,
-    slope_of,
+    slopes_of,
     spin,
 )
 from pipeline.preprocessing.reference_delay import check_delays, delay_of
@@ -109,7 +109,7 @@ class _Gyroscope:
             rate = rate_of_turn(recording)
             if rate is None or recording.gyroscope is None:
                 continue
-            slopes = self.slopes[recording.name] = [slope_of(reading, rate) for reading in recording.gyroscope.T]
+            slopes = self.slopes[recording.name] = slopes_of(recording.gyroscope, rate)
             if None not in slopes:
                 gain, bias = np.array(slopes, np.float64).T
                 found.append((axis_index(recording), float(quantiles(np.abs(rate), 0.9)[0]), gain, bias))

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.preprocessing.evidence import place
-from pipeline.records import Note
+from pipeline.records import Note, median
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -50,7 +50,7 @@ class Comparison:
     def __init__(self, recording: Recording, channels: Sequence[Channel], limits: Limits) -> None:
         self.recording, self.channels, self.limits = recording, channels, limits
         self.dt = np.diff(recording.time)
-        self.interval = float(np.median(self.dt))
+        self.interval = float(median(self.dt))
         self.known = np.ones(len(self.dt), bool)  # intervals that every channel knows
         for channel in channels:
             finite = np.isfinite(channel.low)

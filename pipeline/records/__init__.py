@@ -19,7 +19,7 @@ from pipeline.records.motion import (
     motion_at_rest,
     rate_of_attitude,
 )
-from pipeline.records.recording import AXES, SENSORS, Encoding, Noise, Note, Recording, noise_of_steps
+from pipeline.records.recording import AXES, SENSORS, Encoding, Noise, Note, Recording, median, noise_of_steps
 
 __all__ = [
     "AXES",
@@ -41,6 +41,7 @@ __all__ = [
     "coverage_factor",
     "finite",
     "level_in_body",
+    "median",
     "motion_at_rest",
     "noise_of_steps",
     "rate_of_attitude",

