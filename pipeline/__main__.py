@@ -54,12 +54,6 @@ def main(argv: list[str] | None = None) -> int:
         known = ", ".join((*COMMANDS, *STAGES))
         print(f"{PROGRAM}: no command {command!r}; known: {known}", file=sys.stderr)
         return 2
-    if command in STAGES:
-        from pipeline.stages.job_server import run_on_server  # noqa: PLC0415
-
-        code = run_on_server([command, *rest])
-        if code is not None:
-            return code
     return run_command([command, *rest])
 
 

@@ -1,7 +1,7 @@
 """Runs the jobs of a run in processes forked from one that has already imported the stages (0.2 to 0.6 s a process).
 
-``python -m pipeline STAGE ...`` passes its arguments, folder and standard streams through a Unix socket, and waits for
-the exit code. Without a server (a job by hand, on another machine, or not on Linux) the command runs the stage itself.
+The command ``job_command.py`` passes its arguments, folder and standard streams through a Unix socket, and waits for
+the exit code.
 """
 
 from __future__ import annotations
@@ -9,13 +9,15 @@ from __future__ import annotations
 import os
 import socket
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
+
+from pipeline.stages.job_command import ADDRESS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-ADDRESS = "IMU_CALIBRATION_JOB_SERVER"  # environment variable: path of the socket
-KILLED = 137  # exit code of a process that was killed, as shells return it
+COMMAND = [sys.executable, "-PS", str(Path(__file__).with_name("job_command.py"))]  # imports no package
 # glibc returns freed memory to the system by default, and clearing it anew is 8 % of the time of the stages.
 KEEP_FREED_MEMORY = {"MALLOC_TRIM_THRESHOLD_": "500000000", "MALLOC_MMAP_THRESHOLD_": "500000000"}
 
@@ -28,7 +30,7 @@ def start_server() -> Callable[[], None]:
     if sys.platform != "linux":
         return lambda: None
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    os.environ[ADDRESS] = os.path.join(tempfile.mkdtemp(prefix="imu-calibration-"), "jobs")  # noqa: PTH118  (pathlib would be imported by each job)
+    os.environ[ADDRESS] = f"{tempfile.mkdtemp(prefix='imu-calibration-')}/jobs"
     listener.bind(os.environ[ADDRESS])
     listener.listen(128)
     with listener:
@@ -44,22 +46,6 @@ def start_server() -> Callable[[], None]:
         server.communicate()  # closes its standard input, at which it ends
 
     return end
-
-
-def run_on_server(argv: Sequence[str]) -> int | None:
-    """Run a stage on the server and return its exit code; None where no server answers."""
-    address = os.environ.get(ADDRESS)
-    if address is None:
-        return None
-    request = "\0".join([os.getcwd(), *argv])  # noqa: PTH109
-    try:
-        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
-            connection.connect(address)
-            socket.send_fds(connection, [os.fsencode(request)], [0, 1, 2])
-            answer = connection.recv(1)
-    except OSError:
-        return None
-    return answer[0] if answer else KILLED
 
 
 def serve(listener: socket.socket, stages: Sequence[str], run_command: Callable[[list[str]], int]) -> int:

@@ -3,16 +3,15 @@
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from pipeline.stages.job_server import start_server
+from pipeline.stages.job_server import COMMAND, start_server
 
-VERDICT = [sys.executable, "-m", "pipeline", "verdict", "--results", "results", "--output", "done.json", "--failures"]
+VERDICT = [*COMMAND, "verdict", "--results", "results", "--output", "done.json", "--failures"]
 
 
 @pytest.fixture(scope="module")

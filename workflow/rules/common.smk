@@ -26,7 +26,7 @@ from pipeline.io.files import recording_files
 from pipeline.outcome import outcome
 from pipeline.results_folder import finish_publishing, repetitions
 from pipeline.run_progress import Monitor
-from pipeline.stages.job_server import start_server
+from pipeline.stages.job_server import COMMAND, start_server
 
 try:
     CAMPAIGN = load_campaign(config)
@@ -50,7 +50,7 @@ def without_braces(path):
 
 if "{" in str(CAMPAIGN.results):
     CAMPAIGN.results.mkdir(parents=True, exist_ok=True)
-RUN = f"{shlex.quote(sys.executable)} -m pipeline"
+RUN = shlex.join(COMMAND)
 RESULTS = without_braces(CAMPAIGN.results)
 BATCH = f"{RESULTS}/batches/{{batch}}"
 LOG = f"{RESULTS}/logs/{{batch}}"
