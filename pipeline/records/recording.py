@@ -199,8 +199,7 @@ def noise_of_steps(step: NDArray[np.float64], axis: int = 0, *, keepdims: bool =
 
 def median(values: NDArray[np.float64], axis: int = 0, *, keepdims: bool = False) -> NDArray[np.float64]:
     """Return ``numpy.median`` along an axis: for a thousand values in half of its time, for matrices in a fifth."""
-    ordered, half, before = np.sort(values, axis), values.shape[axis] // 2, (slice(None),) * axis
-    middle = 0.5 * (ordered[(*before, half)] + ordered[(*before, half - 1 + values.shape[axis] % 2)])
-    last = ordered[(*before, -1)]  # NaN, if any is
-    found = np.where(np.isnan(last), last, middle)
+    ordered, half = np.sort(values, axis), values.shape[axis] // 2
+    one, two, last = (ordered.take(k, axis) for k in (half, half - 1 + values.shape[axis] % 2, -1))
+    found = np.where(np.isnan(last), last, 0.5 * (one + two))  # NaN stands last
     return np.expand_dims(found, axis) if keepdims else found
