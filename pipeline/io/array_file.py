@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from pipeline.records import Note
 
 FEWEST_ROWS = 2  # shorter arrays are settings, not samples
+DEEPEST = 3  # dimensions: images, not read
 WIDEST = 64  # columns; a wider array is an image or a matrix
 BYTES_OF_A_DOUBLE = 8  # longer numbers are no reading of a converter
 V73 = b"MATLAB 7.3"
@@ -50,7 +51,7 @@ def _tree(group: Any) -> dict[str, Any]:  # noqa: ANN401  (h5py.Group)
     for name, item in group.items():
         if hasattr(item, "items"):
             found[name] = _tree(item) if name != "#refs#" else {}
-        else:
+        elif getattr(item, "ndim", DEEPEST) < DEEPEST:
             unit = next((item.attrs[k] for k in ("units", "unit") if k in item.attrs), "")
             found[name] = (item[()], unit.decode() if isinstance(unit, bytes) else str(unit))
     return found

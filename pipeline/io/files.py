@@ -24,23 +24,21 @@ if TYPE_CHECKING:
 
 
 class MessageFormat(NamedTuple):
-    """A kind of log other than text and MCAP: its name, and library, extra and module that read it."""
+    """A kind of log other than text and MCAP: its name, and the module and the extra of the package that read it."""
 
     kind: str
     library: str
     extra: str
-    module: str
 
 
-_ARRAYS = ("h5py", "hdf5", "pipeline.io.array_file")
 MESSAGE_FORMATS = {
-    ".bag": MessageFormat("ROS 1 bag", "rosbags.rosbag1", "ros", "pipeline.io.ros_bag"),
-    ".db3": MessageFormat("ROS 2 bag (SQLite)", "rosbags.rosbag2", "ros", "pipeline.io.ros_bag"),
-    ".ulg": MessageFormat("ULog", "pyulog", "ulog", "pipeline.io.ulog"),
-    ".bin": MessageFormat("DataFlash", "pymavlink.DFReader", "ardupilot", "pipeline.io.dataflash"),
-    ".h5": MessageFormat("HDF5", *_ARRAYS),
-    ".hdf5": MessageFormat("HDF5", *_ARRAYS),
-    ".mat": MessageFormat("MATLAB", *_ARRAYS),
+    ".bag": MessageFormat("ROS 1 bag", "rosbags.rosbag1", "ros"),
+    ".db3": MessageFormat("ROS 2 bag (SQLite)", "rosbags.rosbag2", "ros"),
+    ".ulg": MessageFormat("ULog", "pyulog", "ulog"),
+    ".bin": MessageFormat("DataFlash", "pymavlink.DFReader", "ardupilot"),
+    ".h5": MessageFormat("HDF5", "h5py", "hdf5"),
+    ".hdf5": MessageFormat("HDF5", "h5py", "hdf5"),
+    ".mat": MessageFormat("MATLAB", "h5py", "hdf5"),
 }
 SUFFIXES = (".csv", ".gcsv", ".mcap", *MESSAGE_FORMATS, ".BIN")  # .BIN: as ArduPilot names its logs
 FILE = "{file}"

@@ -113,8 +113,7 @@ class ArrayReader(LogReader):
 
     def messages(self) -> Iterator[Rows]:
         """Yield the arrays of each topic as messages."""
-        module = import_module(MESSAGE_FORMATS[self.file.suffix.lower()].module)
-        for topic in module.topics(self.file, self.notes):
+        for topic in _topics(self.file, self.notes):
             self.has_recorder &= topic.recorded_ns is not None
             table = _table(topic.columns)
             fields: Mapping[str, Any] = table.dtype.fields or {}
@@ -122,6 +121,22 @@ class ArrayReader(LogReader):
             metadata = {STATED + name: unit for name, unit in topic.units.items() if unit}
             definition = (self.kind, ARRAYS, json.dumps(places).encode())
             yield _rows(self.define(topic.name, ARRAYS, definition, metadata), table, topic.recorded_ns)
+
+
+def _topics(path: Path, notes: list[Note]) -> Iterator[Topic]:
+    """Yield the arrays of a log by the module of its format."""
+    suffix = path.suffix.lower()
+    if suffix == ".ulg":
+        from pipeline.io import ulog  # noqa: PLC0415  (each log needs one of the three)
+
+        return ulog.topics(path, notes)
+    if suffix == ".bin":
+        from pipeline.io import dataflash  # noqa: PLC0415
+
+        return dataflash.topics(path, notes)
+    from pipeline.io import array_file  # noqa: PLC0415
+
+    return array_file.topics(path, notes)
 
 
 def _table(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.void]:

@@ -46,7 +46,8 @@ class BagReader(LogReader):
         text = connection.msgdef.data
         if not ros1 and connection.msgdef.format.name != "MSG":
             text = _humble(connection.msgtype)
-        schema = (connection.msgtype, "ros1msg" if ros1 else "ros2msg", text.encode())
+        known = ("ros1msg" if ros1 else "ros2msg") if text else "no"
+        schema = (connection.msgtype, known, text.encode())
         return self.define(connection.topic, "ros1" if ros1 else "cdr", schema, {})
 
 

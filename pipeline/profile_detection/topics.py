@@ -58,11 +58,12 @@ def topics_of(path: Path) -> list[TopicLayout]:
 def _layout(reader: AnyReader, rows: Rows) -> TopicLayout | None:
     """Return the numbers of a topic's messages; None where they are too few, vary in length or are no arrays."""
     channel = reader.channels[rows.channel]
-    find = ros_layouts(channel, reader.schemas.get(channel.schema_id))
-    if find is None or len(rows.starts) < FEWEST_ROWS:
+    try:
+        find = ros_layouts(channel, reader.schemas.get(channel.schema_id))
+        layout = find(rows.payload(0)) if find is not None and len(rows.starts) >= FEWEST_ROWS else None
+    except (ValueError, KeyError):  # a definition that is none, or a message that is not what it says
         return None
-    layout = find(rows.payload(0))
-    if not layout.matches(rows):
+    if layout is None or not layout.places or not layout.matches(rows):
         return None
     places: dict[str, tuple[int, str]] = {}
     for name, place in layout.places.items():

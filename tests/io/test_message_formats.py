@@ -10,9 +10,10 @@ import h5py
 import numpy as np
 import pytest
 import yaml
-from foreign_logs import GRAVITY, Truth, write_arrays, write_bag, write_dataflash, write_matlab73, write_ulog
+from foreign_logs import GRAVITY, STORES, Truth, write_arrays, write_bag, write_dataflash, write_matlab73, write_ulog
 from pymavlink.DFReader import DFReader_binary
 from pyulog import ULog
+from rosbags import rosbag2
 from sample_logs import SENSOR, procedure, profile
 
 from pipeline.commands.apply import main as apply
@@ -206,6 +207,21 @@ def test_check_proposes_a_profile_that_reads_the_log(
     assert saved["mcap"]["topics"][topic]["time"] == {"field": time, "unit": unit}
     assert_is(read_log(log, mcap_format(saved)), truth)
     assert "PROPOSED PROFILE" in capsys.readouterr().out
+
+
+def test_a_log_without_readings_is_told_what_it_holds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "talker.db3"
+    store = STORES[".db3"]
+    text, kind = store.types["std_msgs/msg/String"], "std_msgs/msg/String"
+    with rosbag2.Writer(tmp_path / "talker", version=8) as bag:
+        connection = bag.add_connection("/topic", kind, typestore=store)
+        for i, data in enumerate(["a", "bcd", "", "efghij"]):
+            bag.write(connection, i, store.serialize_cdr(text(data=data), kind))
+    next((tmp_path / "talker").glob("*.db3")).rename(path)
+    assert check([str(path)]) == 2
+    said = capsys.readouterr().out
+    assert "no topic of type sensor_msgs/msg/Imu; the file has /topic (std_msgs/msg/String)" in said
+    assert "no topic holds the three axes of a sensor; the file has /topic (4)" in said
 
 
 def test_arrays_of_several_lengths_are_topics_by_their_first_array(tmp_path: Path) -> None:
