@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from pipeline.errors import ConfigurationError
+from pipeline.model.data_sheet import assumed_figures
 from pipeline.model.effects import register
 from pipeline.model.effects.files import read_effect_files
 from pipeline.outcome import run_command
@@ -20,6 +21,7 @@ from pipeline.simulation.description import (
     add_recording_options,
     described,
     description_from,
+    read_config,
     read_description,
 )
 
@@ -78,6 +80,9 @@ def main(argv: Sequence[str]) -> int:
         left = countdown.left(number)
         print(f"{text} ({number} of {total}{', ' * bool(left)}{left})", flush=True)
 
+    for sensor in sorted({unit.sensor for unit in description.units}):
+        assumed = assumed_figures(sensor, read_config("sensor", sensor))
+        print(f"note: {assumed}\n" if assumed else "", end="")
     write_campaign(description, directory, (lambda _: None) if quiet else tell, sheet_only=sheet_only)
     print(f"then: {run_command({'campaign': str(directory)})}")
     return 0

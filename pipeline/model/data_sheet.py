@@ -49,6 +49,12 @@ def range_settings(key: str, value: Any, sensor: Mapping[str, Any]) -> list[tupl
     return [(f"sensor.{part}.full_scale", float(value)), (f"sensor.{part}.counts_per_unit", ranges[float(value)])]
 
 
+def assumed_figures(name: str, sensor: Mapping[str, Any]) -> str:
+    """Return which figures of a ``completed`` sensor are those of ``generic``; empty for none."""
+    parts = [f"{', '.join(found)} of the {part}" for part in SENSORS if (found := sensor[part].get("assumed"))]
+    return f"the file of the sensor {name} does not state {', and '.join(parts)}: generic's are used" if parts else ""
+
+
 def as_stated(sheet: Mapping[str, Any]) -> dict[str, Any]:
     """Return the figures that the sensor's file states; None for those of ``generic``."""
     return {**sheet, **dict.fromkeys(sheet.get("assumed") or ())}

@@ -25,6 +25,7 @@ from pipeline.estimation.multi_position import selection as by_hand
 from pipeline.estimation.observations import observe
 from pipeline.estimation.rest_means import is_multi_position
 from pipeline.estimation.selection import unselected
+from pipeline.model.data_sheet import assumed_figures
 from pipeline.model.effects import effect
 from pipeline.model.effects.base import unit_of
 from pipeline.planning.detection_limits import RestLimits, TurntableLimits
@@ -68,7 +69,7 @@ def plan_of(unit: UnitDescription, extra: Sequence[Planned] = (), *, half_only: 
         "at_a_table": simulated.table["motion"] != "none",
         "minutes": simulated.minutes,
         "samples": sum(r.samples for r in simulated.recordings),
-        "warnings": _warnings(simulated),
+        "warnings": _warnings(simulated, unit.sensor),
         **{sensor: of_sensor(sensor, simulated, half_only=half_only) for sensor in SENSORS},
     }
 
@@ -199,11 +200,12 @@ def noise_of_sheet(sheet: Mapping[str, Any], interval: float, *, long_rest: bool
     return Noise(np.full(3, np.sqrt(variance)), np.full(3, wander), float(sheet.get("wander_time_s") or 100.0), source)
 
 
-def _warnings(simulated: SimulatedProcedure) -> list[str]:
-    """Return what sensor or table cannot do of the procedure, as sentences."""
+def _warnings(simulated: SimulatedProcedure, sensor: str) -> list[str]:
+    """Return what sensor or table cannot do of the procedure, and figures that are assumed, as sentences."""
     full = float(simulated.sheets["gyroscope"]["full_scale"])
     rates = [float(np.abs(r.table_rate).max()) for r in simulated.recordings if r.table_rate is not None]
-    fastest, found = max(rates, default=0.0), []
+    fastest, assumed = max(rates, default=0.0), assumed_figures(sensor, simulated.sheets)
+    found = [assumed] if assumed else []
     if fastest > full:
         found.append(f"the fastest turn, {fastest:g} deg/s, is beyond the gyroscope's full scale of {full:g} deg/s")
     if simulated.table["motion"] == "commanded":
