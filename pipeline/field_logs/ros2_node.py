@@ -1,0 +1,157 @@
+"""A ROS 2 node: calibrated ``sensor_msgs/Imu`` messages as they come.
+
+    python -m pipeline.field_logs.ros2_node results/demo/calibrations/U1.json --topic /imu/data_raw
+
+It publishes on ``<topic>_calibrated``. A message is a copy of the original in which the calibrated vectors are
+replaced; stamp, frame, orientation and covariances stay, as in ``python -m pipeline apply``. ROS is imported by
+``main`` alone: ``MessageCalibrator`` takes any object with the fields of the message.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import sys
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.errors import PipelineError
+from pipeline.io.channel_table import axis_matrix, maps_of_log
+from pipeline.io.units import STANDARD_GRAVITY
+from pipeline.model.calibration_file import read_calibration
+from pipeline.model.compensation import SMOOTHING_S, load
+from pipeline.model.log_motion import ExponentialRegression
+from pipeline.records import SENSORS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+# Field of the message, its covariance, and what one of its units is in g or deg/s.
+FIELDS = {
+    "accelerometer": ("linear_acceleration", "linear_acceleration_covariance", 1.0 / STANDARD_GRAVITY),
+    "gyroscope": ("angular_velocity", "angular_velocity_covariance", float(np.degrees(1.0))),
+}
+ABSENT = -1.0  # first element of a covariance whose field holds nothing (sensor_msgs/Imu)
+DEPTH = 10  # messages that wait for a subscriber, as in rclpy's own examples
+
+
+class MessageCalibrator:
+    """Calibrates Imu messages one by one.
+
+    ``needs_temperature``: whether an effect of the calibration follows it; messages before the first temperature are
+    then dropped, with one warning. A line through the past (memory ``smoothing``, s) bridges the time between
+    temperatures. Time counts from the first message. Where stamps run backwards (a log that is played again), the
+    memory of the samples before is cleared, with a warning.
+    """
+
+    def __init__(
+        self, file: Path, warn: Callable[[str], Any], python_effects: Sequence[str] = (), smoothing: float = SMOOTHING_S
+    ) -> None:
+        self.compensation, self.warn, self.smoothing = load(file, python_effects), warn, smoothing
+        self.axes = {s: axis_matrix(m) for s, m in maps_of_log(read_calibration(file).get("log") or {}).items()}
+        self.needs_temperature = "temperature" in self.compensation.stream().needs
+        self.warmth: float | None = None
+        self.waiting = False
+        self._start(None)
+
+    def _start(self, first: int | None) -> None:
+        """Forget the samples before; of the temperature, the last value stays."""
+        self.stream, self.line = self.compensation.stream(0.0), ExponentialRegression(self.smoothing)
+        self.first, self.last = first, -1
+        if self.warmth is not None:
+            self._temperature_at(0.0, self.warmth)
+
+    def _temperature_at(self, time: float, measured: float = float("nan")) -> float:
+        return float(self.line.apply(np.array([time]), np.array([measured]))[0])
+
+    def _time(self, message: Any) -> float:  # noqa: ANN401  (any message with a header)
+        """Return the stamp of a message, s from the first one."""
+        stamp = message.header.stamp
+        self.now = stamp.sec * 1_000_000_000 + stamp.nanosec
+        self.first = self.now if self.first is None else self.first
+        return float((self.now - self.first) / 1e9)
+
+    def temperature(self, message: Any) -> None:  # noqa: ANN401  (sensor_msgs/Temperature, degC)
+        """Take a temperature."""
+        self.warmth = float(message.temperature)
+        self._temperature_at(self._time(message), self.warmth)
+
+    def imu(self, message: Any) -> Any | None:  # noqa: ANN401  (sensor_msgs/Imu)
+        """Return the calibrated copy of a message; None where the temperature is needed and not known yet."""
+        if self.needs_temperature and self.warmth is None:
+            if not self.waiting:
+                self.warn("the calibration needs a temperature: messages are dropped until the first one comes")
+            self.waiting = True
+            return None
+        time = self._time(message)
+        if self.now < self.last:
+            self.warn(f"stamps run backwards by {(self.last - self.now) / 1e9:g} s: the past is forgotten")
+            self._start(self.now)
+            time = 0.0
+        self.last = self.now
+        readings = {}
+        for sensor, (field, covariance, factor) in FIELDS.items():
+            if getattr(message, covariance)[0] != ABSENT:
+                vector = getattr(message, field)
+                readings[sensor] = self.axes[sensor] @ (np.array([vector.x, vector.y, vector.z]) * factor)
+        out = copy.deepcopy(message)
+        if not readings:
+            return out
+        warmth = {"temperature": self._temperature_at(time)} if self.needs_temperature else {}
+        found = self.stream.apply(**readings, **warmth, time=time)
+        for sensor in set(readings) & {s for s in SENSORS if self.compensation.calibration(s) is not None}:
+            field, _, factor = FIELDS[sensor]
+            x, y, z = (getattr(found, sensor) / factor).tolist()
+            vector = getattr(out, field)
+            vector.x, vector.y, vector.z = x, y, z
+        return out
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the node until ROS stops it."""
+    rclpy, messages = import_module("rclpy"), import_module("sensor_msgs.msg")
+    sensor_data = import_module("rclpy.qos").qos_profile_sensor_data
+    words = sys.argv if argv is None else ["ros2_node", *argv]
+    given = _parser().parse_args(import_module("rclpy.utilities").remove_ros_args(words)[1:])
+    rclpy.init(args=words)
+    node = rclpy.create_node("imu_calibration")
+    try:
+        calibrator = MessageCalibrator(given.calibration, node.get_logger().warning, given.python_effects)
+        publisher = node.create_publisher(messages.Imu, given.output or f"{given.topic}_calibrated", DEPTH)
+
+        def on_imu(message: Any) -> None:  # noqa: ANN401
+            calibrated = calibrator.imu(message)
+            if calibrated is not None:
+                publisher.publish(calibrated)
+
+        node.create_subscription(messages.Imu, given.topic, on_imu, sensor_data)
+        if calibrator.needs_temperature:
+            node.create_subscription(messages.Temperature, given.temperature_topic, calibrator.temperature, sensor_data)
+        rclpy.spin(node)
+    except KeyboardInterrupt:
+        pass
+    except PipelineError as error:
+        node.get_logger().fatal(str(error))
+        return 2
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m pipeline.field_logs.ros2_node", description=__doc__)
+    add = parser.add_argument
+    add("calibration", type=Path, help="calibrations/<unit>.json")
+    add("--topic", default="/imu/data_raw", help="topic of the readings (default: %(default)s)")
+    add("--output", help="topic of the calibrated messages (default: that of the readings + _calibrated)")
+    add("--temperature-topic", default="/imu/temperature", help="sensor_msgs/Temperature (default: %(default)s)")
+    add("--python-effect", action="append", default=[], dest="python_effects", metavar="FILE", help="as of apply")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())
