@@ -191,7 +191,11 @@ def _next(progress: Progress, goal: float, dwell: float, rests: list[str]) -> tu
     """Return whether the goal is reached, and the next rest in words."""
     held = sum(progress.held_out)
     count = f"{progress.used} rests of the fit, {held} held out"
-    now = f"not determined yet: {progress.reason.partition(': ')[0]}" if progress.reason else f"{1e3 * progress.expanded:.3g} mg"
+    now = (
+        f"not determined yet: {progress.reason.partition(': ')[0]}"
+        if progress.reason
+        else f"{1e3 * progress.expanded:.3g} mg"
+    )
     lines = [f"expanded uncertainty: {now} ({count}; goal {1e3 * goal:.3g} mg)"]
     proposal = propose(progress, goal)
     if not proposal.further:

@@ -17,6 +17,9 @@ where
     V   : median of sum_c v_c in the stretch: noise and tremor
     q   : 6: of 10^5 windows of three axes, noise alone passes in 6e-4
 
+Readings that are coarse against their noise repeat their value: the limit of a mean is at least one count, and V at
+least the variance of rounding, ``sum_c count_c^2 / 12``, in which a single flip of a count stays below the limit.
+
 Of a stretch that is mostly a turn, d and V are the medians of all stretches. A stretch is cut where the unit turns. Of
 pieces between which it turned by less than the limit of a rest, the longest is kept.
 """
@@ -45,6 +48,7 @@ RATE_LIMIT_DPS = 0.7  # of a stretch against those around it: hand-held rests di
 # but for the ends of moves; its moves reach 60 (see tests/signal/test_rests.py).
 TREMOR_LIMIT_DPS = 2.5
 SAME_DEG = 2.0  # the limit of a rest in ``pipeline.signal.rests``
+ROUNDING = 1e-6  # relative, of a difference of decimals
 NORMAL = 1.4826  # standard deviation over median absolute deviation of a normal distribution
 
 
@@ -75,8 +79,10 @@ def quiet_pieces(rate: Values, stretches: Sequence[tuple[int, int]], interval: f
     spread = NORMAL * np.array([np.median(own, axis=0) for own in off])
     noise = np.array([np.median(variance) for _, variance in of_parts])
     spread = np.where(resting[:, None], spread, np.median(spread, axis=0))
+    count = counts_of(differences)
     limit = np.minimum(SIGNIFICANT * np.maximum(white, spread), np.maximum(SIGNIFICANT * white, TREMOR_LIMIT_DPS))
-    loud = SIGNIFICANT**2 * np.where(resting, noise, np.median(noise))
+    limit = np.maximum(limit, count * (1.0 + ROUNDING))
+    loud = SIGNIFICANT**2 * np.maximum(np.where(resting, noise, np.median(noise)), np.sum(count**2) / 12.0)
     pieces: Spans = []
     for i, (start, stop) in enumerate(stretches):
         turns = np.any(off[i] > limit[i], axis=1) | (of_parts[i][1] > loud[i])
@@ -87,6 +93,15 @@ def quiet_pieces(rate: Values, stretches: Sequence[tuple[int, int]], interval: f
             found = [(0, stop - start)]  # for the caller to refuse, with the reason
         pieces += [(start + a, start + b) for a, b in found]
     return pieces
+
+
+def counts_of(differences: Values) -> Values:
+    """Return the smallest step between successive readings of each axis, (k,), by their absolute differences (n, k).
+
+    Of coarse readings it is one count, of fine ones nothing beside their noise.
+    """
+    smallest = np.min(differences, axis=0, where=differences > 0.0, initial=np.inf)
+    return np.asarray(np.where(np.isfinite(smallest), smallest, 0.0))
 
 
 def windows(values: Values, size: int) -> tuple[Values, Values]:

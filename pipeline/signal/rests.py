@@ -8,7 +8,8 @@ specific force in a short window, summed over the axes, is below a multiple of t
 where
 
     W   : window, 0.5 s and at least 5 samples
-    v_0 : the noise: the 5th percentile of v, so that no part of the recording has to be known to rest
+    v_0 : the noise: the 5th percentile of v, so that no part of the recording has to be known to rest, and at least
+          that of rounding, by the smallest step between successive readings
     m   : the multiple, from the widest range over which the number of rests stays the same
 
 A rest is trimmed by W at its start. A gyroscope must be quiet, too (``pipeline.signal.quiet_rates``), as a turn about
@@ -28,7 +29,7 @@ import numpy as np
 from pipeline.records import median, noise_of_steps
 from pipeline.signal.creep import creep_in
 from pipeline.signal.filters import filter_autocovariance, stretch_starts
-from pipeline.signal.quiet_rates import RATE_LIMIT_DPS, quiet_pieces, windows
+from pipeline.signal.quiet_rates import RATE_LIMIT_DPS, counts_of, quiet_pieces, windows
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -124,7 +125,8 @@ def find_rests(recording: Recording) -> list[Rest]:
     if force is None or recording.samples < 2 * size:
         return []
     variance = windows(force, size)[1]
-    noise = max(float(np.percentile(variance, 5.0)), SMALLEST_VARIANCE)
+    rounding = float(np.sum(counts_of(np.abs(np.diff(force[np.isfinite(force).all(axis=1)], axis=0))) ** 2)) / 12.0
+    noise = max(float(np.percentile(variance, 5.0)), rounding, SMALLEST_VARIANCE)
     variance[_spoilt(recording, size)] = np.inf
     found = [_below(variance, multiple * noise, recording, size) for multiple in MULTIPLES]
     quiet = found[_plateau([len(rests) for rests in found])]

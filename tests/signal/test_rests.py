@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hand_simulator import Hand, draw
 
 from pipeline.records import Recording
 from pipeline.signal.rests import Rest, assess_rests, find_rests, rests_from_table, runs, still_samples
@@ -206,3 +207,17 @@ def test_the_published_intervals_that_reach_into_a_move_are_refused(number: int,
     assessed = assess_rests(recording, intervals, noise)
     assert [rest.accepted for rest in assessed] == [k != number - 1 for k in range(10)]
     assert assessed[number - 1].reason
+
+
+@pytest.mark.parametrize(("sensor", "counts"), [("gyroscope", 16.384), ("accelerometer", 256.0)])
+def test_readings_coarser_than_their_noise_lose_no_rest(sensor: str, counts: float) -> None:
+    drawn = draw(Hand(rests=20, rate_hz=10.0, white={"accelerometer": 6e-4, "gyroscope": 0.01}), 4)
+    fine = find_rests(drawn.recording)
+    assert len(fine) == 20
+    reading = drawn.recording.reading(sensor)
+    coarse = replace(drawn.recording, **{sensor: np.round(reading * counts) / counts})
+    assert np.mean(np.diff(coarse.reading(sensor)[drawn.still], axis=0) == 0.0) > 0.6
+    found = [rest for rest in find_rests(coarse) if rest.accepted]
+    assert len(found) == 20
+    inside = [np.mean(drawn.still[rest.start : rest.stop]) for rest in found]
+    assert min(inside) > 0.95
