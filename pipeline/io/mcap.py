@@ -21,7 +21,7 @@ from pipeline.io.mcap_reader import McapReader
 from pipeline.io.message_logs import open_log
 from pipeline.io.ros2_messages import IMU, JOINT_STATE, QUATERNION_STAMPED, TEMPERATURE
 from pipeline.io.timestamps import check_fine, check_plausible, in_order
-from pipeline.io.units import ACCELEROMETER, GYROSCOPE, TABLE_CHANNELS
+from pipeline.io.units import ACCELEROMETER, GYROSCOPE, TABLE_CHANNELS, TRIADS
 from pipeline.records import Encoding, Note
 
 if TYPE_CHECKING:
@@ -235,11 +235,16 @@ class _Log:
             self.end_ns = min(self.end_ns, int(series.time_ns[-1]))
         unmatched = np.flatnonzero((series.time_ns[index] != base.time_ns) & (base.time_ns <= self.end_ns))
         if unmatched.size:
+            sensor = next((n for n, triad in TRIADS.items() if triad[0] in series.values), "")
+            what = f"both sensors have to bear the same stamps, and the {sensor} has its own"
+            what = what if sensor else "the table has to be logged with the Imu's stamps"
             message = (
                 f"{unmatched.size} of {len(index)} Imu messages have no message of equal stamp on {series.topic}, the "
-                f"first at {base.time_ns[unmatched[0]] / 1e9:.9g} s; the table has to be logged with the Imu's stamps"
+                f"first at {base.time_ns[unmatched[0]] / 1e9:.9g} s; {what}"
             )
             hint = "or, where its clock is another one, set ingest.mcap.table_clock=own"
+            if sensor:
+                hint = f"read one sensor at a time: leave this topic out of the profile, and set method.{sensor}=null"
             raise IngestError(message, self.path, code="bad_time", hint=hint)
         extra = len(series.time_ns) - len(index)
         if extra > 0:

@@ -6,6 +6,8 @@ microseconds since power-on; the format states no units.
 
 from __future__ import annotations
 
+import contextlib
+import io
 import re
 from typing import TYPE_CHECKING, Any
 
@@ -28,10 +30,12 @@ def topics(path: Path, notes: list[Note]) -> Iterator[Topic]:
     """Yield the topics of a log; refuse one that ``pyulog`` finds damaged, and note where the logger lost data."""
     from pyulog import ULog  # noqa: PLC0415  (an extra)
 
-    with path.open("rb") as stream:
+    with path.open("rb") as stream, contextlib.redirect_stdout(io.StringIO()) as said:
         log = ULog(stream)
-    if log.file_corruption:
-        raise IngestError("damaged ULog file: a part of it is no message", str(path), hint="copy the file again")
+    complaint = said.getvalue().partition("\n")[0]
+    if log.file_corruption or "corrupt" in complaint:
+        message = f"damaged ULog file: {complaint or 'a part of it is no message'}"
+        raise IngestError(message, str(path), hint="copy the file again from its source")
     if log.dropouts:
         lost = sum(d.duration for d in log.dropouts)
         notes.append(Note("N-DROPOUT", len(log.dropouts), 0, 0, f"the logger lost data for {lost} ms in all"))

@@ -239,5 +239,13 @@ def test_arrays_of_several_lengths_are_topics_by_their_first_array(tmp_path: Pat
     axes = {f"accel_{a}": {"field": a, "unit": "m/s^2"} for a in "xyz"}
     table = read(path, "array_file", topics={"/table": {"time": {"field": "t", "unit": "us"}, **axes}})
     np.testing.assert_allclose(table.values["accel_y"], truth.force[:, 1] / GRAVITY, rtol=1e-15)
+    gyro = {f"gyro_{a}": {"field": f"gyr[{i}]", "unit": "rad/s"} for i, a in enumerate("xyz")}
+    force = {f"accel_{a}": {"field": f"acc[{i}]", "unit": "m/s^2"} for i, a in enumerate("xyz")}
+    topics = {
+        "/acc": {"time": {"field": "acc_t", "unit": "us"}, **force},
+        "/gyr": {"time": {"field": "gyr_t", "unit": "us"}, **gyro},
+    }
+    with pytest.raises(IngestError, match="both sensors have to bear the same stamps, and the gyroscope has its own"):
+        read(path, "array_file", topics=topics)
     with pytest.raises(IngestError, match="has no times of a recorder"):
         read(path, "array_file", topics={"/table": axes}, time_source="log_time")
