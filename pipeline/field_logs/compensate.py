@@ -149,7 +149,8 @@ def compensate_log(
         if source.suffix.lower() == ".mcap":
             from pipeline.field_logs.mcap_log import McapLog  # noqa: PLC0415  (each log needs one of the two)
 
-            log = McapLog(source, out, profile, topic, smoothing)
+            known = compensation.covariances
+            log = McapLog(source, out, profile, topic=topic, smoothing=smoothing, covariances=known)
         elif source.suffix.lower() in MESSAGE_FORMATS:
             from pipeline.field_logs.message_log import MessageLog  # noqa: PLC0415
 

@@ -1,8 +1,9 @@
 """An MCAP log with a topic of calibrated messages added; every message of the log is kept byte for byte.
 
-Readings in ``sensor_msgs/Imu`` (ROS 2 or ROS 1) give copies of the originals in which six numbers are replaced.
+Readings in ``sensor_msgs/Imu`` (ROS 2 or ROS 1) give copies of the originals in which readings are replaced.
 Readings that the profile maps from the fields of other messages (protobuf, JSON, own types) give ROS 2
-``sensor_msgs/Imu``.
+``sensor_msgs/Imu``. Where the calibration holds the noise of a sample, it gives the covariances of the calibrated
+sensors.
 
 A message knows the temperatures that stand before it in the file (``pipeline.model.log_motion``), as in a
 running system. Messages before the first temperature get that one.
@@ -27,7 +28,7 @@ from pipeline.io.units import SECOND_NS, SINCE_1970_NS, TRIADS
 from pipeline.model.log_motion import ExponentialRegression
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
     from pathlib import Path
 
     from mcap.records import McapRecord
@@ -51,8 +52,17 @@ class McapLog:
 
     smoothing = 0.0  # ``Temperatures`` smooths
 
-    def __init__(self, source: Path, out: Output, profile: LogProfile, topic: str | None, smoothing: float) -> None:
-        self.source, self.profile, self.topic = source, profile, topic
+    def __init__(
+        self,
+        source: Path,
+        out: Output,
+        profile: LogProfile,
+        *,
+        topic: str | None,
+        smoothing: float,
+        covariances: Mapping[str, Values],
+    ) -> None:
+        self.source, self.profile, self.topic, self.covariances = source, profile, topic, covariances
         self.settings, self.copy = mcap_format(profile.ingest), McapCopy(out)
         self.temperature_smoothing = smoothing
         self.temperatures: Temperatures | None = None
@@ -135,10 +145,10 @@ class McapLog:
         rows, time_ns, turned = block.content
         channel, before = self._channel(rows.channel)
         if self.readings.kind == MAPPED:
-            self.copy.add(new_imu(rows, readings, channel.id, time_ns), before, channel.id)
+            self.copy.add(new_imu(rows, readings, channel.id, time_ns, self.covariances), before, channel.id)
         else:
             truths = {s: v for s, v in readings.items() if s in changed | turned}
-            copies = replaced(rows, self.readings.decoders[rows.channel], truths, channel.id)
+            copies = replaced(rows, self.readings.decoders[rows.channel], truths, channel.id, self.covariances)
             self.copy.add(copies, before, channel.id)
 
     def _channel(self, source: int) -> tuple[Channel, list[McapRecord]]:

@@ -14,6 +14,8 @@ from pipeline.io.ros2_messages import imu_table
 from pipeline.io.units import STANDARD_GRAVITY, TRIADS
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
     from pipeline.io.mcap_chunk import Rows
@@ -26,20 +28,28 @@ CHANNEL_AT = 9  # byte of a record where the channel's number stands
 SENSOR_OF = {channels: sensor for sensor, channels in TRIADS.items()}
 
 
-def replaced(rows: Rows, decoder: ChannelDecoder, truths: Truths, channel: int) -> NDArray[np.uint8] | list[bytes]:
+def replaced(
+    rows: Rows, decoder: ChannelDecoder, truths: Truths, channel: int, covariances: Mapping[str, NDArray[np.float64]]
+) -> NDArray[np.uint8] | list[bytes]:
     """Return copies of Imu messages, whole records, in which the readings of some sensors are replaced.
 
     ``decoder`` has read the messages last; ``truths`` are (n, 3) calibrated readings, g or deg/s; ``channel`` is the
-    number of the channel of the copies.
+    number of the channel of the copies; ``covariances`` are those of a sample, (3, 3), g^2 or (deg/s)^2, of some
+    sensors: where there is none, that of the message stays.
     """
-    numbers = _numbers(truths)
+    numbers = _numbers(truths, covariances)
     if decoder.layout is not None:
         return _all_at_once(rows, decoder.layout, numbers, channel)
     return [_one(row, rows, decoder.layout_of(row, rows), numbers, channel) for row in range(len(rows.starts))]
 
 
-def _numbers(truths: Truths) -> dict[str, NDArray[np.float64]]:
-    """Return the numbers of Imu messages: path to column, m/s^2 and rad/s."""
+def _in_ros_units(sensor: str, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a covariance in g^2 or (deg/s)^2 in (m/s^2)^2 or (rad/s)^2."""
+    return covariance * (STANDARD_GRAVITY if sensor == "accelerometer" else np.pi / 180.0) ** 2
+
+
+def _numbers(truths: Truths, covariances: Mapping[str, NDArray[np.float64]]) -> dict[str, NDArray[np.float64]]:
+    """Return the numbers of Imu messages: path to column, (n,) or (n, 9), m/s^2 and rad/s."""
     found: dict[str, NDArray[np.float64]] = {}
     for vector, (channels, _unit) in VECTORS.items():
         sensor = SENSOR_OF[channels]
@@ -47,6 +57,9 @@ def _numbers(truths: Truths) -> dict[str, NDArray[np.float64]]:
             values = truths[sensor]
             scaled = values * STANDARD_GRAVITY if sensor == "accelerometer" else np.radians(values)
             found |= {f"{vector}.{a}": scaled[:, i] for i, a in enumerate("xyz")}
+            if sensor in covariances:
+                covariance = _in_ros_units(sensor, covariances[sensor]).ravel()
+                found[f"{vector}_covariance"] = np.broadcast_to(covariance, (len(values), 9))
     return found
 
 
@@ -59,7 +72,7 @@ def _all_at_once(
     items = np.dtype(
         {
             "names": ["channel", *places],
-            "formats": ["<u2", *(p.code for p in places.values())],
+            "formats": ["<u2", *(p.code if p.count is None else (p.code, p.count) for p in places.values())],
             "offsets": [CHANNEL_AT, *(HEAD.itemsize + p.offset for p in places.values())],
             "itemsize": size,
         }
@@ -89,9 +102,16 @@ def _one(row: int, rows: Rows, layout: MessageLayout, numbers: dict[str, NDArray
     return bytes(record)
 
 
-def new_imu(rows: Rows, truths: Truths, channel: int, time_ns: NDArray[np.int64]) -> NDArray[np.uint8]:
+def new_imu(
+    rows: Rows,
+    truths: Truths,
+    channel: int,
+    time_ns: NDArray[np.int64],
+    covariances: Mapping[str, NDArray[np.float64]],
+) -> NDArray[np.uint8]:
     """Return records of new ROS 2 Imu messages with the times and numbers of the originals' records."""
-    messages = imu_table(time_ns, truths.get("accelerometer"), truths.get("gyroscope"))
+    scaled = {s: _in_ros_units(s, c) for s, c in covariances.items()}
+    messages = imu_table(time_ns, truths.get("accelerometer"), truths.get("gyroscope"), scaled)
     count, size = messages.shape
     heads = np.zeros(count, HEAD)
     for name in ("sequence", "log_time", "publish_time"):

@@ -21,6 +21,7 @@ from pipeline.errors import InputError
 from pipeline.io.units import SECOND_NS, STANDARD_GRAVITY
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -164,12 +165,17 @@ def _streams(recording: Recording) -> dict[str, NDArray[np.uint8]]:
 
 
 def imu_table(
-    time_ns: NDArray[np.int64], accelerometer: NDArray[np.float64] | None, gyroscope: NDArray[np.float64] | None
+    time_ns: NDArray[np.int64],
+    accelerometer: NDArray[np.float64] | None,
+    gyroscope: NDArray[np.float64] | None,
+    covariances: Mapping[str, NDArray[np.float64]] | None = None,
 ) -> NDArray[np.uint8]:
     """Return Imu messages, rows of bytes, of (n,) times and (n, 3) readings in g and deg/s.
 
-    Orientation, angular rate and acceleration each have a covariance, whose first element is -1 for what is absent.
+    Orientation, angular rate and acceleration each have a covariance, whose first element is -1 for what is absent;
+    zeros stand for an unknown one. ``covariances``: sensor to (3, 3), (m/s^2)^2 or (rad/s)^2.
     """
+    covariances = covariances or {}
     numbers = np.zeros((len(time_ns), 37))
     numbers[:, 3] = 1.0  # the identity
     numbers[:, 4] = -1.0
@@ -177,10 +183,12 @@ def imu_table(
         numbers[:, 16] = -1.0
     else:
         numbers[:, 13:16] = np.radians(gyroscope)
+        numbers[:, 16:25] = np.ravel(covariances.get("gyroscope", np.zeros(9)))
     if accelerometer is None:
         numbers[:, 28] = -1.0
     else:
         numbers[:, 25:28] = accelerometer * STANDARD_GRAVITY
+        numbers[:, 28:37] = np.ravel(covariances.get("accelerometer", np.zeros(9)))
     message = _Message("imu")
     message.doubles(37)
     return message.fill(time_ns, numbers)

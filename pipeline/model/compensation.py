@@ -11,7 +11,7 @@ iteration. The effects of a sensor that depend on the other sensor's truth alone
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
@@ -23,6 +23,7 @@ from pipeline.model.effects import register
 from pipeline.model.effects.files import load_python_effect
 from pipeline.model.log_motion import SIGNALS, ExponentialRegression, LogEnd, fields_used, log_motion
 from pipeline.model.measurement import Part, sensor_effects, solve, without_effects
+from pipeline.model.sample_noise import sample_covariance
 from pipeline.records import SENSORS
 
 if TYPE_CHECKING:
@@ -203,11 +204,15 @@ def _checked(given: dict[str, Any]) -> tuple[dict[str, NDArray[Any]], bool]:
 
 @dataclass(frozen=True)
 class Compensation:
-    """The calibration of a unit, ready to be applied to arrays; readings of a sensor without one pass unchanged."""
+    """The calibration of a unit, ready to be applied to arrays; readings of a sensor without one pass unchanged.
+
+    ``covariances``: sensor to the covariance of a calibrated sample, (3, 3) array in g^2 or (deg/s)^2, where known.
+    """
 
     accelerometer: SensorCalibration | None
     gyroscope: SensorCalibration | None
     unit: str = ""
+    covariances: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
 
     def apply(
         self,
@@ -255,4 +260,5 @@ def load(path: str | Path, python_effects: Sequence[str | Path] = ()) -> Compens
     file = Path(path)
     document = read_calibration(file)
     accelerometer, gyroscope = (sensor_of(document, sensor, file) for sensor in SENSORS)
-    return Compensation(accelerometer, gyroscope, str(document.get("unit", "")))
+    covariances = {s: c for s in SENSORS if (c := sample_covariance(document, s)) is not None}
+    return Compensation(accelerometer, gyroscope, str(document.get("unit", "")), covariances)

@@ -17,10 +17,11 @@ from mcap_ros2.decoder import DecoderFactory
 
 from pipeline.commands.apply import main
 from pipeline.errors import InputError
+from pipeline.estimation.noise_identification import identify_noise
 from pipeline.field_logs.compensate import LogProfile, compensate_log
 from pipeline.io.ros2_messages import DEFINITIONS, IMU, TEMPERATURE
 from pipeline.model.compensation import load
-from pipeline.records import SENSORS, FittedEffect, SensorCalibration
+from pipeline.records import SENSORS, FittedEffect, Recording, SensorCalibration
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -179,6 +180,27 @@ def test_calibrated_messages_are_those_of_the_arrays_to_the_last_bit(calibration
         assert (a.header.stamp.nanosec, a.header.frame_id) == (b.header.stamp.nanosec, b.header.frame_id)
         assert a.orientation.w == b.orientation.w == 0.9
         assert list(a.linear_acceleration_covariance) == list(b.linear_acceleration_covariance)
+
+
+@pytest.mark.parametrize("varied", [False, True])
+def test_covariances_are_those_of_a_calibrated_sample(calibration: Path, tmp_path: Path, *, varied: bool) -> None:
+    data = json.loads(calibration.read_text())
+    rng, n, dt, sigma = np.random.default_rng(1), 20_000, 0.01, np.array([0.02, 0.03, 0.05])
+    raw = sigma * rng.standard_normal((n, 3))
+    time_ns = (np.arange(n) * dt * 1e9).astype(np.int64)
+    rest = Recording("static", "static", None, time_ns, gyroscope=raw)
+    data["noise"] = {"gyroscope": identify_noise("gyroscope", [rest])}
+    calibration.write_text(json.dumps(data))
+    matrix = np.array(data["gyroscope"]["matrix"])
+    scatter = np.cov(np.radians(raw @ matrix.T), rowvar=False)
+    log, out = write_log(tmp_path / "log.mcap", varied=varied), tmp_path / "out.mcap"
+    compensate_log(load(calibration), log, out)
+    for before, after in zip(decoded(out, "/imu/data")[:9], decoded(out, "/imu/data_calibrated")[:9], strict=True):
+        found = np.reshape(after.angular_velocity_covariance, (3, 3))
+        np.testing.assert_allclose(found, scatter, rtol=0.05, atol=0.02 * scatter.max())
+        np.testing.assert_array_equal(found, found.T)
+        assert list(before.linear_acceleration_covariance) == list(after.linear_acceleration_covariance)
+        assert list(before.orientation_covariance) == list(after.orientation_covariance)
 
 
 def test_messages_of_varying_length_are_compensated_alike(calibration: Path, tmp_path: Path) -> None:
