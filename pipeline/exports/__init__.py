@@ -24,6 +24,7 @@ import yaml
 from jinja2 import Environment, StrictUndefined, Template
 
 from pipeline.exports.c_effects import plan_of
+from pipeline.exports.noise import noise_remarks
 from pipeline.exports.sensors import FUNCTIONS, ExportedSensor, before_use, final_errors, plain
 from pipeline.files import write_atomically
 from pipeline.records import SENSORS, SensorCalibration
@@ -52,6 +53,8 @@ class Format:
         Effect that the format carries in part, to how well.
     says, adds, adds_with_temperature : list of str
         Remarks: before the others, after what is left out, and there where a bias follows the temperature.
+    noise : bool
+        Whether the format carries noise parameters: remarks state their origin, interval and the effective density.
     errors : str
         How the held-out errors are introduced; by default as those of the export, or of the full calibration.
     files : dict
@@ -72,6 +75,7 @@ class Format:
     approximates: dict[str, str] = field(default_factory=dict)
     adds: list[str] = field(default_factory=list)
     adds_with_temperature: list[str] = field(default_factory=list)
+    noise: bool = False
     errors: str | None = None
     files: dict[str, str] = field(default_factory=dict)
     reads: JSON = field(default_factory=dict)
@@ -97,7 +101,9 @@ def formats() -> dict[str, tuple[Format, Template]]:
     return found
 
 
-def export_all(calibration: JSON, settings: JSON, folder: Path, validation: JSON | None = None) -> list[Path]:
+def export_all(
+    calibration: JSON, settings: JSON, folder: Path, validation: JSON | None = None, diagnosis: JSON | None = None
+) -> list[Path]:
     """Write a calibration in every format; return what was written.
 
     Parameters
@@ -110,28 +116,42 @@ def export_all(calibration: JSON, settings: JSON, folder: Path, validation: JSON
         Made if need be.
     validation : dict, optional
         ``validations/<unit>.json``.
+    diagnosis : dict, optional
+        ``diagnoses/<unit>.json``, for the effective noise.
     """
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     for name in formats():
-        for file, text in export(name, calibration, settings, validation).items():
+        for file, text in export(name, calibration, settings, validation, diagnosis).items():
             write_atomically(folder / file, text)
             written.append(folder / file)
     return written
 
 
-def export(name: str, calibration: JSON, settings: JSON, validation: JSON | None = None) -> dict[str, str]:
+def export(
+    name: str, calibration: JSON, settings: JSON, validation: JSON | None = None, diagnosis: JSON | None = None
+) -> dict[str, str]:
     """Return the files of one format, by name: none where it can hold nothing of this unit."""
     declared, template = formats()[name]
     parts = {
         file: replace(declared, units={s: declared.units[s]}, needs=[s]) for s, file in declared.files.items()
     } or {name: declared}
-    texts = {file: _rendered(part, template, calibration, settings, validation) for file, part in parts.items()}
+    of_noise = noise_remarks(settings, calibration, diagnosis) if declared.noise else []
+    texts = {
+        file: _rendered(part, template, calibration, settings, validation=validation, of_noise=of_noise)
+        for file, part in parts.items()
+    }
     return {file: text for file, text in texts.items() if text is not None}
 
 
 def _rendered(
-    declared: Format, template: Template, document: JSON, settings: JSON, validation: JSON | None
+    declared: Format,
+    template: Template,
+    document: JSON,
+    settings: JSON,
+    *,
+    validation: JSON | None,
+    of_noise: list[str],
 ) -> str | None:
     """Return the text of a file, None where a sensor or its counts are missing."""
     sheets = settings.get("sensor") or {}
@@ -149,7 +169,7 @@ def _rendered(
         unit=document["unit"],
         document=document,
         settings=settings,
-        remarks=_remarks(declared, sensors, document, validation),
+        remarks=_remarks(declared, sensors, document, validation) + of_noise,
     )
 
 

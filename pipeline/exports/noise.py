@@ -19,7 +19,7 @@ import numpy as np
 
 from pipeline.io.units import STANDARD_GRAVITY
 from pipeline.model.sample_noise import FAST_S
-from pipeline.records import SENSOR_UNITS, SENSORS
+from pipeline.records import SENSORS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 JSON = dict[str, Any]
 FACTORS = {"accelerometer": STANDARD_GRAVITY, "gyroscope": np.pi / 180.0}  # to m/s^2 and rad/s
 SI = {"accelerometer": "m/s^2", "gyroscope": "rad/s"}
+AVERAGING_S = 1.0  # of the effective density in remarks; the diagnosis has others
 FLAT = 2.0 * np.log(2.0) / np.pi  # Allan variance of a bias instability of 1
 
 
@@ -59,14 +60,20 @@ def noise_remarks(settings: Mapping[str, Any], document: Mapping[str, Any], diag
 
 
 def effective_text(sensor: str, effective: Mapping[str, Any]) -> str:
-    """Return a sentence on the effective density of a sensor, in m/s^2 or rad/s."""
-    factor, si = FACTORS[sensor], SI[sensor]
-    parts = [f"{e['effect'].replace('_', ' ')} {factor * e['density']:.3g}" for e in effective["effects"]]
-    of_effects = f"; of it by diagnosed effects that are not compensated: {', '.join(parts)}" if parts else ""
+    """Return a sentence on the effective density of a sensor, in m/s^2 or rad/s, over about ``AVERAGING_S``."""
+    factor, si, motion = FACTORS[sensor], SI[sensor], effective["motion"]
+    found = min(effective["densities"], key=lambda d: abs(np.log(d["averaging_time_s"] / AVERAGING_S)))
+    shares = [f"{e['effect'].replace('_', ' ')} {factor * e['density']:.3g}" for e in found["effects"] if e["density"]]
+    of_effects = f"; of effects that the diagnosis found and nothing compensates: {', '.join(shares)}" if shares else ""
+    moving = [
+        f"{value:.3g} {unit} rms"
+        for value, unit in ((motion["rate_dps"], "deg/s"), (motion["force_change_g"], "g"))
+        if value is not None
+    ]
     return (
-        f"{sensor}, effective density over {effective['averaging_time_s']:g} s in the motion of "
-        f"{', '.join(effective['recordings'])} ({effective['motion']}): {factor * effective['density']:.3g} "
-        f"{si}/sqrt(Hz), {effective['over_white']:.3g} times white noise{of_effects}."
+        f"{sensor}, effective density in the motion of {', '.join(effective['recordings'])} ({', '.join(moving)}), "
+        f"averaged over {found['averaging_time_s']:g} s: {factor * found['density']:.3g} {si}/sqrt(Hz), "
+        f"{found['over_white']:.3g} times the white noise{of_effects}."
     )
 
 
@@ -95,7 +102,9 @@ def _figures(sensor: str, settings: Mapping[str, Any], document: Mapping[str, An
     if seen:
         out["walk_origin"] = "measured at rest"
         if lesser:
-            out["walk_origin"] += f" on {len(seen)} of {len(axes)} axes; on the others it is the lesser of the sensor's "
+            out["walk_origin"] += (
+                f" on {len(seen)} of {len(axes)} axes; on the others it is the lesser of the sensor's "
+            )
             out["walk_origin"] += "configuration and the upper limit"
         else:
             out["walk_interval"] = [_rms(w[k] for w in seen) for k in (1, 2)]

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.exports.noise import noise
 from pipeline.io.channel_table import STRAIGHT, maps_of_log
 from pipeline.model.effects import owner_of
 from pipeline.model.effects.base import REFERENCE_TEMPERATURE, STANDARD_GRAVITY, Owner
@@ -105,8 +106,8 @@ class ExportedSensor:
 
     @property
     def noise_density(self) -> float:
-        """White noise by the sensor's configuration, unit/sqrt(Hz)."""
-        return float(self.sheet["noise_density"] * self.factor)
+        """White noise by the sensor's configuration, unit/sqrt(Hz); 0 where it is not stated."""
+        return float((self.sheet["noise_density"] or 0.0) * self.factor)
 
     @property
     def temperature_polynomials(self) -> tuple[Values, Values]:
@@ -200,19 +201,6 @@ def accelerometer_frame(accelerometer: ExportedSensor | None, gyroscope: Exporte
     return {"M_a": M_a, "T_i_b": pose, "M_g": M_g, "C": C, "A": A}
 
 
-def noise(settings: dict[str, Any]) -> dict[str, float]:
-    """Return Kalibr's four noise parameters by the sensor's configuration, in m/s^2 and rad/s.
-
-    The random walk that stands for a bias with the standard deviation s and the correlation time T has ``s sqrt(2/T)``.
-    """
-    found = {}
-    for sensor, unit in (("accelerometer", "m/s^2"), ("gyroscope", "rad/s")):
-        sheet, factor = settings["sensor"][sensor], FACTORS[unit]
-        found[f"{sensor}_noise_density"] = float(sheet["noise_density"] * factor)
-        found[f"{sensor}_random_walk"] = float(sheet["bias_wander"] * np.sqrt(2.0 / sheet["wander_time_s"]) * factor)
-    return found
-
-
 def sampling_rate(document: dict[str, Any]) -> float:
     """Return the sampling rate of the unit's recordings, Hz; 0 where none is known."""
     rates = [i["rate_hz"] for i in document.get("inputs", []) if i.get("rate_hz")]
@@ -234,6 +222,8 @@ FUNCTIONS: dict[str, Any] = {
     "matmul": np.matmul,
     "lower_half": np.triu_indices(3)[::-1],  # column by column
     "noise": noise,
+    "scaled": lambda value, factor: None if value is None else float(value * factor),
+    "sqrt": np.sqrt,
     "rint": lambda values: np.rint(values).astype(int).tolist(),
     "rotation_times_lower": rotation_times_lower,
     "row_lengths": row_lengths,

@@ -34,7 +34,7 @@ INPUTS: dict[str, tuple[str, ...]] = {  # stage: the stages whose folders it rea
     "validate": ("filter", *FITS),
     "diagnose": ("filter", *FITS, "validate"),
     "calibration": ("ingest", *FITS, "validate"),
-    "export": ("calibration", "validate"),
+    "export": ("calibration", "validate", "diagnose"),
     "report": ("filter", "calibration", "validate", "diagnose", "export"),
     "gather": (),
 }

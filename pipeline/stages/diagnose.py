@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from pipeline.diagnosis.diagnose import diagnose
+from pipeline.diagnosis.effective_noise import effective_noise
 from pipeline.diagnosis.functional_form_search import effect_file
 from pipeline.files import read_json, write_atomically, write_json
 from pipeline.io.parquet import load_recordings
@@ -25,6 +26,11 @@ def process_unit(job: Job, unit: str, settings: dict[str, Any]) -> None:
         document[sensor] = found = calibration and diagnose(
             calibration, recordings, noises[sensor], settings, fits["accelerometer"], validation=validation[sensor]
         )
+        if calibration and found:
+            other = next(fit for s, fit in fits.items() if s != sensor)
+            found["effective_noise"] = effective_noise(
+                calibration, recordings, noises[sensor], settings["table"], found, other=other
+            )
         if found and found.get("suggested_effect"):
             found["suggested_file"] = f"{unit}_{sensor}_unknown.yaml"
             write_atomically(job.output / found["suggested_file"], effect_file(found["suggested_effect"], unit))

@@ -13,5 +13,6 @@ if TYPE_CHECKING:
 
 def process_unit(job: Job, unit: str, settings: dict[str, Any]) -> None:
     """Write every format into the unit's folder."""
-    calibration, validation = (read_json(job.inputs[stage] / f"{unit}.json") for stage in ("calibration", "validate"))
-    export_all(calibration, settings, job.output / unit, validation)
+    stages = ("calibration", "validate", "diagnose")
+    calibration, validation, diagnosis = (read_json(job.inputs[stage] / f"{unit}.json") for stage in stages)
+    export_all(calibration, settings, job.output / unit, validation, diagnosis)

@@ -114,7 +114,7 @@ def test_kalibrs_own_equation_predicts_the_reading(tmp_path: Path, settings: dic
     assert np.triu(a["M"], 1).max() == np.triu(g["M"], 1).max() == 0.0
     np.testing.assert_allclose(C @ C.T, np.eye(3), atol=1e-14)
     assert imu["update_rate"] == 100.0
-    assert imu["accelerometer_noise_density"] == pytest.approx(4e-4 * 9.80665)
+    assert imu["accelerometer_noise_density"] == pytest.approx(4e-4 / np.sqrt(2.0) * 9.80665)  # one-sided in the sheet
 
 
 def test_a_factor_of_a_matrix_is_lower_triangular_times_a_rotation() -> None:

@@ -3,6 +3,7 @@ rule export:
     input:
         calibration=f"{BATCH}/calibration",
         validate=f"{BATCH}/validate",
+        diagnose=f"{BATCH}/diagnose",
     output:
         directory(f"{BATCH}/export"),
     log:
@@ -16,4 +17,4 @@ rule export:
         code=code_digest("pipeline.stages.export"),
     shell:
         "{RUN} export --config {params.config:q} --calibration {input.calibration:q} --validate {input.validate:q}"
-        " --output {output:q} > {log:q} 2>&1"
+        " --diagnose {input.diagnose:q} --output {output:q} > {log:q} 2>&1"

@@ -1,0 +1,135 @@
+"""The white noise that would scatter averages as much as a calibration errs in motion.
+
+    n_e(t)^2 = t var(mean of the error over t),    over_white = n_e / n,   n^2 = white^2 dt
+
+where the error is that of the calibrated readings on held-out motion less its mean, which an estimator takes as bias,
+and the variance is over stretches of length t, one after the other, and the axes (of the magnitude where no attitude is
+logged). White noise alone gives n at every t. Effects that are not compensated add errors which last as long as the
+motion does: so figures of an estimator that fit its motion are several times those at rest. The share of an effect that
+the diagnosis found is n_e of its own error, by the parameters of the diagnosis.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.model.effects import effect_of
+from pipeline.model.effects.base import truth
+from pipeline.model.measurement import linear_truth
+from pipeline.records import FittedEffect
+from pipeline.validation.error_breakdown import last_step
+from pipeline.validation.samples import samples_of_motion
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.records import Noise, Recording, SensorCalibration
+    from pipeline.validation.samples import Samples
+
+    Values = NDArray[np.float64]
+
+AVERAGING_S = (0.1, 1.0, 10.0)  # between two images, between key frames, between fixes of a position
+FEWEST = 8  # stretches, which tell a standard deviation to a quarter
+
+
+def effective_noise(
+    calibration: SensorCalibration,
+    recordings: Sequence[Recording],
+    noise: Noise,
+    table: Mapping[str, Any],
+    found: Mapping[str, Any],
+    *,
+    other: SensorCalibration | None = None,
+) -> dict[str, Any] | None:
+    """Return the effective noise of a sensor; None without held-out motion.
+
+    ``found``: the sensor's diagnosis; ``other``: calibration of the other sensor. The result has ``unit``,
+    ``recordings``, ``motion`` (rms rate in deg/s, rms change of the specific force in g, duration in s), ``white`` (n)
+    and ``densities``: for each averaging time ``density``, ``over_white`` and the share of each effect.
+    """
+    sensor = calibration.sensor
+    held_out = [r for r in recordings if r.role == "validation"]
+    samples = [(r, s) for r in held_out if (s := samples_of_motion(sensor, r, noise, table)) is not None]
+    errors = [(r, s, e) for r, s in samples if (e := _error(calibration, s, other)) is not None]
+    if not errors:
+        return None
+    effects = {name: [_of_effect(calibration, s, found, name) for _, s in samples] for name in found["selected"]}
+    white = float(np.sqrt(np.mean(noise.white**2) * errors[0][0].interval))
+    densities = []
+    for time in AVERAGING_S:
+        density = _density([(s.time, e) for _, s, e in errors], time)
+        if density is None:
+            continue
+        parts = [
+            {"effect": name, "density": _density([(s.time, e) for (_, s), e in zip(samples, of, strict=True)], time)}
+            for name, of in effects.items()
+            if all(e is not None for e in of)
+        ]
+        ratio = density / white if white > 0 else None
+        densities.append({"averaging_time_s": time, "density": density, "over_white": ratio, "effects": parts})
+    if not densities:
+        return None
+    return {
+        "unit": f"{'g' if sensor == 'accelerometer' else 'deg/s'}/sqrt(Hz)",
+        "recordings": [r.name for r, _, _ in errors],
+        "motion": _motion([r for r, _, _ in errors]),
+        "white": white,
+        "densities": densities,
+    }
+
+
+def _error(calibration: SensorCalibration, samples: Samples, other: SensorCalibration | None) -> Values | None:
+    """Return the error of calibrated readings, (n, 3), or of their magnitude, (n, 1); None if an effect is left out."""
+    found = last_step(calibration, samples, other)
+    if found is None:
+        return None
+    vector, magnitude, true = found
+    return (np.linalg.norm(vector, axis=1) - magnitude)[:, None] if true is None else vector - true
+
+
+def _of_effect(calibration: SensorCalibration, samples: Samples, found: Mapping[str, Any], name: str) -> Values | None:
+    """Return the error that an effect of the diagnosis leaves: (n, 3); None where motion or parameters are unknown."""
+    entry = next((e for e in found["ranking"] if e["effect"] == name), None)
+    motion = samples.motion
+    if entry is None or motion is None or not entry.get("parameters"):
+        return None
+    fitted = FittedEffect(name, entry["parameters"])
+    this = effect_of(fitted)
+    if any(getattr(motion, need) is None for need in this.needs):
+        return None
+    if this.moves:
+        return np.asarray(truth(samples.sensor, this.moved(motion, fitted.values)) - truth(samples.sensor, motion))
+    K = np.asarray(np.linalg.inv(calibration.matrix), np.float64)
+    reading = this.reading(samples.sensor, motion, K, fitted.values)
+    return np.asarray(linear_truth(calibration, calibration.bias + reading))
+
+
+def _density(parts: Sequence[tuple[Values, Values | None]], time: float) -> float | None:
+    """Return n_e of errors at sample times; None where an averaging time holds no sample or there are few of them."""
+    squares, count = 0.0, 0
+    for at, error in parts:
+        if error is None or len(at) < 2:
+            continue
+        known = np.isfinite(error).all(axis=1)
+        size = round(time / float(np.median(np.diff(at))))
+        values = error[known]
+        stretches = len(values) // size if size else 0
+        if not stretches:
+            continue
+        means = (values - values.mean(axis=0))[: stretches * size].reshape(stretches, size, -1).mean(axis=1)
+        squares += float(np.sum(means**2)) / means.shape[1]
+        count += stretches
+    return float(np.sqrt(time * squares / count)) if count >= FEWEST else None
+
+
+def _motion(recordings: Sequence[Recording]) -> dict[str, float | None]:
+    """Return how much held-out motion moves, by the readings."""
+    rates = [r.gyroscope - np.nanmedian(r.gyroscope, axis=0) for r in recordings if r.gyroscope is not None]
+    forces = [r.accelerometer - np.nanmean(r.accelerometer, axis=0) for r in recordings if r.accelerometer is not None]
+    rms = [float(np.sqrt(np.nanmean(np.sum(np.concatenate(v) ** 2, axis=1)))) if v else None for v in (rates, forces)]
+    duration = float(sum(r.time[-1] - r.time[0] for r in recordings))
+    return {"rate_dps": rms[0], "force_change_g": rms[1], "duration_s": duration}
