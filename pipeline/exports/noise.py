@@ -78,15 +78,18 @@ def effective_text(sensor: str, effective: Mapping[str, Any]) -> str:
 
 
 def _figures(sensor: str, settings: Mapping[str, Any], document: Mapping[str, Any]) -> JSON:
-    """Return white noise and walk of a sensor in its own unit, their intervals (None: none) and origins."""
-    sheet = settings["sensor"][sensor]
-    density, wander, time = (sheet.get(key) for key in ("noise_density", "bias_wander", "wander_time_s"))
+    """Return white noise and walk of a sensor in its own unit, their intervals (None: none) and origins.
+
+    ``KeyError`` where nothing was measured and there is no configuration.
+    """
+    found = (document.get("noise") or {}).get(sensor) or {}
+    axes = [axis["terms"] for axis in (found.get("axes") or {}).values() if axis["terms"]]
+    keys = ("noise_density", "bias_wander", "wander_time_s")
+    density, wander, time = (settings["sensor"][sensor].get(k) if axes else settings["sensor"][sensor][k] for k in keys)
     white = None if density is None else density / np.sqrt(2.0)
     walk = None if wander is None or not time else wander * np.sqrt(2.0 / time)
     out: JSON = {"white": white, "white_interval": None, "white_origin": "of the sensor's configuration"}
     out |= {"walk": walk, "walk_interval": None, "walk_origin": "for the bias wander of the sensor's configuration"}
-    found = (document.get("noise") or {}).get(sensor) or {}
-    axes = [axis["terms"] for axis in (found.get("axes") or {}).values() if axis["terms"]]
     if not axes:
         return out
     whites = [value for terms in axes if (value := _white(terms))]

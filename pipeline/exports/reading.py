@@ -53,7 +53,7 @@ class FoundCalibration:
     sensors : dict of str to SensorCalibration
         Those that the file holds; the covariance is None where it states no uncertainty.
     noise : dict
-        Kalibr's four noise parameters (``pipeline.exports.sensors.noise``), as far as the file states them.
+        Kalibr's four noise parameters (``pipeline.exports.noise``), as far as the file states them.
     notes : list of str
         What was taken for granted or not read.
     document : dict or None
@@ -206,7 +206,7 @@ def _read(
         values = {key: tree.value(e) for key, e in expressions.items() if key not in ("where", "model")}
         found[s] = _calibration(s, declared, values, known[s], notes)
     noise = {key: float(np.ravel(content.at(path))[0]) for key, path in declared.reads.get("noise", {}).items()
-             if content.has(path)}  # fmt: skip
+             if content.has(path) and content.at(path) is not None}  # fmt: skip
     unread = content.unread()
     if unread:
         more = f" and {len(unread) - 12} more" if len(unread) > 12 else ""

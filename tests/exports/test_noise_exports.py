@@ -13,7 +13,9 @@ from scipy.signal import lfilter
 from pipeline.estimation.noise_identification import identify_noise
 from pipeline.estimation.noise_terms import allan_variance, each_term
 from pipeline.exports import export, export_all
+from pipeline.exports.conversion import document_of, settings_of
 from pipeline.exports.noise import FLAT, noise
+from pipeline.exports.reading import read_any
 from pipeline.records import SENSORS, Recording, SensorCalibration
 
 if TYPE_CHECKING:
@@ -124,7 +126,9 @@ def test_a_process_is_white_or_a_walk_by_its_correlation_time_and_flicker_meets_
         return {"terms": empty | given}
 
     def exported(**given: Any) -> tuple[float, float]:
-        made = document() | {"noise": {"accelerometer": {"source": "static", "axes": {"x": terms(**given)}}}}
+        made = document() | {
+            "noise": {"accelerometer": {"source": "static", "length_s": 1e3, "axes": {"x": terms(**given)}}}
+        }
         found = noise(SETTINGS, made)
         return tuple(found[f"accelerometer_{k}"] / G0 for k in ("noise_density", "random_walk"))  # type: ignore[return-value,operator]
 
@@ -156,3 +160,10 @@ def test_a_simulated_short_process_is_exported_as_its_plateau() -> None:
     found = noise(SETTINGS, made)["gyroscope_noise_density"]
     seconds = values.reshape(-1, 50, 3).mean(axis=1)  # means over 1 s scatter by the density
     assert found == pytest.approx(np.radians(seconds.std()), rel=0.05)
+
+
+def test_a_conversion_keeps_the_densities(measured: dict[str, Any], tmp_path: Path) -> None:
+    export_all(measured, SETTINGS, tmp_path)
+    found = read_any(tmp_path / "kalibr.yaml")
+    again = noise(settings_of(found, {}), document_of(found))
+    assert again == pytest.approx(noise(SETTINGS, measured), rel=1e-9)

@@ -87,7 +87,7 @@ def test_a_format_in_counts_asks_for_the_sensor(folder: Path, name: str) -> None
 
 def test_the_content_tells_the_format_whatever_the_file_is_called(folder: Path, tmp_path: Path) -> None:
     for file in sorted(folder.iterdir()):
-        if file.name == "kalibr_imu.yaml":
+        if file.name in {"kalibr_imu.yaml", "vins.yaml"}:
             continue
         copy = tmp_path / ("x_acc.calib" if file.suffix == ".calib" else "x")
         shutil.copy(file, copy)
@@ -191,8 +191,9 @@ def test_what_a_conversion_cannot_do_is_refused(folder: Path, tmp_path: Path) ->
         main([str(folder / "imucal.json"), str(tmp_path / "x"), "--to", "calibration"])
     with pytest.raises(ConfigurationError, match="OUT is the file IN"):
         main([str(folder / "imucal.json"), str(folder / "imucal.json")])
-    with pytest.raises(InputError, match="noise only"):
-        read_any(folder / "kalibr_imu.yaml")
+    for name in ("kalibr_imu.yaml", "vins.yaml"):
+        with pytest.raises(InputError, match="noise only"):
+            read_any(folder / name)
     imu = yaml.safe_load((folder / "kalibr.yaml").read_text())
     del imu["imu0"]["gyroscopes"]["C_gyro_i"]
     (tmp_path / "k.yaml").write_text(yaml.safe_dump(imu))
@@ -204,7 +205,10 @@ def test_what_a_conversion_cannot_do_is_refused(folder: Path, tmp_path: Path) ->
 
 
 def test_every_format_with_a_calibration_can_be_read() -> None:
-    assert [name for name, (declared, _) in formats().items() if not declared.reads] == ["kalibr_imu.yaml"]
+    assert [name for name, (declared, _) in formats().items() if not declared.reads] == [
+        "kalibr_imu.yaml",
+        "vins.yaml",
+    ]
 
 
 def test_the_worked_sample_of_an_explanation_is_what_apply_gives(folder: Path) -> None:
