@@ -59,8 +59,9 @@ def effective_noise(
         return None
     effects = {name: [_of_effect(calibration, s, found, name) for _, s in samples] for name in found["selected"]}
     white = float(np.sqrt(np.mean(noise.white**2) * errors[0][0].interval))
+    interval = errors[0][0].interval
     densities = []
-    for time in AVERAGING_S:
+    for time in dict.fromkeys(max(1, round(t / interval)) * interval for t in AVERAGING_S):  # whole samples
         density = _density([(s.time, e) for _, s, e in errors], time)
         if density is None:
             continue
@@ -70,7 +71,7 @@ def effective_noise(
             if all(e is not None for e in of)
         ]
         ratio = density / white if white > 0 else None
-        densities.append({"averaging_time_s": time, "density": density, "over_white": ratio, "effects": parts})
+        densities.append({"averaging_time_s": round(time, 9), "density": density, "over_white": ratio, "effects": parts})
     if not densities:
         return None
     return {
