@@ -12,8 +12,8 @@ for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(threads, "1")  # a job is one core; set before numpy is imported
 
 COMMANDS = (
-    "run", "new", "check", "plan", "guide", "explain", "add", "remove", "apply", "convert", "simulate", "config",
-    "study", "thesis",
+    "run", "new", "check", "plan", "guide", "explain", "add", "remove", "apply", "convert", "noise", "simulate",
+    "config", "study", "thesis",
 )  # fmt: skip
 STAGES = (
     "ingest", "filter", "fit", "validate", "diagnose", "calibration", "export", "report", "gather", "verdict",

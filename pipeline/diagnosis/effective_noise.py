@@ -71,7 +71,9 @@ def effective_noise(
             if all(e is not None for e in of)
         ]
         ratio = density / white if white > 0 else None
-        densities.append({"averaging_time_s": round(time, 9), "density": density, "over_white": ratio, "effects": parts})
+        densities.append(
+            {"averaging_time_s": round(time, 9), "density": density, "over_white": ratio, "effects": parts}
+        )
     if not densities:
         return None
     return {

@@ -16,7 +16,7 @@ Sources: Strang, SIAM Review 41, 1999 (the transform); Whittle 1953; Patterson &
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -34,7 +34,8 @@ if TYPE_CHECKING:
 RATIO = 1.05  # of the edges of a bin: the spectrum of a random walk changes by a tenth, its mean by 0.2 %
 LONGEST_TIME = 0.5  # correlation time, in lengths of the recording, above which a process is a random walk
 STEP = 1.5  # largest change of a logarithm in one iteration
-ITERATIONS, PRECISE = 60, 1e-4  # of -2 log L; 3.84 is 95 %
+ITERATIONS, PRECISE = 60, 1e-3  # of -2 log L; 3.84 is 95 %
+LARGEST_DAMPING = 1e4
 LOG_LEAST = -690.0  # of a squared coefficient: above the smallest double
 
 
@@ -121,6 +122,15 @@ class Fits:
     beta: Values
     beta_covariance: Values
 
+    def rows(self, index: NDArray[np.int64] | NDArray[np.bool_]) -> Fits:
+        """Return some of the fits."""
+        return Fits(**{f.name: getattr(self, f.name)[index] for f in fields(Fits)})
+
+    def replace(self, index: NDArray[np.int64], others: Fits) -> None:
+        """Put other fits in the place of some."""
+        for f in fields(Fits):
+            getattr(self, f.name)[index] = getattr(others, f.name)
+
     def information(self, count: Values) -> Values:
         """Return the Fisher information of the parameters: (g, 2 J, 2 J) array; 1 on the diagonal for absent ones."""
         found = 0.5 * (self.slopes * count) @ self.slopes.transpose(0, 2, 1)
@@ -152,7 +162,7 @@ def evaluate(spectrum: Spectrum, kinds: NDArray[np.int64], parameters: Values) -
     slopes = np.concatenate([size * shapes, size * by_time], axis=1) / total[:, None, :]
     products, weight = spectrum.products, 1.0 / total
     d, g = products.shape[1] - 1, len(kinds)
-    power, determinant = np.broadcast_to(products[:, 0, 0], total.shape), np.zeros(g)
+    power, determinant = np.tile(products[:, 0, 0], (g, 1)), np.zeros(g)
     beta, inverse = np.zeros((g, d)), np.zeros((g, d, d))
     restricted = power
     if d:
@@ -180,46 +190,26 @@ def maximised(
     high = max(np.log(LONGEST_TIME * spectrum.length), low + 1e-6)
     free = active(kinds) if held is None else active(kinds) & ~held
     best = evaluate(spectrum, kinds, start)
-    damping = np.full(len(kinds), 1e-2)
-    running = np.ones(len(kinds), bool)
+    damping, running = np.full(len(kinds), 1e-2), np.arange(len(kinds))
     diagonal = np.arange(2 * terms)
     for _ in range(ITERATIONS):
-        weighted = best.slopes * spectrum.count
-        gradient = 0.5 * np.sum(best.slopes * (spectrum.count - best.power / best.total)[:, None, :], axis=2)
-        information = 0.5 * weighted @ best.slopes.transpose(0, 2, 1)
-        information *= free[:, :, None] & free[:, None, :]
+        now, here = best if len(running) == len(kinds) else best.rows(running), free[running]
+        gradient = 0.5 * np.sum(now.slopes * (spectrum.count - now.power / now.total)[:, None, :], axis=2)
+        information = 0.5 * (now.slopes * spectrum.count) @ now.slopes.transpose(0, 2, 1)
+        information *= here[:, :, None] & here[:, None, :]
         own = information[:, diagonal, diagonal]
-        information[:, diagonal, diagonal] += np.where(free, damping[:, None] * own + 1e-9, 1.0)
-        step = np.clip(-np.linalg.solve(information, np.where(free, gradient, 0.0)[:, :, None])[:, :, 0], -STEP, STEP)
-        tried = best.parameters + step
+        information[:, diagonal, diagonal] += np.where(here, damping[running, None] * own + 1e-9, 1.0)
+        gradient = np.where(here, gradient, 0.0)
+        step = np.clip(-np.linalg.solve(information, gradient[:, :, None])[:, :, 0], -STEP, STEP)
+        tried = now.parameters + step
         tried[:, :terms] = np.maximum(tried[:, :terms], LOG_LEAST)
-        moved = np.where(free[:, terms:], np.clip(tried[:, terms:], low, high), tried[:, terms:])
-        tried[:, terms:] = moved
-        new = evaluate(spectrum, kinds, tried)
-        gain = best.deviance - new.deviance
-        better = gain > 0
-        running &= (gain > PRECISE) | (~better & (damping < 1e4))
-        damping = np.where(better, np.maximum(0.2 * damping, 1e-6), 8.0 * damping)
-        best = _chosen(better, new, best)
-        if not running.any():
+        tried[:, terms:] = np.where(here[:, terms:], np.clip(tried[:, terms:], low, high), tried[:, terms:])
+        new = evaluate(spectrum, kinds[running], tried)
+        better = new.deviance < now.deviance
+        best.replace(running[better], new.rows(better))
+        damping[running] *= np.where(better, 0.2, 8.0)
+        promised = -np.sum(gradient * step, axis=1)
+        running = running[(promised > PRECISE) & (damping[running] < LARGEST_DAMPING)]
+        if not running.size:
             break
     return best
-
-
-def _chosen(first: NDArray[np.bool_], a: Fits, b: Fits) -> Fits:
-    """Return for each setting the first fit where asked for, else the second."""
-
-    def pick(x: Values, y: Values) -> Values:
-        return np.where(first.reshape(-1, *[1] * (x.ndim - 1)), x, y)
-
-    return Fits(
-        b.kinds,
-        pick(a.parameters, b.parameters),
-        pick(a.deviance, b.deviance),
-        pick(a.unrestricted, b.unrestricted),
-        pick(a.total, b.total),
-        pick(a.power, b.power),
-        pick(a.slopes, b.slopes),
-        pick(a.beta, b.beta),
-        pick(a.beta_covariance, b.beta_covariance),
-    )

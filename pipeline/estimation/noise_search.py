@@ -36,10 +36,11 @@ MOST_MARKOV = 2  # processes of different correlation times; a third is not told
 TIMES = 10  # correlation times whose score is looked at, in equal steps of their logarithm
 STARTS = 2  # of them that are fitted
 PROMISING = 0.25  # of the penalty of a term: a score that predicts less of it is not followed
+SLIGHT = 2.0  # of the gain of one parameter: its penalty is ln(n), 4 and more
 QUANTILE, ONE_SIDED = 1.959964, 1.644854  # of the standard normal distribution: 95 % from two sides, from one
 NEAREST = 12  # compositions that are published, best first
 FARTHEST = 14.0  # change of the logarithm of a squared coefficient: a factor of 1000 in the coefficient
-PROFILE_STEPS, PROFILE_PRECISE = 9, 0.01  # of the root of the loss: 1 % of half an interval
+PROFILE_STEPS, PROFILE_PRECISE, LIMIT_PRECISE = 9, 0.02, 0.02  # of the root of the loss: 2 % of half an interval
 
 
 @dataclass(frozen=True)
@@ -247,7 +248,9 @@ def _profile(
         fits = maximised(spectrum, kinds, warm, held)
         best = np.minimum(best, fits.deviance) if one_sided else best
         excess = np.sqrt(np.maximum(fits.deviance - best, 1e-12)) / quantile
-        done = (np.abs(excess - 1.0) < PROFILE_PRECISE) | ((size >= FARTHEST) & (excess < 1.0))
+        done = (np.abs(excess - 1.0) < (LIMIT_PRECISE if one_sided else PROFILE_PRECISE)) | (
+            (size >= FARTHEST) & (excess < 1.0)
+        )
         if done.all():
             break
         inner, outer = np.where(excess <= 1.0, size, inner), np.where(excess > 1.0, size, outer)
@@ -271,8 +274,16 @@ def ranked(search: Search) -> list[tuple[Candidate, float]]:
 
 
 def best_of(search: Search, required: tuple[int, ...], optional: Sequence[int]) -> Candidate:
-    """Return the best composition over all choices of the optional deterministic columns."""
+    """Return the best composition over all choices of the optional deterministic columns.
+
+    Beside white noise alone, a column is left out where it gains less than ``SLIGHT`` of -2 log L.
+    """
     best = search.run(required)
+    if optional and len(best.kinds) == 1:
+        fits = fitted(search.spectrum.with_columns((*required, *optional)), best)
+        last = range(len(required), len(required) + len(optional))
+        optional = [c for c, j in zip(optional, last, strict=True)
+                    if fits.beta[0, j] ** 2 > SLIGHT * fits.beta_covariance[0, j, j]]  # fmt: skip
     for size in range(1, len(optional) + 1):
         for chosen in combinations(optional, size):
             best = min(best, search.run((*required, *chosen)), key=lambda c: c.bic)

@@ -1,0 +1,97 @@
+"""Identify the noise of a unit from one log at rest: N, B, K and more of each axis, with intervals."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.commands.check import DEFAULT_PROFILE, campaign_of, composed, named
+from pipeline.errors import ConfigurationError
+from pipeline.estimation.noise_identification import identify_noise
+from pipeline.exports import export, formats
+from pipeline.files import json_text, write_atomically
+from pipeline.io.ingest_settings import checks_of
+from pipeline.io.read import read_table, to_recording
+from pipeline.preprocessing.checks import check_recordings
+from pipeline.records import AXES, SENSORS
+from pipeline.report.noise_section import remarks, term_rows
+from pipeline.report.numbers import MINUS, number
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+JSON = dict[str, Any]
+EPILOG = """\
+The unit has to rest during the whole log. Hours show the slow terms; what the log is too short for is printed as an
+upper limit (<). -o writes a consumer's file by its name (kalibr_imu.yaml, vins.yaml), or everything as .json.
+
+examples:
+  python -m pipeline noise static.csv
+  python -m pipeline noise static.mcap --sensor mpu6050 -o kalibr_imu.yaml
+  python -m pipeline noise static.bag -o noise.json
+"""
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run ``python -m pipeline noise LOG``."""
+    arguments = _parser().parse_args(argv)
+    target: Path | None = arguments.output
+    consumers = [name for name, (declared, _) in formats().items() if declared.noise and not declared.units]
+    if target is not None and target.name not in consumers and target.suffix != ".json":
+        listed = ", ".join([*consumers, "a name that ends in .json"])
+        raise ConfigurationError(f"-o is {target.name}, which is no format of noise; expected {listed}")
+    log: Path = arguments.log
+    campaign = campaign_of(log)
+    profile = named(arguments.ingest, log, campaign) if arguments.ingest else DEFAULT_PROFILE
+    config = composed(profile, arguments.sensor, campaign)
+    ingest, sheet = config["ingest"], config["sensor"] if arguments.sensor else {}
+    entry = {"role": "static", "axis": None}
+    table = read_table([log], ingest)
+    recording = to_recording("static", entry, table, sheet, checks_of(ingest))
+    settings = {"procedure": {"recordings": {"static": entry}}, "table": {}, "sensor": sheet, "ingest": ingest}
+    (recording,) = check_recordings([recording], settings)
+    found = {sensor: identify_noise(sensor, [recording]) for sensor in SENSORS}
+    print("\n\n".join(_told(sensor, found[sensor]) for sensor in SENSORS).replace(MINUS, "-"))
+    if target is None:
+        return 0
+    document = {"unit": log.stem, "sensor": arguments.sensor, "noise": found}
+    document["inputs"] = [{"rate_hz": round(1.0 / recording.interval, 6)}]
+    text = json_text(found)
+    if target.suffix != ".json":
+        known = {s: config["sensor"][s] if arguments.sensor else {} for s in SENSORS}
+        missing = [s for s in SENSORS if not found[s]["axes"] and not known[s]]
+        if missing:
+            raise ConfigurationError(f"the log holds no noise of the {' and '.join(missing)}: state --sensor", str(log))
+        exported = {"sensor": known, "table": {"gravity_g": 1.0}}
+        (text,) = export(target.name, document, exported).values()
+    write_atomically(target, text)
+    print(f"written: {target}", file=sys.stderr)
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m pipeline noise",
+        description=__doc__,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("log", type=Path, metavar="LOG", help="a log at rest")
+    parser.add_argument("--ingest", metavar="PROFILE", help="ingest profile of the log (default: canonical_csv)")
+    parser.add_argument("--sensor", metavar="NAME", help="name in configs/sensor, for counts and full scale")
+    parser.add_argument("-o", "--output", type=Path, metavar="OUT", help="file to write, in the format of its name")
+    return parser
+
+
+def _told(sensor: str, noise: JSON) -> str:
+    """Return the terms of a sensor as a table, and the remarks."""
+    lines = [sensor]
+    if noise["source"]:
+        lines[0] += f": {noise['samples']} samples, {number(noise['length_s'])} s without a gap"
+    rows = [["", *AXES, "unit"], *([r["name"], *r["axes"], r["unit"]] for r in term_rows(noise))]
+    if len(rows) > 1:
+        widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+        lines += ["  " + "  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip() for row in rows]
+    return "\n".join([*lines, *(f"  {line}" for line in remarks(noise))])
