@@ -7,13 +7,15 @@ whose verdict follows from it and from the error on held-out motion (``verdict``
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from pipeline.diagnosis import multi_position, turntable
 from pipeline.diagnosis.findings import document_of
 from pipeline.diagnosis.verdict import evidence_of, judged
 from pipeline.errors import NotObservableError
-from pipeline.estimation.candidates import configured_effects
+from pipeline.estimation.candidates import MOUNTING, configured_effects
+from pipeline.estimation.effects import mountings_by_gravity, of_the_angle
 from pipeline.estimation.rest_means import is_multi_position
 from pipeline.model.effects import catalogue
 
@@ -21,6 +23,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.records import Noise, Recording, SensorCalibration
+
+IN_DOUBT = ("reference_in_doubt", "unexplained")  # verdicts on an accelerometer whose mountings may be wrong
 
 
 def diagnose(
@@ -31,6 +35,7 @@ def diagnose(
     accelerometer: SensorCalibration | None = None,
     *,
     validation: Mapping[str, Any] | None = None,
+    gravity: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Return a sensor's part of ``diagnoses/<unit>.json``.
 
@@ -44,6 +49,8 @@ def diagnose(
         Sections ``sensor``, ``table`` and ``effects``; ``procedure`` for recordings by hand.
     accelerometer : SensorCalibration, optional
         For the gyroscope by hand, which needs the direction of gravity; without it, it is calibrated again.
+    gravity : mapping, optional
+        Diagnosis of the accelerometer, for a gyroscope whose mountings it determines.
     validation : mapping, optional
         The sensor's part of ``validations/<unit>.json``; without it, a free fit stands for the calibration.
 
@@ -61,6 +68,9 @@ def diagnose(
     by_hand = is_multi_position(sensor, recordings)
     procedure = multi_position if by_hand else turntable
     configured = configured_effects(sensor, settings, [] if by_hand else recordings)
+    by_gravity = sensor == "gyroscope" and MOUNTING in configured
+    if by_gravity:
+        accelerometer = mountings_by_gravity(recordings, settings)
     found = None
     try:
         found = procedure.findings(calibration, recordings, noise, settings, configured, accelerometer=accelerometer)
@@ -68,7 +78,18 @@ def diagnose(
     except NotObservableError as reason:
         document = _not_enough_data(sensor, configured, reason.message, procedure.NEEDED)
     evidence = evidence_of(document, sensor, recordings, noise, settings, validation=validation, found=found)
+    if by_gravity and gravity:
+        evidence = replace(evidence, doubts=[*evidence.doubts, *_doubts_of_gravity(gravity)])
     return judged(document, evidence)
+
+
+def _doubts_of_gravity(accelerometer: Mapping[str, Any]) -> list[str]:
+    """Return why the mountings that an accelerometer determines may be wrong."""
+    who = "the accelerometer, which determines the mountings,"
+    if accelerometer["verdict"] in IN_DOUBT:
+        return [f"{who} has the verdict {accelerometer['verdict']}"]
+    missing = [name for name in accelerometer["selected"] if of_the_angle(name)]
+    return [f"{who} misses {' and '.join(missing)}: add it to effects.accelerometer"] if missing else []
 
 
 def _not_enough_data(sensor: str, configured: list[str], reason: str, needed: str) -> dict[str, Any]:

@@ -40,7 +40,7 @@ def fit(
 
         return fit_effects_by_rests(before, recordings, noise, settings)
     names = configured_effects(sensor, settings, recordings)
-    accelerometer = _mountings_by_gravity(recordings, settings) if sensor == "gyroscope" and MOUNTING in names else None
+    accelerometer = mountings_by_gravity(recordings, settings) if sensor == "gyroscope" and MOUNTING in names else None
     if settings["effects"][sensor] == AUTO:
         observations = observe(sensor, recordings, settings["table"])
         if not observations.parts:
@@ -52,13 +52,27 @@ def fit(
     return fit_joint(sensor, recordings, names, noise, settings, before, accelerometer)
 
 
-def _mountings_by_gravity(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> SensorCalibration | None:
-    """Return the accelerometer with the mountings of its turns; None where the recordings do not determine them."""
+def mountings_by_gravity(recordings: Sequence[Recording], settings: Mapping[str, Any]) -> SensorCalibration | None:
+    """Return the accelerometer with the mountings of its turns; None where the recordings do not determine them.
+
+    What its readings show beside the listed effects is fitted with them: otherwise it would be taken for mountings.
+    Errors of the table's angle that are not listed are left out, as one that is named wrongly turns the mountings.
+    """
     listed = settings["effects"]["accelerometer"]
     within = (MOUNTING, *effect(MOUNTING).contains)
-    wanted = AUTO if listed == AUTO else [MOUNTING, *(name for name in listed if name not in within)]
+    wanted = [MOUNTING, *(name for name in ([] if listed == AUTO else listed) if name not in within)]
     both = {**settings, "effects": {**settings["effects"], "accelerometer": wanted}}
+    names = configured_effects("accelerometer", both, recordings)
+    observations = observe("accelerometer", recordings, settings["table"])
+    noise = noise_of("accelerometer", recordings, settings)
     try:
-        return fit("accelerometer", recordings, None, both)
+        seen = select(observations, names, noise, settings["sensor"]["accelerometer"]).names
+        names += [name for name in seen if not of_the_angle(name)]
+        return fit_joint("accelerometer", recordings, names, noise, settings)
     except NotObservableError:
         return None
+
+
+def of_the_angle(name: str) -> bool:
+    """Return whether an effect is an error of the table's angle or axes."""
+    return effect(name).owner == "table" and name not in bench_priors()

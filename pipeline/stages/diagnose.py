@@ -24,7 +24,13 @@ def process_unit(job: Job, unit: str, settings: dict[str, Any]) -> None:
     document: dict[str, Any] = {"schema_version": 1, "unit": unit}
     for sensor, calibration in fits.items():
         document[sensor] = found = calibration and diagnose(
-            calibration, recordings, noises[sensor], settings, fits["accelerometer"], validation=validation[sensor]
+            calibration,
+            recordings,
+            noises[sensor],
+            settings,
+            fits["accelerometer"],
+            validation=validation[sensor],
+            gravity=document.get("accelerometer"),
         )
         if calibration and found:
             other = next(fit for s, fit in fits.items() if s != sensor)

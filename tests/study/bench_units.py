@@ -127,7 +127,10 @@ def judged(kind: str, seed: int, number: int, hidden: float) -> dict[str, Any]:
         error = np.concatenate([found.bias - truth[sensor]["bias"], (found.matrix - matrix).ravel()])
         U = coverage_factor(found.freedom[:12]) * np.sqrt(np.diag(found.covariance)[:12])
         held = validate(found, recordings, noises[sensor], settings)
-        said = diagnose(found, recordings, noises[sensor], settings, fits["accelerometer"], validation=held)
+        gravity = line["sensors"].get("accelerometer")
+        said = diagnose(
+            found, recordings, noises[sensor], settings, fits["accelerometer"], validation=held, gravity=gravity
+        )
         inside = held["expected_rms_error"][0] <= held["steps"][-1]["rms_error"] <= held["expected_rms_error"][1]
         line["sensors"][sensor] = {
             "error_over_U": (error / U).tolist(), "over_floor": held["steps"][-1]["rms_error"] / held["noise_floor"],
