@@ -126,7 +126,7 @@ def test_a_range_that_the_file_does_not_list_is_refused(layers: list[str], says:
 
 
 def test_figures_that_are_not_stated_are_those_of_generic_and_named(compose: Compose) -> None:
-    sensor = compose("sensor=bmi088", "sensor.gyroscope.bias=1")["sensor"]
+    sensor = compose("sensor=bmi055", "sensor.gyroscope.bias=1")["sensor"]
     generic = FILES["generic"]
     for part, bias in (("accelerometer", generic["accelerometer"]["bias"]), ("gyroscope", 1)):
         assert sensor[part]["noise_density"] == generic[part]["noise_density"]
@@ -135,7 +135,7 @@ def test_figures_that_are_not_stated_are_those_of_generic_and_named(compose: Com
         assert ("bias" in sensor[part]["assumed"]) == (part == "accelerometer")
         assert as_stated(sensor[part])["noise_density"] is None
     assert (
-        read_config("sensor", "bmi088")["accelerometer"]["noise_density"] == generic["accelerometer"]["noise_density"]
+        read_config("sensor", "bmi055")["accelerometer"]["noise_density"] == generic["accelerometer"]["noise_density"]
     )
     assert read_config("sensor", "adxl355")["gyroscope"]["counts_per_unit"] == generic["gyroscope"]["counts_per_unit"]
 
