@@ -39,7 +39,7 @@ def test_without_a_choice_the_table_of_the_procedure_is_written_down(
 ) -> None:
     assert main([str(tmp_path / "a")]) == 0
     assert "table acutronic: accuracy of its angles 0.00028 deg" in capsys.readouterr().out
-    assert main([str(tmp_path / "b"), "--procedure", "multi_position"]) == 0
+    assert main([str(tmp_path / "b"), "--procedure", "six_positions"]) == 0
     assert "table hand: there is no table" in capsys.readouterr().out
     assert load_campaign({"campaign": str(tmp_path / "b")}).units["U1"].config["table"]["name"] == "hand"
 
@@ -92,7 +92,7 @@ def test_each_bench_gets_its_own_instructions(tmp_path: Path, options: list[str]
 
 
 def test_on_a_terminal_it_asks_what_is_not_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    answers = iter(["mpu6050", "4 500", "multi_position", ""])
+    answers = iter(["mpu6050", "4 500", "six_positions", ""])
     asked: list[Any] = []
 
     def answer(question: str) -> str:
@@ -108,9 +108,9 @@ def test_on_a_terminal_it_asks_what_is_not_given(tmp_path: Path, monkeypatch: py
         "procedure [three_axis_turns]: ",
         "table [hand]: ",
     ]
-    assert (tmp_path / "bench" / "units.csv").read_text().splitlines()[1] == "U1,,,,mpu6050,hand,multi_position,"
+    assert (tmp_path / "bench" / "units.csv").read_text().splitlines()[1] == "U1,,,,mpu6050,hand,six_positions,"
     asked.clear()
-    main([str(tmp_path / "b"), "--sensor", "stim300", "--range", "10", "400", "--procedure", "ferraris",
+    main([str(tmp_path / "b"), "--sensor", "stim300", "--range", "10", "400", "--procedure", "six_positions",
           "--table", "hand"])  # fmt: skip
     assert asked == []
 
