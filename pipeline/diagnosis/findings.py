@@ -16,6 +16,7 @@ import numpy as np
 from pipeline.diagnosis.words import next_experiment, to_distinguish
 from pipeline.estimation.posterior import CERTAIN
 from pipeline.estimation.selection import ALIKE, EVIDENCE, GATE_BIC, INFLATED
+from pipeline.estimation.something_else import OTHER
 from pipeline.model.effects import effect
 
 if TYPE_CHECKING:
@@ -113,15 +114,16 @@ def _how_sure(found: Findings) -> dict[str, Any]:
     ]
     limits = {}
     for name, values in answers.upper_limit.items():
+        if name in found.selected or name.startswith(OTHER):
+            continue
         this = effect(name).of_recordings(found.turns)
         linear = [p for p in this.parameters(found.sensor) if p.name not in this.nonlinear or this.moves]
-        if name not in found.selected:
-            limits[name] = {p.name: {"value": float(v), "unit": p.unit} for p, v in zip(linear, values, strict=True)}
+        limits[name] = {p.name: {"value": float(v), "unit": p.unit} for p, v in zip(linear, values, strict=True)}
     return {
         "probability": {name: min(answers.probability(name), CERTAIN) for name in answers.upper_limit},
         "answer_set": sets,
         "upper_limit": limits,
-        "to_distinguish": to_distinguish(sets, on_table=found.on_table),
+        "to_distinguish": to_distinguish(sets, found.sensor, on_table=found.on_table),
     }
 
 

@@ -23,6 +23,7 @@ from pipeline.estimation.generalized_least_squares import calibration_of, fit_in
 from pipeline.estimation.observations import observe
 from pipeline.estimation.posterior_turns import posterior
 from pipeline.estimation.selection import FAR_ABOVE, select
+from pipeline.estimation.something_else import free_curves
 from pipeline.model.effects import catalogue
 from pipeline.records import Noise
 from pipeline.validation.error_breakdown import with_known_effects
@@ -73,6 +74,9 @@ def findings(
     least = left[-1] if noise_square is None else noise_square
     at_noise = not reported.names and left[0] < CLOSE * least
     excess = left[0] if at_noise else max(left[0] - least, left[0] - left[-1])
+    motions = [part.motion for part in observations.parts]
+    others = free_curves(sensor, motions) if selection.names or unknown else []
+    answers = posterior(selection, never_shown(hidden, reported.names), others)
     verdict = verdict_of_selection(
         reported.names,
         unknown,
@@ -80,6 +84,7 @@ def findings(
         2.0 * (reported.fit.log_likelihood - reported.base.log_likelihood),
         above_noise=noise_square is not None and left[-1] > FAR_ABOVE**2 * noise_square,
         held_out=held_out,
+        beyond=max((answers.probability(this.name) for this in others), default=0.0),
     )
     explained, white_square = reported.first.explained([]), float(np.mean(reported.start.scale**2))
 
@@ -111,7 +116,7 @@ def findings(
         terms=final.terms,
         covariance=final.covariance,
         limits=reported.limits,
-        answers=posterior(selection, never_shown(hidden, reported.names)),
+        answers=answers,
         shares=lambda name: _shares(reported, name),
         left=left,
         drop_alone=drop_alone,

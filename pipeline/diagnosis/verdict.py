@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from pipeline.diagnosis.words import listed, of_unknown, plain
+from pipeline.estimation.something_else import OTHER
 from pipeline.model.effects.base import unit_of
 from pipeline.validation.heldout import last_error
 
@@ -37,6 +38,7 @@ EXPLAINED = 1.5  # times the noise: a residual of a fit up to it is noise; 0.92 
 MOSTLY = 0.5  # share of the residual's excess that selected effects must explain where something else is left
 BELIEVED = 3  # effects at once; more are what the catalogue makes of physics that it does not hold
 UNKNOWN_SHARE = 0.03  # of the gain in 2 log L by what was selected, above which what is left is worth naming
+LIKELY = 0.5  # probability of something outside the catalogue, above which what was selected is no explanation
 WORSE = 0.3  # of the noise's mean square, by which what was selected may raise the held-out error's at most
 HELPFUL = 0.1  # share of the held-out error's mean square that each effect worth a try takes away
 QUIET = 0.6  # times the noise: a residual below it contradicts the noise of the rests
@@ -79,6 +81,7 @@ class Evidence:
     doubts: Sequence[str] = ()  # what the recordings' checks say of the reference
     approximations: Sequence[str] = ()  # what the method's matrix and bias lack (``pipeline.diagnosis.method_errors``)
     unknown: Sequence[str] = ()  # covariates on which the residual depends, given what was selected
+    beyond: Sequence[str] = ()  # covariates on which something outside the catalogue is likely to depend
     implausible: Sequence[str] = ()  # selected effects beyond the sensor's limits, where that is not accepted
     held_out: Mapping[str, float] | None = None  # ``error_before, error_after, floor`` of the selection's own fits
     method: str = ""
@@ -95,15 +98,19 @@ def verdict_of_selection(
     *,
     above_noise: bool,
     held_out: Mapping[str, float] | None,
+    beyond: float = 0.0,
 ) -> str:
     """Return the verdict of a selection alone.
 
     What is selected must explain most of the excess, unless nothing else is left. A residual that still depends on
     something beyond the catalogue is unexplained where that is worth naming; next to a much
     larger effect it may be the small error of its linear equation. ``share`` of the residual's excess and ``gain`` in
-    2 log L are what the selected effects explain; ``above_noise``: the residual stays far above the noise with them.
+    2 log L are what the selected effects explain; ``above_noise``: the residual stays far above the noise with them;
+    ``beyond``: probability of physics outside the catalogue.
     """
     if _made_worse(held_out) or len(names) > BELIEVED:
+        return "unexplained"
+    if names and beyond > LIKELY:
         return "unexplained"
     if (unknown or above_noise) and (not names or share < MOSTLY):
         return "unexplained"
@@ -183,6 +190,11 @@ def evidence_of(
         ],
         approximations=[error["name"] for error in document["method_errors"] if error["name"] in COMPARED],
         unknown=[entry["covariate"] for entry in document["unexplained"] if not entry.get("explained_by")],
+        beyond=[
+            name.removeprefix(OTHER)
+            for name, probability in document["probability"].items()
+            if name.startswith(OTHER) and probability > LIKELY
+        ],
         implausible=() if accepted else implausible,
         held_out=document.get("held_out"),
         method=str(method.get(sensor) or ""),
@@ -252,6 +264,9 @@ def _why_unexplained(e: Evidence) -> str:
     if e.unknown:
         depends = listed([plain(n) for n in e.unknown])
         found.append(f"The residual{given} depends on {depends} in a form that no effect of the catalogue has.")
+    if e.beyond and e.selected and not e.unknown:
+        follows = listed([plain(n) for n in e.beyond])
+        found.append(f"Beside {names}, something outside the catalogue is likely to depend on {follows}.")
     left = e.left_over_noise if e.selected else e.over_noise
     if left is not None and (left > EXPLAINED or not found):
         found.append(f"The residual of the fit{given} is {left:.3g} times the noise.")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from pipeline.estimation.something_else import OTHER
 from pipeline.model.effects import catalogue
 from pipeline.model.effects.base import largest_by_unit, unit_of
 
@@ -172,7 +173,11 @@ def _how_sure(part: Mapping[str, Any]) -> list[str]:
 
 def _answer(effects: Sequence[str]) -> str:
     """Return one answer in words."""
-    return " + ".join(plain(name) for name in effects) or "nothing"
+    names = [
+        f"something else that follows the {name.removeprefix(OTHER)}" if name.startswith(OTHER) else plain(name)
+        for name in effects
+    ]
+    return " + ".join(names) or "nothing"
 
 
 def _limit(limits: Mapping[str, Mapping[str, Any]]) -> str:
@@ -180,12 +185,15 @@ def _limit(limits: Mapping[str, Mapping[str, Any]]) -> str:
     return ", ".join(f"{v:.2g}{'' if unit == '1' else ' ' + unit}" for unit, v in largest_by_unit(limits).items())
 
 
-def to_distinguish(sets: Sequence[Mapping[str, Any]], *, on_table: bool) -> str:
+def to_distinguish(sets: Sequence[Mapping[str, Any]], sensor: str, *, on_table: bool) -> str:
     """Return the experiment that would distinguish the two most probable answers; empty where there is one."""
     if len(sets) < 2:
         return ""
     first, second = (each["effects"] for each in sets[:2])
     apart = [name for name in first if name not in second] or [name for name in second if name not in first]
+    if apart[0].startswith(OTHER):
+        own = "specific_force" if sensor == "accelerometer" else "rate"
+        return UNKNOWN[apart[0].removeprefix(OTHER).replace("input", own)]
     experiment = catalogue()[apart[0]].experiment
     return experiment if on_table else BY_HAND.get(apart[0], experiment)
 

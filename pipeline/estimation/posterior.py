@@ -25,10 +25,9 @@ import numpy as np
 
 from pipeline.estimation.design import Term
 from pipeline.estimation.selection import DELAYS
-from pipeline.model.effects import effect
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -155,7 +154,7 @@ class Search:
 
     def _beam(self) -> None:
         level = [self.required]
-        while level and max(map(len, level)) < MOST + len(self.required):
+        while level:
             children = dict.fromkeys(child for names in level for child in self._extend(names))
             level = sorted(children, key=lambda names: -self.pool[names].score)[:BEAM]
             for names in level:
@@ -182,6 +181,8 @@ class Search:
 
     def _extend(self, names: Set) -> list[Set]:
         """Add every allowed effect to a set; return the new sets."""
+        if len(names) >= MOST + len(self.required):
+            return []
         if names not in self._extended:
             self._extended.add(names)
             self._finish(names)
@@ -394,12 +395,13 @@ def excited(products: Values, size: Values, limit: Values, least: float) -> Valu
     return np.asarray((kept @ kept.T) * limit / size[:, None] * size)
 
 
-def excluded(names: Collection[str]) -> dict[str, Set]:
+def excluded(effects: Sequence[Effect]) -> dict[str, Set]:
     """Return the effects that are never in a set with each: those that contain one another, and the two delays."""
-    found = {name: {o for o in names if o in effect(name).contains or name in effect(o).contains} for name in names}
-    for one, other in (DELAYS, DELAYS[::-1]):
-        if one in found:
-            found[one].add(other)
+    found: dict[str, set[str]] = {this.name: set() for this in effects}
+    for this in effects:
+        for other in {*this.contains, *(DELAYS if this.name in DELAYS else ())} & found.keys() - {this.name}:
+            found[this.name].add(other)
+            found[other].add(this.name)
     return {name: frozenset(others) for name, others in found.items() if others}
 
 

@@ -29,14 +29,12 @@ from pipeline.estimation.posterior import (
 )
 from pipeline.estimation.ranking import EXCITED, without
 from pipeline.estimation.selection import DELAYS
-from pipeline.model.effects import effect
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
+    from collections.abc import Collection, Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from pipeline.estimation.design import NormalPrior
     from pipeline.estimation.generalized_least_squares import Fit
     from pipeline.estimation.selection import Selection
     from pipeline.model.effects.base import Effect
@@ -48,87 +46,84 @@ MOST_FITS = 3  # of them
 LEAST_LAG_S = 1e-4  # below it a lag has the column of a time offset, and no sign of its own
 
 
-def posterior(selection: Selection, hidden: Collection[str]) -> Answers:
+def posterior(selection: Selection, hidden: Collection[str], others: Sequence[Effect] = ()) -> Answers:
     """Return probabilities, answer set and upper limits.
 
-    ``hidden``: effects that the recordings cannot show.
+    ``hidden``: effects that the recordings cannot show. ``others``: further candidates.
     """
-    names = list(dict.fromkeys(t.effect.name for t in selection.first.candidates if t.effect.name not in hidden))
-    own = frozenset(selection.names)
-    searches: list[Search | None] = []
-    first = Search(_problem(selection, selection.fit, names), seeds=[own])
-    movers = [_movers(own)]
+    sensor = selection.observations.sensor
+    candidates = {term.effect.name: term for term in reversed(selection.first.candidates)}
+    candidates = {name: term for name, term in sorted(candidates.items()) if name not in hidden}
+    candidates |= {this.name: Term(this, np.zeros(len(this.parameters(sensor)))) for this in others}
+    own, moving = frozenset(selection.names), frozenset(n for n, term in candidates.items() if term.effect.moves)
+    first = Search(_problem(selection, selection.fit, candidates), seeds=[own])
     best = first.best()
-    if best != own and _movers(best) == movers[0] and any(effect(n).nonlinear for n in best ^ own):
-        first = Search(_problem(selection, _fit(selection, best), names), seeds=[own, best])
-    searches.append(first)
-    for other in _worth_a_fit(first, movers[0]):
-        fit = _fit(selection, first.best([key for key in first.pool if _movers(key) == other]))
-        movers.append(other)
+    if best != own and best & moving == own & moving and any(candidates[n].effect.nonlinear for n in best ^ own):
+        first = Search(_problem(selection, _fit(selection, best, candidates), candidates), seeds=[own, best])
+    searches: list[Search | None] = [first]
+    fitted = [own & moving]
+    for movers in _worth_a_fit(first, moving, own & moving):
+        names = first.best([key for key in first.pool if key & moving == movers])
+        fit = _fit(selection, names, candidates)
+        fitted.append(movers)
         lag = next((t.values[0] for t in fit.terms if t.effect.name == DELAYS[1]), np.inf)
-        possible = DELAYS[1] not in other or lag > LEAST_LAG_S  # a lag cannot be negative
-        still = [n for n in names if not effect(n).moves or n in other]
-        searches.append(Search(_problem(selection, fit, still), other) if possible else None)
+        possible = DELAYS[1] not in movers or lag > LEAST_LAG_S  # a lag cannot be negative
+        still = {name: term for name, term in candidates.items() if name not in moving - movers}
+        searches.append(Search(_problem(selection, fit, still), movers) if possible else None)
 
     def owner(key: frozenset[str]) -> int:
-        return movers.index(_movers(key)) if _movers(key) in movers else 0
+        return fitted.index(key & moving) if key & moving in fitted else 0
 
-    return answers(searches, owner, names)
-
-
-def _movers(names: Collection[str]) -> frozenset[str]:
-    return frozenset(name for name in names if effect(name).moves)
+    return answers(searches, owner, candidates)
 
 
-def _worth_a_fit(search: Search, own: frozenset[str]) -> list[frozenset[str]]:
+def _worth_a_fit(search: Search, moving: frozenset[str], own: frozenset[str]) -> list[frozenset[str]]:
     """Return the sets of timing effects, other than those of the fit, whose sets have weight; the likeliest first."""
     pool = search.pool
     total = float(log_sum(np.array([found.score for found in pool.values()])))
     shares: dict[frozenset[str], float] = {}
     for names, found in pool.items():
-        key = _movers(names)
+        key = names & moving
         shares[key] = shares.get(key, 0.0) + float(np.exp(found.score - total))
     other = [key for key, share in shares.items() if key and key != own and share > WORTH_A_FIT]
     return sorted(other, key=lambda key: -shares[key])[:MOST_FITS]
 
 
-def _fit(selection: Selection, names: Collection[str]) -> Fit:
+def _fit(selection: Selection, names: Collection[str], candidates: Mapping[str, Term]) -> Fit:
     """Fit base, configured effects and a set of others."""
     fitted = {term.effect.name: term for term in selection.fit.terms}
     terms = list(selection.base.terms)
     for name in sorted(names):
-        this, prior = _candidate(selection, name)
-        values = (selection.steps.get(name) or selection.alone[name]).values
+        term = candidates[name]
+        scored = selection.steps.get(name) or selection.alone.get(name)
+        values = term.values if scored is None else scored.values
         if name == DELAYS[1]:
-            values = np.maximum(values, this.starts(selection.observations.sensor)[0])
-        terms.append(fitted.get(name) or Term(this, values, prior=prior))
+            values = np.maximum(values, term.effect.starts(selection.observations.sensor)[0])
+        terms.append(fitted.get(name) or replace(term, values=values))
     start = Start(selection.fit.bias, selection.fit.K, selection.start.scale)
     return fit_terms(selection.observations, terms, start, selection.settings)
 
 
-def _candidate(selection: Selection, name: str) -> tuple[Effect, NormalPrior | None]:
-    """Return an effect that was a candidate, with what is known of it beforehand."""
-    term = next(t for t in selection.first.candidates if t.effect.name == name)
-    return term.effect, term.prior
-
-
-def _versions(selection: Selection, fit: Fit, name: str) -> list[tuple[Term, float]]:
+def _versions(sensor: str, fit: Fit, term: Term) -> list[tuple[Term, float]]:
     """Return the terms of an effect and their prior log weights."""
-    this, prior = _candidate(selection, name)
-    held, width = next((t for t in fit.terms if t.effect.name == name), None), None
-    if held is not None and this.nonlinear:
+    held, width = next((t for t in fit.terms if t.effect.name == term.effect.name), None), None
+    if held is not None and term.effect.nonlinear:
         last = BASE + sum(len(t.values) for t in fit.terms[: fit.terms.index(held) + 1]) - 1
         width = float(np.sqrt(fit.covariance[last, last]) / max(abs(held.values[-1]), 1e-300))
-    found = time_constants(this, selection.observations.sensor, held, width)
-    return [(replace(term, full=False, prior=prior), weight) for term, weight in found]
+    found = time_constants(term.effect, sensor, held, width)
+    return [(replace(each, full=False, prior=term.prior), weight) for each, weight in found]
 
 
-def _problem(selection: Selection, fit: Fit, names: Sequence[str]) -> Problem:
+def _problem(selection: Selection, fit: Fit, candidates: Mapping[str, Term]) -> Problem:
     """Return the linear problem at a fit."""
     observations = selection.observations
     configured = fit.terms[: len(selection.base.terms)]
     fitted = {t.effect.name: t for t in fit.terms[len(configured) :]}
-    listed = [(name, term, weight) for name in names for term, weight in _versions(selection, fit, name)]
+    listed = [
+        (name, term, weight)
+        for name, candidate in candidates.items()
+        for term, weight in _versions(observations.sensor, fit, candidate)
+    ]
     design = design_beside(observations, fit, [*configured, *(term for _, term, _ in listed)])
     settings = [WHITE, *selection.settings, *random_walks(selection.settings)]
     stacked, logarithms = design.products(settings)
@@ -157,4 +152,12 @@ def _problem(selection: Selection, fit: Fit, names: Sequence[str]) -> Problem:
     change[:, -1] = moved
     free = 3.0 * observations.samples - known
     within = float(np.sum(observations.scatter / fit.scale**2))
-    return Problem((change.T @ products @ change)[1:], prior[1:], within, free, versions, limits, excluded(names))
+    return Problem(
+        (change.T @ products @ change)[1:],
+        prior[1:],
+        within,
+        free,
+        versions,
+        limits,
+        excluded([term.effect for term in candidates.values()]),
+    )

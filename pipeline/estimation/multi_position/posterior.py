@@ -26,36 +26,36 @@ from pipeline.estimation.posterior import (
 from pipeline.estimation.ranking import without
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
+    from collections.abc import Collection, Mapping, Sequence
 
     from numpy.typing import NDArray
 
     from pipeline.estimation.design import Term
     from pipeline.estimation.multi_position.likelihood import NoiseHypothesis
     from pipeline.estimation.multi_position.selection import Selection
+    from pipeline.model.effects.base import Effect
 
     Values = NDArray[np.float64]
 
 
-def posterior(selection: Selection, hidden: Collection[str]) -> Answers:
+def posterior(selection: Selection, hidden: Collection[str], others: Sequence[Effect] = ()) -> Answers:
     """Return probabilities, answer set and upper limits.
 
-    ``hidden``: effects that the recordings cannot show.
+    ``hidden``: effects that the recordings cannot show. ``others``: further candidates.
     """
-    names = [this.name for this in selection.candidates if this.name not in hidden]
-    return answers([Search(_problem(selection, names), seeds=[selection.names])], lambda _: 0, names)
+    effects = {this.name: this for this in (*selection.candidates, *others) if this.name not in hidden}
+    return answers([Search(_problem(selection, effects), seeds=[selection.names])], lambda _: 0, effects)
 
 
-def _problem(selection: Selection, names: Sequence[str]) -> Problem:
+def _problem(selection: Selection, effects: Mapping[str, Effect]) -> Problem:
     """Return the linear problem at the fit of what was selected."""
     model, state = selection.model, selection.fits[-1].state
     held = len(selection.fits[0].state.terms)
     fitted = {term.effect.name: term for term in state.terms[held:]}
-    by_name = {this.name: this for this in selection.candidates}
     listed: list[tuple[str, Term, float]] = []
-    for name in names:
+    for name, this in effects.items():
         width = None  # of a fitted time constant: as wide as the steps of the grid
-        terms = time_constants(by_name[name], model.sensor, fitted.get(name), width)
+        terms = time_constants(this, model.sensor, fitted.get(name), width)
         listed += [(name, term, weight) for term, weight in terms]
     equations = model.equations(state, [term for _, term, _ in listed])
     base = np.concatenate([equations.base, *equations.effects[:held]], axis=1)
@@ -99,7 +99,7 @@ def _problem(selection: Selection, names: Sequence[str]) -> Problem:
         limits.setdefault(name, limit)
         versions.setdefault(name, []).append(Version(np.arange(block.start, block.stop), weight))
     free = float(max(len(readings) - kept, 1))
-    return Problem(change.T @ products @ change, prior, 0.0, free, versions, limits, excluded(names))
+    return Problem(change.T @ products @ change, prior, 0.0, free, versions, limits, excluded([*effects.values()]))
 
 
 def _random_walks(hypotheses: Sequence[NoiseHypothesis]) -> list[NoiseHypothesis]:
