@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 AUTO = "auto"  # in place of a list of effects: what the diagnosis selects
 MOUNTING, ZERO = "mounting", "encoder_zero"
 SEAT_DEG = 5.0  # where mountings are fitted and the table's config states no size: the default tolerance of ingest
+CONSTANTS = 8  # values of a time constant, in equal ratios from the first start to the last
+SECOND_SHARE = 0.1  # of the likelier one's prior probability, by assumption
 SECOND = {"accelerometer": (), "gyroscope": ("table_encoder_error",)}  # exact look-alikes of a likelier effect
 
 
@@ -189,3 +191,33 @@ def require_available(observations: Observations, names: Sequence[str]) -> None:
                 f"{name} needs the time between the recordings, but their times overlap (each starts at 0?): "
                 f"record them on one clock, or take {name} out of effects.{observations.sensor}"
             )
+
+
+def limits_or_noise(
+    limits: NDArray[np.float64] | None, products: NDArray[np.float64], samples: float
+) -> NDArray[np.float64]:
+    """Return the limits of an effect's parameters; where there is none, the size that adds as much as white noise."""
+    power = np.maximum(np.diag(products), 1e-300)
+    noise = np.sqrt(samples / power)
+    return noise if limits is None else np.where(np.isfinite(limits[: len(power)]), limits[: len(power)], noise)
+
+
+def time_constants(
+    this: Effect, sensor: str, fitted: Term | None = None, width: float | None = None
+) -> list[tuple[Term, float]]:
+    """Return an effect at values of what is not linear in it, with log weights of their prior; the fitted one first.
+
+    ``width``: standard uncertainty of the fitted value's logarithm; None: as wide as the steps between the others.
+    """
+    starts = this.starts(sensor)
+    first, last = starts[0], starts[-1]
+    if not this.nonlinear or this.moves:
+        return [(fitted or Term(this, np.zeros(len(first))), 0.0)]
+    ratio = np.where(first > 0.0, last / np.where(first > 0.0, first, 1.0), 1.0)
+    share = 1.0 / CONSTANTS
+    grid = [(Term(this, first * ratio ** (k / (CONSTANTS - 1))), float(np.log(share))) for k in range(CONSTANTS)]
+    if fitted is None:
+        return grid
+    if width is not None:
+        share = min(share, float(np.sqrt(2.0 * np.pi) * width / np.log(ratio.max())))
+    return [(fitted, float(np.log(share))), *grid]

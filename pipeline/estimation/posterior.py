@@ -23,7 +23,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.estimation.design import Term
 from pipeline.estimation.selection import DELAYS
 
 if TYPE_CHECKING:
@@ -52,7 +51,6 @@ SWEEPS, EXCHANGES = 3, 3
 CERTAIN = 0.97  # what is said of more than that: of the inclusions with 1.000, 96.6 % were right in those sensors
 ENOUGH = 0.95  # of an answer set, and of an upper limit
 HALVINGS = 40  # of the interval that holds a quantile
-CONSTANTS = 8  # values of a time constant, in equal ratios from the first start to the last
 
 
 @dataclass(frozen=True)
@@ -377,13 +375,6 @@ def quantile(weight: Values, mean: Values, deviation: Values) -> Values:
     return np.asarray(high)
 
 
-def limits_or_noise(limits: Values | None, products: Values, samples: float) -> Values:
-    """Return the limits of an effect's parameters; where there is none, the size that adds as much as white noise."""
-    power = np.maximum(np.diag(products), 1e-300)
-    noise = np.sqrt(samples / power)
-    return noise if limits is None else np.where(np.isfinite(limits[: len(power)]), limits[: len(power)], noise)
-
-
 def excited(products: Values, size: Values, limit: Values, least: float) -> Values:
     """Return the change of columns to those of parameters over their limits, in the directions that are excited.
 
@@ -403,24 +394,3 @@ def excluded(effects: Sequence[Effect]) -> dict[str, Set]:
             found[this.name].add(other)
             found[other].add(this.name)
     return {name: frozenset(others) for name, others in found.items() if others}
-
-
-def time_constants(
-    this: Effect, sensor: str, fitted: Term | None = None, width: float | None = None
-) -> list[tuple[Term, float]]:
-    """Return an effect at values of what is not linear in it, with log weights of their prior; the fitted one first.
-
-    ``width``: standard uncertainty of the fitted value's logarithm; None: as wide as the steps between the others.
-    """
-    starts = this.starts(sensor)
-    first, last = starts[0], starts[-1]
-    if not this.nonlinear or this.moves:
-        return [(fitted or Term(this, np.zeros(len(first))), 0.0)]
-    ratio = np.where(first > 0.0, last / np.where(first > 0.0, first, 1.0), 1.0)
-    share = 1.0 / CONSTANTS
-    grid = [(Term(this, first * ratio ** (k / (CONSTANTS - 1))), float(np.log(share))) for k in range(CONSTANTS)]
-    if fitted is None:
-        return grid
-    if width is not None:
-        share = min(share, float(np.sqrt(2.0 * np.pi) * width / np.log(ratio.max())))
-    return [(fitted, float(np.log(share))), *grid]

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.estimation.candidates import SECOND, SECOND_SHARE, limits_or_noise, time_constants
 from pipeline.estimation.design import BASE, Start, Term
 from pipeline.estimation.gauss_markov import WHITE, random_walks
 from pipeline.estimation.generalized_least_squares import design_beside, fit_terms
@@ -23,9 +24,7 @@ from pipeline.estimation.posterior import (
     answers,
     excited,
     excluded,
-    limits_or_noise,
     log_sum,
-    time_constants,
 )
 from pipeline.estimation.ranking import EXCITED, without
 from pipeline.estimation.selection import DELAYS
@@ -111,7 +110,8 @@ def _versions(sensor: str, fit: Fit, term: Term) -> list[tuple[Term, float]]:
         last = BASE + sum(len(t.values) for t in fit.terms[: fit.terms.index(held) + 1]) - 1
         width = float(np.sqrt(fit.covariance[last, last]) / max(abs(held.values[-1]), 1e-300))
     found = time_constants(term.effect, sensor, held, width)
-    return [(replace(each, full=False, prior=term.prior), weight) for each, weight in found]
+    second = float(np.log(SECOND_SHARE)) if term.effect.name in SECOND[sensor] else 0.0
+    return [(replace(each, full=False, prior=term.prior), weight + second) for each, weight in found]
 
 
 def _problem(selection: Selection, fit: Fit, candidates: Mapping[str, Term]) -> Problem:

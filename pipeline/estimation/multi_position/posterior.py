@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.estimation.candidates import limits_or_noise, time_constants
 from pipeline.estimation.gauss_markov import WALK_RATIO, WALK_SHARE, WALK_TIME
 from pipeline.estimation.multi_position.likelihood import NEW
 from pipeline.estimation.posterior import (
@@ -20,8 +21,6 @@ from pipeline.estimation.posterior import (
     answers,
     excited,
     excluded,
-    limits_or_noise,
-    time_constants,
 )
 from pipeline.estimation.ranking import without
 
