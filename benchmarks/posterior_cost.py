@@ -11,8 +11,9 @@ from __future__ import annotations
 import json
 import sys
 import time
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pipeline.diagnosis import multi_position, turntable
 from pipeline.diagnosis.diagnose import diagnose
@@ -21,6 +22,9 @@ from pipeline.files import read_json
 from pipeline.io.parquet import load_recordings
 from pipeline.records import SENSORS, SensorCalibration
 from pipeline.stages.unit_files import require_noises
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 
 def main(results: Path) -> None:
@@ -34,7 +38,7 @@ def main(results: Path) -> None:
         unit, batch = file.stem, file.parents[1]
         fits: dict[str, SensorCalibration | None] = {}
         for sensor in SENSORS:
-            stages = [p for p in (batch / "fit" / sensor).glob(f"*/{unit}.json")]
+            stages = list((batch / "fit" / sensor).glob(f"*/{unit}.json"))
             last = max(stages, key=lambda p: (len(read_json(p).get("stages", ())), p.stat().st_mtime_ns))
             data = read_json(last)
             fits[sensor] = None if "not_calibrated" in data else SensorCalibration.from_json(sensor, data)
@@ -43,22 +47,26 @@ def main(results: Path) -> None:
         for sensor, fit in fits.items():
             if fit is None:
                 continue
-            spent = {
-                with_it: _cost(fit, load_recordings(file), noises[sensor], settings[unit], fits, with_it)
-                for with_it in total
-            }
+            spent = {}
+            for with_it in total:
+                known = fit, load_recordings(file), noises[sensor], settings[unit], fits["accelerometer"]
+                spent[with_it] = _cost(partial(diagnose, *known), with_it=with_it)
             print(f"{unit:<24} {sensor:<14} {spent[False]:6.2f} s {spent[True]:6.2f} s")
             total = {with_it: total[with_it] + spent[with_it] for with_it in total}
     print(f"ratio {total[True] / total[False]:.2f} ({total[True]:.1f} s over {total[False]:.1f} s)")
 
 
-def _cost(fit: Any, recordings: Any, noise: Any, settings: Any, fits: Any, with_it: bool) -> float:
+def _without(*_: object) -> Answers:
+    return Answers([((), 1.0)], {})
+
+
+def _cost(diagnosed: Callable[[], object], *, with_it: bool) -> float:
+    """Return the CPU time of a diagnosis."""
     kept = [(module, module.posterior) for module in (turntable, multi_position)]
-    if not with_it:
-        for module, _ in kept:
-            module.posterior = lambda *_: Answers([((), 1.0)], {})
+    for module, own in kept:
+        module.posterior = own if with_it else _without
     began = time.process_time()
-    diagnose(fit, recordings, noise, settings, fits["accelerometer"])
+    diagnosed()
     spent = time.process_time() - began
     for module, own in kept:
         module.posterior = own

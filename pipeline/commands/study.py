@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 from pipeline.errors import ConfigurationError
 from pipeline.run_progress import Countdown
+from pipeline.study.answers import figures, numbers, reliability_diagram
 from pipeline.study.cases import FAMILIES
-from pipeline.study.page import page
+from pipeline.study.page import DIAGRAM, page
 from pipeline.study.run import RESULTS, TRUTH, read_lines, run_study
 from pipeline.study.scores import all_figures, cases_of, in_the_catalogue, mean_excess_gone
 
@@ -42,7 +43,12 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--n", type=int, default=100, help="cases of each family (100)")
     parser.add_argument("--seed", type=int, default=1, help="every random number follows from it (1)")
     parser.add_argument("--processes", type=int, default=1, help="cores to use (1)")
-    parser.add_argument("--table", type=Path, metavar="FILE", help="write the study as a Markdown page")
+    parser.add_argument(
+        "--table",
+        type=Path,
+        metavar="FILE",
+        help="write the study as a Markdown page, and its diagram to images/ beside it",
+    )
     arguments = parser.parse_args(argv)
     families = _families(arguments.families)
     countdown = Countdown(0)
@@ -56,12 +62,14 @@ def main(argv: Sequence[str]) -> int:
     )
     countdown.end()
     cases = cases_of(read_lines(arguments.directory / TRUTH), read_lines(arguments.directory / RESULTS))
-    for figure in all_figures(cases):
+    for figure in [*all_figures(cases), *figures(cases)]:
         low, high = figure.interval
         print(
             f"{figure.name:<75} {figure.hits:>4} of {figure.total:<4} {100 * low:5.1f} to {100 * high:5.1f} %"
             f"  {figure.goal:<8} {' '.join(figure.misses[:8])}"
         )
+    for each in numbers(cases):
+        print(f"{each.name}: {each.value:.2g} (n = {each.total})  {each.goal}")
     mean = mean_excess_gone(in_the_catalogue(cases))
     if mean.total > 1:
         print(
@@ -70,6 +78,9 @@ def main(argv: Sequence[str]) -> int:
         )
     if arguments.table:
         command = f"python -m pipeline study DIR --families {arguments.families} --n {arguments.n}"
+        diagram = arguments.table.parent / "images" / DIAGRAM
+        diagram.parent.mkdir(exist_ok=True)
+        diagram.write_text(reliability_diagram(cases), encoding="utf-8")
         arguments.table.write_text(page(cases, f"{command} --seed {arguments.seed}"), encoding="utf-8")
     return 0
 

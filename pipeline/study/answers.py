@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from pipeline.report.chart import Dots, Line, Panel, chart
+from pipeline.report.chart import Figure as Chart
 from pipeline.study.scores import Figure, exact, is_null, share, wilson
 
 if TYPE_CHECKING:
@@ -23,6 +25,11 @@ SETS = (
 LIMITS = {"limit_30": "0.3", "limit_60": "0.6", "limit_100": "1"}  # family to the share of the detection size
 EDGES = (0.0, 0.01, 0.03, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 1.0)  # of said probabilities
 GOAL, FAMILY_GOAL, SIZE_GOAL = ">= 93.6 %", ">= 90 %", 3.0
+STYLE = (
+    "<style>.chart{background:#fff}text{font:12px sans-serif;fill:#57606a}.e{text-anchor:end}.m{text-anchor:middle}"
+    "path{fill:none;stroke:currentColor;stroke-width:1.5;vector-effect:non-scaling-stroke}.grid{stroke:#d0d7de}"
+    ".dots{stroke-width:6;stroke-linecap:round}.dashed{stroke-dasharray:4}.c2{color:#1d5fbf}.c5{color:#8b949e}</style>"
+)
 RATIO_GOAL = {"limit_30": 4.0, "limit_60": 2.2, "limit_100": 1.6}  # of the median limit over the truth
 
 
@@ -131,3 +138,20 @@ def reliability(cases: Sequence[JSON]) -> list[Bin]:
         Bin(float(said[place == k].mean()), int(there[place == k].sum()), int(np.sum(place == k)))
         for k in np.unique(place)
     ]
+
+
+def reliability_diagram(cases: Sequence[JSON]) -> str:
+    """Return the said probabilities against the true shares as an SVG file; empty where none was said."""
+    bins = reliability(cases)
+    if not bins:
+        return ""
+    said, true = np.array([b.said for b in bins]), np.array([b.hits / b.total for b in bins])
+    low, high = np.array([b.interval for b in bins]).T
+    ends = np.array([0.0, 1.0])
+    total = sum(b.total for b in bins)
+    figure = Chart("reliability", f"Probabilities of effects against the share of them that is there (n = {total})")
+    points = "; ".join(f"said {b.said:.2g}: {b.hits} of {b.total}" for b in bins)
+    panel = Panel([Line(ends, ends, 5, "dashed"), Dots(said, true, 2, low, high)], "true share", 300, limits=(0.0, 1.0))
+    drawn = chart(figure, points, [panel], "said probability; bars: 95 % intervals", margin=0.02)
+    head, tail = str(drawn.svg).replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1).split("</title>", 1)
+    return f"{head}</title>{STYLE}{tail}\n"

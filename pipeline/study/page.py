@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from pipeline.model.effects import effect
+from pipeline.study.answers import figures, numbers, reliability
 from pipeline.study.cases import FAINT, SIZES
 from pipeline.study.scores import (
     Z,
@@ -47,6 +48,17 @@ SIZE_TEXT = "Selected first, of n, on the MPU-6050 at the size of its data sheet
 SIGNAL_TEXT = """\
 Every hidden effect by lambda: what a perfect diagnosis, to which noise and equation are known, would gain in 2 log L by
 it beside the others (`pipeline/study/bench.py`). A selection asks for 40 to 100, by its number of parameters."""
+FIGURE_HEAD = ["figure", "n", "share", "95 % interval", "goal"]
+ANSWER_TEXT = """\
+A case counts where one answer of the 95 % answer set is exactly the hidden effects, by their own names (nothing, where
+nothing is hidden or nothing can be seen). Limits are those of effects that were not selected, each parameter by itself:
+so the cases at the detection size are those whose effect stood out less than on average."""
+DIAGRAM = "reliability.svg"
+RELIABLE_TEXT = f"""\
+The probability of every effect in the same cases, against the share of them in which it was there.
+
+![Probabilities of effects against the share of them that is there](images/{DIAGRAM})"""
+RELIABLE_HEAD = ["said, mean", "n", "true", "95 % interval"]
 MISS_TEXT = "In brackets lambda."
 SHAPE_HEAD = ["hidden", "n", "unexplained", "other warning", "silent", "nothing", "most often said", "excess gone"]
 SHAPE_TEXT = """\
@@ -62,7 +74,9 @@ def page(cases: Sequence[JSON], command: str) -> str:
     faults = [[case["key"], case["error"]] for case in cases if "error" in case]
     parts = [
         HEAD.format(command=command, code=code),
-        _table(["figure", "n", "share", "95 % interval", "goal"], _figures(cases)),
+        _table(FIGURE_HEAD, _figures(cases)),
+        _section("Answer sets, probabilities and upper limits", ANSWER_TEXT, FIGURE_HEAD, _answers(cases)),
+        _section("Are probabilities right?", RELIABLE_TEXT, RELIABLE_HEAD, _reliable(cases)),
         _section("Detection by size", SIZE_TEXT, ["sensor", "effect", "x1", "x0.3", "x0.1"], found_at(said)),
         _section("Detection by signal", SIGNAL_TEXT, ["lambda", "n", "selected", "95 % interval"], by_signal(cases)),
         _section("Called something else", "", ["sensor", "hidden", "said", "cases"], confusions(said)),
@@ -94,6 +108,15 @@ def _figures(cases: Sequence[JSON]) -> Rows:
         name = "held-out excess over the noise floor that is gone with what was selected, mean"
         rows.append([name, mean.total, _percent(mean.value), interval, ">= 98 %"])
     return rows
+
+
+def _answers(cases: Sequence[JSON]) -> Rows:
+    rows = [[f.name, f.total, _percent(f.hits / f.total), _between(*f.interval), f.goal] for f in figures(cases)]
+    return rows + [[n.name, n.total, f"{n.value:.2g}", "", n.goal] for n in numbers(cases)]
+
+
+def _reliable(cases: Sequence[JSON]) -> Rows:
+    return [[f"{b.said:.2g}", b.total, _percent(b.hits / b.total), _between(*b.interval)] for b in reliability(cases)]
 
 
 def _percent(share: float) -> str:

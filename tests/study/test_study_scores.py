@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from pipeline.study.answers import figures, in_the_set, numbers, ratios, reliability, reliability_diagram
 from pipeline.study.page import by_signal, confusions, found_at, instead, of_shapes, page, table_of
 from pipeline.study.scores import (
     all_figures,
@@ -132,3 +133,39 @@ def test_the_page_has_the_figures_the_code_and_the_cases_that_miss() -> None:
     assert "code being `0123`." in text
     assert "| single-00000 | mpu6050 gyroscope one_way | g_sensitivity | b |" in text
     assert "| mpu6050 | gyroscope | `g_sensitivity` | 0.1 | deg/s/g |" in text
+
+
+def answer(*sets: tuple[str, ...], **more: Any) -> dict[str, Any]:
+    each = [{"effects": list(names), "probability": 0.9 / len(sets)} for names in sets]
+    return {"answer_set": each, "probability": {}, "upper_limit": {}, **more}
+
+
+def test_the_truth_must_be_one_of_the_answers_by_its_own_name() -> None:
+    pair = truth("b", "a") | said("a")
+    assert in_the_set(pair | answer(("a",), ("a", "b")))
+    assert not in_the_set(pair | answer(("a",), ("b",)) | {"look_alikes": {"a": {"b": 1.0}}})
+    assert in_the_set(truth("a", key="unseen-00000") | said() | answer(()))
+    assert not in_the_set(truth(key="null_white-00000") | said() | answer(("a",)))
+    shares = {f.name: (f.hits, f.total) for f in figures([pair | answer(("a", "b")), pair | answer(("a",))])}
+    assert shares["truth in the 95 % answer set"] == (1, 2)
+    assert shares["most probable answer: exactly the truth"] == (1, 2)
+
+
+def test_limits_are_counted_where_the_effect_was_not_selected() -> None:
+    limits = {"a": {"p": {"value": 1.5, "unit": "g"}}}
+    low = {"a": {"p": {"value": 0.5, "unit": "g"}}}
+    cases = [
+        truth("a", key="limit_30-00000") | said() | answer((), upper_limit=each) for each in (limits, low, {}, limits)
+    ]
+    assert ratios(cases, "limit_30").tolist() == [1.5, 0.5, 1.5]
+    assert [(f.hits, f.total) for f in figures(cases)] == [(2, 3)]
+    assert [(n.value, n.total) for n in numbers(cases)] == [(1.5, 3)]
+
+
+def test_said_probabilities_are_compared_with_the_share_that_is_true() -> None:
+    cases = [truth("a") | said() | answer((), probability={"a": p, "b": 0.02}) for p in (0.6, 0.6, 0.97)]
+    cases += [truth("b") | said() | answer((), probability={"a": 0.6, "b": 0.02})]
+    found = [(b.said, b.hits, b.total) for b in reliability(cases)]
+    assert found == [(pytest.approx(0.02), 1, 4), (pytest.approx(0.6), 2, 3), (pytest.approx(0.97), 1, 1)]
+    assert reliability_diagram(cases).count("<svg xmlns=") == 1
+    assert reliability_diagram([]) == ""
