@@ -20,7 +20,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), ROOT / "CONTRIBUTING.md"]
-BLOCK = re.compile(r"^```(?:bash)?\n(.*?)^```", re.MULTILINE | re.DOTALL)
+FENCED = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)  # language, text
 INDENTED = re.compile(r"(?:^ {4}.*\n)+", re.MULTILINE)
 INLINE = re.compile(r"`((?:nice )?(?:python|snakemake|imu-calibration) [^`]*)`")
 PROGRAMS = ("python ", "snakemake ", "imu-calibration ", "pip ", "cp ")
@@ -49,9 +49,11 @@ MAY_END_WITH = {"python -m pipeline check my_log.csv": 2}  # a log that needs a 
 NOT_RUN = {  # by the start of the command, and why
     "pip ": "no package is installed by a test",
     "snakemake --profile profiles/slurm": "python -m pytest -m slurm runs it",
+    "python -m pipeline.field_logs.ros2_node": "needs ROS 2; tests/commands play a log to it",
     "python -m pipeline guide": "waits for a growing log; tests/commands run it",
     "python -m pipeline thesis seeds": "some minutes; tests/thesis makes some of its rows",
     "python -m pytest": "the tests themselves",
+    "python benchmarks/peers.py": "needs other programs, which it compiles",
 }
 NOT_RUN_IN = {
     "find_the_missing_effect.md": "test_tutorial.py",
@@ -67,9 +69,8 @@ class Parsed(Exception):  # noqa: N818  (no error)
 def commands(document: Path, *, inline: bool) -> list[str]:
     """Return the commands of the blocks of a document, and of its sentences, each in one line without comment."""
     text = document.read_text(encoding="utf-8")
-    blocks = BLOCK.findall(text) + [
-        block.replace("\n    ", "\n")[4:] for block in INDENTED.findall(BLOCK.sub("", text))
-    ]
+    blocks = [block for language, block in FENCED.findall(text) if language in {"", "bash"}]
+    blocks += [block.replace("\n    ", "\n")[4:] for block in INDENTED.findall(FENCED.sub("", text))]
     lines = [line.removeprefix("$ ") for block in blocks for line in re.sub(r" *\\\n *", " ", block).splitlines()]
     found = [re.sub(r" {2,}#.*", "", line).strip() for line in lines if line.startswith(PROGRAMS)]
     if inline:
