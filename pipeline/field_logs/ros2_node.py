@@ -3,8 +3,9 @@
     python -m pipeline.field_logs.ros2_node results/demo/calibrations/U1.json --topic /imu/data_raw
 
 It publishes on ``<topic>_calibrated``. A message is a copy of the original in which the calibrated vectors are
-replaced; stamp, frame, orientation and covariances stay, as in ``python -m pipeline apply``. ROS is imported by
-``main`` alone: ``MessageCalibrator`` takes any object with the fields of the message.
+replaced, and their covariances where the calibration holds the noise of a sample; stamp, frame and orientation stay, as
+in ``python -m pipeline apply``. ROS is imported by ``main`` alone: ``MessageCalibrator`` takes any object with the
+fields of the message.
 """
 
 from __future__ import annotations
@@ -52,6 +53,8 @@ class MessageCalibrator:
     ) -> None:
         self.compensation, self.warn, self.smoothing = load(file, python_effects), warn, smoothing
         self.axes = {s: axis_matrix(m) for s, m in maps_of_log(read_calibration(file).get("log") or {}).items()}
+        covariances = self.compensation.covariances
+        self.covariances = {s: (c / FIELDS[s][2] ** 2).ravel().tolist() for s, c in covariances.items()}
         self.needs_temperature = "temperature" in self.compensation.stream().needs
         self.warmth: float | None = None
         self.waiting = False
@@ -103,10 +106,12 @@ class MessageCalibrator:
         warmth = {"temperature": self._temperature_at(time)} if self.needs_temperature else {}
         found = self.stream.apply(**readings, **warmth, time=time)
         for sensor in set(readings) & {s for s in SENSORS if self.compensation.calibration(s) is not None}:
-            field, _, factor = FIELDS[sensor]
+            field, covariance, factor = FIELDS[sensor]
             x, y, z = (getattr(found, sensor) / factor).tolist()
             vector = getattr(out, field)
             vector.x, vector.y, vector.z = x, y, z
+            if sensor in self.covariances:
+                setattr(out, covariance, self.covariances[sensor].copy())
         return out
 
 

@@ -13,6 +13,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from pipeline.commands.apply import main as apply_main
+from pipeline.estimation.noise_identification import identify_noise
 from pipeline.field_logs import ros2_node
 from pipeline.field_logs.ros2_node import MessageCalibrator
 from pipeline.files import write_json
@@ -42,6 +43,9 @@ def calibration(tmp_path: Path) -> Path:
     }
     document = {"unit": "U1", "schema_version": 1, "status": "ok", "error": None, **parts}
     document["log"] = {"ingest": {}, "axis_map": {"accelerometer": AXES, "gyroscope": AXES}}
+    time, noise = np.arange(500, dtype=np.int64) * 2_000_000, np.random.default_rng(1).normal(0, 0.1, (500, 3))
+    rest = Recording("static", "static", None, time, gyroscope=noise)
+    document["noise"] = {"gyroscope": identify_noise("gyroscope", [rest])}
     write_json(tmp_path / "U1.json", document)
     return tmp_path / "U1.json"
 
@@ -120,7 +124,8 @@ def run(monkeypatch: pytest.MonkeyPatch, calibration: Path, played: list[tuple[s
 
 
 def vectors(message: Any) -> list[float]:
-    return [getattr(getattr(message, v), a) for v in ("linear_acceleration", "angular_velocity") for a in "xyz"]
+    of = [getattr(getattr(message, v), a) for v in ("linear_acceleration", "angular_velocity") for a in "xyz"]
+    return [*of, *message.linear_acceleration_covariance, *message.angular_velocity_covariance]
 
 
 def test_the_node_publishes_what_apply_writes(
@@ -140,6 +145,8 @@ def test_the_node_publishes_what_apply_writes(
         for _, m in messages(tmp_path / "out.mcap", f"{imu_topic}_calibrated")
     }
     assert len(ros.published) == len(expected) == SAMPLES
+    variance = ros.published[0][1].angular_velocity_covariance[0]
+    assert variance == pytest.approx(np.radians(0.1) ** 2, rel=0.2)  # 500 samples, times the matrix
     for _, message in ros.published:
         stamp = message.header.stamp.sec, message.header.stamp.nanosec
         np.testing.assert_allclose(vectors(message), expected[stamp], rtol=0, atol=1e-12)
