@@ -289,7 +289,8 @@ class McapFormat(Section):
 
     ``topics``: topic to channel (or ``time``) to field. ``time_source``: the stamps in the messages, or the recorder's
     times. ``table_clock``: ``shared`` if the table's messages have the stamps of the Imu messages, ``own`` if they are
-    aligned by the motion. ``clock_difference_s``: largest difference between stamps and recorder's times (None: any).
+    aligned by the motion. ``sensor_clock``: ``own`` if the two sensors have stamps and rates of their own, of one
+    clock. ``clock_difference_s``: largest difference between stamps and recorder's times (None: any).
     ``reorder_s``: how late a message may stand in the file.
     """
 
@@ -302,6 +303,7 @@ class McapFormat(Section):
     time_source: Literal["header", "log_time"] = Field(default="header", description="header or log_time")
     allow_truncated: bool = Field(default=False, description="true or false")
     table_clock: Literal["shared", "own"] = Field(default="shared", description="shared or own")
+    sensor_clock: Literal["shared", "own"] = Field(default="shared", description="shared or own")
     clock_difference_s: Duration | None = Field(default=3600.0, description="a time in s, 0 or more")
     reorder_s: Duration = Field(default=1.0, description="a time in s, 0 or more")
 

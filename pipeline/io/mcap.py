@@ -138,11 +138,12 @@ class _Log:
             if topic is not None:
                 topic.read(rows, self.reader)
         self._note_container()
-        first, *others = self._chosen()
-        base = self._series(first)
+        base, *others = (self._series(topic) for topic in self._chosen())
+        if self.settings.sensor_clock == OWN:
+            base, others = self._slower_first(base, others)
         values = dict(base.values)
-        for topic in others:
-            values = self._at_rows(self._series(topic), base) | values
+        for series in others:
+            values = self._at_rows(series, base) | values
         self._check_finite(values, base)
         ignored = [listed for name, listed in listed_topics(self.reader) if name not in self.topics]
         if ignored:
@@ -219,6 +220,27 @@ class _Log:
         times, own = base.time_ns - base.time_ns[0], series.time_ns - base.time_ns[0]
         return {n: np.interp(times, own, numbers) for n, numbers in series.values.items()}
 
+    def _slower_first(self, base: _Series, others: list[_Series]) -> tuple[_Series, list[_Series]]:
+        """Return the rows of the slower of two sensors with the averages of the faster one, and all else."""
+        sensors = {triad[0] for triad in TRIADS.values()}
+        other = next((s for s in others if sensors & set(s.values)), None)
+        if other is None:
+            return base, others
+        from pipeline.io.sensor_clocks import averaged, rows_covered, slower_first  # noqa: PLC0415  (few logs need it)
+
+        others = [s for s in others if s is not other]
+        slow, fast = (base, other) if slower_first(base.time_ns, other.time_ns) else (other, base)
+        rows = rows_covered(slow.time_ns, fast.time_ns, fast.topic, self.path)
+        values = {c: averaged(slow.time_ns, rows, fast.time_ns, v) for c, v in fast.values.items()}
+        for channel in fast.values:
+            self.encodings.pop(channel, None)
+        lost = len(slow.time_ns) - len(rows)
+        detail = f"{len(fast.time_ns)} messages on {fast.topic} averaged over the intervals of {slow.topic}"
+        detail += f", {lost} of whose messages they do not cover" if lost else ""
+        self.notes.append(Note("N-AVERAGED", len(rows), 0, 0, detail))
+        values |= {c: v[rows] for c, v in slow.values.items()}
+        return _Series(slow.topic, slow.time_ns[rows], values), others
+
     def _at_rows(self, series: _Series, base: _Series) -> Columns:
         """Return the channels of a topic at the times of the rows; none of a table's with a clock of its own."""
         channels = set(series.values)
@@ -244,7 +266,7 @@ class _Log:
             )
             hint = "or, where its clock is another one, set ingest.mcap.table_clock=own"
             if sensor:
-                hint = f"read one sensor at a time: leave this topic out of the profile, and set method.{sensor}=null"
+                hint = "set ingest.mcap.sensor_clock=own: the faster sensor is averaged about the stamps of the slower"
             raise IngestError(message, self.path, code="bad_time", hint=hint)
         extra = len(series.time_ns) - len(index)
         if extra > 0:
