@@ -10,14 +10,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+
 from pipeline.commands.check import DEFAULT_PROFILE, campaign_of, composed, named
 from pipeline.config.campaign import load_campaign
-from pipeline.errors import CannotCalibrateError, ConfigurationError, PipelineError
+from pipeline.errors import CannotCalibrateError, ConfigurationError, NotObservableError, PipelineError
+from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.io.files import MESSAGE_FORMATS, candidate_files, recording_files
 from pipeline.io.ingest_settings import checks_of
 from pipeline.io.read import read_table, to_recording
 from pipeline.planning.next_rest import MOST, in_words, progress_of, propose
-from pipeline.planning.next_turn import next_face_or_turn
+from pipeline.planning.next_turn import Turn, most_informative_turn, next_face_or_turn
 from pipeline.preprocessing.checks import check_recordings
 from pipeline.signal.rests import WINDOW_S, find_rests
 from pipeline.simulation.description import BY_HAND
@@ -31,11 +34,13 @@ if TYPE_CHECKING:
 
 POLL_S = 1.0  # between two looks at a growing log: short against a rest
 STILL_RESTING_S = 1.0  # from a rest's end to that of the log, below which the rest may go on
+FIRST = Turn(0, 2, 180.0)  # about x, while nothing of the gyroscope is known
 WANDERS = 2.0  # bias wanders in the default goal: a calibration says nothing of the bias of another hour to less (95 %)
 EPILOG = """\
 The rests are found as a run finds them. The next rest is the one by which the accelerometer's calibration gains most;
 the largest expanded uncertainty (95 %) of bias, in mg, and of the matrix, in mg at 1 g, is compared with --goal. With
---procedure ferraris the next missing face or turn is named. How attitudes are named: docs/record.md.
+--gyroscope-goal, turns that tell most of the gyroscope's matrix follow (method=rests_and_moves). With --procedure
+ferraris the next missing face or turn is named. How attitudes are named: docs/record.md.
 
 A recording of a campaign is read by the campaign's configuration, together with the unit's other recordings. Any other
 file is read by --sensor, --ingest and --procedure.
@@ -85,15 +90,16 @@ def main(argv: Sequence[str]) -> int:
     source = _source(arguments)
     sheet = source.config["sensor"]["accelerometer"]
     goal = 1e-3 * arguments.goal if arguments.goal is not None else WANDERS * float(sheet["bias_wander"])
+    goals = Goals(goal, arguments.gyroscope_goal)
     if not arguments.follow:
         missing = [str(f) for f in source.files if not f.exists()]
         if missing:
             raise ConfigurationError(f"there is no file {', '.join(missing)}; --follow waits for one")
-        advice = _advice(source.read(growing=False), source.config, goal, arguments.dwell)
+        advice = _advice(source.read(growing=False), source.config, goals, arguments.dwell)
         print("\n".join([*advice.rests, *advice.words]))
         return 0
     try:
-        _follow(source, goal, arguments.dwell)
+        _follow(source, goals, arguments.dwell)
     except KeyboardInterrupt:
         print()
     return 0
@@ -111,6 +117,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--follow", action="store_true", help="read a growing log until the goal is reached (Ctrl-C ends it)")
     wanted = "largest expanded uncertainty, mg (default: twice the bias wander that the sensor's file states)"
     add("--goal", type=float, metavar="MG", help=wanted)
+    wanted = "likewise of the gyroscope's matrix, by the moves between the rests (default: it is left out)"
+    add("--gyroscope-goal", type=float, metavar="PERCENT", help=wanted)
     add("--dwell", type=float, metavar="S", default=BY_HAND.dwell_s, help="of a rest (default: %(default)g)")
     add("--sensor", metavar="NAME", help="name in configs/sensor (default: generic)")
     add("--procedure", metavar="NAME", help="multi_position (default), orientations_24, six_positions or ferraris")
@@ -120,10 +128,10 @@ def _parser() -> argparse.ArgumentParser:
 
 def _source(arguments: argparse.Namespace) -> Source:
     """Return where the recordings lie and how they are read."""
-    for option in ("goal", "dwell"):
+    for option in ("goal", "gyroscope_goal", "dwell"):
         value = getattr(arguments, option)
         if value is not None and not value > 0.0:
-            raise ConfigurationError(f"--{option} is {value:g}; it must be above 0")
+            raise ConfigurationError(f"--{option.replace('_', '-')} is {value:g}; it must be above 0")
     first, campaign = arguments.files[0], campaign_of(arguments.files[0])
     files = tuple(arguments.files)
     if campaign is not None and not (arguments.sensor or arguments.procedure or arguments.ingest):
@@ -171,7 +179,14 @@ class Advice(NamedTuple):
     words: list[str]
 
 
-def _advice(recordings: Sequence[Recording], config: dict[str, Any], goal: float, dwell: float) -> Advice:
+class Goals(NamedTuple):
+    """Largest expanded uncertainties that are enough."""
+
+    accelerometer: float  # g
+    gyroscope: float | None  # per cent of the matrix; None: not asked
+
+
+def _advice(recordings: Sequence[Recording], config: dict[str, Any], goals: Goals, dwell: float) -> Advice:
     if config["procedure"].get("faces"):
         done, words = next_face_or_turn(recordings, config["procedure"])
         return Advice(done, [], words)
@@ -179,7 +194,27 @@ def _advice(recordings: Sequence[Recording], config: dict[str, Any], goal: float
     rows = zip(progress.rests, progress.up, progress.held_out, strict=True)
     lines = [f"{k:>4}  {_described(*pair, up, held=held)}" for k, (pair, up, held) in enumerate(rows, start=1)]
     lines += [f"   -  {r.name} {r.time[rest.start]:.1f} s: left out: {rest.reason}" for r, rest in progress.left_out]
-    return Advice(*_next(progress, goal, dwell, lines))
+    done, words = _next(progress, goals.accelerometer, dwell)
+    if done and goals.gyroscope is not None:
+        done, words = _next_turn(recordings, config, progress, goals.gyroscope, dwell)
+    return Advice(done, lines, words)
+
+
+def _next_turn(
+    recordings: Sequence[Recording], config: dict[str, Any], progress: Progress, goal: float, dwell: float
+) -> tuple[bool, list[str]]:
+    """Return whether the gyroscope's goal is reached, and the next turn in words."""
+    try:
+        found = rests_and_moves.fit(recordings, None, config)
+    except NotObservableError as lack:
+        return False, [f"gyroscope's matrix: not determined yet: {lack.message}", f"next: {FIRST.in_words(dwell)}"]
+    expanded = 100.0 * float(np.max(found.to_json()["expanded_uncertainty"]["matrix"]))
+    now = f"expanded uncertainty of the gyroscope's matrix: {expanded:.2g} % (goal {goal:g} %)"
+    if expanded <= goal:
+        return True, [now, "enough: both goals are reached"]
+    gravity = float(config["table"].get("gravity_g") or 1.0)
+    turn = most_informative_turn(found, float(np.sqrt(2.0)) * progress.error / gravity)
+    return False, [now, f"next: {turn.in_words(dwell)}"]
 
 
 def _described(recording: Recording, rest: Rest, up: Any, *, held: bool) -> str:  # noqa: ANN401  (an array)
@@ -187,7 +222,7 @@ def _described(recording: Recording, rest: Rest, up: Any, *, held: bool) -> str:
     return f"{recording.name} {start:.1f} to {stop:.1f} s: {in_words(up)}{' (held out)' if held else ''}"
 
 
-def _next(progress: Progress, goal: float, dwell: float, rests: list[str]) -> tuple[bool, list[str], list[str]]:
+def _next(progress: Progress, goal: float, dwell: float) -> tuple[bool, list[str]]:
     """Return whether the goal is reached, and the next rest in words."""
     held = sum(progress.held_out)
     count = f"{progress.used} rests of the fit, {held} held out"
@@ -199,7 +234,7 @@ def _next(progress: Progress, goal: float, dwell: float, rests: list[str]) -> tu
     lines = [f"expanded uncertainty: {now} ({count}; goal {1e3 * goal:.3g} mg)"]
     proposal = propose(progress, goal)
     if not proposal.further:
-        return True, rests, [*lines, "enough: the goal is reached"]
+        return True, [*lines, "enough: the goal is reached"]
     lines.append(f"next: {in_words(proposal.up)}; rest it for {dwell:g} s or more")
     if progress.next_is_held_out:
         lines.append("      (held out of the fit, to judge it: an attitude far from all others)")
@@ -210,10 +245,10 @@ def _next(progress: Progress, goal: float, dwell: float, rests: list[str]) -> tu
         )
     else:
         lines.append(f"expected: {1e3 * proposal.expected:.3g} mg after {proposal.further} more rests of the fit")
-    return False, rests, lines
+    return False, lines
 
 
-def _follow(source: Source, goal: float, dwell: float) -> None:
+def _follow(source: Source, goals: Goals, dwell: float) -> None:
     """Look at a growing log again and again, and tell what is new, until it is enough."""
     told: Advice | None = None
     waiting = ""
@@ -222,7 +257,7 @@ def _follow(source: Source, goal: float, dwell: float) -> None:
         try:
             recordings = [_without_last_rest(r, dwell) for r in source.read(growing=True)]
             problem = "" if recordings else f"there is no file {source.files[0]} yet"
-            advice = _advice(recordings, source.config, goal, dwell) if recordings else None
+            advice = _advice(recordings, source.config, goals, dwell) if recordings else None
         except CannotCalibrateError:
             raise
         except PipelineError as error:

@@ -52,6 +52,10 @@ def test_a_recording_of_a_campaign_is_read_by_its_configuration(
     assert sum("held out)" in line for line in lines) == 8
     assert "16 rests of the fit, 8 held out; goal 1 mg" in lines[-2]
     assert lines[-1] == "enough: the goal is reached"
+    assert main(["guide", str(rests), "--goal", "1", "--gyroscope-goal", "1"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "enough: both goals are reached"
+    assert main(["guide", str(rests), "--goal", "1", "--gyroscope-goal", "0.001"]) == 0
+    assert "which stays level, rest it for 4 s again" in capsys.readouterr().out.splitlines()[-1]
     assert main(["guide", str(rests), "--goal", "0.001"]) == 0
     assert "the goal is out of reach" in capsys.readouterr().out
 
