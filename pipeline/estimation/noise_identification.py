@@ -38,12 +38,14 @@ if TYPE_CHECKING:
 FEWEST = 60  # samples, which tell white noise to a tenth
 SHORTEST = 16  # samples of a stretch
 GAP = 1.5  # intervals from which a step of time is a gap
+UNEVEN = 0.5  # rms scatter of the sampling intervals, relative, above which averages over equal times mean nothing
 FILLED = 10  # samples that are missing or marked in a row, up to which a straight line takes their place
 IMPLAUSIBLE = 1e-4  # probability of the bins under the fit, below which the composition is in doubt
 COARSE = 0.4  # standard deviation, in counts, below which rounding is no longer white noise (Widrow & Kollar 2008)
 SHOWN = 0.25  # longest averaging time that the Allan deviation shows with some confidence, in lengths of the recording
 PER_DECADE = 8  # averaging times
 STEP = 1.01  # of a correlation time, for a derivative
+SLOW = ("bias_instability", "random_walk", "gauss_markov", "ramp", "temperature")
 OF_RESTS = "no static recording: what is slower than a rest is not seen, and in rests by hand the unit moves"
 
 
@@ -53,7 +55,13 @@ def identify_noise(sensor: str, recordings: Sequence[Recording]) -> JSON:
     empty: JSON = {"unit": SENSOR_UNITS[sensor], "source": None, "reason": None, "axes": None}
     if not known:
         return empty | {"reason": f"the recordings hold no readings of the {sensor}"}
-    static, others = ([r for r in known if (r.role == "static") == is_static] for is_static in (True, False))
+    even = [r for r in known if _scatter_of_intervals(r) <= UNEVEN]
+    if not even:
+        reason = (
+            f"the sampling intervals scatter by more than {UNEVEN:.0%}: equal numbers of samples are no equal times"
+        )
+        return empty | {"reason": reason}
+    static, others = ([r for r in even if (r.role == "static") == is_static] for is_static in (True, False))
     source, chosen, stretches = "static", static, [s for r in static for s in static_stretches(sensor, r)]
     if _samples(stretches) < FEWEST and others:
         source, chosen, stretches = "rests", others, [s for r in others for s in _rests(sensor, r)]
@@ -72,6 +80,12 @@ def identify_noise(sensor: str, recordings: Sequence[Recording]) -> JSON:
         "axes": {a: _axis(SENSOR_UNITS[sensor], stretches, c, interval, single=single) for c, a in enumerate(AXES)},
         "doubts": [OF_RESTS] if source == "rests" else [],
     }
+
+
+def _scatter_of_intervals(recording: Recording) -> float:
+    """Return the rms scatter of the sampling intervals without gaps, relative."""
+    steps = np.diff(recording.time_ns) / (1e9 * recording.interval)
+    return float(np.sqrt(np.mean((steps[steps <= GAP] - 1.0) ** 2)))
 
 
 def _samples(stretches: Sequence[Stretch]) -> int:
@@ -121,7 +135,7 @@ def _axis(unit: str, stretches: list[Stretch], column: int, interval: float, *, 
     count = float(steps[steps > 1e-9 * scale].min())
     if scale < COARSE * count:
         doubts.append(f"the readings are rounded to {count:.3g} {unit}, which is coarser than their noise")
-    terms = _terms(unit, spectrum, best, scale) | regression.terms(unit, best, fit)
+    terms = _terms(unit, spectrum, best, scale, regression.names(best)) | regression.terms(unit, best, fit)
     longest = max(stretches, key=lambda s: len(s.time))
     return {
         "terms": terms,
@@ -187,7 +201,7 @@ def _p_value(spectrum: Spectrum, fit: Fits) -> float:
     return float(chdtrc(max(len(z) - fit.kinds.shape[1], 1), float(z @ z)))
 
 
-def _terms(unit: str, spectrum: Spectrum, best: Candidate, scale: float) -> JSON:
+def _terms(unit: str, spectrum: Spectrum, best: Candidate, scale: float, names: Sequence[str]) -> JSON:
     """Return the stochastic terms."""
     within, limits = intervals(spectrum, best), upper_limits(spectrum, best)
     kinds, n = best.kinds, len(best.kinds)
@@ -199,7 +213,7 @@ def _terms(unit: str, spectrum: Spectrum, best: Candidate, scale: float) -> JSON
             j = kinds.index(kind)
             out[name] = term | _coefficient(best.parameters[j], within[:, j], scale)
         else:
-            reason = _reason(kind, kinds, spectrum)
+            reason = _reason(kind, names, spectrum)
             out[name] = term | {"reason": reason, "upper_limit": scale * float(np.sqrt(limits[kind]))}
     out[STOCHASTIC[MARKOV]] = [
         {"unit": unit}
@@ -224,12 +238,12 @@ def _coefficient(logarithm: float, within: Values, scale: float) -> JSON:
     }
 
 
-def _reason(kind: int, kinds: Sequence[int], spectrum: Spectrum) -> str:
-    """Return why a term is not in the composition."""
-    slow = [STOCHASTIC[k].replace("_", " ") for k in kinds if k > WHITE]
+def _reason(kind: int, names: Sequence[str], spectrum: Spectrum) -> str:
+    """Return why a term is not in a composition of these names."""
+    slow = [name for name in names if name in SLOW]
     if kind < WHITE or slow:
-        others = " and ".join(dict.fromkeys(slow if kind > WHITE else [STOCHASTIC[k].replace("_", " ") for k in kinds]))
-        return f"not seen beside {others}"
+        others = [name.replace("_", " ") for name in dict.fromkeys(slow if kind > WHITE else names)]
+        return f"not seen beside {' and '.join(others)}"
     return (
         f"the recording is too short: over its {spectrum.length:.3g} s the Allan deviation falls like that of white "
         f"noise up to averaging times of {SHOWN * spectrum.length:.3g} s"

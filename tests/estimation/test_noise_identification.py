@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -190,6 +191,15 @@ def test_readings_that_hold_no_noise_are_refused_with_a_reason(values: Values, r
     found = identify_noise("gyroscope", [recording(values)])
     assert reason in (found["reason"] or found["axes"]["x"]["reason"])
     assert "no readings of the accelerometer" in identify_noise("accelerometer", [recording(values)])["reason"]
+
+
+def test_samples_that_come_in_bursts_are_refused() -> None:
+    values = recording(np.random.default_rng(9).standard_normal(999))
+    time_ns = values.time_ns.copy()
+    time_ns[1::2] -= 90_000_000  # pairs of samples 10 ms apart, every 200 ms
+    found = identify_noise("gyroscope", [replace(values, time_ns=time_ns)])
+    assert found["axes"] is None
+    assert "sampling intervals scatter by more than 50%" in found["reason"]
 
 
 def test_a_spectrum_that_no_composition_has_is_in_doubt() -> None:
