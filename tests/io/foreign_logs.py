@@ -63,18 +63,34 @@ def write_bag(path: Path, truth: Truth, topics: tuple[str, ...] = ("/imu",)) -> 
     return path
 
 
+def _record(kind: str, content: bytes) -> bytes:
+    return struct.pack("<HB", len(content), ord(kind)) + content
+
+
+ULOG_HEAD = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0) + _record("B", bytes(40))
+
+
 def write_ulog(path: Path, truth: Truth, instances: int = 1) -> Path:
     """Write a ULog by its specification (docs.px4.io, ULog File Format): magic, formats, subscriptions, data."""
-
-    def record(kind: str, content: bytes) -> bytes:
-        return struct.pack("<HB", len(content), ord(kind)) + content
-
-    out = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0), record("B", bytes(40))]
-    out.append(record("F", b"sensor_combined:uint64_t timestamp;float[3] gyro_rad;float[3] accelerometer_m_s2;"))
-    out += [record("A", struct.pack("<BH", i, i) + b"sensor_combined") for i in range(instances)]
+    out = [
+        ULOG_HEAD,
+        _record("F", b"sensor_combined:uint64_t timestamp;float[3] gyro_rad;float[3] accelerometer_m_s2;"),
+    ]
+    out += [_record("A", struct.pack("<BH", i, i) + b"sensor_combined") for i in range(instances)]
     for us, rate, force in zip(truth.time_us.tolist(), truth.rate, truth.force, strict=True):
         for i in range(instances):
-            out.append(record("D", struct.pack("<HQ6f", i, us, *rate, *(force + i))))
+            out.append(_record("D", struct.pack("<HQ6f", i, us, *rate, *(force + i))))
+    path.write_bytes(b"".join(out))
+    return path
+
+
+def write_raw_ulog(path: Path, truth: Truth, messages: dict[str, tuple[str, NDArray[Any]]], instance: int) -> Path:
+    """Write messages of one instance with the times of a recording: name to (fields, (n, 3) readings), at 25 degC."""
+    out = [ULOG_HEAD, *(_record("F", f"{name}:{fields}".encode()) for name, (fields, _) in messages.items())]
+    out += [_record("A", struct.pack("<BH", instance, i) + name.encode()) for i, name in enumerate(messages)]
+    for k, us in enumerate(truth.time_us.tolist()):
+        for i, (_, readings) in enumerate(messages.values()):
+            out.append(_record("D", struct.pack("<HQQ4f", i, us + 7, us, *readings[k], 25.0)))
     path.write_bytes(b"".join(out))
     return path
 

@@ -10,7 +10,17 @@ import h5py
 import numpy as np
 import pytest
 import yaml
-from foreign_logs import GRAVITY, STORES, Truth, write_arrays, write_bag, write_dataflash, write_matlab73, write_ulog
+from foreign_logs import (
+    GRAVITY,
+    STORES,
+    Truth,
+    write_arrays,
+    write_bag,
+    write_dataflash,
+    write_matlab73,
+    write_raw_ulog,
+    write_ulog,
+)
 from pymavlink.DFReader import DFReader_binary
 from pyulog import ULog
 from rosbags import rosbag2
@@ -19,6 +29,7 @@ from sample_logs import SENSOR, procedure, profile
 from pipeline.commands.apply import main as apply
 from pipeline.commands.check import main as check
 from pipeline.errors import IngestError
+from pipeline.files import CONFIGS
 from pipeline.io.files import MESSAGE_FORMATS
 from pipeline.io.ingest_settings import mcap_format
 from pipeline.io.mcap import read_log
@@ -102,6 +113,22 @@ def test_ulog_agrees_with_pyulog(tmp_path: Path) -> None:
     np.testing.assert_array_equal(
         read(path, "px4_ulog").values["accel_z"], data["accelerometer_m_s2[2]"].astype(float) / GRAVITY
     )
+
+
+def test_the_raw_messages_of_one_sensor_of_a_board(tmp_path: Path) -> None:
+    """``sensor_accel`` and ``sensor_gyro`` of instance 1, as PX4 names their fields."""
+    truth = Truth()
+    message = "uint64_t timestamp;uint64_t timestamp_sample;float x;float y;float z;float temperature;"
+    logged = {"sensor_accel": truth.force, "sensor_gyro": truth.rate}
+    path = write_raw_ulog(tmp_path / "log.ulg", truth, {n: (message, v) for n, v in logged.items()}, instance=1)
+    text = yaml.safe_load((CONFIGS / "ingest" / "px4_raw.yaml").read_text().replace("${ingest.instance}", "1"))
+    table = read_log(path, mcap_format(text))
+    rows = (table.time_ns // 1000 - truth.time_us[0]) // 10_000
+    assert len(rows) == 298
+    np.testing.assert_allclose(table.values["accel_y"], truth.force[rows, 1] / GRAVITY, rtol=1e-15)
+    mean = np.degrees((truth.rate[:-2] + 6 * truth.rate[1:-1] + truth.rate[2:]) / 8)  # of the lines between messages
+    np.testing.assert_allclose(table.values["gyro_x"], mean[rows - 1, 0], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(table.values["temperature"], 25.0)
 
 
 def test_a_unit_other_than_the_file_states_is_refused(tmp_path: Path) -> None:
