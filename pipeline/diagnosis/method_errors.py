@@ -267,7 +267,7 @@ def _meaning(name: str, sensor: str, stages: Sequence[str], recordings: Sequence
             "angle is late by rate times delay (Sudsanguan 2019, eqs 3.3-3.14)"
         )
     if "given" in stages:
-        return GIVEN
+        return f"{GIVEN}; another mounting looks the same" if name == "rotation" else GIVEN
     if printed and "cholesky_lu" in stages:
         return FORWARD
     text = next((MEANINGS[sensor, s, name] for s in stages if (sensor, s, name) in MEANINGS), PLAIN[name])

@@ -41,6 +41,7 @@ CALIBRATION = "calibration.json"  # the name of the product's own format among t
 LARGEST_BYTES = 50_000_000  # of a file to read; a calibration has some kilobytes, a vehicle's parameters 100
 NEAR_ONE = (0.5, 2.0)  # what a matrix multiplies by where readings and truth have the same unit
 C_EFFECT = re.compile(r"r\[\d\] -= .*/\* (\w+) \*/")  # a line of calibration.h
+TURNED = re.compile(r"Turn the readings to body axes first: [^.]*\.")  # a remark of our own exports
 SAME = 1e-12  # relative to the largest: what is smaller is rounding of the formats' own arithmetic
 
 
@@ -120,6 +121,7 @@ def _read_text(file: Path, name: str, declared: Format, counts: Mapping[str, flo
     except (TemplateError, YAMLError, KeyError, ValueError, TypeError, np.linalg.LinAlgError) as error:
         told = error.args[0] if isinstance(error, KeyError) else error
         raise InputError(f"this is no {name} ({declared.consumer}): {told}", str(file)) from error
+    found.notes.extend(TURNED.findall(text))
     if effects := dict.fromkeys(C_EFFECT.findall(text)):
         found.notes.append(f"effects in C expressions, which are not read: {', '.join(effects)}")
     return found

@@ -143,6 +143,22 @@ def test_a_kalibr_result_of_its_own_program_predicts_the_reading(tmp_path: Path)
     assert found.noise["gyroscope_random_walk"] == 1e-5
 
 
+def test_a_calibration_of_basalt_itself_is_read_below_its_root(tmp_path: Path) -> None:
+    """basalt-headers: accel = raw + S raw - b with S lower triangular (s11, s21, s31, s22, s32, s33)."""
+    accel, gyro = [0.1, -0.2, 0.3, 0.01, 0.002, -0.003, -0.02, 0.004, 0.03], [0.01, 0.02, -0.03, *np.arange(9) * 1e-3]
+    content = {"calib_accel_bias": accel, "calib_gyro_bias": gyro, "accel_noise_std": [0.016] * 3, "T_imu_cam": []}
+    (tmp_path / "calibration.json").write_text(json.dumps({"value0": content}))
+    with pytest.raises(InputError, match="no calibration of a unit"):  # the name is that of our own format
+        read_any(tmp_path / "calibration.json", "calibration.json")
+    found = read_any(tmp_path / "calibration.json", "basalt_imu.json").sensors
+    f, w = np.array([0.5, -2.0, 9.5]), np.array([0.3, -0.4, 0.5])
+    S = np.array([[0.01, 0.0, 0.0], [0.002, -0.02, 0.0], [-0.003, 0.004, 0.03]])
+    a, g = found["accelerometer"], found["gyroscope"]
+    np.testing.assert_allclose(a.matrix @ (f / G0 - a.bias) * G0, f + S @ f - accel[:3], atol=1e-14)
+    G = np.reshape(gyro[3:], (3, 3)).T  # column by column
+    np.testing.assert_allclose(g.matrix @ (w / RADIAN - g.bias) * RADIAN, w + G @ w - gyro[:3], atol=1e-14)
+
+
 def test_a_chain_of_conversions_keeps_every_parameter(folder: Path, tmp_path: Path) -> None:
     chain = ["kalibr.yaml", "imucal.json", "imu_calib_toolkit.json", "calibration.json", "kalibr.yaml"]
     before = folder / "kalibr.yaml"
