@@ -27,7 +27,7 @@ from pipeline.model.effects.base import truth, unit_of
 from pipeline.model.kinematics import table_motion
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -130,6 +130,51 @@ def method_errors(
     return sorted(found, key=lambda entry: -float(entry["share"]))
 
 
+def given_differences(
+    calibration: SensorCalibration, free_fit: Callable[[], SensorCalibration], recordings: Sequence[Recording]
+) -> list[dict[str, Any]]:
+    """Return what a given calibration and a free fit of rests and moves by hand differ in, the largest share first.
+
+    Bias and the symmetric part of E only: by hand, nothing ties the sensor's axes to a body. Shares are those of a
+    truth of any direction, 1 g or the rms rate of the recordings. Nothing for a method that fits.
+    """
+    if [stage.name for stage in calibration.stages] != ["given"]:
+        return []
+    free, sensor = free_fit(), calibration.sensor
+    known = calibration.covariance, free.covariance
+    K = np.linalg.inv(free.matrix)
+    M, maps = calibration.matrix, (np.kron(np.eye(3), K.T), np.kron(calibration.matrix @ K, K.T))
+    variance = np.zeros(12)
+    for covariance, of_matrix in zip(known, maps, strict=True):
+        if covariance is not None:
+            both = np.block([[M, np.zeros((3, 9))], [np.zeros((9, 3)), of_matrix]])
+            variance += np.diag(both @ covariance[:12, :12] @ both.T)
+    E, d, uncertainty = M @ K - np.eye(3), M @ (free.bias - calibration.bias), np.sqrt(np.clip(variance, 0.0, None))
+    diagonal = np.diag(np.diag(E))
+    parts = {"scale_factor": diagonal, "non_orthogonality": 0.5 * (E + E.T) - diagonal}
+    difference = _Difference(calibration, d, parts, uncertainty, None)
+    sure = difference.certain([])
+    rates = [np.sum(w**2, axis=1) for r in recordings if (w := r.reading("gyroscope")) is not None]
+    size = 1.0 if sensor == "accelerometer" else float(np.sqrt(np.nanmean(np.concatenate(rates))))
+    rms = {"bias": float(np.linalg.norm(d))}
+    rms |= {name: size * float(np.linalg.norm(part)) / np.sqrt(3.0) for name, part in parts.items()}
+    total = sum(value**2 for value in rms.values())
+    found = [
+        {
+            "name": name,
+            "meaning": GIVEN,
+            **_size(name, difference, np.zeros((1, 3)), recordings),
+            "share": value**2 / total,
+            "rms": value,
+            "held_out_share": None,
+            "held_out_magnitude_share": None,
+        }
+        for name, value in rms.items()
+        if value**2 > LEAST_SHARE * total and sure[name]
+    ]
+    return sorted(found, key=lambda entry: -float(entry["share"]))
+
+
 @dataclass(frozen=True)
 class _Difference:
     """A method compared with the free fit."""
@@ -138,7 +183,7 @@ class _Difference:
     bias: Values  # (3,): M (b - b_m)
     matrices: dict[str, Values]  # the parts of E: (3, 3) each
     uncertainty: Values  # (12,), of bias and E
-    free: Fit
+    free: Fit | None  # None by hand, where effects are not compared
 
     def parts(self, motion: Motion) -> dict[str, Values]:
         """Return the error of the calibrated reading by its cause, without the filter's: (n, 3) arrays."""
@@ -150,6 +195,7 @@ class _Difference:
     def _of_effects(self, motion: Motion) -> Values:
         """Return what the method's effects add at the free fit's values, less what they add at the method's."""
         added = np.zeros((len(motion.time), 3))
+        assert self.free is not None  # noqa: S101  (on a table)
         fitted = {term.effect.name: term.values for term in self.free.terms}
         for effect in self.method.effects:
             this = effect_of(effect)

@@ -22,6 +22,7 @@ import numpy as np
 
 from pipeline.diagnosis import functional_forms as forms
 from pipeline.diagnosis.findings import Findings
+from pipeline.diagnosis.method_errors import given_differences
 from pipeline.diagnosis.observability import MORE, never_shown, not_observable_by_hand
 from pipeline.diagnosis.residual_dependence import GATE_P
 from pipeline.diagnosis.residual_plots import added_variable_of_rests
@@ -130,6 +131,9 @@ def findings(
                 "added_variable": added_variable_of_rests(selection) if selection.names else None,
                 "unexplained": [],
             },
+            "method_errors": given_differences(
+                calibration, lambda: calibration_of(model, selection.fits[0], calibration, settings), recordings
+            ),
             "cross_validation": _nested(selection, lambda part: select(part, calibration, configured, noise, sheet)),
         },
     )

@@ -313,6 +313,11 @@ def _above(e: Evidence, published: HeldOut) -> tuple[str, str]:
     if e.as_printed or not (free.above or same):
         return "left_by_method", f"{text}. {_of_method(e)}"
     left = e.left_over_noise if e.selected else e.over_noise
+    if e.method == GIVEN and e.free is None and left is not None and left <= EXPLAINED:
+        return (
+            "left_by_method",
+            f"{text}. A fit of these recordings leaves noise alone: the given calibration causes it.",
+        )
     if e.full and e.selected:
         text += f"; with the selected effects it is {e.full.error:.3g} {unit}, against at most {e.full.high:.3g}"
     if left is not None and left > EXPLAINED:
@@ -384,6 +389,9 @@ def _next_step(verdict: str, document: Mapping[str, Any], e: Evidence) -> str:
     if verdict != "left_by_method":
         return ""
     changes = ["the equations as corrected (method.as_printed=false)"] if e.as_printed else []
-    changes += [] if e.method in FREE else ["a method that fits the full matrix (reference_least_squares)"]
+    free = [
+        "the default method" if e.method == GIVEN else "a method that fits the full matrix (reference_least_squares)"
+    ]
+    changes += [] if e.method in FREE else free
     changes += ["no filter (filter=none)"] if e.filtered else []
     return f"calibrate the same recordings with {' and '.join(changes)}" if changes else ""

@@ -1,0 +1,79 @@
+"""A given calibration is compared with what these recordings show, and blamed for no more than that."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.diagnosis.method_errors import given_differences
+from pipeline.diagnosis.verdict import Evidence, HeldOut, decide, judged
+from pipeline.records import Recording, SensorCalibration, StageResult
+
+ABOVE = HeldOut(0.5, 0.01, 0.1)
+GIVEN = Evidence("gyroscope", "nothing_missing", over_noise=0.9, published=ABOVE, method="given", on_table=False)
+FREE = SensorCalibration(
+    "gyroscope", np.array([1.0, -2.0, 0.5]), np.diag([1.01, 0.99, 1.02]), covariance=np.eye(12) * 1e-8
+)
+RATE = np.tile([[30.0, 0.0, 0.0]], (50, 1))
+MOVES = [Recording("recording", "rests", None, np.arange(50) * 10**7, None, RATE)]
+DOCUMENT = {
+    "verdict": "missing_effect",
+    "selected": ["g_sensitivity"],
+    "next_experiment": "",
+    "override": "effects.gyroscope=[g_sensitivity]",
+    "ranking": [],
+    "unexplained": [],
+}
+
+
+def given(**changes: np.ndarray) -> SensorCalibration:
+    return replace(FREE, stages=(StageResult("given", {}),), covariance=None, **changes)
+
+
+def test_a_shift_of_the_bias_is_named_with_its_size() -> None:
+    (found,) = given_differences(given(bias=[*FREE.bias, 0.0, 0.3, 0.0]), lambda: FREE, MOVES)
+    assert (found["name"], found["unit"], found["share"]) == ("bias", "deg/s", 1.0)
+    assert found["size"] == pytest.approx(0.3 * 0.99)
+
+
+def test_a_scale_factor_is_named_and_a_rotation_of_the_mounting_is_not() -> None:
+    (found,) = given_differences(given(matrix=FREE.matrix @ np.diag([1.02, 1.0, 1.0])), lambda: FREE, MOVES)
+    assert found["name"] == "scale_factor"
+    assert found["size"] == pytest.approx(0.02)
+    assert found["rms"] == pytest.approx(30.0 * 0.02 / np.sqrt(3.0))
+    angle = np.radians(2.0)
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
+    named = [e["name"] for e in given_differences(given(matrix=turn @ FREE.matrix), lambda: FREE, MOVES)]
+    assert "rotation" not in named
+    assert "non_orthogonality" not in named
+
+
+def test_what_the_uncertainties_of_both_explain_is_not_named() -> None:
+    near = given(bias=FREE.bias + 4e-4)  # four standard uncertainties of the fit
+    assert given_differences(near, lambda: FREE, MOVES) == []
+    wide = replace(given(bias=[*FREE.bias, 0.0, 0.3, 0.0]), covariance=np.eye(12) * 0.1**2)
+    assert given_differences(wide, lambda: FREE, MOVES) == []
+
+
+def test_a_method_that_fits_is_not_compared() -> None:
+    assert given_differences(replace(FREE, stages=(StageResult("rests_and_moves", {}),)), lambda: FREE, MOVES) == []
+
+
+def test_the_given_calibration_is_blamed_where_a_fit_of_the_recordings_leaves_noise_alone() -> None:
+    verdict, reason = decide(GIVEN)
+    assert verdict == "left_by_method"
+    assert reason.endswith("the given calibration causes it.")
+    assert decide(replace(GIVEN, method="rests_and_moves"))[0] == "reference_in_doubt"
+    assert decide(replace(GIVEN, over_noise=4.0))[0] == "unexplained"
+    inside = replace(GIVEN, published=HeldOut(0.05, 0.01, 0.1))
+    assert decide(inside) == ("nothing_missing", "")
+    assert decide(replace(inside, approximations=("bias",)))[0] == "left_by_method"
+
+
+def test_no_effect_is_offered_where_nothing_is_fitted() -> None:
+    missing = replace(GIVEN, found="missing_effect", selected=("g_sensitivity",), published=None)
+    document = judged(DOCUMENT, missing)
+    assert document["verdict"] == "missing_effect"
+    assert document["override"] == ""
+    assert "by a method that fits, with effects.gyroscope=[g_sensitivity]" in document["next_experiment"]
+    assert judged(DOCUMENT, replace(missing, method="rests_and_moves"))["override"]
