@@ -14,6 +14,7 @@ GIVEN = Evidence("gyroscope", "nothing_missing", over_noise=0.9, published=ABOVE
 FREE = SensorCalibration(
     "gyroscope", np.array([1.0, -2.0, 0.5]), np.diag([1.01, 0.99, 1.02]), covariance=np.eye(12) * 1e-8
 )
+SHIFT = np.array([0.0, 0.3, 0.0])
 RATE = np.tile([[30.0, 0.0, 0.0]], (50, 1))
 MOVES = [Recording("recording", "rests", None, np.arange(50) * 10**7, None, RATE)]
 DOCUMENT = {
@@ -31,7 +32,7 @@ def given(**changes: np.ndarray) -> SensorCalibration:
 
 
 def test_a_shift_of_the_bias_is_named_with_its_size() -> None:
-    (found,) = given_differences(given(bias=[*FREE.bias, 0.0, 0.3, 0.0]), lambda: FREE, MOVES)
+    (found,) = given_differences(given(bias=FREE.bias + SHIFT), lambda: FREE, MOVES)
     assert (found["name"], found["unit"], found["share"]) == ("bias", "deg/s", 1.0)
     assert found["size"] == pytest.approx(0.3 * 0.99)
 
@@ -51,7 +52,7 @@ def test_a_scale_factor_is_named_and_a_rotation_of_the_mounting_is_not() -> None
 def test_what_the_uncertainties_of_both_explain_is_not_named() -> None:
     near = given(bias=FREE.bias + 4e-4)  # four standard uncertainties of the fit
     assert given_differences(near, lambda: FREE, MOVES) == []
-    wide = replace(given(bias=[*FREE.bias, 0.0, 0.3, 0.0]), covariance=np.eye(12) * 0.1**2)
+    wide = replace(given(bias=FREE.bias + SHIFT), covariance=np.eye(12) * 0.1**2)
     assert given_differences(wide, lambda: FREE, MOVES) == []
 
 
