@@ -35,7 +35,7 @@ Composition = tuple[int, ...]  # kinds of the stochastic terms, in rising order
 MOST_MARKOV = 2  # processes of different correlation times; a third is not told apart by less than some 10^6 samples
 TIMES = 10  # correlation times whose score is looked at, in equal steps of their logarithm
 STARTS = 2  # of them that are fitted
-PROMISING = 0.25  # of the penalty of a term: a score that predicts less of it is not followed
+PROMISING = 0.4  # of the penalty of a term: a score that predicts less of it is not followed
 SLIGHT = 2.0  # of the gain of one parameter: its penalty is ln(n), 4 and more
 QUANTILE, ONE_SIDED = 1.959964, 1.644854  # of the standard normal distribution: 95 % from two sides, from one
 NEAREST = 12  # compositions that are published, best first
@@ -75,12 +75,15 @@ class Search:
         self.penalty = float(np.log(spectrum.size))
         self.found: dict[tuple[Composition, tuple[int, ...]], Candidate] = {}
 
-    def run(self, columns: tuple[int, ...]) -> Candidate:
-        """Return the best composition beside these deterministic columns."""
+    def run(self, columns: tuple[int, ...], start: Candidate | None = None) -> Candidate:
+        """Return the best composition beside these deterministic columns.
+
+        ``start``: a composition beside other columns, with which the search begins where it is better than white noise.
+        """
         spectrum = self.spectrum.with_columns(columns)
         power = spectrum.products[:, 0, 0].sum() / spectrum.size
         white = np.array([np.log(max(power * spectrum.interval, 1e-300)), 0.0])
-        self.fit(spectrum, [((WHITE,), white)], columns)
+        self.fit(spectrum, [((WHITE,), white), *([(start.kinds, start.parameters)] if start else [])], columns)
         best = self._best(columns)
         while True:
             tries = self._added(spectrum, best)
@@ -286,5 +289,5 @@ def best_of(search: Search, required: tuple[int, ...], optional: Sequence[int]) 
                     if fits.beta[0, j] ** 2 > SLIGHT * fits.beta_covariance[0, j, j]]  # fmt: skip
     for size in range(1, len(optional) + 1):
         for chosen in combinations(optional, size):
-            best = min(best, search.run((*required, *chosen)), key=lambda c: c.bic)
+            best = min(best, search.run((*required, *chosen), best), key=lambda c: c.bic)
     return best
