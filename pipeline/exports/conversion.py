@@ -53,6 +53,7 @@ def settings_of(found: FoundCalibration, sheets: Mapping[str, Any]) -> JSON:
         density, walk = (found.noise.get(f"{s}_{what}") for what in ("noise_density", "random_walk"))
         if density is not None and walk is not None:
             sensor[s] |= {"noise_density": np.sqrt(2.0) * density / FACTORS[unit], "wander_time_s": WALK_S}  # one-sided
+            sensor[s]["noise_origin"] = f"as {found.name} states it"
             sensor[s]["bias_wander"] = walk / FACTORS[unit] * np.sqrt(WALK_S / 2.0)
     return {"sensor": sensor, "table": {"gravity_g": 1.0}}
 

@@ -88,8 +88,10 @@ def _figures(sensor: str, settings: Mapping[str, Any], document: Mapping[str, An
     density, wander, time = (settings["sensor"][sensor].get(k) if axes else settings["sensor"][sensor][k] for k in keys)
     white = None if density is None else density / np.sqrt(2.0)
     walk = None if wander is None or not time else wander * np.sqrt(2.0 / time)
-    out: JSON = {"white": white, "white_interval": None, "white_origin": "of the sensor's configuration"}
-    out |= {"walk": walk, "walk_interval": None, "walk_origin": "for the bias wander of the sensor's configuration"}
+    converted = settings["sensor"][sensor].get("noise_origin")  # of another program's file
+    out: JSON = {"white": white, "white_interval": None, "white_origin": converted or "of the sensor's configuration"}
+    out |= {"walk": walk, "walk_interval": None}
+    out["walk_origin"] = converted or "for the bias wander of the sensor's configuration"
     if not axes:
         return out
     whites = [value for terms in axes if (value := _white(terms))]

@@ -174,6 +174,14 @@ def test_a_chain_of_conversions_keeps_every_parameter(folder: Path, tmp_path: Pa
     np.testing.assert_allclose(last["gyroscope"].effects[0].values, SENSITIVE.values, rtol=0, atol=1e-9)
 
 
+def test_noise_that_both_formats_hold_is_kept_with_its_origin(folder: Path, tmp_path: Path) -> None:
+    assert main([str(folder / "kalibr.yaml"), str(tmp_path / "basalt_imu.json")]) == 0
+    first, last = read_any(folder / "kalibr.yaml").noise, read_any(tmp_path / "basalt_imu.json").noise
+    assert len(first) == 4
+    assert last == pytest.approx(first, rel=1e-12)
+    assert "as kalibr.yaml states it" in (tmp_path / "basalt_imu.json").read_text()
+
+
 def test_convert_states_what_is_lost(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source = str(folder / "calibration.json")
     main([source, str(tmp_path / "px4.params")])
