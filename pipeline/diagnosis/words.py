@@ -161,7 +161,9 @@ def _how_sure(part: Mapping[str, Any]) -> list[str]:
     if sets:
         said = [f"{_answer(each['effects'])} ({each['probability']:.2g})" for each in sets[:MOST_ANSWERS]]
         more = [f"{len(sets) - MOST_ANSWERS} more"] if len(sets) > MOST_ANSWERS else []
-        head = IN_DOUBT if part["verdict"] in ("unexplained", "reference_in_doubt") else "What is missing"
+        closed = not any(name.startswith(OTHER) for each in sets for name in each["effects"])
+        doubtful = closed and part["verdict"] in ("unexplained", "reference_in_doubt")
+        head = IN_DOUBT if doubtful else "What is missing"
         lines.append(f"{head}, with 95 % probability: {listed([*said, *more], 'or')}.")
     if part.get("to_distinguish"):
         lines.append(f"These recordings cannot distinguish them; this one would: {part['to_distinguish']}.")

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from pipeline.model.effects.base import Effect
 
     Values = NDArray[np.float64]
+    Solved = tuple[list[str], Values, Values, Values, Values]  # of ``Given._solved``
     Pick = tuple[int, int]  # version and scale of an effect
     Set = frozenset[str]
 
@@ -50,7 +51,7 @@ NEGLIGIBLE = 1e-5  # weight of a hypothesis or of a part of a mixture that is le
 SWEEPS, EXCHANGES = 3, 3
 CERTAIN = 0.97  # what is said of more than that: of the inclusions with 1.000, 96.6 % were right in those sensors
 ENOUGH = 0.95  # of an answer set, and of an upper limit
-HALVINGS = 40  # of the interval that holds a quantile
+HALVINGS = 24  # of the interval that holds a quantile
 
 
 @dataclass(frozen=True)
@@ -132,9 +133,9 @@ class Search:
         """Return the most probable set of all, or of some."""
         return max(among or self.pool, key=lambda names: self.pool[names].score)
 
-    def given(self, names: Set, but: Set = frozenset()) -> Given:
-        """Return the problem beside a set, less some of its members."""
-        return Given(self.problem, {n: pick for n, pick in self.pool[names].picks.items() if n not in but})
+    def given(self, names: Set, but: Set = frozenset(), only: Sequence[str] | None = None) -> Given:
+        """Return the problem beside a set, less some of its members, for some further effects or all."""
+        return Given(self.problem, {n: p for n, p in self.pool[names].picks.items() if n not in but}, only)
 
     def _prune(self, seeds: Sequence[Set]) -> None:
         """Leave out hypotheses that have no weight beside any of some sets."""
@@ -187,11 +188,14 @@ class Search:
             own = self.pool[names]
             for name, found in self.given(names).conditionals(self._allowed(names)).items():
                 each = log_sum(found, axis=2)
-                score = float(log_sum(each)) + own.spread + ODDS * len(names | {name})
+                total = float(log_sum(each))
+                score = total + own.spread + ODDS * len(names | {name})
                 child, held = names | {name}, self.pool.get(names | {name})
                 if held is None or (not held.final and held.score < score):
                     v, s = np.unravel_index(int(np.argmax(each)), each.shape)
-                    self.pool[child] = Found(score, {**own.picks, name: (int(v), int(s))})
+                    picks = {**own.picks, name: (int(v), int(s))}
+                    spread = total - float(each[v, s]) if len(child) == 1 else 0.0
+                    self.pool[child] = Found(score, picks, spread, final=len(child) == 1)
         return [names | {name} for name in self._allowed(names)]
 
     def _finish(self, names: Set) -> None:
@@ -256,34 +260,36 @@ class Given:
     def conditionals(self, names: Sequence[str]) -> dict[str, Values]:
         """Return log E with each of some further effects: its (versions, scales, t) array, without the prior odds."""
         found: dict[str, Values] = {}
-        for owners, weight, values, _, along in self._solved(names):
-            shrunk = _shrunk(values)
-            gain = np.sum(along**2 * shrunk, axis=3)
-            log_det = np.sum(np.log1p(SCALES[:, None, None, None] ** 2 * values), axis=3)
-            score = self.problem.rss(self.products[:, -1, -1, None] - gain) - 0.5 * log_det
-            score = score + self.level[:, None] + SCALE_PRIOR[:, None, None] + weight
+        for solved in self._solved(names):
+            owners, score = solved[0], self._scored(solved)
             for name in dict.fromkeys(owners):
                 own = [i for i, owner in enumerate(owners) if owner == name]
                 found[name] = score[:, :, own].transpose(2, 0, 1)
         return found
 
+    def _scored(self, solved: Solved) -> Values:
+        """Return log E with each of some versions: (scales, t, versions) array."""
+        _, weight, values, _, along = solved
+        gain = np.sum(along**2 * _shrunk(values), axis=3)
+        log_det = np.sum(np.log1p(SCALES[:, None, None, None] ** 2 * values), axis=3)
+        score = self.problem.rss(self.products[:, -1, -1, None] - gain) - 0.5 * log_det
+        return np.asarray(score + self.level[:, None] + SCALE_PRIOR[:, None, None] + weight)
+
     def mixture(self, name: str) -> tuple[Values, Values, Values]:
         """Return log weight, (m,), mean and standard deviation, (m, k), of an effect's parameters over their limits."""
         parts = []
-        score = self.conditionals([name])[name]
-        top = score.max()
-        for _, _, values, vectors, along in self._solved([name]):
-            shrunk = _shrunk(values)
+        for solved in self._solved([name]):
+            _, _, values, vectors, along = solved
+            shrunk, weight = _shrunk(values), self._scored(solved)
             mean = np.einsum("tmij,stmj->stmi", vectors, along * shrunk)
             squares = self.products[:, -1, -1, None] - np.sum(along**2 * shrunk, axis=3) + self.problem.within
             spread = np.einsum("tmij,stmj->stmi", vectors**2, shrunk) * squares[..., None] / self.problem.free
-            weight = score.transpose(1, 2, 0)
-            kept = weight > top + np.log(NEGLIGIBLE)
+            kept = weight > weight.max() + np.log(NEGLIGIBLE)
             parts.append((weight[kept], mean[kept], np.sqrt(np.maximum(spread[kept], 0.0))))
         (found,) = parts  # the versions of an effect have as many columns
         return found
 
-    def _solved(self, names: Sequence[str]) -> list[tuple[list[str], Values, Values, Values, Values]]:
+    def _solved(self, names: Sequence[str]) -> list[Solved]:
         """Return owners, log weights, eigenvalues, eigenvectors and projected readings of versions of each size."""
         groups: dict[int, list[tuple[str, Version]]] = {}
         for name in names:
@@ -347,7 +353,7 @@ def _upper_limit(name: str, likely: Sequence[tuple[Search, Set]]) -> Values | No
         if (id(search), kept) in seen or (search.required & search.problem.excluded.get(name, frozenset())):
             continue
         seen.add((id(search), kept))
-        weight, mean, deviation = search.given(names, gone).mixture(name)
+        weight, mean, deviation = search.given(names, gone, [name]).mixture(name)
         limit = search.problem.limits[name]
         parts.append((weight + ODDS * len(kept), mean * limit, deviation * limit))
     if not parts:

@@ -124,7 +124,7 @@ def table(page: str, heading: str) -> list[list[str]]:
 
 
 def test_commands_print_what_the_page_says(page: str, typed: Typed) -> None:
-    assert page.count("```") == 4 * len(typed.printed) == 36  # no block but commands and what they print
+    assert page.count("```") == 4 * len(typed.printed) == 44  # no block but commands and what they print
     for _, said, printed in typed.printed:
         compare(said, printed)
 
