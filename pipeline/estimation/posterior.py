@@ -204,7 +204,7 @@ class Search:
         if held is not None and held.final:
             return
         picks: dict[str, Pick] = dict(held.picks) if held else dict.fromkeys(sorted(names), FIRST)
-        spread, score, changed = 0.0, 0.0, True
+        spread = score = 0.0
         for _ in range(SWEEPS):
             before, spread = dict(picks), 0.0
             for name in picks:
@@ -214,8 +214,7 @@ class Search:
                 picks[name] = int(v), int(s)
                 score = float(each[v, s])
                 spread += float(log_sum(each)) - score
-            changed = picks != before
-            if not changed:
+            if picks == before:
                 break
         if not picks:
             score = float(log_sum(Given(self.problem, {}, []).alone()))
@@ -307,8 +306,7 @@ class Given:
 
 def _shrunk(values: Values) -> Values:
     """Return ``s^2 / (1 + s^2 lambda)`` of (t, m, k) eigenvalues: (scales, t, m, k) array."""
-    square = SCALES[:, None, None, None] ** 2
-    return np.asarray(square / (1.0 + square * values))
+    return np.asarray(1.0 / (SCALES[:, None, None, None] ** -2.0 + values))
 
 
 def log_sum(values: Values, axis: int | None = None) -> Values:
