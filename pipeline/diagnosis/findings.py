@@ -68,6 +68,7 @@ class Findings:
     scatter: Mapping[str, float] = field(default_factory=dict)  # further entries of ``wander``
     more: Mapping[str, Any] = field(default_factory=dict)  # further entries of the document
     turns: Sequence[str] = ()  # recordings that some effects have parameters for
+    search: Callable[[], Findings | None] | None = None  # looks for a formula outside the catalogue; None: found none
 
     def share(self, drop: float) -> float:
         """Return the share of the residual's excess over the noise that a drop of its squares is."""

@@ -1,299 +1,226 @@
-"""Search for the functional form of physics that the catalogue of effects does not hold.
+"""Search for the formula of physics that the catalogue of effects does not hold.
 
-Where the residual depends on a covariate (``pipeline.diagnosis.residual_dependence``), each simple form in it is scored
-as an effect would be, given base, configured and selected effects, on the a axes that it improves:
+Every form of the grammar (``pipeline.diagnosis.functional_forms``) is scored as an effect would be, with base and
+effects projected out, under the noise of the engine, on the a axes that it improves:
 
-    delta BIC = 2 (max log L' - max log L) - (r a + s) log N,    r coefficients, s scanned parameters, N readings
+    score = 2 (max log L' - max log L) - (r a + s) log N - 2 C log 10
 
-The best form is published in words and as the definition of an effect. Where slow effects were selected, a step or
-exponential of the temperature is tried in their place, and replaces them if it explains far more.
+r coefficients, s scanned constants, N readings, C the form's complexity: each choice of the grammar is one of about
+ten. Constants are scanned coarsely, then finer about the best. Further terms are added while they bring clearly more.
+The search starts from the selected effects, and again without them, which may stand in for the form; whichever has the
+better score after another selection with the form in the base is reported.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import chain, count
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pipeline.diagnosis import functional_forms as forms
-from pipeline.diagnosis.residual_dependence import SLOW, dependences
-from pipeline.diagnosis.residual_regression import ProjectedCurves
-from pipeline.estimation.selection import FAR_ABOVE, select
-from pipeline.model.effects import catalogue, forget, register
-from pipeline.model.effects.base import unit_of
-from pipeline.model.effects.files import effect_from
+from pipeline.diagnosis.functional_forms import Form, Span
+from pipeline.diagnosis.residual_regression import ProjectedCurves, Scan
+from pipeline.estimation.design import felt
+from pipeline.model.effects import catalogue
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping, Sequence
+    from collections.abc import Iterable, Sequence
 
     from numpy.typing import NDArray
 
-    from pipeline.diagnosis.functional_forms import Form
+    from pipeline.diagnosis.functional_forms import Factor
     from pipeline.diagnosis.residual_regression import Gain
+    from pipeline.estimation.gauss_markov import Setting
     from pipeline.estimation.selection import Selection
-    from pipeline.records import Noise, SensorCalibration
 
     Values = NDArray[np.float64]
 
-CLEARLY = 10.0  # delta BIC for a further harmonic, or for time in place of what changes with it
-MOST_HARMONICS = 3  # at once; further ones are found once these are added
-REFINED = 40  # forms of a scan, best first on all three axes, for which the axes are then chosen
-FAR_MORE = 0.1  # of what slow effects gain, by which a form in their place must gain more
-MUCH = 40.0  # delta BIC by which it must be better in any case
-OWNERS = {"harmonic": "table", "ripple": "table", "band": "table"}
+PRICE = 2.0 * float(np.log(10.0))  # of a choice: log prior of one of about ten signals, functions or powers
+CLEARLY = 10.0  # score of a form, and of a further term: "very strong" (Raftery, Sociological Methodology 25, 1995)
+MORE = 0.02  # of the first term's delta BIC that a further one must have: less may be its constants' rounding
+MOST_TERMS = 3
+REFINED = 16  # forms that are scored under every noise setting, and whose constants are refined
+ROUNDS = (1.0, 0.25, 0.0625)  # of the coarse scan's distance
+VALUES_AT_ONCE = 4_000_000  # of columns that are scanned together: 32 MB
+PROBED = 200  # rows at which two forms that are equal to 1e-9 are one
 
 
 @dataclass(frozen=True)
-class _FittedForm:
-    """The best functional form in one covariate."""
+class Scored:
+    """A form, what it gains, and that less the price of its complexity."""
 
-    covariate: str
     form: Form
     gain: Gain
-    coefficients: Values  # (3, r), zero on the axes that are left out
-    sizes: Values  # (3,): amplitude, height or whole change, unit of the sensor; signed where a sign has a meaning
+
+    @property
+    def score(self) -> float:
+        """Delta BIC less the price of the form's complexity."""
+        return self.gain.delta_bic - PRICE * self.form.complexity
 
 
-def unexplained(selection: Selection) -> list[dict[str, Any]]:
-    """Return the covariates on which the residual still depends, each with its form, the best first.
+class Forms:
+    """The forms of the grammar that a unit's recordings can show, and what each gains beside a fit.
 
-    Entries hold ``covariate, p_value, shape`` (words), ``axes, formulas, coefficients`` (of each axis), ``size, unit,
-    delta_bic, explained_by`` (another covariate whose form explains it too, or None) and ``kind``.
+    ``explained``: formulas that count as explained.
     """
-    found = dict(dependences(selection))
-    sensor = selection.observations.sensor
-    fitted = sorted((_best_form(selection, covariate) for covariate in found), key=_rank)
-    if not found:
-        instead = _instead_of_slow_effects(selection)
-        if instead is None:
-            return []
-        fitted, found = [instead], {instead.covariate: instead.gain.p_value}
-    best = fitted[0]
-    still = dict(dependences(selection, forms.columns_of(best.form.formulas, sensor)))
-    return [
-        {
-            "covariate": each.covariate,
-            "p_value": found[each.covariate],
-            "shape": forms.described(each.form, each.sizes, each.gain.axes, sensor),
-            "kind": each.form.kind,
-            "axes": ["xyz"[c] for c in each.gain.axes],
-            "formulas": list(each.form.formulas),
-            "coefficients": [each.coefficients[c].tolist() for c in each.gain.axes],
-            "size": float(np.abs(each.sizes).max()),
-            "unit": "1" if each.form.kind == "ripple" else unit_of(sensor),
-            "delta_bic": each.gain.delta_bic,
-            "explained_by": None if each is best or each.covariate in still else best.covariate,
-        }
-        for each in fitted
-    ]
+
+    def __init__(self, selection: Selection, explained: Sequence[str] = ()) -> None:
+        self.selection, self.sensor = selection, selection.observations.sensor
+        of = forms.columns_of(explained, self.sensor) if explained else None
+        self.explained = of
+        self.scan = Scan(selection, of)
+        self._coarse = Scan(replace(selection, settings=_few_settings(selection)), of)
+        self._motions = [felt(part, selection.fit.terms) for part in selection.observations.parts]
+        self._known: dict[str, Values] = {}
+
+    def column(self, text: str) -> Values:
+        """Return a formula's values: (n,) array, or (n, 3) where each axis has its own."""
+        if text not in self._known:
+            of = forms.columns_of([text], self.sensor)
+            self._known[text] = np.concatenate([of(motion) for motion in self._motions])[..., 0]
+        return self._known[text]
+
+    def columns(self, form: Form) -> Values:
+        """Return the values of a form's columns: (n, r) or (n, 3, r) array."""
+        own = np.stack([self.column(text) for text in form.factor.texts], axis=-1)
+        if form.modulator is None:
+            return own
+        times = self.column(form.modulator.texts[0])[..., None]
+        if own.ndim != times.ndim:
+            own, times = (v if v.ndim == 3 else v[:, None] for v in (own, times))
+        return np.asarray(own * times)
+
+    def gains(self, tried: Sequence[Form], *, coarse: bool = False) -> list[Gain]:
+        """Return what each form gains; ``coarse``: under few noise settings."""
+        scan = self._coarse if coarse else self.scan
+        found: dict[int, Gain] = {}
+        kinds: dict[tuple[int, bool], list[int]] = {}
+        for k, form in enumerate(tried):
+            by_axis = "u" in (form.factor.signal, form.modulator.signal if form.modulator else "")
+            kinds.setdefault((len(form.factor.texts), by_axis), []).append(k)
+        for (r, by_axis), members in kinds.items():
+            size = max(8, VALUES_AT_ONCE // (len(self.selection.observations.weight) * r * (3 if by_axis else 1)))
+            for first in range(0, len(members), size):
+                some = members[first : first + size]
+                columns = np.stack([self.columns(tried[k]) for k in some], axis=-2)
+                scanned = np.array([tried[k].scanned for k in some])
+                found |= dict(zip(some, scan.best_axes(scan.drops(columns), r, scanned), strict=True))
+        return [found[k] for k in range(len(tried))]
+
+    def ranked(self) -> list[Scored]:
+        """Return the best form of each name, best score first."""
+        spans = self._spans()
+        tried = self._tried(spans)
+        scored = [Scored(form, gain) for form, gain in zip(tried, self.gains(tried, coarse=True), strict=True)]
+        best = _best_of_each(scored)[:REFINED]
+        best = [Scored(e.form, g) for e, g in zip(best, self.gains([each.form for each in best]), strict=True)]
+        for apart in ROUNDS:
+            near = [
+                Form(factor, each.form.modulator)
+                for each in best
+                if each.form.factor.signal in spans
+                for factor in forms.finer(each.form.factor, spans[each.form.factor.signal], apart)
+            ]
+            best = _best_of_each([*best, *(Scored(f, g) for f, g in zip(near, self.gains(near), strict=True))])
+        return _best_of_each([*best, *(self._polynomial(span) for span in [*spans.values(), None])])
+
+    def _spans(self) -> dict[str, Span]:
+        """Return the spans of the signals that all recordings hold."""
+        observations = self.selection.observations
+        motions = [part.motion for part in observations.parts]
+        names = ["fx", "fy", "fz"]
+        names += ["speed"] if any(np.any(~m.still) for m in motions) else []
+        names += ["temperature"] if all(m.temperature is not None for m in motions) else []
+        names += ["time"] if observations.clock_shared else []
+        return {name: Span.of(observations, name) for name in names}
+
+    def _tried(self, spans: dict[str, Span]) -> list[Form]:
+        """Return the forms of the coarse scan; of equal ones the simplest, and none of the catalogue."""
+        turning = any(part.motion.axis is not None for part in self.selection.observations.parts)
+        factors = forms.factors(spans, turning=turning)
+        pairs = [
+            Form(factor, modulator)
+            for modulator in forms.modulators(list(spans))
+            for factor in factors
+            if modulator is None or _may_multiply(modulator, factor)
+        ]
+        rows = np.random.default_rng(0).integers(len(self.selection.observations.weight), size=PROBED)
+        seen = {_digest(self.column(text)[rows]) for text in _of_the_catalogue(self.sensor)}
+        kept = []
+        for form in sorted(pairs, key=lambda form: form.complexity):
+            digest = _digest(self.columns(form)[rows])
+            if digest not in seen:
+                seen.add(digest)
+                kept.append(form)
+        return kept + [Form(band) for band in (forms.bands(spans["speed"]) if "speed" in spans else [])]
+
+    def _polynomial(self, span: Span | None) -> Scored:
+        """Return the polynomial of the best order, without powers that base or effects hold; None: in ``u``."""
+        own = "fz" if self.sensor == "accelerometer" else "wz"
+        signal = "u" if span is None else span.signal
+        texts = forms.powers(span or Span.of(self.selection.observations, own), signal)
+        projected = ProjectedCurves(self.selection, forms.columns_of(texts, self.sensor), self.explained)
+        kept = projected.independent(range(len(texts)))
+        drops = projected.drop(kept) if kept else np.zeros((*projected.left.shape, 1))
+        gains = [projected.gain(drops[:, :, k], k + 1) for k in range(drops.shape[2])]
+        best = max(range(len(gains)), key=lambda k: gains[k].delta_bic - PRICE * k)
+        index = kept[: best + 1]
+        formulas = tuple(texts[k] for k in index)
+        return Scored(Form(forms.polynomial(signal, formulas, (index[-1] + 1) if index else 0)), gains[best])
 
 
-def _instead_of_slow_effects(selection: Selection) -> _FittedForm | None:
-    """Return a step or exponential of the temperature that explains far more than the selected slow effects.
-
-    Where the unit only warms up, all of these are one curve in time, and none is far better.
-    """
-    slow = [term for term in selection.fit.terms if term.effect.name in SLOW and term.effect.name in selection.names]
-    if not slow or any(part.motion.temperature is None for part in selection.observations.parts):
-        return None
-    others = tuple(term for term in selection.fit.terms if term not in slow)
-    names = [name for name in selection.names if name not in SLOW]
-    without = replace(selection, names=names, fit=replace(selection.fit, terms=others))
-    found, before = _best_scanned(without, "temperature", "temperature")
-    gain = 2.0 * (selection.fit.log_likelihood - before)
-    parameters = sum(len(term.values) for term in slow)
-    worth = gain - parameters * float(np.log(3.0 * selection.observations.samples))
-    return found if found.gain.delta_bic > worth + max(MUCH, FAR_MORE * gain) else None
+def _few_settings(selection: Selection) -> list[Setting]:
+    """Return the noise settings of the coarse scan: that of the fit, the least wander and the one in the middle."""
+    ordered = sorted(selection.settings, key=lambda setting: setting.ratio)
+    few = [selection.fit.setting, ordered[0], ordered[len(ordered) // 2]]
+    return [setting for k, setting in enumerate(few) if setting not in few[:k]]
 
 
-def _rank(fitted: _FittedForm) -> float:
-    """Return the order of forms: time, of which everything slow is a function, only where it is clearly better."""
-    return -fitted.gain.delta_bic + (CLEARLY if fitted.covariate == "time" else 0.0)
+def _may_multiply(modulator: Factor, factor: Factor) -> bool:
+    """Return whether a product says more than a function of one signal."""
+    return factor.signal != modulator.signal or factor.kind == "step"
 
 
-def _best_form(selection: Selection, covariate: str) -> _FittedForm:
-    """Return the best form in a covariate."""
-    sensor = selection.observations.sensor
-    if covariate == "angle":
-        found = [_best_harmonics(selection, factor) for factor in (("", "u") if sensor == "gyroscope" else ("",))]
-    elif covariate == "specific_force":
-        signals = ["u", "fx", "fy", "fz"] if sensor == "accelerometer" else ["fx", "fy", "fz"]
-        found = [_best_polynomial(selection, covariate, signal) for signal in signals]
-    else:
-        signal = "speed" if covariate == "rate" else covariate
-        found = [_best_scanned(selection, covariate, signal)[0], _best_polynomial(selection, covariate, signal)]
-        if sensor == "gyroscope" and covariate == "rate":
-            found.append(_best_polynomial(selection, covariate, "u"))
-    return max(found, key=lambda fitted: fitted.gain.delta_bic)
+def _digest(values: Values) -> bytes:
+    """Return what forms have in common whose values differ by a factor alone."""
+    size = float(np.linalg.norm(values))
+    flat = values.ravel() if values.ndim == 1 or values.shape[1] > 1 else values[:, 0].ravel()
+    first = float(flat[np.argmax(np.abs(flat) > 1e-6 * size)]) if size > 0.0 else 1.0
+    return np.round(values.reshape(len(values), -1) / (size * np.sign(first) or 1.0), 9).tobytes()
 
 
-def _best_harmonics(selection: Selection, factor: str) -> _FittedForm:
-    """Return harmonics of the table's angle, added one by one while delta BIC rises clearly."""
-    tried = forms.harmonics(factor)
-    projected = _projected(selection, [text for form in tried for text in form.formulas])
-    chosen: list[int] = []
-    best, index = _gain_of_harmonics(projected, [])
-    while len(chosen) < MOST_HARMONICS:
-        options = [[*chosen, n] for n in range(len(tried)) if n not in chosen]
-        gains = [_gain_of_harmonics(projected, option) for option in options]
-        k = int(np.argmax([gain.delta_bic for gain, _ in gains]))
-        if chosen and gains[k][0].delta_bic < best.delta_bic + CLEARLY:
+def _of_the_catalogue(sensor: str) -> list[str]:
+    """Return the formulas of effects of the catalogue that every axis has a coefficient for."""
+    declared = [getattr(e, "declared", None) for e in catalogue().values() if sensor in e.sensors]
+    terms = [term for each in declared if each for term in each.terms.values()]
+    return [term.formulas[""].text for term in terms if "" in term.formulas and not term.shared]
+
+
+def _best_of_each(scored: Iterable[Scored]) -> list[Scored]:
+    """Return the best of each form's constants, best score first."""
+    best: dict[tuple[str, ...], Scored] = {}
+    for each in scored:
+        held = best.get(each.form.name)
+        if held is None or each.score > held.score:
+            best[each.form.name] = each
+    return sorted(best.values(), key=lambda each: -each.score)
+
+
+def search(selection: Selection) -> tuple[list[Scored], list[Scored]]:
+    """Return the terms of the best form beside what is selected, none where it is not clearly better, and all ranked."""
+    terms: list[Scored] = []
+    ranked: list[Scored] = []
+    while len(terms) < MOST_TERMS:
+        held = [text for term in terms for text in term.form.formulas]
+        found = Forms(selection, held).ranked()
+        ranked = ranked or found
+        if found[0].score < CLEARLY or (terms and found[0].gain.delta_bic < MORE * terms[0].gain.delta_bic):
             break
-        chosen, (best, index) = options[k], gains[k]
-    found = _on_axes(projected.coefficients(index, best.setting), best)
-    amplitude = np.sqrt(np.sum(found.reshape(3, -1, 2) ** 2, axis=2)).max(axis=1)
-    return _FittedForm("angle", forms.harmonic(factor, [forms.CYCLES[n] for n in chosen]), best, found, amplitude)
+        terms.append(found[0])
+    return terms, ranked
 
 
-def _gain_of_harmonics(projected: ProjectedCurves, chosen: Sequence[int]) -> tuple[Gain, list[int]]:
-    """Return what some harmonics gain, nothing where one is held already, and their columns."""
-    columns = [k for n in chosen for k in (2 * n, 2 * n + 1)]
-    index = projected.independent(columns)
-    if not chosen or len(index) < len(columns):
-        return replace(projected.gain(np.zeros_like(projected.left), 1), delta_bic=-np.inf), columns
-    return projected.gain(projected.drop(index)[:, :, -1], len(index), len(chosen)), columns
-
-
-def _best_polynomial(selection: Selection, covariate: str, signal: str) -> _FittedForm:
-    """Return the polynomial of the best order, without powers that base or effects hold already."""
-    own = "fz" if selection.observations.sensor == "accelerometer" else "wz"
-    span = forms.Span.of(selection.observations, own if signal == "u" else signal)
-    texts = forms.powers(span, signal)
-    projected = _projected(selection, texts)
-    kept = projected.independent(range(len(texts)))
-    drops = projected.drop(kept) if kept else np.zeros((*projected.left.shape, 1))
-    gains = [projected.gain(drops[:, :, k], k + 1) for k in range(drops.shape[2])]
-    best = int(np.argmax([g.delta_bic for g in gains]))
-    index = kept[: best + 1]
-    found = _on_axes(projected.coefficients(index, gains[best].setting), gains[best])
-    formulas = tuple(texts[k] for k in index)
-    form = forms.polynomial(signal, formulas, (index[-1] + 1) if index else 0)
-    return _FittedForm(covariate, form, gains[best], found, _change(selection, formulas, found))
-
-
-def _best_scanned(selection: Selection, covariate: str, signal: str) -> tuple[_FittedForm, float]:
-    """Return the best step, band or exponential, by a coarse and a fine scan, and the log likelihood without it."""
-    span = forms.Span.of(selection.observations, signal)
-    places = span.places()
-    single = forms.steps(span, places)
-    if signal in ("temperature", "time"):
-        single += forms.steps(span, places, [span.size / forms.PLACES])
-        single += forms.exponentials(span, [span.size * c for c in forms.CONSTANTS])
-    form, gain, projected, weights = _best_of(selection, single, forms.bands(span, places) if signal == "speed" else [])
-    fine = forms.finer(form, span)
-    if fine:
-        other = _best_of(selection, fine, [])
-        if other[1].delta_bic > gain.delta_bic:
-            form, gain, projected, weights = other
-    inner = np.einsum("q,cqp,p->c", weights, projected.inner[gain.setting], weights)
-    found = _on_axes((projected.cross[gain.setting] @ weights / np.maximum(inner, 1e-300))[:, None], gain)
-    sizes = found[:, 0] if form.kind != "exponential" else _change(selection, form.formulas, found)
-    return _FittedForm(covariate, form, gain, found, sizes), projected.before
-
-
-def _best_of(
-    selection: Selection, single: Sequence[Form], pairs: Sequence[Form]
-) -> tuple[Form, Gain, ProjectedCurves, Values]:
-    """Return the best of forms with one coefficient an axis, and the weights of the columns that it consists of."""
-    projected = _projected(selection, [form.formulas[0] for form in single])
-    both = [*single, *pairs]
-    weights = np.zeros((len(single), len(both)))
-    np.fill_diagonal(weights, 1.0)
-    for k, form in enumerate(pairs, len(single)):
-        for j, value in form.combination.items():
-            weights[j, k] = value
-    drops = projected.drops(weights)
-    order = np.argsort(-projected.gains(drops, 3 + np.array([form.scanned for form in both])))[:REFINED]
-    gains = {int(k): projected.gain(drops[:, :, k], 1, both[k].scanned) for k in order}
-    best = max(gains, key=lambda k: gains[k].delta_bic)
-    return both[best], gains[best], projected, weights[:, best]
-
-
-def _projected(selection: Selection, texts: Sequence[str]) -> ProjectedCurves:
-    return ProjectedCurves(selection, forms.columns_of(texts, selection.observations.sensor))
-
-
-def _on_axes(coefficients: Values, gain: Gain) -> Values:
-    """Return coefficients with zeros on the axes on which the form does not act."""
-    kept = np.zeros_like(coefficients)
-    kept[list(gain.axes)] = coefficients[list(gain.axes)]
-    return kept
-
-
-def _change(selection: Selection, formulas: Sequence[str], coefficients: Values) -> Values:
-    """Return by how much a form changes over all rows: (3,) array."""
-    if not formulas:
-        return np.zeros(3)
-    columns = forms.columns_of(formulas, selection.observations.sensor)
-    values = np.concatenate([columns(part.motion) for part in selection.observations.parts])
-    each = values if values.ndim == 3 else values[:, None, :]
-    on_each_axis = np.broadcast_to(each, (len(each), 3, each.shape[2]))
-    change: Values = np.ptp(np.einsum("ncr,cr->nc", on_each_axis, coefficients), axis=0)
-    return change
-
-
-def suggested_effect(
-    unknown: Sequence[Mapping[str, Any]], sensor: str, taken: Collection[str] = ()
-) -> dict[str, Any] | None:
-    """Return the definition of an effect with the best form of what ``unexplained`` returned; None without one.
-
-    Its name is none of those that are ``taken``.
-    """
-    if not unknown:
-        return None
-    entry = unknown[0]
-    plain = f"unknown_{entry['covariate']}"
-    name = next(n for n in chain([plain], (f"{plain}_{k}" for k in count(2))) if n not in taken)
-    terms = dict(zip("ABCDEFGHIJ", entry["formulas"], strict=False))
-    return {
-        "name": name,
-        "owner": OWNERS.get(entry["kind"], "sensor" if entry["covariate"] != "time" else "recording"),
-        "sensors": [sensor],
-        "meaning": f"First guess, to be confirmed: the {sensor} shows {entry['shape']}.",
-        "terms": {term: {"formula": formula, "unit": entry["unit"]} for term, formula in terms.items()},
-        "axes": list(entry["axes"]),
-        "source": "what a diagnosis found in the residual",
-    }
-
-
-def effect_file(definition: Mapping[str, Any], unit: str) -> str:
-    """Return the text of an effect file, ready to be copied into a campaign's ``effects/``; a unit showed it."""
-    import yaml  # noqa: PLC0415  (only a unit with unknown physics pays for it)
-
-    name, sensor = definition["name"], definition["sensors"][0]
-    remarks = (
-        f"# What unit {unit} shows beyond the catalogue of effects: a first guess, to be named, tried and confirmed.\n"
-        f"# To try it, copy this file to effects/{name}.yaml in the campaign's directory and add {name} to\n"
-        f"# effects.{sensor}. To rename it, change the file's name and the one below together.\n"
-    )
-    return remarks + str(yaml.safe_dump(dict(definition), sort_keys=False, allow_unicode=True, width=110))
-
-
-def select_with_form(
-    selection: Selection,
-    unknown: Sequence[Mapping[str, Any]],
-    configured: Sequence[str],
-    noise: Noise | None,
-    sheet: Mapping[str, Any],
-    *,
-    accelerometer: SensorCalibration | None = None,
-) -> Selection:
-    """Select again with the best form in the base, so that effects of the catalogue no longer take its place.
-
-    Where the residual stays far above the noise even so, the form is not what is missing, and nothing changes.
-    ``unknown`` is what ``unexplained`` returned of the selection.
-    """
-    definition = suggested_effect(unknown, selection.observations.sensor, catalogue())
-    if definition is None:
-        return selection
-    register(effect_from(definition, "a first guess"))
-    try:
-        again = select(
-            selection.observations, [*configured, definition["name"]], noise, sheet, accelerometer=accelerometer
-        )
-    finally:
-        forget(definition["name"])
-    floor = 0.0 if noise is None else float(np.sqrt(np.mean(noise.white**2 + noise.wander**2)))
-    return selection if 0.0 < FAR_ABOVE * floor < again.fit.residual_rms else again
+def without_effects(selection: Selection) -> Selection:
+    """Return a selection of nothing: base and configured effects."""
+    return replace(selection, names=[], fit=selection.base)

@@ -1,16 +1,18 @@
-"""Simple functional forms that a residual may have in one covariate v, as formulas that a user's effect file may hold.
+"""A grammar of effects that the catalogue may not hold, as formulas of an effect file, each with the unit that it has.
 
-    harmonic, ripple : (1 or u) (a cos(n A) + b sin(n A)), A the table's angle, n = 1 to 12, u the rate of a gyroscope
-    polynomial       : sum over p = 1 to d of a_p x^p, d = 2 to 5, x the covariate centred and scaled to its span
-    step, band       : a where v > v_0; or a (1 + tanh((v - v_0) / w)) / 2; a where the speed lies between two values
-    exponential      : a exp(-(v - v_min) / s), which decays, or a exp((v - v_max) / s), which grows
+    form   := factor, or modulator * factor        modulator := u, abs(u), u ** 2, u ** 3, fx, fy, fz, speed, T, time
+    factor := s ** p | abs(u) | sign(u) | step(s - a) | (1 + tanh((s - a) / w)) / 2 | exp(+-(s - a) / c)
+              | cos and sin(n angle) | band(speed, a, b) | polynomial in (s - a) / w           T = temperature - 25
 
-Places, widths and constants are scanned: first coarsely over the span, then about the best.
+What a function is applied to has no unit, by construction; the unit of a product is the product of the units, and that
+of a coefficient follows: unit of the sensor over unit of the form. Complexity counts a form's signals, functions,
+powers and cycles; its scanned constants a, w, c count as parameters of the fit.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections import Counter
+from dataclasses import dataclass
 from itertools import combinations
 from typing import TYPE_CHECKING
 
@@ -21,7 +23,7 @@ from pipeline.model.effects.base import truth, unit_of
 from pipeline.model.formula import parse
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -33,27 +35,18 @@ if TYPE_CHECKING:
     Values = NDArray[np.float64]
 
 CYCLES = range(1, 13)
-ORDER = 5  # as DEGREE of the tests that find a dependence (pipeline.diagnosis.residual_dependence)
-PLACES = 40  # a step is then placed to 1/80 of the span before the fine scan
-FINE = 12  # places to each side of the best, down to a twelfth of the coarse distance
-WIDTHS = (0.25, 0.5, 1.0, 2.0, 4.0)  # of the coarse distance
-CONSTANTS = tuple(np.geomspace(0.06, 1.5, 9))  # of the span; steps of 1.5, then FACTORS about the best
-FACTORS = tuple(np.geomspace(0.6, 1.6, 9))
+POWERS = range(1, 6)
+ORDER = 5  # of a polynomial; as DEGREE of the tests that find a dependence (pipeline.diagnosis.residual_dependence)
+PLACES = 20  # a step is then placed to 1/40 of the span before the finer scans
+SPEEDS = 40  # at most, between which steps are tried
+SHARPEST = 1.0 / 80.0  # width of a soft step, share of the span: smoothed temperatures make a sharp one as wide as that
+CONSTANTS = tuple(np.geomspace(0.06, 1.5, 9))  # of the span; the finer scans close the factors of 1.5 between them
+FINER = 4  # places or constants to each side of the best, in each finer scan
+WIDTHS = (0.5, 1.0, 2.0)  # of a soft step, in those of the scan before
 SAME_SPEED = 0.02  # relative difference of speeds that are one speed of the procedure
-UNITS = {"temperature": "degC", "time": "s", "speed": "deg/s", "angle": "deg"}
-
-
-@dataclass(frozen=True)
-class Form:
-    """A functional form that is tried."""
-
-    kind: str
-    signal: str
-    formulas: tuple[str, ...]  # one for each coefficient
-    words: str  # a noun phrase, in which {size} stands for its size
-    scanned: int = 1  # how many nonlinear parameters were scanned to find it
-    place: float = 0.0  # of a step, or the constant of an exponential: where a finer scan begins
-    combination: dict[int, float] = field(default_factory=dict)  # of the scan's columns; empty: its own formula
+UNITS = {"temperature": "degC", "time": "s", "speed": "deg/s", "angle": "deg"} | {f"f{a}": "g" for a in "xyz"}
+ORIGIN = "(temperature - 25)"  # powers of the temperature count from that of data sheets, as the catalogue's
+NAMES = {"u": "the axis' own signal", "speed": "the speed", "time": "the time", ORIGIN: "the temperature above 25 degC"}
 
 
 def columns_of(formulas: Iterable[str], sensor: str) -> Curves:
@@ -124,8 +117,8 @@ class Span:
         """Return where steps are tried: evenly over the span; for a speed, between the speeds that were held."""
         if self.signal != "speed":
             return self.low + self.size * (np.arange(PLACES) + 0.5) / PLACES
-        moving = self.values[self.values > SAME_SPEED * self.high / PLACES]
-        held = np.unique(np.quantile(moving, np.linspace(0.0, 1.0, PLACES)) if len(moving) else moving)
+        moving = self.values[self.values > SAME_SPEED * self.high / SPEEDS]
+        held = np.unique(np.quantile(moving, np.linspace(0.0, 1.0, SPEEDS)) if len(moving) else moving)
         held = np.concatenate([[0.0], held])
         apart = np.diff(held) > SAME_SPEED * held[1:]
         middle: Values = 0.5 * (held[1:] + held[:-1])
@@ -136,19 +129,159 @@ class Span:
         return round(value, max(0, 4 - int(np.floor(np.log10(self.size)))))
 
 
-def harmonics(factor: str = "") -> list[Form]:
-    """Return the harmonics of the table's angle; with the factor ``u`` those in proportion to the rate."""
-    return [harmonic(factor, [n]) for n in CYCLES]
+@dataclass(frozen=True)
+class Factor:
+    """A function of one signal: its columns as formulas, its exponents of units, and what was scanned to find it."""
+
+    kind: str
+    signal: str
+    texts: tuple[str, ...]
+    words: str  # a noun phrase
+    complexity: int = 2  # its signal and its function
+    power: int = 0  # of the signal's unit; 0: without a unit
+    constants: tuple[float, ...] = ()  # scanned
 
 
-def harmonic(factor: str, cycles: Sequence[int]) -> Form:
-    """Return harmonics of so many cycles a turn as one form."""
-    times = f"{factor} * " if factor else ""
-    formulas = tuple(f"{times}{f}({n} * radians(angle))" for n in cycles for f in ("cos", "sin"))
-    each = " and ".join(str(n) for n in sorted(cycles))
-    rate = " in proportion to the rate" if factor else ""
-    words = f"{each} cycle{'' if each == '1' else 's'} per turn of the table{rate}, amplitude {{size}}"
-    return Form("ripple" if factor else "harmonic", "angle", formulas, words)
+@dataclass(frozen=True)
+class Form:
+    """A functional form that is tried: a factor, or its product with a modulator."""
+
+    factor: Factor
+    modulator: Factor | None = None
+
+    @property
+    def kind(self) -> str:
+        """Kind of the factor; ``ripple`` for harmonics in proportion to the axis' own signal."""
+        ripple = self.factor.kind == "harmonic" and self.modulator is not None and self.modulator.texts == ("u",)
+        return "ripple" if ripple else self.factor.kind
+
+    @property
+    def formulas(self) -> tuple[str, ...]:
+        """One for each coefficient."""
+        times = f"{self.modulator.texts[0]} * " if self.modulator else ""
+        return tuple(f"{times}{text}" for text in self.factor.texts)
+
+    @property
+    def covariate(self) -> str:
+        """The covariate of ``pipeline.diagnosis.residual_dependence`` that the form is told by."""
+        signals = [self.factor.signal, *([self.modulator.signal] if self.modulator else [])]
+        known = {"speed": "rate"}
+        order = ["angle", "temperature", "time", "rate"]
+        named = [known.get(name, name) for name in signals]
+        return next((name for name in order if name in named), "specific_force" if self._of_force(signals) else "rate")
+
+    @staticmethod
+    def _of_force(signals: Sequence[str]) -> bool:
+        return any(name.startswith("f") for name in signals) or "u" in signals
+
+    @property
+    def scanned(self) -> int:
+        """How many nonlinear parameters were scanned to find it."""
+        return len(self.factor.constants)
+
+    @property
+    def complexity(self) -> int:
+        """Number of choices that the grammar takes to state it."""
+        return self.factor.complexity + (self.modulator.complexity if self.modulator else 0)
+
+    @property
+    def name(self) -> tuple[str, ...]:
+        """What stays the same when its constants change."""
+        own = self.factor.texts if not self.factor.constants else (self.factor.kind, self.factor.signal)
+        return (*own, *(self.modulator.texts if self.modulator else ()))
+
+    def unit(self, sensor: str) -> str:
+        """Return the unit of a coefficient: that of the sensor over that of the form."""
+        exponents = Counter({unit_of(sensor): 1})
+        for factor in filter(None, (self.factor, self.modulator)):
+            exponents[UNITS.get(factor.signal, unit_of(sensor))] -= factor.power
+        own = exponents.pop(unit_of(sensor))
+        above = unit_of(sensor) if own == 1 else "1"
+        below = {**({unit_of(sensor): own} if own < 0 else {}), **{u: e for u, e in exponents.items() if e < 0}}
+        return above + "".join(f"/{_power(unit, -e)}" for unit, e in below.items()) if below else above
+
+    def described(self) -> str:
+        """Return the form as a noun phrase, in which ``{size}`` stands for its size."""
+        times = ""
+        if self.modulator:
+            text = self.modulator.texts[0]
+            name = "the rate" if self.kind == "ripple" else NAMES.get(text, text)
+            times = f" in proportion to {name}"
+        lead = ", amplitude {size}" if self.factor.kind == "harmonic" else ", of {size}"
+        if self.factor.kind in ("power", "magnitude", "polynomial", "exponential", "growth") or (times and lead != ", amplitude {size}"):
+            lead = ", {size} in all"
+        return f"{self.factor.words}{times}{lead}"
+
+
+def _power(unit: str, exponent: int) -> str:
+    inside = f"({unit})" if "/" in unit else unit
+    return inside if exponent == 1 else f"{inside}^{exponent}"
+
+
+def power(signal: str, p: int) -> Factor:
+    """Return a power of a signal, in its own unit."""
+    base = ORIGIN if signal == "temperature" else signal
+    text = base if p == 1 else f"{base} ** {p}"
+    return Factor("power", signal, (text,), f"a part in proportion to {text}", 1 + (p > 1), p)
+
+
+def modulators(signals: Sequence[str]) -> list[Factor | None]:
+    """Return what a factor may be multiplied with; None: nothing."""
+    absolute = Factor("magnitude", "u", ("abs(u)",), "a part in proportion to abs(u)", 2, 1)
+    of_u = [power("u", 1), absolute, power("u", 2), power("u", 3)]
+    return [None, *of_u, *(power(name, 1) for name in signals if name not in ("u", "angle"))]
+
+
+def factors(spans: dict[str, Span], *, turning: bool) -> list[Factor]:
+    """Return the factors with one column, constants as in the coarse scan, and the harmonics."""
+    found = [power(name, p) for name in spans for p in POWERS] + [power("u", p) for p in POWERS]
+    found += [Factor("magnitude", "u", (f"{f}(u)",), f"a part in proportion to {f}(u)", 2, p) for f, p in OF_SIGN]
+    for span in spans.values():
+        if span.signal in ("temperature", "time", "speed"):
+            found += [step(span, a) for a in span.places()]
+        if span.signal in ("temperature", "time"):
+            found += [step(span, a, span.size / PLACES) for a in span.places()]
+            found += [exponential(span, c * span.size, growth=g) for c in CONSTANTS for g in (False, True)]
+    return found + ([harmonic(n) for n in CYCLES] if turning else [])
+
+
+OF_SIGN = (("abs", 1), ("sign", 0))
+
+
+def harmonic(n: int) -> Factor:
+    """Return the cosine and sine of so many cycles a turn."""
+    words = f"{n} cycle{'' if n == 1 else 's'} per turn of the table"
+    return Factor("harmonic", "angle", tuple(f"{f}({n} * radians(angle))" for f in ("cos", "sin")), words)
+
+
+def step(span: Span, place: float, width: float | None = None) -> Factor:
+    """Return a step at a place, sharp or over a width."""
+    signal, unit, digits = span.signal, UNITS[span.signal], 0 if span.signal == "time" else 1
+    words = f"a step at {place:.{digits}f} {unit}"
+    if width is None:
+        return Factor("step", signal, (f"step({signal} - {place:.7g})",), words, constants=(place,))
+    soft = f"0.5 * (1 + tanh(({signal} - {place:.7g}) / {width:.3g}))"
+    over = f"{words}, over about {2 * float(f'{width:.3g}'):.2g} {unit}"
+    return Factor("step", signal, (soft,), over, 3, constants=(place, width))
+
+
+def exponential(span: Span, constant: float, *, growth: bool) -> Factor:
+    """Return an exponential that decays from the smallest value, or grows towards the largest."""
+    s, signal = float(f"{constant:.4g}"), span.signal
+    text = f"({signal} - {span.rounded(span.high):g})" if growth else f"({span.rounded(span.low):g} - {signal})"
+    words = f"an exponential of the {signal} that {'grows' if growth else 'decays'} with a constant of {s:.3g} "
+    kind = "exponential" if not growth else "growth"
+    return Factor(kind, signal, (f"exp({text} / {s:g})",), words + UNITS[signal], constants=(s,))
+
+
+def bands(span: Span) -> list[Factor]:
+    """Return bands between any two of the places of a speed."""
+    found = []
+    for low, high in combinations(span.places().tolist(), 2):
+        text = f"band({span.signal}, {low:.5g}, {high:.5g})"
+        words = f"a band from {low:.3g} to {high:.3g} {UNITS[span.signal]}"
+        found.append(Factor("band", span.signal, (text,), words, 2, constants=(low, high)))
+    return found
 
 
 def powers(span: Span, name: str) -> tuple[str, ...]:
@@ -161,66 +294,25 @@ def powers(span: Span, name: str) -> tuple[str, ...]:
     return (x, *(f"{x} ** {p}" for p in range(2, ORDER + 1)))
 
 
-def steps(span: Span, places: Sequence[float] | Values, widths: Sequence[float] = ()) -> list[Form]:
-    """Return sharp steps at some places, or soft ones of some widths each."""
-    signal, unit, digits = span.signal, UNITS[span.signal], 0 if span.signal == "time" else 1
-    found = []
-    for p in places:
-        at = float(f"{p:.7g}")
-        words = f"a step at {at:.{digits}f} {unit}"
-        if not widths:
-            found.append(Form("step", signal, (f"step({signal} - {p:.7g})",), f"{words}, of {{size}}", place=at))
-        for width in widths:
-            soft = f"0.5 * (1 + tanh(({signal} - {p:.7g}) / {width:.3g}))"
-            over = f"{words}, over about {2 * float(f'{width:.3g}'):.2g} {unit}, of {{size}}"
-            found.append(Form("step", signal, (soft,), over, 2, at))
-    return found
-
-
-def bands(span: Span, places: Values) -> list[Form]:
-    """Return bands between any two of some places, as differences of the steps there."""
-    found = []
-    for i, j in combinations(range(len(places)), 2):
-        low, high = float(places[i]), float(places[j])
-        text = f"band({span.signal}, {low:.5g}, {high:.5g})"
-        words = f"a band from {low:.3g} to {high:.3g} {UNITS[span.signal]} of {{size}}"
-        found.append(Form("band", span.signal, (text,), words, 2, combination={i: 1.0, j: -1.0}))
-    return found
-
-
-def exponentials(span: Span, constants: Iterable[float]) -> list[Form]:
-    """Return exponentials that decay from the smallest value, or grow towards the largest."""
-    found, signal = [], span.signal
-    for constant in constants:
-        s = span.rounded(constant)
-        decay = f"exp(({span.rounded(span.low):g} - {signal}) / {s:g})"
-        growth = f"exp(({signal} - {span.rounded(span.high):g}) / {s:g})"
-        for text, way in ((decay, "decays"), (growth, "grows")):
-            words = f"an exponential of the {signal} that {way} with a constant of {s:.3g} {UNITS[signal]}"
-            found.append(Form("exponential", signal, (text,), f"{words}, {{size}} in all", place=s))
-    return found
-
-
-def polynomial(signal: str, formulas: tuple[str, ...], order: int) -> Form:
+def polynomial(signal: str, formulas: tuple[str, ...], order: int) -> Factor:
     """Return the sum of some powers of a signal."""
-    of = {"u": "the axis' own signal", "speed": "the speed"}.get(signal, signal)
-    words = f"a polynomial of order {order} in {of}, {{size}} over its span"
-    return Form("polynomial", signal, formulas, words, 0)
+    words = f"a polynomial of order {order} in {NAMES.get(signal, signal)}"
+    return Factor("polynomial", signal, formulas, words, 1 + len(formulas))
 
 
-def finer(form: Form, span: Span) -> list[Form]:
-    """Return forms of the same kind near one: steps at other places, sharp and soft, or other constants."""
-    if form.kind == "step":
-        apart = span.size / PLACES
-        if span.signal == "speed":
-            places = span.places()
-            near = places[np.argsort(np.abs(places - form.place))[:3]]
-            apart = float(np.ptp(near)) / 2.0
-        around = form.place + apart * np.arange(-FINE, FINE + 1) / FINE
-        return steps(span, around) + steps(span, around[::3], [apart * w for w in WIDTHS])
-    if form.kind == "exponential":
-        return exponentials(span, [form.place * f for f in FACTORS])
-    return []
+def finer(factor: Factor, span: Span, apart: float) -> Iterator[Factor]:
+    """Yield factors of the same kind about one, ``apart`` of the coarse scan's distance between them."""
+    steps = apart * np.arange(-FINER, FINER + 1) / FINER
+    if factor.kind == "step":
+        places = factor.constants[0] + steps * span.size / PLACES
+        if len(factor.constants) == 1:
+            yield from (step(span, a) for a in places)
+            return
+        for width in factor.constants[1] * np.array(WIDTHS):
+            yield from (step(span, a, max(width, SHARPEST * span.size)) for a in places)
+    elif factor.kind in ("exponential", "growth"):
+        constants = factor.constants[0] * (CONSTANTS[1] / CONSTANTS[0]) ** steps
+        yield from (exponential(span, c, growth=factor.kind == "growth") for c in constants)
 
 
 def described(form: Form, sizes: Values, axes: Sequence[int], sensor: str) -> str:
@@ -228,10 +320,11 @@ def described(form: Form, sizes: Values, axes: Sequence[int], sensor: str) -> st
 
     ``sizes`` are amplitude, height or whole change on each axis, unit of the sensor; signed where a sign has a meaning.
     """
-    unit, factor = unit_of(sensor), 1.0
+    unit, scale = unit_of(sensor), 1.0
     if form.kind == "ripple":
-        unit, factor = "%", 100.0
+        unit, scale = "%", 100.0
     elif sensor == "accelerometer" and float(np.abs(sizes).max()) < 0.1:
-        unit, factor = "mg", 1e3
-    values = factor * (sizes if form.kind in ("step", "band") else np.abs(sizes))
-    return form.words.format(size=listed([f"{values[c]:.3g} {unit} on {'xyz'[c]}" for c in axes]))
+        unit, scale = "mg", 1e3
+    signed = form.kind in ("step", "band") and form.modulator is None
+    values = scale * (sizes if signed else np.abs(sizes))
+    return form.described().format(size=listed([f"{values[c]:.3g} {unit} on {'xyz'[c]}" for c in axes]))

@@ -48,8 +48,8 @@ ABOVE = 1.1  # times the white noise: a residual that may hold something sudden
 SIGNALS = {"temperature": "temperature", "time": "time", "rate": "speed"}  # of covariates in which steps are tried
 
 
-def dependences(selection: Selection, explained: Curves | None = None) -> list[tuple[str, float]]:
-    """Return the covariates on which the residual still depends, each with its p-value, the likeliest first.
+def dependences(selection: Selection, explained: Curves | None = None) -> list[tuple[str, float, float]]:
+    """Return the covariates on which the residual depends, with p-value and delta BIC, the likeliest first.
 
     Curves ``explained`` (motion to (n, m) values) count as explained.
     """
@@ -62,7 +62,7 @@ def dependences(selection: Selection, explained: Curves | None = None) -> list[t
         free = [replace(setting, prior=least) for setting in selection_grid(None)]
         freely = _significant(replace(selection, settings=[*selection.settings, *free]), explained)
         found = {name: values for name, values in freely.items() if name in found}
-    return [(name, p) for name, (_, p) in sorted(found.items(), key=lambda item: -item[1][0])]
+    return [(name, p, delta) for name, (delta, p) in sorted(found.items(), key=lambda item: -item[1][0])]
 
 
 def _significant(selection: Selection, explained: Curves | None) -> dict[str, tuple[float, float]]:

@@ -22,9 +22,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.estimation.design import felt
-from pipeline.estimation.gauss_markov import WHITE, Products
+from pipeline.estimation.gauss_markov import WHITE, GaussMarkov, Products
 from pipeline.estimation.generalized_least_squares import design_at
-from pipeline.estimation.ranking import projection
+from pipeline.estimation.ranking import RIDGE, projection
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -51,7 +51,63 @@ class Gain:
     setting: int  # index of its best noise setting
 
 
-class ProjectedCurves:
+class _Evidence:
+    """The likelihood of a fit under every noise setting, by what further columns explain of its residual."""
+
+    def __init__(self, selection: Selection) -> None:
+        self.scale = selection.start.scale
+        self.samples = 3.0 * selection.observations.samples
+        self.within = float(np.sum(selection.observations.scatter / self.scale**2))
+        self.settings = [WHITE, *selection.settings]
+        self.left: Values = np.zeros((len(selection.settings), 3))
+        self.penalty: Values = np.zeros(len(selection.settings))
+
+    def _set(self, left: Values, logarithms: Values) -> None:
+        """Set what base and effects leave, (t, 3), and log det C of one channel, white noise alone first."""
+        self.left = left
+        self.penalty = 1.5 * logarithms[1:] - np.array([setting.prior for setting in self.settings[1:]])
+        self.before = float(self._log_likelihood(self.left.sum(axis=1)).max())
+
+    def _log_likelihood(self, rss: Values) -> Values:
+        """Return the log likelihood under each noise setting, (t, ...), of whitened sums of squares."""
+        total = np.maximum(rss + self.within, 1e-300)
+        penalty = self.penalty.reshape(-1, *[1] * (rss.ndim - 1))
+        found: Values = -0.5 * self.samples * np.log(total / self.samples) - penalty
+        return found
+
+    def gains(self, drops: Values, parameters: int | NDArray[np.intp]) -> Values:
+        """Return delta BIC of forms on all three axes, from their (t, 3, m) drops and numbers of parameters: (m,)."""
+        rss = self.left.sum(axis=1)[:, None] - drops.sum(axis=1)
+        best = self._log_likelihood(rss).max(axis=0)
+        found: Values = 2.0 * (best - self.before) - parameters * float(np.log(self.samples))
+        return found
+
+    def best_axes(self, drops: Values, columns: int, scanned: int | NDArray[np.intp] = 0) -> list[Gain]:
+        """Return what each form explains, on the axes that it improves.
+
+        Their (t, 3, m) ``drops`` are those of so many columns on each axis; ``scanned`` counts parameters such as a
+        place.
+        """
+        from scipy.special import chdtrc  # noqa: PLC0415  (0.1 s that only a diagnosis pays)
+
+        order = np.argsort(-drops.max(axis=0), axis=0)
+        together = np.cumsum(np.take_along_axis(drops, order[None], axis=1), axis=1)
+        likelihoods = self._log_likelihood(self.left.sum(axis=1)[:, None, None] - together)
+        gained = np.maximum(2.0 * (likelihoods.max(axis=0) - self.before), 0.0)
+        k = columns * np.arange(1, 4)[:, None] + scanned
+        delta, p = gained - k * float(np.log(self.samples)), chdtrc(k, gained)
+        best, at = delta.argmax(axis=0), likelihoods.argmax(axis=0)
+        return [
+            Gain(float(delta[a, m]), float(p[a, m]), tuple(sorted(order[: a + 1, m].tolist())), int(at[a, m]))
+            for m, a in enumerate(best.tolist())
+        ]
+
+    def gain(self, drop: Values, columns: int, scanned: int = 0) -> Gain:
+        """Return what one form explains, on the axes that it improves; ``drop`` as for ``best_axes``, (t, 3)."""
+        return self.best_axes(drop[:, :, None], columns, scanned)[0]
+
+
+class ProjectedCurves(_Evidence):
     """Products of curves and residual after base and effects are projected out of them.
 
     Parameters
@@ -65,24 +121,12 @@ class ProjectedCurves:
     """
 
     def __init__(self, selection: Selection, curves: Curves, explained: Curves | None = None) -> None:
-        observations, design = selection.observations, design_at(selection.observations, selection.fit)
-        self.scale = selection.start.scale
-        self.samples = 3.0 * observations.samples
-        self.within = float(np.sum(observations.scatter / self.scale**2))
-        motions = [felt(part, selection.fit.terms) for part in observations.parts]
-        columns, places = [design.columns.columns], [[design.places(c)[0]] for c in range(3)]
-        for further in filter(None, (explained, curves)):
-            values = np.concatenate([further(motion) for motion in motions])
-            first, apart = sum(c.shape[1] for c in columns), values.shape[2] if values.ndim == 3 else 0
-            for c in range(3):
-                places[c].append(first + c * apart + np.arange(values.shape[-1]))
-            columns.append(values.reshape(len(values), -1))
-        A, weight = np.concatenate(columns, axis=1), observations.weight
-        self.size = np.sqrt(np.einsum("i,ij,ij->j", weight, A, A))[places[0][-1]]
-        settings = list(selection.settings)
-        stacked, logarithms = Products(observations.blocks, weight, A).products([WHITE, *settings])
-        self.penalty = 1.5 * logarithms[1:] - np.array([setting.prior for setting in settings])
+        super().__init__(selection)
+        observations, (A, places) = selection.observations, _columns(selection, explained, curves)
+        self.size = np.sqrt(np.einsum("i,ij,ij->j", observations.weight, A, A))[places[0][-1]]
+        stacked, logarithms = Products(observations.blocks, observations.weight, A).products(self.settings)
         self._project(stacked, places)
+        self._set(self.left, logarithms)
 
     def _project(self, products: Values, places: Sequence[Sequence[NDArray[np.intp]]]) -> None:
         """Project base and effects out of curves and residual: products inner, cross and left, by noise and axis."""
@@ -106,14 +150,6 @@ class ProjectedCurves:
         self.cross: Values = np.stack(cross, axis=1)[1:] * over[:, :, None]
         self.left: Values = np.stack(left, axis=1)[1:] * over
         self.error: Values = np.stack(error, axis=1)[1:] / self.scale[:, None]
-        self.before = float(self._log_likelihood(self.left.sum(axis=1)).max())
-
-    def _log_likelihood(self, rss: Values) -> Values:
-        """Return the log likelihood under each noise setting, (t, ...), of whitened sums of squares."""
-        total = np.maximum(rss + self.within, 1e-300)
-        penalty = self.penalty.reshape(-1, *[1] * (rss.ndim - 1))
-        found: Values = -0.5 * self.samples * np.log(total / self.samples) - penalty
-        return found
 
     def independent(self, index: Iterable[int]) -> list[int]:
         """Return the curves of ``index`` that are independent of base, effects and the curves before them."""
@@ -155,31 +191,6 @@ class ProjectedCurves:
             error += np.abs(taken) * error[:, :, j : j + 1]
         return explained, independent
 
-    def gains(self, drops: Values, parameters: int | NDArray[np.intp]) -> Values:
-        """Return delta BIC of forms on all three axes, from their (t, 3, m) drops and numbers of parameters: (m,)."""
-        rss = self.left.sum(axis=1)[:, None] - drops.sum(axis=1)
-        best = self._log_likelihood(rss).max(axis=0)
-        found: Values = 2.0 * (best - self.before) - parameters * float(np.log(self.samples))
-        return found
-
-    def gain(self, drop: Values, columns: int, scanned: int = 0) -> Gain:
-        """Return what one form explains, on the axes that it improves.
-
-        Its (t, 3) ``drop`` is that of so many columns on each axis; ``scanned`` counts parameters such as a place.
-        """
-        from scipy.special import chdtrc  # noqa: PLC0415  (0.1 s that only a diagnosis pays)
-
-        order = np.argsort(-drop.max(axis=0))
-        found = []
-        for axes in (order[:1], order[:2], order):
-            likelihoods = self._log_likelihood(self.left.sum(axis=1) - drop[:, axes].sum(axis=1))
-            at = int(np.argmax(likelihoods))
-            gained = max(2.0 * (float(likelihoods[at]) - self.before), 0.0)
-            k = columns * len(axes) + scanned
-            delta = gained - k * float(np.log(self.samples))
-            found.append(Gain(delta, float(chdtrc(k, gained)), tuple(sorted(int(a) for a in axes)), at))
-        return max(found, key=lambda gain: gain.delta_bic)
-
     def coefficients(self, index: Sequence[int], setting: int) -> Values:
         """Return the estimates of some curves under one noise: (3, r) array, unit of the sensor.
 
@@ -191,3 +202,96 @@ class ProjectedCurves:
         known = np.where(both, inner, np.eye(len(index)))
         found: Values = np.linalg.solve(known, (cross * independent)[..., None])[..., 0]
         return found
+
+
+class Scan(_Evidence):
+    """What each of many forms explains by itself, without the products between forms; arguments as above."""
+
+    def __init__(self, selection: Selection, explained: Curves | None = None) -> None:
+        super().__init__(selection)
+        observations, (A, places) = selection.observations, _columns(selection, explained)
+        self.blocks, self.weight = observations.blocks, observations.weight
+        self._label = self.blocks.label(len(self.weight))
+        self._noise = GaussMarkov(self.blocks, self.settings)
+        self._model = []
+        left = []
+        for index in places:
+            order = np.concatenate([index[0][:-1], *index[1:], index[0][-1:]])
+            inside, means = self._whitened(A[:, order])
+            products = means @ means.transpose(0, 2, 1) + inside.T @ inside
+            k = len(order) - 1
+            size = np.sqrt(np.einsum("tpp->tp", products[:, :k, :k]))
+            size = np.where(size > 0.0, size, 1.0)
+            scaled = products[:, :k, :k] / (size[:, :, None] * size[:, None, :]) + RIDGE * np.eye(k)
+            inverse = np.linalg.inv(scaled) / (size[:, :, None] * size[:, None, :])
+            target = products[:, :k, k]
+            left.append(products[:, k, k] - np.einsum("tp,tpq,tq->t", target, inverse, target))
+            self._model.append((inside, means, inverse, products))
+        logarithms = self._noise.log_determinant + np.sum(np.log(self.blocks.weight))
+        self._set(np.stack(left, axis=1)[1:] / self.scale**2, logarithms)
+
+    def _whitened(self, columns: Values) -> tuple[Values, Values]:
+        """Return (n, q) columns about the means of their blocks, and these, whitened: (n, q) and (t, q, m) arrays."""
+        means = self.blocks.sums(self.weight[:, None] * columns) / self.blocks.weight[:, None]
+        return np.sqrt(self.weight)[:, None] * (columns - means[self._label]), self._noise.whitened(means)
+
+    def drops(self, columns: Values) -> Values:
+        """Return what forms explain under each noise on each axis: (t, 3, m) array.
+
+        ``columns``: (n, m, r) of m forms with r coefficients, or (n, 3, m, r) where each axis has its own.
+        """
+        *_, m, r = columns.shape
+        found = np.zeros((len(self.left), 3, m))
+        each = [columns] if columns.ndim == 3 else [columns[:, c] for c in range(3)]
+        whitened = [self._whitened(z.reshape(len(z), m * r)) for z in each]
+        for c in range(3):
+            found[:, c] = self._explained(*whitened[c % len(whitened)], c, r) / self.scale[c] ** 2
+        return found
+
+    def _explained(self, inside: Values, means: Values, c: int, r: int) -> Values:
+        """Return what forms of r whitened columns each explain on an axis: (t, m) array."""
+        own_inside, own_means, inverse, products = self._model[c]
+        t, q, _ = means.shape
+        k = len(inverse[0])
+        across = means @ own_means.transpose(0, 2, 1) + inside.T @ own_inside
+        taken = across[:, :, :k] @ inverse
+        cross = (across[:, :, k] - np.einsum("tqp,tp->tq", taken, products[:, :k, k])).reshape(t, q // r, r)
+        inner = np.empty((t, q // r, r, r))
+        for i in range(r):
+            for j in range(r):
+                both = np.sum(means[:, i::r] * means[:, j::r], axis=2)
+                both += np.sum(inside[:, i::r] * inside[:, j::r], axis=0)
+                inner[:, :, i, j] = both - np.sum(taken[:, i::r] * across[:, j::r, :k], axis=2)
+        size = np.sqrt(np.maximum(np.sum(means[0] ** 2, axis=1) + np.sum(inside**2, axis=0), 0.0))
+        known = np.sqrt(np.einsum("pp->p", products[0, :k, :k]))
+        unit = (ROUNDING * np.sqrt(self.samples / 3.0)) ** 0.5
+        error = (unit * (size + np.abs(taken) @ known)).reshape(t, q // r, r)
+        return self._eliminated(inner, cross, error, size.reshape(q // r, r))
+
+    @staticmethod
+    def _eliminated(inner: Values, cross: Values, error: Values, size: Values) -> Values:
+        """Return what the columns of each form explain together, 0 where base and effects hold one of them."""
+        found, new = np.zeros(cross.shape[:2]), np.ones(cross.shape[:2], bool)
+        for j in range(cross.shape[2]):
+            pivot = inner[:, :, j, j]
+            new &= (pivot > error[:, :, j] ** 2) & (pivot[0] > (NEW * size[:, j]) ** 2)
+            over = np.where(new, 1.0 / np.where(new, pivot, 1.0), 0.0)
+            found += cross[:, :, j] ** 2 * over
+            taken = inner[:, :, j] * over[:, :, None]
+            cross = cross - taken * cross[:, :, j : j + 1]
+            inner = inner - taken[:, :, :, None] * inner[:, :, j, None, :]
+        return np.asarray(np.where(new, found, 0.0)[1:])
+
+
+def _columns(selection: Selection, *further: Curves | None) -> tuple[Values, list[list[NDArray[np.intp]]]]:
+    """Return the columns of a selection's fit, its residual and those of curves, and where those of each axis lie."""
+    design = design_at(selection.observations, selection.fit)
+    motions = [felt(part, selection.fit.terms) for part in selection.observations.parts]
+    columns, places = [design.columns.columns], [[design.places(c)[0]] for c in range(3)]
+    for curves in filter(None, further):
+        values = np.concatenate([curves(motion) for motion in motions])
+        first, apart = sum(c.shape[1] for c in columns), values.shape[2] if values.ndim == 3 else 0
+        for c in range(3):
+            places[c].append(first + c * apart + np.arange(values.shape[-1]))
+        columns.append(values.reshape(len(values), -1))
+    return np.concatenate(columns, axis=1), places

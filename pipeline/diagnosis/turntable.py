@@ -6,12 +6,13 @@ logged, else the rms error of the magnitude, against the noise floor of ``pipeli
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pipeline.diagnosis.findings import Findings
-from pipeline.diagnosis.functional_form_search import select_with_form, suggested_effect, unexplained
+from pipeline.diagnosis.formula_discovery import Discovery, dependent, discover
 from pipeline.diagnosis.method_errors import method_errors
 from pipeline.diagnosis.observability import never_shown, not_observable, one_way
 from pipeline.diagnosis.residual_plots import plots
@@ -61,8 +62,29 @@ def findings(
     sensor, sheet = calibration.sensor, settings["sensor"][calibration.sensor]
     observations = observe(sensor, recordings, settings["table"])
     selection = select(observations, configured, noise, sheet, calibration, accelerometer=accelerometer)
-    unknown = unexplained(selection)
-    reported = select_with_form(selection, unknown, configured, noise, sheet, accelerometer=accelerometer)
+    unknown = dependent(selection)
+
+    def described(discovery: Discovery) -> Findings:
+        return _described(discovery, calibration, recordings, noise, settings, configured)
+
+    def search() -> Findings | None:
+        found = discover(selection, unknown, configured, noise, sheet, accelerometer=accelerometer)
+        return described(found) if found.suggested else None
+
+    return replace(described(Discovery(selection, selection, unknown)), search=search)
+
+
+def _described(
+    discovery: Discovery,
+    calibration: SensorCalibration,
+    recordings: Sequence[Recording],
+    noise: Noise | None,
+    settings: Mapping[str, Any],
+    configured: list[str],
+) -> Findings:
+    """Return what was selected and discovered in common terms."""
+    sensor, selection, reported = calibration.sensor, discovery.context, discovery.reported
+    observations, unknown = selection.observations, discovery.unknown
     fits = _fits(reported)
     held, floor = _held_out(reported, fits, recordings, noise, settings["table"])
     held_out = None
@@ -134,7 +156,8 @@ def findings(
         full=(lambda: calibrated(selection.fit)) if selection.names else None,
         more={
             "held_out": held_out,
-            "suggested_effect": None if reported is selection else suggested_effect(unknown, sensor, catalogue()),
+            "suggested_effect": discovery.suggested,
+            "formulas": discovery.front,
             "pictures": plots(selection, unknown, noise, reported),
             "method_errors": method_errors(calibration, reported, recordings, settings),
         },

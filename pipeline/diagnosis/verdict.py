@@ -361,6 +361,11 @@ def judged(document: dict[str, Any], e: Evidence) -> dict[str, Any]:
     return document | given | decided
 
 
+def may_be_unknown(verdict: str, e: Evidence) -> bool:
+    """Return whether physics outside the catalogue may be the cause: no check of the recordings names another."""
+    return verdict == "unexplained" or (verdict == "reference_in_doubt" and not e.doubts)
+
+
 def _offered(verdict: str, document: Mapping[str, Any], e: Evidence) -> bool:
     """Return whether to offer the selected effects.
 

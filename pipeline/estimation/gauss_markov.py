@@ -226,6 +226,11 @@ class GaussMarkov:
 
     def products(self, columns: Values) -> Values:
         """Return ``A^T C^-1 A`` of (m, p) columns: (g, p, p) array."""
+        whitened = self.whitened(columns)
+        return np.asarray(whitened @ whitened.transpose(0, 2, 1))
+
+    def whitened(self, columns: Values) -> Values:
+        """Return ``R A`` with ``R^T R = C^-1`` of (m, p) columns, blocks last and in order: (g, p, m) array."""
         # blocks, columns, settings: numpy is fast where the last axis is long and contiguous
         half, phi, below = (np.ascontiguousarray(v.T) for v in (self._half, self._phi, self._e_by_setting()))
         z = columns[self._order][:, :, None] / half[:, None, :]
@@ -233,8 +238,7 @@ class GaussMarkov:
         for k in range(1, len(z)):  # T = L D L^T: z = L^-1 w
             z[k] -= below[k - 1] * z[k - 1]
         z /= np.sqrt(np.ascontiguousarray(self._d.reshape(self._half.shape).T))[:, None, :]
-        whitened = np.ascontiguousarray(z.transpose(2, 1, 0))
-        return np.asarray(whitened @ whitened.transpose(0, 2, 1))
+        return np.ascontiguousarray(z.transpose(2, 1, 0))
 
     def _e_by_setting(self) -> Values:
         """Return the subdiagonal of L at every setting: (g, m - 1) array."""

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.diagnosis.diagnose import diagnose
 from pipeline.diagnosis.effective_noise import effective_noise
-from pipeline.diagnosis.functional_form_search import effect_file
+from pipeline.diagnosis.formula_discovery import effect_file
 from pipeline.files import read_json, write_atomically, write_json
 from pipeline.io.parquet import load_recordings
 from pipeline.stages.unit_files import load_fits, require_noises

@@ -14,8 +14,8 @@ import yaml
 from bench_session import CONTINUOUS, SIZE, STOP_AND_GO, Course, Session, record, values_of
 
 from pipeline.diagnosis.diagnose import diagnose
-from pipeline.diagnosis.functional_form_search import effect_file, suggested_effect, unexplained
-from pipeline.diagnosis.functional_forms import columns_of, harmonics
+from pipeline.diagnosis.formula_discovery import dependent, effect_file, suggested_effect
+from pipeline.diagnosis.functional_forms import columns_of, harmonic
 from pipeline.diagnosis.residual_regression import ProjectedCurves
 from pipeline.diagnosis.words import in_words
 from pipeline.estimation.design import Term
@@ -179,7 +179,7 @@ def test_a_shape_gains_what_a_joint_fit_with_it_gains() -> None:
     }
     terms = [*selection.fit.terms, Term(effect_from(definition, "test"), np.zeros(6))]
     fit = fit_terms(selection.observations, terms, selection.start, selection.settings)
-    formulas = harmonics()[4].formulas
+    formulas = harmonic(5).texts
     projected = ProjectedCurves(selection, columns_of(formulas, "gyroscope"))
     drop = projected.drop([0, 1])[:, :, -1]
     expected = 2.0 * (fit.log_likelihood - selection.fit.log_likelihood) - 6.0 * np.log(projected.samples)
@@ -216,7 +216,7 @@ def test_slow_effects_that_a_slow_wander_nearly_hides_are_judged() -> None:
 
 def test_names_that_are_taken_are_not_given_again() -> None:
     entry = {"covariate": "angle", "shape": "5 cycles", "kind": "harmonic", "formulas": ["cos(angle)"], "axes": ["x"]}
-    entry["unit"] = "g"
+    entry["units"] = ["g"]
     made = suggested_effect([entry], "accelerometer", {"unknown_angle", "unknown_angle_2"})
     assert made is not None
     assert made["name"] == "unknown_angle_3"
@@ -232,4 +232,4 @@ def test_nothing_is_guessed_in_sixty_units_without_anything_unknown(sensor: str,
         session = Session(
             9000 + seed, courses[seed % 3], wander=wander, static=bool(seed % 2), ramp=15.0 * (seed % 5 == 0)
         )
-        assert unexplained(selection_of(sensor, record(session))) == [], seed
+        assert dependent(selection_of(sensor, record(session))) == [], seed
