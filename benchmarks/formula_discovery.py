@@ -281,18 +281,19 @@ def main() -> None:
     parser.add_argument("what", choices=("hidden", "null"))
     parser.add_argument("out", type=Path)
     parser.add_argument("--n", type=int, default=20)
+    parser.add_argument("--first", type=int, default=0, help="number of the first one, to divide a long study")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--depth", default="standard", choices=("standard", "full"))
     arguments = parser.parse_args()
     lines = [json.loads(line) for line in arguments.out.read_text().splitlines()] if arguments.out.is_file() else []
     done, of = {line["number"] for line in lines}, {"hidden": hidden, "null": null}[arguments.what]
     with arguments.out.open("a", encoding="utf-8") as file:
-        for number in range(arguments.n):
+        for number in range(arguments.first, arguments.first + arguments.n):
             if number not in done:
                 lines.append(of(number, arguments.seed, arguments.depth))
                 file.write(json.dumps(lines[-1], default=float) + "\n")
                 file.flush()
-                print(f"\r{number + 1} of {arguments.n}", end="", file=sys.stderr)
+                print(f"\r{len(lines)} of {arguments.n}", end="", file=sys.stderr)
     print()
     if arguments.what == "hidden":
         _share("exact form", [line["exact"] for line in lines])

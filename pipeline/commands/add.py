@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from contextlib import suppress
+from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,8 +13,8 @@ import yaml
 from pipeline.commands.run import add_run_options, run_snakemake
 from pipeline.config.campaign import find_campaign, read_layers
 from pipeline.config.devices import edit_effects, sensor_and_effect
-from pipeline.errors import ConfigurationError, MissingInputError
-from pipeline.files import write_atomically
+from pipeline.errors import ConfigurationError, MissingInputError, PipelineError
+from pipeline.files import read_json, write_atomically
 from pipeline.outcome import RESULTS, read_summary, run_command
 from pipeline.records import SENSORS
 
@@ -28,6 +29,7 @@ examples:
   python -m pipeline add my_bench U1 gyroscope.g_sensitivity accelerometer.lever_arm --no-run
   python -m pipeline add my_fleet --missing                 to each unit, the missing effects of its own diagnosis
   python -m pipeline add my_fleet --missing g_sensitivity   only this effect, in the units where it is missing
+  python -m pipeline add my_bench U1 --suggested            the formula that the diagnosis suggests, as effects/*.yaml
   python -m pipeline remove demo mpu6050-2-hidden gyroscope.g_sensitivity
 
 Effects that are set in units.csv or on the command line override the file: the command is then refused, and names the
@@ -45,7 +47,52 @@ def main(argv: Sequence[str]) -> int:
         metavar="EFFECT",
         help="add to every unit the effects that are missing by the last run (or only EFFECT)",
     )
-    return change(parser.parse_args(argv), remove=False)
+    parser.add_argument(
+        "--suggested",
+        action="store_true",
+        help="write the formulas that the last run suggests for the unit to effects/, and add them",
+    )
+    arguments = parser.parse_args(argv)
+    if not arguments.suggested:
+        return change(arguments, remove=False)
+    written, arguments.effects = _write_suggested(arguments)
+    try:
+        return change(arguments, remove=False)
+    except PipelineError:
+        for file in written:
+            file.unlink()
+        raise
+
+
+def _write_suggested(arguments: argparse.Namespace) -> tuple[list[Path], list[str]]:
+    """Write the formulas suggested for a unit as effects of the campaign; return the new files and SENSOR.EFFECT."""
+    if not arguments.unit or arguments.effects:
+        raise ConfigurationError("--suggested takes a unit and no effects: it reads them from the results")
+    directory = find_campaign(arguments.campaign)
+    diagnoses = Path(arguments.results) / directory.name / "diagnoses"
+    document = diagnoses / f"{arguments.unit}.json"
+    if not document.is_file():
+        advice = "run the campaign first, or publish the unit's files (python -m pipeline unpack)"
+        raise MissingInputError(f"does not exist: {advice}", str(document))
+    parts = read_json(document)
+    found = {s: parts[s] for s in SENSORS if parts.get(s) and parts[s].get("suggested_effect")}
+    if not found:
+        raise ConfigurationError("the diagnosis suggests no formula for this unit", str(document))
+    written, names = [], []
+    for sensor, part in found.items():
+        text, plain = (diagnoses / part["suggested_file"]).read_text(encoding="utf-8"), part["suggested_effect"]["name"]
+        for name in chain([plain], (f"{plain}_{k}" for k in count(2))):
+            file = directory / "effects" / f"{name}.yaml"
+            own = text.replace(plain, name)
+            if not file.is_file():
+                file.parent.mkdir(exist_ok=True)
+                write_atomically(file, own)
+                print(f"{file} written")
+                written.append(file)
+            if file.read_text(encoding="utf-8") == own:
+                names.append(f"{sensor}.{name}")
+                break
+    return written, names
 
 
 def change(arguments: argparse.Namespace, *, remove: bool) -> int:

@@ -199,6 +199,12 @@ class Uncertainty(Section):
     monte_carlo: Annotated[int, Field(ge=0, le=10_000_000)]
 
 
+class Diagnosis(Section):
+    """How much a diagnosis computes."""
+
+    depth: Literal["standard", "full"]
+
+
 class SensorLimits(Section):
     """What a unit must keep to pass; None is not checked."""
 
@@ -323,6 +329,7 @@ class Unit(Section):
     ingest: Ingest
     effects: Effects
     uncertainty: Uncertainty
+    diagnosis: Diagnosis
     limits: Limits
     certificate: Certificate
 

@@ -78,7 +78,7 @@ READS: dict[str, tuple[str, ...]] = {
         "method", "ingest.csv", "ingest.mcap", "config_sha256",
     ),
     "validate": (*SENSORS_AND_TABLE, "limits"),
-    "diagnose": (*SENSORS_AND_TABLE, "effects", "method"),
+    "diagnose": (*SENSORS_AND_TABLE, "effects", "method", "diagnosis"),
     "export": ("sensor", "table.gravity_g"),
     "report": (
         "sensor", "table", "procedure", "method", "filter", "ingest", "effects", "limits", "certificate",

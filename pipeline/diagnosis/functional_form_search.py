@@ -14,7 +14,8 @@ better score after another selection with the form in the base is reported.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -23,6 +24,8 @@ from pipeline.diagnosis.functional_forms import Form, Span
 from pipeline.diagnosis.residual_regression import ProjectedCurves, Scan
 from pipeline.estimation.design import felt
 from pipeline.model.effects import catalogue
+from pipeline.model.effects.base import truth
+from pipeline.model.formula import parse
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -38,6 +41,7 @@ if TYPE_CHECKING:
 
 PRICE = 2.0 * float(np.log(10.0))  # of a choice: log prior of one of about ten signals, functions or powers
 CLEARLY = 10.0  # score of a form, and of a further term: "very strong" (Raftery, Sociological Methodology 25, 1995)
+SLOWLY = 30.0  # the same of a form in time and temperature alone: HIGHEST_GATE of the selection
 MORE = 0.02  # of the first term's delta BIC that a further one must have: less may be its constants' rounding
 MOST_TERMS = 3
 REFINED = 16  # forms that are scored under every noise setting, and whose constants are refined
@@ -58,27 +62,41 @@ class Scored:
         """Delta BIC less the price of the form's complexity."""
         return self.gain.delta_bic - PRICE * self.form.complexity
 
+    @property
+    def clear(self) -> bool:
+        """Whether the evidence is very strong; wander of another kind than the model's looks like a slow form."""
+        signals = {factor.signal for factor in (self.form.factor, self.form.modulator) if factor}
+        return self.score > (SLOWLY if signals <= {"time", "temperature"} else CLEARLY)
+
 
 class Forms:
-    """The forms of the grammar that a unit's recordings can show, and what each gains beside a fit.
+    """The forms of the grammar that a unit's recordings can show, and what each gains beside a fit."""
 
-    ``explained``: formulas that count as explained.
-    """
-
-    def __init__(self, selection: Selection, explained: Sequence[str] = ()) -> None:
+    def __init__(self, selection: Selection) -> None:
         self.selection, self.sensor = selection, selection.observations.sensor
-        of = forms.columns_of(explained, self.sensor) if explained else None
-        self.explained = of
-        self.scan = Scan(selection, of)
-        self._coarse = Scan(replace(selection, settings=_few_settings(selection)), of)
-        self._motions = [felt(part, selection.fit.terms) for part in selection.observations.parts]
+        motions = [felt(part, selection.fit.terms) for part in selection.observations.parts]
+        self._signals = [(forms.signals_of(motion), truth(self.sensor, motion)) for motion in motions]
         self._known: dict[str, Values] = {}
+        self.explain(())
+
+    def explain(self, formulas: Sequence[str]) -> None:
+        """Count formulas as explained from now on."""
+        self.explained = forms.columns_of(formulas, self.sensor) if formulas else None
+        self.scan = Scan(self.selection, self.explained)
 
     def column(self, text: str) -> Values:
         """Return a formula's values: (n,) array, or (n, 3) where each axis has its own."""
         if text not in self._known:
-            of = forms.columns_of([text], self.sensor)
-            self._known[text] = np.concatenate([of(motion) for motion in self._motions])[..., 0]
+            formula = parse(text)
+            found = []
+            for signals, u in self._signals:
+                each = [
+                    forms.value(formula, signals | {"u": u[:, c]}) for c in range(3 if "u" in formula.signals else 1)
+                ]
+                found.append(np.stack(each, axis=1))
+            self._known[text] = np.concatenate(found)
+            if "u" not in formula.signals:
+                self._known[text] = self._known[text][:, 0]
         return self._known[text]
 
     def columns(self, form: Form) -> Values:
@@ -93,7 +111,8 @@ class Forms:
 
     def gains(self, tried: Sequence[Form], *, coarse: bool = False) -> list[Gain]:
         """Return what each form gains; ``coarse``: under few noise settings."""
-        scan = self._coarse if coarse else self.scan
+        few = _few_settings(self.selection)
+        scan = Scan(replace(self.selection, settings=few), self.explained) if coarse else self.scan
         found: dict[int, Gain] = {}
         kinds: dict[tuple[int, bool], list[int]] = {}
         for k, form in enumerate(tried):
@@ -110,8 +129,7 @@ class Forms:
 
     def ranked(self) -> list[Scored]:
         """Return the best form of each name, best score first."""
-        spans = self._spans()
-        tried = self._tried(spans)
+        spans, tried = self._spans, self._tried
         scored = [Scored(form, gain) for form, gain in zip(tried, self.gains(tried, coarse=True), strict=True)]
         best = _best_of_each(scored)[:REFINED]
         best = [Scored(e.form, g) for e, g in zip(best, self.gains([each.form for each in best]), strict=True)]
@@ -125,6 +143,7 @@ class Forms:
             best = _best_of_each([*best, *(Scored(f, g) for f, g in zip(near, self.gains(near), strict=True))])
         return _best_of_each([*best, *(self._polynomial(span) for span in [*spans.values(), None])])
 
+    @cached_property
     def _spans(self) -> dict[str, Span]:
         """Return the spans of the signals that all recordings hold."""
         observations = self.selection.observations
@@ -135,8 +154,10 @@ class Forms:
         names += ["time"] if observations.clock_shared else []
         return {name: Span.of(observations, name) for name in names}
 
-    def _tried(self, spans: dict[str, Span]) -> list[Form]:
+    @cached_property
+    def _tried(self) -> list[Form]:
         """Return the forms of the coarse scan; of equal ones the simplest, and none of the catalogue."""
+        spans = self._spans
         turning = any(part.motion.axis is not None for part in self.selection.observations.parts)
         factors = forms.factors(spans, turning=turning)
         pairs = [
@@ -210,15 +231,15 @@ def _best_of_each(scored: Iterable[Scored]) -> list[Scored]:
 def search(selection: Selection) -> tuple[list[Scored], list[Scored]]:
     """Return the terms of the best form beside what is selected, none where it is not clearly better, and all ranked."""
     terms: list[Scored] = []
-    ranked: list[Scored] = []
-    while len(terms) < MOST_TERMS:
-        held = [text for term in terms for text in term.form.formulas]
-        found = Forms(selection, held).ranked()
-        ranked = ranked or found
-        if found[0].score < CLEARLY or (terms and found[0].gain.delta_bic < MORE * terms[0].gain.delta_bic):
-            break
+    grammar = Forms(selection)
+    first = found = grammar.ranked()
+    while found[0].clear and (not terms or found[0].gain.delta_bic > MORE * terms[0].gain.delta_bic):
         terms.append(found[0])
-    return terms, ranked
+        if len(terms) == MOST_TERMS:
+            break
+        grammar.explain([text for term in terms for text in term.form.formulas])
+        found = grammar.ranked()
+    return terms, first
 
 
 def without_effects(selection: Selection) -> Selection:

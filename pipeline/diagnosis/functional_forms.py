@@ -56,15 +56,15 @@ def columns_of(formulas: Iterable[str], sensor: str) -> Curves:
     def columns(motion: Motion) -> Values:
         signals = signals_of(motion)
         if not any("u" in formula.signals for formula in parsed):
-            return np.stack([_value(formula, signals) for formula in parsed], axis=1)
+            return np.stack([value(formula, signals) for formula in parsed], axis=1)
         u = truth(sensor, motion)
-        each = [[_value(f, signals | {"u": u[:, c]}) for f in parsed] for c in range(3)]
+        each = [[value(f, signals | {"u": u[:, c]}) for f in parsed] for c in range(3)]
         return np.stack([np.stack(axis, axis=1) for axis in each], axis=1)
 
     return columns
 
 
-def _value(formula: Formula, signals: dict[str, Values | None]) -> Values:
+def value(formula: Formula, signals: dict[str, Values | None]) -> Values:
     """Return a formula's values, zero in a recording that lacks one of its signals."""
     known = {name: value for name, value in signals.items() if value is not None}
     size = len(known["time"])
@@ -208,7 +208,9 @@ class Form:
             name = "the rate" if self.kind == "ripple" else NAMES.get(text, text)
             times = f" in proportion to {name}"
         lead = ", amplitude {size}" if self.factor.kind == "harmonic" else ", of {size}"
-        if self.factor.kind in ("power", "magnitude", "polynomial", "exponential", "growth") or (times and lead != ", amplitude {size}"):
+        if self.factor.kind in ("power", "magnitude", "polynomial", "exponential", "growth") or (
+            times and lead != ", amplitude {size}"
+        ):
             lead = ", {size} in all"
         return f"{self.factor.words}{times}{lead}"
 

@@ -41,6 +41,7 @@ UNKNOWN_SHARE = 0.03  # of the gain in 2 log L by what was selected, above which
 LIKELY = 0.5  # probability of something outside the catalogue, above which what was selected is no explanation
 WORSE = 0.3  # of the noise's mean square, by which what was selected may raise the held-out error's at most
 HELPFUL = 0.1  # share of the held-out error's mean square that each effect worth a try takes away
+LEFT_OVER = 1.1  # times the noise floor: four standard deviations of the rms of 3 x 300 samples
 QUIET = 0.6  # times the noise: a residual below it contradicts the noise of the rests
 COMPARED = ("bias", "scale_factor", "non_orthogonality", "rotation")  # parts compared with the uncertainty of both fits
 GIVEN = "given"  # the method that takes an existing calibration; nothing is fitted, and effects cannot be added to it
@@ -362,7 +363,12 @@ def judged(document: dict[str, Any], e: Evidence) -> dict[str, Any]:
 
 
 def may_be_unknown(verdict: str, e: Evidence) -> bool:
-    """Return whether physics outside the catalogue may be the cause: no check of the recordings names another."""
+    """Return whether physics outside the catalogue may be the cause: no check of the recordings names another.
+
+    That includes selected effects with which the held-out error stays above the noise floor.
+    """
+    if verdict == "missing_effect" and e.held_out is not None:
+        return e.held_out["error_after"] > LEFT_OVER * e.held_out["floor"]
     return verdict == "unexplained" or (verdict == "reference_in_doubt" and not e.doubts)
 
 
