@@ -39,6 +39,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.diagnosis.diagnose import diagnose
+from pipeline.errors import PipelineError
 from pipeline.estimation.candidates import candidates_for
 from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.observations import observe
@@ -249,18 +250,20 @@ def hidden(number: int, seed: int, depth: str) -> JSON:
                 "terms": {"A": {"formula": text, "unit": "1"}}}  # fmt: skip
     register(effect_from(truth_of, "the hidden formula"))
     method = "reference_least_squares"
-    best = _held_out(recordings, MODEL, sensor, ["hidden"], method)["after"]
-    try:
-        held = _held_out(recordings, MODEL, sensor, names, method)
-    except Exception as error:  # noqa: BLE001  (counts as not reached)
-        held = {"before": 0.0, "after": np.inf, "floor": 0.0, "error": str(error)}
-    finally:
-        forget()
+
+    def error(names: list[str]) -> JSON:
+        try:
+            return _held_out(recordings, MODEL, sensor, names, method)
+        except PipelineError as refused:  # what is proposed is not observable: the floor is not reached
+            return {"before": 0.0, "after": None, "floor": 0.0, "error": str(refused)}
+
+    best, held = error(["hidden"])["after"] or 0.0, error(names)
+    forget()
     return {
         "number": number, "sensor": sensor, "procedure": way, "hidden": text, "size": size, "cpu_s": spent,
         "verdict": part["verdict"], "selected": part["selected"], "found": texts,
         "exact": bool(texts) and same(text, texts, recordings, case), "held_out": {**held, "best": best},
-        "floor": held["after"] <= AT_FLOOR * max(held["floor"], best),
+        "floor": held["after"] is not None and held["after"] <= AT_FLOOR * max(held["floor"], best),
         "stability": (part.get("formulas") or [{}])[0].get("stability"),
     }  # fmt: skip
 

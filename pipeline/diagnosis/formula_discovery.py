@@ -1,4 +1,4 @@
-"""The formula of physics that the catalogue does not hold, judged against catalogue and recordings, as an effect's file.
+"""The formula of physics that the catalogue does not hold, judged against catalogue and recordings, as an effect file.
 
 The search (``pipeline.diagnosis.functional_form_search``) is made with the selected effects and without them. With each
 form in the base, effects are selected again; of these models, and that of the catalogue alone, the one with the least
@@ -12,6 +12,7 @@ lists, by complexity, the forms that gain more than all simpler ones.
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import chain, count
 from typing import TYPE_CHECKING, Any
@@ -90,7 +91,9 @@ def discover(
         assert definition is not None  # noqa: S101  (there is an entry)
         if 0.0 < FAR_ABOVE * floor < _beside(context, definition).residual_rms:
             continue
-        again = _with_effect(context, definition, configured, noise, sheet, accelerometer)
+        with _registered(definition):
+            names = [*configured, definition["name"]]
+            again = select(context.observations, names, noise, sheet, accelerometer=accelerometer)
         if _worth(again, terms) <= least:
             continue
         least = _worth(again, terms)
@@ -112,19 +115,12 @@ def _beside(context: Selection, definition: dict[str, Any]) -> Fit:
     return fit_terms(context.observations, terms, context.start, context.settings)
 
 
-def _with_effect(
-    context: Selection,
-    definition: dict[str, Any],
-    configured: Sequence[str],
-    noise: Noise | None,
-    sheet: Mapping[str, Any],
-    accelerometer: SensorCalibration | None,
-) -> Selection:
-    """Select again with a form in the base, so that effects of the catalogue no longer take its place."""
+@contextmanager
+def _registered(definition: dict[str, Any]) -> Iterator[None]:
+    """Add a form to the catalogue meanwhile."""
     register(effect_from(definition, "a first guess"))
     try:
-        names = [*configured, definition["name"]]
-        return select(context.observations, names, noise, sheet, accelerometer=accelerometer)
+        yield
     finally:
         forget(definition["name"])
 
@@ -217,7 +213,7 @@ def _stability(selection: Selection, finalists: Sequence[Scored]) -> list[float]
 
 
 def resamples(observations: Observations) -> Iterator[list[Values]]:
-    """Yield the factors of the rows' weights, one array a recording, without each recording, then without each fifth."""
+    """Yield factors of the rows' weights, an array a recording, without each recording, then without each fifth."""
     lengths = [len(part.weight) for part in observations.parts]
     if len(lengths) > 1:
         for out in range(len(lengths)):

@@ -229,7 +229,7 @@ def _best_of_each(scored: Iterable[Scored]) -> list[Scored]:
 
 
 def search(selection: Selection) -> tuple[list[Scored], list[Scored]]:
-    """Return the terms of the best form beside what is selected, none where it is not clearly better, and all ranked."""
+    """Return the terms of the best form beside what is selected, none where none is clear, and all forms ranked."""
     terms: list[Scored] = []
     grammar = Forms(selection)
     first = found = grammar.ranked()

@@ -207,11 +207,10 @@ class Form:
             text = self.modulator.texts[0]
             name = "the rate" if self.kind == "ripple" else NAMES.get(text, text)
             times = f" in proportion to {name}"
-        lead = ", amplitude {size}" if self.factor.kind == "harmonic" else ", of {size}"
-        if self.factor.kind in ("power", "magnitude", "polynomial", "exponential", "growth") or (
-            times and lead != ", amplitude {size}"
-        ):
-            lead = ", {size} in all"
+        height = self.factor.kind in ("step", "band") and not times
+        lead = (
+            ", amplitude {size}" if self.factor.kind == "harmonic" else ", of {size}" if height else ", {size} in all"
+        )
         return f"{self.factor.words}{times}{lead}"
 
 

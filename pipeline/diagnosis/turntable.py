@@ -65,7 +65,7 @@ def findings(
     unknown = dependent(selection)
 
     def described(discovery: Discovery) -> Findings:
-        return _described(discovery, calibration, recordings, noise, settings, configured)
+        return _described(discovery, calibration, recordings, noise, {**settings, "configured": configured})
 
     def search() -> Findings | None:
         found = discover(selection, unknown, configured, noise, sheet, accelerometer=accelerometer)
@@ -80,10 +80,10 @@ def _described(
     recordings: Sequence[Recording],
     noise: Noise | None,
     settings: Mapping[str, Any],
-    configured: list[str],
 ) -> Findings:
-    """Return what was selected and discovered in common terms."""
+    """Return what was selected and discovered in common terms; ``settings`` with the ``configured`` effects."""
     sensor, selection, reported = calibration.sensor, discovery.context, discovery.reported
+    configured = settings["configured"]
     observations, unknown = selection.observations, discovery.unknown
     fits = _fits(reported)
     held, floor = _held_out(reported, fits, recordings, noise, settings["table"])

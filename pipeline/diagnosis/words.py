@@ -135,9 +135,15 @@ def _unknown(part: Mapping[str, Any], sensor: str) -> list[str]:
     effect = part.get("suggested_effect")
     if effect:
         file = part.get("suggested_file", f"<unit>_{sensor}_unknown.yaml")
+        stability = (part.get("formulas") or [{}])[0].get("stability")
+        if stability is not None:
+            lines.append(
+                f"It is the best of all formulas in {100 * stability:.0f} % of the resamples, each without one "
+                "recording or without a fifth of every recording."
+            )
         lines.append(
             f"To try that form, copy diagnoses/{file} from the results to effects/{effect['name']}.yaml in the "
-            f"campaign's directory, and add {sensor}.{effect['name']}."
+            f"campaign's directory, and add {sensor}.{effect['name']}; the option --suggested of add does both."
         )
     return lines
 

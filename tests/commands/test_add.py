@@ -1,13 +1,17 @@
 """Adding effects to units and removing them again: files that keep their content, and refusals that name the place."""
 
+import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from pipeline.commands import add, remove
 from pipeline.config.campaign import load_campaign
 from pipeline.config.devices import set_override
-from pipeline.errors import ConfigurationError, PipelineError
+from pipeline.diagnosis.formula_discovery import effect_file
+from pipeline.errors import ConfigurationError, MissingInputError, PipelineError
+from pipeline.model.effects.files import read_effect_file
 
 SHEET = """unit,serial,overrides
 U1,S1,
@@ -123,3 +127,45 @@ def test_each_unit_gets_what_its_own_diagnosis_found_missing(campaign: Path) -> 
     assert effects(campaign, "U3")["accelerometer"] == ["lever_arm", "hysteresis"]
     with pytest.raises(ConfigurationError, match="lever_arm is missing in no unit"):
         add.main([*words, "lever_arm"])
+
+
+def test_a_suggested_formula_is_written_to_the_campaign_and_added(campaign: Path) -> None:
+    diagnoses = campaign / "results" / campaign.name / "diagnoses"
+    diagnoses.mkdir(parents=True)
+    for unit, cycles in (("U1", 5), ("U3", 7)):
+        terms = {"A": {"formula": f"cos({cycles} * radians(angle))", "unit": "deg/s"}}
+        definition = {"name": "unknown_angle", "owner": "table", "sensors": ["gyroscope"], "meaning": "A gear."}
+        part = {"suggested_effect": definition | {"terms": terms}, "suggested_file": f"{unit}_gyroscope_unknown.yaml"}
+        (diagnoses / part["suggested_file"]).write_text(effect_file(part["suggested_effect"], unit))
+        (diagnoses / f"{unit}.json").write_text(json.dumps({"accelerometer": None, "gyroscope": part}))
+    words = ["--suggested", "--no-run", "--results", str(campaign / "results")]
+    assert add.main([str(campaign), "U1", *words]) == 0
+    assert add.main([str(campaign), "U1", *words]) == 0
+    assert add.main([str(campaign), "U3", *words]) == 0
+    assert effects(campaign, "U1")["gyroscope"] == ["unknown_angle"]
+    assert effects(campaign, "U3")["gyroscope"] == ["unknown_angle_2"]
+    written = sorted(file.name for file in (campaign / "effects").iterdir())
+    assert written == ["unknown_angle.yaml", "unknown_angle_2.yaml"]
+    assert read_effect_file(campaign / "effects" / "unknown_angle_2.yaml").name == "unknown_angle_2"
+    with pytest.raises(MissingInputError, match="run the campaign first"):
+        add.main([str(campaign), "U2", *words])
+    with pytest.raises(ConfigurationError, match="takes a unit and no effects"):
+        add.main([str(campaign), "U1", "gyroscope.time_offset", *words])
+
+
+def test_a_suggested_formula_that_cannot_be_added_leaves_no_file(campaign: Path) -> None:
+    diagnoses = campaign / "results" / campaign.name / "diagnoses"
+    diagnoses.mkdir(parents=True)
+    definition: dict[str, Any] = {
+        "name": "unknown_time",
+        "owner": "recording",
+        "sensors": ["gyroscope"],
+        "meaning": "A step.",
+    }
+    definition["terms"] = {"A": {"formula": "step(time - 5)", "unit": "deg/s"}}
+    (diagnoses / "U2_gyroscope_unknown.yaml").write_text(effect_file(definition, "U2"))
+    part = {"suggested_effect": definition, "suggested_file": "U2_gyroscope_unknown.yaml"}
+    (diagnoses / "U2.json").write_text(json.dumps({"accelerometer": None, "gyroscope": part}))
+    with pytest.raises(PipelineError, match="the column overrides sets"):
+        add.main([str(campaign), "U2", "--suggested", "--no-run", "--results", str(campaign / "results")])
+    assert not list((campaign / "effects").glob("*"))

@@ -13,10 +13,11 @@ import pytest
 import yaml
 from bench_session import CONTINUOUS, SIZE, STOP_AND_GO, Course, Session, record, values_of
 
+from pipeline.diagnosis import turntable
 from pipeline.diagnosis.diagnose import diagnose
-from pipeline.diagnosis.formula_discovery import dependent, effect_file, suggested_effect
-from pipeline.diagnosis.functional_forms import columns_of, harmonic
-from pipeline.diagnosis.residual_regression import ProjectedCurves
+from pipeline.diagnosis.formula_discovery import dependent, discover, effect_file, suggested_effect
+from pipeline.diagnosis.functional_forms import Factor, Form, Span, columns_of, harmonic, power, step
+from pipeline.diagnosis.residual_regression import ProjectedCurves, Scan
 from pipeline.diagnosis.words import in_words
 from pipeline.estimation.design import Term
 from pipeline.estimation.gauss_markov import Setting
@@ -26,6 +27,7 @@ from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import Selection, select
 from pipeline.model.effects import forget, register
 from pipeline.model.effects.files import effect_from
+from pipeline.model.kinematics import reference_motion
 from pipeline.records import Recording, SensorCalibration
 from pipeline.signal.temperature import smooth_temperature
 from pipeline.study.cases import draw
@@ -70,9 +72,13 @@ def warm(recording: Recording) -> np.ndarray:
     return smooth_temperature(recording.time, recording.temperature)
 
 
-def diagnosed(sensor: str, recordings: list[Recording], configured: tuple[str, ...] = ()) -> dict[str, Any]:
+def diagnosed(
+    sensor: str, recordings: list[Recording], configured: tuple[str, ...] = (), depth: str = "standard"
+) -> dict[str, Any]:
     noise = estimate_noise(sensor, recordings, SHEET[sensor])
-    settings = {"sensor": SHEET, "table": TABLE, "effects": {sensor: list(configured)}}
+    settings = {
+        "sensor": SHEET, "table": TABLE, "effects": {sensor: list(configured)}, "diagnosis": {"depth": depth}
+    }  # fmt: skip
     return diagnose(SensorCalibration(sensor), recordings, noise, settings)
 
 
@@ -162,7 +168,76 @@ def test_a_known_effect_is_named_beside_unknown_physics_that_would_hide_or_disto
     assert part["selected"] == [name]
     assert part["unexplained"][0]["shape"].startswith("5 cycles")
     text = "\n".join(in_words(part, sensor))
-    assert f"add {sensor}.unknown_angle." in text
+    assert f"add {sensor}.unknown_angle; the option --suggested of add does both." in text
+
+
+def test_a_product_of_signals_is_written_as_it_was_hidden_and_no_other_is_as_good() -> None:
+    def late(recording: Recording) -> np.ndarray:
+        motion = reference_motion(recording, 1.0)
+        assert motion is not None
+        return 0.03 * (motion.specific_force[:, :1] * (recording.time[:, None] > 540.0)) * np.array([1.0, -0.7, 1.2])
+
+    recordings = with_extra("gyroscope", late)
+    part = diagnosed("gyroscope", recordings)
+    (term,) = part["suggested_effect"]["terms"].values()
+    assert part["verdict"] == "unexplained"
+    found = re.fullmatch(r"fx \* step\(time - ([\d.]+)\)", term["formula"])
+    assert found, term["formula"]
+    assert float(found[1]) == pytest.approx(540.0, abs=3.0)
+    assert term["unit"] == "deg/s/g"
+    assert part["suggested_effect"]["owner"] == "recording"
+    first, *others = part["formulas"]
+    assert first["suggested"]
+    assert first["stability"] > 0.9
+    assert all(other["score"] < first["score"] and other["complexity"] <= first["complexity"] for other in others)
+    require_mended("gyroscope", recordings, part)
+
+
+def test_nothing_is_searched_where_nothing_is_missing_but_at_full_depth_and_then_nothing_is_invented(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    recordings, searched = record(Session(5, SHORT)), []
+    monkeypatch.setattr(turntable, "discover", lambda *a, **k: searched.append(1) or discover(*a, **k))
+    assert diagnosed("gyroscope", recordings)["verdict"] == "nothing_missing"
+    assert not searched
+    part = diagnosed("gyroscope", recordings, depth="full")
+    assert (part["verdict"], part["suggested_effect"], part["formulas"], searched) == ("nothing_missing", None, [], [1])
+
+
+SPAN = Span("temperature", np.linspace(20.0, 40.0, 5))
+
+
+@pytest.mark.parametrize(
+    ("sensor", "factor", "modulator", "unit"),
+    [
+        ("accelerometer", power("u", 4), None, "1/g^3"),
+        ("gyroscope", power("u", 4), None, "1/(deg/s)^3"),
+        ("accelerometer", power("temperature", 2), power("fx", 1), "1/degC^2"),
+        ("gyroscope", power("temperature", 1), power("fx", 1), "deg/s/degC/g"),
+        ("gyroscope", power("speed", 1), power("u", 1), "1/(deg/s)"),
+        ("accelerometer", power("speed", 2), None, "g/(deg/s)^2"),
+        ("accelerometer", step(SPAN, 30.0, 2.0), None, "g"),
+        ("gyroscope", step(SPAN, 30.0), power("time", 1), "deg/s/s"),
+        ("gyroscope", harmonic(5), power("u", 1), "1"),
+    ],
+)
+def test_a_coefficient_has_the_unit_that_makes_the_term_one_of_the_sensor(
+    sensor: str, factor: Factor, modulator: Factor | None, unit: str
+) -> None:
+    assert Form(factor, modulator).unit(sensor) == unit
+
+
+def test_a_scan_of_single_forms_finds_what_the_products_of_all_curves_say() -> None:
+    selection = selection_of("gyroscope", with_extra("gyroscope", gear(5e-4)))
+    tried = [[*harmonic(5).texts], ["fx * speed", "u * speed"], ["wx", "wy"]]
+    scan, motions = Scan(selection), [part.motion for part in selection.observations.parts]
+    for texts in tried:
+        columns = columns_of(texts, "gyroscope")
+        values = np.concatenate([columns(motion) for motion in motions])
+        expected = ProjectedCurves(selection, columns).drop([0, 1])[:, :, -1]
+        found = scan.drops(values[..., None, :])[:, :, 0]
+        assert found == pytest.approx(expected, rel=1e-6, abs=1e-6)
+        assert scan.gain(found, 2) == pytest.approx(ProjectedCurves(selection, columns).gain(expected, 2), rel=1e-5)
 
 
 def test_a_shape_gains_what_a_joint_fit_with_it_gains() -> None:
