@@ -25,6 +25,7 @@ from pipeline.diagnosis.residual_dependence import dependences
 from pipeline.diagnosis.residual_regression import ProjectedCurves
 from pipeline.estimation.design import Term
 from pipeline.estimation.generalized_least_squares import fit_terms
+from pipeline.estimation.observations import without_rows
 from pipeline.estimation.selection import FAR_ABOVE, select
 from pipeline.model.effects import catalogue, forget, register
 from pipeline.model.effects.base import unit_of
@@ -47,7 +48,6 @@ if TYPE_CHECKING:
 FINALISTS = 8  # forms that compete in the resamples
 FOLDS = 5  # parts of every recording that are left out in turn
 LISTED = 6  # entries of the front
-LEFT_OUT = 1e-9  # weight of rows that are left out: their information vanishes, and no block is empty
 
 
 @dataclass(frozen=True)
@@ -202,8 +202,8 @@ def _front(selection: Selection, terms: Sequence[Scored], ranked: Sequence[Score
 def _stability(selection: Selection, finalists: Sequence[Scored]) -> list[float]:
     """Return in which share of the resamples each form has the best score."""
     wins, counted = np.zeros(len(finalists)), 0
-    for weights in resamples(selection.observations):
-        tried = Forms(replace(selection, observations=reweighted(selection.observations, weights)))
+    for observations in _resamples(selection.observations):
+        tried = Forms(replace(selection, observations=observations))
         gains = tried.gains([each.form for each in finalists])
         scores = [g.delta_bic - PRICE * each.form.complexity for g, each in zip(gains, finalists, strict=True)]
         if max(scores) > CLEARLY:
@@ -212,24 +212,13 @@ def _stability(selection: Selection, finalists: Sequence[Scored]) -> list[float]
     return [float(share) for share in wins / max(counted, 1)]
 
 
-def resamples(observations: Observations) -> Iterator[list[Values]]:
-    """Yield factors of the rows' weights, an array a recording, without each recording, then without each fifth."""
+def _resamples(observations: Observations) -> Iterator[Observations]:
+    """Yield the observations without each recording, then without each fifth of every recording."""
     lengths = [len(part.weight) for part in observations.parts]
-    if len(lengths) > 1:
-        for out in range(len(lengths)):
-            yield [np.full(n, LEFT_OUT if k == out else 1.0) for k, n in enumerate(lengths)]
+    for out in range(len(lengths) if len(lengths) > 1 else 0):
+        yield without_rows(observations, [np.full(n, k == out) for k, n in enumerate(lengths)])
     for fold in range(FOLDS):
-        yield [np.where(np.arange(n) * FOLDS // max(n, 1) == fold, LEFT_OUT, 1.0) for n in lengths]
-
-
-def reweighted(observations: Observations, factors: Sequence[Values]) -> Observations:
-    """Return observations whose rows have weights times some factors."""
-    parts = []
-    for part, factor in zip(observations.parts, factors, strict=True):
-        weight = part.weight * factor
-        share = float(weight.sum() / part.weight.sum())
-        parts.append(replace(part, weight=weight, scatter=share * part.scatter))
-    return replace(observations, parts=tuple(parts))
+        yield without_rows(observations, [np.arange(n) * FOLDS // n == fold for n in lengths])
 
 
 def suggested_effect(

@@ -41,6 +41,7 @@ BLOCKS = 300  # of the bias: their length is below a tenth of the shortest corre
 SHORTEST_BLOCK_S = 4.0  # a fraction of the shortest correlation time of the grid
 FORGOTTEN, FORGOTTEN_DPS = 1e-5, 1e-4  # share of the largest rate that a filter may still hold of a doubtful one
 LONGEST_RESPONSE = 400  # samples
+LEFT_OUT = 1e-9  # weight of rows that are left out: their information vanishes, and no block is empty
 
 
 @dataclass(frozen=True)
@@ -133,6 +134,16 @@ def _follows(before: Part | None, part: Part) -> bool:
     if before.clock_shared and part.clock_shared:
         return True
     return before.motion.setup == part.motion.setup != "" and bool(before.motion.time[-1] < part.motion.time[0])
+
+
+def without_rows(observations: Observations, left_out: Sequence[NDArray[np.bool_]]) -> Observations:
+    """Return observations without the information of some rows, one array a recording; the rows stay."""
+    parts = []
+    for part, out in zip(observations.parts, left_out, strict=True):
+        weight = np.where(out, LEFT_OUT, 1.0) * part.weight
+        share = float(weight.sum() / part.weight.sum())
+        parts.append(replace(part, weight=weight, scatter=share * part.scatter))
+    return replace(observations, parts=tuple(parts))
 
 
 def weighted(observations: Observations, noise: Noise | None) -> Observations:
