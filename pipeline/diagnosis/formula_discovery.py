@@ -23,6 +23,7 @@ from pipeline.diagnosis import functional_forms as forms
 from pipeline.diagnosis.functional_form_search import CLEARLY, PRICE, Forms, search, without_effects
 from pipeline.diagnosis.residual_dependence import dependences
 from pipeline.diagnosis.residual_regression import ProjectedCurves
+from pipeline.diagnosis.words import listed
 from pipeline.estimation.design import Term
 from pipeline.estimation.generalized_least_squares import fit_terms
 from pipeline.estimation.observations import without_rows
@@ -141,7 +142,7 @@ def _entry(selection: Selection, terms: Sequence[Scored]) -> dict[str, Any]:
     return {
         "covariate": first.form.covariate,
         "p_value": first.gain.p_value,
-        "shape": forms.listed(words),
+        "shape": listed(words),
         "kind": first.form.kind,
         "axes": ["xyz"[c] for c in axes],
         "formulas": texts,
