@@ -25,11 +25,8 @@ if TYPE_CHECKING:
     from pipeline.diagnosis.findings import Findings
     from pipeline.records import Noise, Recording, SensorCalibration
 
-<<<<<<< HEAD
 IN_DOUBT = ("reference_in_doubt", "unexplained")  # verdicts on an accelerometer whose mountings may be wrong
-=======
 FULL = "full"  # ``diagnosis.depth`` at which everything is computed, whatever the verdict
->>>>>>> fb8677a (Search formulas of a unit-checked grammar by projected evidence, and judge them against the catalogue)
 
 
 def diagnose(
@@ -73,37 +70,27 @@ def diagnose(
     by_hand = is_multi_position(sensor, recordings)
     procedure = multi_position if by_hand else turntable
     configured = configured_effects(sensor, settings, [] if by_hand else recordings)
-<<<<<<< HEAD
     by_gravity = sensor == "gyroscope" and MOUNTING in configured
     if by_gravity:
         accelerometer = mountings_by_gravity(recordings, settings)
-    found = None
-=======
     full = (settings.get("diagnosis") or {}).get("depth") == FULL
 
     def judge(found: Findings | None, document: dict[str, Any]) -> tuple[dict[str, Any], bool]:
         evidence = evidence_of(document, sensor, recordings, noise, settings, validation=validation, found=found)
+        if by_gravity and gravity:
+            evidence = replace(evidence, doubts=[*evidence.doubts, *_doubts_of_gravity(gravity)])
         verdict = judged(document, evidence)
         return verdict, full or may_be_unknown(verdict["verdict"], evidence)
 
->>>>>>> fb8677a (Search formulas of a unit-checked grammar by projected evidence, and judge them against the catalogue)
     try:
         found = procedure.findings(calibration, recordings, noise, settings, configured, accelerometer=accelerometer)
     except NotObservableError as reason:
-<<<<<<< HEAD
-        document = _not_enough_data(sensor, configured, reason.message, procedure.NEEDED)
-    evidence = evidence_of(document, sensor, recordings, noise, settings, validation=validation, found=found)
-    if by_gravity and gravity:
-        evidence = replace(evidence, doubts=[*evidence.doubts, *_doubts_of_gravity(gravity)])
-    return judged(document, evidence)
-=======
         return judge(None, _not_enough_data(sensor, configured, reason.message, procedure.NEEDED))[0]
     document, unknown = judge(found, document_of(found, configured, settings["effects"][sensor]))
     if unknown and found.search:
         found = found.search() or found
         document, _ = judge(found, document_of(found, configured, settings["effects"][sensor]))
     return document
->>>>>>> fb8677a (Search formulas of a unit-checked grammar by projected evidence, and judge them against the catalogue)
 
 
 def _doubts_of_gravity(accelerometer: Mapping[str, Any]) -> list[str]:
