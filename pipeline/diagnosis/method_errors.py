@@ -96,7 +96,7 @@ def method_errors(
     recordings : sequence of Recording
         All of the unit, filtered.
     settings : mapping
-        Sections ``table`` and ``method``.
+        Sections ``table``, ``method`` and, for a given calibration, ``sensor``.
 
     Returns
     -------
@@ -107,7 +107,7 @@ def method_errors(
     stages = [stage.name for stage in calibration.stages]
     if not stages or stages[-1] in FREE:
         return []
-    difference = _difference_of(calibration, selection)
+    difference = _difference_of(calibration, selection, settings)
     own = _together([_errors(difference, r, settings["table"]) for r in recordings if r.role == calibration.sensor])
     held_out = _together([_errors(difference, r, settings["table"]) for r in recordings if r.role == "validation"])
     share, held = (_shares({name: e[0] for name, e in found.items()}) for found in (own, held_out))
@@ -131,7 +131,10 @@ def method_errors(
 
 
 def given_differences(
-    calibration: SensorCalibration, free_fit: Callable[[], SensorCalibration], recordings: Sequence[Recording]
+    calibration: SensorCalibration,
+    free_fit: Callable[[], SensorCalibration],
+    recordings: Sequence[Recording],
+    settings: Mapping[str, Any],
 ) -> list[dict[str, Any]]:
     """Return what a given calibration and a free fit of rests and moves by hand differ in, the largest share first.
 
@@ -141,7 +144,7 @@ def given_differences(
     if [stage.name for stage in calibration.stages] != ["given"]:
         return []
     free, sensor = free_fit(), calibration.sensor
-    known = calibration.covariance, free.covariance
+    known = _own_covariance(calibration, settings), free.covariance
     K = np.linalg.inv(free.matrix)
     M, maps = calibration.matrix, (np.kron(np.eye(3), K.T), np.kron(calibration.matrix @ K, K.T))
     variance = np.zeros(12)
@@ -215,7 +218,19 @@ class _Difference:
         return {"two_sided": whole, "bias": of_bias, **of_matrix}
 
 
-def _difference_of(calibration: SensorCalibration, selection: Selection) -> _Difference:
+def _own_covariance(calibration: SensorCalibration, settings: Mapping[str, Any]) -> Values:
+    """Return the covariance of bias and matrix: (12, 12).
+
+    Where a given calibration states none, its bias has at least the wander that the sensor's data sheet states.
+    """
+    own = np.zeros((12, 12)) if calibration.covariance is None else calibration.covariance[:12, :12]
+    if own.any() or [stage.name for stage in calibration.stages] != ["given"]:
+        return own
+    wander = float(settings["sensor"][calibration.sensor]["bias_wander"])
+    return np.diag([wander**2] * 3 + [0.0] * 9)
+
+
+def _difference_of(calibration: SensorCalibration, selection: Selection, settings: Mapping[str, Any]) -> _Difference:
     """Compare with the free fit of base, configured effects and those selected that the method has too."""
     free, names = selection.base, [effect.name for effect in calibration.effects]
     known = {term.effect.name for term in free.terms}
@@ -224,7 +239,7 @@ def _difference_of(calibration: SensorCalibration, selection: Selection) -> _Dif
         start = Start(free.bias, free.K, selection.start.scale)
         free = fit_terms(selection.observations, [*free.terms, *more], start, selection.settings)
     M = calibration.matrix
-    own = np.zeros((12, 12)) if calibration.covariance is None else calibration.covariance[:12, :12]
+    own = _own_covariance(calibration, settings)
     of_free, of_method = np.zeros((12, 12)), np.zeros((12, 12))
     of_free[:3, :3] = of_method[:3, :3] = M
     of_free[3:, 3:], of_method[3:, 3:] = np.kron(M, np.eye(3)), np.kron(np.eye(3), free.K.T)

@@ -132,7 +132,10 @@ def findings(
                 "unexplained": [],
             },
             "method_errors": given_differences(
-                calibration, lambda: calibration_of(model, selection.fits[0], calibration, settings), recordings
+                calibration,
+                lambda: calibration_of(model, selection.fits[0], calibration, settings),
+                recordings,
+                settings,
             ),
             "cross_validation": _nested(selection, lambda part: select(part, calibration, configured, noise, sheet)),
         },

@@ -14,6 +14,7 @@ GIVEN = Evidence("gyroscope", "nothing_missing", over_noise=0.9, published=ABOVE
 FREE = SensorCalibration(
     "gyroscope", np.array([1.0, -2.0, 0.5]), np.diag([1.01, 0.99, 1.02]), covariance=np.eye(12) * 1e-8
 )
+SHEET = {"sensor": {"gyroscope": {"bias_wander": 0.01}}}
 SHIFT = np.array([0.0, 0.3, 0.0])
 RATE = np.tile([[30.0, 0.0, 0.0]], (50, 1))
 MOVES = [Recording("recording", "rests", None, np.arange(50) * 10**7, None, RATE)]
@@ -32,32 +33,34 @@ def given(**changes: np.ndarray) -> SensorCalibration:
 
 
 def test_a_shift_of_the_bias_is_named_with_its_size() -> None:
-    (found,) = given_differences(given(bias=FREE.bias + SHIFT), lambda: FREE, MOVES)
+    (found,) = given_differences(given(bias=FREE.bias + SHIFT), lambda: FREE, MOVES, SHEET)
     assert (found["name"], found["unit"], found["share"]) == ("bias", "deg/s", 1.0)
     assert found["size"] == pytest.approx(0.3 * 0.99)
 
 
 def test_a_scale_factor_is_named_and_a_rotation_of_the_mounting_is_not() -> None:
-    (found,) = given_differences(given(matrix=FREE.matrix @ np.diag([1.02, 1.0, 1.0])), lambda: FREE, MOVES)
+    (found,) = given_differences(given(matrix=FREE.matrix @ np.diag([1.02, 1.0, 1.0])), lambda: FREE, MOVES, SHEET)
     assert found["name"] == "scale_factor"
     assert found["size"] == pytest.approx(0.02)
     assert found["rms"] == pytest.approx(30.0 * 0.02 / np.sqrt(3.0))
     angle = np.radians(2.0)
     turn = np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
-    named = [e["name"] for e in given_differences(given(matrix=turn @ FREE.matrix), lambda: FREE, MOVES)]
+    named = [e["name"] for e in given_differences(given(matrix=turn @ FREE.matrix), lambda: FREE, MOVES, SHEET)]
     assert "rotation" not in named
     assert "non_orthogonality" not in named
 
 
 def test_what_the_uncertainties_of_both_explain_is_not_named() -> None:
-    near = given(bias=FREE.bias + 4e-4)  # four standard uncertainties of the fit
-    assert given_differences(near, lambda: FREE, MOVES) == []
+    near = given(bias=FREE.bias + 0.04)  # four times the wander of the data sheet, as the file states no uncertainty
+    assert given_differences(near, lambda: FREE, MOVES, SHEET) == []
     wide = replace(given(bias=FREE.bias + SHIFT), covariance=np.eye(12) * 0.1**2)
-    assert given_differences(wide, lambda: FREE, MOVES) == []
+    assert given_differences(wide, lambda: FREE, MOVES, SHEET) == []
 
 
 def test_a_method_that_fits_is_not_compared() -> None:
-    assert given_differences(replace(FREE, stages=(StageResult("rests_and_moves", {}),)), lambda: FREE, MOVES) == []
+    assert (
+        given_differences(replace(FREE, stages=(StageResult("rests_and_moves", {}),)), lambda: FREE, MOVES, SHEET) == []
+    )
 
 
 def test_the_given_calibration_is_blamed_where_a_fit_of_the_recordings_leaves_noise_alone() -> None:
