@@ -189,6 +189,7 @@ def in_common(settings: Mapping[str, dict[str, Any]]) -> tuple[dict[str, Any], d
 
 
 def _of_gather(campaign: Campaign) -> dict[str, Any]:
+    common, own = in_common({name: {"sensor": _limits(unit.config["sensor"])} for name, unit in campaign.units.items()})
     compared = {u for c in campaign.compare for g in c["groups"] for u in g["units"]}
     return {
         "campaign": campaign.name,
@@ -200,7 +201,15 @@ def _of_gather(campaign: Campaign) -> dict[str, Any]:
         "page": campaign.page,
         "combine": campaign.combine,
         "truths": {u: str(campaign.truth(u)) for u in sorted(compared)},
+        "common": common,
+        "units": own,
     }
+
+
+def _limits(sensor: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the limits of bias and matrix in a data sheet."""
+    limited = ("bias", "scale_factor", "cross_axis")
+    return {name: {key: sensor[name].get(key) for key in limited} for name in BOTH if sensor.get(name)}
 
 
 def _canonical(value: Any) -> bytes:  # noqa: ANN401  (any JSON value)

@@ -13,10 +13,13 @@ from pipeline.records import SENSOR_UNITS, SENSORS
 from pipeline.report.chart import Dots, Figure, Layer, Panel, chart
 from pipeline.report.numbers import number, plain
 from pipeline.report.pages import script_data, template
+from pipeline.report.strips import strips
 from pipeline.report.summary import COLUMNS
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.report.strips import Placed
 
 JSON = dict[str, Any]
 FIRST = 100  # rows that a browser shows at once; it shows the others when asked
@@ -35,6 +38,7 @@ def render(
     *,
     twins: Sequence[Sequence[str]] = (),
     statistics: JSON | None = None,
+    placed: Mapping[str, Mapping[str, Placed]] | None = None,
     history: JSON | None = None,
     settings: JSON | None = None,
 ) -> str:
@@ -55,6 +59,8 @@ def render(
         Files of several units with the same content under different names.
     statistics : dict, optional
         As of ``fleet.fleet_statistics``.
+    placed : mapping, optional
+        Unit to its parameters against the data sheet, as of ``strips.against_limits``.
     history : dict, optional
         As of ``run_section.runs_data``.
     settings : dict, optional
@@ -64,6 +70,7 @@ def render(
     frame = pd.DataFrame(rows).reindex(columns=list(dict.fromkeys([*COLUMNS, *(k for row in rows for k in row)])))
     judged = [row.get("pass") for row in rows]
     serials = frame[frame["serial"].fillna("") != ""].groupby("serial", sort=False)
+    strip = strips(rows, placed or {})
     text: str = template("campaign.html").render(
         campaign=campaign,
         rows=rows,
@@ -79,6 +86,7 @@ def render(
         groups=[(f"Serial {n}", [rows[i] for i in same.index]) for n, same in serials if len(same) > 1],
         figures=[f for sensor in SENSORS if (f := _fleet_figure(sensor, frame))],
         statistics=statistics if statistics and len(rows) >= FEWEST_UNITS else None,
+        strips=strip.figures,
         far_shown=FAR_SHOWN,
         far=FAR,
         causes=_causes(failures),
@@ -87,7 +95,7 @@ def render(
         history=history,
         history_data=script_data({"units": history["units"]}) if history else None,
         names=script_data([row["unit"] for row in rows]),
-        values=script_data(_fleet_values(rows)),
+        values=script_data(_fleet_values(rows) | strip.dots),
         first=FIRST,
         sections=comparisons,
         verdicts=VERDICTS,

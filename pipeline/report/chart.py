@@ -89,13 +89,17 @@ class Samples:
 
 @dataclass(frozen=True)
 class Dots:
-    """Values that each count by themselves, with an upright interval ``low`` to ``high`` where it is given."""
+    """Values that each count by themselves, with an upright interval ``low`` to ``high`` where it is given.
+
+    ``units``: the place of each in the list of the chart's units, counted from 1, where x does not tell it.
+    """
 
     x: Values
     y: Values
     colour: int = 0
     low: Values | None = None
     high: Values | None = None
+    units: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -248,7 +252,8 @@ def _draw(layer: Layer, x: Axis, y: Axis) -> str:
         low, high, room = y.units(layer.low[known]), y.units(layer.high[known]), LARGE_MEANS
         path = f'<path class="strokes faint-strokes c{layer.colour}" d="{_path("M%d %dV%d", at, low, high)}"/>'
     size = " large" * (len(layer.x) <= room)
-    return f'{path}<path class="dots{size} c{layer.colour}" d="{_dots(at, y.units(layer.y[known]))}"/>'
+    units = f' data-units="{" ".join(str(layer.units[i]) for i in known)}"' if layer.units else ""
+    return f'{path}<path class="dots{size} c{layer.colour}" d="{_dots(at, y.units(layer.y[known]))}"{units}/>'
 
 
 def _samples(layer: Samples, values: Values, colour: str, x: Axis, y: Axis) -> str:

@@ -21,6 +21,7 @@ from pipeline.report.comparison_section import section, unit_figures
 from pipeline.report.fleet import fleet_statistics, unit_parameters, write_parameters
 from pipeline.report.pages import failure_page
 from pipeline.report.run_section import runs_data, times_of, with_history
+from pipeline.report.strips import Placed, against_limits
 from pipeline.report.summary import summary_row, write_summary
 from pipeline.results_folder import PUBLISHED, finish_publishing, publish_all
 from pipeline.stages.batch import FAILED, failure_of, record_output
@@ -47,6 +48,7 @@ class Gathered:
     files: list[tuple[Path, str]] = field(default_factory=list)
     row: JSON = field(default_factory=dict)
     fitted: dict[str, Parameter] = field(default_factory=dict)
+    placed: dict[str, Placed] = field(default_factory=dict)
     figures: list[JSON] = field(default_factory=list)
 
 
@@ -112,6 +114,7 @@ def _read_unit(job: Job, batch: Path, sheet_row: dict[str, str]) -> Gathered:
         truth = Path(job.run["truths"][unit])  # behind the recordings, where they were simulated
         found.figures = unit_figures(*documents, read_json(truth) if truth.is_file() else None)
     found.fitted = unit_parameters(found.calibration)
+    found.placed = against_limits(found.calibration, job.units[unit]["sensor"])
     found.row = summary_row(unit, *documents, sheet_row)
     return found
 
@@ -161,6 +164,7 @@ def _write_campaign(job: Job, units: Mapping[str, Gathered], new: Path) -> None:
         run["page"],
         twins=same_files({name: u.calibration.get("inputs") or [] for name, u in units.items()}),
         statistics=statistics,
+        placed={name: u.placed for name, u in units.items()},
         history=runs_data(entries, run["run"]),
         settings=run["run"],
     )

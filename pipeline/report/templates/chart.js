@@ -49,6 +49,7 @@ function pointsOf(path) { // [x, low, high] of each vertex in drawing units; of 
       out.push([x, y, y]);
     }
   }
+  path.dataset.units?.split(" ").forEach((unit, i) => { out[i].unit = unit - 1; out[i].i = i; });
   known.set(path, out);
   return out;
 }
@@ -119,12 +120,12 @@ function prepare(svg) {
     const first = found[0][1].point ?? found[0][1].range, value = valueAt(x, first[0] / SUBDIVISION, x.full);
     const read = (v) => told(panel.y, valueAt(panel.y, v / SUBDIVISION, panel.y.full));
     const head = document.createElement("b");
-    head.textContent = names ? names[Math.round(value) - 1] : `${x.label}: ${told(x, value)}`;
+    head.textContent = names ? names[first.unit ?? Math.round(value) - 1] : `${x.label}: ${told(x, value)}`;
     const rows = found.map(([colour, { point, range }]) => {
       const row = document.createElement("span"), dot = document.createElement("i");
       dot.className = colour;
       const name = figure.querySelector(`.legend .${colour}`)?.parentNode.textContent.trim() ?? "";
-      const numbers = values ? (values[colour] ?? values.after)[Math.round(value) - 1] : point ? read(point[1]) + (range ? ` (${read(Math.max(range[1], range[2]))} to ${read(Math.min(range[1], range[2]))})` : "") : `${read(Math.max(range[1], range[2]))} to ${read(Math.min(range[1], range[2]))}`;
+      const numbers = values ? (values[colour] ?? values.after)[point.i ?? Math.round(value) - 1] : point ? read(point[1]) + (range ? ` (${read(Math.max(range[1], range[2]))} to ${read(Math.min(range[1], range[2]))})` : "") : `${read(Math.max(range[1], range[2]))} to ${read(Math.min(range[1], range[2]))}`;
       row.append(dot, `${name} ${numbers} ${panel.y.unit}`);
       return row;
     });

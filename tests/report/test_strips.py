@@ -1,0 +1,77 @@
+"""Strip plots: the dots stand where value over limit is, and tell the unit and the value."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.report.strips import FARTHEST, against_limits, strips
+
+SHEET = {"accelerometer": {"bias": 0.08, "scale_factor": 0.03, "cross_axis": 0.02}}
+NAMES = ["Bias x", "Bias y", "Bias z", *(f"Scale factor error {a}" for a in "xyz")]
+NAMES += [f"{a} reads of {b}" for a in "xyz" for b in "xyz" if a != b]
+
+
+def campaign(count: int) -> tuple[list[dict[str, Any]], dict[str, Any], np.ndarray]:
+    """Return units with random biases and sensitivities, and the shares of the limits that follow."""
+    rng = np.random.default_rng(3)
+    rows, placed, shares = [], {}, []
+    for i in range(count):
+        bias, K = rng.normal(0.0, 0.06, 3), np.eye(3) + rng.normal(0.0, 0.01, (3, 3))
+        part = {"unit": "g", "bias": bias.tolist(), "matrix": np.linalg.inv(K).tolist()}
+        rows.append({"unit": f"U{i}", "status": "ok", "sensor": "mpu6050", "method": "staged"})
+        placed[f"U{i}"] = against_limits({"accelerometer": part, "gyroscope": None}, SHEET)
+        beside = K[~np.eye(3, dtype=bool)]
+        shares.append([*bias / 0.08, *(np.diag(K) - 1.0) / 0.03, *beside / 0.02])
+    return rows, placed, np.array(shares)
+
+
+def drawn(svg: str) -> list[tuple[str, int, str, float]]:
+    """Return class, unit, row and share (%) of each dot, read from the coordinates."""
+    low, high, start, stop = map(float, re.findall(r'<svg[^>]*data-scale="([^,]+),([^,]+),([^,]+),([^,]+)', svg)[0])
+    heights = re.findall(r'class="panel" data-scale="([^,]+),([^,]+),([^,]+),([^,]+)', svg)[0]
+    bottom, top, y_start, y_stop = map(float, heights)
+    found = []
+    for colour, path, units in re.findall(r'class="dots[^"]* (c\d)" d="([^"]+)" data-units="([^"]+)"', svg):
+        x, y = np.cumsum(np.array(re.findall(r"[Mm](-?\d+) (-?\d+)", path), float), axis=0).T / 10.0
+        row = bottom + (y - y_start) / (y_stop - y_start) * (top - bottom)
+        share = low + (x - start) / (stop - start) * (high - low)
+        names = [NAMES[12 - round(v)] for v in row]
+        found += zip([colour] * len(x), map(int, units.split()), names, share, strict=True)
+    return found
+
+
+def test_each_dot_stands_at_its_share_of_the_limit_and_tells_its_value() -> None:
+    rows, placed, shares = campaign(7)
+    rows[2]["status"] = "failed"
+    out = strips(rows, placed)
+    assert len(out.figures) == 1  # no gyroscope
+    dots = drawn(out.figures[0].svg)
+    assert len(dots) == 6 * 12
+    assert {unit for _, unit, _, _ in dots} == {1, 2, 4, 5, 6, 7}
+    told = [text for texts in out.dots["strip-1"].values() for text in texts]
+    for (colour, unit, name, share), text in zip(dots, told, strict=True):
+        true = 100.0 * shares[unit - 1, NAMES.index(name)]
+        assert share == pytest.approx(np.clip(true, -300.0, 300.0), abs=0.3)
+        assert (colour == "c0") == (abs(true) > 100.0)
+        assert text.startswith(f"{name}: ")
+        value = float(re.findall(r"[\d.]+(?:e-\d+)?", text.split(": ")[1].replace("−", "-"))[0])
+        limit = float(text.rpartition("±")[2])
+        assert 100.0 * value / limit == pytest.approx(abs(true), rel=2e-3)
+    beyond = (np.abs(np.delete(shares, 2, 0)) > 1.0).any(axis=1).sum()
+    assert f"{beyond} of 6 units are beyond the data sheet" in out.figures[0].finding
+
+
+def test_of_many_units_the_farthest_are_drawn() -> None:
+    rows, placed, shares = campaign(200)
+    dots = drawn(strips(rows, placed).figures[0].svg)
+    for k, name in enumerate(NAMES):
+        order = np.argsort(shares[:, k]) + 1
+        assert {u for _, u, n, _ in dots if n == name} == {*order[:FARTHEST].tolist(), *order[-FARTHEST:].tolist()}
+
+
+def test_two_siblings_are_not_drawn() -> None:
+    assert strips(*campaign(2)[:2]).figures == []
