@@ -39,6 +39,7 @@ FEWEST = 60  # samples, which tell white noise to a tenth
 SHORTEST = 16  # samples of a stretch
 GAP = 1.5  # intervals from which a step of time is a gap
 UNEVEN = 0.5  # rms scatter of the sampling intervals, relative, above which averages over equal times mean nothing
+ALIKE = 0.02  # by which the sampling intervals of rests may differ; those of other rates are left out
 FILLED = 10  # samples that are missing or marked in a row, up to which a straight line takes their place
 IMPLAUSIBLE = 1e-4  # probability of the bins under the fit, below which the composition is in doubt
 COARSE = 0.4  # standard deviation, in counts, below which rounding is no longer white noise (Widrow & Kollar 2008)
@@ -68,8 +69,10 @@ def identify_noise(sensor: str, recordings: Sequence[Recording]) -> JSON:
     if _samples(stretches) < FEWEST:
         reason = f"the rests hold {_samples(stretches)} evenly sampled readings; {FEWEST} are needed: record static"
         return empty | {"reason": reason}
-    rates = [(s.time[-1] - s.time[0]) / (len(s.time) - 1) for s in stretches]
+    rates = np.array([(s.time[-1] - s.time[0]) / (len(s.time) - 1) for s in stretches])
     interval = float(np.median(rates))
+    alike = np.abs(rates / interval - 1.0) < ALIKE
+    stretches = [s for s, taken in zip(stretches, alike, strict=True) if taken]
     single = source == "static" and len(chosen) == 1
     return empty | {
         "source": source,

@@ -210,7 +210,7 @@ def maximised(
         best.replace(running[better], new.rows(better))
         damping[running] *= np.where(better, 0.2, 8.0)
         promised = -np.sum(gradient * step, axis=1)
-        slow = better & (gain < PRECISE)
+        slow = better & (gain < PRECISE) & (damping[running] < 1.0)
         running = running[(promised > PRECISE) & ~slow & (damping[running] < LARGEST_DAMPING)]
         if not running.size:
             break

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     Values = NDArray[np.float64]
 
 STEADY_DEGC = 0.1  # a temperature that changes less is no regressor: the noise of thermometers on the chip
+STRAIGHT = 0.03  # share of a temperature's change that is no ramp, below which the two are not told apart
 LINES = 5  # sinusoids
 # Power of a line over the level around it, in ln(n): of n independent exponential values one exceeds it with a
 # probability of 1 / sqrt(n).
@@ -68,11 +69,18 @@ class Regression:
         self.stretches, self.column, self.interval, self.scale = stretches, column, interval, scale
         start, end = stretches[0].time[0], stretches[-1].time[-1]
         self.middle, self.span = float(0.5 * (start + end)), float(end - start)
-        warm = [s.temperature for s in stretches if s.temperature is not None]
-        changed = len(warm) == len(stretches) and np.ptp(np.concatenate(warm)) > STEADY_DEGC
-        self.optional = (["ramp"] + ["temperature"] * bool(changed)) if single else []
+        self.optional = (["ramp"] + ["temperature"] * self._warms()) if single else []
         self.lines = self._found() if single else []
         self.spectrum: Spectrum
+
+    def _warms(self) -> bool:
+        """Return whether the temperature changes, and not in proportion to the time, as a ramp does."""
+        if any(s.temperature is None for s in self.stretches):
+            return False
+        warm = np.concatenate([s.temperature for s in self.stretches if s.temperature is not None])
+        time = np.concatenate([s.time for s in self.stretches]) - self.middle
+        left = warm - np.polynomial.Polynomial.fit(time, warm, 1)(time)
+        return bool(np.ptp(warm) > STEADY_DEGC and np.std(left) > STRAIGHT * np.std(warm))
 
     def solve(self) -> tuple[Search, Candidate, Spectrum]:
         """Return all compositions, the best one, and the spectrum with its columns."""
@@ -127,7 +135,11 @@ class Regression:
     def _slope(self, best: Candidate, name: str, unit: str, per: float) -> dict[str, Any]:
         """Return the coefficient of a column as published; the column is ``per`` times its unit."""
         if name not in self.optional:
-            reason = "only a static recording shows it" if name == "ramp" else "the temperature did not change"
+            reason = (
+                "only a static recording shows it"
+                if name == "ramp"
+                else "the temperature did not change, or only as a ramp"
+            )
             return {"value": None, "unit": unit, "interval": None, "reason": reason, "upper_limit": None}
         column = 1 + self.optional.index(name)
         columns = (*(c for c in best.columns if c != column), column)

@@ -35,7 +35,7 @@ Composition = tuple[int, ...]  # kinds of the stochastic terms, in rising order
 MOST_MARKOV = 2  # processes of different correlation times; a third is not told apart by less than some 10^6 samples
 TIMES = 10  # correlation times whose score is looked at, in equal steps of their logarithm
 STARTS = 2  # of them that are fitted
-PROMISING = 0.4  # of the penalty of a term: a score that predicts less of it is not followed
+PROMISING = 0.25  # of the penalty of a term: a score that predicts less of it is not followed
 SLIGHT = 2.0  # of the gain of one parameter: its penalty is ln(n), 4 and more
 QUANTILE, ONE_SIDED = 1.959964, 1.644854  # of the standard normal distribution: 95 % from two sides, from one
 NEAREST = 12  # compositions that are published, best first
@@ -90,7 +90,8 @@ class Search:
             slow = len(best.kinds) > 1 or tries
             if slow:
                 dropped = [_without(best, j) for j in range(len(best.kinds)) if len(best.kinds) > 1]
-                lower = self.fit(spectrum, dropped, columns)
+                self.fit(spectrum, dropped, columns)
+                lower = [self.found[kinds, columns] for kinds, _ in dropped]
                 tries += [new for c in lower for new in self._added(spectrum, c)]
             self.fit(spectrum, tries, columns)
             new = self._best(columns)
@@ -102,13 +103,11 @@ class Search:
         """Return the best composition so far beside these columns."""
         return min((c for c in self.found.values() if c.columns == columns), key=lambda c: c.bic)
 
-    def fit(
-        self, spectrum: Spectrum, tries: Sequence[tuple[Composition, Values]], columns: tuple[int, ...]
-    ) -> list[Candidate]:
+    def fit(self, spectrum: Spectrum, tries: Sequence[tuple[Composition, Values]], columns: tuple[int, ...]) -> None:
         """Fit compositions from their starts, in one batch; each is kept at its best."""
         tries = [t for t in tries if (t[0], columns) not in self.found]
         if not tries:
-            return []
+            return
         kinds = _packed([k for k, _ in tries])
         terms = kinds.shape[1]
         start = np.zeros((len(tries), 2 * terms))
@@ -122,7 +121,6 @@ class Search:
             if k not in out or bic < out[k].bic:
                 out[k] = Candidate(k, columns, parameters, bic, float(fits.deviance[g]))
         self.found |= {(c.kinds, columns): c for c in out.values()}
-        return list(out.values())
 
     def _added(self, spectrum: Spectrum, candidate: Candidate) -> list[tuple[Composition, Values]]:
         """Return the compositions of one term more whose score promises a lower criterion, and their starts."""

@@ -54,6 +54,10 @@ def noise_remarks(settings: Mapping[str, Any], document: Mapping[str, Any], diag
             interval = figures[f"{key}_interval"]
             within = f", 95 %: {factor * interval[0]:.3g} to {factor * interval[1]:.3g}" if interval else ""
             lines.append(f"{sensor}, {key}: {factor * figures[key]:.4g} {unit}{within}; {figures[f'{key}_origin']}.")
+        found = (document.get("noise") or {}).get(sensor) or {}
+        axes = (found.get("axes") or {}).values()
+        doubts = dict.fromkeys([*(found.get("doubts") or []), *(d for axis in axes for d in axis.get("doubts") or [])])
+        lines += [f"{sensor}, in doubt: {doubt}." for doubt in doubts]
         effective = ((diagnosis or {}).get(sensor) or {}).get("effective_noise")
         lines += [effective_text(sensor, effective)] if effective else []
     return lines

@@ -162,6 +162,13 @@ def test_a_simulated_short_process_is_exported_as_its_plateau() -> None:
     assert found == pytest.approx(np.radians(seconds.std()), rel=0.05)
 
 
+def test_noise_that_no_composition_fits_is_exported_as_doubtful() -> None:
+    drive = np.random.default_rng(4).standard_normal((SAMPLES, 3))
+    shaken = lfilter([1.0], [1.0, -1.6, 0.95], drive, axis=0)  # a resonance, as of vibration
+    text = export("kalibr_imu.yaml", document(dict.fromkeys(SENSORS, shaken)), SETTINGS)["kalibr_imu.yaml"]
+    assert "# gyroscope, in doubt: no composition fits the spectrum" in text
+
+
 def test_a_conversion_keeps_the_densities(measured: dict[str, Any], tmp_path: Path) -> None:
     export_all(measured, SETTINGS, tmp_path)
     found = read_any(tmp_path / "kalibr.yaml")
