@@ -321,12 +321,13 @@ class Products:
 
     def products(self, settings: Sequence[Setting]) -> tuple[Values, Values]:
         """Return ``A^T C^-1 A``, (g, p, p), and ``log det C`` of one channel, (g,), up to that of the weights."""
-        model = GaussMarkov(self.blocks, settings)
-        within = self.white - self.means.T @ (self.blocks.weight[:, None] * self.means)
-        found = within + model.products(self.means)
-        for g in (g for g, setting in enumerate(settings) if setting.ratio == 0.0):
-            found[g] = self.white
-        return found, model.log_determinant + np.sum(np.log(self.blocks.weight))
+        found, logarithm = np.repeat(self.white[None], len(settings), axis=0), np.zeros(len(settings))
+        wander = [g for g, setting in enumerate(settings) if setting.ratio > 0.0]
+        if wander:
+            model = GaussMarkov(self.blocks, [settings[g] for g in wander])
+            found[wander] += model.products(self.means) - self.means.T @ (self.blocks.weight[:, None] * self.means)
+            logarithm[wander] = model.log_determinant + np.sum(np.log(self.blocks.weight))
+        return found, logarithm
 
     def influence(self, setting: Setting) -> Values:
         """Return ``A^T C^-1``: (p, n) array."""

@@ -83,22 +83,22 @@ class Ranking:
         """Keep of each candidate the directions that the motion excites, scaled to unit norm under white noise."""
         ends = [*starts[1:], len(sizes) - 1]
         size = np.where(sizes > 0, sizes, 1.0)
-        blocks, self.excited, self.places = [], [], []
-        width = 0
+        self.places: list[NDArray[np.intp]] = []
+        blocks, width = [], 0
         for start, end in zip(starts, ends, strict=True):
             block = slice(start, end)
             values, vectors = np.linalg.eigh(products[0, block, block] / np.outer(size[block], size[block]))
             kept = values > EXCITED**2
-            self.excited.append(float(np.sqrt(max(values[-1], 0.0))))
             blocks.append(vectors[:, kept] / np.sqrt(values[kept]) / size[block, None])
             self.places.append(np.arange(width, width + int(kept.sum())))
             width += int(kept.sum())
-        reduction = np.zeros((len(sizes), width + 1))
-        for start, end, block, place in zip(starts, ends, blocks, self.places, strict=True):
-            reduction[start:end, place] = block
-        reduction[-1, -1] = 1.0
         self.blocks = blocks
-        self.products: Values = reduction.T @ products @ reduction
+
+        def reduced(columns: Values) -> Values:
+            own = [columns[:, :, s:e] @ block for s, e, block in zip(starts, ends, blocks, strict=True)]
+            return np.concatenate([*own, columns[:, :, -1:]], axis=2)
+
+        self.products: Values = reduced(reduced(products).transpose(0, 2, 1))
         self.unreduced = products[:, :-1, :-1], starts, ends
 
     def indices(self, name: str) -> list[int]:

@@ -67,13 +67,11 @@ def delay_of(recording: Recording, channels: Sequence[Channel], limits: Limits) 
         allowed = limits.late_s + (limits.clock * float(recording.time[-1]) if of_sensor else 0.0)
         step, one, two = _thinned(first, other, recording)
         furthest = min(max(int(np.ceil(min(allowed, FURTHEST_S) / step)), FURTHEST), len(one) // 4)
-        windows = np.lib.stride_tricks.sliding_window_view(two, len(two) - 2 * furthest)
-        apart = windows - one[furthest : len(one) - furthest]
-        squares = np.einsum("ij,ij->i", apart, apart) / apart.shape[1] - apart.mean(axis=1) ** 2
+        squares, steps = _variances(one[furthest : len(one) - furthest], two), len(one) - 2 * furthest
         power = min(float(np.var(one)), float(np.var(two)))
         if float(squares.min()) >= BETTER * power:
             continue  # nothing moves, or they are not alike at any delay
-        interval = _interval(squares, NEARLY * power, windows.shape[1])
+        interval = _interval(squares, NEARLY * power, steps)
         if interval is None:
             continue
         best, low, high = ((d - furthest) * step for d in interval)
@@ -89,6 +87,14 @@ def delay_of(recording: Recording, channels: Sequence[Channel], limits: Limits) 
             )
         found = delay if of_sensor else found
     return found
+
+
+def _variances(fixed: Array, moved: Array) -> Array:
+    """Return the variance of the difference to (n,) values of each n successive ones of (m,): (m - n + 1,) array."""
+    n, one, two = len(fixed), fixed - fixed.mean(), moved - moved.mean()
+    total, squares = (np.append(0.0, np.cumsum(v)) for v in (two, two * two))
+    apart = one @ one + squares[n:] - squares[:-n] - 2.0 * np.correlate(two, one, "valid")
+    return np.asarray(np.maximum(apart / n - ((total[n:] - total[:-n]) / n) ** 2, 0.0))
 
 
 def check_delays(found: Sequence[tuple[Recording, Delay]], limits: Limits) -> None:

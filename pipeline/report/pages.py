@@ -27,8 +27,13 @@ def _figure(value: object) -> str:
 
 @cache
 def _environment() -> Environment:
-    loader = FileSystemLoader(FOLDER)
-    environment = Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True, auto_reload=False)
+    environment = Environment(
+        loader=FileSystemLoader(FOLDER),
+        auto_reload=False,
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
     functions = (number, measured, percent, percent_change, probability, typeset, parameter_texts)
     environment.filters |= {function.__name__: function for function in functions}
     environment.filters |= {"words": plain, "figure": _figure, "unit": unit_text, "numeric": "#{}".format}

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import NotObservableError
+from pipeline.estimation.candidates import AUTO
 from pipeline.estimation.engine import draw_normal
 from pipeline.estimation.least_squares import certified
 from pipeline.estimation.monte_carlo import beside_trials, quadratic_results, trials_of
@@ -49,7 +50,6 @@ if TYPE_CHECKING:
 
     Values = NDArray[np.float64]
 
-AUTO = "auto"
 STEP = 0.1  # of a standard uncertainty: the columns are differentiated where they are used
 REMARK = {
     "accelerometer": "white noise, bias wander and what the rests scatter beyond both, as the residuals tell them",
