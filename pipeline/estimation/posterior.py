@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from pipeline.model.effects.base import Effect
 
     Values = NDArray[np.float64]
-    Solved = tuple[list[str], Values, Values, Values, Values]  # of ``Given._solved``
     Pick = tuple[int, int]  # version and scale of an effect
     Set = frozenset[str]
 
@@ -51,7 +50,8 @@ NEGLIGIBLE = 1e-5  # weight of a hypothesis or of a part of a mixture that is le
 SWEEPS, EXCHANGES = 3, 3
 CERTAIN = 0.97  # what is said of more than that: of the inclusions with 1.000, 96.6 % were right in those sensors
 ENOUGH = 0.95  # of an answer set, and of an upper limit
-HALVINGS = 24  # of the interval that holds a quantile
+HALVINGS, EXACT = 40, 1e-12  # of the interval that holds a quantile; relative
+FARTHEST = 40.0  # standard deviations: beyond them the normal distribution is 0 or 1 in doubles
 
 
 @dataclass(frozen=True)
@@ -133,17 +133,19 @@ class Search:
         """Return the most probable set of all, or of some."""
         return max(among or self.pool, key=lambda names: self.pool[names].score)
 
-    def given(self, names: Set, but: Set = frozenset(), only: Sequence[str] | None = None) -> Given:
-        """Return the problem beside a set, less some of its members, for some further effects or all."""
-        return Given(self.problem, {n: p for n, p in self.pool[names].picks.items() if n not in but}, only)
+    def given(self, names: Set, but: Set = frozenset()) -> Given:
+        """Return the problem beside a set, less some of its members."""
+        return Given(self.problem, {n: pick for n, pick in self.pool[names].picks.items() if n not in but})
 
     def _prune(self, seeds: Sequence[Set]) -> None:
         """Leave out hypotheses that have no weight beside any of some sets."""
         kept = np.zeros(len(self.problem.prior), bool)
         for names in seeds:
             found = Given(self.problem, dict.fromkeys(sorted(names), FIRST))
-            level = found.level + self.problem.rss(found.products[:, -1, -1])
-            for each in (level, *(np.max(c, axis=(0, 1)) for c in found.conditionals(self._allowed(names)).values())):
+            for each in (
+                found.alone(),
+                *(np.max(c, axis=(0, 1)) for c in found.conditionals(self._allowed(names)).values()),
+            ):
                 kept |= each > each.max() + np.log(NEGLIGIBLE)
         self.problem = self.problem.under(kept)
 
@@ -209,7 +211,7 @@ class Search:
             before, spread = dict(picks), 0.0
             for name in picks:
                 others = {n: pick for n, pick in picks.items() if n != name}
-                each = log_sum(Given(self.problem, others, [name]).conditionals([name])[name], axis=2)
+                each = log_sum(Given(self.problem, others).conditionals([name])[name], axis=2)
                 v, s = np.unravel_index(int(np.argmax(each)), each.shape)
                 picks[name] = int(v), int(s)
                 score = float(each[v, s])
@@ -217,96 +219,95 @@ class Search:
             if picks == before:
                 break
         if not picks:
-            score = float(log_sum(Given(self.problem, {}, []).alone()))
+            score = float(log_sum(Given(self.problem, {}).alone()))
         self.pool[names] = Found(score + spread + ODDS * len(names), picks, spread, final=True)
 
 
 class Given:
-    """A problem beside a set of effects at chosen versions and scales.
+    """A problem beside a set of effects at chosen versions and scales."""
 
-    ``only``: candidates that are asked for; None: all.
-    """
-
-    def __init__(self, problem: Problem, picks: Mapping[str, Pick], only: Sequence[str] | None = None) -> None:
-        self.problem, products = problem, problem.products
-        held = [problem.versions[name][v].columns for name, (v, _) in picks.items()]
-        names = problem.versions if only is None else only
-        last = products.shape[1] - 1
-        asked = [v.columns for name in names for v in problem.versions[name]]
-        self.kept = np.concatenate([*asked, [last]]).astype(np.intp)
-        self._place = np.zeros(last + 1, np.intp)
-        self._place[self.kept] = np.arange(len(self.kept))
-        self.products = products if only is None else products[:, self.kept[:, None], self.kept]
-        if only is None:
-            self.kept = self._place = np.arange(last + 1)
-        self.level = problem.prior
-        if held:
+    def __init__(self, problem: Problem, picks: Mapping[str, Pick]) -> None:
+        self.problem, self.level = problem, problem.prior
+        self.squares, self._half = problem.products[:, -1, -1], None  # of the readings; what the set takes
+        if picks:
+            held = [problem.versions[name][v].columns for name, (v, _) in picks.items()]
             at = np.concatenate(held)
             scale = np.repeat([SCALES[s] for _, s in picks.values()], [len(c) for c in held])
-            inner = products[:, at[:, None], at] + np.diag(scale**-2.0)
-            cross = products[:, at[:, None], self.kept]
-            L = np.linalg.cholesky(inner)
-            half = np.linalg.solve(L, cross)
-            self.products = self.products - half.transpose(0, 2, 1) @ half
+            L = np.linalg.cholesky(problem.products[:, at[:, None], at] + np.diag(scale**-2.0))
+            self._half = np.linalg.inv(L) @ problem.products[:, at]
+            self.squares = self.squares - np.sum(self._half[:, :, -1] ** 2, axis=1)
             logarithm = 2.0 * np.sum(np.log(np.einsum("tkk->tk", L)), axis=1) + 2.0 * float(np.sum(np.log(scale)))
             chosen = sum(float(SCALE_PRIOR[s] + problem.versions[n][v].log_weight) for n, (v, s) in picks.items())
             self.level = problem.prior - 0.5 * logarithm + chosen
 
     def alone(self) -> Values:
         """Return log E of the set under each hypothesis: (t,) array."""
-        return self.level + self.problem.rss(self.products[:, -1, -1])
+        return self.level + self.problem.rss(self.squares)
 
     def conditionals(self, names: Sequence[str]) -> dict[str, Values]:
         """Return log E with each of some further effects: its (versions, scales, t) array, without the prior odds."""
         found: dict[str, Values] = {}
-        for solved in self._solved(names):
-            owners, score = solved[0], self._scored(solved)
+        for owners, weight, inner, cross in self._blocks(names):
+            score, _ = self._scored(weight, inner, cross)
             for name in dict.fromkeys(owners):
                 own = [i for i, owner in enumerate(owners) if owner == name]
                 found[name] = score[:, :, own].transpose(2, 0, 1)
         return found
 
-    def _scored(self, solved: Solved) -> Values:
-        """Return log E with each of some versions: (scales, t, versions) array."""
-        _, weight, values, _, along = solved
-        gain = np.sum(along**2 * _shrunk(values), axis=3)
-        log_det = np.sum(np.log1p(SCALES[:, None, None, None] ** 2 * values), axis=3)
-        score = self.problem.rss(self.products[:, -1, -1, None] - gain) - 0.5 * log_det
-        return np.asarray(score + self.level[:, None] + SCALE_PRIOR[:, None, None] + weight)
-
-    def mixture(self, name: str) -> tuple[Values, Values, Values]:
-        """Return log weight, (m,), mean and standard deviation, (m, k), of an effect's parameters over their limits."""
-        parts = []
-        for solved in self._solved([name]):
-            _, _, values, vectors, along = solved
-            shrunk, weight = _shrunk(values), self._scored(solved)
-            mean = np.einsum("tmij,stmj->stmi", vectors, along * shrunk)
-            squares = self.products[:, -1, -1, None] - np.sum(along**2 * shrunk, axis=3) + self.problem.within
-            spread = np.einsum("tmij,stmj->stmi", vectors**2, shrunk) * squares[..., None] / self.problem.free
-            kept = weight > weight.max() + np.log(NEGLIGIBLE)
-            parts.append((weight[kept], mean[kept], np.sqrt(np.maximum(spread[kept], 0.0))))
-        (found,) = parts  # the versions of an effect have as many columns
+    def mixtures(self, names: Sequence[str]) -> dict[str, tuple[Values, Values, Values]]:
+        """Return log weight, (m,), mean and standard deviation, (m, k), of effects' parameters over their limits."""
+        found = {}
+        for owners, log_weight, inner, cross in self._blocks(names):
+            score, squares = self._scored(log_weight, inner, cross)
+            owner, top = np.array([owners.index(name) for name in owners]), np.full(len(owners), -np.inf)
+            np.maximum.at(top, owner, np.max(score, axis=(0, 1)))
+            kept = score > top[owner] + np.log(NEGLIGIBLE)
+            s, t, m = np.nonzero(kept)
+            inverse = np.linalg.inv(inner[t, m] + SCALES[s, None, None] ** -2.0 * np.eye(inner.shape[-1]))
+            mean, weight = (inverse @ cross[t, m, :, None])[..., 0], score[kept]
+            spread = np.einsum("nkk->nk", inverse) * (squares[kept] / self.problem.free)[:, None]
+            deviation = np.sqrt(np.maximum(spread, 0.0))
+            for place in np.unique(owner):
+                own = owner[m] == place
+                found[owners[place]] = weight[own], mean[own], deviation[own]
         return found
 
-    def _solved(self, names: Sequence[str]) -> list[Solved]:
-        """Return owners, log weights, eigenvalues, eigenvectors and projected readings of versions of each size."""
+    def _blocks(self, names: Sequence[str]) -> list[tuple[list[str], Values, Values, Values]]:
+        """Return owners, log weights and products of versions of each size, (t, m, k, k), also with readings."""
         groups: dict[int, list[tuple[str, Version]]] = {}
         for name in names:
             for version in self.problem.versions[name]:
                 groups.setdefault(len(version.columns), []).append((name, version))
-        out = []
+        out, products = [], self.problem.products
         for members in groups.values():
-            at = self._place[np.array([version.columns for _, version in members])]
-            values, vectors = np.linalg.eigh(self.products[:, at[:, :, None], at[:, None, :]])
-            along = np.einsum("tmji,tmj->tmi", vectors, self.products[:, at, -1])
+            at = np.array([version.columns for _, version in members])
+            inner, cross = products[:, at[:, :, None], at[:, None, :]], products[:, at, -1]
+            if self._half is not None:
+                half = self._half[:, :, at].transpose(0, 2, 3, 1)
+                inner = inner - half @ half.transpose(0, 1, 3, 2)
+                cross = cross - (half @ self._half[:, None, :, -1:])[..., 0]
             weight = np.array([version.log_weight for _, version in members])
-            out.append(([name for name, _ in members], weight, np.clip(values, 0.0, None), vectors, along))
+            out.append(([name for name, _ in members], weight, inner, cross))
         return out
 
+    def _scored(self, weight: Values, inner: Values, cross: Values) -> tuple[Values, Values]:
+        """Return log E with further versions, and the sum of squares that they leave: (scales, t, versions) arrays.
 
-def _shrunk(values: Values) -> Values:
-    """Return ``s^2 / (1 + s^2 lambda)`` of (t, m, k) eigenvalues: (scales, t, m, k) array."""
-    return np.asarray(1.0 / (SCALES[:, None, None, None] ** -2.0 + values))
+        By elimination of ``G + D^-2``, whose pivots are not below ``D^-2``.
+        """
+        k, least = inner.shape[-1], SCALES[:, None, None] ** -2.0
+        left = np.concatenate([inner, cross[..., None]], axis=3).transpose(2, 3, 0, 1)[:, :, None]
+        left = left + np.eye(k, k + 1)[:, :, None, None, None] * least
+        gain, log_det = np.zeros(left.shape[2:]), np.full(left.shape[2:], -k * np.log(least))
+        for j in range(k):
+            pivot, row = np.maximum(left[j, j], least), left[j, j + 1 :]
+            over = row / pivot
+            gain += row[-1] * over[-1]
+            log_det += np.log(pivot)
+            left[j + 1 :, j + 1 :] -= row[:-1, None] * over
+        squares = self.squares[:, None] - gain
+        score = self.problem.rss(squares) - 0.5 * log_det + self.level[:, None] + SCALE_PRIOR[:, None, None] + weight
+        return score, squares + self.problem.within
 
 
 def log_sum(values: Values, axis: int | None = None) -> Values:
@@ -336,29 +337,31 @@ def answers(searches: Sequence[Search | None], owner: Callable[[Set], int], name
     keys = list(pool)
     sets = [(tuple(sorted(keys[i])), float(weight[i])) for i in order]
     likely = [(pool[keys[i]][0], keys[i]) for i in order[:BEAM] if weight[i] > 0.01 * weight[order[0]]]
-    limits = {name: _upper_limit(name, likely) for name in names}
-    return Answers(sets, {name: limit for name, limit in limits.items() if limit is not None})
+    return Answers(sets, _upper_limits(list(names), likely))
 
 
-def _upper_limit(name: str, likely: Sequence[tuple[Search, Set]]) -> Values | None:
-    """Return the upper limits of an effect's parameters, given that it is there beside likely sets: (k,) array."""
-    parts, seen = [], set()
-    for search, names in likely:
-        if name not in search.problem.versions:
-            continue
-        gone = (search.problem.excluded.get(name, frozenset()) | {name}) - (search.required - {name})
-        kept = names - gone
-        if (id(search), kept) in seen or (search.required & search.problem.excluded.get(name, frozenset())):
-            continue
-        seen.add((id(search), kept))
-        weight, mean, deviation = search.given(names, gone, [name]).mixture(name)
-        limit = search.problem.limits[name]
-        parts.append((weight + ODDS * len(kept), mean * limit, deviation * limit))
-    if not parts:
-        return None
-    weight, mean, deviation = (np.concatenate(each) for each in zip(*parts, strict=True))
-    weight = np.exp(weight - weight.max())
-    return quantile(weight / weight.sum(), mean, deviation)
+def _upper_limits(names: Sequence[str], likely: Sequence[tuple[Search, Set]]) -> dict[str, Values]:
+    """Return the upper limits of effects' parameters, given that each is there beside likely sets: (k,) arrays."""
+    parts: dict[str, list[tuple[Values, Values, Values]]] = {}
+    seen = set()
+    for search, members in likely:
+        asked: dict[Set, list[str]] = {}  # by the rest of the set, beside which they are
+        for name in (n for n in names if n in search.problem.versions):
+            barred = search.problem.excluded.get(name, frozenset())
+            kept = members - ((barred | {name}) - (search.required - {name}))
+            if not search.required & barred and (id(search), kept, name) not in seen:
+                seen.add((id(search), kept, name))
+                asked.setdefault(kept, []).append(name)
+        for kept, own in asked.items():
+            for name, (weight, mean, deviation) in search.given(members, members - kept).mixtures(own).items():
+                limit = search.problem.limits[name]
+                parts.setdefault(name, []).append((weight + ODDS * len(kept), mean * limit, deviation * limit))
+    found = {}
+    for name in (n for n in names if n in parts):
+        weight, mean, deviation = (np.concatenate(each) for each in zip(*parts[name], strict=True))
+        weight = np.exp(weight - weight.max())
+        found[name] = quantile(weight / weight.sum(), mean, deviation)
+    return found
 
 
 def quantile(weight: Values, mean: Values, deviation: Values) -> Values:
@@ -369,14 +372,20 @@ def quantile(weight: Values, mean: Values, deviation: Values) -> Values:
     from scipy.special import ndtr  # noqa: PLC0415  (0.1 s that only a diagnosis pays)
 
     kept = weight > NEGLIGIBLE
-    weight, mean, deviation = weight[kept], mean[kept], np.maximum(deviation[kept], 1e-300)
-    low, high = np.zeros(mean.shape[1]), np.max(np.abs(mean) + 5.0 * deviation, axis=0)
-    for _ in range(HALVINGS):
-        middle = 0.5 * (low + high)
-        inside = weight @ (ndtr((middle - mean) / deviation) - ndtr((-middle - mean) / deviation))
-        below = inside < ENOUGH * weight.sum()
-        low, high = np.where(below, middle, low), np.where(below, high, middle)
-    return np.asarray(high)
+    weight, mean, deviation = weight[kept], np.abs(mean[kept]), np.maximum(deviation[kept], 1e-300)
+    low, high = np.zeros(mean.shape[1]), np.max(mean + 5.0 * deviation, axis=0)
+    found = high
+    for _ in range(HALVINGS):  # of Newton, or halvings where a step of it leaves the interval
+        above, beneath = (np.clip((found + side * mean) / deviation, -FARTHEST, FARTHEST) for side in (-1.0, 1.0))
+        off = weight @ (ndtr(above) - ndtr(-beneath)) - ENOUGH * weight.sum()
+        density = weight @ ((np.exp(-0.5 * above**2) + np.exp(-0.5 * beneath**2)) / deviation) / np.sqrt(2.0 * np.pi)
+        low, high = np.where(off < 0.0, found, low), np.where(off < 0.0, high, found)
+        following = found - off / np.maximum(density, 1e-300)
+        following = np.where((following > low) & (following < high), following, 0.5 * (low + high))
+        if np.all(np.abs(following - found) <= EXACT * high):
+            break
+        found = following
+    return np.asarray(following)
 
 
 def excited(products: Values, size: Values, limit: Values, least: float) -> Values:

@@ -93,8 +93,10 @@ def _variances(fixed: Array, moved: Array) -> Array:
     """Return the variance of the difference to (n,) values of each n successive ones of (m,): (m - n + 1,) array."""
     n, one, two = len(fixed), fixed - fixed.mean(), moved - moved.mean()
     total, squares = (np.append(0.0, np.cumsum(v)) for v in (two, two * two))
-    apart = one @ one + squares[n:] - squares[:-n] - 2.0 * np.correlate(two, one, "valid")
-    return np.asarray(np.maximum(apart / n - ((total[n:] - total[:-n]) / n) ** 2, 0.0))
+    power = one @ one
+    apart = power + squares[n:] - squares[:-n] - 2.0 * np.correlate(two, one, "valid")
+    rounding = np.finfo(float).eps * power
+    return np.asarray(np.maximum(apart - (total[n:] - total[:-n]) ** 2 / n, rounding) / n)
 
 
 def check_delays(found: Sequence[tuple[Recording, Delay]], limits: Limits) -> None:
