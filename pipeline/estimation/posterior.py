@@ -50,7 +50,7 @@ NEGLIGIBLE = 1e-5  # weight of a hypothesis or of a part of a mixture that is le
 SWEEPS, EXCHANGES = 3, 3
 CERTAIN = 0.97  # what is said of more than that: of the inclusions with 1.000, 96.6 % were right in those sensors
 ENOUGH = 0.95  # of an answer set, and of an upper limit
-HALVINGS, EXACT = 40, 1e-12  # of the interval that holds a quantile; relative
+HALVINGS, EXACT = 40, 1e-9  # of the interval that holds a quantile; relative
 FARTHEST = 40.0  # standard deviations: beyond them the normal distribution is 0 or 1 in doubles
 
 
