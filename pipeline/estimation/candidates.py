@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 AUTO = "auto"  # in place of a list of effects: what the diagnosis selects
 MOUNTING, ZERO = "mounting", "encoder_zero"
 SEAT_DEG = 5.0  # where mountings are fitted and the table's config states no size: the default tolerance of ingest
-CONSTANTS = 8  # values of a time constant, in equal ratios from the first start to the last
 SECOND_SHARE = 0.1  # of the likelier one's prior probability, by assumption
 SECOND = {"accelerometer": (), "gyroscope": ("table_encoder_error",)}  # exact look-alikes of a likelier effect
 
@@ -202,22 +201,33 @@ def limits_or_noise(
     return noise if limits is None else np.where(np.isfinite(limits[: len(power)]), limits[: len(power)], noise)
 
 
+def excited(
+    products: NDArray[np.float64], size: NDArray[np.float64], limit: NDArray[np.float64], least: float
+) -> NDArray[np.float64]:
+    """Return the change of columns to those of parameters over their limits, in the directions that are excited.
+
+    ``products``: (k, k), less the base. ``size``: (k,), norm of the columns with it. ``least``: share of it that must
+    be left.
+    """
+    values, vectors = np.linalg.eigh(products / np.outer(size, size))
+    kept = vectors[:, values > least**2]
+    return np.asarray((kept @ kept.T) * limit / size[:, None] * size)
+
+
 def time_constants(
     this: Effect, sensor: str, fitted: Term | None = None, width: float | None = None
 ) -> list[tuple[Term, float]]:
-    """Return an effect at values of what is not linear in it, with log weights of their prior; the fitted one first.
+    """Return an effect at the starts of its time constant, with log weights of their prior; the fitted one first.
 
     ``width``: standard uncertainty of the fitted value's logarithm; None: as wide as the steps between the others.
     """
     starts = this.starts(sensor)
-    first, last = starts[0], starts[-1]
     if not this.nonlinear or this.moves:
-        return [(fitted or Term(this, np.zeros(len(first))), 0.0)]
-    ratio = np.where(first > 0.0, last / np.where(first > 0.0, first, 1.0), 1.0)
-    share = 1.0 / CONSTANTS
-    grid = [(Term(this, first * ratio ** (k / (CONSTANTS - 1))), float(np.log(share))) for k in range(CONSTANTS)]
+        return [(fitted or Term(this, np.zeros(len(starts[0]))), 0.0)]
+    share = 1.0 / len(starts)
+    grid = [(Term(this, values), float(np.log(share))) for values in starts]
     if fitted is None:
         return grid
     if width is not None:
-        share = min(share, float(np.sqrt(2.0 * np.pi) * width / np.log(ratio.max())))
+        share = min(share, float(np.sqrt(2.0 * np.pi) * width / np.log(starts[-1][-1] / starts[0][-1])))
     return [(fitted, float(np.log(share))), *grid]

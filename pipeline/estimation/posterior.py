@@ -43,13 +43,13 @@ INCLUSION = 0.02  # prior probability of each effect
 FIRST = 0, 3  # version and scale from which those of a set are improved
 ODDS = float(np.log(INCLUSION / (1.0 - INCLUSION)))
 BEAM, MOST = 6, 5  # sets that are extended, and their largest size
-FAR = 12.0  # of log E below the best, beyond which a set is not extended
+FAR = 9.0  # of log E below the best, beyond which a set is not extended
 NEAR = 7.0  # of log E below the best, within which a set's scales are found
-MOST_NEAR = 16  # of these sets
+MOST_NEAR, ROUNDS = 16, 3  # of these sets; of a search for the best scales, and of exchanges
 NEGLIGIBLE = 1e-5  # weight of a hypothesis or of a part of a mixture that is left out
-SWEEPS, EXCHANGES = 3, 3
 CERTAIN = 0.97  # what is said of more than that: of the inclusions with 1.000, 96.6 % were right in those sensors
 ENOUGH = 0.95  # of an answer set, and of an upper limit
+LIKELY = 0.05  # share of the best probability, above which a set counts for upper limits
 HALVINGS, EXACT = 40, 1e-9  # of the interval that holds a quantile; relative
 FARTHEST = 40.0  # standard deviations: beyond them the normal distribution is 0 or 1 in doubles
 
@@ -165,7 +165,7 @@ class Search:
 
     def _exchange(self) -> None:
         """Replace each member of the best set by every other effect."""
-        for _ in range(EXCHANGES):
+        for _ in range(ROUNDS):
             best = self.best()
             for name in sorted(best - self.required):  # the order of a set differs from process to process
                 self._extend(best - {name})
@@ -207,7 +207,7 @@ class Search:
             return
         picks: dict[str, Pick] = dict(held.picks) if held else dict.fromkeys(sorted(names), FIRST)
         spread = score = 0.0
-        for _ in range(SWEEPS):
+        for _ in range(ROUNDS):
             before, spread = dict(picks), 0.0
             for name in picks:
                 others = {n: pick for n, pick in picks.items() if n != name}
@@ -336,7 +336,7 @@ def answers(searches: Sequence[Search | None], owner: Callable[[Set], int], name
     order = np.argsort(-weight, kind="stable")
     keys = list(pool)
     sets = [(tuple(sorted(keys[i])), float(weight[i])) for i in order]
-    likely = [(pool[keys[i]][0], keys[i]) for i in order[:BEAM] if weight[i] > 0.01 * weight[order[0]]]
+    likely = [(pool[keys[i]][0], keys[i]) for i in order[:BEAM] if weight[i] > LIKELY * weight[order[0]]]
     return Answers(sets, _upper_limits(list(names), likely))
 
 
@@ -386,17 +386,6 @@ def quantile(weight: Values, mean: Values, deviation: Values) -> Values:
             break
         found = following
     return np.asarray(following)
-
-
-def excited(products: Values, size: Values, limit: Values, least: float) -> Values:
-    """Return the change of columns to those of parameters over their limits, in the directions that are excited.
-
-    ``products``: (k, k), less the base. ``size``: (k,), norm of the columns with it. ``least``: share of it that must
-    be left.
-    """
-    values, vectors = np.linalg.eigh(products / np.outer(size, size))
-    kept = vectors[:, values > least**2]
-    return np.asarray((kept @ kept.T) * limit / size[:, None] * size)
 
 
 def excluded(effects: Sequence[Effect]) -> dict[str, Set]:

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.estimation.candidates import SECOND, SECOND_SHARE, limits_or_noise, time_constants
-from pipeline.estimation.design import BASE, Start, Term
+from pipeline.estimation.candidates import SECOND, SECOND_SHARE, excited, limits_or_noise, time_constants
+from pipeline.estimation.design import BASE, Design, Start, Term
 from pipeline.estimation.gauss_markov import WHITE, random_walks
 from pipeline.estimation.generalized_least_squares import design_beside, fit_terms
 from pipeline.estimation.posterior import (
@@ -22,7 +22,6 @@ from pipeline.estimation.posterior import (
     Search,
     Version,
     answers,
-    excited,
     excluded,
     log_sum,
 )
@@ -114,6 +113,33 @@ def _versions(sensor: str, fit: Fit, term: Term) -> list[tuple[Term, float]]:
     return [(replace(each, full=False, prior=term.prior), weight + second) for each, weight in found]
 
 
+def _products(
+    selection: Selection, fit: Fit, listed: Sequence[tuple[str, Term, float]]
+) -> tuple[Design, Values, Values, list[slice]]:
+    """Return a design at a fit, its products, log determinants, and the place of each listed term.
+
+    Where nothing is fitted beside the base, the products are those of the selection's ranking.
+    """
+    ranking, walks = selection.ranking, random_walks(selection.settings)
+    places = {
+        (term.effect.name, term.values.tobytes()): at
+        for term, at in zip(ranking.candidates, ranking.design.slices, strict=False)
+    }
+    keys = [(name, term.values.tobytes()) for name, term, _ in listed]
+    if fit.terms or any(key not in places for key in keys):
+        design = design_beside(
+            selection.observations, fit, [*fit.terms[: len(selection.base.terms)], *(t for _, t, _ in listed)]
+        )
+        return (
+            design,
+            *design.products([WHITE, *selection.settings, *walks]),
+            design.slices[len(selection.base.terms) :],
+        )
+    found = (ranking.stacked, ranking.logarithms), ranking.design.products(walks)
+    stacked, logarithms = (np.concatenate(pair) for pair in zip(*found, strict=True))
+    return ranking.design, stacked, logarithms, [places[key] for key in keys]
+
+
 def _problem(selection: Selection, fit: Fit, candidates: Mapping[str, Term]) -> Problem:
     """Return the linear problem at a fit."""
     observations = selection.observations
@@ -124,9 +150,8 @@ def _problem(selection: Selection, fit: Fit, candidates: Mapping[str, Term]) -> 
         for name, candidate in candidates.items()
         for term, weight in _versions(observations.sensor, fit, candidate)
     ]
-    design = design_beside(observations, fit, [*configured, *(term for _, term, _ in listed)])
+    design, stacked, logarithms, places = _products(selection, fit, listed)
     settings = [WHITE, *selection.settings, *random_walks(selection.settings)]
-    stacked, logarithms = design.products(settings)
     known = BASE + sum(s.stop - s.start for s in design.slices[: len(configured)])
     size = np.where(design.sizes() > 0.0, design.sizes(), 1.0)
     base = stacked[:, :known, :known] / np.outer(size[:known], size[:known])
@@ -137,7 +162,7 @@ def _problem(selection: Selection, fit: Fit, candidates: Mapping[str, Term]) -> 
     moved[-1] = change[-1, -1] = 1.0
     versions: dict[str, list[Version]] = {}
     limits: dict[str, Values] = {}
-    for (name, _, weight), at in zip(listed, design.slices[len(configured) :], strict=True):
+    for (name, _, weight), at in zip(listed, places, strict=True):
         own = slice(at.start - known, at.stop - known)
         limit = (
             limits[name]

@@ -74,6 +74,7 @@ class Ranking:
         self.within = float(np.sum(observations.scatter / scale**2))
         design = Design(observations, [*configured, *candidates], K, scale, project=True)
         stacked, logarithms = design.products(self.settings)
+        self.design, self.stacked, self.logarithms = design, stacked, logarithms
         self.penalty = 0.5 * logarithms - np.array([setting.prior for setting in self.settings])
         known = BASE + sum(s.stop - s.start for s in design.slices[: len(configured)])
         products = without(stacked, np.arange(known))[:, known:, known:]

@@ -10,6 +10,7 @@ import pytest
 from scipy.linalg import null_space
 from scipy.special import logsumexp
 
+from pipeline.estimation.candidates import excited
 from pipeline.estimation.posterior import (
     ODDS,
     SCALE_PRIOR,
@@ -19,7 +20,6 @@ from pipeline.estimation.posterior import (
     Search,
     Version,
     answers,
-    excited,
     quantile,
 )
 

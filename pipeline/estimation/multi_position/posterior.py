@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.estimation.candidates import limits_or_noise, time_constants
+from pipeline.estimation.candidates import excited, limits_or_noise, time_constants
 from pipeline.estimation.gauss_markov import WALK_RATIO, WALK_SHARE, WALK_TIME
 from pipeline.estimation.multi_position.likelihood import NEW
 from pipeline.estimation.posterior import (
@@ -19,7 +19,6 @@ from pipeline.estimation.posterior import (
     Search,
     Version,
     answers,
-    excited,
     excluded,
 )
 from pipeline.estimation.ranking import without
