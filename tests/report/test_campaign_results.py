@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import ast
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pytest
 
 import pipeline
 from pipeline.errors import InputError, MissingInputError
+from pipeline.estimation.noise_identification import identify_noise
+from pipeline.records import Recording
 from pipeline.report.summary import summary_row, write_summary
 
 from .conftest import Unit, build_unit
@@ -59,6 +63,23 @@ def test_each_table_holds_the_values_of_the_files(unit: Unit, results: Path) -> 
     verdicts = campaign.diagnosis.set_index("sensor")["verdict"]
     assert verdicts.to_dict() == {s: part["verdict"] for s, part in unit.diagnosis.items()}
     assert campaign.effects.query("selected")["effect"].tolist() == ["quadratic_nonlinearity"]
+
+
+def test_the_table_of_the_noise_has_a_row_for_each_term(unit: Unit, results: Path, tmp_path: Path) -> None:
+    readings = np.random.default_rng(1).normal(0.0, 0.01, (500, 3))
+    rest = Recording("static", "static", None, np.arange(500) * 10_000_000, accelerometer=readings)
+    noise = {sensor: identify_noise(sensor, [rest]) for sensor in ("accelerometer", "gyroscope")}
+    shutil.copytree(results, tmp_path / "demo")
+    (tmp_path / "demo" / "calibrations" / "U1.json").write_text(json.dumps(unit.calibration | {"noise": noise}))
+    table = pipeline.load_campaign(tmp_path / "demo").noise
+    assert set(table["sensor"]) == {"accelerometer"}
+    rows = table.set_index(["axis", "term"])
+    terms = noise["accelerometer"]["axes"]["y"]["terms"]
+    white = rows.loc["y", "white"]
+    assert [white["value"], white["low"], white["high"]] == [terms["white"]["value"], *terms["white"]["interval"]]
+    assert white["value_unit"] == "g/sqrt(Hz)"
+    assert rows.loc["y", "random_walk"]["upper_limit"] == terms["random_walk"]["upper_limit"]
+    assert "too short" in rows.loc["y", "random_walk"]["reason"]
 
 
 def test_one_unit_is_its_documents_and_a_failed_one_names_its_cause(unit: Unit, results: Path) -> None:
