@@ -319,6 +319,18 @@ def test_a_series_is_switched_off_and_a_chart_enlarged_and_put_back(browser: Bro
     page.context.close()
 
 
+def test_the_contents_stay_in_view_and_tell_where_the_reader_is(browser: Browser, pages: Path) -> None:
+    page = opened(browser, pages / "unit.html")
+    page.locator(".contents a[href='#gyroscope']").click()
+    page.locator(".contents a[aria-current]", has_text="Gyroscope").wait_for()
+    box = page.locator(".contents").bounding_box() or {}
+    assert box["y"] == 0.0 < page.evaluate("scrollY")
+    below = page.locator(".contents .parts a").all_text_contents()
+    assert below == page.locator("#gyroscope h3").all_text_contents()
+    assert left_alone(page, pages / "unit.html")
+    page.context.close()
+
+
 def test_on_paper_a_page_has_no_controls(browser: Browser, pages: Path) -> None:
     page = opened(browser, pages / "unit.html", color_scheme="dark")
     page.emulate_media(media="print")

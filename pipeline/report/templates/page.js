@@ -25,3 +25,30 @@ for (const button of document.querySelectorAll(".copy button")) {
     else select();
   });
 }
+// The contents mark the part that is read, and list its own parts.
+const contents = document.querySelector(".contents");
+if (contents) {
+  const links = [...contents.querySelectorAll("a")], heads = links.map((link) => document.getElementById(link.hash.slice(1)));
+  const below = document.createElement("ul");
+  below.className = "parts";
+  contents.append(below);
+  let now = -1;
+  const entry = (head, i, part) => {
+    const item = document.createElement("li"), link = document.createElement("a");
+    head.id ||= `${part.id}-${i}`;
+    link.href = `#${head.id}`; link.textContent = head.textContent;
+    item.append(link);
+    return item;
+  };
+  const follow = () => {
+    const next = heads.findLastIndex((head) => head && head.getBoundingClientRect().top < 120);
+    if (next === now) return;
+    now = next;
+    links.forEach((link, i) => i === now ? link.setAttribute("aria-current", "true") : link.removeAttribute("aria-current"));
+    const list = contents.firstElementChild, link = links[now];
+    if (link) list.scrollLeft = link.offsetLeft - list.clientWidth / 2;
+    below.replaceChildren(...[...heads[now]?.querySelectorAll("h3") ?? []].map((head, i) => entry(head, i, heads[now])));
+  };
+  addEventListener("scroll", () => requestAnimationFrame(follow), { passive: true });
+  follow();
+}
