@@ -51,7 +51,8 @@ def posterior(selection: Selection, hidden: Collection[str], others: Sequence[Ef
     """
     sensor = selection.observations.sensor
     candidates = {term.effect.name: term for term in reversed(selection.first.candidates)}
-    candidates = {name: term for name, term in sorted(candidates.items()) if name not in hidden}
+    shown = {*(candidates.keys() - set(hidden)), *selection.names}
+    candidates = {name: term for name, term in sorted(candidates.items()) if name in shown}
     candidates |= {this.name: Term(this, np.zeros(len(this.parameters(sensor)))) for this in others}
     own, moving = frozenset(selection.names), frozenset(n for n, term in candidates.items() if term.effect.moves)
     first = Search(_problem(selection, selection.fit, candidates), seeds=[own])

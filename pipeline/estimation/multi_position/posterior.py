@@ -41,7 +41,8 @@ def posterior(selection: Selection, hidden: Collection[str], others: Sequence[Ef
 
     ``hidden``: effects that the recordings cannot show. ``others``: further candidates.
     """
-    effects = {this.name: this for this in (*selection.candidates, *others) if this.name not in hidden}
+    shown = {this.name: this for this in (*selection.candidates, *others)}
+    effects = {name: this for name, this in shown.items() if name not in hidden or name in selection.names}
     return answers([Search(_problem(selection, effects), seeds=[selection.names])], lambda _: 0, effects)
 
 
