@@ -38,6 +38,7 @@ def diagnose(
     *,
     validation: Mapping[str, Any] | None = None,
     gravity: Mapping[str, Any] | None = None,
+    moves: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Return a sensor's part of ``diagnoses/<unit>.json``.
 
@@ -53,6 +54,8 @@ def diagnose(
         For the gyroscope by hand, which needs the direction of gravity; without it, it is calibrated again.
     gravity : mapping, optional
         Diagnosis of the accelerometer, for a gyroscope whose mountings it determines.
+    moves : mapping, optional
+        Part ``gravity_direction`` of ``validations/<unit>.json``, for a gyroscope by hand.
     validation : mapping, optional
         The sensor's part of ``validations/<unit>.json``; without it, a free fit stands for the calibration.
 
@@ -77,6 +80,8 @@ def diagnose(
 
     def judge(found: Findings | None, document: dict[str, Any]) -> tuple[dict[str, Any], bool]:
         evidence = evidence_of(document, sensor, recordings, noise, settings, validation=validation, found=found)
+        if moves and "largest_expected_rms_deg" in moves:
+            evidence = replace(evidence, moves=(moves["rms_deg"]["after"], moves["largest_expected_rms_deg"]))
         if by_gravity and gravity:
             evidence = replace(evidence, doubts=[*evidence.doubts, *_doubts_of_gravity(gravity)])
         verdict = judged(document, evidence)

@@ -77,6 +77,7 @@ class Evidence:
     over_noise: float | None = None  # residual of the fit over the noise, without what was selected
     left_over_noise: float | None = None  # and with it
     published: HeldOut | None = None  # of the unit's calibration
+    moves: tuple[float, float] | None = None  # rms error of held-out moves, and the largest that is expected, deg
     free: HeldOut | None = None  # of a free fit of the same recordings; filtered ones against the filtered reference
     full: HeldOut | None = None  # of the free fit with the selected effects
     doubts: Sequence[str] = ()  # what the recordings' checks say of the reference
@@ -225,6 +226,12 @@ def decide(e: Evidence) -> tuple[str, str]:
         return _above(e, e.published)
     if e.found == "unexplained" or (e.found == "missing_effect" and _unconfirmed(e)):
         return "unexplained", _why_unexplained(e)
+    if e.moves and e.moves[0] > e.moves[1] and e.found != "missing_effect":
+        return "unexplained", (
+            f"After the held-out moves, the integrated rate misses the direction of gravity by {e.moves[0]:.3g} deg "
+            f"(rms); noise and stated uncertainties explain at most {e.moves[1]:.3g} deg. Check that the unit rested "
+            "before and after each of them, without sliding, and that no samples are missing."
+        )
     return (e.found, _beyond(e)) if e.found == "missing_effect" else _within(e)
 
 

@@ -31,6 +31,7 @@ def process_unit(job: Job, unit: str, settings: dict[str, Any]) -> None:
             fits["accelerometer"],
             validation=validation[sensor],
             gravity=document.get("accelerometer"),
+            moves=validation["gravity_direction"] if sensor == "gyroscope" else None,
         )
         if calibration and found:
             other = next(fit for s, fit in fits.items() if s != sensor)

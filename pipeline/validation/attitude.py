@@ -217,8 +217,10 @@ def gravity_direction(
     dict
         ``reason`` (why there is none, else None), ``moves`` (how many), ``mean_deg``, ``rms_deg`` and ``max_deg`` (each
         ``before`` and ``after`` the gyroscope's calibration), ``noise_floor_deg`` (the mean that white noise alone
-        gives) and ``creeping_rests`` (in which the unit went on turning). Where the procedure states turns, ``turns``:
-        ``recording, time_s, axis, stated_deg`` and ``angle_deg`` (``before`` and ``after``) of each.
+        gives), ``largest_expected_rms_deg`` (by noise and uncertainties, exceeded with a probability of 0.5 %; where
+        the fit determines the matrix) and ``creeping_rests`` (in which the unit went on turning). Where the procedure
+        states turns, ``turns``: ``recording, time_s, axis, stated_deg`` and ``angle_deg`` (``before`` and ``after``) of
+        each.
     """
     if not is_multi_position("gyroscope", recordings):
         return {"reason": "not recorded by hand"}
@@ -239,7 +241,14 @@ def gravity_direction(
     raw, calibrated = State(np.zeros(3), np.eye(3)), State(gyroscope.bias, gyroscope.matrix, terms)
     before = model.direction_errors(raw)[0]
     after, floor = model.direction_errors(calibrated)
-    own = {}
+    own: dict[str, Any] = {}
+    if gyroscope.covariance is not None and gyroscope.covariance[3:12, 3:12].any():
+        ratio = 0.0 if noise is None else float(np.mean(noise.wander / np.maximum(noise.white, 1e-300)))
+        few = gyroscope.degrees_of_freedom
+        freedom = np.full(12, few) if gyroscope.freedom is None else gyroscope.freedom
+        details = gyroscope.stages[-1].details if gyroscope.stages else {}
+        largest = model.largest_direction_error(calibrated, gyroscope.covariance, freedom, details, ratio)
+        own["largest_expected_rms_deg"] = largest
     if turns:
         pairs = (turns.described(state) for state in (raw, calibrated))
         own["turns"] = [
