@@ -95,6 +95,8 @@ def diagnose(
     if unknown and found.search:
         found = found.search() or found
         document, _ = judge(found, document_of(found, configured, settings["effects"][sensor]))
+    if found.deeper and (full or document["verdict"] != "nothing_missing"):
+        document |= found.deeper()
     return document
 
 

@@ -69,6 +69,7 @@ class Findings:
     more: Mapping[str, Any] = field(default_factory=dict)  # further entries of the document
     turns: Sequence[str] = ()  # recordings that some effects have parameters for
     search: Callable[[], Findings | None] | None = None  # looks for a formula outside the catalogue; None: found none
+    deeper: Callable[[], dict[str, Any]] | None = None  # further entries of the document where something is missing
 
     def share(self, drop: float) -> float:
         """Return the share of the residual's excess over the noise that a drop of its squares is."""

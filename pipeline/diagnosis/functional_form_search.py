@@ -233,12 +233,12 @@ def search(selection: Selection) -> tuple[list[Scored], list[Scored]]:
     terms: list[Scored] = []
     grammar = Forms(selection)
     first = found = grammar.ranked()
-    while found[0].clear and (not terms or found[0].gain.delta_bic > MORE * terms[0].gain.delta_bic):
+    while found and found[0].clear and (not terms or found[0].gain.delta_bic > MORE * terms[0].gain.delta_bic):
         terms.append(found[0])
         if len(terms) == MOST_TERMS:
             break
         grammar.explain([text for term in terms for text in term.form.formulas])
-        found = grammar.ranked()
+        found = [each for each in grammar.ranked() if not any(each.form.refines(term.form) for term in terms)]
     return terms, first
 
 

@@ -184,10 +184,16 @@ class Form:
         """Number of choices that the grammar takes to state it."""
         return self.factor.complexity + (self.modulator.complexity if self.modulator else 0)
 
+    def refines(self, other: Form) -> bool:
+        """Return whether it differs from another form by its constants alone: a step beside a step."""
+        same = self.factor.kind == other.factor.kind and self.factor.signal == other.factor.signal
+        return same and bool(self.factor.constants)
+
     @property
     def name(self) -> tuple[str, ...]:
         """What stays the same when its constants change."""
-        own = self.factor.texts if not self.factor.constants else (self.factor.kind, self.factor.signal)
+        scanned = (self.factor.kind, self.factor.signal, str(self.scanned))
+        own = scanned if self.factor.constants else self.factor.texts
         return (*own, *(self.modulator.texts if self.modulator else ()))
 
     def unit(self, sensor: str) -> str:

@@ -84,7 +84,7 @@ def _significant(selection: Selection, explained: Curves | None) -> dict[str, tu
 
 def _smooth_tests(selection: Selection, explained: Curves | None) -> Tests:
     """Return covariate, delta BIC and number of parameters of each test with smooth curves, and the samples."""
-    bases = _bases_of(selection)
+    bases = bases_of(selection)
     projected = ProjectedCurves(selection, lambda m: np.concatenate([b(m) for _, b, _ in bases], axis=1), explained)
     names: list[str] = []
     counts: list[int] = []
@@ -104,7 +104,7 @@ def _smooth_tests(selection: Selection, explained: Curves | None) -> Tests:
 def _step_tests(selection: Selection, explained: Curves | None) -> Tests:
     """Return the same of the tests with steps and ripples."""
     observations = selection.observations
-    held = [name for name, _, _ in _bases_of(selection)]
+    held = [name for name, _, _ in bases_of(selection)]
     names: list[str] = []
     scanned: list[tuple[str, Values]] = []
     for covariate, signal in SIGNALS.items():
@@ -135,7 +135,7 @@ def _step_tests(selection: Selection, explained: Curves | None) -> Tests:
     return names, projected.gains(np.concatenate(drops, axis=2), parameters), parameters, projected.samples
 
 
-def _bases_of(selection: Selection) -> list[tuple[str, Curves, list[Block]]]:
+def bases_of(selection: Selection) -> list[tuple[str, Curves, list[Block]]]:
     """Return covariates that the recordings hold, the curves of each, and which of these are tried together.
 
     A block is tried with its first ``least`` curves, and with each further one.

@@ -122,7 +122,7 @@ class ProjectedCurves(_Evidence):
 
     def __init__(self, selection: Selection, curves: Curves, explained: Curves | None = None) -> None:
         super().__init__(selection)
-        observations, (A, places) = selection.observations, _columns(selection, explained, curves)
+        observations, (A, places) = selection.observations, columns_of_fit(selection, explained, curves)
         self.size = np.sqrt(np.einsum("i,ij,ij->j", observations.weight, A, A))[places[0][-1]]
         stacked, logarithms = Products(observations.blocks, observations.weight, A).products(self.settings)
         self._project(stacked, places)
@@ -209,7 +209,7 @@ class Scan(_Evidence):
 
     def __init__(self, selection: Selection, explained: Curves | None = None) -> None:
         super().__init__(selection)
-        observations, (A, places) = selection.observations, _columns(selection, explained)
+        observations, (A, places) = selection.observations, columns_of_fit(selection, explained)
         self.blocks, self.weight = observations.blocks, observations.weight
         self._label = self.blocks.label(len(self.weight))
         self._noise = GaussMarkov(self.blocks, self.settings)
@@ -283,7 +283,7 @@ class Scan(_Evidence):
         return np.asarray(np.where(new, found, 0.0)[1:])
 
 
-def _columns(selection: Selection, *further: Curves | None) -> tuple[Values, list[list[NDArray[np.intp]]]]:
+def columns_of_fit(selection: Selection, *further: Curves | None) -> tuple[Values, list[list[NDArray[np.intp]]]]:
     """Return the columns of a selection's fit, its residual and those of curves, and where those of each axis lie."""
     design = design_at(selection.observations, selection.fit)
     motions = [felt(part, selection.fit.terms) for part in selection.observations.parts]

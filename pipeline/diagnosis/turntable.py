@@ -13,6 +13,8 @@ import numpy as np
 
 from pipeline.diagnosis.findings import Findings
 from pipeline.diagnosis.formula_discovery import Discovery, dependent, discover
+from pipeline.diagnosis.goodness_of_fit import goodness_of_fit
+from pipeline.diagnosis.influence import influence
 from pipeline.diagnosis.method_errors import method_errors
 from pipeline.diagnosis.observability import never_shown, not_observable, one_way
 from pipeline.diagnosis.residual_plots import plots
@@ -162,7 +164,16 @@ def _described(
             "method_errors": method_errors(calibration, reported, recordings, settings),
         },
         turns=turns_of(observations),
+        deeper=lambda: {
+            "influence": influence(reported, [*_form(discovery), *reported.names]),
+            "goodness_of_fit": goodness_of_fit(reported),
+        },
     )
+
+
+def _form(discovery: Discovery) -> list[str]:
+    """Return the name of the suggested form, an effect of the reported selection's base."""
+    return [str(discovery.suggested["name"])] if discovery.suggested else []
 
 
 def _fits(selection: Selection) -> list[Fit]:

@@ -55,6 +55,8 @@ def in_words(part: Mapping[str, Any] | None, sensor: str) -> list[str]:
     for name in part["selected"]:
         lines += _selected(entries[name], sensor, with_form=bool(part.get("suggested_effect")))
     lines += _unknown(part, sensor)
+    lines += [_driven(entry) for entry in part.get("influence") or [] if entry["recordings"]]
+    lines += _goodness(part.get("goodness_of_fit"))
     lines += _held_out(part, sensor)
     wander = part.get("wander") or {}
     if wander.get("inflated"):
@@ -120,6 +122,30 @@ def _value(name: str, parameter: Mapping[str, Any]) -> str:
     uncertainty = parameter["standard_uncertainty"]
     spread = f" +- {2 * uncertainty:.2g}" if uncertainty else ""
     return f"{name} = {parameter['value']:.4g}{spread}{unit}"
+
+
+def _goodness(found: Mapping[str, Any] | None) -> list[str]:
+    """Return how well the model fits, by simulations from it."""
+    if not found:
+        return []
+    share, count = 100 * found["share_worse"], found["simulations"]
+    line = f"Of {count} simulations from the fitted model, {share:.0f} % fit worse than the readings"
+    return [f"{line}." if share >= 1.0 else f"{line}: the model is not complete."]
+
+
+def _driven(entry: Mapping[str, Any]) -> str:
+    """Return which recordings and which seconds drive a finding."""
+    first = entry["recordings"][0]
+    text = (
+        f"{plain(entry['effect']).capitalize()} is shown mostly by {first['recording']} ({100 * first['share']:.0f} %"
+    )
+    if entry["seconds"]:
+        stretch = entry["seconds"][0]
+        where = "" if stretch["recording"] == first["recording"] else f" of {stretch['recording']}"
+        text += f"; {100 * stretch['share']:.0f} % from {stretch['from_s']:.0f} to {stretch['to_s']:.0f} s{where}"
+    if not entry["depends_on"]:
+        return f"{text}); without any one recording the evidence for it remains."
+    return f"{text}); without {listed(entry['depends_on'], 'or')} the evidence for it is gone."
 
 
 def _unknown(part: Mapping[str, Any], sensor: str) -> list[str]:

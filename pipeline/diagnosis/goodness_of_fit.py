@@ -1,0 +1,109 @@
+"""Goodness of fit: the share of simulations from the fitted model that fit worse than the readings.
+
+    T = min over tests of p(2 log L' - 2 log L)
+
+The tests are the smooth curves of ``pipeline.diagnosis.residual_dependence``. The whitened linear model is fitted to
+the residual and to draws from the noise of the fit, under every noise setting, so that the share allows for the number of
+tests and for the noise that each fit takes (a parametric bootstrap: Davison and Hinkley, Bootstrap Methods and their
+Application, 1997, section 4.2).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.diagnosis.residual_dependence import bases_of
+from pipeline.diagnosis.residual_regression import ProjectedCurves, columns_of_fit
+from pipeline.estimation.gauss_markov import GaussMarkov, Products
+from pipeline.estimation.ranking import RIDGE, projection
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pipeline.estimation.observations import Observations
+    from pipeline.estimation.selection import Selection
+    from pipeline.records import Motion
+
+    Values = NDArray[np.float64]
+
+SIMULATIONS = 199  # the share is known to 3.5 % (standard error) at worst
+
+
+def goodness_of_fit(selection: Selection) -> dict[str, Any]:
+    """Return ``share_worse``, of so many ``simulations``."""
+    from scipy.special import chdtrc  # noqa: PLC0415  (0.1 s that only a diagnosis pays)
+
+    bases, observations = bases_of(selection), selection.observations
+
+    def curves(motion: Motion) -> Values:
+        return np.concatenate([of(motion) for _, of, _ in bases], axis=1)
+
+    fitted = ProjectedCurves(selection, curves)
+    draws = _draws(selection)
+    A, places = columns_of_fit(selection, curves)
+    parts = [
+        _projected(
+            selection.observations,
+            fitted,
+            np.concatenate([A[:, [*model[:-1], *own]], A[:, model[-1:]] / fitted.scale[c], draws[c]], axis=1),
+            len(own),
+        )
+        for c, (model, own) in enumerate(places)
+    ]
+    within = np.append(fitted.within, np.full(SIMULATIONS, 3.0 * (observations.samples - len(observations.weight))))
+    left = sum(left for _, _, left in parts)  # (t, 1 + s)
+
+    def likelihood(rss: Values) -> Values:
+        total = np.maximum(rss + within, 1e-300)
+        found = -0.5 * fitted.samples * np.log(total / fitted.samples)
+        return np.asarray((found - fitted.penalty.reshape(-1, *[1] * (rss.ndim - 1))).max(axis=0))
+
+    before, least, at = likelihood(np.asarray(left)), np.ones(1 + SIMULATIONS), 0
+    for _, _, blocks in bases:
+        for block, fewest in blocks:
+            kept = fitted.independent(at + np.asarray(block))
+            if len(kept) < fewest:
+                continue
+            drop = sum(_drops(inner[:, kept][:, :, kept], cross[:, kept]) for inner, cross, _ in parts)
+            gain = 2.0 * (likelihood(np.asarray(left)[:, None] - drop) - before)
+            p = chdtrc(3 * np.arange(1, len(kept) + 1)[:, None], np.maximum(gain, 0.0))[fewest - 1 :].min(axis=0)
+            least = np.minimum(least, p)
+        at += 1 + max(max(block) for block, _ in blocks)
+    return {"share_worse": float(np.mean(least[1:] <= least[0])), "simulations": SIMULATIONS}
+
+
+def _draws(selection: Selection) -> Values:
+    """Return draws from the noise of the fit, in units of the white noise of one sample: (3, n, s) array."""
+    observations, rng = selection.observations, np.random.default_rng(0)
+    blocks, weight = observations.blocks, observations.weight
+    label, noise = blocks.label(len(weight)), GaussMarkov(blocks, [selection.fit.setting])
+    found = []
+    for _ in range(3):
+        white = rng.standard_normal((len(weight), SIMULATIONS)) / np.sqrt(weight)[:, None]
+        mean = blocks.sums(weight[:, None] * white) / blocks.weight[:, None]
+        found.append(white + (noise.draw(rng, SIMULATIONS) - mean)[label])
+    return np.stack(found)
+
+
+def _projected(
+    observations: Observations, fitted: ProjectedCurves, columns: Values, curves: int
+) -> tuple[Values, Values, Values]:
+    """Project base and effects out: inner (t, q, q), cross (t, q, 1 + s) and left (t, 1 + s) of an axis.
+
+    ``columns``: those of the model, q curves, the residual and s draws.
+    """
+    products = Products(observations.blocks, observations.weight, columns).products(fitted.settings)[0][1:]
+    k = columns.shape[1] - 1 - SIMULATIONS - curves
+    taken = projection(products, np.arange(k))[:, :, k:]
+    rest = products[:, k:, k:] - products[:, :k, k:].transpose(0, 2, 1) @ taken
+    return rest[:, :curves, :curves], rest[:, :curves, curves:], np.einsum("tss->ts", rest[:, curves:, curves:])
+
+
+def _drops(inner: Values, cross: Values) -> Values:
+    """Return what the first 1 to r of some curves explain: (t, r, 1 + s) array."""
+    size = np.sqrt(np.maximum(np.einsum("tii->ti", inner), 1e-300))
+    scaled = inner / (size[:, :, None] * size[:, None, :]) + RIDGE * np.eye(inner.shape[1])
+    root = np.linalg.cholesky(scaled)
+    return np.asarray(np.cumsum(np.linalg.solve(root, cross / size[:, :, None]) ** 2, axis=1))

@@ -1,0 +1,188 @@
+"""Which recordings and which seconds drive a finding.
+
+    gain = r0^T C^-1 r0 - r1^T C^-1 r1,    r0 = r1 + Z gamma - X (X^T C^-1 X)^-1 X^T C^-1 Z gamma
+
+r1 is the residual of the fit, Z gamma what the effect adds, X the columns of base and other effects, C the noise of the
+fit. Both sums are over whitened blocks of time and the scatter within them, so that the gain is a sum over seconds.
+Without a recording, the linear model is fitted again: delta BIC and the largest change of a parameter, in its standard
+uncertainties, tell whether the finding depends on that recording (Cook, Technometrics 19, 1977).
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.estimation.design import BASE
+from pipeline.estimation.gauss_markov import GaussMarkov
+from pipeline.estimation.generalized_least_squares import design_at
+from pipeline.estimation.observations import without_rows
+from pipeline.estimation.ranking import projection, without
+from pipeline.estimation.selection import GATE_BIC
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.estimation.design import Term
+    from pipeline.estimation.generalized_least_squares import Fit
+    from pipeline.estimation.selection import Selection
+
+    Values = NDArray[np.float64]
+    JSON = dict[str, Any]
+
+MOST_OF = 0.5  # share of the gain that the listed seconds have together
+MOST_STRETCHES = 5
+DETERMINED = 1e-6  # share of an effect's weakest direction, of that in all recordings: less is not determined
+
+
+def influence(selection: Selection, names: Sequence[str]) -> list[JSON]:
+    """Return for each effect of a selection's fit its recordings and its seconds, those with the largest share first.
+
+    Entries hold ``effect, recordings`` (``recording, share, delta_bic_without, change``), ``seconds`` (``recording,
+    from_s, to_s, share``) and ``depends_on``, recordings without which the evidence is gone.
+    """
+    fit, found, at = selection.fit, [], BASE
+    own = {}
+    for term in fit.terms:
+        own[term.effect.name] = term, np.arange(at, at + len(term.values))
+        at += len(term.values)
+    without_each = _without_each(selection)
+    for name in names:
+        term, index = own[name]
+        gains = _gains_of_blocks(selection, term, index)
+        recordings = _of_recordings(selection, index, gains, without_each)
+        found.append(
+            {
+                "effect": name,
+                "recordings": recordings,
+                "seconds": _stretches(selection, gains),
+                "depends_on": [r["recording"] for r in recordings if _gone(r)],
+            }
+        )
+    return found
+
+
+def _gone(recording: JSON) -> bool:
+    """Return whether the evidence is gone without a recording."""
+    return recording["delta_bic_without"] is None or bool(recording["delta_bic_without"] < GATE_BIC)
+
+
+def _gains_of_blocks(selection: Selection, term: Term, own: NDArray[np.intp]) -> Values:
+    """Return the share of each block in what an effect gains: (m,) array."""
+    observations, fit = selection.observations, selection.fit
+    design, described = design_at(observations, fit), term.effect.parameters(observations.sensor)
+    change = np.zeros(design.count)
+    linear = [term.effect.moves or p.name not in term.effect.nonlinear for p in described]
+    change[own] = np.where(linear, term.values, 0.0)
+    products = design.products([fit.setting])[0][:, :-1, :-1]
+    others = np.setdiff1d(np.arange(design.count), own)
+    change[others] = -(projection(products, others)[0] @ change)
+    blocks, weight = observations.blocks, observations.weight
+    label, noise, gains = blocks.label(len(weight)), GaussMarkov(blocks, [fit.setting]), np.zeros(len(blocks.first))
+    for c in range(3):
+        columns, places = design.of_axis(c), design.places(c)[1]
+        both = np.stack([columns[:, -1] + columns[:, :-1] @ change[places[:-1]], columns[:, -1]], axis=1)
+        means = blocks.sums(weight[:, None] * both) / blocks.weight[:, None]
+        inside = np.sum(weight[:, None] * (both - means[label]) ** 2 * [1.0, -1.0], axis=1)
+        white = noise.whitened(means)[0] ** 2
+        each = np.bincount(label, inside, len(gains))
+        each[blocks.order] += white[0] - white[1]
+        gains += each / fit.scale[c] ** 2
+    total = float(gains.sum())
+    return np.asarray(gains / total if total > 0.0 else gains * 0.0)
+
+
+def _without_each(selection: Selection) -> list[tuple[Values, float, float]]:
+    """Return for each recording the products of the fit without it, the scatter within rows, and the samples."""
+    found = []
+    parts = selection.observations.parts
+    for out in range(len(parts) if len(parts) > 1 else 0):
+        rest = without_rows(selection.observations, [np.full(len(p.weight), k == out) for k, p in enumerate(parts)])
+        products = design_at(rest, selection.fit).products([selection.fit.setting])[0]
+        found.append((products, float(np.sum(rest.scatter / selection.fit.scale**2)), 3.0 * rest.samples))
+    return found
+
+
+def _of_recordings(
+    selection: Selection, own: NDArray[np.intp], gains: Values, without_each: Sequence[tuple[Values, float, float]]
+) -> list[JSON]:
+    """Return the share of each recording in an effect, and what is left of the effect without it."""
+    fit, parts = selection.fit, selection.observations.parts
+    ends = np.cumsum([len(part.weight) for part in parts])
+    of_block = np.searchsorted(ends, selection.observations.blocks.first, side="right")
+    whole = design_at(selection.observations, fit).products([fit.setting])[0]
+    least = _weakest(whole, own)
+    found = []
+    for k, part in enumerate(parts):
+        entry: JSON = {"recording": part.name, "share": float(gains[of_block == k].sum())}
+        entry |= {"delta_bic_without": None, "change": None}
+        if without_each:
+            entry |= _refitted(fit, own, least, without_each[k])
+        found.append(entry)
+    return sorted(found, key=lambda entry: -entry["share"])
+
+
+def _weakest(products: Values, own: NDArray[np.intp]) -> float:
+    """Return the least information on an effect's parameters beside all others, columns scaled as they are given."""
+    others = np.setdiff1d(np.arange(products.shape[1] - 1), own)
+    size = np.sqrt(np.maximum(np.diag(products[0])[own], 1e-300))
+    return float(np.linalg.eigvalsh(without(products, others)[0][np.ix_(own, own)] / np.outer(size, size))[0])
+
+
+def _refitted(fit: Fit, own: NDArray[np.intp], least: float, rest: tuple[Values, float, float]) -> JSON:
+    """Return delta BIC of an effect without a recording, and the largest change of its parameters."""
+    products, within, samples = rest
+    p = products.shape[1] - 1
+    others = np.setdiff1d(np.arange(p), own)
+    if _weakest(products, own) < DETERMINED * least:
+        return {}
+    beside = without(products, others)
+    model = np.zeros(p)
+    model[own] = fit_values(fit)[own - BASE]
+    step = projection(beside, own)[0][:, -1]  # about the values of the fit, whose residual is the last column
+    left = float(without(beside, own)[0, -1, -1])
+    size = beside[0][np.ix_(own, own)]
+    alone = left + float((step + model[own]) @ size @ (step + model[own]))
+    gain = samples * float(np.log((alone + within) / (left + within)))
+    uncertainty = np.sqrt(np.clip(np.diag(fit.covariance)[own], 1e-300, None))
+    return {
+        "delta_bic_without": gain - len(own) * float(np.log(samples)),
+        "change": float(np.max(np.abs(step) / uncertainty)),
+    }
+
+
+def fit_values(fit: Fit) -> Values:
+    """Return the parameters of all effects of a fit."""
+    return np.concatenate([term.values for term in fit.terms]) if fit.terms else np.zeros(0)
+
+
+def _stretches(selection: Selection, gains: Values) -> list[JSON]:
+    """Return the fewest blocks that have half of the gain, adjacent ones of a recording joined, largest share first."""
+    order = np.argsort(-gains)
+    count = int(np.searchsorted(np.cumsum(gains[order]), MOST_OF)) + 1
+    chosen = np.sort(order[:count])
+    observations = selection.observations
+    time = np.concatenate([part.motion.time for part in observations.parts])
+    ends = np.cumsum([len(part.weight) for part in observations.parts])
+    first, last = observations.blocks.first, np.append(observations.blocks.first[1:], len(time)) - 1
+    part = np.searchsorted(ends, first, side="right")
+    breaks = [0, *(k for k in range(1, len(chosen)) if _apart(chosen[k - 1], chosen[k], part)), len(chosen)]
+    found = [
+        {
+            "recording": observations.parts[part[run[0]]].name,
+            "from_s": float(time[first[run[0]]]),
+            "to_s": float(time[last[run[-1]]]),
+            "share": float(gains[run].sum()),
+        }
+        for a, b in pairwise(breaks)
+        if len(run := chosen[a:b])
+    ]
+    return sorted(found, key=lambda stretch: -stretch["share"])[:MOST_STRETCHES]
+
+
+def _apart(a: int, b: int, part: NDArray[np.intp]) -> bool:
+    return bool(b != a + 1 or part[a] != part[b])
