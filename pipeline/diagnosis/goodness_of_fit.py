@@ -3,8 +3,8 @@
     T = min over tests of p(2 log L' - 2 log L)
 
 The tests are the smooth curves of ``pipeline.diagnosis.residual_dependence``. The whitened linear model is fitted to
-the residual and to draws from the noise of the fit, under every noise setting, so that the share allows for the number of
-tests and for the noise that each fit takes (a parametric bootstrap: Davison and Hinkley, Bootstrap Methods and their
+the residual and to draws from the noise of the fit, under every noise setting, so that the share allows for the number
+of tests and for the noise that each fit takes (a parametric bootstrap: Davison and Hinkley, Bootstrap Methods and their
 Application, 1997, section 4.2).
 """
 
