@@ -17,7 +17,7 @@ import numpy as np
 from pipeline.diagnosis.residual_dependence import bases_of
 from pipeline.diagnosis.residual_regression import ProjectedCurves, columns_of_fit
 from pipeline.estimation.gauss_markov import GaussMarkov, Products
-from pipeline.estimation.ranking import RIDGE, projection
+from pipeline.estimation.ranking import projection
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -66,7 +66,10 @@ def goodness_of_fit(selection: Selection) -> dict[str, Any]:
             kept = fitted.independent(at + np.asarray(block))
             if len(kept) < fewest:
                 continue
-            drop = sum(_drops(inner[:, kept][:, :, kept], cross[:, kept]) for inner, cross, _ in parts)
+            drop = sum(
+                _drops(inner[:, kept][:, :, kept], cross[:, kept], fitted.error[:, c, kept] * fitted.scale[c])
+                for c, (inner, cross, _) in enumerate(parts)
+            )
             gain = 2.0 * (likelihood(np.asarray(left)[:, None] - drop) - before)
             p = chdtrc(3 * np.arange(1, len(kept) + 1)[:, None], np.maximum(gain, 0.0))[fewest - 1 :].min(axis=0)
             least = np.minimum(least, p)
@@ -101,9 +104,15 @@ def _projected(
     return rest[:, :curves, :curves], rest[:, :curves, curves:], np.einsum("tss->ts", rest[:, curves:, curves:])
 
 
-def _drops(inner: Values, cross: Values) -> Values:
-    """Return what the first 1 to r of some curves explain: (t, r, 1 + s) array."""
-    size = np.sqrt(np.maximum(np.einsum("tii->ti", inner), 1e-300))
-    scaled = inner / (size[:, :, None] * size[:, None, :]) + RIDGE * np.eye(inner.shape[1])
-    root = np.linalg.cholesky(scaled)
-    return np.asarray(np.cumsum(np.linalg.solve(root, cross / size[:, :, None]) ** 2, axis=1))
+def _drops(inner: Values, cross: Values, error: Values) -> Values:
+    """Return what the first 1 to r of some curves explain: (t, r, 1 + s) array; nothing where rounding hides one."""
+    found = np.zeros_like(cross)
+    for j in range(inner.shape[1]):
+        new = inner[:, j, j] > error[:, j] ** 2
+        over = np.where(new, 1.0 / np.where(new, inner[:, j, j], 1.0), 0.0)
+        found[:, j] = cross[:, j] ** 2 * over[:, None]
+        taken = inner[:, :, j] * over[:, None]
+        cross = cross - taken[:, :, None] * cross[:, j : j + 1]
+        inner = inner - taken[:, :, None] * inner[:, j, None, :]
+        error = error + np.abs(taken) * error[:, j : j + 1]
+    return np.asarray(np.cumsum(found, axis=1))
