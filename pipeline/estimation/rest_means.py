@@ -14,7 +14,7 @@ import numpy as np
 
 from pipeline.signal.creep import believed_rates, creep_in
 from pipeline.signal.filters import filter_autocovariance, variance_of_mean
-from pipeline.signal.rests import find_rests, rests_from_table
+from pipeline.signal.rests import find_rests, rests_from_table, usable
 from pipeline.signal.temperature import smooth_temperature
 
 if TYPE_CHECKING:
@@ -145,9 +145,7 @@ def rest_means(
 def sound_samples(recording: Recording, sensor: str) -> NDArray[np.bool_]:
     """Return which samples of a sensor are neither clipped, stuck nor missing: (n,) array of bool."""
     reading = recording.reading(sensor)
-    if reading is None:
-        return np.zeros(recording.samples, bool)
-    return np.asarray(np.isfinite(reading).all(axis=1) & recording.valid)
+    return np.zeros(recording.samples, bool) if reading is None else usable(recording, reading)
 
 
 @dataclass(frozen=True)

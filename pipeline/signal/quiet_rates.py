@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.records import noise_of_steps
+from pipeline.records import median, noise_of_steps
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -71,13 +71,13 @@ def quiet_pieces(rate: Values, stretches: Sequence[tuple[int, int]], interval: f
         return list(stretches)
     parts = [rate[start:stop] for start, stop in stretches]
     of_parts = [windows(part, size) for part in parts]
-    medians = np.array([np.median(mean, axis=0) for mean, _ in of_parts])
+    medians = np.array([median(mean) for mean, _ in of_parts])
     reference, resting = _references(medians, np.array([mean[[0, -1]] for mean, _ in of_parts]))
     off = [np.abs(mean - r) for (mean, _), r in zip(of_parts, reference, strict=True)]
     differences = np.concatenate([np.abs(np.diff(part, axis=0)) for part in parts])
     white = noise_of_steps(differences) / np.sqrt(size)
-    spread = NORMAL * np.array([np.median(own, axis=0) for own in off])
-    noise = np.array([np.median(variance) for _, variance in of_parts])
+    spread = NORMAL * np.array([median(own) for own in off])
+    noise = np.array([median(variance) for _, variance in of_parts])
     spread = np.where(resting[:, None], spread, np.median(spread, axis=0))
     count = counts_of(differences)
     limit = np.minimum(SIGNIFICANT * np.maximum(white, spread), np.maximum(SIGNIFICANT * white, TREMOR_LIMIT_DPS))
@@ -106,7 +106,7 @@ def counts_of(differences: Values) -> Values:
 
 def windows(values: Values, size: int) -> tuple[Values, Values]:
     """Return the mean of each window of ``size`` rows, (m, k), and its variance summed over the columns, (m,)."""
-    middle = np.median(values, axis=0)
+    middle = median(values)
     centred = values - middle
     sums = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(centred, axis=0)])
     squares = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(centred**2, axis=0)])
@@ -125,7 +125,7 @@ def _references(medians: Values, ends: Values) -> tuple[Values, NDArray[np.bool_
         return np.where(resting[:, None], medians, middle), resting
     for i, own in enumerate(medians):
         first = int(np.clip(i - NEIGHBOURS // 2, 0, max(len(medians) - NEIGHBOURS, 0)))
-        around = np.median(medians[first : first + NEIGHBOURS], axis=0)
+        around = median(medians[first : first + NEIGHBOURS])
         if np.abs(own - around).max() > RATE_LIMIT_DPS:
             out[i], resting[i] = around, False
     return out, resting

