@@ -94,7 +94,7 @@ def one_chart() -> str:
     panel = Panel([Line(x, 3.0 * x - 1.0, 0)], "height, m")
     svg = chart(Figure("line", "A line"), "It rises.", [panel], "way, km").svg
     legend = '<ul class="legend"><li><i class="c0"></i>the line</li></ul>'
-    style, script = asset("page.css"), asset("chart.js")
+    style, script = asset("page.css"), asset("chart.js") + asset("chart_files.js")
     figure = f"<figure>{svg}<figcaption>{legend}</figcaption></figure>"
     return f"<!doctype html><title>line</title><style>{style}</style>{figure}<script>{script}</script>"
 
@@ -102,7 +102,7 @@ def one_chart() -> str:
 def opened(browser: Browser, path: Path, **settings: Any) -> Page:
     """Open a page that fails the test at its end if it asks for anything or reports an error."""
     page = browser.new_context(**settings).new_page()
-    page.set_default_timeout(120_000)
+    page.set_default_timeout(20_000)
     page.asked, page.wrong = [], []  # type: ignore[attr-defined]
     page.on("request", lambda r: page.asked.append(r.url))  # type: ignore[attr-defined]
     page.on("console", lambda m: page.wrong.append(m.text) if m.type in ("error", "warning") else None)  # type: ignore[attr-defined]
@@ -302,6 +302,37 @@ def test_dragging_zooms_into_what_was_marked_and_escape_goes_back(browser: Brows
     page.context.close()
 
 
+def test_a_chart_moves_with_shift_and_is_saved_with_its_values(browser: Browser, pages: Path) -> None:
+    page = opened(browser, pages / "chart.html")
+    page.locator("svg.chart").focus()
+    page.keyboard.press("+")
+    ticks = "all => all.map((e) => parseFloat(e.textContent))"
+    before = page.eval_on_selector_all("svg > .ticks text", ticks)
+    box = page.locator("svg.chart").bounding_box() or {}
+    page.keyboard.down("Shift")
+    page.mouse.move(box["x"] + box["width"] * 0.5, box["y"] + 40)
+    page.mouse.down()
+    page.mouse.move(box["x"] + box["width"] * (0.5 - 342 * 0.2 / 420), box["y"] + 40, steps=3)
+    page.mouse.up()
+    page.keyboard.up("Shift")
+    after = page.eval_on_selector_all("svg > .ticks text", ticks)
+    assert before[0] == pytest.approx(2.5, abs=0.5)
+    assert after[0] == pytest.approx(before[0] + 1.0)  # a fifth of the 5 km in view
+    page.locator("figure").hover()
+    with page.expect_download() as saved:
+        page.get_by_role("button", name="CSV").click()
+    rows = [row.split(",") for row in saved.value.path().read_text().splitlines()]
+    assert rows[0] == ["panel", "series", '"way', ' km"', "value", "low", "high"]
+    assert [float(row[3]) for row in rows[1:]] == pytest.approx(np.arange(11.0), abs=0.005)
+    assert [float(row[4]) for row in rows[1:]] == pytest.approx(3.0 * np.arange(11.0) - 1.0, abs=0.02)
+    with page.expect_download() as saved:
+        page.get_by_role("button", name="PNG").click()
+    head = saved.value.path().read_bytes()[:24]
+    assert head.startswith(b"\x89PNG")
+    assert int.from_bytes(head[16:20], "big") == 4 * 420
+    page.context.close()
+
+
 def test_a_series_is_switched_off_and_a_chart_enlarged_and_put_back(browser: Browser, pages: Path) -> None:
     page = opened(browser, pages / "chart.html")
     name = page.get_by_role("button", name="the line")
@@ -334,6 +365,6 @@ def test_the_contents_stay_in_view_and_tell_where_the_reader_is(browser: Browser
 def test_on_paper_a_page_has_no_controls(browser: Browser, pages: Path) -> None:
     page = opened(browser, pages / "unit.html", color_scheme="dark")
     page.emulate_media(media="print")
-    assert page.locator("nav:visible, .enlarge:visible, input:visible, .chart-hint:visible").count() == 0
+    assert page.locator("nav:visible, .tools:visible, input:visible, .chart-hint:visible").count() == 0
     assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
     page.context.close()

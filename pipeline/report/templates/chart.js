@@ -35,6 +35,7 @@ function ticksOf(axis, count) {
   return out;
 }
 
+const unitAt = (x, point) => point.unit ?? Math.round(valueAt(x, point[0] / SUBDIVISION, x.full)) - 1; // its place in the list of units
 const known = new WeakMap();
 function pointsOf(path) { // [x, low, high] of each vertex in drawing units; of a line or dots low is high
   if (known.has(path)) return known.get(path);
@@ -92,6 +93,10 @@ function prepare(svg) {
     if (high - low < limit) return;
     axis.view = { low: Math.max(low, axis.full.low), high: Math.min(high, axis.full.high) };
   };
+  const pan = (axis, by) => {
+    const wide = axis.view.high - axis.view.low, low = Math.min(Math.max(axis.view.low + by, axis.full.low), axis.full.high - wide);
+    axis.view = { low, high: low + wide };
+  };
   const reset = () => { for (const axis of [x, ...panels.map((p) => p.y)]) axis.view = { ...axis.full }; redraw(); };
   const hide = () => { readout.hidden = true; cursor.remove(); shown = null; };
 
@@ -120,12 +125,12 @@ function prepare(svg) {
     const first = found[0][1].point ?? found[0][1].range, value = valueAt(x, first[0] / SUBDIVISION, x.full);
     const read = (v) => told(panel.y, valueAt(panel.y, v / SUBDIVISION, panel.y.full));
     const head = document.createElement("b");
-    head.textContent = names ? names[first.unit ?? Math.round(value) - 1] : `${x.label}: ${told(x, value)}`;
+    head.textContent = names ? names[unitAt(x, first)] : `${x.label}: ${told(x, value)}`;
     const rows = found.map(([colour, { point, range }]) => {
       const row = document.createElement("span"), dot = document.createElement("i");
       dot.className = colour;
       const name = figure.querySelector(`.legend .${colour}`)?.parentNode.textContent.trim() ?? "";
-      const numbers = values ? (values[colour] ?? values.after)[point.i ?? Math.round(value) - 1] : point ? read(point[1]) + (range ? ` (${read(Math.max(range[1], range[2]))} to ${read(Math.min(range[1], range[2]))})` : "") : `${read(Math.max(range[1], range[2]))} to ${read(Math.min(range[1], range[2]))}`;
+      const numbers = values ? (values[colour] ?? values.after)[point.i ?? unitAt(x, point)] : point ? read(point[1]) + (range ? ` (${read(Math.max(range[1], range[2]))} to ${read(Math.min(range[1], range[2]))})` : "") : `${read(Math.max(range[1], range[2]))} to ${read(Math.min(range[1], range[2]))}`;
       row.append(dot, `${name} ${numbers} ${panel.y.unit}`);
       return row;
     });
@@ -150,7 +155,11 @@ function prepare(svg) {
 
   svg.addEventListener("pointermove", (event) => {
     const [px, py] = inside(event);
-    if (drag) {
+    if (drag?.pan) {
+      pan(x, valueAt(x, drag.x) - valueAt(x, px)); pan(drag.panel.y, valueAt(drag.panel.y, drag.y) - valueAt(drag.panel.y, py));
+      [drag.x, drag.y] = [px, py];
+      redraw();
+    } else if (drag) {
       const tall = Math.abs(py - drag.y) > 12, p = drag.panel.y;
       frame.setAttribute("x", Math.min(px, drag.x)); frame.setAttribute("width", Math.abs(px - drag.x));
       frame.setAttribute("y", tall ? Math.min(py, drag.y) : p.stop); frame.setAttribute("height", tall ? Math.abs(py - drag.y) : p.start - p.stop);
@@ -164,7 +173,7 @@ function prepare(svg) {
   svg.addEventListener("pointerdown", (event) => {
     const [px, py] = inside(event);
     if (event.pointerType !== "mouse" || event.button || px < x.start) return;
-    drag = { x: px, y: py, panel: panelAt(py) };
+    drag = { x: px, y: py, panel: panelAt(py), pan: event.shiftKey };
     svg.setPointerCapture(event.pointerId);
     hide();
     event.preventDefault();
@@ -172,9 +181,10 @@ function prepare(svg) {
   });
   svg.addEventListener("pointerup", (event) => {
     if (!drag) return;
-    const [px, py] = inside(event), { x: ox, y: oy, panel } = drag, ends = (axis, a, b) => [valueAt(axis, a), valueAt(axis, b)].sort((p, q) => p - q);
+    const [px, py] = inside(event), { x: ox, y: oy, panel, pan: moved } = drag, ends = (axis, a, b) => [valueAt(axis, a), valueAt(axis, b)].sort((p, q) => p - q);
     drag = null;
     frame.remove();
+    if (moved) return;
     if (Math.abs(px - ox) > 6) zoom(x, ...ends(x, ox, px));
     if (Math.abs(py - oy) > 12) zoom(panel.y, ...ends(panel.y, oy, py));
     if (Math.abs(px - ox) > 6 || Math.abs(py - oy) > 12) redraw();
@@ -188,6 +198,13 @@ function prepare(svg) {
     const panel = panels[current], all = [...panel.layers.querySelectorAll(".line, .dots, .strokes")].flatMap((p) => pointsOf(p).map((q) => q[0]));
     const column = [...new Set(all)].sort((a, b) => a - b).filter((v) => v >= base(x, x.start) - 1 && v <= base(x, x.stop) + 1);
     const i = shown === null ? -1 : column.findIndex((v) => v >= shown), middle = valueAt(x, (x.start + x.stop) / 2), half = (x.view.high - x.view.low) / 2;
+    if (event.shiftKey && event.key.startsWith("Arrow")) {
+      const [dx, dy] = { ArrowRight: [1, 0], ArrowLeft: [-1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
+      for (const [axis, by] of [[x, dx], [panel.y, dy]]) pan(axis, by * (axis.view.high - axis.view.low) / 10);
+      redraw();
+      event.preventDefault();
+      return;
+    }
     const step = { ArrowRight: 1, ArrowLeft: -1, PageDown: 10, PageUp: -10 }[event.key];
     if (step) show(panel, column[Math.min(Math.max(i + step, 0), column.length - 1)], null);
     else if (event.key === "ArrowDown" || event.key === "ArrowUp") {
@@ -227,8 +244,8 @@ large.setAttribute("aria-label", "Enlarged chart");
 document.body.append(large);
 large.addEventListener("close", () => large.figure.space.replaceWith(large.figure));
 for (const figure of document.querySelectorAll("figure")) {
-  const button = document.createElement("button");
-  button.type = "button"; button.className = "enlarge"; button.textContent = "\u2922";
+  const tools = document.createElement("div"), button = document.createElement("button");
+  tools.className = "tools"; button.type = "button"; button.className = "enlarge"; button.textContent = "\u2922";
   button.setAttribute("aria-label", "Enlarge or put back this chart");
   button.addEventListener("click", () => {
     if (large.open) { large.close(); button.focus(); return; }
@@ -238,7 +255,8 @@ for (const figure of document.querySelectorAll("figure")) {
     large.append(figure);
     large.showModal();
   });
-  figure.prepend(button);
+  tools.append(button);
+  figure.prepend(tools);
 }
 for (const hint of document.querySelectorAll(".chart-hint")) hint.hidden = false;
 if (window.parent !== window) // shown inside of another page, such as a report of Snakemake: links to neighbours lead nowhere
