@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -215,15 +216,19 @@ def excited(
 
 
 def time_constants(
-    this: Effect, sensor: str, fitted: Term | None = None, width: float | None = None
+    this: Effect, sensor: str, fitted: Term | None = None, width: float | None = None, *, between: bool = True
 ) -> list[tuple[Term, float]]:
-    """Return an effect at the starts of its time constant, with log weights of their prior; the fitted one first.
+    """Return an effect at some time constants, with log weights of their prior; the fitted one first.
 
+    ``between``: whether there is one between each two of the effect's starts, in equal ratios.
     ``width``: standard uncertainty of the fitted value's logarithm; None: as wide as the steps between the others.
     """
     starts = this.starts(sensor)
     if not this.nonlinear or this.moves:
         return [(fitted or Term(this, np.zeros(len(starts[0]))), 0.0)]
+    if between:
+        middle = [np.sqrt(one * other) for one, other in pairwise(starts)]
+        starts = sorted([*starts, *middle], key=lambda values: float(values[-1]))
     share = 1.0 / len(starts)
     grid = [(Term(this, values), float(np.log(share))) for values in starts]
     if fitted is None:

@@ -109,7 +109,7 @@ def _versions(sensor: str, fit: Fit, term: Term) -> list[tuple[Term, float]]:
     if held is not None and term.effect.nonlinear:
         last = BASE + sum(len(t.values) for t in fit.terms[: fit.terms.index(held) + 1]) - 1
         width = float(np.sqrt(fit.covariance[last, last]) / max(abs(held.values[-1]), 1e-300))
-    found = time_constants(term.effect, sensor, held, width)
+    found = time_constants(term.effect, sensor, held, width, between=bool(fit.terms))
     second = float(np.log(SECOND_SHARE)) if term.effect.name in SECOND[sensor] else 0.0
     return [(replace(each, full=False, prior=term.prior), weight + second) for each, weight in found]
 
