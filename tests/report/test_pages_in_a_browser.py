@@ -237,6 +237,29 @@ def test_a_dot_tells_the_value_of_the_unit_and_not_a_rounded_coordinate(browser:
     page.context.close()
 
 
+def test_units_that_are_chosen_are_marked_in_every_chart_and_list(browser: Browser, pages: Path) -> None:
+    page = opened(browser, pages / "campaign.html")
+    picture = page.locator("svg[data-names]").first
+    picture.focus()
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("Enter")
+    name = fleet()[1]["unit"]
+    rings = "all => all.map((e) => e.getAttribute('d').split('M').length - 1)"
+    assert page.eval_on_selector_all("svg .chosen", rings) == [3, 3]  # before, after and floor, of either sensor
+    assert page.locator("tr.chosen th").all_text_contents() == [name]
+    assert page.locator(".brush [role=status]").text_content() == f"1 unit marked: {name}"
+    page.locator("#all tbody tr td:nth-child(4)").first.click()
+    assert page.locator("tr.chosen").count() == 2
+    page.get_by_role("button", name="Clear").click()
+    page.get_by_label("Filter:").fill("missing effect -l0 -l1 -l2 -l3")
+    page.get_by_role("button", name="Mark in the charts").click()
+    wanted = [i for i in range(960, UNITS) if i % 9 == 0 and i % 200 != 7]
+    assert page.eval_on_selector_all("svg .chosen", rings) == [3 * len(wanted)] * 2
+    assert left_alone(page, pages / "campaign.html")
+    page.context.close()
+
+
 def test_any_two_runs_are_compared_with_the_largest_change_first(browser: Browser, pages: Path) -> None:
     page = opened(browser, pages / "campaign.html")
 

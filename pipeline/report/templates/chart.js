@@ -64,7 +64,7 @@ function prepare(svg) {
   cursor.setAttribute("class", "cursor"); frame.setAttribute("class", "frame");
   svg.tabIndex = 0;
   figure.append(readout);
-  let current = 0, drag = null, shown = null;
+  let current = 0, drag = null, shown = null, unit = null, moved = false;
 
   const label = (at, top, text, kind) => {
     const t = document.createElementNS(SVG, "text");
@@ -137,6 +137,7 @@ function prepare(svg) {
     readout.replaceChildren(head, ...rows);
     readout.hidden = false;
     shown = first[0];
+    unit = names ? unitAt(x, first) : null;
     const px = place(x, value);
     cursor.setAttribute("d", `M${px} ${panel.y.stop}V${panel.y.start}`);
     svg.append(cursor);
@@ -160,7 +161,7 @@ function prepare(svg) {
       [drag.x, drag.y] = [px, py];
       redraw();
     } else if (drag) {
-      const tall = Math.abs(py - drag.y) > 12, p = drag.panel.y;
+      const tall = drag.choose || Math.abs(py - drag.y) > 12, p = drag.panel.y;
       frame.setAttribute("x", Math.min(px, drag.x)); frame.setAttribute("width", Math.abs(px - drag.x));
       frame.setAttribute("y", tall ? Math.min(py, drag.y) : p.stop); frame.setAttribute("height", tall ? Math.abs(py - drag.y) : p.start - p.stop);
       svg.append(frame);
@@ -173,7 +174,8 @@ function prepare(svg) {
   svg.addEventListener("pointerdown", (event) => {
     const [px, py] = inside(event);
     if (event.pointerType !== "mouse" || event.button || px < x.start) return;
-    drag = { x: px, y: py, panel: panelAt(py), pan: event.shiftKey };
+    drag = { x: px, y: py, panel: panelAt(py), pan: event.shiftKey, choose: names && (event.ctrlKey || event.metaKey) };
+    moved = false;
     svg.setPointerCapture(event.pointerId);
     hide();
     event.preventDefault();
@@ -181,13 +183,25 @@ function prepare(svg) {
   });
   svg.addEventListener("pointerup", (event) => {
     if (!drag) return;
-    const [px, py] = inside(event), { x: ox, y: oy, panel, pan: moved } = drag, ends = (axis, a, b) => [valueAt(axis, a), valueAt(axis, b)].sort((p, q) => p - q);
+    const [px, py] = inside(event), { x: ox, y: oy, panel, pan: panned, choose } = drag, ends = (axis, a, b) => [valueAt(axis, a), valueAt(axis, b)].sort((p, q) => p - q);
     drag = null;
     frame.remove();
-    if (moved) return;
+    moved = panned || Math.abs(px - ox) > 6 || Math.abs(py - oy) > 12;
+    if (panned) return;
+    if (choose && moved) {
+      const within = (axis, a, b, at) => (at - base(axis, a)) * (at - base(axis, b)) <= 0;
+      const points = [...panel.layers.querySelectorAll(".dots")].flatMap(pointsOf).filter((p) => within(x, ox, px, p[0]) && within(panel.y, oy, py, p[1]));
+      return window.choose?.([...new Set(points.map((p) => unitAt(x, p)))]);
+    }
     if (Math.abs(px - ox) > 6) zoom(x, ...ends(x, ox, px));
     if (Math.abs(py - oy) > 12) zoom(panel.y, ...ends(panel.y, oy, py));
     if (Math.abs(px - ox) > 6 || Math.abs(py - oy) > 12) redraw();
+  });
+  svg.addEventListener("click", (event) => {
+    if (!names || moved) return;
+    const [px, py] = inside(event), panel = panelAt(py);
+    show(panel, base(x, px), base(panel.y, py));
+    if (unit !== null) window.choose?.([unit]);
   });
   svg.addEventListener("pointercancel", () => { drag = null; frame.remove(); });
   svg.addEventListener("pointerleave", () => { if (!drag) hide(); });
@@ -215,7 +229,8 @@ function prepare(svg) {
       const about = shown === null ? middle : valueAt(x, shown / SUBDIVISION, x.full), wide = half * (event.key === "+" ? 0.5 : 2);
       zoom(x, about - wide, about + wide);
       redraw();
-    } else if (event.key === "0" || (event.key === "Escape" && (shown !== null || x.view.low !== x.full.low || x.view.high !== x.full.high))) { hide(); reset(); } else return;
+    } else if (event.key === "Enter" && shown !== null && unit !== null) window.choose?.([unit]);
+    else if (event.key === "0" || (event.key === "Escape" && (shown !== null || x.view.low !== x.full.low || x.view.high !== x.full.high))) { hide(); reset(); } else return;
     event.preventDefault();
     event.stopPropagation();
   });

@@ -31,6 +31,8 @@ function pngOf(figure, svg, done) {
   svg.querySelectorAll("*").forEach((element, i) => {
     const style = getComputedStyle(element);
     for (const key of KEPT) to[i].style.setProperty(key, style.getPropertyValue(key));
+    if (element.localName === "path") // their strokes do not grow with the drawing
+      for (const key of ["stroke-width", "stroke-dasharray"]) to[i].style.setProperty(key, style.getPropertyValue(key).replace(/[\d.]+/g, (v) => v * ratio));
   });
   copy.setAttribute("xmlns", SVG); copy.setAttribute("width", width); copy.setAttribute("height", box.height * ratio);
   const picture = new Image(), canvas = document.createElement("canvas"), pen = canvas.getContext("2d"), style = getComputedStyle(figure);

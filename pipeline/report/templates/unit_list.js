@@ -46,7 +46,7 @@ state.draw = () => {
   const words = box.value.toLowerCase().split(/\s+/).filter((w) => w && w !== "-");
   const wanted = words.filter((w) => w[0] !== "-"), unwanted = words.filter((w) => w[0] === "-").map((w) => w.slice(1));
   const fits = (row) => wanted.every((w) => textOf(row).includes(w)) && !unwanted.some((w) => textOf(row).includes(w));
-  const found = words.length ? state.rows.filter(fits) : state.rows;
+  const found = state.found = words.length ? state.rows.filter(fits) : state.rows;
   all.tBodies[0].replaceChildren(...found.slice(0, most));
   const left = found.length - most;
   pager.hidden = left <= 0;
