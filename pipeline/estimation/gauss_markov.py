@@ -325,7 +325,9 @@ class Products:
         wander = [g for g, setting in enumerate(settings) if setting.ratio > 0.0]
         if wander:
             model = GaussMarkov(self.blocks, [settings[g] for g in wander])
-            found[wander] += model.products(self.means) - self.means.T @ (self.blocks.weight[:, None] * self.means)
+            # First what is within the blocks: in another order, rounding exceeds what collinear columns leave.
+            within = self.white - self.means.T @ (self.blocks.weight[:, None] * self.means)
+            found[wander] = within + model.products(self.means)
             logarithm[wander] = model.log_determinant + np.sum(np.log(self.blocks.weight))
         return found, logarithm
 
