@@ -39,6 +39,7 @@ MOSTLY = 0.5  # share of the residual's excess that selected effects must explai
 BELIEVED = 3  # effects at once; more are what the catalogue makes of physics that it does not hold
 UNKNOWN_SHARE = 0.03  # of the gain in 2 log L by what was selected, above which what is left is worth naming
 LIKELY = 0.5  # probability of something outside the catalogue, above which what was selected is no explanation
+SURE = 0.9  # the same where the held-out error is at the noise floor with what was selected (thermal_ramp, long-004)
 WORSE = 0.3  # of the noise's mean square, by which what was selected may raise the held-out error's at most
 HELPFUL = 0.1  # share of the held-out error's mean square that each effect worth a try takes away
 LEFT_OVER = 1.05  # times the noise floor: four standard deviations of the rms of 3 x 1000 samples
@@ -108,11 +109,12 @@ def verdict_of_selection(
     something beyond the catalogue is unexplained where that is worth naming; next to a much
     larger effect it may be the small error of its linear equation. ``share`` of the residual's excess and ``gain`` in
     2 log L are what the selected effects explain; ``above_noise``: the residual stays far above the noise with them;
-    ``beyond``: probability of physics outside the catalogue.
+    ``beyond``: probability of physics outside the catalogue; it counts less where held-out motion shows noise alone.
     """
     if _made_worse(held_out) or len(names) > BELIEVED:
         return "unexplained"
-    if names and beyond > LIKELY:
+    at_floor = held_out is not None and held_out["error_after"] <= held_out["floor"]
+    if names and beyond > (SURE if at_floor else LIKELY):
         return "unexplained"
     if (unknown or above_noise) and (not names or share < MOSTLY):
         return "unexplained"
