@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.errors import NotObservableError
-from pipeline.estimation.engine import LinearMap
+from pipeline.estimation.engine import LinearMap, scaled_inverse
 from pipeline.estimation.gauss_markov import Products
 from pipeline.model.effects.base import Layout, truth
 
@@ -274,9 +274,7 @@ class Design:
     def _inverse(self, setting: Setting) -> Values:
         """Return the inverse of the products of the parameters' columns: (p, p) array."""
         gram = self.products([setting])[0][0, :-1, :-1]
-        size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-        found = np.linalg.pinv(gram / np.outer(size, size), rcond=1e-12, hermitian=True) / np.outer(size, size)
-        return np.asarray(found, np.float64)
+        return scaled_inverse(gram)
 
     def sizes(self) -> Values:
         """Return the norm of each parameter's column before the base was taken out: (p + 1,) array."""

@@ -46,6 +46,7 @@ ONE_SIGMA, COVERED = 0.6827, 0.95  # probabilities at which the mixture and Stud
 FEWEST = 2.0  # degrees of freedom: Student's t has no variance below
 STEPS, SMALL_STEP = 60, 1e-5  # of Newton's method for a quantile; relative
 NEGLIGIBLE = 1e-6  # weight of a hypothesis, relative to the largest, below which it does not change two digits of u
+RANK = 1e-12  # of the eigenvalues of a scaled matrix: the rounding of a double, with a margin
 AVERAGED_OUT = 1e-3  # share of a column's size in block means, below which it does not take up their noise
 
 
@@ -133,6 +134,16 @@ class Posterior:
         if np.isfinite(self.spare):
             out *= np.sqrt(self.spare / rng.chisquare(self.spare, count))[:, None]
         return out
+
+
+def scaled_inverse(matrix: Values) -> Values:
+    """Return the pseudo-inverse of a (p, p) symmetric matrix whose parameters have different units and sizes.
+
+    Rows and columns are scaled to a unit diagonal first, so that no small parameter counts as rounding of a large one.
+    """
+    size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    scale = np.outer(size, size)
+    return np.asarray(np.linalg.pinv(matrix / scale, rcond=RANK, hermitian=True) / scale, np.float64)
 
 
 def draw_normal(rng: np.random.Generator, covariance: Values, count: int) -> Values:

@@ -24,7 +24,7 @@ import numpy as np
 from pipeline.errors import NotObservableError
 from pipeline.estimation.candidates import parameter_names, require_available, starts_of
 from pipeline.estimation.design import BASE, BASE_NAMES, Design, Start, Term, motions_of, ordinary_base
-from pipeline.estimation.engine import AVERAGED_OUT, Posterior, ResidualNoise, noise_beside
+from pipeline.estimation.engine import AVERAGED_OUT, RANK, Posterior, ResidualNoise, noise_beside
 from pipeline.estimation.gauss_markov import WHITE, Setting, selection_grid
 from pipeline.estimation.least_squares import certified
 from pipeline.estimation.noise import static_or_sheet
@@ -56,7 +56,6 @@ ROUNDS = 25  # of Gauss-Newton
 SMALL_STEP = 1e-3  # of a standard uncertainty
 RATIOS = (0.01, 0.03, 0.1, 0.2, 0.3, 0.5, 1.0, 3.0)  # of bias to white noise: the grid of a fit
 TIMES = (30.0, 100.0, 300.0, 1000.0)  # s, correlation times of that grid
-RANK = 1e-12  # of the products' eigenvalues: the rounding of a double, with a margin
 LEAST_EIGENVALUE = 1e-7  # of the products of columns of unit norm: a column is 3e-4 new
 
 

@@ -99,11 +99,17 @@ class SensorCalibration:
         names = [f"bias_{a}" for a in "xyz"] + [f"matrix_{a}{b}" for a in "xyz" for b in "xyz"]
         return names + [f"{e.name}.{p}" for e in self.effects for p in e.parameters]
 
+    def effective_freedom(self) -> NDArray[np.float64]:
+        """Return the effective degrees of freedom of each parameter: (p,) array."""
+        if self.freedom is not None:
+            return self.freedom
+        return np.full(len(self.parameter_names()), self.degrees_of_freedom)
+
     def to_json(self) -> dict[str, Any]:
         """Return the sensor's part of ``calibrations/<unit>.json``."""
         size = len(self.parameter_names())
         covariance = np.zeros((size, size)) if self.covariance is None else self.covariance
-        freedom = np.full(size, self.degrees_of_freedom) if self.freedom is None else self.freedom
+        freedom = self.effective_freedom()
         factors = coverage_factor(freedom)
         standard = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
         return {

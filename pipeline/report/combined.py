@@ -25,6 +25,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.estimation.engine import scaled_inverse
+from pipeline.estimation.uncertainty_budget import effective_degrees_of_freedom
 from pipeline.io.files import wrong_name
 from pipeline.records import NORMAL, SENSORS, Contribution, SensorCalibration, StageResult
 
@@ -95,11 +97,12 @@ def _sensor(sensor: str, parts: Sequence[JSON]) -> JSON:
     own, common = _covariances(each, parts)
     kind = np.concatenate([KIND, *(np.full(len(e.values), 3 + k) for k, e in enumerate(each[0].effects))])
     r2 = repeatability(x, np.stack([np.diag(A) for A in own]), kind) ** 2
-    weights = [np.linalg.pinv(A + np.diag(r2), hermitian=True) for A in own]
-    covariance = np.linalg.pinv(np.sum(weights, axis=0), hermitian=True)
-    theta = covariance @ np.sum([W @ xi for W, xi in zip(weights, x, strict=True)], axis=0)
-    freedom = np.sum([_freedom(c, x.shape[1]) for c in each], axis=0)
-    alone = np.linalg.pinv(np.sum([np.linalg.pinv(A, hermitian=True) for A in own], axis=0), hermitian=True)
+    weights = [scaled_inverse(A + np.diag(r2)) for A in own]
+    covariance = scaled_inverse(np.sum(weights, axis=0))
+    mean = x.mean(axis=0)  # a parameter that all state exactly stays as it is
+    theta = mean + covariance @ np.sum([W @ (xi - mean) for W, xi in zip(weights, x, strict=True)], axis=0)
+    freedom = np.sum([c.effective_freedom() for c in each], axis=0)
+    alone = scaled_inverse(np.sum([scaled_inverse(A) for A in own], axis=0))
     scatter = np.where(r2 > 0.0, np.bincount(kind)[kind] * (len(x) - 1.0), np.inf)
     lines = [
         Contribution("noise of the readings", "A", "Student's t", alone, freedom),
@@ -107,9 +110,9 @@ def _sensor(sensor: str, parts: Sequence[JSON]) -> JSON:
         Contribution("repeatability", "A", "Student's t", covariance - alone + np.diag(r2), scatter),
     ]
     total = np.sum([line.covariance for line in lines], axis=0)
-    squares = np.stack([line.standard_uncertainty**2 for line in lines])
-    share = np.sum(squares**2 / np.stack([line.degrees_of_freedom for line in lines]), axis=0)
-    effective = np.divide(np.diag(total) ** 2, share, out=np.full(len(theta), np.inf), where=share > 0.0)
+    effective = effective_degrees_of_freedom(
+        np.stack([line.standard_uncertainty for line in lines]), np.stack([line.degrees_of_freedom for line in lines])
+    )
     effects, at = [], 12
     for effect in each[0].effects:
         values = theta[at : at + len(effect.parameters)].tolist()
@@ -134,11 +137,6 @@ def _sensor(sensor: str, parts: Sequence[JSON]) -> JSON:
         budget=budget,
     )
     return joint.to_json()
-
-
-def _freedom(calibration: SensorCalibration, count: int) -> Values:
-    found = calibration.freedom
-    return np.full(count, calibration.degrees_of_freedom) if found is None else found
 
 
 def _covariances(each: Sequence[SensorCalibration], parts: Sequence[JSON]) -> tuple[list[Values], Values]:

@@ -244,8 +244,7 @@ def gravity_direction(
     own: dict[str, Any] = {}
     if gyroscope.covariance is not None and gyroscope.covariance[3:12, 3:12].any():
         ratio = 0.0 if noise is None else float(np.mean(noise.wander / np.maximum(noise.white, 1e-300)))
-        few = gyroscope.degrees_of_freedom
-        freedom = np.full(12, few) if gyroscope.freedom is None else gyroscope.freedom
+        freedom = gyroscope.effective_freedom()
         details = gyroscope.stages[-1].details if gyroscope.stages else {}
         largest = model.largest_direction_error(calibrated, gyroscope.covariance, freedom, details, ratio)
         own["largest_expected_rms_deg"] = largest

@@ -69,6 +69,29 @@ def test_the_joint_estimate_of_drawn_calibrations_is_inside_its_uncertainty(scat
     assert np.mean(np.square(found_r)) == pytest.approx(expected, rel=0.4 if scatter == 0.0 else 0.1)
 
 
+def test_small_and_exact_parameters_stand_beside_large_ones() -> None:
+    """A clock rate in ppm has 1e14 times the variance of a bias; the matrix is stated without uncertainty."""
+    documents = []
+    for k, shift in enumerate((-1e-6, 1e-6)):
+        found = document(f"U{k}", TRUTH + np.concatenate([np.full(3, shift), np.zeros(9)]))
+        part = found["accelerometer"]
+        covariance = np.diag([1e-12] * 3 + [0.0] * 9 + [100.0])
+        part["covariance"] = {
+            "parameters": [*part["covariance"]["parameters"], "clock_rate.e"],
+            "values": covariance.tolist(),
+        }
+        part["effects"] = [{"name": "clock_rate", "parameters": {"e": {"value": 50.0 + k, "unit": "ppm"}}}]
+        part["effective_degrees_of_freedom"] = [50.0] * 13
+        part["uncertainty_budget"] = {"contributions": []}
+        documents.append(found)
+    found, _ = joint(documents)
+    part = found["S1"]["accelerometer"]
+    assert part["bias"] == pytest.approx(TRUTH[:3], abs=1e-12)
+    assert part["matrix"] == np.eye(3).tolist()
+    assert part["effects"][0]["parameters"]["e"]["value"] == pytest.approx(50.5)
+    assert np.diag(part["covariance"]["values"])[12] == pytest.approx(50.0, rel=1e-6)
+
+
 def test_a_recording_is_never_used_twice() -> None:
     one, other = document("U1", TRUTH), document("U2", TRUTH)
     other["inputs"].append(one["inputs"][0])
