@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.design import NormalPrior, Term
-from pipeline.model.effects import bench_priors, catalogue, effect
+from pipeline.model.effects import catalogue, effect, stated_priors
 from pipeline.model.effects.base import parameter_limits
 from pipeline.model.effects.sessions import OWN
 
@@ -44,7 +44,7 @@ def configured_effects(sensor: str, settings: Mapping[str, Any], recordings: Seq
 def bench_effects(sensor: str, settings: Mapping[str, Any], recordings: Sequence[Recording]) -> list[str]:
     """Return the effects of the bench: those that the table's config states, and zeros that were found."""
     table = settings["table"]
-    stated = [name for name, key in bench_priors().items() if table.get(key) and table.get("motion") != "none"]
+    stated = stated_priors(table) if table.get("motion") != "none" else {}
     own_clocks = not all(recording.clock_shared for recording in recordings)
     names = [name for name in stated if not (effect(name).needs_clock and own_clocks)]
     found = any(note.code == "N-FOUND" for recording in recordings for note in recording.notes)

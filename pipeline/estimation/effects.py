@@ -11,7 +11,7 @@ from pipeline.estimation.noise import noise_of
 from pipeline.estimation.observations import observe
 from pipeline.estimation.rest_means import is_multi_position
 from pipeline.estimation.selection import select
-from pipeline.model.effects import bench_priors, effect
+from pipeline.model.effects import bench_priors, effect, stated_priors
 from pipeline.records import SensorCalibration
 
 if TYPE_CHECKING:
@@ -30,8 +30,7 @@ def fit(
     """
     before = previous or SensorCalibration(sensor)
     by_hand = is_multi_position(sensor, recordings)
-    table = settings.get("table") or {}
-    of_bench = not by_hand and any(table.get(key) for key in bench_priors().values())
+    of_bench = not by_hand and stated_priors(settings.get("table") or {})
     if not settings["effects"][sensor] and not of_bench:
         return before
     noise = noise_of(sensor, recordings, settings)

@@ -22,7 +22,7 @@ import numpy as np
 from pipeline.estimation.gauss_markov import Blocks, information
 from pipeline.estimation.table_errors import between_stops
 from pipeline.estimation.turns import Rows, followed, rows_of
-from pipeline.model.effects import bench_priors
+from pipeline.model.effects import stated_priors
 from pipeline.model.effects.base import length, turning_direction
 from pipeline.model.kinematics import earth_of, table_motion
 from pipeline.signal.filters import apply_filter
@@ -195,7 +195,7 @@ def observe(sensor: str, recordings: Sequence[Recording], table: Mapping[str, An
                 parts.append(part)
     parts.sort(key=_in_time)
     doubt = any(note.code == "N-SEATS" for recording in recordings for note in recording.notes)
-    bench = {name: float(table[key]) for name, key in bench_priors().items() if table.get(key)}
+    bench = stated_priors(table)
     angle = float(table.get("angle_accuracy_deg") or 0.0) if "mounting" in bench else 0.0
     return Observations(sensor, tuple(parts), earth_of(table) is not None, bench, doubt, angle)
 

@@ -38,7 +38,7 @@ from pipeline.estimation.noise import noise_of, prior_of
 from pipeline.estimation.table_errors import Reference, disturbance
 from pipeline.estimation.turns import blocks_of_samples, parts_of, settled
 from pipeline.estimation.uncertainty_budget import base_parameters, budgeted, noise_contribution
-from pipeline.model.effects import bench_priors
+from pipeline.model.effects import stated_priors
 from pipeline.model.effects.base import truth
 from pipeline.records import AXES, SensorCalibration, StageResult
 
@@ -114,7 +114,7 @@ def fit(
         return with_matrix(of_channels(beta.T.ravel() + errors))
 
     own = bench_effects(sensor, settings, recordings)
-    if own and not any(settings["table"].get(key) for key in bench_priors().values()):  # else by the stage ``effects``
+    if own and not stated_priors(settings["table"]):  # else by the stage ``effects``
         return fit_joint(sensor, recordings, own, noise_of(sensor, recordings, settings), settings, found)
     return budgeted(found, reference, noise, contributions, settings, results)
 

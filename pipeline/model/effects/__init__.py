@@ -41,6 +41,11 @@ def bench_priors() -> dict[str, str]:
     return {name: this.prior for name, this in built_in().items() if this.prior}
 
 
+def stated_priors(table: Mapping[str, Any]) -> dict[str, float]:
+    """Return the effects of the bench whose standard deviation a table's config states, with that."""
+    return {name: float(table[key]) for name, key in bench_priors().items() if table.get(key)}
+
+
 @contextmanager
 def leaving_out(names: Iterable[str]) -> Iterator[None]:
     """Take effects out of the catalogue within a ``with`` block, as unknown effects in studies of the diagnosis."""
