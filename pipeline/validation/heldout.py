@@ -25,7 +25,7 @@ from pipeline.model.measurement import linear_truth
 from pipeline.validation.error_breakdown import direction_known, error_breakdown, last_error_of_magnitude
 from pipeline.validation.expected_error import expected_rms_error, linearized
 from pipeline.validation.norm_error import squared_norm_errors
-from pipeline.validation.over_temperature import residuals_over_temperature
+from pipeline.validation.over_temperature import is_swept, residuals_over_temperature
 from pipeline.validation.samples import samples_of_motion, samples_of_rests
 
 if TYPE_CHECKING:
@@ -110,11 +110,11 @@ def validate(
         if part["held_out"] and expected is not None:
             part["worse_than_raw"] = _worse_than_raw(calibration, samples, expected[1], other)
         swept = residuals_over_temperature(calibration, samples, other)
-        if swept is None and reason is None:
-            fitted, reason = _choose(sensor, recordings, noise, settings, of_fit=True)
-            swept = residuals_over_temperature(calibration, fitted, other)
+        whose = "the held-out samples" if part["held_out"] else "the samples of the fit"
+        if swept is None and part["held_out"] and is_swept(recordings):
+            fitted, _ = _choose(sensor, recordings, noise, settings, of_fit=True)
+            swept, whose = residuals_over_temperature(calibration, fitted, other), "the samples of the fit"
         if swept:
-            whose = "the held-out samples" if reason is None else "the samples of the fit"
             part["over_temperature"] = {"samples_of": whose, "bins": swept}
     limits = (settings.get("limits") or {}).get(sensor) or {}
     part["limits"], part["pass"] = _check_limits(calibration, part["steps"][-1], limits)

@@ -13,14 +13,20 @@ import numpy as np
 from pipeline.validation.error_breakdown import last_error_of_magnitude
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
-    from pipeline.records import SensorCalibration
+    from pipeline.records import Recording, SensorCalibration
     from pipeline.validation.samples import Samples
 
 WIDTH = 5.0  # degC of a bin; a bias that follows the temperature by 1 mg/degC (MPU-6050) changes by 5 mg within it
 SWEPT = 2 * WIDTH  # degC: a range that fills two bins; a unit that warms up on the bench changes by less
 FEWEST = 10  # samples of a bin that is shown
+
+
+def is_swept(recordings: Iterable[Recording]) -> bool:
+    """Return whether the temperature of the recordings may have been swept: it spans ``SWEPT`` in all of them."""
+    warmth = [r.temperature[np.isfinite(r.temperature)] for r in recordings if r.temperature is not None]
+    return bool(np.ptp(np.concatenate([np.zeros(0), *warmth])) >= SWEPT) if any(map(len, warmth)) else False
 
 
 def residuals_over_temperature(
