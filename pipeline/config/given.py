@@ -11,14 +11,13 @@ from typing import TYPE_CHECKING, Any
 from pipeline.config.options import Problem
 from pipeline.config.schema import OF_BENCH
 from pipeline.errors import PipelineError
-from pipeline.model.effects.base import Owner
+from pipeline.history import SENSORS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
 GIVEN = "given"  # the method
-SENSORS = ("accelerometer", "gyroscope")
 
 
 def with_given(config: Mapping[str, Any], campaign: Path, unit: str) -> dict[str, Any]:
@@ -30,6 +29,7 @@ def with_given(config: Mapping[str, Any], campaign: Path, unit: str) -> dict[str
     """
     from pipeline.exports.reading import format_of, read_any  # noqa: PLC0415  (only for this method)
     from pipeline.model.effects import owner_of  # noqa: PLC0415  (as above)
+    from pipeline.model.effects.base import Owner  # noqa: PLC0415  (as above)
 
     method, effects = dict(config["method"]), dict(config["effects"])
     if not method["file"]:

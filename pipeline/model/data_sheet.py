@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import ConfigurationError
-from pipeline.records import SENSORS
+from pipeline.history import SENSORS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
