@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.estimation.design import Term
+    from pipeline.estimation.design import Design, Term
     from pipeline.estimation.generalized_least_squares import Fit
     from pipeline.estimation.selection import Selection
 
@@ -45,16 +45,20 @@ def influence(selection: Selection, names: Sequence[str]) -> list[JSON]:
     Entries hold ``effect, recordings`` (``recording, share, delta_bic_without, change``), ``seconds`` (``recording,
     from_s, to_s, share``) and ``depends_on``, recordings without which the evidence is gone.
     """
-    fit, found, at = selection.fit, [], BASE
-    own = {}
-    for term in fit.terms:
+    if not names:
+        return []
+    own, at = {}, BASE
+    for term in selection.fit.terms:
         own[term.effect.name] = term, np.arange(at, at + len(term.values))
         at += len(term.values)
+    design = design_at(selection.observations, selection.fit)
+    whole = design.products([selection.fit.setting])[0]
     without_each = _without_each(selection)
+    found = []
     for name in names:
         term, index = own[name]
-        gains = _gains_of_blocks(selection, term, index)
-        recordings = _of_recordings(selection, index, gains, without_each)
+        gains = _gains_of_blocks(selection, design, whole, term, index)
+        recordings = _of_recordings(selection, whole, index, gains, without_each)
         found.append(
             {
                 "effect": name,
@@ -71,16 +75,15 @@ def _gone(recording: JSON) -> bool:
     return recording["delta_bic_without"] is None or bool(recording["delta_bic_without"] < GATE_BIC)
 
 
-def _gains_of_blocks(selection: Selection, term: Term, own: NDArray[np.intp]) -> Values:
-    """Return the share of each block in what an effect gains: (m,) array."""
+def _gains_of_blocks(selection: Selection, design: Design, whole: Values, term: Term, own: NDArray[np.intp]) -> Values:
+    """Return the share of each block in what an effect gains: (m,) array. ``whole``: products of the fit's design."""
     observations, fit = selection.observations, selection.fit
-    design, described = design_at(observations, fit), term.effect.parameters(observations.sensor)
+    described = term.effect.parameters(observations.sensor)
     change = np.zeros(design.count)
     linear = [term.effect.moves or p.name not in term.effect.nonlinear for p in described]
     change[own] = np.where(linear, term.values, 0.0)
-    products = design.products([fit.setting])[0][:, :-1, :-1]
     others = np.setdiff1d(np.arange(design.count), own)
-    change[others] = -(projection(products, others)[0] @ change)
+    change[others] = -(projection(whole[:, :-1, :-1], others)[0] @ change)
     blocks, weight = observations.blocks, observations.weight
     label, noise, gains = blocks.label(len(weight)), GaussMarkov(blocks, [fit.setting]), np.zeros(len(blocks.first))
     for c in range(3):
@@ -108,13 +111,16 @@ def _without_each(selection: Selection) -> list[tuple[Values, float, float]]:
 
 
 def _of_recordings(
-    selection: Selection, own: NDArray[np.intp], gains: Values, without_each: Sequence[tuple[Values, float, float]]
+    selection: Selection,
+    whole: Values,
+    own: NDArray[np.intp],
+    gains: Values,
+    without_each: Sequence[tuple[Values, float, float]],
 ) -> list[JSON]:
     """Return the share of each recording in an effect, and what is left of the effect without it."""
     fit, parts = selection.fit, selection.observations.parts
     ends = np.cumsum([len(part.weight) for part in parts])
     of_block = np.searchsorted(ends, selection.observations.blocks.first, side="right")
-    whole = design_at(selection.observations, fit).products([fit.setting])[0]
     least = _weakest(whole, own)
     found = []
     for k, part in enumerate(parts):
@@ -142,7 +148,7 @@ def _refitted(fit: Fit, own: NDArray[np.intp], least: float, rest: tuple[Values,
         return {}
     beside = without(products, others)
     model = np.zeros(p)
-    model[own] = fit_values(fit)[own - BASE]
+    model[own] = np.concatenate([term.values for term in fit.terms])[own - BASE]
     step = projection(beside, own)[0][:, -1]  # about the values of the fit, whose residual is the last column
     left = float(without(beside, own)[0, -1, -1])
     size = beside[0][np.ix_(own, own)]
@@ -153,11 +159,6 @@ def _refitted(fit: Fit, own: NDArray[np.intp], least: float, rest: tuple[Values,
         "delta_bic_without": gain - len(own) * float(np.log(samples)),
         "change": float(np.max(np.abs(step) / uncertainty)),
     }
-
-
-def fit_values(fit: Fit) -> Values:
-    """Return the parameters of all effects of a fit."""
-    return np.concatenate([term.values for term in fit.terms]) if fit.terms else np.zeros(0)
 
 
 def _stretches(selection: Selection, gains: Values) -> list[JSON]:
