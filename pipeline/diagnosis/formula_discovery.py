@@ -26,7 +26,7 @@ from pipeline.diagnosis.residual_regression import ProjectedCurves
 from pipeline.diagnosis.words import listed
 from pipeline.estimation.design import Term
 from pipeline.estimation.generalized_least_squares import fit_terms
-from pipeline.estimation.observations import without_rows
+from pipeline.estimation.observations import without_each_recording, without_rows
 from pipeline.estimation.selection import FAR_ABOVE, select
 from pipeline.model.effects import catalogue, forget, register
 from pipeline.model.effects.base import unit_of
@@ -215,9 +215,8 @@ def _stability(selection: Selection, finalists: Sequence[Scored]) -> list[float]
 
 def _resamples(observations: Observations) -> Iterator[Observations]:
     """Yield the observations without each recording, then without each fifth of every recording."""
+    yield from without_each_recording(observations)
     lengths = [len(part.weight) for part in observations.parts]
-    for out in range(len(lengths) if len(lengths) > 1 else 0):
-        yield without_rows(observations, [np.full(n, k == out) for k, n in enumerate(lengths)])
     for fold in range(FOLDS):
         yield without_rows(observations, [np.arange(n) * FOLDS // n == fold for n in lengths])
 

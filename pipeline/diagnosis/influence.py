@@ -18,7 +18,7 @@ import numpy as np
 from pipeline.estimation.design import BASE
 from pipeline.estimation.gauss_markov import GaussMarkov
 from pipeline.estimation.generalized_least_squares import design_at
-from pipeline.estimation.observations import without_rows
+from pipeline.estimation.observations import without_each_recording
 from pipeline.estimation.ranking import projection, without
 from pipeline.estimation.selection import GATE_BIC
 
@@ -102,9 +102,7 @@ def _gains_of_blocks(selection: Selection, design: Design, whole: Values, term: 
 def _without_each(selection: Selection) -> list[tuple[Values, float, float]]:
     """Return for each recording the products of the fit without it, the scatter within rows, and the samples."""
     found = []
-    parts = selection.observations.parts
-    for out in range(len(parts) if len(parts) > 1 else 0):
-        rest = without_rows(selection.observations, [np.full(len(p.weight), k == out) for k, p in enumerate(parts)])
+    for rest in without_each_recording(selection.observations):
         products = design_at(rest, selection.fit).products([selection.fit.setting])[0]
         found.append((products, float(np.sum(rest.scatter / selection.fit.scale**2)), 3.0 * rest.samples))
     return found

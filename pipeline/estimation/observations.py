@@ -28,7 +28,7 @@ from pipeline.model.kinematics import earth_of, table_motion
 from pipeline.signal.filters import apply_filter
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -144,6 +144,13 @@ def without_rows(observations: Observations, left_out: Sequence[NDArray[np.bool_
         share = float(weight.sum() / part.weight.sum())
         parts.append(replace(part, weight=weight, scatter=share * part.scatter))
     return replace(observations, parts=tuple(parts))
+
+
+def without_each_recording(observations: Observations) -> Iterator[Observations]:
+    """Yield observations without the information of each recording; nothing where there is only one."""
+    lengths = [len(part.weight) for part in observations.parts]
+    for out in range(len(lengths) if len(lengths) > 1 else 0):
+        yield without_rows(observations, [np.full(n, k == out) for k, n in enumerate(lengths)])
 
 
 def weighted(observations: Observations, noise: Noise | None) -> Observations:
