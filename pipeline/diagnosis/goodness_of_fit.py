@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.diagnosis.residual_dependence import bases_of
-from pipeline.diagnosis.residual_regression import ProjectedCurves, columns_of_fit
+from pipeline.diagnosis.residual_dependence import bases_of, curves_of, smooth_tests
+from pipeline.diagnosis.residual_regression import ProjectedCurves, columns_of_fit, each_explains
 from pipeline.estimation.gauss_markov import GaussMarkov, Products
 from pipeline.estimation.ranking import projection
 
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
     from pipeline.estimation.observations import Observations
     from pipeline.estimation.selection import Selection
-    from pipeline.records import Motion
 
     Values = NDArray[np.float64]
 
@@ -36,16 +35,13 @@ def goodness_of_fit(selection: Selection) -> dict[str, Any]:
     from scipy.special import chdtrc  # noqa: PLC0415  (0.1 s that only a diagnosis pays)
 
     bases, observations = bases_of(selection), selection.observations
-
-    def curves(motion: Motion) -> Values:
-        return np.concatenate([of(motion) for _, of, _ in bases], axis=1)
-
+    curves = curves_of(bases)
     fitted = ProjectedCurves(selection, curves)
     draws = _draws(selection)
     A, places = columns_of_fit(selection, curves)
     parts = [
         _projected(
-            selection.observations,
+            observations,
             fitted,
             np.concatenate([A[:, [*model[:-1], *own]], A[:, model[-1:]] / fitted.scale[c], draws[c]], axis=1),
             len(own),
@@ -56,24 +52,18 @@ def goodness_of_fit(selection: Selection) -> dict[str, Any]:
     left = sum(left for _, _, left in parts)  # (t, 1 + s)
 
     def likelihood(rss: Values) -> Values:
-        total = np.maximum(rss + within, 1e-300)
-        found = -0.5 * fitted.samples * np.log(total / fitted.samples)
-        return np.asarray((found - fitted.penalty.reshape(-1, *[1] * (rss.ndim - 1))).max(axis=0))
+        return np.asarray(fitted.log_likelihood(rss, within).max(axis=0))
 
-    before, least, at = likelihood(np.asarray(left)), np.ones(1 + SIMULATIONS), 0
-    for _, _, blocks in bases:
-        for block, fewest in blocks:
-            kept = fitted.independent(at + np.asarray(block))
-            if len(kept) < fewest:
-                continue
-            drop = sum(
-                _drops(inner[:, kept][:, :, kept], cross[:, kept], fitted.error[:, c, kept] * fitted.scale[c])
-                for c, (inner, cross, _) in enumerate(parts)
-            )
-            gain = 2.0 * (likelihood(np.asarray(left)[:, None] - drop) - before)
-            p = chdtrc(3 * np.arange(1, len(kept) + 1)[:, None], np.maximum(gain, 0.0))[fewest - 1 :].min(axis=0)
-            least = np.minimum(least, p)
-        at += 1 + max(max(block) for block, _ in blocks)
+    error = fitted.error * fitted.scale[:, None]  # of the products in ``parts``, which hold no scale
+    before, least = likelihood(np.asarray(left)), np.ones(1 + SIMULATIONS)
+    for _, kept, fewest in smooth_tests(bases, fitted):
+        drop = sum(
+            np.cumsum(each_explains(inner[:, kept][:, :, kept], cross[:, kept], error[:, c, kept])[0], axis=1)
+            for c, (inner, cross, _) in enumerate(parts)
+        )
+        gain = 2.0 * (likelihood(np.asarray(left)[:, None] - drop) - before)
+        p = chdtrc(3 * np.arange(1, len(kept) + 1)[:, None], np.maximum(gain, 0.0))[fewest - 1 :].min(axis=0)
+        least = np.minimum(least, p)
     return {"share_worse": float(np.mean(least[1:] <= least[0])), "simulations": SIMULATIONS}
 
 
@@ -102,17 +92,3 @@ def _projected(
     taken = projection(products, np.arange(k))[:, :, k:]
     rest = products[:, k:, k:] - products[:, :k, k:].transpose(0, 2, 1) @ taken
     return rest[:, :curves, :curves], rest[:, :curves, curves:], np.einsum("tss->ts", rest[:, curves:, curves:])
-
-
-def _drops(inner: Values, cross: Values, error: Values) -> Values:
-    """Return what the first 1 to r of some curves explain: (t, r, 1 + s) array; nothing where rounding hides one."""
-    found = np.zeros_like(cross)
-    for j in range(inner.shape[1]):
-        new = inner[:, j, j] > error[:, j] ** 2
-        over = np.where(new, 1.0 / np.where(new, inner[:, j, j], 1.0), 0.0)
-        found[:, j] = cross[:, j] ** 2 * over[:, None]
-        taken = inner[:, :, j] * over[:, None]
-        cross = cross - taken[:, :, None] * cross[:, j : j + 1]
-        inner = inner - taken[:, :, None] * inner[:, j, None, :]
-        error = error + np.abs(taken) * error[:, j : j + 1]
-    return np.asarray(np.cumsum(found, axis=1))

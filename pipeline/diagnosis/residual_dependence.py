@@ -24,7 +24,7 @@ from pipeline.diagnosis.residual_regression import ProjectedCurves
 from pipeline.estimation.gauss_markov import selection_grid
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
     Values = NDArray[np.float64]
     Block = tuple[Sequence[int], int]
+    Basis = tuple[str, Curves, list[Block]]
     Tests = tuple[list[str], Values, NDArray[np.intp], float]
 
 GATE_BIC = 10.0  # "very strong" of R. E. Kass and A. E. Raftery, JASA 90 (1995), 773-795
@@ -85,18 +86,14 @@ def _significant(selection: Selection, explained: Curves | None) -> dict[str, tu
 def _smooth_tests(selection: Selection, explained: Curves | None) -> Tests:
     """Return covariate, delta BIC and number of parameters of each test with smooth curves, and the samples."""
     bases = bases_of(selection)
-    projected = ProjectedCurves(selection, lambda m: np.concatenate([b(m) for _, b, _ in bases], axis=1), explained)
+    projected = ProjectedCurves(selection, curves_of(bases), explained)
     names: list[str] = []
     counts: list[int] = []
-    drops, at = [np.zeros((*projected.left.shape, 0))], 0
-    for covariate, _, blocks in bases:
-        for block, least in blocks:
-            kept = projected.independent(at + np.asarray(block))
-            if len(kept) >= least:
-                drops.append(projected.drop(kept)[:, :, least - 1 :])
-                counts += range(least, len(kept) + 1)
-                names += [covariate] * (len(kept) + 1 - least)
-        at += 1 + max(max(block) for block, _ in blocks)
+    drops = [np.zeros((*projected.left.shape, 0))]
+    for covariate, kept, least in smooth_tests(bases, projected):
+        drops.append(projected.drop(kept)[:, :, least - 1 :])
+        counts += range(least, len(kept) + 1)
+        names += [covariate] * (len(kept) + 1 - least)
     parameters = 3 * np.array(counts, int)
     return names, projected.gains(np.concatenate(drops, axis=2), parameters), parameters, projected.samples
 
@@ -135,7 +132,26 @@ def _step_tests(selection: Selection, explained: Curves | None) -> Tests:
     return names, projected.gains(np.concatenate(drops, axis=2), parameters), parameters, projected.samples
 
 
-def bases_of(selection: Selection) -> list[tuple[str, Curves, list[Block]]]:
+def curves_of(bases: Sequence[Basis]) -> Curves:
+    """Return what evaluates the curves of all covariates, those of each after those of the one before."""
+    return lambda motion: np.concatenate([curves(motion) for _, curves, _ in bases], axis=1)
+
+
+def smooth_tests(bases: Sequence[Basis], projected: ProjectedCurves) -> Iterator[tuple[str, list[int], int]]:
+    """Yield covariate, independent curves and ``least`` of each block in which as many as that are independent.
+
+    ``projected`` holds ``curves_of(bases)``.
+    """
+    at = 0
+    for covariate, _, blocks in bases:
+        for block, least in blocks:
+            kept = projected.independent(at + np.asarray(block))
+            if len(kept) >= least:
+                yield covariate, kept, least
+        at += 1 + max(max(block) for block, _ in blocks)
+
+
+def bases_of(selection: Selection) -> list[Basis]:
     """Return covariates that the recordings hold, the curves of each, and which of these are tried together.
 
     A block is tried with its first ``least`` curves, and with each further one.
@@ -144,7 +160,7 @@ def bases_of(selection: Selection) -> list[tuple[str, Curves, list[Block]]]:
     motions = [part.motion for part in observations.parts]
     degrees: list[Block] = [(range(DEGREE), 2)]
     components: list[Block] = [(range(3 * i, 3 * i + 3), 3) for i in range(3)]
-    bases: list[tuple[str, Curves, list[Block]]] = [("specific_force", _force, [*components, (range(9), 9)])]
+    bases: list[Basis] = [("specific_force", _force, [*components, (range(9), 9)])]
     if observations.clock_shared:
         bases.append(("time", _chebyshev(Span.of(observations, "time")), degrees))
     if all(m.temperature is not None for m in motions):

@@ -66,11 +66,14 @@ class _Evidence:
         """Set what base and effects leave, (t, 3), and log det C of one channel, white noise alone first."""
         self.left = left
         self.penalty = 1.5 * logarithms[1:] - np.array([setting.prior for setting in self.settings[1:]])
-        self.before = float(self._log_likelihood(self.left.sum(axis=1)).max())
+        self.before = float(self.log_likelihood(self.left.sum(axis=1)).max())
 
-    def _log_likelihood(self, rss: Values) -> Values:
-        """Return the log likelihood under each noise setting, (t, ...), of whitened sums of squares."""
-        total = np.maximum(rss + self.within, 1e-300)
+    def log_likelihood(self, rss: Values, within: Values | None = None) -> Values:
+        """Return the log likelihood under each noise setting, (t, ...), of whitened sums of squares.
+
+        ``within``: scatter within rows, of the shape of the last axes of ``rss``; without it that of the readings.
+        """
+        total = np.maximum(rss + (self.within if within is None else within), 1e-300)
         penalty = self.penalty.reshape(-1, *[1] * (rss.ndim - 1))
         found: Values = -0.5 * self.samples * np.log(total / self.samples) - penalty
         return found
@@ -78,7 +81,7 @@ class _Evidence:
     def gains(self, drops: Values, parameters: int | NDArray[np.intp]) -> Values:
         """Return delta BIC of forms on all three axes, from their (t, 3, m) drops and numbers of parameters: (m,)."""
         rss = self.left.sum(axis=1)[:, None] - drops.sum(axis=1)
-        best = self._log_likelihood(rss).max(axis=0)
+        best = self.log_likelihood(rss).max(axis=0)
         found: Values = 2.0 * (best - self.before) - parameters * float(np.log(self.samples))
         return found
 
@@ -92,7 +95,7 @@ class _Evidence:
 
         order = np.argsort(-drops.max(axis=0), axis=0)
         together = np.cumsum(np.take_along_axis(drops, order[None], axis=1), axis=1)
-        likelihoods = self._log_likelihood(self.left.sum(axis=1)[:, None, None] - together)
+        likelihoods = self.log_likelihood(self.left.sum(axis=1)[:, None, None] - together)
         gained = np.maximum(2.0 * (likelihoods.max(axis=0) - self.before), 0.0)
         k = columns * np.arange(1, 4)[:, None] + scanned
         delta, p = gained - k * float(np.log(self.samples)), chdtrc(k, gained)
@@ -177,19 +180,9 @@ class ProjectedCurves(_Evidence):
 
     def _each(self, index: Sequence[int]) -> tuple[Values, NDArray[np.bool_]]:
         """Return what each curve adds to those before it, and whether it is independent of them: (t, 3, r)."""
-        inner, cross = self.inner[:, :, index][:, :, :, index], self.cross[:, :, index].copy()
-        error = self.error[:, :, index].copy()
-        explained, independent = np.zeros_like(cross), np.zeros(cross.shape, bool)
-        for j in range(len(index)):
-            pivot = inner[:, :, j, j]
-            independent[:, :, j] = pivot > error[:, :, j] ** 2
-            over = np.where(independent[:, :, j], 1.0 / np.where(independent[:, :, j], pivot, 1.0), 0.0)
-            explained[:, :, j] = cross[:, :, j] ** 2 * over
-            taken = inner[:, :, j] * over[:, :, None]
-            cross -= taken * cross[:, :, j : j + 1]
-            inner = inner - taken[:, :, :, None] * inner[:, :, j, None, :]
-            error += np.abs(taken) * error[:, :, j : j + 1]
-        return explained, independent
+        inner, cross = self.inner[:, :, index][:, :, :, index], self.cross[:, :, index]
+        explained, independent = each_explains(inner, cross[..., None], self.error[:, :, index])
+        return explained[..., 0], independent
 
     def coefficients(self, index: Sequence[int], setting: int) -> Values:
         """Return the estimates of some curves under one noise: (3, r) array, unit of the sensor.
@@ -281,6 +274,25 @@ class Scan(_Evidence):
             cross = cross - taken * cross[:, :, j : j + 1]
             inner = inner - taken[:, :, :, None] * inner[:, :, j, None, :]
         return np.asarray(np.where(new, found, 0.0)[1:])
+
+
+def each_explains(inner: Values, cross: Values, error: Values) -> tuple[Values, NDArray[np.bool_]]:
+    """Return what each of r curves explains beside those before it, (..., r, s), and whether it is independent of them.
+
+    ``inner``: (..., r, r), products of the curves. ``cross``: (..., r, s), their products with s residuals. ``error``:
+    (..., r), the rounding error e; a curve that leaves less explains nothing.
+    """
+    explained, independent = np.zeros_like(cross), np.zeros(error.shape, bool)
+    for j in range(inner.shape[-1]):
+        pivot = inner[..., j, j]
+        independent[..., j] = new = pivot > error[..., j] ** 2
+        over = np.where(new, 1.0 / np.where(new, pivot, 1.0), 0.0)
+        explained[..., j, :] = cross[..., j, :] ** 2 * over[..., None]
+        taken = inner[..., j] * over[..., None]
+        cross = cross - taken[..., None] * cross[..., j, None, :]
+        inner = inner - taken[..., None] * inner[..., j, None, :]
+        error = error + np.abs(taken) * error[..., j, None]
+    return explained, independent
 
 
 def columns_of_fit(selection: Selection, *further: Curves | None) -> tuple[Values, list[list[NDArray[np.intp]]]]:
