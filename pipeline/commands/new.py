@@ -7,14 +7,12 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import yaml
-
 from pipeline.errors import ConfigurationError, InputError
 from pipeline.files import CONFIGS
 from pipeline.model.data_sheet import range_settings
 from pipeline.outcome import run_command
 from pipeline.planning.instructions import readme
-from pipeline.simulation.description import UnitDescription
+from pipeline.simulation.description import UnitDescription, read_option
 from pipeline.simulation.procedures import TABLE_PROCEDURES
 
 if TYPE_CHECKING:
@@ -51,12 +49,12 @@ def main(argv: Sequence[str]) -> int:
     if sheet.exists():
         raise InputError("exists already; choose a directory without a campaign", str(sheet))
     sensor_name = _chosen("sensor", arguments.sensor, "generic")
-    sensor = _option("sensor", sensor_name)
+    sensor = read_option("sensor", sensor_name)
     ranges = _chosen_ranges(sensor, arguments.range)
     procedure_name = _chosen("procedure", arguments.procedure, "three_axis_turns")
-    procedure = _option("procedure", procedure_name)
+    procedure = read_option("procedure", procedure_name)
     table_name = _chosen("table", arguments.table, procedure["table"])
-    table = _option("table", table_name)
+    table = read_option("table", table_name)
     if (table["motion"] == "none") == (procedure_name in TABLE_PROCEDURES):
         known = ", ".join(TABLE_PROCEDURES)
         raise ConfigurationError(
@@ -80,15 +78,6 @@ def main(argv: Sequence[str]) -> int:
     print(_accuracy(table_name, table))
     print(f"then: {run_command({'campaign': str(arguments.directory)})}")
     return 0
-
-
-def _option(group: str, name: str) -> dict[str, Any]:
-    file = CONFIGS / group / f"{name}.yaml"
-    if not file.is_file():
-        options = ", ".join(sorted(f.stem for f in (CONFIGS / group).glob("*.yaml")))
-        raise ConfigurationError(f"no {group} is called {name!r}; known: {options}")
-    content: dict[str, Any] = yaml.safe_load(file.read_text(encoding="utf-8"))
-    return content
 
 
 def _accuracy(name: str, table: dict[str, Any]) -> str:

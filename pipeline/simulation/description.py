@@ -190,7 +190,13 @@ def _read_mapping(path: Path) -> dict[str, Any]:
 
 @cache
 def read_config(group: str, name: str) -> dict[str, Any]:
-    """Read one configuration of a group as plain YAML, without composing it; of a sensor, ``completed``.
+    """Return ``read_option``; of a sensor, ``completed``."""
+    found = read_option(group, name)
+    return completed(found, read_option(group, "generic")) if group == "sensor" else found
+
+
+def read_option(group: str, name: str) -> dict[str, Any]:
+    """Read one configuration of a group as its file states it, without composing it.
 
     Raises
     ------
@@ -201,8 +207,7 @@ def read_config(group: str, name: str) -> dict[str, Any]:
     if not path.is_file():
         known = ", ".join(sorted(p.stem for p in path.parent.glob("*.yaml")))
         raise ConfigurationError(f"no {group} is called {name!r}; known: {known}")
-    found = _read_mapping(path)
-    return completed(found, _read_mapping(path.with_name("generic.yaml"))) if group == "sensor" else found
+    return _read_mapping(path)
 
 
 def _counted(entry: dict[str, Any]) -> list[UnitDescription]:
