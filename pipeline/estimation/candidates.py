@@ -215,6 +215,31 @@ def excited(
     return np.asarray((kept @ kept.T) * limit / size[:, None] * size)
 
 
+def over_limits(
+    places: Sequence[tuple[str, slice]],
+    products: NDArray[np.float64],
+    size: NDArray[np.float64],
+    limits: Mapping[str, NDArray[np.float64]],
+    *,
+    samples: float,
+    least: float,
+) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]]]:
+    """Return the change of columns to those of parameters over their limits, (p + 1, p + 1), and the limits.
+
+    ``places``: effect and columns, more than once for an effect of several versions. ``products``: (p + 1, p + 1), less
+    the base, readings last. ``limits``: by the data sheet. ``size, samples, least``: of ``excited, limits_or_noise``.
+    """
+    found: dict[str, NDArray[np.float64]] = {}
+    change = np.zeros(products.shape)
+    change[-1, -1] = 1.0
+    for name, own in places:
+        inner = products[own, own]
+        if name not in found:
+            found[name] = limits_or_noise(limits.get(name), inner, samples)
+        change[own, own] = excited(inner, size[own], found[name], least)
+    return change, found
+
+
 def time_constants(
     this: Effect, sensor: str, fitted: Term | None = None, width: float | None = None, *, between: bool = True
 ) -> list[tuple[Term, float]]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.estimation.candidates import SECOND, SECOND_SHARE, excited, limits_or_noise, time_constants
+from pipeline.estimation.candidates import SECOND, SECOND_SHARE, over_limits, time_constants
 from pipeline.estimation.design import BASE, Design, Start, Term
 from pipeline.estimation.gauss_markov import WHITE, random_walks
 from pipeline.estimation.generalized_least_squares import design_beside, fit_terms
@@ -158,25 +158,15 @@ def _problem(selection: Selection, fit: Fit, candidates: Mapping[str, Term]) -> 
     base = stacked[:, :known, :known] / np.outer(size[:known], size[:known])
     prior = np.array([s.prior for s in settings]) - 0.5 * (logarithms + np.linalg.slogdet(base)[1])
     products = without(stacked, np.arange(known))[:, known:, known:]
-    change = np.zeros((products.shape[1], products.shape[1]))
-    moved = np.zeros(products.shape[1])
-    moved[-1] = change[-1, -1] = 1.0
+    own = [(name, slice(at.start - known, at.stop - known)) for (name, _, _), at in zip(listed, places, strict=True)]
+    samples = 3.0 * observations.samples
+    change, limits = over_limits(own, products[0], size[known:], selection.limits, samples=samples, least=EXCITED)
     versions: dict[str, list[Version]] = {}
-    limits: dict[str, Values] = {}
-    for (name, _, weight), at in zip(listed, places, strict=True):
-        own = slice(at.start - known, at.stop - known)
-        limit = (
-            limits[name]
-            if name in limits
-            else limits_or_noise(selection.limits.get(name), products[0, own, own], 3.0 * observations.samples)
-        )
-        change[own, own] = excited(products[0, own, own], size[at], limit, EXCITED)
+    for (name, at), (_, _, weight) in zip(own, listed, strict=True):
         if name in fitted and name not in versions:
-            moved[own] = fitted[name].values[: at.stop - at.start]
-        limits.setdefault(name, limit)
-        versions.setdefault(name, []).append(Version(np.arange(own.start, own.stop), weight))
-    change[:, -1] = moved
-    free = 3.0 * observations.samples - known
+            change[at, -1] = fitted[name].values[: at.stop - at.start]
+        versions.setdefault(name, []).append(Version(np.arange(at.start, at.stop), weight))
+    free = samples - known
     within = float(np.sum(observations.scatter / fit.scale**2))
     return Problem(
         (change.T @ products @ change)[1:],

@@ -6,11 +6,12 @@ Columns are taken at the fit of what was selected, with its values put back into
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.estimation.candidates import excited, limits_or_noise, time_constants
+from pipeline.estimation.candidates import over_limits, time_constants
 from pipeline.estimation.gauss_markov import WALK_RATIO, WALK_SHARE, WALK_TIME
 from pipeline.estimation.multi_position.likelihood import NEW
 from pipeline.estimation.posterior import (
@@ -81,23 +82,14 @@ def _problem(selection: Selection, effects: Mapping[str, Effect]) -> Problem:
     )
     prior = np.array([h.prior for h in hypotheses]) - 0.5 * (np.array([log for _, log in whitened]) + logarithm)
     products = without(stacked, np.arange(known))[:, known:, known:]
-    change = np.zeros(products.shape[1:])
-    change[-1, -1] = 1.0
+    ends = np.cumsum([0, *(Z.shape[1] for Z in columns)]).tolist()
+    places = [(name, slice(*span)) for (name, _, _), span in zip(listed, pairwise(ends), strict=True)]
+    samples = len(readings)
+    change, limits = over_limits(places, products[0], size[0, known:], selection.limits, samples=samples, least=NEW)
     versions: dict[str, list[Version]] = {}
-    limits: dict[str, Values] = {}
-    at = 0
-    for (name, _, weight), Z in zip(listed, columns, strict=True):
-        block = slice(at, at + Z.shape[1])
-        at = block.stop
-        limit = (
-            limits[name]
-            if name in limits
-            else limits_or_noise(selection.limits.get(name), products[0, block, block], len(readings))
-        )
-        change[block, block] = excited(products[0, block, block], size[0, known:][block], limit, NEW)
-        limits.setdefault(name, limit)
-        versions.setdefault(name, []).append(Version(np.arange(block.start, block.stop), weight))
-    free = float(max(len(readings) - kept, 1))
+    for (name, at), (_, _, weight) in zip(places, listed, strict=True):
+        versions.setdefault(name, []).append(Version(np.arange(at.start, at.stop), weight))
+    free = float(max(samples - kept, 1))
     return Problem(change.T @ products @ change, prior, 0.0, free, versions, limits, excluded([*effects.values()]))
 
 
