@@ -29,7 +29,7 @@ import numpy as np
 
 from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.accelerometer import nonlinear_least_squares
-from pipeline.estimation.accelerometer.ellipsoid_fit import COLUMNS, ROWS, derivative_of
+from pipeline.estimation.accelerometer.ellipsoid_fit import COLUMNS, IDEAL, ROWS, derivative_of, triangle
 from pipeline.estimation.accelerometer.orientations import orientations_of
 from pipeline.estimation.rest_means import holdout_interval
 from pipeline.records import AXES, coverage_factor
@@ -50,7 +50,6 @@ SHARPNESS = 8  # of the norm that stands for the largest U: within 32 % of it fo
 SWEEPS = 10  # of the exchange; it ends by itself after two or three
 MOST = 60  # rests that are planned ahead: some 7 min
 FEWEST = 9  # rests of the fit, one a parameter
-IDEAL = np.concatenate([np.zeros(3), np.eye(3)[ROWS, COLUMNS]])
 PLACE = np.array([0, 1, 2, *(3 + 3 * ROWS + COLUMNS)])  # of the nine among bias and full matrix
 SAME = 0.08  # of two components of the vertical: 5 deg from the edge between their sides, so that its name stays
 LEVEL_DEG = 3.0  # a tilt that is not worth a word: units are set down by hand to about 1 deg
@@ -151,11 +150,10 @@ def progress_of(recordings: Sequence[Recording], settings: Mapping[str, Any], dw
     inflation, freedom, expanded = np.ones(9), np.full(9, np.inf), np.inf
     if fitted is not None and not reason:
         assert fitted.covariance is not None  # noqa: S101
-        assert fitted.freedom is not None  # noqa: S101
         own = np.diag(fitted.covariance)[PLACE]
-        freedom, inflation = fitted.freedom[PLACE], own / np.diag(np.linalg.inv(F))
+        freedom, inflation = fitted.effective_freedom()[PLACE], own / np.diag(np.linalg.inv(F))
         expanded = float(np.max(coverage_factor(freedom) * np.sqrt(own)))
-    of_both = [(pair, held) for held in (False, True) for pair in (orientations.rests, orientations.held_out)[held]]
+    of_both = [(pair, False) for pair in orientations.rests] + [(pair, True) for pair in orientations.held_out]
     of_both.sort(key=lambda entry: (recordings.index(entry[0][0]), entry[0][1].start))
     pairs = [pair for pair, _ in of_both]
     last = sum(pair[0] is pairs[-1][0] for pair in pairs) if pairs else 0
@@ -204,18 +202,15 @@ def _directions(pairs: Sequence[tuple[Recording, Rest]], values: Values) -> Valu
     """Return the direction of the vertical in the body at each rest: (m, 3) array."""
     readings = [np.asarray(r.accelerometer)[rest.start : rest.stop] for r, rest in pairs]
     mean = np.array([np.nanmean(values, axis=0) for values in readings]).reshape(-1, 3)
-    L = np.zeros((3, 3))
-    L[ROWS, COLUMNS] = values[3:]
-    force = (mean - values[:3]) @ L.T
+    force = (mean - values[:3]) @ triangle(values).T
     return np.asarray(force / np.linalg.norm(force, axis=1, keepdims=True))
 
 
 def propose(progress: Progress, goal: float) -> Proposal:
     """Return the next rest, and how many rests of the fit are expected to reach the goal, g; at most ``MOST``."""
     up = attitudes()
-    L = np.zeros((3, 3))
-    L[ROWS, COLUMNS] = progress.values[3:]
-    X = derivative_of(progress.values[:3] + up @ np.linalg.inv(L).T, progress.values) / progress.error
+    readings = progress.values[:3] + up @ np.linalg.inv(triangle(progress.values)).T
+    X = derivative_of(readings, progress.values) / progress.error
     planned, F = _planned(progress, X, goal)
     expected = progress.largest(F, len(planned))
     if progress.next_is_held_out:  # as far as it can be from all rests, so that it judges the fit between them

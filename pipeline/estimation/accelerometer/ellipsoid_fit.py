@@ -44,6 +44,7 @@ NAMES = [f"bias_{axis}" for axis in "xyz"] + [
     for i, j in zip(ROWS, COLUMNS, strict=True)
 ]
 MISALIGNMENT = np.concatenate([np.zeros(3, bool), ROWS != COLUMNS])
+IDEAL = np.concatenate([np.zeros(3), np.eye(3)[ROWS, COLUMNS]])  # the nine values of an ideal sensor
 ROUNDS = 20  # of s_r^2 and the fit, one after the other
 
 
@@ -66,7 +67,7 @@ class Ellipsoid:
     @property
     def matrix(self) -> Values:
         """L = T S: (3, 3) array."""
-        return _triangle(self.values)
+        return triangle(self.values)
 
     @property
     def standard_uncertainty(self) -> Values:
@@ -76,7 +77,7 @@ class Ellipsoid:
         return out
 
 
-def _triangle(values: Values) -> Values:
+def triangle(values: Values) -> Values:
     """Return L of the nine values: (3, 3) array."""
     L = np.zeros((3, 3))
     L[ROWS, COLUMNS] = values[3:]
@@ -85,7 +86,7 @@ def _triangle(values: Values) -> Values:
 
 def error_of(y: Values, target: Values, values: Values) -> Values:
     """Return |L (y - b)| less its target: (m,) array, g."""
-    return np.asarray(np.linalg.norm((y - values[:3]) @ _triangle(values).T, axis=1) - target)
+    return np.asarray(np.linalg.norm((y - values[:3]) @ triangle(values).T, axis=1) - target)
 
 
 def derivative_of(y: Values, values: Values) -> Values:
@@ -93,7 +94,7 @@ def derivative_of(y: Values, values: Values) -> Values:
 
     ``d/db = -L^T n`` and ``d/dL_ij = n_i (y - b)_j``, with ``n = u / |u|``.
     """
-    L, centred = _triangle(values), y - values[:3]
+    L, centred = triangle(values), y - values[:3]
     u = centred @ L.T
     n = u / np.linalg.norm(u, axis=1, keepdims=True)
     return np.concatenate([-n @ L, n[:, ROWS] * centred[:, COLUMNS]], axis=1)
@@ -138,23 +139,22 @@ def _insert(values: Values, free: Mask, x: Values) -> Values:
 
 def _start(y: Values, gravity_g: float, free: Mask) -> Values:
     """Return the values of the ellipsoid through the readings, or those of an ideal sensor where they draw none."""
-    ideal = np.concatenate([np.zeros(3), np.eye(3)[ROWS, COLUMNS]])
     tilted = bool(free[MISALIGNMENT].all())
     products = 2.0 * y[:, [0, 0, 1]] * y[:, [1, 2, 2]]
     columns = [y**2, products, 2.0 * y] if tilted else [y**2, 2.0 * y]
     try:
         p = solve_linear(np.concatenate(columns, axis=1), np.ones(len(y)), sigma=1.0).x
     except NotObservableError:
-        return ideal
+        return IDEAL
     xy, xz, yz = p[3:6] if tilted else np.zeros(3)
     Q = np.array([[p[0], xy, xz], [xy, p[1], yz], [xz, yz, p[2]]])
     if np.min(np.linalg.eigvalsh(Q)) <= 0:
-        return ideal
+        return IDEAL
     b = -np.linalg.solve(Q, p[-3:])
     scaled = Q * gravity_g**2 / (1.0 + b @ Q @ b)
     reverse = np.linalg.cholesky(scaled[::-1, ::-1])[::-1, ::-1]  # upper triangular U with U U^T = L^T L
     found = np.concatenate([b, reverse.T[ROWS, COLUMNS]])
-    return np.where(free, found, ideal)
+    return np.where(free, found, IDEAL)
 
 
 def _excess_variance(error: Values, variance: Values, spare: int) -> float:
