@@ -158,7 +158,7 @@ def _by_hand(config: dict[str, Any]) -> dict[str, Any]:
 
 
 def _whole(entry: dict[str, Any]) -> dict[str, Any]:
-    """Return a recording that a run cuts into parts as one of rests: what is missing is looked for in all of it."""
+    """Return the entry of a recording; one that a run cuts into parts counts as rests from its start to its end."""
     return {**entry, "role": "rests"} if entry["role"] == "session" else entry
 
 
@@ -280,7 +280,7 @@ def _new(advice: Advice, told: Advice) -> bool:
 
 
 def _without_last_rest(recording: Recording, dwell: float) -> Recording:
-    """Return a recording without the rest at its end, where that is still shorter than a rest is to be."""
+    """Return a recording without the rest at its end, where that may go on and is still shorter than ``dwell``."""
     rests = find_rests(recording) if recording.role == "rests" else []
     if not rests:
         return recording

@@ -1,13 +1,15 @@
 """The formula of physics that the catalogue does not hold, judged against catalogue and recordings, as an effect file.
 
-The search (``pipeline.diagnosis.functional_form_search``) is made with the selected effects and without them. With each
-form in the base, effects are selected again; of these models, and that of the catalogue alone, the one with the least
+The search (``pipeline.diagnosis.functional_form_search``) is made beside the selected effects, and again without them,
+since they may have been selected in place of the form. With each form in the base, effects are selected again. Of these
+models, and that of the catalogue alone, the one with the least
 
     -2 log L + k log N + 2 C log 10
 
-is reported. Stability is the share of resamples, each without one recording or without a fifth of every recording, in
-which the form has the best score of all finalists; resamples in which none has a clear score are not counted. The front
-lists, by complexity, the forms that gain more than all simpler ones.
+is reported, with k parameters of effects and scanned constants, N readings and the complexity C of the form. Stability
+is the share of resamples in which the form has the best score of all finalists. Each resample leaves out one recording,
+or a fifth of every recording. Resamples in which no form has a clear score are not counted. The front lists, by
+complexity, the forms that gain more than all simpler ones.
 """
 
 from __future__ import annotations
@@ -42,6 +44,7 @@ if TYPE_CHECKING:
     from pipeline.estimation.generalized_least_squares import Fit
     from pipeline.estimation.observations import Observations
     from pipeline.estimation.selection import Selection
+    from pipeline.model.effects.base import Effect
     from pipeline.records import Noise, SensorCalibration
 
     Values = NDArray[np.float64]
@@ -90,9 +93,10 @@ def discover(
         entry = _entry(context, terms)
         definition = suggested_effect([entry], selection.observations.sensor, catalogue())
         assert definition is not None  # noqa: S101  (there is an entry)
-        if 0.0 < FAR_ABOVE * floor < _beside(context, definition).residual_rms:
+        form = effect_from(definition, "a first guess")
+        if 0.0 < FAR_ABOVE * floor < _beside(context, form).residual_rms:
             continue
-        with _registered(definition):
+        with _registered(form):
             names = [*configured, definition["name"]]
             again = select(context.observations, names, noise, sheet, accelerometer=accelerometer)
         if _worth(again, terms) <= least:
@@ -109,21 +113,20 @@ def _worth(selection: Selection, terms: Sequence[Scored]) -> float:
     return 2.0 * selection.fit.log_likelihood - fitted * float(np.log(3.0 * selection.observations.samples)) - price
 
 
-def _beside(context: Selection, definition: dict[str, Any]) -> Fit:
+def _beside(context: Selection, form: Effect) -> Fit:
     """Fit a form beside what a selection holds."""
-    form = effect_from(definition, "a first guess")
     terms = [*context.fit.terms, Term(form, np.zeros(len(form.parameters(context.observations.sensor))))]
     return fit_terms(context.observations, terms, context.start, context.settings)
 
 
 @contextmanager
-def _registered(definition: dict[str, Any]) -> Iterator[None]:
-    """Add a form to the catalogue meanwhile."""
-    register(effect_from(definition, "a first guess"))
+def _registered(form: Effect) -> Iterator[None]:
+    """Hold a form in the catalogue for the time of a ``with`` block."""
+    register(form)
     try:
         yield
     finally:
-        forget(definition["name"])
+        forget(form.name)
 
 
 def _entry(selection: Selection, terms: Sequence[Scored]) -> dict[str, Any]:

@@ -7,8 +7,6 @@ effects projected out, under the noise of the engine, on the a axes that it impr
 
 r coefficients, s scanned constants, N readings, C the form's complexity: each choice of the grammar is one of about
 ten. Constants are scanned coarsely, then finer about the best. Further terms are added while they bring clearly more.
-The search starts from the selected effects, and again without them, which may stand in for the form; whichever has the
-better score after another selection with the form in the base is reported.
 """
 
 from __future__ import annotations

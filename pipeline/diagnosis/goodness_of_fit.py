@@ -31,7 +31,7 @@ SIMULATIONS = 199  # the share is known to 3.5 % (standard error) at worst
 
 
 def goodness_of_fit(selection: Selection) -> dict[str, Any]:
-    """Return ``share_worse``, of so many ``simulations``."""
+    """Return ``share_worse``, the share of simulations that fit worse, and ``simulations``, their number."""
     from scipy.special import chdtrc  # noqa: PLC0415  (0.1 s that only a diagnosis pays)
 
     bases, observations = bases_of(selection), selection.observations

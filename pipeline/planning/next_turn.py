@@ -84,7 +84,7 @@ def most_informative_turn(gyroscope: SensorCalibration, direction: float) -> Tur
 
 
 def next_face_or_turn(recordings: Sequence[Recording], procedure: Mapping[str, Any]) -> tuple[bool, list[str]]:
-    """Return whether all faces and turns are there, and what is there, what lacks and what comes next, as lines."""
+    """Return whether all faces and turns are there, and lines that say what is there and what comes next."""
     stated = procedure["turns"]
     faces, turns, angle = dict.fromkeys(FACES, 0), dict.fromkeys(AXES, 0), float(stated["angle_deg"])
     for recording in (r for r in recordings if r.role == ROLE):
