@@ -87,9 +87,8 @@ class Search:
         best = self._best(columns)
         while True:
             tries = self._added(spectrum, best)
-            slow = len(best.kinds) > 1 or tries
-            if slow:
-                dropped = [_without(best, j) for j in range(len(best.kinds)) if len(best.kinds) > 1]
+            if len(best.kinds) > 1:
+                dropped = [_without(best, j) for j in range(len(best.kinds))]
                 self.fit(spectrum, dropped, columns)
                 lower = [self.found[kinds, columns] for kinds, _ in dropped]
                 tries += [new for c in lower for new in self._added(spectrum, c)]
