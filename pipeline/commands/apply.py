@@ -24,7 +24,8 @@ every other cell is kept as it is written. MCAP in, MCAP out: every message is k
 calibrated messages is added beside that of the Imu messages.
 
 The log is read as the recordings were with which the unit was calibrated (columns, units, raw counts, axes), or by the
-ingest profile that --ingest names. It is read in a stream, in bounded memory.
+ingest profile that --ingest names. Text and MCAP are read in a stream, in bounded memory. A log of another format is
+held in memory, and the output is CSV with the columns time_s, accel_x_g .. gyro_z_dps, temperature_degc.
 
 examples:
   python -m pipeline apply --calibration results/demo/calibrations/U1.json drive.csv -o drive_calibrated.csv

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
     Values = NDArray[np.float64]
 
-# The worked sample: a body that stands a little off level, turns, and is warmer than the reference temperature.
 NUMBER = re.compile(r"\d+\.\d+(?:e[-+]?\d+)?")
+# The worked sample: a body that stands a little off level, turns, and is warmer than the reference temperature.
 SAMPLE: dict[str, Any] = {
     "accelerometer": np.array([0.1, -0.2, 0.97]),
     "gyroscope": np.array([10.0, -20.0, 30.0]),

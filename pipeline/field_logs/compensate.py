@@ -1,7 +1,7 @@
 """Compensation of a log as a stream: blocks are read, compensated and written one after the other.
 
-The format of the log gives the blocks and writes them (``pipeline.field_logs.csv_log``, ``mcap_log``); all else is the
-same for all formats. Memory is bounded by the largest block.
+The format of the log gives the blocks and writes them (``pipeline.field_logs.csv_log``, ``mcap_log``, ``message_log``);
+all else is the same for all formats. Memory is bounded by the largest block, except in ``message_log``.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ def compensate_log(
     with replacing(target) as out:
         log: CsvLog | McapLog | MessageLog
         if source.suffix.lower() == ".mcap":
-            from pipeline.field_logs.mcap_log import McapLog  # noqa: PLC0415  (each log needs one of the two)
+            from pipeline.field_logs.mcap_log import McapLog  # noqa: PLC0415  (each log needs one of the three)
 
             known = compensation.covariances
             log = McapLog(source, out, profile, topic=topic, smoothing=smoothing, covariances=known)
