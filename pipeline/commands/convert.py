@@ -10,7 +10,7 @@ from pipeline.config.options import LARGEST_CONFIG
 from pipeline.errors import ConfigurationError
 from pipeline.exports import formats
 from pipeline.exports.conversion import convert
-from pipeline.exports.reading import CALIBRATION, FoundCalibration, format_of, read_any
+from pipeline.exports.reading import CALIBRATION, FoundCalibration, counts_of, format_of, read_any
 from pipeline.files import CONFIGS
 from pipeline.io.yaml_file import read_yaml
 from pipeline.records import SENSORS
@@ -33,13 +33,11 @@ examples:
 def main(argv: Sequence[str]) -> int:
     """Run ``python -m pipeline convert``."""
     arguments = _parser().parse_args(argv)
-    counts = {s: sheet.get("counts_per_unit") for s, sheet in sheets_of(arguments.sensor).items()}
-    found = read_any(arguments.source, format_of(arguments.source_format), counts)
+    found = read_any(arguments.source, arguments.source_format, counts_of(sheets_of(arguments.sensor)))
     sheets = sheets_of(arguments.sensor, found)
-    name = format_of(arguments.target_format) or format_of(arguments.target.name)
+    name = format_of(arguments.target.name if arguments.target_format is None else arguments.target_format)
     if arguments.target.exists() and arguments.target.samefile(arguments.source):
         raise ConfigurationError("OUT is the file IN: choose another name", str(arguments.target))
-    assert name is not None  # noqa: S101  (OUT has a name)
     files, lost = convert(found, name, arguments.target, sheets)
     print(f"{arguments.source} ({found.name}): {' and '.join(found.sensors)}")
     for note in found.notes:

@@ -13,7 +13,7 @@ from pipeline.commands.convert import sheets_of
 from pipeline.diagnosis.words import in_words
 from pipeline.errors import InputError, MissingInputError
 from pipeline.exports.explanation import explain_calibration
-from pipeline.exports.reading import format_of, read_any
+from pipeline.exports.reading import counts_of, read_any
 from pipeline.history import read_history
 from pipeline.model.plausible import sentences
 from pipeline.outcome import Finding, commands_of, next_commands, read_summary, verdict_lines
@@ -45,9 +45,9 @@ def main(argv: Sequence[str]) -> int:
     arguments = parser.parse_args(argv)
     file = Path(arguments.campaign)
     if file.is_file() and not _is_diagnosis(file):
-        counts = {s: sheet.get("counts_per_unit") for s, sheet in sheets_of(arguments.sensor).items()}
+        counts = counts_of(sheets_of(arguments.sensor))
         try:
-            sys.stdout.write(explain_calibration(read_any(file, format_of(arguments.format), counts)))
+            sys.stdout.write(explain_calibration(read_any(file, arguments.format, counts)))
         except InputError as error:
             raise InputError(f"is no diagnosis, and no calibration: {error.message}", error.file) from error
         return 0

@@ -27,7 +27,7 @@ def with_given(config: Mapping[str, Any], campaign: Path, unit: str) -> dict[str
     uncertainties as in ``calibrations/<unit>.json``. The effects of the file that belong to the sensor are those of
     the model. Raises ``Problem``.
     """
-    from pipeline.exports.reading import format_of, read_any  # noqa: PLC0415  (only for this method)
+    from pipeline.exports.reading import counts_of, read_any  # noqa: PLC0415  (only for this method)
     from pipeline.model.effects import owner_of  # noqa: PLC0415  (as above)
     from pipeline.model.effects.base import Owner  # noqa: PLC0415  (as above)
 
@@ -37,9 +37,8 @@ def with_given(config: Mapping[str, Any], campaign: Path, unit: str) -> dict[str
     if stated := [f"table.{key}" for key in OF_BENCH if config["table"].get(key)]:
         raise Problem(f"method=given: {stated[0]} is set, which a fit would estimate; nothing is fitted: set it null")
     file = campaign / method["file"].replace("{unit}", unit)
-    counts = {s: config["sensor"][s]["counts_per_unit"] for s in SENSORS}
     try:
-        found = read_any(file, format_of(method["format"]), counts)
+        found = read_any(file, method["format"], counts_of(config["sensor"]))
         digest = hashlib.sha256(file.read_bytes()).hexdigest()
     except PipelineError as error:
         raise Problem(f"method.file: {error}") from error

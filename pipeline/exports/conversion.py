@@ -12,7 +12,7 @@ import numpy as np
 
 from pipeline.errors import ConfigurationError
 from pipeline.exports import export, formats
-from pipeline.exports.reading import CALIBRATION, FoundCalibration, read_any
+from pipeline.exports.reading import CALIBRATION, FoundCalibration, counts_of, read_any
 from pipeline.exports.sensors import FACTORS, ExportedSensor
 from pipeline.files import json_text, write_atomically
 from pipeline.records import SENSOR_UNITS, SENSORS
@@ -99,8 +99,7 @@ def lost(found: FoundCalibration, name: str, file: Path, sheets: Mapping[str, An
     declared = formats()[name][0]
     if not declared.reads:
         return [f"bias and matrix: {name} is for {declared.equation}"]
-    counts = {s: (sheets.get(s) or {}).get("counts_per_unit") for s in SENSORS}
-    back = read_any(file, name, counts)
+    back = read_any(file, name, counts_of(sheets))
     lines = []
     for s, calibration in found.sensors.items():
         if s not in back.sensors:

@@ -77,19 +77,22 @@ def read_any(file: Path, name: str | None = None, counts: Mapping[str, float | N
     file : Path
         Where a format has a file for each sensor, either of them.
     name : str, optional
-        Of the format; without it, the file's name and content tell.
+        Of the format, or its beginning (``format_of``); without it, the file's name and content tell.
     counts : mapping, optional
         Sensor to its counts per g or deg/s, for formats in counts.
 
     Raises
     ------
+    ConfigurationError
+        If no format, or several, have this name.
     InputError
         If the format is not known, or the file does not hold what the format needs.
     """
+    stated = None if name is None else format_of(name)
     if not file.is_file():
         raise MissingInputError("there is no such calibration", str(file))
     text = read_text(file, LARGEST_BYTES, "a calibration")
-    name = name or _recognised(file, text)
+    name = stated or _recognised(file, text)
     if name == CALIBRATION:
         document = read_calibration(file)
         own = {s: c for s in SENSORS if (c := sensor_of(document, s, file)) is not None}
@@ -127,10 +130,13 @@ def _read_text(file: Path, name: str, declared: Format, counts: Mapping[str, flo
     return found
 
 
-def format_of(given: str | None) -> str | None:
-    """Return the format that a name or the beginning of a name stands for; None for None."""
-    if given is None:
-        return None
+def counts_of(sheets: Mapping[str, Any]) -> dict[str, float | None]:
+    """Return the counts per g or deg/s of each sensor, from its part of the sensor's configuration; None: not known."""
+    return {s: (sheets.get(s) or {}).get("counts_per_unit") for s in SENSORS}
+
+
+def format_of(given: str) -> str:
+    """Return the format that a name or the beginning of a name stands for."""
     known = [CALIBRATION, *formats()]
     found = [name for name in known if given in (name, name.partition(".")[0])]
     found = found or [name for name in known if name.startswith(given)]
