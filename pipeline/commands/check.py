@@ -138,9 +138,7 @@ def _readings(files: Sequence[Path], profile: str | None, sensor: str | None) ->
         elif found not in readings:
             readings.append(found)
     if others:
-        campaign = campaign_of(others[0])
-        chosen = named(profile, others[0], campaign) if profile else DEFAULT_PROFILE
-        config = composed(chosen, sensor, campaign)
+        config = config_of_log(others[0], profile, sensor)
         ingest, sheet = config["ingest"], config["sensor"]
         said = f"ingest={ingest['name']}" + (f", sensor={sensor}" if sensor else "")
         parts = [p["file"] for p in (ingest["csv"] or {}).get("parts") or []]
@@ -184,6 +182,15 @@ def _of_campaign(directory: Path | None) -> list[Reading]:
             settings = {"procedure": procedure, **{k: config[k] for k in ("table", "sensor", "ingest")}}
             readings += [Reading([(folder / f).resolve() for f in files], settings, said) for files in candidates]
     return readings
+
+
+def config_of_log(file: Path, profile: str | None, sensor: str | None, more: Sequence[str] = ()) -> dict[str, Any]:
+    """Return the configuration by which a log is read alone: by a profile (default: ``DEFAULT_PROFILE``) and a sensor.
+
+    The options of the campaign that the log lies in, if any, may be named too. ``more``: further overrides.
+    """
+    campaign = campaign_of(file)
+    return composed(named(profile, file, campaign) if profile else DEFAULT_PROFILE, sensor, campaign, more)
 
 
 def named(profile: str, file: Path, campaign: Path | None) -> str:

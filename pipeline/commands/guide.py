@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pipeline.commands.check import DEFAULT_PROFILE, campaign_of, composed, named
+from pipeline.commands.check import campaign_of, config_of_log
 from pipeline.config.campaign import load_campaign
 from pipeline.errors import CannotCalibrateError, ConfigurationError, NotObservableError, PipelineError
 from pipeline.estimation.gyroscope import rests_and_moves
@@ -141,9 +141,8 @@ def _source(arguments: argparse.Namespace) -> Source:
             own = {(folder / f).resolve() for files in candidates.values() for parts in files for f in parts}
             if first.resolve() in own:
                 return Source(_by_hand(unit.config), folder, files)
-    profile = named(arguments.ingest, first, campaign) if arguments.ingest else DEFAULT_PROFILE
     more = [f"procedure={arguments.procedure}"] if arguments.procedure else []
-    return Source(_by_hand(composed(profile, arguments.sensor, campaign, more)), None, files)
+    return Source(_by_hand(config_of_log(first, arguments.ingest, arguments.sensor, more)), None, files)
 
 
 def _by_hand(config: dict[str, Any]) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.commands.check import DEFAULT_PROFILE, campaign_of, composed, named
+from pipeline.commands.check import config_of_log
 from pipeline.errors import ConfigurationError
 from pipeline.estimation.noise_identification import identify_noise
 from pipeline.exports import export, formats
@@ -43,9 +43,7 @@ def main(argv: Sequence[str]) -> int:
         listed = ", ".join([*consumers, "a name that ends in .json"])
         raise ConfigurationError(f"-o is {target.name}, which is no format of noise; expected {listed}")
     log: Path = arguments.log
-    campaign = campaign_of(log)
-    profile = named(arguments.ingest, log, campaign) if arguments.ingest else DEFAULT_PROFILE
-    config = composed(profile, arguments.sensor, campaign)
+    config = config_of_log(log, arguments.ingest, arguments.sensor)
     ingest, sheet = config["ingest"], config["sensor"] if arguments.sensor else {}
     entry = {"role": "static", "axis": None}
     table = read_table([log], ingest)
