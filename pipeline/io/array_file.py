@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.io.message_logs import Topic
+from pipeline.io.message_logs import Topic, library_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -26,14 +26,11 @@ FEWEST_ROWS = 2  # shorter arrays are settings, not samples
 DEEPEST = 3  # dimensions: images, not read
 WIDEST = 64  # columns; a wider array is an image or a matrix
 BYTES_OF_A_DOUBLE = 8  # longer numbers are no reading of a converter
-V73 = b"MATLAB 7.3"
 
 
 def topics(path: Path, _notes: list[Note]) -> Iterator[Topic]:
     """Yield the topics of a file."""
-    with path.open("rb") as stream:
-        start = stream.read(len(V73))
-    if start == V73 or path.suffix.lower() != ".mat":
+    if library_of(path) == "h5py":
         import h5py  # noqa: PLC0415  (an extra)
 
         with h5py.File(path, "r") as file:

@@ -181,7 +181,7 @@ def open_log(path: Path) -> LogReader:
         If the package that reads the format is not installed; the error names the extra.
     """
     known = MESSAGE_FORMATS[path.suffix.lower()]
-    library = _library(path)
+    library = library_of(path)
     try:
         import_module(library)
     except ImportError as error:
@@ -208,8 +208,8 @@ def open_reader(path: Path, *, allow_truncated: bool = False) -> Iterator[AnyRea
         yield McapReader(stream, str(path), allow_truncated=allow_truncated)
 
 
-def _library(path: Path) -> str:
-    """Return the module that reads a log; MATLAB files before version 7.3 are read by scipy."""
+def library_of(path: Path) -> str:
+    """Return the module that reads a log, ``scipy.io`` for MATLAB files before version 7.3, which are no HDF5."""
     library = MESSAGE_FORMATS[path.suffix.lower()].library
     if path.suffix.lower() == ".mat":
         with path.open("rb") as stream:
