@@ -62,13 +62,17 @@ def allan(sensor: str, noise: JSON | None, sheet: JSON, wander: JSON | None) -> 
 
 
 def term_rows(noise: JSON | None) -> list[JSON]:
-    """Return a row for each term: its name, unit, and a text with interval or upper limit for each axis."""
-    axes = [part["terms"] for part in ((noise or {}).get("axes") or {}).values() if part["terms"]]
-    if not axes:
+    """Return a row for each term: its name, unit, and a text with interval or upper limit for each of the three axes.
+
+    An axis whose noise was not identified has the text of an unknown number.
+    """
+    axes = [part["terms"] for part in ((noise or {}).get("axes") or {}).values()]
+    if not any(axes):
         return []
     rows = []
     for name, symbol in SYMBOLS.items():
-        lists = [terms[name] if isinstance(terms[name], list) else [terms[name]] for terms in axes]
+        found = [terms[name] if terms else [] for terms in axes]
+        lists = [each if isinstance(each, list) else [each] for each in found]
         for i in range(max(map(len, lists))):
             parts = [parts[i] if i < len(parts) else None for parts in lists]
             unit = next(part["unit"] for part in parts if part)

@@ -43,6 +43,18 @@ def test_terms_are_printed_and_written(log: Path, tmp_path: Path, capsys: pytest
     assert f"({axes['x']['terms']['white']['interval'][0]:.5f} to " in line
 
 
+def test_axes_that_never_change_keep_their_columns(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table = np.loadtxt(log, delimiter=",", skiprows=1)
+    table[:, 1:3] = 0.1, -0.2
+    np.savetxt(log, table, "%.6f", ",", header="time_s,gyro_x_dps,gyro_y_dps,gyro_z_dps", comments="")
+    assert main([str(log)]) == 0
+    told = capsys.readouterr().out
+    (white,) = (line.split() for line in told.splitlines() if line.startswith("  white N"))
+    assert white[2:4] == ["\N{EN DASH}"] * 2
+    assert float(white[4]) == pytest.approx(0.01, rel=0.02)
+    assert "x, y: not identified: the readings do not change" in told
+
+
 def test_a_file_for_kalibr_needs_what_the_log_does_not_hold(log: Path, tmp_path: Path) -> None:
     target = tmp_path / "kalibr_imu.yaml"
     with pytest.raises(ConfigurationError, match="no noise of the accelerometer: state --sensor"):
