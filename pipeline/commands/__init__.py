@@ -1,1 +1,1 @@
-"""Commands for people: simulate, new, explain, config."""
+"""Commands for people: one module each, with ``main(argv)``."""

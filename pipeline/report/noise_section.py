@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.estimation.gauss_markov import DEFAULT_TIME_S
 from pipeline.estimation.noise_terms import UNITS, allan_variance, each_term
 from pipeline.model.data_sheet import as_stated
 from pipeline.records import AXES, SENSOR_UNITS
@@ -141,7 +142,7 @@ def _text(part: JSON | None) -> str:
 def _of_sheet(sheet: JSON, tau: np.ndarray[Any, np.dtype[np.float64]]) -> np.ndarray[Any, np.dtype[np.float64]]:
     """Return the Allan deviation of the data sheet."""
     variance = allan_variance("white", {"value": float(sheet["noise_density"]) / np.sqrt(2.0)}, tau)
-    time = {"value": float(sheet.get("wander_time_s") or 100.0)}
+    time = {"value": float(sheet.get("wander_time_s") or DEFAULT_TIME_S)}
     wander = {"value": float(sheet.get("bias_wander") or 0.0), "correlation_time_s": time}
     return np.asarray(np.sqrt(variance + allan_variance("gauss_markov", wander, tau)))
 
