@@ -59,7 +59,8 @@ def main(argv: Sequence[str]) -> int:
     text = json_text(found)
     if target.suffix != ".json":
         known = {s: config["sensor"][s] if arguments.sensor else {} for s in SENSORS}
-        missing = [s for s in SENSORS if not found[s]["axes"] and not known[s]]
+        identified = {s: any(axis["terms"] for axis in (found[s]["axes"] or {}).values()) for s in SENSORS}
+        missing = [s for s in SENSORS if not identified[s] and not known[s]]
         if missing:
             raise ConfigurationError(f"the log holds no noise of the {' and '.join(missing)}: state --sensor", str(log))
         exported = {"sensor": known, "table": {"gravity_g": 1.0}}

@@ -67,3 +67,13 @@ def test_a_file_for_kalibr_needs_what_the_log_does_not_hold(log: Path, tmp_path:
     assert imu["update_rate"] == RATE
     with pytest.raises(ConfigurationError, match=r"x.txt, which is no format of noise; expected kalibr_imu.yaml"):
         main([str(log), "-o", str(tmp_path / "x.txt")])
+
+
+def test_a_file_for_kalibr_needs_the_sensor_where_no_axis_changes(log: Path, tmp_path: Path) -> None:
+    table = np.loadtxt(log, delimiter=",", skiprows=1)
+    table[:, 1:] = 0.1, -0.2, 0.3
+    table = np.column_stack([table, 0.001 * np.random.default_rng(2).standard_normal((SAMPLES, 3)) + [0.0, 0.0, 1.0]])
+    names = "time_s,gyro_x_dps,gyro_y_dps,gyro_z_dps,accel_x_g,accel_y_g,accel_z_g"
+    np.savetxt(log, table, "%.6f", ",", header=names, comments="")
+    with pytest.raises(ConfigurationError, match="no noise of the gyroscope: state --sensor"):
+        main([str(log), "-o", str(tmp_path / "kalibr_imu.yaml")])
