@@ -75,6 +75,14 @@ FOREIGN = {
 }
 
 
+def is_mat_5(path: Path) -> bool:
+    """Return whether a file is a MATLAB file before version 7.3, which is no HDF5."""
+    if path.suffix.lower() != ".mat":
+        return False
+    with path.open("rb") as stream:
+        return stream.read(10) != b"MATLAB 7.3"
+
+
 def recording_files(procedure: Mapping[str, Any], ingest: Mapping[str, Any], folder: Path) -> dict[str, list[Path]]:
     """Return the existing files of each recording of a procedure, in its order.
 

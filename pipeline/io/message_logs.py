@@ -1,6 +1,5 @@
-"""Logs of other programs as messages: the one interface between a format's reader and the decoding of messages.
+"""Logs of other programs as messages: ROS bags by ``rosbags``, and arrays (``pipeline.io.array_logs``).
 
-A reader of a format yields the arrays of each topic (``Topic``), or the messages of ROS (``pipeline.io.ros_bag``).
 Arrays become messages of one length, so that fields, units, clocks and checks are those of MCAP (``pipeline.io.mcap``):
 
     message i = the bytes of row i of every array, little endian, one after the other
@@ -14,7 +13,6 @@ import hashlib
 import json
 from collections import Counter
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -22,14 +20,15 @@ import numpy as np
 from mcap.records import Channel, Schema
 
 from pipeline.errors import IngestError
-from pipeline.io.files import MESSAGE_FORMATS
+from pipeline.io.array_logs import COPY_AGAIN, topics_of
+from pipeline.io.files import MESSAGE_FORMATS, is_mat_5
 from pipeline.io.mcap_channels import STATED
 from pipeline.io.mcap_chunk import HEAD, Rows
 from pipeline.io.mcap_reader import McapReader
 from pipeline.io.message_decoder import ARRAYS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -37,27 +36,7 @@ if TYPE_CHECKING:
     from pipeline.io.mcap_channels import AnyReader
     from pipeline.records import Note
 
-
-@dataclass(frozen=True)
-class Topic:
-    """The messages of one topic as arrays.
-
-    Attributes
-    ----------
-    name : str
-        Of the topic; where a log holds it several times, ``name[1]``, ``name[2]`` from the second one on.
-    columns : mapping of str to array
-        Field to (n,) or (n, k) numbers, all of the same n.
-    units : mapping of str to str
-        Field to the unit that the file states, as it writes it.
-    recorded_ns : (n,) array of int64, optional
-        Times of the logger.
-    """
-
-    name: str
-    columns: Mapping[str, NDArray[Any]]
-    units: Mapping[str, str] = field(default_factory=dict)
-    recorded_ns: NDArray[np.int64] | None = None
+RUN_SIZE = 4096  # messages of one topic of a bag that are decoded together
 
 
 class LogReader:
@@ -98,7 +77,7 @@ class LogReader:
         except Exception as error:
             reason = f"{type(error).__name__}: {error}".strip()
             message = f"damaged, or no {self.kind} file: {reason}; {self.count} messages were readable before"
-            raise IngestError(message, self.path, code="damaged", hint="copy the file again from its source") from error
+            raise IngestError(message, self.path, code="damaged", hint=COPY_AGAIN) from error
 
     def define(self, topic: str, encoding: str, schema: tuple[str, str, bytes], metadata: dict[str, str]) -> int:
         """Add a channel with its message definition (name, encoding, text), and return its number."""
@@ -109,60 +88,66 @@ class LogReader:
 
 
 class ArrayReader(LogReader):
-    """A log whose reader ``topics(path, notes)`` yields arrays."""
+    """A log of arrays."""
 
     def messages(self) -> Iterator[Rows]:
         """Yield the arrays of each topic as messages."""
-        for topic in _topics(self.file, self.notes):
+        for topic in topics_of(self.file, self.notes):
             self.has_recorder &= topic.recorded_ns is not None
-            table = _table(topic.columns)
-            fields: Mapping[str, Any] = table.dtype.fields or {}
-            places = [[name, place[1], *_type(place[0])] for name, place in fields.items()]
+            codes = {n: f"<{a.dtype.kind}{a.dtype.itemsize}" for n, a in topic.columns.items()}
+            kind = np.dtype([(n, codes[n], a.shape[1:]) for n, a in topic.columns.items()])
+            count, size = len(next(iter(topic.columns.values()))), kind.itemsize
+            table, fields, places = np.empty(count, kind), dict(kind.fields or {}), []
+            for name, array in topic.columns.items():
+                table[name] = array
+                places.append([name, fields[name][1], codes[name], array.shape[1] if array.ndim > 1 else None])
             metadata = {STATED + name: unit for name, unit in topic.units.items() if unit}
-            definition = (self.kind, ARRAYS, json.dumps(places).encode())
-            yield _rows(self.define(topic.name, ARRAYS, definition, metadata), table, topic.recorded_ns)
+            channel = self.define(topic.name, ARRAYS, (self.kind, ARRAYS, json.dumps(places).encode()), metadata)
+            times = np.zeros(count) if topic.recorded_ns is None else topic.recorded_ns
+            data = table.view(np.uint8).reshape(-1) if size else np.empty(0, np.uint8)
+            yield _rows(channel, data, np.arange(count, dtype=np.int64) * size, np.full(count, size), times)
 
 
-def _topics(path: Path, notes: list[Note]) -> Iterator[Topic]:
-    """Yield the arrays of a log by the module of its format."""
-    suffix = path.suffix.lower()
-    if suffix == ".ulg":
-        from pipeline.io import ulog  # noqa: PLC0415  (each log needs one of the three)
+class BagReader(LogReader):
+    """A ROS 1 bag, or the SQLite file of a ROS 2 bag; the messages are decoded as those of an MCAP file.
 
-        return ulog.topics(path, notes)
-    if suffix == ".bin":
-        from pipeline.io import dataflash  # noqa: PLC0415
+    ROS 2 wrote no message definitions into a bag before version Iron; then those of ``rosbags`` for Humble are used.
+    """
 
-        return dataflash.topics(path, notes)
-    from pipeline.io import array_file  # noqa: PLC0415
+    def messages(self) -> Iterator[Rows]:
+        """Yield the messages of each connection in runs, in the order of the recorder's times."""
+        version = 1 if self.file.suffix.lower() == ".bag" else 2
+        with import_module(f"rosbags.rosbag{version}").Reader(self.file) as bag:
+            numbers = {c.id: self._channel(c, version) for c in bag.connections}
+            waiting: dict[int, list[tuple[int, bytes]]] = {c.id: [] for c in bag.connections}
+            for connection, time, data in bag.messages(bag.connections):
+                run = waiting[connection.id]
+                run.append((time, data))
+                if len(run) == RUN_SIZE:
+                    yield _joined(numbers[connection.id], run)
+                    run.clear()
+            for key, run in waiting.items():
+                if run:
+                    yield _joined(numbers[key], run)
 
-    return array_file.topics(path, notes)
+    def _channel(self, connection: Any, version: int) -> int:  # noqa: ANN401  (rosbags.interfaces.Connection)
+        text = connection.msgdef.data
+        if version == 2 and connection.msgdef.format.name != "MSG":
+            from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415  (an extra)
 
-
-def _table(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.void]:
-    """Return arrays side by side as the items of one packed array."""
-    types = [(n, np.dtype(f"<{a.dtype.kind}{a.dtype.itemsize}"), a.shape[1:]) for n, a in columns.items()]
-    table = np.empty(len(next(iter(columns.values()))), np.dtype(types))
-    for name, array in columns.items():
-        table[name] = array
-    return table
-
-
-def _type(kind: np.dtype[Any]) -> tuple[str, int | None]:
-    """Return the type of a field's numbers, and their count; None for a single one."""
-    if kind.subdtype is None:
-        return kind.str.replace("|", "<"), None
-    return kind.subdtype[0].str.replace("|", "<"), int(np.prod(kind.subdtype[1]))
-
-
-def _rows(channel: int, table: NDArray[np.void], recorded_ns: NDArray[np.int64] | None) -> Rows:
-    count, size = len(table), table.dtype.itemsize
-    data = table.view(np.uint8).reshape(-1) if size else np.empty(0, np.uint8)
-    starts = np.arange(count, dtype=np.int64) * size
-    return rows_of(channel, data, starts, np.full(count, size), np.zeros(count) if recorded_ns is None else recorded_ns)
+            store, name = get_typestore(Stores.ROS2_HUMBLE), connection.msgtype
+            text = store.generate_msgdef(name, ros_version=2)[0] if name in store.fielddefs else ""
+        schema = (connection.msgtype, f"ros{version}msg" if text else "no", text.encode())  # no: the topic is not read
+        return self.define(connection.topic, "ros1" if version == 1 else "cdr", schema, {})
 
 
-def rows_of(
+def _joined(channel: int, run: list[tuple[int, bytes]]) -> Rows:
+    sizes = np.array([len(data) for _, data in run], np.int64)
+    data = np.frombuffer(b"".join(data for _, data in run), np.uint8)
+    return _rows(channel, data, np.cumsum(sizes) - sizes, sizes, np.array([time for time, _ in run], np.int64))
+
+
+def _rows(
     channel: int, data: NDArray[np.uint8], starts: NDArray[np.int64], sizes: NDArray[np.int64], times: NDArray[Any]
 ) -> Rows:
     """Return messages in ``data`` as ``McapReader`` does; ``times`` are the recorder's, ns."""
@@ -181,7 +166,7 @@ def open_log(path: Path) -> LogReader:
         If the package that reads the format is not installed; the error names the extra.
     """
     known = MESSAGE_FORMATS[path.suffix.lower()]
-    library = library_of(path)
+    library = "scipy.io" if is_mat_5(path) else known.library
     try:
         import_module(library)
     except ImportError as error:
@@ -191,11 +176,7 @@ def open_log(path: Path) -> LogReader:
             code="missing_extra",
             hint=f"pip install 'imu-calibration[{known.extra}]'",
         ) from error
-    if known.extra == "ros":
-        from pipeline.io.ros_bag import BagReader  # noqa: PLC0415  (few logs need it)
-
-        return BagReader(path, known.kind)
-    return ArrayReader(path, known.kind)
+    return (BagReader if known.extra == "ros" else ArrayReader)(path, known.kind)
 
 
 @contextmanager
@@ -206,12 +187,3 @@ def open_reader(path: Path, *, allow_truncated: bool = False) -> Iterator[AnyRea
         return
     with path.open("rb") as stream:
         yield McapReader(stream, str(path), allow_truncated=allow_truncated)
-
-
-def library_of(path: Path) -> str:
-    """Return the module that reads a log, ``scipy.io`` for MATLAB files before version 7.3, which are no HDF5."""
-    library = MESSAGE_FORMATS[path.suffix.lower()].library
-    if path.suffix.lower() == ".mat":
-        with path.open("rb") as stream:
-            return library if stream.read(10) == b"MATLAB 7.3" else "scipy.io"
-    return library
