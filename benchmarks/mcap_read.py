@@ -52,9 +52,9 @@ def write_log(path: Path, messages: int, compression: CompressionType) -> None:
 
 def read_ours(path: Path, _messages: int) -> tuple[int, list[float]]:
     from pipeline.io.ingest_settings import McapFormat  # noqa: PLC0415
-    from pipeline.io.mcap import read_mcap  # noqa: PLC0415  (a process loads its own reader only)
+    from pipeline.io.mcap import read_log  # noqa: PLC0415  (a process loads its own reader only)
 
-    table = read_mcap(path, McapFormat())
+    table = read_log(path, McapFormat())
     return len(table.time_ns), [float(v[:1000].sum()) for v in table.values.values()]
 
 

@@ -14,8 +14,7 @@ from pyarrow import csv
 
 from pipeline.field_logs.compensate import Block
 from pipeline.field_logs.log_checks import DECIMALS
-from pipeline.io.arrow import to_arrow
-from pipeline.io.csv_write import times_as_decimals
+from pipeline.io.arrow import times_as_decimals, to_arrow
 from pipeline.io.ingest_settings import mcap_format
 from pipeline.io.mcap import read_log
 from pipeline.io.units import CANONICAL, SINCE_1970_NS, TRIADS

@@ -17,16 +17,14 @@ from pipeline.io.channel_table import ChannelTable
 from pipeline.io.files import unchanged
 from pipeline.io.ingest_settings import HEADER, OWN
 from pipeline.io.mcap_channels import MAPPED, TopicDecoder, kind_of, listed_topics, topic_of
-from pipeline.io.mcap_reader import McapReader
-from pipeline.io.message_logs import open_log
+from pipeline.io.message_logs import open_reader
 from pipeline.io.ros2_messages import IMU, JOINT_STATE, QUATERNION_STAMPED, TEMPERATURE
-from pipeline.io.timestamps import check_fine, check_plausible, in_order
+from pipeline.io.timestamps import averaged, check_fine, check_plausible, in_order, rows_covered, slower_first
 from pipeline.io.units import ACCELEROMETER, GYROSCOPE, TABLE_CHANNELS, TRIADS
 from pipeline.records import Encoding, Note
 
 if TYPE_CHECKING:
     from pathlib import Path
-    from typing import BinaryIO
 
     from numpy.typing import NDArray
 
@@ -37,22 +35,15 @@ if TYPE_CHECKING:
     Columns = dict[str, NDArray[Any]]
 
 
-def read_mcap(path: Path, settings: McapFormat) -> ChannelTable:
-    """Read a log; refuse a damaged or incomplete one, no Imu topic or several, and impossible times."""
-    with unchanged(path), path.open("rb") as stream:
-        return read_stream(stream, str(path), settings)
-
-
-def read_stream(stream: BinaryIO, path: str, settings: McapFormat) -> ChannelTable:
-    """Read a log from an open file; errors as of ``read_mcap``."""
-    reader = McapReader(stream, path, allow_truncated=settings.allow_truncated)
-    return _Log(reader, settings).table()
-
-
 def read_log(path: Path, settings: McapFormat) -> ChannelTable:
-    """Read a log of another format by the same settings (``pipeline.io.message_logs``)."""
-    with unchanged(path):
-        return _Log(open_log(path), settings).table()
+    """Read a log of any format; refuse a damaged or incomplete one, no Imu topic or several, and impossible times."""
+    with unchanged(path), open_reader(path, allow_truncated=settings.allow_truncated) as reader:
+        return read_messages(reader, settings)
+
+
+def read_messages(reader: AnyReader, settings: McapFormat) -> ChannelTable:
+    """Read the messages of an open log; errors as of ``read_log``."""
+    return _Log(reader, settings).table()
 
 
 @dataclass(frozen=True)
@@ -226,8 +217,6 @@ class _Log:
         other = next((s for s in others if sensors & set(s.values)), None)
         if other is None:
             return base, others
-        from pipeline.io.sensor_clocks import averaged, rows_covered, slower_first  # noqa: PLC0415  (few logs need it)
-
         others = [s for s in others if s is not other]
         slow, fast = (base, other) if slower_first(base.time_ns, other.time_ns) else (other, base)
         rows = rows_covered(slow.time_ns, fast.time_ns, fast.topic, self.path)

@@ -22,8 +22,8 @@ import pyarrow as pa
 from pyarrow import parquet
 
 from pipeline.errors import DamagedFileError, InputError
-from pipeline.io.arrow import to_arrow, to_numpy
-from pipeline.io.units import ACCELEROMETER, ATTITUDE, CHANNELS, GYROSCOPE
+from pipeline.io.arrow import BLOCKS, SINGLES, columns_of, to_arrow, to_numpy
+from pipeline.io.units import CHANNELS
 from pipeline.records import Encoding, Note, Recording
 
 if TYPE_CHECKING:
@@ -36,9 +36,7 @@ SCHEMA_VERSION = 2
 AGAIN = "the same command once more makes it again"
 ROW_GROUP = 1_000_000  # samples
 KEY, KEY_CRC = b"recordings", b"recordings_crc32"
-BLOCKS = {"accelerometer": ACCELEROMETER, "gyroscope": GYROSCOPE, "table_attitude": ATTITUDE}
 PLAIN = ("name", "role", "axis", "setup", "up", "source", "filter", "clock_shared")  # fields stored as JSON
-SINGLES = ("temperature", "table_angle", "table_rate", "flags")
 COLUMNS = ("time_ns", *CHANNELS, "flags")
 PAGE_ENCODINGS = {"f": "BYTE_STREAM_SPLIT", "i": "DELTA_BINARY_PACKED", "u": "PLAIN"}
 
@@ -179,16 +177,6 @@ for _name, _channels in {**BLOCKS, **{name: (name,) for name in SINGLES}}.items(
     _property = cached_property(partial(_StoredRecording.channels, names=_channels))
     _property.__set_name__(_StoredRecording, _name)
     setattr(_StoredRecording, _name, _property)
-
-
-def columns_of(recording: Recording) -> dict[str, NDArray[Any]]:
-    """Return the times, channels and flags that a recording holds, by name."""
-    columns: dict[str, NDArray[Any]] = {"time_ns": recording.time_ns}
-    for name, channels in BLOCKS.items():
-        block = getattr(recording, name)
-        if block is not None:
-            columns |= {c: np.ascontiguousarray(block[:, i]) for i, c in enumerate(channels)}
-    return columns | {n: getattr(recording, n) for n in SINGLES if getattr(recording, n) is not None}
 
 
 def _encode_counts(recordings: Sequence[Recording], stored: list[dict[str, NDArray[Any]]]) -> set[str]:

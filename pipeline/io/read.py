@@ -74,20 +74,14 @@ def read_table(
     paths: Sequence[Path], ingest: Mapping[str, Any], formats: Callable[[], list[CsvFormat]] | None = None
 ) -> ChannelTable:
     """Read the file or files of one recording, by their suffix; ``formats`` returns ``csv_formats(ingest)``."""
-    if paths[0].suffix == ".mcap":
-        from pipeline.io.mcap import read_mcap  # noqa: PLC0415  (the decoder costs what a text log need not pay)
-
-        return read_mcap(paths[0], mcap_format(ingest))
-    if paths[0].suffix.lower() in MESSAGE_FORMATS:
-        from pipeline.io.mcap import read_log  # noqa: PLC0415  (as above)
+    if paths[0].suffix.lower() in (".mcap", *MESSAGE_FORMATS):
+        from pipeline.io.mcap import read_log  # noqa: PLC0415  (the decoder costs what a text log need not pay)
 
         return read_log(paths[0], mcap_format(ingest))
+    from pipeline.io.csv_read import read_csv, read_gcsv  # noqa: PLC0415  (a log of messages needs no parser of text)
+
     if paths[0].suffix == ".gcsv":
-        from pipeline.io.gcsv import read_gcsv  # noqa: PLC0415  (few units need it)
-
         return read_gcsv(paths[0], checks_of(ingest))
-    from pipeline.io.csv_read import read_csv  # noqa: PLC0415  (a log of messages needs no parser of text)
-
     return read_csv(paths, formats() if formats else csv_formats(ingest), checks_of(ingest))
 
 

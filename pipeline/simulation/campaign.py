@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import ConfigurationError
-from pipeline.io.csv_write import write_canonical_csv
+from pipeline.io.arrow import write_canonical_csv
 from pipeline.records import AXES, SENSORS
 from pipeline.simulation.description import course_of, read_config
 from pipeline.simulation.procedures import ONE_RECORDING, plan

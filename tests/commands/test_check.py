@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from pipeline.__main__ import main
-from pipeline.io.csv_write import write_canonical_csv
+from pipeline.io.arrow import write_canonical_csv
 from pipeline.io.ros2_messages import write_mcap
 from pipeline.records import Recording
 from pipeline.simulation.campaign import write_campaign

@@ -14,8 +14,8 @@ from mcap.writer import CompressionType, Writer
 from sample_logs import make_recording
 
 from pipeline.errors import IngestError
+from pipeline.io import mcap
 from pipeline.io.ingest_settings import McapFormat
-from pipeline.io.mcap import read_stream
 from pipeline.io.mcap_reader import McapReader
 from pipeline.io.ros2_messages import write_mcap
 
@@ -69,7 +69,8 @@ def log_of(recorder: str, folder: Path, samples: int = 12) -> bytes:
 
 
 def table_of(data: bytes, **settings: Any) -> ChannelTable:
-    return read_stream(BytesIO(data), "log", McapFormat(**settings))
+    form = McapFormat(**settings)
+    return mcap.read_messages(McapReader(BytesIO(data), "log", allow_truncated=form.allow_truncated), form)
 
 
 def messages_of(data: bytes) -> Messages:

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from sample_logs import SENSOR, assert_same_bits, make_recording, procedure, profile
 
+from pipeline.io.arrow import write_canonical_csv
 from pipeline.io.csv_read import read_csv
-from pipeline.io.csv_write import write_canonical_csv
 from pipeline.io.ingest_settings import csv_formats
 from pipeline.io.read import read_recordings
 from pipeline.records import Recording

@@ -17,7 +17,7 @@ from ros_messages import FIRST_NS, INNER, NAME, NUMPY, STEP_NS, RandomField, Ran
 from rosbags.typesys import Stores, get_typestore
 
 from pipeline.io.ingest_settings import mcap_format
-from pipeline.io.mcap import read_mcap
+from pipeline.io.mcap import read_log
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -49,7 +49,7 @@ logs = st.builds(
 
 
 def read(path: Path, **mcap: Any) -> ChannelTable:
-    return read_mcap(path, mcap_format({"mcap": mcap}))
+    return read_log(path, mcap_format({"mcap": mcap}))
 
 
 def official(path: Path, factory: Any) -> list[Any]:

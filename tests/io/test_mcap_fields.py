@@ -15,7 +15,7 @@ from sample_logs import SENSOR, procedure, profile
 
 from pipeline.errors import ConfigurationError, IngestError
 from pipeline.io.ingest_settings import mcap_format
-from pipeline.io.mcap import read_mcap
+from pipeline.io.mcap import read_log
 from pipeline.io.read import read_recordings
 from pipeline.io.ros2_messages import DEFINITIONS, IMU
 
@@ -33,7 +33,7 @@ MAPPED: dict[str, Any] = profile("mcap_fields")["mcap"]["topics"]["/imu"]
 
 
 def read(path: Path, **mcap: Any) -> ChannelTable:
-    return read_mcap(path, mcap_format({"mcap": mcap}))
+    return read_log(path, mcap_format({"mcap": mcap}))
 
 
 def write(path: Path, *topics: tuple[str, str, tuple[str, str, bytes], Sequence[bytes]], **options: Any) -> None:

@@ -16,7 +16,7 @@ from mcap_ros2.writer import Writer as Ros2Writer
 from sample_logs import SENSOR, channels, make_recording, procedure
 
 from pipeline.errors import InputError
-from pipeline.io.csv_write import write_canonical_csv
+from pipeline.io.arrow import write_canonical_csv
 from pipeline.io.mcap_reader import McapReader
 from pipeline.io.read import read_recordings
 from pipeline.io.ros2_messages import DEFINITIONS, IMU, JOINT_STATE, TEMPERATURE, write_mcap

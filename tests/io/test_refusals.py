@@ -11,7 +11,7 @@ import pytest
 from sample_logs import SENSOR, make_recording, procedure, profile
 
 from pipeline.errors import ConfigurationError, InputError, MissingInputError
-from pipeline.io.csv_write import write_canonical_csv
+from pipeline.io.arrow import write_canonical_csv
 from pipeline.io.files import recording_files
 from pipeline.io.ingest_settings import check_ingest
 from pipeline.io.read import read_recordings
