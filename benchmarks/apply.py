@@ -97,7 +97,8 @@ def write_mcap(path: Path, samples: int) -> None:
             force = np.rint(generator.normal(0, 5000, (n, 3))) / 16384
             rate = np.rint(generator.normal(0, 5000, (n, 3))) / 131
             warmth = warm.fill(stamps, np.column_stack([25 + 1e-9 * (stamps - stamps[0]), np.zeros(n)]))
-            for i, (stamp, row) in enumerate(zip(stamps.tolist(), imu_table(stamps, force, rate), strict=True)):
+            messages = imu_table(stamps, {"accelerometer": force, "gyroscope": rate})
+            for i, (stamp, row) in enumerate(zip(stamps.tolist(), messages, strict=True)):
                 writer.add_message(imu, stamp, row.tobytes(), stamp)
                 if i % 100 == 0:
                     writer.add_message(temperature, stamp, warmth[i].tobytes(), stamp)
@@ -180,7 +181,7 @@ WAYS: dict[str, Callable[[Path, Path, Path], int]] = {
     "mcap official": mcap_official,
 }
 MODULES = {
-    "csv": ["pyarrow.csv", "pyarrow.compute", "pipeline.field_logs.csv_log", "pipeline.model.compensation"],
+    "csv": ["pyarrow.csv", "pyarrow.compute", "pipeline.field_logs.text_output", "pipeline.model.compensation"],
     "mcap": ["zstandard", "mcap.writer", "mcap.reader", "pipeline.field_logs.mcap_log", "pipeline.model.compensation"],
 }
 

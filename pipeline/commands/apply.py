@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.errors import ConfigurationError, InputError
-from pipeline.field_logs.compensate import LogProfile, compensate_log
-from pipeline.field_logs.output import require_apart
+from pipeline.field_logs.compensate import LogProfile, compensate_log, require_apart
 from pipeline.io.files import MESSAGE_FORMATS
 from pipeline.model.calibration_file import read_calibration
 from pipeline.model.compensation import SMOOTHING_S, load

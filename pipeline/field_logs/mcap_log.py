@@ -18,12 +18,11 @@ from mcap.records import Channel, Metadata, Schema
 
 from pipeline.errors import IngestError, InputError
 from pipeline.field_logs.compensate import Block
-from pipeline.field_logs.mcap_messages import new_imu, replaced
 from pipeline.io.ingest_settings import mcap_format
 from pipeline.io.mcap_channels import MAPPED, TopicDecoder, kind_of, listed_topics, topic_of
 from pipeline.io.mcap_copy import McapCopy
 from pipeline.io.mcap_reader import McapReader
-from pipeline.io.ros2_messages import DEFINITIONS, IMU, TEMPERATURE
+from pipeline.io.ros2_messages import DEFINITIONS, IMU, TEMPERATURE, new_imu, replaced
 from pipeline.io.units import SECOND_NS, SINCE_1970_NS, TRIADS
 from pipeline.model.log_motion import ExponentialRegression
 
@@ -34,9 +33,8 @@ if TYPE_CHECKING:
     from mcap.records import McapRecord
     from numpy.typing import NDArray
 
-    from pipeline.field_logs.compensate import LogProfile, Readings, Result
+    from pipeline.field_logs.compensate import LogProfile, Output, Readings, Result
     from pipeline.field_logs.log_checks import LogChecks
-    from pipeline.field_logs.output import Output
     from pipeline.io.ingest_settings import McapFormat
     from pipeline.io.mcap_chunk import Rows
 

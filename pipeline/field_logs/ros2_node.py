@@ -21,7 +21,7 @@ import numpy as np
 
 from pipeline.errors import PipelineError
 from pipeline.io.channel_table import axis_matrix, maps_of_log
-from pipeline.io.units import STANDARD_GRAVITY
+from pipeline.io.ros2_messages import VECTORS
 from pipeline.model.calibration_file import read_calibration
 from pipeline.model.compensation import SMOOTHING_S, load
 from pipeline.model.log_motion import ExponentialRegression
@@ -31,10 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
 # Field of the message, its covariance, and what one of its units is in g or deg/s.
-FIELDS = {
-    "accelerometer": ("linear_acceleration", "linear_acceleration_covariance", 1.0 / STANDARD_GRAVITY),
-    "gyroscope": ("angular_velocity", "angular_velocity_covariance", float(np.degrees(1.0))),
-}
+FIELDS = {sensor: (vector, f"{vector}_covariance", 1.0 / one) for vector, (sensor, _unit, one) in VECTORS.items()}
 ABSENT = -1.0  # first element of a covariance whose field holds nothing (sensor_msgs/Imu)
 DEPTH = 10  # messages that wait for a subscriber, as in rclpy's own examples
 

@@ -19,8 +19,8 @@ from pipeline.io.field_path import ONLY, FieldPath
 from pipeline.io.ingest_settings import HEADER, TIME, MappedField
 from pipeline.io.message_decoder import Batch, ChannelDecoder, Wanted
 from pipeline.io.message_layout import short_name
-from pipeline.io.ros2_messages import IMU, JOINT_STATE, QUATERNION_STAMPED, TEMPERATURE
-from pipeline.io.units import ACCELEROMETER, ATTITUDE, COUNTS, GYROSCOPE, SPELLINGS, UNITS, to_house_unit
+from pipeline.io.ros2_messages import IMU, JOINT_STATE, QUATERNION_STAMPED, TEMPERATURE, VECTORS
+from pipeline.io.units import ATTITUDE, COUNTS, SPELLINGS, TRIADS, UNITS, to_house_unit
 from pipeline.records import Encoding
 
 if TYPE_CHECKING:
@@ -38,7 +38,6 @@ if TYPE_CHECKING:
 
 MAPPED = "mapped"  # the kind of a topic whose fields the profile names; other kinds are ROS types
 KINDS = {short_name(kind): kind for kind in (IMU, TEMPERATURE, JOINT_STATE, QUATERNION_STAMPED)}
-VECTORS = {"linear_acceleration": (ACCELEROMETER, "m/s^2"), "angular_velocity": (GYROSCOPE, "rad/s")}
 STATED = "unit of "  # before a field's name in the metadata of a channel: the unit that the file states
 LARGEST_NS = np.iinfo(np.int64).max
 
@@ -108,7 +107,7 @@ class TopicDecoder:
             self._note_absent(name, column == -1.0 if name in VECTORS else batch.absent.get(name, present))
         self.count += len(recorded)
         absent = {name for name, is_absent in self._absent.items() if is_absent}
-        absent |= {c for vector in absent & set(VECTORS) for c in VECTORS[vector][0]}
+        absent |= {c for vector in absent & set(VECTORS) for c in TRIADS[VECTORS[vector][0]]}
         if self.kind == IMU and absent >= set(VECTORS):
             message = f"topic {self.topic} says that both quantities are absent (covariance -1)"
             raise IngestError(message, self.path, code="absent")
@@ -147,8 +146,8 @@ def _fields_of(kind: str, settings: McapFormat) -> dict[str, MappedField]:
     path = FieldPath.parse
     fields = {TIME: (path("header.stamp"), "ns")}
     if kind == IMU:
-        for vector, (channels, unit) in VECTORS.items():
-            fields |= {c: (path(f"{vector}.{a}"), unit) for c, a in zip(channels, "xyz", strict=True)}
+        for vector, (sensor, unit, _) in VECTORS.items():
+            fields |= {c: (path(f"{vector}.{a}"), unit) for c, a in zip(TRIADS[sensor], "xyz", strict=True)}
     elif kind == TEMPERATURE:
         fields["temperature"] = path("temperature"), "degC"
     elif kind == JOINT_STATE:

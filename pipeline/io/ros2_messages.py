@@ -1,10 +1,9 @@
-"""The ROS 2 messages of a calibration log: their definitions, and recordings written as MCAP files of them.
+"""The ROS 2 messages of a calibration log: their definitions, recordings as MCAP files, and calibrated Imu messages.
 
     linear_acceleration [m/s^2] = specific force [g] * 9.80665
     angular_velocity [rad/s]    = angular rate [deg/s] * pi/180
 
-The stamps are the sample times. All messages of a topic have one length: a table of bytes is filled column by column,
-and its rows are the messages.
+All messages of a topic have one length: a table of bytes is filled column by column, and its rows are the messages.
 """
 
 from __future__ import annotations
@@ -14,11 +13,14 @@ import struct
 from typing import TYPE_CHECKING
 
 import numpy as np
+from mcap.opcode import Opcode
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import Writer
 
 from pipeline.errors import InputError
+from pipeline.io.mcap_chunk import HEAD, MESSAGE_HEAD
 from pipeline.io.units import SECOND_NS, STANDARD_GRAVITY
+from pipeline.records import SENSORS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -26,7 +28,12 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from pipeline.io.mcap_chunk import Rows
+    from pipeline.io.message_decoder import ChannelDecoder
+    from pipeline.io.message_layout import MessageLayout
     from pipeline.records import Recording
+
+    Readings = Mapping[str, NDArray[np.float64]]  # sensor to (n, 3) readings, or to the (3, 3) covariance of a sample
 
 IMU = "sensor_msgs/msg/Imu"
 TEMPERATURE = "sensor_msgs/msg/Temperature"
@@ -86,6 +93,12 @@ TOPICS = {
     QUATERNION_STAMPED: "/table/attitude",
 }
 JOINT = "table"
+# Vector of an Imu message: sensor, its unit, and one g or deg/s in that unit.
+VECTORS = {
+    "linear_acceleration": ("accelerometer", "m/s^2", STANDARD_GRAVITY),
+    "angular_velocity": ("gyroscope", "rad/s", np.pi / 180.0),
+}
+CHANNEL_AT = 9  # byte of a record where the channel's number stands
 
 
 class _Message:
@@ -149,7 +162,8 @@ def write_mcap(path: Path, recording: Recording) -> None:
 def _streams(recording: Recording) -> dict[str, NDArray[np.uint8]]:
     """Return the messages of each type, a row of bytes for each sample."""
     time = recording.time_ns
-    streams = {IMU: imu_table(time, recording.accelerometer, recording.gyroscope)}
+    readings = {s: r for s in SENSORS if (r := recording.reading(s)) is not None}
+    streams = {IMU: imu_table(time, readings)}
     if recording.temperature is not None:
         message = _Message("imu")
         message.doubles(2)
@@ -164,31 +178,20 @@ def _streams(recording: Recording) -> dict[str, NDArray[np.uint8]]:
     return streams
 
 
-def imu_table(
-    time_ns: NDArray[np.int64],
-    accelerometer: NDArray[np.float64] | None,
-    gyroscope: NDArray[np.float64] | None,
-    covariances: Mapping[str, NDArray[np.float64]] | None = None,
-) -> NDArray[np.uint8]:
+def imu_table(time_ns: NDArray[np.int64], readings: Readings, covariances: Readings | None = None) -> NDArray[np.uint8]:
     """Return Imu messages, rows of bytes, of (n,) times and (n, 3) readings in g and deg/s.
 
     Orientation, angular rate and acceleration each have a covariance, whose first element is -1 for what is absent;
-    zeros stand for an unknown one. ``covariances``: sensor to (3, 3), (m/s^2)^2 or (rad/s)^2.
+    zeros stand for an unknown one. ``covariances``: sensor to (3, 3), g^2 or (deg/s)^2.
     """
-    covariances = covariances or {}
     numbers = np.zeros((len(time_ns), 37))
     numbers[:, 3] = 1.0  # the identity
-    numbers[:, 4] = -1.0
-    if gyroscope is None:
-        numbers[:, 16] = -1.0
-    else:
-        numbers[:, 13:16] = np.radians(gyroscope)
-        numbers[:, 16:25] = np.ravel(covariances.get("gyroscope", np.zeros(9)))
-    if accelerometer is None:
-        numbers[:, 28] = -1.0
-    else:
-        numbers[:, 25:28] = accelerometer * STANDARD_GRAVITY
-        numbers[:, 28:37] = np.ravel(covariances.get("accelerometer", np.zeros(9)))
+    numbers[:, [4, 16, 28]] = -1.0
+    found = _in_ros_units(readings, covariances or {})
+    for vector, start in (("angular_velocity", 13), ("linear_acceleration", 25)):
+        if f"{vector}.x" in found:
+            numbers[:, start : start + 3] = np.stack([found[f"{vector}.{a}"] for a in "xyz"], axis=1)
+            numbers[:, start + 3 : start + 12] = found.get(f"{vector}_covariance", 0.0)
     message = _Message("imu")
     message.doubles(37)
     return message.fill(time_ns, numbers)
@@ -208,3 +211,85 @@ def _joint(recording: Recording) -> NDArray[np.uint8]:
             columns.append(np.radians(values))
     message.count(0)  # effort
     return message.fill(recording.time_ns, np.stack(columns, axis=1))
+
+
+def replaced(
+    rows: Rows, decoder: ChannelDecoder, truths: Readings, channel: int, covariances: Readings
+) -> NDArray[np.uint8] | list[bytes]:
+    """Return copies of Imu messages, whole records, in which the readings of some sensors are replaced.
+
+    ``decoder`` has read the messages last; ``truths`` are (n, 3) calibrated readings, g or deg/s; ``channel`` is the
+    number of the channel of the copies; ``covariances`` are those of a sample, (3, 3), g^2 or (deg/s)^2, of some
+    sensors: where there is none, that of the message stays.
+    """
+    numbers = _in_ros_units(truths, covariances)
+    if decoder.layout is not None:
+        return _all_at_once(rows, decoder.layout, numbers, channel)
+    return [_one(row, rows, decoder.layout_of(row, rows), numbers, channel) for row in range(len(rows.starts))]
+
+
+def _in_ros_units(readings: Readings, covariances: Readings) -> dict[str, NDArray[np.float64]]:
+    """Return the numbers of Imu messages: path to column, (n,) or (n, 9), m/s^2 and rad/s."""
+    found: dict[str, NDArray[np.float64]] = {}
+    for vector, (sensor, _unit, one) in VECTORS.items():
+        if sensor in readings:
+            found |= {f"{vector}.{a}": readings[sensor][:, i] * one for i, a in enumerate("xyz")}
+            if sensor in covariances:
+                covariance = (covariances[sensor] * one**2).ravel()
+                found[f"{vector}_covariance"] = np.broadcast_to(covariance, (len(readings[sensor]), 9))
+    return found
+
+
+def _all_at_once(
+    rows: Rows, layout: MessageLayout, numbers: dict[str, NDArray[np.float64]], channel: int
+) -> NDArray[np.uint8]:
+    """Copy all records at once, and replace their numbers."""
+    size = HEAD.itemsize + len(layout.sample)
+    places = {path: layout.places[path] for path in numbers}
+    items = np.dtype(
+        {
+            "names": ["channel", *places],
+            "formats": ["<u2", *(p.code if p.count is None else (p.code, p.count) for p in places.values())],
+            "offsets": [CHANNEL_AT, *(HEAD.itemsize + p.offset for p in places.values())],
+            "itemsize": size,
+        }
+    )
+    starts = rows.starts - HEAD.itemsize
+    if rows.stride:
+        whole = np.ndarray(len(starts), f"V{size}", rows.data.data, int(starts[0]), (rows.stride,)).copy()
+    else:
+        whole = np.ndarray(len(rows.data) - size + 1, f"V{size}", rows.data.data, 0, (1,))[starts]
+    records = whole.view(items)
+    records["channel"] = channel
+    for path, column in numbers.items():
+        records[path] = column
+    return whole.view(np.uint8).reshape(len(starts), size)
+
+
+def _one(row: int, rows: Rows, layout: MessageLayout, numbers: dict[str, NDArray[np.float64]], channel: int) -> bytes:
+    """Copy one record, and replace its numbers."""
+    start, end = int(rows.starts[row]) - HEAD.itemsize, int(rows.starts[row] + rows.sizes[row])
+    record = bytearray(rows.data[start:end].tobytes())
+    struct.pack_into("<H", record, CHANNEL_AT, channel)
+    for path, column in numbers.items():
+        place = layout.places[path]
+        at = HEAD.itemsize + place.offset
+        number = np.array([column[row]], place.code).tobytes()
+        record[at : at + len(number)] = number
+    return bytes(record)
+
+
+def new_imu(
+    rows: Rows, truths: Readings, channel: int, time_ns: NDArray[np.int64], covariances: Readings
+) -> NDArray[np.uint8]:
+    """Return records of new ROS 2 Imu messages with the times and numbers of the originals' records."""
+    messages = imu_table(time_ns, truths, covariances)
+    count, size = messages.shape
+    heads = np.zeros(count, HEAD)
+    for name in ("sequence", "log_time", "publish_time"):
+        heads[name] = rows.heads[name]
+    heads["opcode"], heads["channel"], heads["length"] = Opcode.MESSAGE, channel, MESSAGE_HEAD + size
+    table = np.empty((count, HEAD.itemsize + size), np.uint8)
+    table[:, : HEAD.itemsize] = heads.view(np.uint8).reshape(count, HEAD.itemsize)
+    table[:, HEAD.itemsize :] = messages
+    return table
