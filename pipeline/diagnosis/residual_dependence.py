@@ -22,6 +22,7 @@ from numpy.polynomial.chebyshev import chebvander
 from pipeline.diagnosis.functional_forms import Span, signals_of
 from pipeline.diagnosis.residual_regression import ProjectedCurves
 from pipeline.estimation.gauss_markov import selection_grid
+from pipeline.model.effects import effect
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -43,7 +44,6 @@ DEGREE = 5  # up to four turning points over the span; faster changes are steps
 FEWEST, MOST = 3, 8  # periods a turn: one and two look like base and catalogue
 LEAST_RIPPLE = 2  # one is an effect of the catalogue
 PLACES = 16  # of a test for a step: the nearest one is within 1/32 of the span
-SLOW = ("bias_drift", "bias_temperature", "bias_temperature_quadratic", "scale_factor_temperature", "warm_up")
 EQUATION = 0.05  # of what slow effects gain: less may be the error of a smoothed temperature where it turns
 ABOVE = 1.1  # times the white noise: a residual that may hold something sudden
 SIGNALS = {"temperature": "temperature", "time": "time", "rate": "speed"}  # of covariates in which steps are tried
@@ -55,7 +55,7 @@ def dependences(selection: Selection, explained: Curves | None = None) -> list[t
     Curves ``explained`` (motion to (n, m) values) count as explained.
     """
     found = _significant(selection, explained)
-    if any(name in SLOW for name in selection.names):
+    if any(effect(name).slow for name in selection.names):
         least = EQUATION * 2.0 * (selection.fit.log_likelihood - selection.base.log_likelihood)
         found = {k: v for k, v in found.items() if v[0] > least or k not in ("temperature", "time")}
     if found and any(setting.prior for setting in selection.settings):

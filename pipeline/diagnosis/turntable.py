@@ -42,7 +42,6 @@ if TYPE_CHECKING:
 
 NEEDED = "record turns about all three axes on a table whose angle and rate are logged"
 CLOSE = 1.1  # mean square of a residual over that of noise, under which there is no excess to share
-WORTH_RECORDING = ("bias_temperature", "lever_arm", "time_offset")  # where they are hidden, the first is proposed
 
 
 def findings(
@@ -123,7 +122,7 @@ def _described(
             return FAR_OFF
         if one_way(observations):
             return "make every turn in the other direction too: five effects are observable only in both directions"
-        shown = next((name for name in WORTH_RECORDING if name in hidden), None)
+        shown = next((name for name, this in catalogue().items() if this.proposed and name in hidden), None)
         return f"to make {plain(shown)} observable: record {catalogue()[shown].excitation}" if shown else ""
 
     def calibrated(fit: Fit) -> SensorCalibration:

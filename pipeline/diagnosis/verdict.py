@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.diagnosis.words import listed, of_unknown, plain
 from pipeline.estimation.something_else import OTHER
+from pipeline.model.effects import effect
 from pipeline.model.effects.base import unit_of
 from pipeline.validation.heldout import last_error
 
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
     from pipeline.records import Noise, Recording, SensorCalibration
 
 IN_DOUBT = "N-REFERENCE"
-SEATS, OF_SEATS = "N-SEATS", ("mounting", "encoder_zero")  # the note that one mounting does not explain the turns
+SEATS = "N-SEATS"  # the note that one mounting does not explain the turns
 EXPLAINED = 1.5  # times the noise: a residual of a fit up to it is noise; 0.92 to 1.14 in 140 sensors of null families
 MOSTLY = 0.5  # share of the residual's excess that selected effects must explain where something else is left
 BELIEVED = 3  # effects at once; more are what the catalogue makes of physics that it does not hold
@@ -214,7 +215,7 @@ def _seats_explained(document: Mapping[str, Any], sensor: str, found: Findings |
     Mountings or zeros are in the model or selected. Or they were candidates of the accelerometer, were not selected,
     and what is left is noise: an effect that the checks of the recordings do not know looked like a mounting.
     """
-    if set(OF_SEATS) & {*document["configured"], *document["selected"]}:
+    if any(effect(name).of_turns for name in (*document["configured"], *document["selected"])):
         return True
     left = None if found is None else found.left_over_noise
     return sensor == "accelerometer" and left is not None and left <= EXPLAINED

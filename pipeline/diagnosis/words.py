@@ -27,12 +27,6 @@ FAR_OFF = (
     "check the table against its log first (steps, backlash, rate, vibration) and the mounting: the residual is far "
     "above the noise and does not depend on any recorded quantity"
 )
-BY_HAND = {  # experiments where that of the effect asks for a table
-    "g_sensitivity": "repeat the rests on another day and facing another way: Earth's rotation turns with the heading, "
-    "the sensitivity stays with the unit",
-    "g_squared_sensitivity": "record more rests in which two axes are inclined alike, and some with one axis upright",
-    "cross_axis_nonlinearity": "record more rests in which all three axes are inclined, such as body diagonals up",
-}
 VERDICTS = {
     "nothing_missing": "Nothing that these recordings can show is missing in the model of the {sensor}.",
     "missing_effect": "The model of the {sensor} misses {effects}.",
@@ -228,8 +222,13 @@ def to_distinguish(sets: Sequence[Mapping[str, Any]], sensor: str, *, on_table: 
     if apart[0].startswith(OTHER):
         own = "specific_force" if sensor == "accelerometer" else "rate"
         return UNKNOWN[apart[0].removeprefix(OTHER).replace("input", own)]
-    experiment = catalogue()[apart[0]].experiment
-    return experiment if on_table else BY_HAND.get(apart[0], experiment)
+    return _experiment(apart[0], on_table=on_table)
+
+
+def _experiment(name: str, *, on_table: bool) -> str:
+    """Return what separates an effect from its look-alikes."""
+    this = catalogue()[name]
+    return this.experiment if on_table else this.experiment_by_hand or this.experiment
 
 
 def _method_error(error: Mapping[str, Any], sensor: str, whose: str) -> str:
@@ -261,9 +260,7 @@ def next_experiment(verdict: str, ranking: Sequence[Mapping[str, Any]], found: F
         return found.advice(verdict) or "none is needed: nothing that these recordings can show is missing"
     entries = {entry["effect"]: entry for entry in ranking}
     name = next((n for n in found.selected if entries[n]["look_alikes"]), found.selected[0])
-    experiment = catalogue()[name].experiment
-    if not found.on_table:
-        experiment = BY_HAND.get(name, experiment)
+    experiment = _experiment(name, on_table=found.on_table)
     others = listed([plain(a["effect"]) for a in entries[name]["look_alikes"][:2]], "or")
     return f"to {f'distinguish {plain(name)} from {others}' if others else f'confirm {plain(name)}'}: {experiment}"
 

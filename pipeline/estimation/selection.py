@@ -45,7 +45,6 @@ if TYPE_CHECKING:
 
 GATE_BIC = 10.0  # "very strong" evidence (Raftery, Sociological Methodology 25, 1995)
 SLOW_GATE_BIC = 16.0  # for a bias that follows time or temperature, see above
-SLOW_BIAS = ("bias_drift", "bias_temperature", "bias_temperature_quadratic", "warm_up")
 GATE_P = 0.01  # of a false selection, over all candidates (Bonferroni)
 MOST = 5  # effects that one selection adds
 INFLATED = 3.0  # times the expected wander, see above
@@ -270,7 +269,8 @@ class _Search:
     def _gate(self, name: str) -> float:
         """Return the delta BIC to pass: beside large effects, what their equations leave may not pass for another."""
         left = SECOND_ORDER * 2.0 * (self.fit.log_likelihood - self.base.log_likelihood)
-        return float(np.clip(left, SLOW_GATE_BIC if name in SLOW_BIAS else GATE_BIC, HIGHEST_GATE))
+        slow = effect(name).of_the_room(self.observations.sensor)
+        return float(np.clip(left, SLOW_GATE_BIC if slow else GATE_BIC, HIGHEST_GATE))
 
     def _matters(self, score: Score, beside: Sequence[int] = ()) -> bool:
         """Return whether an effect explains a part worth naming of an excess that is far above the noise."""

@@ -20,6 +20,7 @@ import numpy as np
 from pipeline.errors import InputError
 from pipeline.model.calibration_file import read_calibration, sensor_of
 from pipeline.model.effects import register
+from pipeline.model.effects.base import OF_THE_ROOM
 from pipeline.model.effects.files import load_python_effect
 from pipeline.model.log_motion import SIGNALS, ExponentialRegression, LogEnd, fields_used, log_motion
 from pipeline.model.measurement import Part, sensor_effects, solve, without_effects
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
 
 SMOOTHING_S = 3.0  # 30 samples of a thermometer at 10 Hz; a package warms up in minutes
 BLOCK = 8192  # samples that are computed at once: their arrays stay in the processor's cache
-OF_THE_ROOM = {"time", "temperature"}  # fields of a motion that do not depend on the readings
 OF_THE_PAST = {"specific_force_rate", "angular_acceleration", "direction"}
 
 

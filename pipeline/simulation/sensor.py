@@ -53,16 +53,6 @@ if TYPE_CHECKING:
 KEYS = {"bias", "matrix", "scale_factor", "non_orthogonality_deg", "mounting_deg"}
 NOISE_KEYS = {"noise_density", "bias_wander", "wander_time_s"}  # in place of those of the data sheet
 POSITIVE = {"time_constant", "tau"}  # parameters without a sign
-# A typical size as a share of the largest plausible one, where that is not a half: those limits are wide (assumption).
-TYPICAL_SHARE = {
-    "inner_lever_arms": 0.05,
-    "clock_rate": 0.02,
-    "table_tilt": 0.2,
-    "table_axis_nonorthogonality": 0.1,
-    "table_encoder_error": 0.1,
-    "table_rate_ripple": 0.1,
-    "table_backlash": 0.1,
-}
 
 
 @dataclass(frozen=True)
@@ -212,7 +202,7 @@ def _values(
     name, parameters = kind.name, kind.parameters(sensor)
     positive = np.array([p.name in POSITIVE for p in parameters])
     sign = np.where(positive, 1.0, rng.choice([-1.0, 1.0], len(parameters)))
-    typical = TYPICAL_SHARE.get(name, 0.5) * parameter_limits(kind, sensor, limits)
+    typical = kind.typical_share * parameter_limits(kind, sensor, limits)
     drawn = sign * rng.uniform(0.7, 1.3, len(parameters)) * typical
     given = np.array([]) if value is None else np.atleast_1d(np.asarray(value, float))
     if len(given) == len(parameters):

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 REFERENCE_TEMPERATURE = 25.0  # degC, that of data sheets
 STANDARD_GRAVITY = 9.80665  # m/s^2, ISO 80000-3
+OF_THE_ROOM = {"time", "temperature"}  # fields of a motion that do not depend on the readings
 STEP_DEG = 5e-3  # above an encoder's resolution (1e-3 deg), below a step of a program (0.1 deg)
 TURNING_DPS = 0.25  # above a gyroscope's noise and residual bias, below a slow turn of a table (1 deg/s)
 
@@ -80,7 +81,10 @@ class Effect(abc.ABC):
     meaning: str  # one sentence for the reader of a report
     excitation: str  # advice: what a recording must do for this effect to show
     experiment: str  # advice: what separates it from its look-alikes
+    experiment_by_hand: str = ""  # the same without a table, where that is another experiment
     source: str  # of the equation
+    typical_share: float = 0.5  # size of a simulated effect as a share of its limits, where none is given
+    proposed: bool = False  # recording what shows it is the first advice where it is not observable
     definition: dict[str, Any] | None = None  # of a user's effect, its file; every calibration with the effect holds it
 
     @abc.abstractmethod
@@ -132,6 +136,15 @@ class Effect(abc.ABC):
     def moves(self) -> bool:
         """Whether the effect moves the motion in time."""
         return type(self).moved is not Effect.moved
+
+    @property
+    def slow(self) -> bool:
+        """Whether the effect follows the time or the temperature, without moving the motion."""
+        return (self.needs_clock or "temperature" in self.needs) and not self.moves
+
+    def of_the_room(self, sensor: str) -> bool:
+        """Whether the effect follows the time and the temperature alone: it adds to the bias."""
+        return self.slow and self.fields(sensor, self.starts(sensor)[0]) <= OF_THE_ROOM
 
     def starts(self, sensor: str) -> list[Values]:
         """Return the values from which a fit starts, several where the reading is not linear in them."""

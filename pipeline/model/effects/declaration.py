@@ -83,7 +83,10 @@ class Declaration:
     needs_both_directions: bool = False
     excitation: str = ""
     experiment: str = ""
+    experiment_by_hand: str = ""
     source: str = ""
+    typical_share: float = 0.5
+    proposed: bool = False
     built_in: bool = False
     python: str = ""
     parameters: dict[str, Term] = field(default_factory=dict)
@@ -219,10 +222,13 @@ CHECKS: dict[str, Check] = {
     "needs_both_directions": flag,
     "excitation": TEXT,
     "experiment": TEXT,
+    "experiment_by_hand": TEXT,
     "source": TEXT,
+    "typical_share": _size,
 }
 BUILT_IN_CHECKS: dict[str, Check] = {
     "built_in": flag,
+    "proposed": flag,
     "prior": TEXT,
     "python": TEXT,
     "parameters": each(lambda given: Term(**fields(TERM_CHECKS, ("unit",))(given))),

@@ -28,6 +28,10 @@ if TYPE_CHECKING:
 
     Values = NDArray[np.float64]
 
+AS_DECLARED = (
+    *("name", "owner", "sensors", "contains", "prior", "needs_both_directions", "meaning", "excitation", "experiment"),
+    *("experiment_by_hand", "source", "typical_share", "proposed"),
+)
 OF_THE_TURN = ("angle", "rate")
 NEEDED = ("temperature", "angle", "rate", "level")  # fields that a motion may lack
 TRUTHS = {"accelerometer": "specific_force", "gyroscope": "angular_rate"}
@@ -45,9 +49,8 @@ class DeclaredEffect(Effect):
 
     def __init__(self, declared: Declaration, definition: dict[str, Any] | None = None) -> None:
         self.declared, self.definition = declared, definition
-        for name in ("name", "owner", "sensors", "contains", "prior", "needs_both_directions", "meaning"):
+        for name in AS_DECLARED:
             setattr(self, name, getattr(declared, name))
-        self.excitation, self.experiment, self.source = declared.excitation, declared.experiment, declared.source
         self._parameters = {sensor: declared.parameters_of(sensor) for sensor in declared.sensors}
 
     def parameters(self, sensor: str) -> tuple[Parameter, ...]:
