@@ -12,20 +12,27 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.diagnosis import multi_position, turntable
 from pipeline.diagnosis.findings import document_of
-from pipeline.diagnosis.verdict import evidence_of, judged, may_be_unknown
+from pipeline.diagnosis.verdict import EXPLAINED, LIKELY, Evidence, HeldOut, judged, may_be_unknown
 from pipeline.errors import NotObservableError
 from pipeline.estimation.candidates import MOUNTING, configured_effects
 from pipeline.estimation.effects import mountings_by_gravity, of_the_angle
 from pipeline.estimation.rest_means import is_multi_position
-from pipeline.model.effects import catalogue
+from pipeline.estimation.something_else import OTHER
+from pipeline.model.effects import catalogue, effect
+from pipeline.validation.heldout import last_error
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from pipeline.diagnosis.findings import Findings
     from pipeline.records import Noise, Recording, SensorCalibration
 
 IN_DOUBT = ("reference_in_doubt", "unexplained")  # verdicts on an accelerometer whose mountings may be wrong
+REFERENCE, SEATS = (
+    "N-REFERENCE",
+    "N-SEATS",
+)  # notes: the reference contradicts itself; one mounting does not explain all
+COMPARED = ("bias", "scale_factor", "non_orthogonality", "rotation")  # parts compared with the uncertainty of both fits
 FULL = "full"  # ``diagnosis.depth`` at which everything is computed, whatever the verdict
 
 
@@ -98,6 +105,95 @@ def diagnose(
     if found.deeper and (full or document["verdict"] != "nothing_missing"):
         document |= found.deeper()
     return document
+
+
+def held_out_of(part: Mapping[str, Any] | None) -> HeldOut | None:
+    """Return the last error of a sensor's validation; None where nothing is held out or no interval is known."""
+    if not part or not part.get("held_out") or not part.get("expected_rms_error"):
+        return None
+    return HeldOut(float(part["steps"][-1]["rms_error"]), *map(float, part["expected_rms_error"]))
+
+
+def doubts_of(sensor: str, recordings: Sequence[Recording], *, seats: bool = True) -> list[str]:
+    """Return what the notes on the recordings say of the reference of a sensor.
+
+    A note on turns of the other sensor concerns that one alone. ``seats``: whether the note counts that one mounting
+    does not explain the turns.
+    """
+    codes = {REFERENCE, SEATS} if seats else {REFERENCE}
+    own = [r for r in recordings if r.role not in {"accelerometer", "gyroscope"} or r.role == sensor]
+    return [f"{r.name}: {note.detail}" for r in own for note in r.notes if note.code in codes]
+
+
+def evidence_of(
+    document: Mapping[str, Any],
+    sensor: str,
+    recordings: Sequence[Recording],
+    noise: Noise | None,
+    settings: Mapping[str, Any],
+    *,
+    validation: Mapping[str, Any] | None,
+    found: Findings | None = None,
+) -> Evidence:
+    """Return what decides; the held-out error of further fits only where that of the calibration is above its interval.
+
+    ``document`` is the diagnosis of the selection alone, and ``found`` what it was made of; without a ``validation``, a
+    free fit stands for the calibration.
+    """
+    method = settings.get("method") or {}
+    free, full = (found.free, found.full) if found else (None, None)
+
+    def error_of(fit: Callable[[], SensorCalibration] | None, *, smoothed: bool) -> HeldOut | None:
+        if fit is None or noise is None or found is None:
+            return None
+        error = last_error(fit(), recordings, noise, settings, other=found.other, smoothed=smoothed)
+        return None if error is None else HeldOut(error[0], *error[1])
+
+    accepted = ((settings.get("sensor") or {}).get(sensor) or {}).get("accept_implausible")
+    implausible = [
+        e["effect"] for e in document["ranking"] if e["effect"] in document["selected"] and not e["plausible"]
+    ]
+    published = held_out_of(validation) if validation else error_of(free, smoothed=False)
+    contradicted = published is not None and published.above
+    return Evidence(
+        sensor,
+        str(document["verdict"]),
+        tuple(document["selected"]),
+        document["residual_over_noise"],
+        found.left_over_noise if found else None,
+        published=published,
+        free=error_of(free, smoothed=True) if contradicted else None,
+        full=error_of(full, smoothed=True) if contradicted else None,
+        doubts=[
+            *doubts_of(sensor, recordings, seats=not _seats_explained(document, sensor, found)),
+            *(found.departures if found else ()),
+        ],
+        approximations=[error["name"] for error in document["method_errors"] if error["name"] in COMPARED],
+        unknown=[entry["covariate"] for entry in document["unexplained"] if not entry.get("explained_by")],
+        beyond=[
+            name.removeprefix(OTHER)
+            for name, probability in document["probability"].items()
+            if name.startswith(OTHER) and probability > LIKELY
+        ],
+        implausible=() if accepted else implausible,
+        held_out=document.get("held_out"),
+        method=str(method.get(sensor) or ""),
+        as_printed=bool(method.get("as_printed")),
+        filtered=any(r.filter["name"] != "none" for r in recordings if r.role == "validation"),
+        on_table=found is None or found.on_table,
+    )
+
+
+def _seats_explained(document: Mapping[str, Any], sensor: str, found: Findings | None) -> bool:
+    """Return whether the fit explains that turns look as if they were mounted differently.
+
+    Mountings or zeros are in the model or selected. Or they were candidates of the accelerometer, were not selected,
+    and what is left is noise: an effect that the checks of the recordings do not know looked like a mounting.
+    """
+    if any(effect(name).of_turns for name in (*document["configured"], *document["selected"])):
+        return True
+    left = None if found is None else found.left_over_noise
+    return sensor == "accelerometer" and left is not None and left <= EXPLAINED
 
 
 def _doubts_of_gravity(accelerometer: Mapping[str, Any]) -> list[str]:

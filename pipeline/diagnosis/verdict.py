@@ -1,19 +1,7 @@
 """The verdict on one sensor: what its selection found, against the error on held-out motion.
 
-The first that applies:
-
-    reference_in_doubt  a check of the recordings found a contradiction (notes ``N-REFERENCE``, ``N-SEATS``), a face or
-                        turn by hand departs from what is stated, or the residual of the fit is noise alone and the
-                        held-out error is above its interval
-    missing_effect      effects were selected, and with them the held-out error lies in its interval; effects beyond
-                        the sensor's limits only where they lower the held-out error
-    unexplained         the residual of the fit, or the held-out error, is above what noise leaves, unexplained
-    floor_in_doubt      the held-out error is below its interval, or the residual far below the noise
-    left_by_method      the error is above, but that of a free fit of the same recordings is not; or the method's matrix
-                        or bias differs from that of a free fit by more than both fits' noise
-    not_enough_data, nothing_missing
-
-The interval is the 99 % one of ``pipeline.validation.expected_error``; where it is not known, it decides nothing.
+The first of ``RULES`` that applies decides; where none does, it is the verdict of the selection. A held-out error is
+compared with its 99 % interval (``pipeline.validation.expected_error``); where that is not known, it decides nothing.
 """
 
 from __future__ import annotations
@@ -22,19 +10,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from pipeline.diagnosis.words import listed, of_unknown, plain
-from pipeline.estimation.something_else import OTHER
-from pipeline.model.effects import effect
 from pipeline.model.effects.base import unit_of
-from pipeline.validation.heldout import last_error
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from pipeline.diagnosis.findings import Findings
-    from pipeline.records import Noise, Recording, SensorCalibration
-
-IN_DOUBT = "N-REFERENCE"
-SEATS = "N-SEATS"  # the note that one mounting does not explain the turns
 EXPLAINED = 1.5  # times the noise: a residual of a fit up to it is noise; 0.92 to 1.14 in 140 sensors of null families
 MOSTLY = 0.5  # share of the residual's excess that selected effects must explain where something else is left
 BELIEVED = 3  # effects at once; more are what the catalogue makes of physics that it does not hold
@@ -45,7 +25,6 @@ WORSE = 0.3  # of the noise's mean square, by which what was selected may raise 
 HELPFUL = 0.1  # share of the held-out error's mean square that each effect worth a try takes away
 LEFT_OVER = 1.05  # times the noise floor: four standard deviations of the rms of 3 x 1000 samples
 QUIET = 0.6  # times the noise: a residual below it contradicts the noise of the rests
-COMPARED = ("bias", "scale_factor", "non_orthogonality", "rotation")  # parts compared with the uncertainty of both fits
 GIVEN = "given"  # the method that takes an existing calibration; nothing is fitted, and effects cannot be added to it
 FREE = ("reference_least_squares", "nonlinear_least_squares", "cholesky_lu")  # methods that leave bias and matrix free
 
@@ -93,6 +72,45 @@ class Evidence:
     filtered: bool = False
     on_table: bool = True  # a few rests by hand may leave a small residual by chance
 
+    @property
+    def above(self) -> bool:
+        """Whether the held-out error of the calibration is above its interval."""
+        return self.published is not None and self.published.above
+
+    @property
+    def left(self) -> float | None:
+        """The residual of the fit over the noise, with what was selected."""
+        return self.left_over_noise if self.selected else self.over_noise
+
+    @property
+    def at_noise(self) -> bool | None:
+        """Whether the fit leaves noise alone; None where that is not known."""
+        return None if self.left is None else self.left <= EXPLAINED
+
+    @property
+    def missing(self) -> bool:
+        """Whether effects were selected; those beyond the sensor's limits must lower the held-out error."""
+        return self.found == "missing_effect" and not self._unconfirmed
+
+    @property
+    def unexplained(self) -> bool:
+        """Whether no plausible effect explains the residual."""
+        return self.found == "unexplained" or self._unconfirmed
+
+    @property
+    def _unconfirmed(self) -> bool:
+        if not self.implausible or self.held_out is None:
+            return False
+        return self.held_out["error_after"] ** 2 > (1.0 - HELPFUL) * self.held_out["error_before"] ** 2
+
+    @property
+    def of_method(self) -> bool:
+        """Whether the method causes a held-out error above its interval: a free fit is within its own."""
+        same = self.method == "reference_least_squares" and not self.filtered  # the calibration is the free fit
+        free = self.free or self.published
+        within = not (same or (free and free.above))
+        return self.as_printed or within or bool(self.method == GIVEN and self.free is None and self.at_noise)
+
 
 def verdict_of_selection(
     names: Sequence[str],
@@ -132,117 +150,9 @@ def _made_worse(held_out: Mapping[str, float] | None) -> bool:
     return more > WORSE * held_out["floor"] ** 2
 
 
-def held_out_of(part: Mapping[str, Any] | None) -> HeldOut | None:
-    """Return the last error of a sensor's validation; None where nothing is held out or no interval is known."""
-    if not part or not part.get("held_out") or not part.get("expected_rms_error"):
-        return None
-    return HeldOut(float(part["steps"][-1]["rms_error"]), *map(float, part["expected_rms_error"]))
-
-
-def doubts_of(sensor: str, recordings: Sequence[Recording], *, seats: bool = True) -> list[str]:
-    """Return what the notes on the recordings say of the reference of a sensor.
-
-    A note on turns of the other sensor concerns that one alone. ``seats``: whether the note counts that one mounting
-    does not explain the turns.
-    """
-    codes = {IN_DOUBT, SEATS} if seats else {IN_DOUBT}
-    own = [r for r in recordings if r.role not in {"accelerometer", "gyroscope"} or r.role == sensor]
-    return [f"{r.name}: {note.detail}" for r in own for note in r.notes if note.code in codes]
-
-
-def evidence_of(
-    document: Mapping[str, Any],
-    sensor: str,
-    recordings: Sequence[Recording],
-    noise: Noise | None,
-    settings: Mapping[str, Any],
-    *,
-    validation: Mapping[str, Any] | None,
-    found: Findings | None = None,
-) -> Evidence:
-    """Return what decides; the held-out error of further fits only where that of the calibration is above its interval.
-
-    ``document`` is the diagnosis of the selection alone, and ``found`` what it was made of; without a ``validation``, a
-    free fit stands for the calibration.
-    """
-    method = settings.get("method") or {}
-    free, full = (found.free, found.full) if found else (None, None)
-
-    def error_of(fit: Callable[[], SensorCalibration] | None, *, smoothed: bool) -> HeldOut | None:
-        if fit is None or noise is None or found is None:
-            return None
-        error = last_error(fit(), recordings, noise, settings, other=found.other, smoothed=smoothed)
-        return None if error is None else HeldOut(error[0], *error[1])
-
-    accepted = ((settings.get("sensor") or {}).get(sensor) or {}).get("accept_implausible")
-    implausible = [
-        e["effect"] for e in document["ranking"] if e["effect"] in document["selected"] and not e["plausible"]
-    ]
-    published = held_out_of(validation) if validation else error_of(free, smoothed=False)
-    contradicted = published is not None and published.above
-    return Evidence(
-        sensor,
-        str(document["verdict"]),
-        tuple(document["selected"]),
-        document["residual_over_noise"],
-        found.left_over_noise if found else None,
-        published=published,
-        free=error_of(free, smoothed=True) if contradicted else None,
-        full=error_of(full, smoothed=True) if contradicted else None,
-        doubts=[
-            *doubts_of(sensor, recordings, seats=not _seats_explained(document, sensor, found)),
-            *(found.departures if found else ()),
-        ],
-        approximations=[error["name"] for error in document["method_errors"] if error["name"] in COMPARED],
-        unknown=[entry["covariate"] for entry in document["unexplained"] if not entry.get("explained_by")],
-        beyond=[
-            name.removeprefix(OTHER)
-            for name, probability in document["probability"].items()
-            if name.startswith(OTHER) and probability > LIKELY
-        ],
-        implausible=() if accepted else implausible,
-        held_out=document.get("held_out"),
-        method=str(method.get(sensor) or ""),
-        as_printed=bool(method.get("as_printed")),
-        filtered=any(r.filter["name"] != "none" for r in recordings if r.role == "validation"),
-        on_table=found is None or found.on_table,
-    )
-
-
-def _seats_explained(document: Mapping[str, Any], sensor: str, found: Findings | None) -> bool:
-    """Return whether the fit explains that turns look as if they were mounted differently.
-
-    Mountings or zeros are in the model or selected. Or they were candidates of the accelerometer, were not selected,
-    and what is left is noise: an effect that the checks of the recordings do not know looked like a mounting.
-    """
-    if any(effect(name).of_turns for name in (*document["configured"], *document["selected"])):
-        return True
-    left = None if found is None else found.left_over_noise
-    return sensor == "accelerometer" and left is not None and left <= EXPLAINED
-
-
 def decide(e: Evidence) -> tuple[str, str]:
     """Return the verdict and its reason as one or two sentences; empty where the selection is the reason."""
-    if e.doubts:
-        return "reference_in_doubt", f"A check of the recordings contradicts the reference: {'; '.join(e.doubts)}."
-    if e.published and e.published.above:
-        return _above(e, e.published)
-    if e.found == "unexplained" or (e.found == "missing_effect" and _unconfirmed(e)):
-        return "unexplained", _why_unexplained(e)
-    if e.moves and e.moves[0] > e.moves[1] and e.found != "missing_effect":
-        return "unexplained", (
-            f"After the held-out moves, the integrated rate misses the direction of gravity by {e.moves[0]:.3g} deg "
-            f"(rms); noise and stated uncertainties explain at most {e.moves[1]:.3g} deg. Check that the unit rested "
-            "before and after each of them, without sliding, and that no samples are missing."
-        )
-    return (e.found, _beyond(e)) if e.found == "missing_effect" else _within(e)
-
-
-def _unconfirmed(e: Evidence) -> bool:
-    """Return whether effects beyond the sensor's limits were selected that do not lower the held-out error."""
-    if not e.implausible or e.held_out is None:
-        return False
-    return e.held_out["error_after"] ** 2 > (1.0 - HELPFUL) * e.held_out["error_before"] ** 2
+    return next(((verdict, reason(e)) for verdict, applies, reason in RULES if applies(e)), (e.found, ""))
 
 
 def _beyond(e: Evidence) -> str:
@@ -260,9 +170,7 @@ def _beyond(e: Evidence) -> str:
 def _why_unexplained(e: Evidence) -> str:
     """Return why no effect of the catalogue explains the residual, as sentences."""
     names, unit = listed([plain(name) for name in e.selected]), unit_of(e.sensor)
-    found = []
-    if e.implausible:
-        found.append(_beyond(e))
+    found = [_beyond(e)] if e.implausible else []
     if _made_worse(e.held_out) and e.held_out:
         before, after = e.held_out["error_before"], e.held_out["error_after"]
         found.append(f"With {names} the error on held-out motion rises from {before:.3g} to {after:.3g} {unit}.")
@@ -278,72 +186,17 @@ def _why_unexplained(e: Evidence) -> str:
     if e.beyond and e.selected and not e.unknown:
         follows = listed([plain(n) for n in e.beyond])
         found.append(f"Beside {names}, something outside the catalogue is likely to depend on {follows}.")
-    left = e.left_over_noise if e.selected else e.over_noise
-    if left is not None and (left > EXPLAINED or not found):
-        found.append(f"The residual of the fit{given} is {left:.3g} times the noise.")
+    if e.left is not None and (not e.at_noise or not found):
+        found.append(f"The residual of the fit{given} is {e.left:.3g} times the noise.")
     return " ".join(found) or "No effect of the catalogue explains the residual."
 
 
-def _within(e: Evidence) -> tuple[str, str]:
-    """Return the verdict where no effect was found and the held-out error is not above its interval."""
-    if e.published and e.published.below:
-        unit, held = unit_of(e.sensor), e.published
-        return "floor_in_doubt", (
-            f"On held-out motion the error is {held.error:.3g} {unit}, less than by the noise estimate "
-            f"({held.low:.3g} to {held.high:.3g} {unit}): this estimate is too large, and may hide an effect. "
-            "Check that the unit did not move in the recording that the noise is taken from."
-        )
-    if e.on_table and e.found == "nothing_missing" and e.over_noise is not None and e.over_noise < QUIET:
-        return "floor_in_doubt", (
-            f"The residual of the fit is {e.over_noise:.2g} times the noise estimate. Noise cannot be larger at "
-            "rest than in turns: check that the unit did not move in the static recording, and record it again."
-        )
-    if e.found == "nothing_missing" and e.approximations and e.method == GIVEN:
-        differs = listed([name.replace("_", " ") for name in e.approximations])
-        return "left_by_method", f"The given calibration differs from a free fit of these recordings in {differs}."
-    if e.found == "nothing_missing" and e.approximations:
-        return "left_by_method", (
-            f"The method {e.method} causes errors that a free fit of the same recordings does not have: "
-            f"{', '.join(name.replace('_', ' ') for name in e.approximations)}."
-        )
-    return e.found, ""
-
-
-def _above(e: Evidence, published: HeldOut) -> tuple[str, str]:
-    unit = unit_of(e.sensor)
-    text = (
-        f"On held-out motion the error is {published.error:.3g} {unit}; noise and stated uncertainties explain at "
-        f"most {published.high:.3g} {unit}"
-    )
-    if e.found == "missing_effect" and not (_unconfirmed(e) or (e.full and e.full.above)):
-        return "missing_effect", _beyond(e)
-    if e.found == "unexplained" or _unconfirmed(e):
-        return "unexplained", f"{text}. {_why_unexplained(e)}"
-    free = e.free or published
-    same = e.method == "reference_least_squares" and not e.filtered  # the calibration is the free fit
-    if e.as_printed or not (free.above or same):
-        return "left_by_method", f"{text}. {_of_method(e)}"
-    left = e.left_over_noise if e.selected else e.over_noise
-    if e.method == GIVEN and e.free is None and left is not None and left <= EXPLAINED:
-        return (
-            "left_by_method",
-            f"{text}. A fit of these recordings leaves noise alone: the given calibration causes it.",
-        )
-    if e.full and e.selected:
-        text += f"; with the selected effects it is {e.full.error:.3g} {unit}, against at most {e.full.high:.3g}"
-    if left is not None and left > EXPLAINED:
-        return "unexplained", f"{text}. The residual of the fit is {left:.3g} times the noise, too."
-    return "reference_in_doubt", (
-        f"{text}. The residual of the fit is noise alone, so fit and held-out recording contradict each other: check "
-        "that the held-out recording is of this unit in the same mounting, and check the rate, attitude and clock that "
-        "the table logged in it. The cause may also be an effect that the recordings of the fit cannot show (not "
-        "observable)."
-    )
-
-
 def _of_method(e: Evidence) -> str:
+    """Return what the method causes, as a sentence."""
     if e.as_printed:
         return f"The method {e.method} uses the equations as printed, with their errata (as_printed)."
+    if e.free is None and e.method == GIVEN:
+        return "A fit of these recordings leaves noise alone: the given calibration causes it."
     if e.free is None:
         return f"The method {e.method} causes it."
     found = f"The error of a free fit of the same recordings is {e.free.error:.3g} {unit_of(e.sensor)}"
@@ -354,6 +207,87 @@ def _of_method(e: Evidence) -> str:
     causes = f"the method {e.method} and the filter cause" if e.filtered else f"the method {e.method} causes"
     against = " against the filtered reference" if e.filtered else ""
     return f"{found}{against}: {causes} the rest."
+
+
+def _approximations(e: Evidence) -> str:
+    """Return in what the method's calibration differs from a free fit, as a sentence."""
+    differs = [name.replace("_", " ") for name in e.approximations]
+    if e.method == GIVEN:
+        return f"The given calibration differs from a free fit of these recordings in {listed(differs)}."
+    return (
+        f"The method {e.method} causes errors that a free fit of the same recordings does not have: "
+        f"{', '.join(differs)}."
+    )
+
+
+def _above(e: Evidence, why: str, *, selected: bool = False) -> str:
+    """Return by how much the held-out error is above its interval (``selected``: also with these effects), and why."""
+    assert e.published  # noqa: S101  (it is above)
+    unit, with_them = unit_of(e.sensor), ""
+    if selected and e.full and e.selected:
+        with_them = f"; with the selected effects it is {e.full.error:.3g} {unit}, against at most {e.full.high:.3g}"
+    return (
+        f"On held-out motion the error is {e.published.error:.3g} {unit}; noise and stated uncertainties explain at "
+        f"most {e.published.high:.3g} {unit}{with_them}. {why}"
+    )
+
+
+def _below(e: Evidence) -> str:
+    """Return by how much the held-out error is below its interval, and why."""
+    assert e.published  # noqa: S101  (it is below)
+    unit, held = unit_of(e.sensor), e.published
+    return (
+        f"On held-out motion the error is {held.error:.3g} {unit}, less than by the noise estimate "
+        f"({held.low:.3g} to {held.high:.3g} {unit}): this estimate is too large, and may hide an effect. "
+        "Check that the unit did not move in the recording that the noise is taken from."
+    )
+
+
+CONTRADICT = (
+    "The residual of the fit is noise alone, so fit and held-out recording contradict each other: check that the "
+    "held-out recording is of this unit in the same mounting, and check the rate, attitude and clock that the table "
+    "logged in it. The cause may also be an effect that the recordings of the fit cannot show (not observable)."
+)
+MOVES = (
+    "After the held-out moves, the integrated rate misses the direction of gravity by {0:.3g} deg (rms); noise and "
+    "stated uncertainties explain at most {1:.3g} deg. Check that the unit rested before and after each of them, "
+    "without sliding, and that no samples are missing."
+)
+TOO_QUIET = (
+    "The residual of the fit is {:.2g} times the noise estimate. Noise cannot be larger at rest than in turns: check "
+    "that the unit did not move in the static recording, and record it again."
+)
+# Verdict, where it applies, and its reason; ``e.above``: the held-out error of the calibration is above its interval.
+RULES: tuple[tuple[str, Callable[[Evidence], object], Callable[[Evidence], str]], ...] = (
+    (
+        "reference_in_doubt",
+        lambda e: e.doubts,
+        lambda e: f"A check of the recordings contradicts the reference: {'; '.join(e.doubts)}.",
+    ),
+    ("missing_effect", lambda e: e.above and e.missing and not (e.full and e.full.above), _beyond),
+    ("unexplained", lambda e: e.above and e.unexplained, lambda e: _above(e, _why_unexplained(e))),
+    ("left_by_method", lambda e: e.above and e.of_method, lambda e: _above(e, _of_method(e))),
+    (
+        "unexplained",
+        lambda e: e.above and e.at_noise is False,
+        lambda e: _above(e, f"The residual of the fit is {e.left:.3g} times the noise, too.", selected=True),
+    ),
+    ("reference_in_doubt", lambda e: e.above, lambda e: _above(e, CONTRADICT, selected=True)),
+    ("unexplained", lambda e: e.unexplained, _why_unexplained),
+    (
+        "unexplained",
+        lambda e: e.moves and e.moves[0] > e.moves[1] and not e.missing,
+        lambda e: MOVES.format(*e.moves or ()),
+    ),
+    ("missing_effect", lambda e: e.missing, _beyond),
+    ("floor_in_doubt", lambda e: e.published and e.published.below, _below),
+    (
+        "floor_in_doubt",
+        lambda e: e.on_table and e.found == "nothing_missing" and e.over_noise is not None and e.over_noise < QUIET,
+        lambda e: TOO_QUIET.format(e.over_noise),
+    ),
+    ("left_by_method", lambda e: e.found == "nothing_missing" and e.approximations, _approximations),
+)
 
 
 def judged(document: dict[str, Any], e: Evidence) -> dict[str, Any]:

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 from bench_session import Session, record
 
-from pipeline.diagnosis.diagnose import diagnose
-from pipeline.diagnosis.verdict import Evidence, HeldOut, decide, doubts_of, held_out_of, judged
+from pipeline.diagnosis.diagnose import diagnose, doubts_of, held_out_of
+from pipeline.diagnosis.verdict import Evidence, HeldOut, decide, judged
 from pipeline.estimation.noise import estimate_noise
 from pipeline.outcome import commands_of
 from pipeline.records import Note, Recording

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from bad_units import SETTINGS, cases, sound
 
-from pipeline.diagnosis.verdict import doubts_of
+from pipeline.diagnosis.diagnose import doubts_of
 from pipeline.errors import IngestError
 from pipeline.preprocessing.at_rest import check_static
 from pipeline.preprocessing.checks import check_recordings
