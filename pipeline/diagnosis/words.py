@@ -40,14 +40,17 @@ VERDICTS = {
 GIVEN_DIFFERS = "The model explains the {sensor}; the given calibration is not that of these recordings."
 
 
-def in_words(part: Mapping[str, Any] | None, sensor: str) -> list[str]:
-    """Return a sensor's part of ``diagnoses/<unit>.json``, None where it was not calibrated, as sentences."""
+def in_words(part: Mapping[str, Any] | None, sensor: str, most_values: int | None = None) -> list[str]:
+    """Return a sensor's part of ``diagnoses/<unit>.json``, None where it was not calibrated, as sentences.
+
+    Effects with more than ``most_values`` parameters are stated without their values: a table beside lists them.
+    """
     if part is None:
         return [f"The {sensor} was not calibrated, so there is nothing to diagnose."]
     lines = [_verdict(part, sensor), *([part["reason"]] if part.get("reason") else [])]
     entries = {entry["effect"]: entry for entry in part["ranking"]}
     for name in part["selected"]:
-        lines += _selected(entries[name], sensor, with_form=bool(part.get("suggested_effect")))
+        lines += _selected(entries[name], sensor, most_values, with_form=bool(part.get("suggested_effect")))
     lines += _unknown(part, sensor)
     lines += [_driven(entry) for entry in part.get("influence") or [] if entry["recordings"]]
     lines += _goodness(part.get("goodness_of_fit"))
@@ -88,10 +91,12 @@ def listed(words: Sequence[str], conjunction: str = "and") -> str:
     return f" {conjunction} ".join(filter(None, [", ".join(words[:-1]), *words[-1:]]))
 
 
-def _selected(entry: Mapping[str, Any], sensor: str, *, with_form: bool) -> list[str]:
+def _selected(entry: Mapping[str, Any], sensor: str, most_values: int | None, *, with_form: bool) -> list[str]:
     known = catalogue().get(entry["effect"])
     meaning = entry.get("meaning") or (known.meaning if known else "")
     values = ", ".join(_value(name, p) for name, p in entry["parameters"].items())
+    if most_values is not None and len(entry["parameters"]) > most_values:
+        values = f"{len(entry['parameters'])} parameters, in the table below"
     share = 100 * entry["explained_share"]
     head = f"{plain(entry['effect']).capitalize()}: {f'{meaning} ' if meaning else ''}{values}."
     bic = f"(delta BIC {entry['delta_bic']:.0f})"

@@ -6,11 +6,14 @@ From it the page's script reads values and zooms.
 
 Coordinates are whole tenths of a pixel and paths are written as differences, which keeps a page small. Where samples
 are many, they are drawn as the range from the smallest to the largest of equal buckets, so that no extreme is lost
-(S. Steinarsson, Downsampling Time Series for Visual Representation, University of Iceland 2013, section 4.1).
+(S. Steinarsson, Downsampling Time Series for Visual Representation, University of Iceland 2013, section 4.1). Each such
+path has all its samples as ``data-full``, from which the page's script draws what a zoom shows: 16-bit numbers (base64)
+from -32767 at the low end of the axis to 32767, -32768 where there is no value; ``data-full`` of the chart is x.
 """
 
 from __future__ import annotations
 
+from base64 import b64encode
 from dataclasses import dataclass, replace
 from html import escape
 from typing import TYPE_CHECKING
@@ -33,6 +36,7 @@ LEFT, RIGHT, TOP, BOTTOM, GAP = 64, 14, 8, 36, 14  # px, margins of the panels a
 UPRIGHT = 28  # px, of height for each tick of axis y
 MAXIMUM_DOTS = 240  # samples that are drawn as dots; about one in 1.4 px
 BUCKETS = 140  # ranges that are drawn of more samples; about one in 2.4 px
+MAXIMUM_FULL = 20_000  # samples that a page holds of a curve (53 kB); of more, the ends of half as many buckets
 LARGE_DOTS, LARGE_MEANS = 300, 20  # dots, and dots with intervals, that have room to be large
 LETTER = 6.2  # px, width of a letter
 
@@ -184,6 +188,8 @@ def chart(
     parts.append(f'<g class="ticks">{labels}</g>')
     parts.append(text((x.start + x.stop) / 2, top - GAP + 28, x_label, "m"))
     attributes = x.attribute(x_label, columns) + (f' data-names="{units}"' if units else "")
+    long = [layer for p in panels for layer in p.layers if isinstance(layer, Samples) and len(layer.x) > MAXIMUM_DOTS]
+    attributes += _full(long[0].x, long[0].x, x) if long else ""
     return figure.drawn(description, top - GAP + BOTTOM, "".join(parts), attributes)
 
 
@@ -258,21 +264,38 @@ def _draw(layer: Layer, x: Axis, y: Axis) -> str:
 
 def _samples(layer: Samples, values: Values, colour: str, x: Axis, y: Axis) -> str:
     """Return one column of samples as dots, or as the ranges of buckets."""
-    known = np.isfinite(layer.x) & np.isfinite(values)
+    column, known = values, np.isfinite(layer.x) & np.isfinite(values)
     at, values = layer.x[known], values[known]
     if len(at) <= MAXIMUM_DOTS:
         return f'<path class="dots {colour}" d="{_dots(x.units(at), y.units(values))}"/>'
-    size = -(-len(at) // BUCKETS)
-    start = np.arange(0, len(at) // size * size, size)  # the last bucket also takes the remainder
-    count = np.diff(np.append(start, len(at)))
+    start, count = _buckets(len(at), BUCKETS)
     centre = x.units(np.add.reduceat(at, start) / count)
     low, high = (y.units(end.reduceat(values, start)) for end in (np.minimum, np.maximum))
     faint = " faint-strokes" * layer.mean
-    out = f'<path class="strokes {colour}{faint}" d="{_path("M%d %dV%d", centre, low, high)}"/>'
+    full = _full(layer.x, column, y)
+    out = f'<path class="strokes {colour}{faint}" d="{_path("M%d %dV%d", centre, low, high)}"{full}/>'
     if layer.mean:
         means = y.units(np.add.reduceat(values, start) / count)
-        out += f'<path class="line {colour}" d="{_line(centre, means)}"/>'
+        out += f'<path class="line mean {colour}" d="{_line(centre, means)}"/>'
     return out
+
+
+def _buckets(samples: int, most: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return start and length of equal buckets; the last one also takes the remainder."""
+    size = -(-samples // most)
+    start = np.arange(0, samples // size * size, size)
+    return start, np.diff(np.append(start, samples))
+
+
+def _full(x: Values, values: Values, axis: Axis) -> str:
+    """Return all values of a curve as the attribute ``data-full``; of too many, both ends of each bucket."""
+    if len(values) > MAXIMUM_FULL:
+        start, _ = _buckets(len(values), MAXIMUM_FULL // 2)
+        ends = (x[start], x[start]) if values is x else (end.reduceat(values, start) for end in (np.fmin, np.fmax))
+        values = np.stack([*ends], 1).ravel()
+    at = (2.0 * (np.clip(values, axis.low, axis.high) - axis.low) / (axis.high - axis.low) - 1.0) * 32767.0
+    numbers = np.where(np.isfinite(at), np.rint(at), -32768.0).astype("<i2")
+    return f' data-full="{b64encode(numbers.tobytes()).decode()}"'
 
 
 def _line(x: NDArray[np.int64], y: NDArray[np.int64]) -> str:

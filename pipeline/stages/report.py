@@ -29,7 +29,7 @@ def process_unit(job: Job, unit: str, settings: dict[str, Any]) -> None:
     """Write the page and the calibration report of a unit."""
     calibration, validation, diagnosis = (read_json(job.inputs[s] / f"{unit}.json") for s in STAGES)
     recordings = load_recordings(job.inputs["filter"] / f"{unit}.parquet")
-    words = {sensor: in_words(diagnosis[sensor], sensor) for sensor in SENSORS}
+    words = {sensor: in_words(diagnosis[sensor], sensor, most_values=3) for sensor in SENSORS}
     page = render(calibration, validation, diagnosis, recordings, settings, words=words)
     write_atomically(job.output / f"{unit}.html", page)
     report = certificate(calibration, validation, settings, sensor_temperature(recordings))

@@ -5,10 +5,13 @@ from __future__ import annotations
 from argparse import Namespace
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
 from all_ways import single_ways
 from judged import RIGHT, SILENT
 from run import drawn, run
+from unit_copy import Copy, NotApplicableError
+from ways_of_benches import exchanged_files
 from whole_run import run_campaign
 
 if TYPE_CHECKING:
@@ -36,6 +39,14 @@ def test_a_tenth_of_the_ways_leaves_no_silent_error_and_good_units_right(tmp_pat
 def test_there_are_at_least_150_ways() -> None:
     names = {(way.kind, way.name) for way in single_ways()}
     assert len(names) == len(single_ways()) >= 150
+
+
+@pytest.mark.parametrize(("first", "second"), [("static", "accel_x"), ("accel_x", "static")])
+def test_an_exchange_with_a_recording_that_the_unit_lacks_is_not_applicable(first: str, second: str) -> None:
+    tables = {"accel_x": {"time_s": np.zeros(1)}}
+    with pytest.raises(NotApplicableError, match="no static"):
+        exchanged_files(Copy("C1", "U1", "mpu6050", "csv", 0.01, tables, {}), first, second)
+    assert list(tables) == ["accel_x"]
 
 
 @pytest.mark.corruption

@@ -185,8 +185,8 @@ def other_validation(copy: Copy, how: str) -> None:
 
 def exchanged_files(copy: Copy, first: str, second: str) -> None:
     """Exchange two files."""
-    if second not in copy.tables:
-        raise NotApplicableError(f"no {second}")
+    if absent := [name for name in (first, second) if name not in copy.tables]:
+        raise NotApplicableError(f"no {' and '.join(absent)}")
     copy.tables[first], copy.tables[second] = copy.tables[second], copy.tables[first]
 
 

@@ -11,7 +11,7 @@ import pytest
 from playwright.sync_api import Browser, Page, sync_playwright
 
 from pipeline.report import campaign_page, unit_page
-from pipeline.report.chart import Figure, Line, Panel, chart
+from pipeline.report.chart import Figure, Line, Panel, Samples, chart
 from pipeline.report.pages import asset
 from pipeline.report.run_section import runs_data
 
@@ -40,7 +40,9 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> Path:
     words = {"accelerometer": ["Quadratic nonlinearity is missing."], "gyroscope": []}
     (folder / "unit.html").write_text(unit_page.render(*unit.arguments, words=words))
     (folder / "campaign.html").write_text(campaign_page.render("factory", fleet(), failures(), history=runs()))
-    (folder / "chart.html").write_text(one_chart())
+    x = np.linspace(0.0, 10.0, 11)
+    (folder / "chart.html").write_text(one_chart(Line(x, 3.0 * x - 1.0, 0)))
+    (folder / "samples.html").write_text(one_chart(Samples(*noisy_samples(), mean=True)))
     return folder
 
 
@@ -88,11 +90,15 @@ def failures() -> list[dict[str, Any]]:
     ]
 
 
-def one_chart() -> str:
-    """Return a page with the line y = 3 x - 1."""
-    x = np.linspace(0.0, 10.0, 11)
-    panel = Panel([Line(x, 3.0 * x - 1.0, 0)], "height, m")
-    svg = chart(Figure("line", "A line"), "It rises.", [panel], "way, km").svg
+def noisy_samples() -> tuple[np.ndarray, np.ndarray]:
+    """Return 5,000 samples: a slope with noise, which the drawing shows in 140 ranges."""
+    x = np.sort(np.random.default_rng(3).uniform(0.0, 10.0, 5000))
+    return x, x + np.random.default_rng(4).standard_normal(len(x))
+
+
+def one_chart(layer: Line | Samples) -> str:
+    """Return a page with a chart."""
+    svg = chart(Figure("line", "A line"), "It rises.", [Panel([layer], "height, m")], "way, km").svg
     legend = '<ul class="legend"><li><i class="c0"></i>the line</li></ul>'
     style, script = asset("page.css"), asset("chart.js") + asset("chart_files.js")
     figure = f"<figure>{svg}<figcaption>{legend}</figcaption></figure>"
@@ -353,6 +359,46 @@ def test_a_chart_moves_with_shift_and_is_saved_with_its_values(browser: Browser,
     head = saved.value.path().read_bytes()[:24]
     assert head.startswith(b"\x89PNG")
     assert int.from_bytes(head[16:20], "big") == 4 * 420
+    page.context.close()
+
+
+def test_a_zoom_shows_the_samples_within_it_and_the_file_holds_all(browser: Browser, pages: Path) -> None:
+    page = opened(browser, pages / "samples.html")
+    x, y = noisy_samples()
+    page.locator("svg.chart").focus()
+    drawn = page.locator("svg .layers path").first.get_attribute("d")
+    for _ in range(5):
+        page.keyboard.press("+")
+    low, high = page.evaluate("(() => { const t = [...document.querySelectorAll('svg > .ticks text')]; "
+                              "return [t[0], t.at(-1)].map((e) => +e.textContent); })()")  # fmt: skip
+    within = (x > low) & (x < high)
+    dots = page.locator("svg .dots").get_attribute("d") or ""
+    assert within.sum() <= dots.count("M") <= 5000 / 2**5 * 1.3
+    page.keyboard.press("ArrowRight")
+    at, value = (float(v) for v in re.findall(r"-?[\d.]+", page.locator(".readout").inner_text().replace("−", "-")))
+    nearest = int(np.argmin(np.abs(x - at)))
+    assert (at, value) == pytest.approx((x[nearest], y[nearest]), abs=4e-4)  # 1 / 65,534 of either axis
+    page.keyboard.press("Escape")
+    assert page.locator("svg .layers path").first.get_attribute("d") == drawn
+    with page.expect_download() as saved:
+        page.locator("figure").hover()
+        page.get_by_role("button", name="CSV").click()
+    rows = [row.split(",") for row in saved.value.path().read_text().splitlines()[1:]]
+    assert np.array([row[3:5] for row in rows], float) == pytest.approx(np.stack([x, y], 1), abs=4e-4)
+    assert left_alone(page, pages / "samples.html")
+    page.context.close()
+
+
+def test_a_wide_table_is_folded_on_a_phone_and_on_no_other_screen(browser: Browser, pages: Path) -> None:
+    page = opened(browser, pages / "campaign.html", viewport=PHONE)
+    page.locator("#all.folded").wait_for()
+    wide, shown = page.eval_on_selector(".tall", "e => [e.scrollWidth, e.clientWidth]")
+    assert wide <= shown
+    before = "e => getComputedStyle(e, '::before').content"
+    told = [page.locator(f"#all tbody tr:first-child > :nth-child({k})").evaluate(before) for k in (2, 8, 9)]
+    assert told == ['"result"', '"Accelerometer, before"', '"after"']
+    page.set_viewport_size({"width": 900, "height": 900})
+    page.locator("#all:not(.folded)").wait_for()
     page.context.close()
 
 

@@ -1,7 +1,8 @@
 "use strict";
 // Interactive charts: values at the pointer or by arrow keys, zoom by dragging, series switched off, enlarged view.
-// Values are read from the drawn paths and from data-scale (low, high, start, stop, kind, label) of each axis.
-const SVG = "http://www.w3.org/2000/svg", SUBDIVISION = 10;
+// Values are read from the drawn paths and from data-scale (low, high, start, stop, kind, label) of each axis. A zoom draws the samples
+// within it from data-full: 16-bit numbers from -32767 (low) to 32767 (high) of the axis, -32768 for none.
+const SVG = "http://www.w3.org/2000/svg", SUBDIVISION = 10, MOST = 32767, DOTS = 300, BUCKETS = 140, MEANS = 40;
 const scaleOf = (element) => {
   const [low, high, start, stop, kind, ...label] = element.dataset.scale.split(",");
   const ends = { low: +low, high: +high }, text = label.join(",").trim();
@@ -11,11 +12,11 @@ const place = (axis, value, range = axis.view) => axis.start + (value - range.lo
 const valueAt = (axis, at, range = axis.view) => range.low + (at - axis.start) / (axis.stop - axis.start) * (range.high - range.low);
 const plain = (value, digits = 4) => value === 0 ? "0" : Math.abs(value) >= 1e-4 && Math.abs(value) < 1e6 ? String(+value.toPrecision(digits)) : value.toExponential(Math.min(digits - 1, 2));
 const say = (axis, value, digits) => plain(axis.kind === "log" ? 10 ** value : value, digits).replace("-", "\u2212");
-const told = (axis, value) => { // with the digits that a coordinate of a tenth of a pixel holds
+const told = (axis, value) => { // with the digits that a coordinate holds: a tenth of a pixel, or 16 bits
   if (axis.names) return axis.names[Math.min(Math.max(Math.round(value), 1), axis.names.length) - 1];
-  const step = (axis.full.high - axis.full.low) / Math.abs(axis.stop - axis.start) / SUBDIVISION;
+  const step = (axis.full.high - axis.full.low) / (axis.exact ? 2 * MOST : Math.abs(axis.stop - axis.start) * SUBDIVISION);
   const share = axis.kind === "log" ? Math.LN10 * step : step / Math.abs(value);
-  return share >= 1 ? "0" : say(axis, value, Math.min(4, Math.max(1, Math.ceil(-Math.log10(share)))));
+  return share >= 1 ? "0" : say(axis, value, Math.min(axis.exact ? 6 : 4, Math.max(1, Math.ceil(-Math.log10(share)) + (axis.exact ? 1 : 0))));
 };
 
 function ticksOf(axis, count) {
@@ -41,18 +42,41 @@ function pointsOf(path) { // [x, low, high] of each vertex in drawing units; of 
   if (known.has(path)) return known.get(path);
   const out = [];
   let x = 0, y = 0;
-  for (const [, command, text] of path.getAttribute("d").matchAll(/([MlmhV])([^MlmhV]*)/g)) {
-    const n = text.match(/-?[\d.]+/g)?.map(Number) ?? [];
+  for (const [, command, text] of path.getAttribute("d").matchAll(/([MLlmhV])([^MLlmhV]*)/g)) {
+    const n = text.match(/-?[\d.]+(?:e-?\d+)?/g)?.map(Number) ?? [];
     if (command === "V") { out[out.length - 1][2] = n[0]; continue; }
     if (command === "h") continue;
     for (let i = 0; i < n.length; i += 2) {
-      [x, y] = command === "M" ? [n[i], n[i + 1]] : [x + n[i], y + n[i + 1]];
+      [x, y] = command === "M" || command === "L" ? [n[i], n[i + 1]] : [x + n[i], y + n[i + 1]];
       out.push([x, y, y]);
     }
   }
   path.dataset.units?.split(" ").forEach((unit, i) => { out[i].unit = unit - 1; out[i].i = i; });
   known.set(path, out);
   return out;
+}
+
+// All samples of a curve in drawing units of the full view.
+const fullOf = (element, axis) => Array.from(new Int16Array(Uint8Array.from(atob(element.dataset.full), (c) => c.charCodeAt(0)).buffer),
+  (n) => n < -MOST ? NaN : SUBDIVISION * (axis.start + (n / MOST + 1) / 2 * (axis.stop - axis.start)));
+function buckets(points, most, form) {
+  const size = Math.ceil(points.length / most), out = [];
+  for (let i = 0; i < points.length; i += size) {
+    const of = points.slice(i, i + size), heights = of.map((p) => p[1]), mean = (k) => of.reduce((sum, p) => sum + p[k], 0) / of.length;
+    out.push(form(mean(0), mean(1), Math.max(...heights), Math.min(...heights)));
+  }
+  return out;
+}
+function detail(path, x, y, zoomed) { // draws the samples of a curve within the view: as dots, or as the ranges of buckets
+  const mean = path.nextElementSibling?.matches(".mean") ? path.nextElementSibling : null, both = [path, mean].filter(Boolean);
+  for (const each of both) { each.drawn ??= each.getAttribute("d"); known.delete(each); }
+  path.full ??= fullOf(path, y);
+  const [low, high] = [x.view.low, x.view.high].map((v) => SUBDIVISION * place(x, v, x.full));
+  const points = zoomed ? path.full.map((v, i) => [x.samples[i], v]).filter(([u, v]) => u >= low && u <= high && !Number.isNaN(v)) : [];
+  const few = zoomed && points.length <= DOTS, at = few ? points.map(([u, v]) => `M${u} ${v}h0`) : buckets(points, BUCKETS, (u, _, a, b) => `M${u} ${a}V${b}`);
+  path.classList.toggle("dots", few); path.classList.toggle("strokes", !few);
+  path.setAttribute("d", zoomed ? at.join("") : path.drawn);
+  mean?.setAttribute("d", zoomed ? buckets(points, MEANS, (u, v) => `${u} ${v}`).map((p, i) => `${i ? "L" : "M"}${p}`).join("") : mean.drawn);
 }
 
 function prepare(svg) {
@@ -73,7 +97,9 @@ function prepare(svg) {
   };
   const redraw = () => {
     const sx = (x.full.high - x.full.low) / (x.view.high - x.view.low), tx = x.start - sx * place(x, x.view.low, x.full);
-    const across = ticksOf(x, 6);
+    const across = ticksOf(x, 6), zoomed = x.view.low > x.full.low || x.view.high < x.full.high;
+    if (svg.dataset.full) x.samples ??= fullOf(svg, x);
+    x.exact = zoomed && svg.dataset.full;
     xTicks.replaceChildren(...across.map(([v, text]) => label(place(x, v), xTop, text, "m")));
     for (const { y, layers, grid, ticks } of panels) {
       if (!layers.parentNode.classList.contains("clip")) { // an inner svg cuts off what lies outside
@@ -82,6 +108,9 @@ function prepare(svg) {
         layers.replaceWith(clip); clip.append(layers);
       }
       const sy = (y.full.high - y.full.low) / (y.view.high - y.view.low), ty = y.start - sy * place(y, y.view.low, y.full);
+      const curves = layers.querySelectorAll("[data-full]");
+      curves.forEach((path) => detail(path, x, y, zoomed));
+      y.exact = zoomed && curves.length;
       layers.setAttribute("transform", `translate(${tx} ${ty}) scale(${sx / SUBDIVISION} ${sy / SUBDIVISION})`);
       const few = ticksOf(y, Math.max(2, (y.start - y.stop) / 28)), up = few.length > 1 ? few : ticksOf(y, 4);
       ticks.replaceChildren(...up.map(([v, text]) => label(x.start - 4, place(y, v) + 3.5, text, "e")));
@@ -110,8 +139,8 @@ function prepare(svg) {
         const far = Math.abs(p[0] - at) + (upright === null ? 0 : Math.abs(p[1] - upright));
         if (far < least) [best, least] = [p, far];
       }
-      if (!best) continue;
       const entry = found.get(colour) ?? {};
+      if (!best || (entry.point && path.matches(".mean"))) continue; // a sample rather than the mean of many
       if (path.classList.contains("strokes")) entry.range = best; else entry.point = best;
       entry.far = least;
       found.set(colour, entry);

@@ -1,4 +1,4 @@
-// A chart as PNG, as it is shown with its finding and legend, and the values that are drawn as CSV.
+// A chart as PNG, as it is shown with its finding and legend, and its values as CSV: of a curve every sample.
 const KEPT = ["fill", "stroke", "stroke-width", "stroke-dasharray", "stroke-linecap", "opacity", "font", "text-anchor", "paint-order", "vector-effect", "display"];
 function save(blob, svg, ending) {
   const link = document.createElement("a"), page = document.title.split(":")[0];
@@ -13,11 +13,14 @@ function csvOf(figure, svg) {
   const rows = [["panel", "series", ...names ? ["unit"] : [], x.label, "value", "low", "high", ...values ? ["stated"] : []]];
   for (const group of svg.querySelectorAll(".panel")) {
     const y = scaleOf(group);
-    for (const path of group.querySelectorAll(".line, .dots, .strokes")) {
+    if (svg.dataset.full) x.samples ??= fullOf(svg, x);
+    for (const path of group.querySelectorAll(".line:not(.mean), .dots, .strokes")) {
+      const full = path.dataset.full && fullOf(path, y);
+      x.exact = y.exact = Boolean(full);
       const colour = [...path.classList].find((c) => /^c\d$/.test(c));
       const series = figure.querySelector(`.legend .${colour}`)?.parentNode.textContent.trim() ?? "";
-      for (const p of pointsOf(path)) {
-        const unit = unitAt(x, p), range = path.classList.contains("strokes"), ends = [p[1], p[2]].map((v) => read(y, v));
+      for (const p of full ? full.map((v, i) => [x.samples[i], v, v]).filter(([, v]) => !Number.isNaN(v)) : pointsOf(path)) {
+        const unit = unitAt(x, p), range = !full && path.classList.contains("strokes"), ends = [p[1], p[2]].map((v) => read(y, v));
         const place = names && p.unit === undefined ? String(unit + 1) : read(x, p[0]);
         rows.push([y.label, series, ...names ? [names[unit]] : [], place, ...range ? ["", ...y.start > y.stop && p[1] < p[2] ? ends.reverse() : ends] : [ends[0], "", ""],
           ...values ? [(values[colour] ?? values.after)[p.i ?? unit].replaceAll("\u2212", "-")] : []]);

@@ -52,3 +52,27 @@ if (contents) {
   addEventListener("scroll", () => requestAnimationFrame(follow), { passive: true });
   follow();
 }
+// On a phone, a table that is too wide shows each row as a block (page.css). The names of the columns are rules of a style sheet, as
+// the rows of a list change.
+const narrow = matchMedia("(max-width: 700px)"), names_ = document.createElement("style");
+const fit = new ResizeObserver((entries) => requestAnimationFrame(() => {
+  for (const { target } of entries) {
+    const table = target.firstElementChild;
+    if (target.clientWidth === target.fitted) continue;
+    target.fitted = target.clientWidth;
+    table.classList.remove("folded");
+    table.classList.toggle("folded", narrow.matches && target.scrollWidth > target.clientWidth + 1);
+  }
+}));
+document.querySelectorAll(".scroll").forEach((box, i) => {
+  const [first, ...others] = box.querySelectorAll("thead > tr"), last = others.pop() ?? first;
+  if (!first) return;
+  const groups = last === first ? [] : [...first.cells].flatMap((cell) => [cell.textContent.split(",")[0], ...Array(cell.colSpan - 1).fill("")]);
+  box.firstElementChild.dataset.columns = i;
+  [...last.cells].forEach((cell, k) => {
+    const lines = [groups[k], [...cell.childNodes].map((node) => node.textContent).join(" ").trim()].filter(Boolean).map((line) => line.replace(/["\\\n]/g, " "));
+    if (k) names_.append(`[data-columns="${i}"].folded > tbody > tr > :nth-child(${k + 1})::before { content: "${lines.join(", ")}"; }\n`);
+  });
+  fit.observe(box);
+});
+document.head.append(names_);
