@@ -22,7 +22,6 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from pydantic import ValidationError
 
-from pipeline.config.given import GIVEN, with_given
 from pipeline.config.options import (
     GROUPS,
     RUN_SETTINGS,
@@ -35,7 +34,14 @@ from pipeline.config.options import (
     with_references,
 )
 from pipeline.config.schema import OF_BENCH, SECTIONS, Unit
-from pipeline.config.user_effects import ONLY_FROM_THE_COMMAND_LINE, PYTHON, UserEffects, load_user_effects
+from pipeline.config.user_effects import (
+    GIVEN,
+    ONLY_FROM_THE_COMMAND_LINE,
+    PYTHON,
+    UserEffects,
+    load_user_effects,
+    with_given,
+)
 from pipeline.errors import ConfigurationError
 from pipeline.files import CONFIGS
 from pipeline.io.ingest_settings import check_ingest

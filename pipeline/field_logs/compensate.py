@@ -14,11 +14,9 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import IO, TYPE_CHECKING, Any
 
-import numpy as np
-
 from pipeline.errors import ConfigurationError, InputError, MissingInputError, PipelineError
 from pipeline.field_logs.log_checks import LogChecks
-from pipeline.io.channel_table import STRAIGHT, axis_matrix, maps_of_log
+from pipeline.io.channel_table import STRAIGHT, axis_matrix, in_body_axes, maps_of_log
 from pipeline.io.files import MESSAGE_FORMATS, not_regular
 from pipeline.io.units import ACCELEROMETER, CANONICAL, GYROSCOPE, UNITS
 from pipeline.model.compensation import SMOOTHING_S
@@ -28,6 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
 
+    import numpy as np
     from numpy.typing import NDArray
 
     from pipeline.field_logs.mcap_log import McapLog
@@ -76,12 +75,7 @@ class LogProfile:
 
     def to_body(self, sensor: str, readings: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return (n, 3) readings of a sensor in the body's axes."""
-        axis_map = tuple(self.axis_maps.get(sensor, STRAIGHT))
-        if axis_map == STRAIGHT:
-            return readings
-        matrix = axis_matrix(axis_map)
-        turned: NDArray[np.float64] = readings[:, np.argmax(np.abs(matrix), axis=1)] * matrix.sum(axis=1)
-        return turned
+        return in_body_axes(self.axis_maps.get(sensor, STRAIGHT), readings)
 
 
 @dataclass

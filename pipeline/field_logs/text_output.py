@@ -21,6 +21,7 @@ from pipeline.errors import InputError
 from pipeline.field_logs.compensate import Block
 from pipeline.field_logs.log_checks import DECIMALS
 from pipeline.io.arrow import text_scalar, times_as_decimals, to_arrow, to_numpy
+from pipeline.io.channel_table import in_house_unit
 from pipeline.io.csv_layout import Layout, find_faults
 from pipeline.io.ingest_settings import csv_formats, mcap_format
 from pipeline.io.text_log import TextLog
@@ -33,9 +34,8 @@ from pipeline.io.units import (
     SINCE_1970_NS,
     TRIADS,
     UNITS,
-    to_house_unit,
 )
-from pipeline.records import SENSORS, Encoding
+from pipeline.records import SENSORS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -182,7 +182,11 @@ class CsvLog:
             except pa.ArrowInvalid as error:
                 raise self._refusal(body, lines, str(error)) from None
             for k, channel in enumerate(SIGNALS[signal]):
-                numbers[:, k] = _in_house_unit(self.columns[channel], numbers[:, k])
+                column = self.columns[channel]
+                if channel != "time" or column.unit == COUNTS:
+                    numbers[:, k] = in_house_unit(column, numbers[:, k])
+                else:
+                    numbers[:, k] /= SECOND_NS / UNITS["time"][column.unit][0]
             out[signal] = self.profile.to_body(signal, numbers) if signal in SENSORS else numbers[:, 0]
         if self.settings.rate_hz is not None:
             out["time"] = np.arange(rows, rows + len(lines)) / self.settings.rate_hz
@@ -241,16 +245,6 @@ def _index(column: Column, names: list[str]) -> int | None:
     if isinstance(column.column, int):
         return column.column if column.column < len(names) else None
     return names.index(column.column) if column.column in names else None
-
-
-def _in_house_unit(column: Column, numbers: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return values in g, deg/s, degC or s."""
-    if column.unit == COUNTS:
-        return Encoding(1.0 / column.counts_per_unit, column.offset).decode(numbers)
-    if column.channel == "time":
-        multiplier, divisor = UNITS["time"][column.unit]
-        return numbers / (SECOND_NS * divisor / multiplier)
-    return to_house_unit(column.channel, numbers, column.unit)
 
 
 def _digits(values: NDArray[np.float64], decimal: str) -> pa.Array:

@@ -14,15 +14,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import ConfigurationError
-from pipeline.io.units import TRIADS
-from pipeline.records import AXES, Note
+from pipeline.io.units import COUNTS, TRIADS, to_house_unit
+from pipeline.records import AXES, Encoding, Note
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from pipeline.records import Encoding
+    from pipeline.io.ingest_settings import ChannelSource
+
 STRAIGHT = ("+x", "+y", "+z")
 
 
@@ -55,12 +56,11 @@ class ChannelTable:
         return Note(code, int(rows.size), self.line_of(first), self.line_of(last), detail, start, end)
 
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from numpy.typing import NDArray
-
-    from pipeline.io.channel_table import ChannelTable
+def in_house_unit(source: ChannelSource, numbers: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the numbers of a channel (not the time) in g, deg/s, deg or degC."""
+    if source.unit == COUNTS:
+        return Encoding(1.0 / source.counts_per_unit, source.offset).decode(numbers)
+    return to_house_unit(source.channel, numbers, source.unit)
 
 
 def axis_matrix(axis_map: Sequence[str]) -> NDArray[np.float64]:
@@ -87,6 +87,15 @@ def maps_of_log(log: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
     """Return the axis maps in the section ``log`` of a calibration: one a sensor, in older files one for both."""
     stated = log.get("axis_map") or STRAIGHT
     return {s: tuple(stated[s] if isinstance(stated, dict) else stated) for s in TRIADS}
+
+
+def in_body_axes(axis_map: Sequence[str], readings: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (n, 3) readings in the body's axes; the same array where the map is straight."""
+    if tuple(axis_map) == STRAIGHT:
+        return readings
+    matrix = axis_matrix(axis_map)
+    turned: NDArray[np.float64] = readings[:, np.argmax(np.abs(matrix), axis=1)] * matrix.sum(axis=1)
+    return turned
 
 
 def to_body_axes(table: ChannelTable, maps: Mapping[str, Sequence[str]]) -> ChannelTable:

@@ -28,19 +28,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.errors import IngestError
-from pipeline.io.channel_table import ChannelTable, to_body_axes
+from pipeline.io.channel_table import ChannelTable, in_house_unit, to_body_axes
 from pipeline.io.csv_rows import read_rows
 from pipeline.io.csv_times import in_order, times_of
 from pipeline.io.files import refuse_foreign, unchanged
 from pipeline.io.ingest_settings import Checks, Column, CsvFormat
-from pipeline.io.units import ATTITUDE, CANONICAL, COUNTS, DEGREES, SCALARS, TRIADS, UNITS, to_house_unit
+from pipeline.io.units import ATTITUDE, CANONICAL, COUNTS, DEGREES, SCALARS, TRIADS, UNITS
 from pipeline.records import Encoding, Note
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from numpy.typing import NDArray
 
 TABLE_TIME = "table_time"
 FIRST_LINES = (b"GYROFLOW IMU LOG", b"CAMERA IMU LOG")
@@ -73,9 +72,10 @@ def _read_one(path: Path, settings: CsvFormat, checks: Checks) -> ChannelTable:
     values, encodings = {}, {}
     for column, index in rows.layout.columns:
         if column.channel != "time":
-            values[column.channel], encoding = _channel(column, rows.numbers[index])
-            if encoding is not None:
-                encodings[column.channel] = encoding
+            numbers = rows.numbers[index]
+            values[column.channel] = in_house_unit(column, numbers)
+            if column.unit == COUNTS and bool(np.all(numbers == np.rint(numbers))):
+                encodings[column.channel] = Encoding(1.0 / column.counts_per_unit, column.offset)
     lines = rows.lines
     return ChannelTable(
         path=rows.layout.path,
@@ -87,15 +87,6 @@ def _read_one(path: Path, settings: CsvFormat, checks: Checks) -> ChannelTable:
         notes=notes,
         flags=rows.flags,
     )
-
-
-def _channel(column: Column, numbers: NDArray[np.float64]) -> tuple[NDArray[np.float64], Encoding | None]:
-    """Return a channel's values in its unit of the package and, for whole counts, how they are encoded."""
-    if column.unit != COUNTS:
-        return to_house_unit(column.channel, numbers, column.unit), None
-    encoding = Encoding(scale=1.0 / column.counts_per_unit, offset=column.offset)
-    whole = bool(np.all(numbers == np.rint(numbers)))
-    return encoding.decode(numbers), encoding if whole else None
 
 
 def _joined(tables: Sequence[ChannelTable]) -> ChannelTable:

@@ -15,12 +15,13 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 
 from pipeline.errors import IngestError
+from pipeline.io.channel_table import in_house_unit
 from pipeline.io.field_path import ONLY, FieldPath
 from pipeline.io.ingest_settings import HEADER, TIME, MappedField
 from pipeline.io.message_decoder import Batch, ChannelDecoder, Wanted
 from pipeline.io.message_layout import short_name
 from pipeline.io.ros2_messages import IMU, JOINT_STATE, QUATERNION_STAMPED, TEMPERATURE, VECTORS
-from pipeline.io.units import ATTITUDE, COUNTS, SPELLINGS, TRIADS, UNITS, to_house_unit
+from pipeline.io.units import ATTITUDE, COUNTS, SPELLINGS, TRIADS, UNITS
 from pipeline.records import Encoding
 
 if TYPE_CHECKING:
@@ -111,7 +112,7 @@ class TopicDecoder:
         if self.kind == IMU and absent >= set(VECTORS):
             message = f"topic {self.topic} says that both quantities are absent (covariance -1)"
             raise IngestError(message, self.path, code="absent")
-        values = {c: self._in_unit(c, batch.values[c]) for c in self.fields if c not in absent}
+        values = {c: in_house_unit(self.fields[c], batch.values[c]) for c in self.fields if c not in absent}
         return Batch(batch.time_ns, values)
 
     def _check_units(self, stated: Mapping[str, str]) -> None:
@@ -134,11 +135,6 @@ class TopicDecoder:
             what = f"{name} is absent (covariance -1)" if covariance else f"{self.wanted.values[name].text} is empty"
             message = f"{what} in some messages on {self.topic}, see message {self.count + int(changed[0]) + 1}"
             raise IngestError(message, self.path, code="absent" if covariance else "bad_message")
-
-    def _in_unit(self, channel: str, numbers: NDArray[np.float64]) -> NDArray[np.float64]:
-        if channel in self.encodings:
-            return self.encodings[channel].decode(numbers)
-        return to_house_unit(channel, numbers, self.fields[channel].unit)
 
 
 def _fields_of(kind: str, settings: McapFormat) -> dict[str, MappedField]:
