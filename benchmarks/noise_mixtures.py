@@ -25,7 +25,7 @@ from scipy.signal import fftconvolve, lfilter
 from scipy.stats import beta
 
 from pipeline.estimation.noise_identification import identify_noise
-from pipeline.estimation.noise_likelihood import spectrum_of
+from pipeline.estimation.noise_likelihood import solved, spectrum_of
 from pipeline.estimation.noise_search import Search, best_of, count_of
 from pipeline.estimation.noise_terms import STOCHASTIC
 from pipeline.records import Recording
@@ -111,7 +111,7 @@ def long_enough(n: int, dt: float, terms: list[Term]) -> bool:
     ramp = sum(size for letter, size, *_ in terms if letter == "R")
     waves = [g(2.0 * np.pi * f * t) for _, f, _ in sines for g in (np.cos, np.sin)]
     exact = ramp * t + sum((a * np.cos(2.0 * np.pi * f * t + p) for a, f, p in sines), np.zeros(n))
-    spectrum = spectrum_of([np.stack([exact, t / t[-1], *waves], axis=1)], dt)
+    spectrum = spectrum_of([np.stack([exact, t / t[-1], *waves], axis=1)[None]], dt)
     w = spectrum.omega
     s = 2.0 * np.sin(w / 2.0)
     noise = np.zeros_like(w)
@@ -121,7 +121,7 @@ def long_enough(n: int, dt: float, terms: list[Term]) -> bool:
             noise += size**2 * (1.0 - phi**2) / (1.0 + phi**2 - 2.0 * phi * np.cos(w))
         elif letter not in "RS":
             noise += size**2 * {"Q": s**2 / dt**2, "N": 1.0 / dt + 0.0 * s, "B": 1.0 / s, "K": dt / s**2}[letter]
-    spectrum.products[:, 0, 0] += noise * spectrum.count
+    spectrum.products[0, :, 0, 0] += noise * spectrum.count
     required, penalty = tuple(range(2, 2 + len(waves))), np.log(n - 1)
     for j in range(len(sines)):  # each sinusoid by itself
         gain = sines[j][0] ** 2 * n / (2.0 * np.interp(2.0 * np.pi * sines[j][1] * dt, w, noise))
@@ -133,9 +133,9 @@ def long_enough(n: int, dt: float, terms: list[Term]) -> bool:
     columns = (*required, 1) if ramp else required
     order = sorted((term for term in terms if term[0] not in "RS"), key=lambda x: STOCHASTIC.index(NAMES[x[0]]))
     truth = np.array([2.0 * np.log(x[1]) for x in order] + [np.log(x[2]) if x[0] == "G" else 0.0 for x in order])
-    search = Search(spectrum)
-    search.fit(spectrum.with_columns(columns), [(kinds, truth)], columns)
-    best = best_of(search, required, [1])
+    search = Search(spectrum, 0)
+    solved(spectrum, search.fit([(kinds, truth)], columns))
+    best = solved(spectrum, best_of(search, required, [1]))
     if (best.kinds, best.columns) != (kinds, columns):
         return False
     for other in search.found.values():

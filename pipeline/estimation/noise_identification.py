@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.estimation.noise_likelihood import at_once, solved, spectrum_of
 from pipeline.estimation.noise_regression import Regression, Stretch
-from pipeline.estimation.noise_search import QUANTILE, fitted, intervals, ranked, upper_limits
+from pipeline.estimation.noise_search import QUANTILE, Search, best_of, limits, ranked
 from pipeline.estimation.noise_terms import MARKOV, SINGLE, STOCHASTIC, WHITE, allan_variance, each_term, unit_of
 from pipeline.records import AXES, SENSOR_UNITS
 from pipeline.signal.allan import allan_deviation
@@ -80,7 +81,7 @@ def identify_noise(sensor: str, recordings: Sequence[Recording]) -> JSON:
         "samples": _samples(stretches),
         "sampling_interval_s": interval,
         "length_s": float(interval * max(len(s.time) for s in stretches)),
-        "axes": {a: _axis(SENSOR_UNITS[sensor], stretches, c, interval, single=single) for c, a in enumerate(AXES)},
+        "axes": _axes(SENSOR_UNITS[sensor], stretches, interval, single=single),
         "doubts": [OF_RESTS] if source == "rests" else [],
     }
 
@@ -122,24 +123,49 @@ def _rests(sensor: str, recording: Recording) -> list[Stretch]:
     return [Stretch(time, reading) for time, reading in found if len(time) >= SHORTEST]
 
 
-def _axis(unit: str, stretches: list[Stretch], column: int, interval: float, *, single: bool) -> JSON:
+def _axes(unit: str, stretches: list[Stretch], interval: float, *, single: bool) -> JSON:
+    """Return the noise of each axis; all are fitted side by side."""
+    steps = [np.concatenate([np.abs(np.diff(s.reading[:, c])) for s in stretches]) for c in range(3)]
+    scales = [float(np.sqrt(np.mean(step**2) / 2.0)) for step in steps]  # the standard deviation, if it is white
+    axes = [c for c, scale in enumerate(scales) if scale > 0.0]
+    still = {"terms": None, "reason": "the readings do not change: the noise is below one count"}
+    if not axes:
+        return dict.fromkeys(AXES, still)
+    regressions = [Regression(stretches, c, interval, scales[c], single=single) for c in axes]
+    columns = [[r.columns(s) for r in regressions] for s in stretches]
+    most = max(values.shape[1] for values in columns[0])  # an axis with fewer sinusoids has columns of zeros
+    padded = [np.stack([np.pad(v, ((0, 0), (0, most - v.shape[1]))) for v in of_axes]) for of_axes in columns]
+    spectrum = spectrum_of(padded, interval)
+    searches = [Search(spectrum, i) for i in range(len(axes))]
+    optional = range(1, 1 + len(regressions[0].optional))
+    pairs = zip(searches, regressions, strict=True)
+    best = solved(spectrum, at_once([best_of(search, r.required(), optional) for search, r in pairs]))
+    bounds = solved(spectrum, at_once([limits(spectrum, candidate) for candidate in best]))
+    found = dict.fromkeys(AXES, still)
+    for c, regression, search, candidate, bound in zip(axes, regressions, searches, best, bounds, strict=True):
+        count = float(steps[c][steps[c] > 1e-9 * scales[c]].min())
+        found[AXES[c]] = _axis(unit, regression, search, candidate, bound, count)
+    return found
+
+
+def _axis(  # noqa: PLR0917  (what was found of an axis)
+    unit: str,
+    regression: Regression,
+    search: Search,
+    best: Candidate,
+    bounds: tuple[Values, dict[int, float]],
+    count: float,
+) -> JSON:
     """Return the noise of one axis."""
-    steps = np.concatenate([np.abs(np.diff(s.reading[:, column])) for s in stretches])
-    scale = float(np.sqrt(np.mean(steps**2) / 2.0))  # the standard deviation, if it is white
-    if scale == 0.0:
-        return {"terms": None, "reason": "the readings do not change: the noise is below one count"}
-    regression = Regression(stretches, column, interval, scale, single=single)
-    search, best, spectrum = regression.solve()
-    fit = fitted(spectrum, best)
-    p_value = _p_value(spectrum, fit)
+    spectrum = search.spectrum
+    p_value = _p_value(spectrum, best.fit)
     doubts = []
     if p_value < IMPLAUSIBLE:
         doubts.append(f"no composition fits the spectrum (p = {p_value:.1g}): a filter, vibration or a disturbance")
-    count = float(steps[steps > 1e-9 * scale].min())
-    if scale < COARSE * count:
+    if regression.scale < COARSE * count:
         doubts.append(f"the readings are rounded to {count:.3g} {unit}, which is coarser than their noise")
-    terms = _terms(unit, spectrum, best, scale, regression.names(best)) | regression.terms(unit, best, fit)
-    longest = max(stretches, key=lambda s: len(s.time))
+    terms = _terms(unit, spectrum, best, bounds, regression) | regression.terms(unit, best, spectrum)
+    longest = max(regression.stretches, key=lambda s: len(s.time))
     return {
         "terms": terms,
         "reason": None,
@@ -148,33 +174,33 @@ def _axis(unit: str, stretches: list[Stretch], column: int, interval: float, *, 
             for c, probability in ranked(search)
         ],
         "p_value": p_value,
-        "allan": _allan(longest.reading[:, column], interval, terms, fit, spectrum),
+        "allan": _allan(longest.reading[:, regression.column], terms, best, spectrum),
         "doubts": doubts,
     }
 
 
-def _allan(values: Values, interval: float, terms: JSON, fit: Fits, spectrum: Spectrum) -> JSON:
+def _allan(values: Values, terms: JSON, best: Candidate, spectrum: Spectrum) -> JSON:
     """Return the Allan deviation of the readings, and that of the terms with its 95 % band.
 
     The band is that of the logarithm, from the covariance of the terms: the parameters of the stochastic ones are
     logarithms of squared coefficients, in which the derivative of the variance is the part of the term itself.
     """
-    tau, measured = allan_deviation(values, interval, PER_DECADE)
-    tau, measured = (v[tau <= SHOWN * len(values) * interval] for v in (tau, measured))
+    tau, measured = allan_deviation(values, spectrum.interval, PER_DECADE)
+    tau, measured = (v[tau <= SHOWN * len(values) * spectrum.interval] for v in (tau, measured))
     parts = [(name, term, allan_variance(name, term, tau)) for name, term in each_term(terms)]
     total = np.sum([part for _, _, part in parts], axis=0)
-    kinds, times = fit.kinds[0], fit.parameters[0, fit.kinds.shape[1] :]
+    kinds, times = best.kinds, best.parameters[len(best.kinds) :]
     # each kind's terms in the order in which they are published
-    waiting = {kind: [(t, v) for name, t, v in parts if name == STOCHASTIC[kind]] for kind in set(kinds.tolist())}
-    by_size, by_time = np.zeros((2, len(kinds), len(tau)))
+    waiting = {kind: [(t, v) for name, t, v in parts if name == STOCHASTIC[kind]] for kind in set(kinds)}
+    by_size, by_time = np.zeros((2, best.fit.kinds.shape[1], len(tau)))
     for j in np.argsort(times, kind="stable"):
-        term, by_size[j] = waiting[int(kinds[j])].pop(0)
+        term, by_size[j] = waiting[kinds[j]].pop(0)
         if kinds[j] == MARKOV:
             longer = {"value": STEP * term["correlation_time_s"]["value"]}
             changed = allan_variance(STOCHASTIC[MARKOV], {**term, "correlation_time_s": longer}, tau)
             by_time[j] = (changed - by_size[j]) / np.log(STEP)
     jacobian = np.concatenate([by_size, by_time]) / total
-    covariance = fit.covariance(spectrum.count)[0]
+    covariance = best.fit.covariance(spectrum.count)[0]
     variance = np.maximum(np.einsum("it,ij,jt->t", jacobian, covariance, jacobian), 0.0)
     for name, term, part in parts:
         if name not in STOCHASTIC:  # ramp and sinusoid: their square by their own interval
@@ -201,12 +227,14 @@ def _p_value(spectrum: Spectrum, fit: Fits) -> float:
 
     spread = 2.0 / (9.0 * spectrum.count)
     z = (np.cbrt(fit.power[0] / fit.total[0] / spectrum.count) - 1.0 + spread) / np.sqrt(spread)
-    return float(chdtrc(max(len(z) - fit.kinds.shape[1], 1), float(z @ z)))
+    return float(chdtrc(max(len(z) - int(np.sum(fit.kinds >= 0)), 1), float(z @ z)))
 
 
-def _terms(unit: str, spectrum: Spectrum, best: Candidate, scale: float, names: Sequence[str]) -> JSON:
+def _terms(
+    unit: str, spectrum: Spectrum, best: Candidate, bounds: tuple[Values, dict[int, float]], regression: Regression
+) -> JSON:
     """Return the stochastic terms."""
-    within, limits = intervals(spectrum, best), upper_limits(spectrum, best)
+    (within, upper), scale, names = bounds, regression.scale, regression.names(best)
     kinds, n = best.kinds, len(best.kinds)
     out: JSON = {}
     for kind in SINGLE:
@@ -217,7 +245,7 @@ def _terms(unit: str, spectrum: Spectrum, best: Candidate, scale: float, names: 
             out[name] = term | _coefficient(best.parameters[j], within[:, j], scale)
         else:
             reason = _reason(kind, names, spectrum)
-            out[name] = term | {"reason": reason, "upper_limit": scale * float(np.sqrt(limits[kind]))}
+            out[name] = term | {"reason": reason, "upper_limit": scale * float(np.sqrt(upper[kind]))}
     out[STOCHASTIC[MARKOV]] = [
         {"unit": unit}
         | _coefficient(best.parameters[j], within[:, j], scale)

@@ -8,24 +8,25 @@ unknown start exactly, and that of the other terms up to the ends of the recordi
 
 where z are the transforms of what is deterministic (ramp, sinusoids, temperature), beta follows by generalised least
 squares, and the last term makes the likelihood a restricted one. The mean is k = 0 and drops out. Sums over the
-coefficients are formed once, in bins of equal ratio ``RATIO`` of frequency; many settings are fitted side by side by
-Fisher scoring with the damping of Levenberg and Marquardt.
+coefficients are formed once, in bins of equal ratio ``RATIO`` of frequency. Fits of all axes, compositions and columns
+run side by side, by Fisher scoring with the damping of Levenberg and Marquardt: a search is a generator that yields the
+``Trial``s it needs next and receives their ``Fits``; ``at_once`` joins the searches that do not wait for each other.
 
 Sources: Strang, SIAM Review 41, 1999 (the transform); Whittle 1953; Patterson & Thompson, Biometrika 58, 1971.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 
 from pipeline.estimation.noise_terms import MARKOV, fixed_shapes, markov_shape
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Generator, Sequence
 
     from numpy.typing import NDArray
 
@@ -38,17 +39,19 @@ ITERATIONS, PRECISE = 40, 1e-2  # of -2 log L, promised or gained by the last st
 LARGEST_DAMPING = 1e4
 LOG_LEAST = -690.0  # of a squared coefficient: above the smallest double
 
+Composition = tuple[int, ...]  # kinds of the stochastic terms, in rising order
+
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Coefficients of one axis in bins of frequency.
+    """Coefficients of the axes in bins of frequency.
 
     Attributes
     ----------
     omega, count : (b,) arrays
         Mean of w in rad a sample, and coefficients, of each bin.
-    products : (b, c, c) array
-        Sums over each bin of the products of y and the deterministic columns, in this order.
+    products : (a, b, c, c) array
+        Sums over each bin of the products of y and the deterministic columns, in this order, of each of a axes.
     interval, length : float, s
         Between samples, and of the longest stretch without a gap.
     """
@@ -66,34 +69,40 @@ class Spectrum:
 
     @property
     def size(self) -> float:
-        """Number of coefficients."""
+        """Number of coefficients of an axis."""
         return float(self.count.sum())
-
-    def with_columns(self, columns: Sequence[int]) -> Spectrum:
-        """Return the spectrum with only these of the deterministic columns, counted from 1."""
-        index = [0, *columns]
-        return replace(self, products=self.products[:, index][:, :, index])
 
 
 def spectrum_of(stretches: Sequence[Values], interval: float) -> Spectrum:
-    """Return the spectrum of stretches of samples: (n, c) arrays, readings first, then deterministic columns."""
+    """Return the spectrum of stretches of samples: (a, n, c) arrays, readings first, then deterministic columns."""
     from scipy.fft import dct  # noqa: PLC0415  (0.1 s)
 
-    omega, rows = [], []
-    for values in stretches:
-        n = len(values)
-        rows.append(dct(values - values.mean(axis=0), axis=0, norm="ortho")[1:])
-        omega.append(np.pi * np.arange(1, n) / n)
-    w, y = np.concatenate(omega), np.concatenate(rows)
+    rows = [
+        dct(values - values.mean(axis=1, keepdims=True), axis=1, norm="ortho", overwrite_x=True)[:, 1:]
+        for values in stretches
+    ]
+    w = np.concatenate([np.pi * np.arange(1, values.shape[1]) / values.shape[1] for values in stretches])
+    y = rows[0] if len(rows) == 1 else np.concatenate(rows, axis=1)
     if len(stretches) > 1:
         order = np.argsort(w, kind="stable")
-        w, y = w[order], y[order]
+        w, y = w[order], y[:, order]
     bins = np.floor(np.log(w / w[0]) / np.log(RATIO) + 1e-9)
     first = np.flatnonzero(np.diff(bins, prepend=-1.0))
     count = np.diff(np.append(first, len(w))).astype(np.float64)
-    products = np.add.reduceat(y[:, :, None] * y[:, None, :], first)
-    length = interval * max(len(values) for values in stretches)
+    parts = np.split(y, first[1:], axis=1)
+    products = np.stack([part.transpose(0, 2, 1) @ part for part in parts], axis=1)
+    length = interval * max(values.shape[1] for values in stretches)
     return Spectrum(np.add.reduceat(w, first) / count, count, products, interval, length)
+
+
+class Trial(NamedTuple):
+    """A sum of terms to be fitted: axis, terms, numbers of its deterministic columns from 1, and the start."""
+
+    axis: int
+    kinds: Composition
+    columns: tuple[int, ...]
+    parameters: Values  # (2 k,); of k terms the logarithms of the squared coefficients, then of the correlation times
+    held: int | None = None  # parameter that keeps its start
 
 
 @dataclass(frozen=True)
@@ -102,17 +111,22 @@ class Fits:
 
     Attributes
     ----------
+    axis : (g,) array of int
     kinds : (g, J) array of int
         Of ``noise_terms.STOCHASTIC``; -1 for none.
+    columns : (g, d) array of bool
+        Which of the deterministic columns are fitted.
     parameters : (g, 2 J) array
         Logarithms of the squared coefficients, then of the correlation times.
     deviance, unrestricted : (g,) arrays
         -2 log L with and without the determinant of the deterministic columns.
     beta, beta_covariance : (g, d), (g, d, d) arrays
-        Of the deterministic columns.
+        Of the deterministic columns; zeros of those that are not fitted.
     """
 
+    axis: NDArray[np.int64]
     kinds: NDArray[np.int64]
+    columns: NDArray[np.bool_]
     parameters: Values
     deviance: Values
     unrestricted: Values
@@ -122,14 +136,19 @@ class Fits:
     beta: Values
     beta_covariance: Values
 
-    def rows(self, index: NDArray[np.int64] | NDArray[np.bool_]) -> Fits:
+    def rows(self, index: NDArray[np.int64] | NDArray[np.bool_] | slice) -> Fits:
         """Return some of the fits."""
-        return Fits(**{f.name: getattr(self, f.name)[index] for f in fields(Fits)})
+        return Fits(*(getattr(self, name)[index] for name in NAMES))
 
     def replace(self, index: NDArray[np.int64], others: Fits) -> None:
         """Put other fits in the place of some."""
-        for f in fields(Fits):
-            getattr(self, f.name)[index] = getattr(others, f.name)
+        for name in NAMES[3:]:
+            getattr(self, name)[index] = getattr(others, name)
+
+    def own(self, row: int = 0) -> Values:
+        """Return the parameters of one fit as of ``Trial.parameters``."""
+        k, terms = int(np.sum(self.kinds[row] >= 0)), self.kinds.shape[1]
+        return self.parameters[row, [*range(k), *range(terms, terms + k)]]
 
     def information(self, count: Values) -> Values:
         """Return the Fisher information of the parameters: (g, 2 J, 2 J) array; 1 on the diagonal for absent ones."""
@@ -143,68 +162,144 @@ class Fits:
         return np.asarray(np.linalg.inv(self.information(count)), np.float64)
 
 
+NAMES = tuple(f.name for f in fields(Fits))
+Result = TypeVar("Result")
+if TYPE_CHECKING:
+    Work = Generator[list[Trial], Fits, Result]  # yields trials, receives their fits, returns a result
+
+
 def active(kinds: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Return which parameters of (g, J) terms there are: (g, 2 J) array."""
     return np.concatenate([kinds >= 0, kinds == MARKOV], axis=1)
 
 
-def evaluate(spectrum: Spectrum, kinds: NDArray[np.int64], parameters: Values) -> Fits:
-    """Return likelihood and derivatives at parameters."""
+def at_once(works: Sequence[Work[Result]]) -> Work[list[Result]]:
+    """Yield the trials of several generators together; return their results."""
+    results: dict[int, Result] = {}
+    replies: dict[int, Fits | None] = dict.fromkeys(range(len(works)))
+    while True:
+        asked: dict[int, list[Trial]] = {}
+        for i, reply in replies.items():
+            try:
+                asked[i] = works[i].send(reply)  # type: ignore[arg-type]  (None starts a generator)
+            except StopIteration as end:
+                results[i] = end.value
+        if not asked:
+            return [results[i] for i in range(len(works))]
+        fits = yield [trial for trials in asked.values() for trial in trials]
+        replies, at = {}, 0
+        for i, trials in asked.items():
+            replies[i] = fits.rows(slice(at, at + len(trials)))
+            at += len(trials)
+
+
+def solved(spectrum: Spectrum, work: Work[Result]) -> Result:
+    """Maximise the likelihood of all trials that a generator yields; return its result."""
+    reply: Fits | None = None
+    while True:
+        try:
+            reply = maximised(spectrum, work.send(reply))  # type: ignore[arg-type]
+        except StopIteration as end:
+            found: Result = end.value
+            return found
+
+
+def evaluate(spectrum: Spectrum, trials: Sequence[Trial]) -> Fits:
+    """Return likelihood and derivatives at the parameters of trials."""
+    axis, kinds, columns, parameters, _ = _packed(spectrum, trials)
+    return _evaluated(spectrum, axis, kinds, columns, parameters)
+
+
+def _packed(spectrum: Spectrum, trials: Sequence[Trial]) -> tuple[NDArray[np.int64], ...]:
+    """Return axis, kinds, columns and parameters of trials as of ``Fits``, and which parameters are free."""
+    g, terms = len(trials), max(len(trial.kinds) for trial in trials)
+    kinds, parameters = np.full((g, terms), -1), np.zeros((g, 2 * terms))
+    columns = np.zeros((g, spectrum.products.shape[2]), bool)
+    for i, trial in enumerate(trials):
+        k = len(trial.kinds)
+        kinds[i, :k] = trial.kinds
+        parameters[i, :k], parameters[i, terms : terms + k] = trial.parameters[:k], trial.parameters[k:]
+        columns[i, list(trial.columns)] = True
+    free = active(kinds)
+    for i, trial in enumerate(trials):
+        if trial.held is not None:
+            k = len(trial.kinds)
+            free[i, trial.held if trial.held < k else terms + trial.held - k] = False
+    return np.array([trial.axis for trial in trials]), kinds, columns[:, 1:], parameters, free
+
+
+def _evaluated(
+    spectrum: Spectrum,
+    axis: NDArray[np.int64],
+    kinds: NDArray[np.int64],
+    columns: NDArray[np.bool_],
+    parameters: Values,
+) -> Fits:
     terms = kinds.shape[1]
     theta, log_time = parameters[:, :terms], parameters[:, terms:]
     shapes = np.where((kinds >= 0)[:, :, None], spectrum.shapes[np.clip(kinds, 0, MARKOV - 1)], 0.0)
-    by_time = np.zeros_like(shapes)
+    slopes = np.zeros((len(kinds), 2 * terms, len(spectrum.omega)))
     markov = kinds == MARKOV
-    if markov.any():
-        shapes[markov], by_time[markov] = markov_shape(spectrum.omega, spectrum.interval, log_time[markov])
     size = np.exp(theta)[:, :, None]
-    total = np.sum(size * shapes, axis=1)
-    slopes = np.concatenate([size * shapes, size * by_time], axis=1) / total[:, None, :]
-    products, weight = spectrum.products, 1.0 / total
-    d, g = products.shape[1] - 1, len(kinds)
-    power, determinant = np.tile(products[:, 0, 0], (g, 1)), np.zeros(g)
-    beta, inverse = np.zeros((g, d)), np.zeros((g, d, d))
-    restricted = power
-    if d:
-        sums = (weight @ products.reshape(len(products), -1)).reshape(g, d + 1, d + 1)
-        inner = sums[:, 1:, 1:]
-        inverse, determinant = np.linalg.inv(inner), np.linalg.slogdet(inner)[1]
-        beta = np.einsum("gij,gj->gi", inverse, sums[:, 1:, 0])
-        signed = np.concatenate([np.ones((g, 1)), -beta], axis=1)
-        outer = (signed[:, :, None] * signed[:, None, :]).reshape(g, -1)
-        power = np.maximum(outer @ products.reshape(len(products), -1).T, 0.0)
-        restricted = power + inverse.reshape(g, -1) @ products[:, 1:, 1:].reshape(len(products), -1).T
+    if markov.any():
+        shapes[markov], by_time = markov_shape(spectrum.omega, spectrum.interval, log_time[markov])
+        slopes[:, terms:][markov] = size[markov] * by_time
+    shapes *= size
+    total = shapes.sum(axis=1)
+    slopes[:, :terms] = shapes
+    slopes /= total[:, None, :]
+    weight, (g, d) = 1.0 / total, columns.shape
+    power, determinant = spectrum.products[axis, :, 0, 0], np.zeros(g)
+    beta, covariance, restricted = np.zeros((g, d)), np.zeros((g, d, d)), power
+    used = np.flatnonzero(columns.any(axis=0))
+    if used.size:
+        restricted = power.copy()
+        index, n = np.append(0, used + 1), len(used)
+        unused = ~columns[:, used]
+        for a in np.unique(axis):
+            own = np.flatnonzero(axis == a)
+            products = spectrum.products[a][:, index[:, None], index].reshape(-1, (n + 1) ** 2)
+            sums = (weight[own] @ products).reshape(-1, n + 1, n + 1)
+            gone = unused[own]
+            absent = np.zeros((len(own), n, n))
+            absent[:, range(n), range(n)] = gone
+            inner = np.where(gone[:, :, None] | gone[:, None, :], absent, sums[:, 1:, 1:])
+            inverse, determinant[own] = np.linalg.inv(inner) - absent, np.linalg.slogdet(inner)[1]
+            signed = np.concatenate([np.ones((len(own), 1)), -np.einsum("gij,gj->gi", inverse, sums[:, 1:, 0])], axis=1)
+            outer = signed[:, :, None] * signed[:, None, :]
+            power[own] = np.maximum(outer.reshape(len(own), -1) @ products.T, 0.0)
+            outer[:, 1:, 1:] += inverse
+            restricted[own] = outer.reshape(len(own), -1) @ products.T
+            beta[own[:, None], used], covariance[own[:, None, None], used[:, None], used] = -signed[:, 1:], inverse
     unrestricted = np.log(total) @ spectrum.count + np.sum(power * weight, axis=1)
-    return Fits(kinds, parameters, unrestricted + determinant, unrestricted, total, restricted, slopes, beta, inverse)
+    return Fits(
+        axis, kinds, columns, parameters, unrestricted + determinant, unrestricted, total, restricted, slopes, beta,
+        covariance,
+    )  # fmt: skip
 
 
-def maximised(
-    spectrum: Spectrum, kinds: NDArray[np.int64], start: Values, held: NDArray[np.bool_] | None = None
-) -> Fits:
-    """Maximise the restricted likelihood of g sums of terms.
-
-    ``start``: (g, 2 J), see ``Fits.parameters``; ``held``: (g, 2 J), parameters that keep their start.
-    """
+def maximised(spectrum: Spectrum, trials: Sequence[Trial]) -> Fits:
+    """Maximise the restricted likelihood of trials."""
+    axis, kinds, columns, start, free = _packed(spectrum, trials)
     terms = kinds.shape[1]
     low = np.log(spectrum.interval)
     high = max(np.log(LONGEST_TIME * spectrum.length), low + 1e-6)
-    free = active(kinds) if held is None else active(kinds) & ~held
-    best = evaluate(spectrum, kinds, start)
+    bounds = np.repeat([[LOG_LEAST, low], [np.inf, high]], terms, axis=1)
+    best = _evaluated(spectrum, axis, kinds, columns, start)
     damping, running = np.full(len(kinds), 1e-2), np.arange(len(kinds))
     diagonal = np.arange(2 * terms)
     for _ in range(ITERATIONS):
-        now, here = best if len(running) == len(kinds) else best.rows(running), free[running]
+        now = best if len(running) == len(kinds) else best.rows(running)
         gradient = 0.5 * np.sum(now.slopes * (spectrum.count - now.power / now.total)[:, None, :], axis=2)
+        here = free[running]
         information = 0.5 * (now.slopes * spectrum.count) @ now.slopes.transpose(0, 2, 1)
         information *= here[:, :, None] & here[:, None, :]
         own = information[:, diagonal, diagonal]
         information[:, diagonal, diagonal] += np.where(here, damping[running, None] * own + 1e-9, 1.0)
         gradient = np.where(here, gradient, 0.0)
         step = np.clip(-np.linalg.solve(information, gradient[:, :, None])[:, :, 0], *STEPS)
-        tried = now.parameters + step
-        tried[:, :terms] = np.maximum(tried[:, :terms], LOG_LEAST)
-        tried[:, terms:] = np.where(here[:, terms:], np.clip(tried[:, terms:], low, high), tried[:, terms:])
-        new = evaluate(spectrum, kinds[running], tried)
+        tried = np.where(here, np.clip(now.parameters + step, *bounds), now.parameters)
+        new = _evaluated(spectrum, now.axis, now.kinds, now.columns, tried)
         gain = now.deviance - new.deviance
         better = gain > 0
         best.replace(running[better], new.rows(better))

@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.estimation.noise_likelihood import spectrum_of
-from pipeline.estimation.noise_search import ONE_SIDED, QUANTILE, Search, best_of, fitted
+from pipeline.estimation.noise_likelihood import Trial, evaluate, solved, spectrum_of
+from pipeline.estimation.noise_search import ONE_SIDED, QUANTILE, Search
 from pipeline.estimation.noise_terms import STOCHASTIC, unit_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from pipeline.estimation.noise_likelihood import Fits, Spectrum
+    from pipeline.estimation.noise_likelihood import Spectrum
     from pipeline.estimation.noise_search import Candidate
 
     Values = NDArray[np.float64]
@@ -60,7 +60,7 @@ class _Sinusoid:
 
 
 class Regression:
-    """The deterministic columns of one axis, and its best composition beside them.
+    """The deterministic columns of one axis.
 
     ``scale``: the unit in which the readings are fitted. ``single``: one recording, in which a ramp and sinusoids show.
     """
@@ -71,7 +71,11 @@ class Regression:
         self.middle, self.span = float(0.5 * (start + end)), float(end - start)
         self.optional = (["ramp"] + ["temperature"] * self._warms()) if single else []
         self.lines = self._found() if single else []
-        self.spectrum: Spectrum
+        for _ in range(ROUNDS if self.lines else 0):
+            spectrum = spectrum_of([self.columns(s)[None] for s in stretches], interval)
+            fit = solved(spectrum, Search(spectrum, 0).run(self.required())).fit
+            if self._settled(fit.beta[0], fit.beta_covariance[0]) or not self.lines:
+                break
 
     def _warms(self) -> bool:
         """Return whether the temperature changes, and not in proportion to the time, as a ramp does."""
@@ -82,19 +86,10 @@ class Regression:
         left = warm - np.polynomial.Polynomial.fit(time, warm, 1)(time)
         return bool(np.ptp(warm) > STEADY_DEGC and np.std(left) > STRAIGHT * np.std(warm))
 
-    def solve(self) -> tuple[Search, Candidate, Spectrum]:
-        """Return all compositions, the best one, and the spectrum with its columns."""
-        for last in (*[False] * ROUNDS, True):
-            self.spectrum = spectrum = spectrum_of([self._columns(s) for s in self.stretches], self.interval)
-            first = 1 + len(self.optional)
-            required = tuple(range(first, first + 3 * len(self.lines)))
-            search = Search(spectrum)
-            best = search.run(required)
-            if self.lines and not last and not self._settled(fitted(spectrum.with_columns(required), best)):
-                continue
-            best = best_of(search, required, list(range(1, first)))
-            break
-        return search, best, spectrum.with_columns(best.columns)
+    def required(self) -> tuple[int, ...]:
+        """Return the numbers of the sinusoids' columns."""
+        first = 1 + len(self.optional)
+        return tuple(range(first, first + 3 * len(self.lines)))
 
     def names(self, candidate: Candidate) -> list[str]:
         """Return the terms of a composition."""
@@ -102,16 +97,16 @@ class Regression:
         deterministic = [known[c - 1] for c in sorted(candidate.columns)]
         return [STOCHASTIC[k] for k in candidate.kinds] + [name for name in deterministic if name]
 
-    def terms(self, unit: str, best: Candidate, fit: Fits) -> dict[str, Any]:
+    def terms(self, unit: str, best: Candidate, spectrum: Spectrum) -> dict[str, Any]:
         """Return ramp, temperature and sinusoids, as published."""
-        beta, covariance = self.scale * fit.beta[0], self.scale**2 * fit.beta_covariance[0]
+        beta, covariance = self.scale * best.fit.beta[0], self.scale**2 * best.fit.beta_covariance[0]
         out: dict[str, Any] = {
-            "ramp": self._slope(best, "ramp", unit_of("ramp", unit), self.span),
-            "temperature": self._slope(best, "temperature", f"{unit}/degC", 1.0),
+            "ramp": self._slope(best, spectrum, "ramp", unit_of("ramp", unit), self.span),
+            "temperature": self._slope(best, spectrum, "temperature", f"{unit}/degC", 1.0),
             "sinusoid": [],
         }
         for i, line in enumerate(self.lines):
-            j = best.columns.index(1 + len(self.optional) + 3 * i)
+            j = len(self.optional) + 3 * i
             size = float(np.hypot(line.a, line.b))
             direction = np.array([line.a, line.b]) / size
             half = QUANTILE * np.sqrt(
@@ -132,7 +127,7 @@ class Regression:
             )
         return out
 
-    def _slope(self, best: Candidate, name: str, unit: str, per: float) -> dict[str, Any]:
+    def _slope(self, best: Candidate, spectrum: Spectrum, name: str, unit: str, per: float) -> dict[str, Any]:
         """Return the coefficient of a column as published; the column is ``per`` times its unit."""
         if name not in self.optional:
             reason = (
@@ -142,16 +137,16 @@ class Regression:
             )
             return {"value": None, "unit": unit, "interval": None, "reason": reason, "upper_limit": None}
         column = 1 + self.optional.index(name)
-        columns = (*(c for c in best.columns if c != column), column)
-        fit = fitted(self.spectrum.with_columns(columns), best)
-        value = self.scale / per * float(fit.beta[0, -1])
-        spread = self.scale / per * float(np.sqrt(fit.beta_covariance[0, -1, -1]))
+        columns = tuple(sorted({*best.columns, column}))
+        fit = evaluate(spectrum, [Trial(int(best.fit.axis[0]), best.kinds, columns, best.parameters)])
+        value = self.scale / per * float(fit.beta[0, column - 1])
+        spread = self.scale / per * float(np.sqrt(fit.beta_covariance[0, column - 1, column - 1]))
         if column in best.columns:
             return {"value": value, "unit": unit, "interval": [value - QUANTILE * spread, value + QUANTILE * spread]}
         limit = abs(value) + ONE_SIDED * spread
         return {"value": None, "unit": unit, "interval": None, "reason": "not seen", "upper_limit": limit}
 
-    def _columns(self, stretch: Stretch) -> Values:
+    def columns(self, stretch: Stretch) -> Values:
         """Return readings and columns of a stretch: (n, 1 + d) array."""
         t = stretch.time - self.middle
         columns = [stretch.reading[:, self.column] / self.scale]
@@ -165,14 +160,16 @@ class Regression:
             columns += [cosine, sine, slope]
         return np.stack(columns, axis=1)
 
-    def _settled(self, fit: Fits) -> bool:
+    def _settled(self, beta: Values, covariance: Values) -> bool:
         """Refine the sinusoids, drop those that are not significant, and return whether nothing changed."""
+        first = len(self.optional)
         settled, kept = True, []
         penalty = 3.0 * np.log(sum(len(s.time) for s in self.stretches))
         for i, line in enumerate(self.lines):
-            a, b, change = fit.beta[0, 3 * i : 3 * i + 3].tolist()
+            at = first + 3 * i
+            a, b, change = beta[at : at + 3].tolist()
             shift = change / np.hypot(line.a, line.b)  # in widths of a line, 1 / span
-            inner = fit.beta_covariance[0, 3 * i : 3 * i + 2, 3 * i : 3 * i + 2]
+            inner = covariance[at : at + 2, at : at + 2]
             if abs(shift) < NEARLY and np.array([a, b]) @ np.linalg.solve(inner, [a, b]) < penalty:
                 settled = False
                 continue

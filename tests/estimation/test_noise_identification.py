@@ -11,7 +11,7 @@ from scipy.fft import dct
 from scipy.signal import lfilter
 
 from pipeline.estimation.noise_identification import identify_noise, static_stretches
-from pipeline.estimation.noise_likelihood import evaluate, maximised, spectrum_of
+from pipeline.estimation.noise_likelihood import Trial, evaluate, maximised, spectrum_of
 from pipeline.estimation.noise_terms import (
     INSTABILITY,
     QUANTISATION,
@@ -54,10 +54,10 @@ def test_likelihood_of_white_noise_and_walk_is_the_exact_restricted_one() -> Non
     A = X.T @ inverse @ X
     P = inverse - inverse @ X @ np.linalg.solve(A, X.T @ inverse)
     exact = np.linalg.slogdet(C)[1] + np.linalg.slogdet(A)[1] - np.log(n) + values @ P @ values
-    spectrum = spectrum_of([np.stack([values, ramp], axis=1)], DT)
+    spectrum = spectrum_of([np.stack([values, ramp], axis=1)[None]], DT)
     assert len(spectrum.omega) == n - 1
-    parameters = np.array([[2.0 * np.log(N), 2.0 * np.log(K), 0.0, 0.0]])
-    fits = evaluate(spectrum, np.array([[WHITE, WALK]]), parameters)
+    parameters = np.array([2.0 * np.log(N), 2.0 * np.log(K), 0.0, 0.0])
+    fits = evaluate(spectrum, [Trial(0, (WHITE, WALK), (1,), parameters)])
     assert float(fits.deviance[0]) == pytest.approx(float(exact), rel=1e-9)
     assert float(fits.beta[0, 0]) == pytest.approx(float(np.linalg.solve(A, X.T @ inverse @ values)[1]), rel=1e-9)
 
@@ -152,11 +152,11 @@ def test_the_upper_limit_is_where_the_profile_likelihood_loses_its_quantile() ->
     values = np.random.default_rng(5).standard_normal(500) / np.sqrt(DT)
     found = identify_noise("gyroscope", [recording(values)])["axes"]["x"]
     limit = found["terms"]["random_walk"]["upper_limit"]
-    spectrum, kinds = spectrum_of([values[:, None]], DT), np.array([[WHITE, WALK]])
+    spectrum = spectrum_of([values[None, :, None]], DT)
 
     def profile(K: float) -> float:
-        start, held = np.array([[0.0, 2.0 * np.log(K), 0.0, 0.0]]), np.array([[False, True, False, False]])
-        return float(maximised(spectrum, kinds, start, held).deviance[0])
+        start = np.array([0.0, 2.0 * np.log(K), 0.0, 0.0])
+        return float(maximised(spectrum, [Trial(0, (WHITE, WALK), (), start, held=1)]).deviance[0])
 
     least = min(profile(K) for K in np.geomspace(1e-5, 1.0, 120))
     assert profile(limit) - least == pytest.approx(1.644854**2, rel=0.05)
