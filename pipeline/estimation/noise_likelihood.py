@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Values = NDArray[np.float64]
+    Whole = NDArray[np.int64]
+    Mask = NDArray[np.bool_]
 
 RATIO = 1.05  # of the edges of a bin: the spectrum of a random walk changes by a tenth, its mean by 0.2 %
 LONGEST_TIME = 0.5  # correlation time, in lengths of the recording, above which a process is a random walk
@@ -124,9 +126,9 @@ class Fits:
         Of the deterministic columns; zeros of those that are not fitted.
     """
 
-    axis: NDArray[np.int64]
-    kinds: NDArray[np.int64]
-    columns: NDArray[np.bool_]
+    axis: Whole
+    kinds: Whole
+    columns: Mask
     parameters: Values
     deviance: Values
     unrestricted: Values
@@ -136,11 +138,11 @@ class Fits:
     beta: Values
     beta_covariance: Values
 
-    def rows(self, index: NDArray[np.int64] | NDArray[np.bool_] | slice) -> Fits:
+    def rows(self, index: Whole | Mask | slice) -> Fits:
         """Return some of the fits."""
         return Fits(*(getattr(self, name)[index] for name in NAMES))
 
-    def replace(self, index: NDArray[np.int64], others: Fits) -> None:
+    def replace(self, index: Whole, others: Fits) -> None:
         """Put other fits in the place of some."""
         for name in NAMES[3:]:
             getattr(self, name)[index] = getattr(others, name)
@@ -168,7 +170,7 @@ if TYPE_CHECKING:
     Work = Generator[list[Trial], Fits, Result]  # yields trials, receives their fits, returns a result
 
 
-def active(kinds: NDArray[np.int64]) -> NDArray[np.bool_]:
+def active(kinds: Whole) -> Mask:
     """Return which parameters of (g, J) terms there are: (g, 2 J) array."""
     return np.concatenate([kinds >= 0, kinds == MARKOV], axis=1)
 
@@ -181,7 +183,7 @@ def at_once(works: Sequence[Work[Result]]) -> Work[list[Result]]:
         asked: dict[int, list[Trial]] = {}
         for i, reply in replies.items():
             try:
-                asked[i] = works[i].send(reply)  # type: ignore[arg-type]  (None starts a generator)
+                asked[i] = works[i].send(reply)  # type: ignore[arg-type]
             except StopIteration as end:
                 results[i] = end.value
         if not asked:
@@ -210,7 +212,7 @@ def evaluate(spectrum: Spectrum, trials: Sequence[Trial]) -> Fits:
     return _evaluated(spectrum, axis, kinds, columns, parameters)
 
 
-def _packed(spectrum: Spectrum, trials: Sequence[Trial]) -> tuple[NDArray[np.int64], ...]:
+def _packed(spectrum: Spectrum, trials: Sequence[Trial]) -> tuple[Whole, Whole, Mask, Values, Mask]:
     """Return axis, kinds, columns and parameters of trials as of ``Fits``, and which parameters are free."""
     g, terms = len(trials), max(len(trial.kinds) for trial in trials)
     kinds, parameters = np.full((g, terms), -1), np.zeros((g, 2 * terms))
@@ -230,9 +232,9 @@ def _packed(spectrum: Spectrum, trials: Sequence[Trial]) -> tuple[NDArray[np.int
 
 def _evaluated(
     spectrum: Spectrum,
-    axis: NDArray[np.int64],
-    kinds: NDArray[np.int64],
-    columns: NDArray[np.bool_],
+    axis: Whole,
+    kinds: Whole,
+    columns: Mask,
     parameters: Values,
 ) -> Fits:
     terms = kinds.shape[1]
