@@ -236,7 +236,7 @@ def axis_of(values: Values, dt: float) -> dict[str, Any]:
     zero = np.zeros_like(values)
     time_ns = np.rint(np.arange(len(values)) * dt * 1e9).astype(np.int64)
     recording = Recording("static", "static", None, time_ns, gyroscope=np.stack([values, zero, zero], axis=1))
-    return identify_noise("gyroscope", [recording])["axes"]["x"]
+    return identify_noise([recording])["gyroscope"]["axes"]["x"]
 
 
 if __name__ == "__main__":

@@ -50,7 +50,7 @@ def main(argv: Sequence[str]) -> int:
     recording = to_recording("static", entry, table, sheet, checks_of(ingest))
     settings = {"procedure": {"recordings": {"static": entry}}, "table": {}, "sensor": sheet, "ingest": ingest}
     (recording,) = check_recordings([recording], settings)
-    found = {sensor: identify_noise(sensor, [recording]) for sensor in SENSORS}
+    found = identify_noise([recording])
     print("\n\n".join(_told(sensor, found[sensor]) for sensor in SENSORS).replace(MINUS, "-"))
     if target is None:
         return 0

@@ -11,6 +11,7 @@ freedom m is normal with mean 1 - 2/(9m) and variance 2/(9m) (Wilson & Hilferty,
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,13 +20,13 @@ from pipeline.estimation.noise_likelihood import at_once, solved, spectrum_of
 from pipeline.estimation.noise_regression import Regression, Stretch
 from pipeline.estimation.noise_search import QUANTILE, Search, best_of, limits, ranked
 from pipeline.estimation.noise_terms import MARKOV, SINGLE, STOCHASTIC, WHITE, allan_variance, each_term, unit_of
-from pipeline.records import AXES, SENSOR_UNITS
+from pipeline.records import AXES, SENSOR_UNITS, SENSORS
 from pipeline.signal.allan import allan_deviation
 from pipeline.signal.rests import rest_readings, usable
 from pipeline.signal.temperature import temperature_of
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
@@ -48,42 +49,66 @@ SHOWN = 0.25  # longest averaging time that the Allan deviation shows with some 
 PER_DECADE = 8  # averaging times
 STEP = 1.01  # of a correlation time, for a derivative
 SLOW = ("bias_instability", "random_walk", "gauss_markov", "ramp", "temperature")
+STILL = {"terms": None, "reason": "the readings do not change: the noise is below one count"}
 OF_RESTS = "no static recording: what is slower than a rest is not seen, and in rests by hand the unit moves"
 
 
-def identify_noise(sensor: str, recordings: Sequence[Recording]) -> JSON:
-    """Return the noise of a sensor, from its recordings before any filter: see the schema of calibrations."""
+def identify_noise(recordings: Sequence[Recording]) -> dict[str, JSON]:
+    """Return the noise of each sensor, from its recordings before any filter: see the schema of calibrations.
+
+    Axes whose readings have the same sampling are fitted side by side.
+    """
+    found = {sensor: _source(sensor, recordings) for sensor in SENSORS}
+    alike: dict[tuple[Any, ...], list[tuple[str, Regression]]] = {}
+    for sensor, (told, stretches) in found.items():
+        if not stretches:
+            continue
+        told["axes"] = dict.fromkeys(AXES, STILL)
+        single = told["source"] == "static" and len(told["recordings"]) == 1
+        for c in range(3):
+            steps = np.concatenate([np.abs(np.diff(s.reading[:, c])) for s in stretches])
+            if steps.any():
+                regression = Regression(stretches, c, told["sampling_interval_s"], steps, single=single)
+                key = (regression.interval, len(regression.optional), *(len(s.time) for s in stretches))
+                alike.setdefault(key, []).append((sensor, regression))
+    for pairs in alike.values():
+        axes = _axes([regression for _, regression in pairs])
+        for (sensor, regression), axis in zip(pairs, axes, strict=True):
+            found[sensor][0]["axes"][AXES[regression.column]] = axis(SENSOR_UNITS[sensor])
+    return {sensor: told for sensor, (told, _) in found.items()}
+
+
+def _source(sensor: str, recordings: Sequence[Recording]) -> tuple[JSON, list[Stretch]]:
+    """Return what the noise of a sensor is identified from, and its stretches: none, with the reason, or some."""
     known = [r for r in recordings if r.role != "validation" and r.reading(sensor) is not None and r.samples > 1]
     empty: JSON = {"unit": SENSOR_UNITS[sensor], "source": None, "reason": None, "axes": None}
     if not known:
-        return empty | {"reason": f"the recordings hold no readings of the {sensor}"}
+        return empty | {"reason": f"the recordings hold no readings of the {sensor}"}, []
     even = [r for r in known if _scatter_of_intervals(r) <= UNEVEN]
     if not even:
         reason = (
             f"the sampling intervals scatter by more than {UNEVEN:.0%}: equal numbers of samples are no equal times"
         )
-        return empty | {"reason": reason}
+        return empty | {"reason": reason}, []
     static, others = ([r for r in even if (r.role == "static") == is_static] for is_static in (True, False))
     source, chosen, stretches = "static", static, [s for r in static for s in static_stretches(sensor, r)]
     if _samples(stretches) < FEWEST and others:
         source, chosen, stretches = "rests", others, [s for r in others for s in _rests(sensor, r)]
     if _samples(stretches) < FEWEST:
         reason = f"the rests hold {_samples(stretches)} evenly sampled readings; {FEWEST} are needed: record static"
-        return empty | {"reason": reason}
+        return empty | {"reason": reason}, []
     rates = np.array([(s.time[-1] - s.time[0]) / (len(s.time) - 1) for s in stretches])
     interval = float(np.median(rates))
-    alike = np.abs(rates / interval - 1.0) < ALIKE
-    stretches = [s for s, taken in zip(stretches, alike, strict=True) if taken]
-    single = source == "static" and len(chosen) == 1
-    return empty | {
+    stretches = [s for s, rate in zip(stretches, rates, strict=True) if abs(rate / interval - 1.0) < ALIKE]
+    told = empty | {
         "source": source,
         "recordings": [r.name for r in chosen],
         "samples": _samples(stretches),
         "sampling_interval_s": interval,
         "length_s": float(interval * max(len(s.time) for s in stretches)),
-        "axes": _axes(SENSOR_UNITS[sensor], stretches, interval, single=single),
         "doubts": [OF_RESTS] if source == "rests" else [],
     }
+    return told, stretches
 
 
 def _scatter_of_intervals(recording: Recording) -> float:
@@ -123,49 +148,42 @@ def _rests(sensor: str, recording: Recording) -> list[Stretch]:
     return [Stretch(time, reading) for time, reading in found if len(time) >= SHORTEST]
 
 
-def _axes(unit: str, stretches: list[Stretch], interval: float, *, single: bool) -> JSON:
-    """Return the noise of each axis; all are fitted side by side."""
-    steps = [np.concatenate([np.abs(np.diff(s.reading[:, c])) for s in stretches]) for c in range(3)]
-    scales = [float(np.sqrt(np.mean(step**2) / 2.0)) for step in steps]  # the standard deviation, if it is white
-    axes = [c for c, scale in enumerate(scales) if scale > 0.0]
-    still = {"terms": None, "reason": "the readings do not change: the noise is below one count"}
-    if not axes:
-        return dict.fromkeys(AXES, still)
-    regressions = [Regression(stretches, c, interval, scales[c], single=single) for c in axes]
-    columns = [[r.columns(s) for r in regressions] for s in stretches]
+def _axes(regressions: Sequence[Regression]) -> list[Callable[[str], JSON]]:
+    """Return the noise of axes of the same sampling, which are fitted side by side, as functions of their unit."""
+    columns = [[r.columns(r.stretches[i]) for r in regressions] for i in range(len(regressions[0].stretches))]
     most = max(values.shape[1] for values in columns[0])  # an axis with fewer sinusoids has columns of zeros
     padded = [np.stack([np.pad(v, ((0, 0), (0, most - v.shape[1]))) for v in of_axes]) for of_axes in columns]
-    spectrum = spectrum_of(padded, interval)
-    searches = [Search(spectrum, i) for i in range(len(axes))]
-    optional = range(1, 1 + len(regressions[0].optional))
-    pairs = zip(searches, regressions, strict=True)
-    best = solved(spectrum, at_once([best_of(search, r.required(), optional) for search, r in pairs]))
+    spectrum = spectrum_of(padded, regressions[0].interval)
+    searches = [Search(spectrum, i) for i in range(len(regressions))]
+    pairs = list(zip(searches, regressions, strict=True))
+    best = solved(spectrum, at_once([best_of(s, r.required(), range(1, 1 + len(r.optional))) for s, r in pairs]))
     bounds = solved(spectrum, at_once([limits(spectrum, candidate) for candidate in best]))
-    found = dict.fromkeys(AXES, still)
-    for c, regression, search, candidate, bound in zip(axes, regressions, searches, best, bounds, strict=True):
-        count = float(steps[c][steps[c] > 1e-9 * scales[c]].min())
-        found[AXES[c]] = _axis(unit, regression, search, candidate, bound, count)
-    return found
+    longest = [max(r.stretches, key=lambda s: len(s.time)).reading[:, r.column] for r in regressions]
+    tau, measured = allan_deviation(np.stack(longest, axis=1), spectrum.interval, PER_DECADE)
+    shown = tau <= SHOWN * len(longest[0]) * spectrum.interval
+    return [
+        partial(_axis, r, s, candidate, bound, (tau[shown], curve[shown]))
+        for (s, r), candidate, bound, curve in zip(pairs, best, bounds, measured.T, strict=True)
+    ]
 
 
 def _axis(  # noqa: PLR0917  (what was found of an axis)
-    unit: str,
     regression: Regression,
     search: Search,
     best: Candidate,
     bounds: tuple[Values, dict[int, float]],
-    count: float,
+    measured: tuple[Values, Values],
+    unit: str,
 ) -> JSON:
-    """Return the noise of one axis."""
+    """Return the noise of one axis as published."""
     spectrum = search.spectrum
     p_value = _p_value(spectrum, best.fit)
     doubts = []
     if p_value < IMPLAUSIBLE:
         doubts.append(f"no composition fits the spectrum (p = {p_value:.1g}): a filter, vibration or a disturbance")
-    if regression.scale < COARSE * count:
-        doubts.append(f"the readings are rounded to {count:.3g} {unit}, which is coarser than their noise")
+    if regression.scale < COARSE * regression.count:
+        doubts.append(f"the readings are rounded to {regression.count:.3g} {unit}, which is coarser than their noise")
     terms = _terms(unit, spectrum, best, bounds, regression) | regression.terms(unit, best, spectrum)
-    longest = max(regression.stretches, key=lambda s: len(s.time))
     return {
         "terms": terms,
         "reason": None,
@@ -174,19 +192,17 @@ def _axis(  # noqa: PLR0917  (what was found of an axis)
             for c, probability in ranked(search)
         ],
         "p_value": p_value,
-        "allan": _allan(longest.reading[:, regression.column], terms, best, spectrum),
+        "allan": _allan(*measured, terms, best, spectrum),
         "doubts": doubts,
     }
 
 
-def _allan(values: Values, terms: JSON, best: Candidate, spectrum: Spectrum) -> JSON:
+def _allan(tau: Values, measured: Values, terms: JSON, best: Candidate, spectrum: Spectrum) -> JSON:
     """Return the Allan deviation of the readings, and that of the terms with its 95 % band.
 
     The band is that of the logarithm, from the covariance of the terms: the parameters of the stochastic ones are
     logarithms of squared coefficients, in which the derivative of the variance is the part of the term itself.
     """
-    tau, measured = allan_deviation(values, spectrum.interval, PER_DECADE)
-    tau, measured = (v[tau <= SHOWN * len(values) * spectrum.interval] for v in (tau, measured))
     parts = [(name, term, allan_variance(name, term, tau)) for name, term in each_term(terms)]
     total = np.sum([part for _, _, part in parts], axis=0)
     kinds, times = best.kinds, best.parameters[len(best.kinds) :]

@@ -60,13 +60,16 @@ class _Sinusoid:
 
 
 class Regression:
-    """The deterministic columns of one axis.
+    """The deterministic columns of one axis, in units of ``scale``.
 
-    ``scale``: the unit in which the readings are fitted. ``single``: one recording, in which a ramp and sinusoids show.
+    ``steps``: sizes of the differences of successive readings. ``single``: one recording, in which a ramp and sinusoids
+    show.
     """
 
-    def __init__(self, stretches: list[Stretch], column: int, interval: float, scale: float, *, single: bool) -> None:
-        self.stretches, self.column, self.interval, self.scale = stretches, column, interval, scale
+    def __init__(self, stretches: list[Stretch], column: int, interval: float, steps: Values, *, single: bool) -> None:
+        self.stretches, self.column, self.interval = stretches, column, interval
+        self.scale = float(np.sqrt(np.mean(steps**2) / 2.0))  # the standard deviation, if it is white
+        self.count = float(steps[steps > 1e-9 * self.scale].min())
         start, end = stretches[0].time[0], stretches[-1].time[-1]
         self.middle, self.span = float(0.5 * (start + end)), float(end - start)
         self.optional = (["ramp"] + ["temperature"] * self._warms()) if single else []
@@ -189,19 +192,8 @@ class Regression:
         usable = (k >= SLOWEST) & (k < n // 2)
         if usable.sum() < 2 * FEWEST_OF_LEVEL:
             return []
-        number = np.floor(np.log(np.maximum(k[usable], 1) / SLOWEST) / np.log(WIDTH)).astype(int)
-        first = np.flatnonzero(np.diff(number, prepend=-1))
-        ends = np.append(first, usable.sum())
-        pieces, begin = [], 0
-        for end in ends[1:]:  # bins of few lines join the next
-            if end - begin >= FEWEST_OF_LEVEL or end == ends[-1]:
-                pieces.append((begin, end))
-                begin = end
-        level = np.concatenate(
-            [np.full(stop - start, np.median(power[usable][start:stop]) / np.log(2.0)) for start, stop in pieces]
-        )
         ratio = np.zeros(len(power))
-        ratio[usable] = power[usable] / np.maximum(level, 1e-300)
+        ratio[usable] = power[usable] / np.maximum(_level(power[usable]), 1e-300)
         found: list[_Sinusoid] = []
         while len(found) < LINES and ratio.max() > LINE * np.log(n):
             peak = int(np.argmax(ratio))
@@ -211,3 +203,18 @@ class Regression:
             a, b = (2.0 / n * float(y @ wave) for wave in (np.cos(phase), np.sin(phase)))
             found.append(_Sinusoid(frequency, a, b))
         return found
+
+
+def _level(power: Values) -> Values:
+    """Return the level around each line of a periodogram that begins at ``SLOWEST``: of bins, by their median."""
+    number = np.floor(np.log(np.arange(SLOWEST, SLOWEST + len(power)) / SLOWEST) / np.log(WIDTH)).astype(int)
+    ends = np.append(np.flatnonzero(np.diff(number)) + 1, len(power)).tolist()
+    edges = [0]
+    for end in ends:  # bins of few lines join the next
+        if end - edges[-1] >= FEWEST_OF_LEVEL or end == ends[-1]:
+            edges.append(end)
+    size = np.diff(edges)
+    label = np.repeat(np.arange(len(size)), size)
+    ordered, first = power[np.lexsort((power, label))], np.array(edges[:-1])
+    middle = 0.5 * (ordered[first + (size - 1) // 2] + ordered[first + size // 2])
+    return np.asarray(middle[label] / np.log(2.0))

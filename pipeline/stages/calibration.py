@@ -48,7 +48,7 @@ def process_unit(job: Job, unit: str, settings: dict[str, Any]) -> None:
         "log": {"ingest": settings["ingest"], "axis_map": axes},
         "inputs": inputs(recordings),
         "not_calibrated": reasons,
-        "noise": {sensor: identify_noise(sensor, recordings) for sensor in SENSORS},
+        "noise": identify_noise(recordings),
     }
     for sensor, fit in fits.items():
         document[sensor] = None if sensor in reasons else judged(sensor, fit, settings["sensor"][sensor])

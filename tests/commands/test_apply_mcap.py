@@ -189,7 +189,7 @@ def test_covariances_are_those_of_a_calibrated_sample(calibration: Path, tmp_pat
     raw = sigma * rng.standard_normal((n, 3))
     time_ns = (np.arange(n) * dt * 1e9).astype(np.int64)
     rest = Recording("static", "static", None, time_ns, gyroscope=raw)
-    data["noise"] = {"gyroscope": identify_noise("gyroscope", [rest])}
+    data["noise"] = identify_noise([rest])
     calibration.write_text(json.dumps(data))
     matrix = np.array(data["gyroscope"]["matrix"])
     scatter = np.cov(np.radians(raw @ matrix.T), rowvar=False)

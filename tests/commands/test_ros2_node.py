@@ -45,7 +45,7 @@ def calibration(tmp_path: Path) -> Path:
     document["log"] = {"ingest": {}, "axis_map": {"accelerometer": AXES, "gyroscope": AXES}}
     time, noise = np.arange(500, dtype=np.int64) * 2_000_000, np.random.default_rng(1).normal(0, 0.1, (500, 3))
     rest = Recording("static", "static", None, time, gyroscope=noise)
-    document["noise"] = {"gyroscope": identify_noise("gyroscope", [rest])}
+    document["noise"] = identify_noise([rest])
     write_json(tmp_path / "U1.json", document)
     return tmp_path / "U1.json"
 

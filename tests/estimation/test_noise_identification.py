@@ -106,7 +106,7 @@ def test_terms_of_a_mixture_are_found_within_their_intervals() -> None:
     columns = [simulated(rng, 30_000, K=0.1), simulated(rng, 30_000, G=1.5, T=30.0), simulated(rng, 30_000)]
     t = np.arange(30_000) * DT
     columns[2] += 0.003 * t + 0.4 * np.cos(2.0 * np.pi * 1.2345 * t + 0.3)
-    found = identify_noise("gyroscope", [recording(np.stack(columns, axis=1))])
+    found = identify_noise([recording(np.stack(columns, axis=1))])["gyroscope"]
     assert (found["source"], found["samples"], found["length_s"]) == ("static", 30_000, pytest.approx(3000.0))
     x, y, z = (found["axes"][a] for a in "xyz")
     compositions = [part["ranking"][0]["terms"] for part in (x, y, z)]
@@ -139,7 +139,7 @@ def test_a_recording_too_short_for_a_walk_says_so_with_an_upper_limit_that_falls
     values = simulated(np.random.default_rng(4), 30_000, K=0.001)
     limits = []
     for n in (1_000, 30_000):
-        terms = identify_noise("gyroscope", [recording(values[:n])])["axes"]["x"]["terms"]
+        terms = identify_noise([recording(values[:n])])["gyroscope"]["axes"]["x"]["terms"]
         walk = terms["random_walk"]
         assert walk["value"] is None
         assert f"the recording is too short: over its {0.1 * n:.3g} s" in walk["reason"]
@@ -150,7 +150,7 @@ def test_a_recording_too_short_for_a_walk_says_so_with_an_upper_limit_that_falls
 
 def test_the_upper_limit_is_where_the_profile_likelihood_loses_its_quantile() -> None:
     values = np.random.default_rng(5).standard_normal(500) / np.sqrt(DT)
-    found = identify_noise("gyroscope", [recording(values)])["axes"]["x"]
+    found = identify_noise([recording(values)])["gyroscope"]["axes"]["x"]
     limit = found["terms"]["random_walk"]["upper_limit"]
     spectrum = spectrum_of([values[None, :, None]], DT)
 
@@ -165,7 +165,7 @@ def test_the_upper_limit_is_where_the_profile_likelihood_loses_its_quantile() ->
 def test_a_slow_change_with_temperature_is_no_noise() -> None:
     rng, n = np.random.default_rng(6), 20_000
     warm = 25.0 + 3.0 * np.sin(np.linspace(0.0, 5.0, n))
-    found = identify_noise("gyroscope", [recording(simulated(rng, n) + 0.3 * warm, temperature=warm)])
+    found = identify_noise([recording(simulated(rng, n) + 0.3 * warm, temperature=warm)])["gyroscope"]
     terms = found["axes"]["x"]["terms"]
     low, high = terms["temperature"]["interval"]
     assert low < 0.3 < high
@@ -188,16 +188,16 @@ def test_short_gaps_and_marked_samples_are_bridged_and_long_ones_cut() -> None:
     [(np.ones(500), "the readings do not change"), (np.random.default_rng(7).standard_normal(40), "60 are needed")],
 )
 def test_readings_that_hold_no_noise_are_refused_with_a_reason(values: Values, reason: str) -> None:
-    found = identify_noise("gyroscope", [recording(values)])
+    found = identify_noise([recording(values)])["gyroscope"]
     assert reason in (found["reason"] or found["axes"]["x"]["reason"])
-    assert "no readings of the accelerometer" in identify_noise("accelerometer", [recording(values)])["reason"]
+    assert "no readings of the accelerometer" in identify_noise([recording(values)])["accelerometer"]["reason"]
 
 
 def test_samples_that_come_in_bursts_are_refused() -> None:
     values = recording(np.random.default_rng(9).standard_normal(999))
     time_ns = values.time_ns.copy()
     time_ns[1::2] -= 90_000_000  # pairs of samples 10 ms apart, every 200 ms
-    found = identify_noise("gyroscope", [replace(values, time_ns=time_ns)])
+    found = identify_noise([replace(values, time_ns=time_ns)])["gyroscope"]
     assert found["axes"] is None
     assert "sampling intervals scatter by more than 50%" in found["reason"]
 
@@ -205,7 +205,7 @@ def test_samples_that_come_in_bursts_are_refused() -> None:
 def test_a_spectrum_that_no_composition_has_is_in_doubt() -> None:
     rng = np.random.default_rng(8)
     band = lfilter([1.0], [1.0, -1.6, 0.95], rng.standard_normal(20_000))  # a resonance, as of vibration
-    (doubt,) = identify_noise("gyroscope", [recording(np.asarray(band))])["axes"]["x"]["doubts"]
+    (doubt,) = identify_noise([recording(np.asarray(band))])["gyroscope"]["axes"]["x"]["doubts"]
     assert "no composition fits the spectrum" in doubt
     coarse = np.round(0.3 * rng.standard_normal(2000))
-    assert "coarser than their noise" in identify_noise("gyroscope", [recording(coarse)])["axes"]["x"]["doubts"][-1]
+    assert "coarser than their noise" in identify_noise([recording(coarse)])["gyroscope"]["axes"]["x"]["doubts"][-1]

@@ -36,7 +36,7 @@ def document(readings: dict[str, Any] | None = None) -> dict[str, Any]:
     if readings:
         time_ns = (np.arange(SAMPLES) / RATE * 1e9).astype(np.int64)
         static = Recording("static", "static", None, time_ns, **readings)
-        found["noise"] = {s: identify_noise(s, [static]) for s in SENSORS}
+        found["noise"] = identify_noise([static])
     return found
 
 

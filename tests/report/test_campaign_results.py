@@ -68,7 +68,7 @@ def test_each_table_holds_the_values_of_the_files(unit: Unit, results: Path) -> 
 def test_the_table_of_the_noise_has_a_row_for_each_term(unit: Unit, results: Path, tmp_path: Path) -> None:
     readings = np.random.default_rng(1).normal(0.0, 0.01, (500, 3))
     rest = Recording("static", "static", None, np.arange(500) * 10_000_000, accelerometer=readings)
-    noise = {sensor: identify_noise(sensor, [rest]) for sensor in ("accelerometer", "gyroscope")}
+    noise = identify_noise([rest])
     shutil.copytree(results, tmp_path / "demo")
     (tmp_path / "demo" / "calibrations" / "U1.json").write_text(json.dumps(unit.calibration | {"noise": noise}))
     table = pipeline.load_campaign(tmp_path / "demo").noise

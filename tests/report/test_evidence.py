@@ -147,7 +147,7 @@ def test_the_unexplained_is_drawn_with_its_shape_and_says_where_the_points_leave
 def noise_at_rest(samples: int, sigma: float = 0.003, interval: float = 0.12) -> dict[str, Any]:
     time_ns = np.rint(np.arange(samples) * interval * 1e9).astype(np.int64)
     reading = sigma * np.random.default_rng(samples).standard_normal((samples, 3)) + [0.0, 0.0, 1.0]
-    return identify_noise("accelerometer", [Recording("static", "static", None, time_ns, accelerometer=reading)])
+    return identify_noise([Recording("static", "static", None, time_ns, accelerometer=reading)])["accelerometer"]
 
 
 def test_the_words_beside_the_allan_deviation_say_what_was_found_and_whether_it_is_inflated() -> None:
