@@ -23,8 +23,8 @@ from pipeline.io.read import read_table, to_recording
 from pipeline.preprocessing.checks import check_recordings
 from pipeline.profile_detection.columns import find_layout
 from pipeline.profile_detection.proposal import as_yaml, propose
-from pipeline.profile_detection.recording_facts import as_text, facts, topic_lines
-from pipeline.profile_detection.topics import topics_of
+from pipeline.profile_detection.recording_facts import as_text, facts
+from pipeline.profile_detection.topics import topic_lines, topics_of
 from pipeline.profile_detection.unit_guesses import UNKNOWN
 from pipeline.run_progress import Countdown
 from pipeline.signal.segments import cut

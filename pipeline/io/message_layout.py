@@ -161,6 +161,15 @@ class MessageLayout:
         table = rows.table(self._items(wanted))
         return {name: table[name].copy() for name in wanted}
 
+    def elements(self, most: int) -> dict[str, tuple[int, str]]:
+        """Return (offset, type) of each number by its path, of arrays the first elements: ``samples[0]`` .."""
+        found = {}
+        for name, place in self.places.items():
+            indices = [""] if place.count is None else [f"[{i}]" for i in range(min(place.count, most))]
+            size = int(place.code[2:])
+            found |= {name + index: (place.offset + i * size, place.code) for i, index in enumerate(indices)}
+        return found
+
     def number(self, place: tuple[int, str]) -> float:
         """Return a number of the sample at (offset, type)."""
         value: float = np.frombuffer(self.sample, place[1], 1, place[0])[0].item()

@@ -37,18 +37,8 @@ SENSOR_WORDS = {
 NO_SENSOR = {"mag", "magnetometer", "magnetic", "gravity", "table", "encoder", "user", "variance", "covariance", "bias"}
 TIME_FIRST = {"t", "ts", "sec", "secs", "tow", "utc", "epoch", "elapsed", "date"}
 TIME_WORDS = {
-    "time",
-    "timestamp",
-    "stamp",
-    "datetime",
-    "millis",
-    "micros",
-    "seconds",
-    "ticks",
-    "zeit",
-    "tiempo",
-    "temps",
-}
+    "time", "timestamp", "stamp", "datetime", "millis", "micros", "seconds", "ticks", "zeit", "tiempo", "temps",
+}  # fmt: skip
 TABLE_WORDS = {"table", "turntable", "encoder", "enc"}
 TEMPERATURE_WORDS = {"temp", "temperature", "tmp"}
 OTHER_TEMPERATURES = {"baro", "barometer", "battery", "cpu"}
@@ -163,11 +153,6 @@ def _sensor_of(words: list[str]) -> str:
     return next((s for s, known in SENSOR_WORDS.items() if set(before) & known), "" if before else "?")
 
 
-def _is_time(words: list[str]) -> bool:
-    """Return whether a name states a time of the sensor's clock."""
-    return bool(words) and not set(words) & TABLE_WORDS and (words[0] in TIME_FIRST or bool(set(words) & TIME_WORDS))
-
-
 def _other_channel(name: str, words: list[str]) -> str:
     """Return the channel beside time and readings that a name states, empty for none."""
     canonical = [c for c in CHANNELS[6:] if name.lower().startswith(c)]
@@ -184,11 +169,13 @@ def _find_time(found: Columns, words: dict[int, list[str]]) -> None:
     numbers = found.layout.numbers
     rising = [i for i, v in numbers.items() if len(v) > 2 and bool(np.all(np.diff(v) > 0))]
     counters = [i for i, v in numbers.items() if len(v) > 2 and bool(np.mean(np.diff(v) == 1.0) > COUNTING)]
-    named = [i for i in numbers if _is_time(words[i])]
+    of_sensor = {i: w for i, w in words.items() if w and not set(w) & TABLE_WORDS}
+    named = [i for i, w in of_sensor.items() if w[0] in TIME_FIRST or set(w) & TIME_WORDS]
     unnamed = [] if found.layout.header else [i for i in rising if i not in counters]
     candidates = [i for i in named if i in rising] or named or unnamed
     gap_free = [i for i in counters if i not in candidates and bool(np.all(np.diff(numbers[i]) == 1.0))]
-    if candidates and gap_free and _scatters(numbers[candidates[0]]):
+    steps = np.diff(numbers[candidates[0]]) if candidates else np.zeros(1)
+    if gap_free and steps.sum() > 0 and np.std(steps) > SCATTER * abs(float(np.median(steps))):
         found.arrival, found.counter = candidates[0], gap_free[0]
     elif candidates:
         found.time = candidates[0]
@@ -202,11 +189,6 @@ def _find_time(found: Columns, words: dict[int, list[str]]) -> None:
             f"{found.layout.names[index]} does not increase at {back} rows: sessions one after the other (session: 1, "
             "2 .. reads one of them), or a counter that overflows"
         )
-
-
-def _scatters(time: NDArray[np.float64]) -> bool:
-    steps = np.diff(time)
-    return bool(np.std(steps) > SCATTER * abs(float(np.median(steps)))) and bool(time[-1] > time[0])
 
 
 def _triad(words: dict[int, list[str]]) -> Triad | None:
@@ -307,7 +289,8 @@ def find_layout(data: bytes, path: str) -> TextLayout:
     if width < FEWEST_COLUMNS or len(rows) < FEWEST_ROWS:
         first = " / ".join(lines[:3])[:150]
         raise IngestError(f"no table of numbers was found in it; it starts with {first!r}", path, code="no_table")
-    rate_hz, rate_line = _stated_rate(lines[:start])
+    stated = ((found, line.strip()) for line in lines[:start] if RATE_KEY.search(line) and (found := _rate_of(line)))
+    rate_hz, rate_line = next(stated, (None, ""))
     return TextLayout(
         path, separator, decimal, skip, names != _numbered(len(names)), comment, names, _numbers(rows, decimal),
         rate_hz, rate_line, len(kept) - len(rows),
@@ -360,10 +343,6 @@ def _numbers(rows: list[list[str]], decimal: str) -> dict[int, NDArray[np.float6
     return out
 
 
-def _stated_rate(lines: list[str]) -> tuple[float | None, str]:
-    """Return the sampling rate that a line before the data states, and that line."""
-    for line in lines:
-        found = STATED_NUMBER.search(line)
-        if found and RATE_KEY.search(line) and float(found.group(1)) > 0:
-            return float(found.group(1)), line.strip()
-    return None, ""
+def _rate_of(line: str) -> float:
+    found = STATED_NUMBER.search(line)
+    return float(found.group(1)) if found else 0.0

@@ -164,7 +164,7 @@ def _proposal(parts: list[Columns]) -> Proposal:
     rate = _readings("gyroscope", parts)
     if rate is not None:
         moves, why_none = _moves(force, rate, time_s, steady=parts[0].steady)
-        by_table = _by_table(parts, rate)
+        by_table = _by_table(next(c for c in parts if "gyroscope" in c.triads), rate)
         _add("gyroscope", parts, proposal, by_table or rate_unit(rate, moves, why_none, timed=time_s is not None))
     if force is None and rate is None:
         proposal.remarks.append(
@@ -244,15 +244,14 @@ def _moves(
     return moves, "" if moves else "no move between rests rotates gravity, which would show the unit"
 
 
-def _by_table(parts: list[Columns], rate: NDArray[np.float64]) -> Guess | None:
+def _by_table(columns: Columns, rate: NDArray[np.float64]) -> Guess | None:
     """Return what the table's rate in the same rows says of the gyroscope's unit."""
-    for columns in parts:
-        if "gyroscope" in columns.triads and "table_rate" in columns.others:
-            index = columns.others["table_rate"]
-            stated, _ = stated_unit(columns.layout.names[index], "table_rate")
-            multiplier, divisor = UNITS["table_rate"][stated or "deg/s"]
-            return rate_unit_by_table(rate, columns.layout.numbers[index] * multiplier / divisor)
-    return None
+    if "table_rate" not in columns.others:
+        return None
+    index = columns.others["table_rate"]
+    stated, _ = stated_unit(columns.layout.names[index], "table_rate")
+    multiplier, divisor = UNITS["table_rate"][stated or "deg/s"]
+    return rate_unit_by_table(rate, columns.layout.numbers[index] * multiplier / divisor)
 
 
 def _readings(sensor: str, parts: list[Columns]) -> NDArray[np.float64] | None:

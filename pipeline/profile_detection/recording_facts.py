@@ -1,19 +1,13 @@
-"""What ingest makes of a log, in lines for a person: time, channels, rests, clipping, units, notes, MCAP topics."""
+"""What ingest makes of a log, in lines for a person: time, channels, rests, clipping, units, notes."""
 
 from __future__ import annotations
 
 import textwrap
-from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.errors import IngestError
 from pipeline.io.gravity_rotation import misfit_deg, moves_of, rests_of
-from pipeline.io.mcap_channels import KINDS
-from pipeline.io.message_decoder import object_decoder, ros_layouts
-from pipeline.io.message_layout import short_name
-from pipeline.io.message_logs import LogReader, open_reader
 from pipeline.io.quality_flags import CLIPPED, GAP, STUCK, equal_share
 from pipeline.io.units import TRIADS
 from pipeline.profile_detection.unit_guesses import BURSTS, FEWEST_RESTS_FOR_A_SPHERE, sphere
@@ -21,13 +15,10 @@ from pipeline.records import AXES, SENSOR_UNITS, SENSORS
 from pipeline.signal.rests import rests_from_table, runs
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-    from pathlib import Path
+    from collections.abc import Mapping, Sequence
 
-    from mcap.records import Channel, Schema
     from numpy.typing import NDArray
 
-    from pipeline.io.mcap_channels import AnyReader
     from pipeline.records import Note, Recording
 
 ENOUGH = 500_000  # samples that rests and moves are looked for in
@@ -39,9 +30,6 @@ WIDTH = 118  # characters of a line
 LISTED_NOTES = 20  # the rest is counted; they fit one screen
 
 Line = tuple[str, str]
-MOST_FIELDS = 24  # listed of a message
-MOST_TOPICS = 20  # listed one a line
-LONGEST_LIST = 4  # elements listed of an array
 
 
 def facts(recording: Recording, sensor: Mapping[str, Any] | None = None) -> list[Line]:
@@ -221,89 +209,3 @@ def _notes(notes: Sequence[Note]) -> list[str]:
 def _number(value: float, digits: int = 4) -> str:
     text = f"{value:.{digits}g}"
     return f"{value:.0f}" if "e" in text and 1 <= abs(value) < 1e7 else text
-
-
-def topic_lines(path: Path, *, fields: bool) -> list[tuple[str, str]]:
-    """Return what a log of messages holds, as pairs of label and text; nothing where it cannot be walked through.
-
-    ``fields``: whether the fields of messages of types that ingest does not know are listed.
-    """
-    first: dict[int, bytes] = {}
-    try:
-        with open_reader(path) as found:
-            for rows in found.rows():
-                if rows.channel not in first:
-                    first[rows.channel] = rows.payload(0)
-    except (IngestError, OSError):
-        return []
-    lines = [("container", _container(found))]
-    if len(found.channels) > MOST_TOPICS:
-        return [*lines, ("topics", ", ".join(f"{c.topic} ({found.counts[n]})" for n, c in found.channels.items()))]
-    for number, channel in found.channels.items():
-        schema = found.schemas.get(channel.schema_id)
-        kind = f"{schema.name}, {channel.message_encoding}" if schema else channel.message_encoding or "no encoding"
-        text = f"{channel.topic} ({kind}): {counted(found.counts[number], 'message')}"
-        if fields and number in first and not (schema and short_name(schema.name) in KINDS):
-            text += _fields(channel, schema, first[number])
-        lines.append(("topic", text))
-    return lines
-
-
-def _container(reader: AnyReader) -> str:
-    """Return the size of a log of messages, and whether it proves to be complete."""
-    size, proof = counted(reader.count, "message"), "integrity: not_verifiable, without checksums"
-    if isinstance(reader, LogReader):
-        return f"{reader.kind} with {size}; {proof}"
-    library = f", written by {reader.header.library}" if reader.header and reader.header.library else ""
-    proof = "every checksum and count verified" if reader.verified else proof
-    return f"{size} in {counted(len(reader.chunks), 'chunk')}{library}; {proof}"
-
-
-def counted(number: int, what: str) -> str:
-    """Return a number of things in words."""
-    return f"{number:,} {what}{'s'[: number != 1]}"
-
-
-def _fields(channel: Channel, schema: Schema | None, payload: bytes) -> str:
-    """Return the paths of a message's numbers, for a map of fields."""
-    try:
-        paths = list(islice(_paths(channel, schema, payload), MOST_FIELDS + 1))
-    except Exception:  # noqa: BLE001  (any decoder's trouble with a stranger's message: then nothing is listed)
-        return ""
-    more = " .." if len(paths) > MOST_FIELDS else ""
-    return f", with {', '.join(paths[:MOST_FIELDS])}{more}" if paths else ""
-
-
-def _paths(channel: Channel, schema: Schema | None, payload: bytes) -> Iterator[str]:
-    """Yield the paths of the numbers in a message of any encoding."""
-    find_layout = ros_layouts(channel, schema)
-    if find_layout is None:
-        decode = object_decoder(channel, schema)
-        yield from _numbers(decode(payload) if decode else {}, "")
-        return
-    for path, place in find_layout(payload).places.items():
-        if place.count is None:
-            yield path
-        else:
-            yield from (f"{path}[{i}]" for i in range(min(place.count, LONGEST_LIST)))
-
-
-def _numbers(value: Any, path: str) -> Iterator[str]:  # noqa: ANN401  (a message of any decoder)
-    """Yield the paths of the numbers in a decoded message."""
-    if isinstance(value, bool | str | bytes):
-        return
-    if hasattr(value, "__float__"):
-        yield path
-        return
-    if hasattr(value, "DESCRIPTOR"):
-        children = {f.name: getattr(value, f.name) for f in value.DESCRIPTOR.fields}
-    elif isinstance(value, dict):
-        children = value
-    elif hasattr(value, "__len__"):
-        for index in range(min(len(value), LONGEST_LIST)):
-            yield from _numbers(value[index], f"{path}[{index}]")
-        return
-    else:
-        children = getattr(value, "__dict__", {})
-    for name, child in children.items():
-        yield from _numbers(child, f"{path}.{name}" if path else name)
