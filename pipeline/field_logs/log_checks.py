@@ -56,7 +56,7 @@ class LogChecks:
     """
 
     def __init__(self) -> None:
-        self.samples = self.reversed = self.repeated = 0
+        self.samples = self.reversed = self.repeated = self.kept = 0
         self.first_reversed = ""
         self.last_time = -np.inf
         self.windows: list[dict[str, Values]] = []
@@ -96,9 +96,10 @@ class LogChecks:
 
     def _add_windows(self, raw: Mapping[str, Values], calibrated: Mapping[str, Values], time: Values | None) -> None:
         """Keep means and scatter of the windows of a block."""
-        count = min(len(next(iter(raw.values()), ())) // WINDOW, MOST_WINDOWS - sum(map(_count, self.windows)))
+        count = min(len(next(iter(raw.values()), ())) // WINDOW, MOST_WINDOWS - self.kept)
         if count <= 0:
             return
+        self.kept += count
         part: dict[str, Values] = {}
         for sensor, values in raw.items():
             cut = values[: count * WINDOW].reshape(count, WINDOW, 3)
@@ -197,10 +198,6 @@ class LogChecks:
         cause = "rad/s" if abs(np.degrees(integral) / turned - 1.0) < 1.0 else "another unit or range"
         told = f"gravity turns by {turned:.3g} deg between rests, over which the gyroscope integrates to {integral:.3g}"
         return [f"{told} deg: its readings look like {cause}; --ingest names a profile with the unit of each column"]
-
-
-def _count(window: Mapping[str, Values]) -> int:
-    return len(next(iter(window.values())))
 
 
 def _error(sensor: str, means: Values) -> float:

@@ -180,10 +180,9 @@ class _RowReader:
         self, layout: Layout, body: bytes, numbers: dict[int, NDArray[np.float64]]
     ) -> dict[int, NDArray[np.int64]]:
         """Return the times from their digits, from the first that a double does not hold to half a nanosecond."""
-        clock = time_column(layout)
-        if clock is None or self.settings.tick_ns is not None:
+        if self.settings.rate_hz is not None or self.settings.tick_ns is not None:
             return {}
-        column, index = clock
+        column, index = time_column(layout)
         largest = float(np.abs(numbers[index]).max()) * seconds_per_unit(column.unit)
         if not (self.blocks and EXACT in self.blocks[0]):
             if largest < EXACT_BELOW_S:

@@ -41,9 +41,9 @@ LARGEST_DISPLACEMENT = 5  # rows
 RESET_INTERVALS = 5  # a time that falls back by more begins another session
 
 
-def time_column(layout: Layout) -> tuple[Column, int] | None:
-    """Return the column of the time and its index, None where there is none."""
-    return next(((c, i) for c, i in layout.columns if c.channel == "time"), None)
+def time_column(layout: Layout) -> tuple[Column, int]:
+    """Return the column of the time and its index, of a log that is not sampled at a stated rate."""
+    return next((c, i) for c, i in layout.columns if c.channel == "time")
 
 
 def seconds_per_unit(unit: str) -> float:
@@ -53,7 +53,7 @@ def seconds_per_unit(unit: str) -> float:
 
 def exact_times(layout: Layout, body: bytes) -> NDArray[np.int64]:
     """Return the times of rows in ns from their decimal digits."""
-    column, index = next((c, i) for c, i in layout.columns if c.channel == "time")
+    column, index = time_column(layout)
     digits = DECIMAL_DIGITS[column.unit]
     try:
         table = layout.parse(body, {index: pa.decimal128(38, digits)})
@@ -78,7 +78,7 @@ def times_of(rows: Rows, settings: CsvFormat) -> NDArray[np.int64]:
     """Return the time of each row, ns; refuse times out of range, or that have lost their digits."""
     if settings.rate_hz is not None:
         return np.asarray(np.rint(np.arange(len(rows.lines)) * (1e9 / settings.rate_hz)).astype(np.int64))
-    column, index = next((c, i) for c, i in rows.layout.columns if c.channel == "time")
+    column, index = time_column(rows.layout)
     values, name, tick_ns = rows.numbers[index], rows.layout.names[index], settings.tick_ns
     unit_s = float(tick_ns) / 1e9 if tick_ns is not None else seconds_per_unit(column.unit)
     row = int(np.argmax(np.abs(values)))
@@ -119,8 +119,8 @@ def in_order(
     A time that goes back otherwise than by an overflow or by displaced rows is refused, as are two rows of one time
     that differ, and more repairs than ``checks`` allows.
     """
-    clock = time_column(rows.layout)
-    tick_ns = float(settings.tick_ns or UNITS["time"][clock[0].unit if clock else "s"][0])
+    unit = "s" if settings.rate_hz is not None else time_column(rows.layout)[0].unit
+    tick_ns = float(settings.tick_ns or UNITS["time"][unit][0])
     if settings.session is not None:
         rows, time_ns = _one_session(rows, time_ns, settings.session, tick_ns)
     if bool(np.all(np.diff(time_ns) > 0)):

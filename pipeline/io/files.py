@@ -106,20 +106,16 @@ def candidate_files(procedure: Mapping[str, Any], ingest: Mapping[str, Any]) -> 
     out = {}
     for name, entry in recordings.items():
         file = entry["file"]
+        messages = [[file + suffix] for suffix in SUFFIXES[2:]]
         if Path(file).suffix:
             out[name] = [[file]]
         elif not parts:
             out[name] = [[file + suffix] for suffix in SUFFIXES]
         elif owner in (None, name):
-            out[name] = [[str(part["file"]).replace(FILE, file) for part in parts], *_message_files(file)]
+            out[name] = [[str(part["file"]).replace(FILE, file) for part in parts], *messages]
         else:
-            out[name] = _message_files(file)
+            out[name] = messages
     return out
-
-
-def _message_files(file: str) -> list[list[str]]:
-    """Return the names of a recording as a log of messages."""
-    return [[file + suffix] for suffix in SUFFIXES[2:]]
 
 
 def _owner_of_parts(recordings: Mapping[str, Mapping[str, Any]], parts: Sequence[Mapping[str, Any]]) -> str | None:

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.io.ingest_settings import McapFormat
-    from pipeline.io.mcap_channels import AnyReader
     from pipeline.io.mcap_chunk import Rows
+    from pipeline.io.mcap_reader import MessageReader
 
     Columns = dict[str, NDArray[Any]]
 
@@ -41,7 +41,7 @@ def read_log(path: Path, settings: McapFormat) -> ChannelTable:
         return read_messages(reader, settings)
 
 
-def read_messages(reader: AnyReader, settings: McapFormat) -> ChannelTable:
+def read_messages(reader: MessageReader, settings: McapFormat) -> ChannelTable:
     """Read the messages of an open log; errors as of ``read_log``."""
     return _Log(reader, settings).table()
 
@@ -66,7 +66,7 @@ class _Topic:
     recorded: list[NDArray[np.int64]] = field(default_factory=list)
     values: dict[str, list[NDArray[Any]]] = field(default_factory=dict)
 
-    def read(self, rows: Rows, reader: AnyReader) -> None:
+    def read(self, rows: Rows, reader: MessageReader) -> None:
         """Decode the messages of a run."""
         if self.error is not None:
             return
@@ -115,7 +115,7 @@ class _Topic:
 class _Log:
     """One file, and what of it becomes channels."""
 
-    def __init__(self, reader: AnyReader, settings: McapFormat) -> None:
+    def __init__(self, reader: MessageReader, settings: McapFormat) -> None:
         self.reader, self.path, self.settings = reader, reader.path, settings
         self.topics: dict[str, _Topic] = {}
         self.notes: list[Note] = []

@@ -10,7 +10,7 @@ A covariance whose first element is -1 says that the quantity is absent (sensor_
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -32,10 +32,7 @@ if TYPE_CHECKING:
 
     from pipeline.io.ingest_settings import McapFormat
     from pipeline.io.mcap_chunk import Rows
-    from pipeline.io.mcap_reader import McapReader
-    from pipeline.io.message_logs import LogReader
-
-    AnyReader: TypeAlias = McapReader | LogReader
+    from pipeline.io.mcap_reader import MessageReader
 
 MAPPED = "mapped"  # the kind of a topic whose fields the profile names; other kinds are ROS types
 KINDS = {short_name(kind): kind for kind in (IMU, TEMPERATURE, JOINT_STATE, QUATERNION_STAMPED)}
@@ -52,15 +49,11 @@ def kind_of(topic: str, schema: Schema | None, settings: McapFormat) -> str:
 
 def topic_of(kind: str, settings: McapFormat) -> str | None:
     """Return the topic that the profile names for a ROS type; None stands for the only one."""
-    return {
-        IMU: settings.imu_topic,
-        TEMPERATURE: settings.temperature_topic,
-        JOINT_STATE: settings.joint_topic,
-        QUATERNION_STAMPED: settings.attitude_topic,
-    }[kind]
+    topics = (settings.imu_topic, settings.temperature_topic, settings.joint_topic, settings.attitude_topic)
+    return dict(zip(KINDS.values(), topics, strict=True))[kind]
 
 
-def listed_topics(reader: AnyReader) -> list[tuple[str, str]]:
+def listed_topics(reader: MessageReader) -> list[tuple[str, str]]:
     """Return all topics of a file, each with its type in words."""
     found = set()
     for number, channel in reader.channels.items():
@@ -90,7 +83,7 @@ class TopicDecoder:
         self.count = 0
         self._absent: dict[str, bool] = {}  # columns, by the first message
 
-    def read(self, rows: Rows, reader: AnyReader) -> Batch:
+    def read(self, rows: Rows, reader: MessageReader) -> Batch:
         """Return time and channels of some messages; channels that are absent are left out."""
         recorded = rows.heads["log_time"]
         if (recorded > LARGEST_NS).any():

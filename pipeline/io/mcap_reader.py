@@ -47,47 +47,67 @@ class _TruncatedError(Exception):
     """The file ends before its end magic."""
 
 
-class McapReader:
-    """One pass over a file.
-
-    Parameters
-    ----------
-    path : str
-        For messages.
-    allow_truncated : bool
-        Whether the complete chunks of a file without end are read.
+class MessageReader:
+    """One pass over a log of messages.
 
     Attributes
     ----------
+    path : str
+        For messages.
     schemas, channels, counts
         By number; ``counts`` are those of messages.
-    chunks : list of int
-        Byte at which each chunk begins.
-    position : int
-        Bytes read so far.
+    notes : list of Note
+        What the format's own reader remarks.
+    has_recorder : bool
+        Whether the messages have times of the logger.
     truncated : str
         What is missing at the end of a file whose complete chunks are read on request; else empty.
     sha256 : str
         Of the whole file; set when the iteration has ended.
     """
 
-    has_recorder = True  # of the reader's interface, as ``pipeline.io.message_logs.LogReader``
-    notes: tuple[Note, ...] = ()
+    def __init__(self, path: str) -> None:
+        self.path = path
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self.counts: Counter[int] = Counter()
+        self.notes: list[Note] = []
+        self.has_recorder = True
+        self.truncated = self.sha256 = ""
+
+    @property
+    def count(self) -> int:
+        """Number of messages so far."""
+        return self.counts.total()
+
+    @property
+    def verified(self) -> bool:
+        """Whether a checksum covers every message; a file may be written without any."""
+        return False
+
+    def rows(self) -> Iterator[Rows]:
+        """Yield the messages, run by run and channel by channel; damage raises ``IngestError``."""
+        raise NotImplementedError
+
+
+class McapReader(MessageReader):
+    """One pass over an MCAP file.
+
+    ``allow_truncated``: whether the complete chunks of a file without end are read. ``chunks``: byte at which each
+    begins. ``position``: bytes read so far.
+    """
 
     def __init__(self, stream: BinaryIO, path: str, *, allow_truncated: bool = False) -> None:
-        self.stream, self.path, self.allow_truncated = stream, path, allow_truncated
+        super().__init__(path)
+        self.stream, self.allow_truncated = stream, allow_truncated
         check_magic(stream.read(64), path)
         self.size = stream.seek(0, os.SEEK_END)
         stream.seek(0)
         self.header: Header | None = None
-        self.schemas: dict[int, Schema] = {}
-        self.channels: dict[int, Channel] = {}
         self.attachments: list[Attachment] = []
         self.metadata: list[Metadata] = []
-        self.counts: Counter[int] = Counter()
         self.chunks: list[int] = []
         self.position = 0
-        self.truncated = self.sha256 = ""
         self._statistics: Statistics | None = None
         self._chunk_index: list[int] = []  # bytes at which chunks begin, by the summary
         self._crc, self._sha = 0, hashlib.sha256()
@@ -100,13 +120,8 @@ class McapReader:
         self._chunks_checked = True
 
     @property
-    def count(self) -> int:
-        """Number of messages so far."""
-        return self.counts.total()
-
-    @property
     def verified(self) -> bool:
-        """Whether a checksum covers every message; a file may be written without any."""
+        """Whether a checksum covers every message."""
         return self._data_checked or (self._chunks_checked and not self._outside_chunks)
 
     def rows(self) -> Iterator[Rows]:

@@ -161,7 +161,8 @@ class ChannelDecoder:
             parts = [layout.number(place) for place in _stamp_places(self.wanted.time, layout).values()]
             if not parts:
                 return numbers, None
-            moment = (int(parts[0]), int(parts[1])) if len(parts) == 2 else _exact(parts[0])
+            single = parts[0] if isinstance(parts[0], int) else Decimal(parts[0])
+            moment = (int(parts[0]), int(parts[1])) if len(parts) == 2 else single
             self.coarse_time |= isinstance(moment, Decimal)
         else:
             assert self.decode is not None  # noqa: S101  (the constructor found it)
@@ -223,7 +224,3 @@ def _stamp_places(path: FieldPath | None, layout: MessageLayout) -> dict[str, tu
     if place is None:
         raise ValueError(f"{path.text} is an empty list; a moment is expected")
     return {SECONDS: place}
-
-
-def _exact(number: float) -> int | Decimal:
-    return number if isinstance(number, int) else Decimal(number)

@@ -163,7 +163,7 @@ class MessageLayout:
 
     def elements(self, most: int) -> dict[str, tuple[int, str]]:
         """Return (offset, type) of each number by its path, of arrays the first elements: ``samples[0]`` .."""
-        found = {}
+        found: dict[str, tuple[int, str]] = {}
         for name, place in self.places.items():
             indices = [""] if place.count is None else [f"[{i}]" for i in range(min(place.count, most))]
             size = int(place.code[2:])

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections import Counter
 from contextlib import contextmanager
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -24,7 +23,7 @@ from pipeline.io.array_logs import COPY_AGAIN, topics_of
 from pipeline.io.files import MESSAGE_FORMATS, is_mat_5
 from pipeline.io.mcap_channels import STATED
 from pipeline.io.mcap_chunk import HEAD, Rows
-from pipeline.io.mcap_reader import McapReader
+from pipeline.io.mcap_reader import McapReader, MessageReader
 from pipeline.io.message_decoder import ARRAYS
 
 if TYPE_CHECKING:
@@ -33,34 +32,18 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.io.mcap_channels import AnyReader
-    from pipeline.records import Note
 
 RUN_SIZE = 4096  # messages of one topic of a bag that are decoded together
 
 
-class LogReader:
-    """One pass over a log; attributes as of ``McapReader``.
-
-    ``notes`` are those of the format. ``has_recorder``: whether the messages have times of the logger.
-    """
-
-    verified, truncated = False, ""
+class LogReader(MessageReader):
+    """One pass over a log of another program."""
 
     def __init__(self, path: Path, kind: str) -> None:
-        self.file, self.path, self.kind = path, str(path), kind
-        self.schemas: dict[int, Schema] = {}
-        self.channels: dict[int, Channel] = {}
-        self.counts: Counter[int] = Counter()
-        self.notes: list[Note] = []
-        self.has_recorder = True
+        super().__init__(str(path))
+        self.file, self.kind = path, kind
         with path.open("rb") as stream:
             self.sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
-
-    @property
-    def count(self) -> int:
-        """Number of messages so far."""
-        return self.counts.total()
 
     def messages(self) -> Iterator[Rows]:
         """Yield the messages; a subclass reads them from arrays or bytes."""
@@ -180,7 +163,7 @@ def open_log(path: Path) -> LogReader:
 
 
 @contextmanager
-def open_reader(path: Path, *, allow_truncated: bool = False) -> Iterator[AnyReader]:
+def open_reader(path: Path, *, allow_truncated: bool = False) -> Iterator[MessageReader]:
     """Open a log of messages of any format, MCAP included."""
     if path.suffix.lower() in MESSAGE_FORMATS:
         yield open_log(path)

@@ -149,7 +149,9 @@ def to_recording(
         attitude = np.column_stack([table.values[c] for c in ATTITUDE])
         table.values["table_rate"] = rate_of_attitude((table.time_ns - table.time_ns[0]) / 1e9, attitude)
     values = table.values
-    notes = [*notes, *(_absent(sensor_name, table) for sensor_name in TRIADS if TRIADS[sensor_name][0] not in values)]
+    for lacking in (s for s, triad in TRIADS.items() if triad[0] not in values):
+        detail = f"the file holds no readings of the {lacking}: it cannot calibrate this sensor"
+        notes.append(Note("N-ABSENT", len(table.time_ns), 0, 0, detail))
     recording = Recording(
         name=name,
         role=entry["role"],
@@ -170,11 +172,6 @@ def to_recording(
     if checks.disturbed_rows:
         recording = leave_out_shaken_rests(recording, table.note)
     return leave_out_disturbances(recording, table.note, checks.disturbed_rows)
-
-
-def _absent(sensor: str, table: ChannelTable) -> Note:
-    rows = len(table.time_ns)
-    return Note("N-ABSENT", rows, 0, 0, f"the file holds no readings of the {sensor}: it cannot calibrate this sensor")
 
 
 def _stack(values: dict[str, NDArray[np.float64]], channels: Sequence[str]) -> NDArray[np.float64] | None:

@@ -7,26 +7,28 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import islice
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pipeline.errors import IngestError
 from pipeline.io.field_path import STAMPS
+from pipeline.io.files import MESSAGE_FORMATS
 from pipeline.io.mcap_channels import KINDS, STATED
+from pipeline.io.mcap_reader import McapReader
 from pipeline.io.message_decoder import object_decoder, ros_layouts
 from pipeline.io.message_layout import short_name
-from pipeline.io.message_logs import LogReader, open_reader
+from pipeline.io.message_logs import open_reader
 from pipeline.profile_detection.columns import FEWEST_ROWS, MOST_ROWS, TextLayout, find_columns
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
     from mcap.records import Channel, Schema
 
-    from pipeline.io.mcap_channels import AnyReader
     from pipeline.io.mcap_chunk import Rows
+    from pipeline.io.mcap_reader import MessageReader
 
 LONGEST_ARRAY = 16  # elements of a field that may be readings
 LONGEST_LIST = 4  # elements listed of an array
@@ -63,7 +65,7 @@ def topics_of(path: Path) -> list[TopicLayout]:
     return best
 
 
-def _layout(reader: AnyReader, rows: Rows) -> TopicLayout | None:
+def _layout(reader: MessageReader, rows: Rows) -> TopicLayout | None:
     """Return the numbers of a topic's messages; None where they are too few, vary in length or are no arrays."""
     channel = reader.channels[rows.channel]
     try:
@@ -115,11 +117,11 @@ def topic_lines(path: Path, *, fields: bool) -> list[tuple[str, str]]:
     return lines
 
 
-def _container(reader: AnyReader) -> str:
+def _container(reader: MessageReader) -> str:
     """Return the size of a log of messages, and whether it proves to be complete."""
     size, proof = counted(reader.count, "message"), "integrity: not_verifiable, without checksums"
-    if isinstance(reader, LogReader):
-        return f"{reader.kind} with {size}; {proof}"
+    if not isinstance(reader, McapReader):
+        return f"{MESSAGE_FORMATS[Path(reader.path).suffix.lower()].kind} with {size}; {proof}"
     library = f", written by {reader.header.library}" if reader.header and reader.header.library else ""
     proof = "every checksum and count verified" if reader.verified else proof
     return f"{size} in {counted(len(reader.chunks), 'chunk')}{library}; {proof}"
