@@ -245,24 +245,27 @@ def _form(M: Values, held_out: Sequence[LinearizedSamples], uncertain: _Uncertai
         left = np.clip(each.wander - np.diag(B)[label, None] * noise.wander**2, 0.0, None)
         correlated = np.clip(noise.correlation_time / interval, 1.0, n / count) / n
         within = within + _traces_of(MWM * left[:, None, :]) * [share, share**2 * correlated]
-    A, covariances = np.zeros((size, size)), np.zeros((3, size, size))
-    A[:q, :q], covariances[0, :q, :q], at = of_parameters, uncertain.covariance, q
-    for own, across, B, slow in of_blocks:
-        for b, (form, mixed) in enumerate(zip(own, across, strict=True)):
-            mine = slice(at + 3 * b, at + 3 * b + 3)
+    A, Q = np.zeros((size, size)), np.zeros((3, size, size))
+    A[:q, :q], at = of_parameters, q
+    for own, across, _, _ in of_blocks:
+        for form, mixed in zip(own, across, strict=True):
+            mine = slice(at, at + 3)
             A[mine, mine], A[:q, mine], A[mine, :q] = form, mixed, mixed.T
+            at = mine.stop
+    Q[0, :, :q], at = A[:, :q] @ uncertain.covariance, q
+    for own, _, B, slow in of_blocks:  # the covariance of a recording's blocks is that in time, on each axis
         mine = slice(at, at + 3 * len(own))
-        covariances[1, mine, mine] = np.kron(B, np.diag(noise.wander**2))
-        covariances[2, mine, mine] = np.kron(slow, np.diag(uncertain.drift))
+        of_axes = A[:, mine].reshape(size, -1, 3).swapaxes(1, 2)
+        for k, in_time, of_axis in ((1, B, noise.wander**2), (2, slow, uncertain.drift)):
+            Q[k, :, mine] = ((of_axes @ in_time).swapaxes(1, 2) * of_axis).reshape(size, -1)
         at = mine.stop
-    Q = A @ covariances
     transposed = np.swapaxes(Q, 1, 2).reshape(3, -1)
     determined = noise.length / interval if noise.length > 0.0 else REST_SAMPLES
     first_order, second_order = np.trace(Q, axis1=1, axis2=2), Q.reshape(3, -1) @ transposed.T
     third_order = np.empty((3, 3, 3))
     for i, j in combinations_with_replacement(range(3), 2):  # the trace of a product is the same in every order
-        last = size if i else q  # the columns of the parameters
-        product = (Q[i, :, :last] @ Q[j, :last]).ravel()
+        held = slice(q, None) if i else slice(q)  # the columns that are not zero
+        product = (Q[i, :, held] @ Q[j, held]).ravel()
         third_order[i, j] = third_order[j, i] = transposed @ product
     return _QuadraticForm(white, within, 1.0 / determined, first_order, second_order, third_order)
 
