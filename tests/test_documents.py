@@ -5,7 +5,6 @@ import runpy
 from pathlib import Path
 
 import pytest
-import yaml
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = [
@@ -53,17 +52,6 @@ def test_every_document_is_in_the_index() -> None:
 
 def test_the_readme_is_short() -> None:
     assert len((ROOT / "README.md").read_text().splitlines()) <= 150
-
-
-def test_the_table_of_effects_is_the_catalogue() -> None:
-    rows = re.findall(
-        r"^\| `(\w+)` \| (\w+) \| .* \| (\w+) \|$", (ROOT / "docs" / "theory.md").read_text(), re.MULTILINE
-    )
-    catalogue = [yaml.safe_load(file.read_text()) for file in (ROOT / "configs" / "effect").glob("*.yaml")]
-    sensors = {("accelerometer", "gyroscope"): "both"}
-    assert sorted(rows) == sorted(
-        (e["name"], sensors.get(tuple(e["sensors"]), e["sensors"][0]), e["owner"]) for e in catalogue
-    )
 
 
 def test_figures_of_the_blind_study_are_those_of_its_table() -> None:

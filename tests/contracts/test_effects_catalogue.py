@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 
@@ -99,6 +100,14 @@ def test_every_file_that_ships_is_an_effect_with_all_texts() -> None:
         assert all([effect.meaning, effect.excitation, effect.experiment, effect.source]), effect.name
         assert (CONFIGS / f"{effect.name}.yaml").read_text(encoding="utf-8").startswith("# ")  # its equation
         assert effect.definition is None
+
+
+def test_the_table_of_theory_has_a_row_for_every_effect() -> None:
+    text = (CONFIGS.parents[1] / "docs" / "theory.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `(\w+)` \| (\w+) \| .* \| (\w+) \|$", text, re.MULTILINE)
+    both = {SENSORS: "both"}
+    expected = [(e.name, both.get(e.sensors, e.sensors[0]), str(e.owner)) for e in built_in().values()]
+    assert sorted(rows) == sorted(expected), "docs/theory.md, Effects: effect, sensors, term, owner"
 
 
 def test_one_file_adds_an_effect(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, motions: list[Motion]) -> None:

@@ -45,10 +45,12 @@ def motion(n: int = 400, seed: int = 0, dt: float = 0.01) -> Motion:
 
 
 def fitted(name: str, sensor: str, seed: int = 1) -> FittedEffect:
-    rng = np.random.default_rng(seed)
+    rng, this, m = np.random.default_rng(seed), catalogue()[name], motion()
     parameters = {}
-    for p in catalogue()[name].parameters(sensor):
-        value = 120.0 if p.unit == "s" else rng.uniform(-1, 1) * SIZE[sensor]
+    columns = this.columns(sensor, m, np.eye(3), np.ones(len(this.parameters(sensor))))
+    most = 0.1 * np.max(np.abs(truth(sensor, m))) / np.max(np.abs(columns), axis=(0, 1), initial=1e-300)
+    for p, limit in zip(this.parameters(sensor), most, strict=True):
+        value = 120.0 if p.unit == "s" else rng.uniform(-1, 1) * min(SIZE[sensor], limit)
         parameters[p.name] = {"value": value, "unit": p.unit, "expanded_uncertainty": 0.0}
     return FittedEffect(name, parameters)
 
