@@ -10,11 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import ConfigurationError
-from pipeline.model.effects import register
-from pipeline.model.effects.files import read_effect_files
-from pipeline.planning.changes import best_changes
-from pipeline.planning.plan import plan_of
-from pipeline.planning.plan_text import helps_most, plan_text, side_by_side
+from pipeline.model.effects import read_effect_files, register
+from pipeline.planning.changes import best_changes, helps_most
+from pipeline.planning.plan import plan_of, plan_text, side_by_side
 from pipeline.simulation.description import UnitDescription, add_recording_options, described, read_description
 
 if TYPE_CHECKING:

@@ -11,8 +11,7 @@ import yaml
 
 from pipeline.errors import ConfigurationError
 from pipeline.model.data_sheet import assumed_figures
-from pipeline.model.effects import register
-from pipeline.model.effects.files import read_effect_files
+from pipeline.model.effects import read_effect_files, register
 from pipeline.outcome import run_command
 from pipeline.run_progress import Countdown
 from pipeline.simulation.campaign import write_campaign

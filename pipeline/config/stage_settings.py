@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pipeline.config.campaign import Campaign
 
 PACKAGE = Path(__file__).resolve().parents[1]
-EFFECTS = CONFIGS / "effect"  # what pipeline.model.effects.files reads
+EFFECTS = CONFIGS / "effect"  # what pipeline.model.effects reads
 # An import of the package, or of jinja2: module and names, or module alone. ``ast`` takes 0.5 s for all files.
 IMPORT = re.compile(
     r"^[ \t]*(?:from (pipeline[\w.]*|jinja2) import (\([^)]*\)|.*)|import (pipeline[\w.]*))", re.MULTILINE

@@ -90,7 +90,7 @@ def load_user_effects(campaign: Path, configs: Iterable[Path], python: Sequence[
     }
     if not any(files.values()) and not python:
         return UserEffects()
-    from pipeline.model.effects.files import load_python_effect, read_effect_files  # noqa: PLC0415  (imports numpy)
+    from pipeline.model.effects import load_python_effect, read_effect_files  # noqa: PLC0415  (imports numpy)
 
     for folder, those in files.items():
         try:

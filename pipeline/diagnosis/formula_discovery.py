@@ -30,9 +30,8 @@ from pipeline.estimation.design import Term
 from pipeline.estimation.generalized_least_squares import fit_terms
 from pipeline.estimation.observations import without_each_recording, without_rows
 from pipeline.estimation.selection import FAR_ABOVE, select
-from pipeline.model.effects import catalogue, forget, register
+from pipeline.model.effects import catalogue, effect_from, forget, register
 from pipeline.model.effects.base import unit_of
-from pipeline.model.effects.files import effect_from
 from pipeline.model.formula import SIGNALS, parse
 
 if TYPE_CHECKING:

@@ -36,8 +36,7 @@ from pipeline.estimation.multi_position.posterior import posterior
 from pipeline.estimation.multi_position.result import calibration_of, model_of
 from pipeline.estimation.multi_position.selection import FAR, select
 from pipeline.estimation.selection import GATE_BIC
-from pipeline.model.effects import catalogue, effect
-from pipeline.model.effects.files import effect_from
+from pipeline.model.effects import catalogue, effect, effect_from
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.io.units import STANDARD_GRAVITY
-from pipeline.model.sample_noise import FAST_S
+from pipeline.model.calibration_file import FAST_S
 from pipeline.records import SENSORS
 
 if TYPE_CHECKING:

@@ -15,10 +15,13 @@ from pipeline.errors import ConfigurationError, InputError, MissingInputError
 from pipeline.io.files import not_regular
 from pipeline.model.checked import WrongValueError, each, fields, flag, items, mapping, number, one_of, or_none, text
 from pipeline.model.effects import effect_of
-from pipeline.records import SENSOR_UNITS, SENSORS, FittedEffect, SensorCalibration
+from pipeline.records import AXES, SENSOR_UNITS, SENSORS, FittedEffect, SensorCalibration
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
+
+    from numpy.typing import NDArray
 
     from pipeline.model.checked import Check
 
@@ -29,6 +32,7 @@ LARGEST_FACTOR = 1000.0
 # Two axes 1 deg apart have a condition of 2 / sin(1 deg) = 115; a sensor's axes are 90 deg apart within some degrees.
 LARGEST_CONDITION = 100.0
 
+FAST_S = 0.1  # shorter than estimators average over between two images or scans: there a process counts as white
 WHAT_TO_DO = "take the file as the run published it, or calibrate the unit anew"
 
 _VECTOR = items(number, 3)
@@ -140,6 +144,30 @@ def sensor_of(document: dict[str, Any], sensor: str, file: Path) -> SensorCalibr
             _refuse(file, f"{sensor}.effects[{i}] is {entry['name']} a second time; expected each effect once")
         _check_effect(file, f"{sensor}.effects[{i}]", sensor, entry)
     return SensorCalibration.from_json(sensor, part)
+
+
+def sample_covariance(document: Mapping[str, Any], sensor: str) -> NDArray[np.float64] | None:
+    """Return the covariance of a calibrated sample: (3, 3) array, g^2 or (deg/s)^2.
+
+        cov = M diag(N^2 / dt + 2 Q^2 / dt^2 + sum_i G_i^2) M^T
+
+    with the white and quantisation noise N and Q of an axis at rest, identified at the sampling interval dt, and the
+    standard deviation G_i of its Gauss-Markov processes with a correlation time of less than ``FAST_S``: a bias that
+    wanders more slowly is no part of the noise of a sample. None where the sensor is not calibrated, or the noise of an
+    axis is not known.
+    """
+    noise, part = (document.get("noise") or {}).get(sensor) or {}, document.get(sensor)
+    axes = noise.get("axes") or {}
+    if not part or any((axes.get(axis) or {}).get("terms") is None for axis in AXES):
+        return None
+    dt, variances = float(noise["sampling_interval_s"]), []
+    for axis in AXES:
+        terms = axes[axis]["terms"]
+        white, quantisation = (terms[name]["value"] or 0.0 for name in ("white", "quantisation"))
+        fast = [g["value"] for g in terms["gauss_markov"] if g["correlation_time_s"]["value"] < FAST_S]
+        variances.append(white**2 / dt + 2.0 * quantisation**2 / dt**2 + sum(g**2 for g in fast))
+    spread = np.array(part["matrix"], np.float64) * np.sqrt(variances)
+    return np.asarray(spread @ spread.T)
 
 
 def _check_matrix(file: Path, key: str, matrix: np.ndarray) -> None:

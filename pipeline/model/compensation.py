@@ -18,13 +18,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 import numpy as np
 
 from pipeline.errors import InputError
-from pipeline.model.calibration_file import read_calibration, sensor_of
-from pipeline.model.effects import register
+from pipeline.model.calibration_file import read_calibration, sample_covariance, sensor_of
+from pipeline.model.effects import load_python_effect, register
 from pipeline.model.effects.base import OF_THE_ROOM
-from pipeline.model.effects.files import load_python_effect
 from pipeline.model.log_motion import SIGNALS, ExponentialRegression, LogEnd, fields_used, log_motion
 from pipeline.model.measurement import Part, sensor_effects, solve, without_effects
-from pipeline.model.sample_noise import sample_covariance
 from pipeline.records import SENSORS
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from pipeline.simulation.procedures import TABLE_PROCEDURES, plan
 from pipeline.simulation.trajectory import Gimbals, Planned, random_gimbals
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator, Mapping, Sequence
 
     from pipeline.planning.plan import Document
     from pipeline.simulation.description import UnitDescription
@@ -33,6 +33,8 @@ MOTION_S, MOTION_DPS = 120.0, 100.0  # of the random motion that is proposed
 UPRIGHT_DPS = 60.0  # one turn about an upright z in 6 s
 LONG_REST_S = 600.0  # six correlation times of a typical wander (configs/sensor)
 POSITIONS = 2  # times as many rests
+CLEARLY_SMALLER = 99.5  # per cent
+TOP = 3  # changes that are printed
 
 
 @dataclass(frozen=True)
@@ -164,3 +166,32 @@ def _shared(key: str, old: Mapping[str, Any]) -> bool:
 def _entries(document: Mapping[str, Any]) -> dict[str, Document]:
     """Return the observable effects by ``sensor.effect``."""
     return {f"{s}.{entry['effect']}": entry for s in SENSORS for entry in document[s]["effects"]}
+
+
+def helps_most(gains: Sequence[Gain]) -> list[str]:
+    """Return the changes that help most as lines, in the given order."""
+    useful = [gain for gain in gains if gain.shown or gain.distinguished or 100.0 * gain.factor < CLEARLY_SMALLER]
+    if not useful:
+        return ["additional recordings: none of those examined shows more"] if gains else []
+    lines = ["additional recordings, the most helpful first:"]
+    for number, gain in enumerate(useful[:TOP], start=1):
+        options = f" ({gain.change.options})" if gain.change.options else ""
+        lines.append(f"  {number}. {gain.change.what}{options}: {gain.minutes:+.1f} min")
+        lines.append(f"     {_brought(gain)}")
+    return lines
+
+
+def _brought(gain: Gain) -> str:
+    """Return the effect of a change on what can be found; the factor is a mean over effects and sensors."""
+    parts = [f"shows {_listed(gain.shown)}"] if gain.shown else []
+    parts += [f"distinguishes {_listed(gain.distinguished)} from similar effects"] if gain.distinguished else []
+    percent = 100.0 * gain.factor
+    whose = "the others" if parts else "effects"
+    smaller = percent < CLEARLY_SMALLER
+    parts.append(f"finds {whose} " + (f"at {percent:.0f} % of the size" if smaller else "at the same size"))
+    return "; ".join(parts)
+
+
+def _listed(keys: Sequence[str]) -> str:
+    by_sensor = {s: [k.partition(".")[2] for k in keys if k.startswith(f"{s}.")] for s in SENSORS}
+    return " and ".join(f"{', '.join(names)} of the {sensor}" for sensor, names in by_sensor.items() if names)

@@ -12,8 +12,7 @@ import numpy as np
 
 from pipeline.estimation.rest_means import ROLE
 from pipeline.model.kinematics import LEVEL_AT_ZERO
-from pipeline.planning.plan import plan_of
-from pipeline.planning.plan_text import share_text, size_text
+from pipeline.planning.plan import plan_of, share_text, size_text
 from pipeline.records import AXES, SENSORS
 from pipeline.signal.rests import SETTLING_S
 from pipeline.simulation.description import course_of, read_config

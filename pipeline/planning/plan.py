@@ -1,4 +1,4 @@
-"""The plan of a procedure as a document: what it would find of each effect, and what to record more.
+"""The plan of a procedure as a document and as text: what it would find of each effect.
 
     {"sensor", "table", "procedure", "course": {how it is run}, "at_a_table", "minutes", "samples", "warnings": [text],
      "accelerometer": {"noise": {"white", "wander"}, "unit",
@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from pipeline.simulation.description import UnitDescription
     from pipeline.simulation.trajectory import Planned
 
+CLEARLY_LARGER = 1.2  # times the smallest size, from which on the size at which an effect is named is printed
 SEED = 0  # of the simulated noise: a plan is the same each time
 # The middle of what is drawn at random for a simulated unit: it warms up by some degrees in a room that changes little.
 ROOM: dict[str, Any] = {
@@ -215,3 +216,105 @@ def _warnings(simulated: SimulatedProcedure, sensor: str) -> list[str]:
             f"{1000.0 * np.radians(angle):.2g} mg, and sizes below that are only found if they repeat from stop to stop"
         )
     return found
+
+
+def plan_text(document: Mapping[str, Any]) -> list[str]:
+    """Return a plan (``plan_of``) as lines."""
+    lines = [_heading(document), *(f"note: {text}" for text in document["warnings"])]
+    for sensor in SENSORS:
+        lines += ["", *_of_sensor(sensor, document[sensor])]
+    return lines
+
+
+def _heading(document: Mapping[str, Any]) -> str:
+    """Return what is planned, as a line."""
+    what = f"{document['sensor']} on {document['table']}, {document['procedure']}"
+    where = " at the table" if document["at_a_table"] else ""
+    return f"{what}: {document['minutes']:.1f} min{where}, {document['samples']} samples"
+
+
+def _of_sensor(sensor: str, part: Mapping[str, Any]) -> list[str]:
+    if part["reason"]:
+        return [f"{sensor}: nothing can be planned: {part['reason']}"]
+    noise, unit = part["noise"], part["unit"]
+    lines = [f"{sensor} (noise {noise['white']:.2g} {unit} a sample, bias wander {noise['wander']:.2g} {unit})"]
+    head = ["effect", "smallest size", "of limit", "similar signal", "note"]
+    if part["effects"]:
+        lines += _aligned([head, *(_row(entry) for entry in part["effects"])])
+    if part["not_observable"]:
+        lines.append("  not observable:")
+        lines += _aligned([[e["effect"], e["reason"]] for e in part["not_observable"]])
+    return lines
+
+
+def _row(entry: Mapping[str, Any]) -> list[str]:
+    alike = ", ".join(f"{a['effect']} {a['share']:.2f}" for a in entry["look_alikes"][:2])
+    return [
+        entry["effect"],
+        size_text(entry["smallest"], entry["unit"]),
+        share_text(entry["share_of_limit"]),
+        alike,
+        _note(entry),
+    ]
+
+
+def _note(entry: Mapping[str, Any]) -> str:
+    """Return up to which size another effect would be named in place of this one."""
+    named, smallest, taken = entry["named"], entry["smallest"], entry["taken_for"]
+    limit = None if entry["share_of_limit"] is None else smallest / entry["share_of_limit"]
+    never = named is None or (limit is not None and named > limit)
+    if taken:
+        return f"named as {taken}" + ("" if never else f" below {size_text(named, entry['unit'])}")
+    if never:
+        return "not distinguishable from those"
+    return f"named from {size_text(named, entry['unit'])}" if named > CLEARLY_LARGER * smallest else ""
+
+
+def size_text(value: float, unit: str) -> str:
+    """Return a size with its unit."""
+    return f"{value:.2g}" + ("" if unit == "1" else f" {unit}")
+
+
+def share_text(value: float | None) -> str:
+    """Return a share of a limit in per cent."""
+    if value is None:
+        return "no limit"
+    return f"{100.0 * value:.2g} %" if value >= 1e-3 else "< 0.1 %"
+
+
+def side_by_side(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]:
+    """Return two plans as lines, side by side."""
+    lines = [f"A: {_heading(first)}", f"B: {_heading(second)}"]
+    a, b = first["course"], second["course"]
+    lines += [f"   {name}: {a[name]} in A, {b[name]} in B" for name in a if a[name] != b[name]]
+    for name, document in (("A", first), ("B", second)):
+        lines += [f"note on {name}: {text}" for text in document["warnings"]]
+    for sensor in SENSORS:
+        lines += ["", sensor, *_compared(first[sensor], second[sensor])]
+    return lines
+
+
+def _compared(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]:
+    reasons = [f"  {n}: nothing can be planned: {p['reason']}" for n, p in (("A", first), ("B", second)) if p["reason"]]
+    a, b = ({entry["effect"]: entry for entry in part["effects"]} for part in (first, second))
+    rows = [["effect", "smallest in A", "of limit", "smallest in B", "of limit", "B / A"]]
+    hidden = {e["effect"] for part in (first, second) for e in part["not_observable"]}
+    for name in sorted(a.keys() | b.keys() | hidden):
+        cells = [name]
+        for found in (a.get(name), b.get(name)):
+            cells += (
+                [size_text(found["smallest"], found["unit"]), share_text(found["share_of_limit"])]
+                if found
+                else ["-", ""]
+            )
+        both = name in a and name in b
+        rows.append([*cells, f"{b[name]['smallest'] / a[name]['smallest']:.2f}" if both else ""])
+    return [*reasons, *(_aligned(rows) if len(rows) > 1 else [])]
+
+
+def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return rows as lines whose columns begin at the same place."""
+    widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
+    return [
+        "  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
+    ]

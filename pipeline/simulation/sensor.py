@@ -32,9 +32,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import ConfigurationError
-from pipeline.model.effects import effect
+from pipeline.model.effects import effect, effect_from
 from pipeline.model.effects.base import parameter_limits, truth
-from pipeline.model.effects.files import effect_from
 from pipeline.records import SENSORS
 from pipeline.simulation.scene import ALTERATIONS
 from pipeline.simulation.trajectory import rotation_about

@@ -25,7 +25,6 @@ from pipeline.model.measurement import linear_truth
 from pipeline.validation.error_breakdown import direction_known, error_breakdown, last_error_of_magnitude
 from pipeline.validation.expected_error import expected_rms_error, linearized
 from pipeline.validation.norm_error import squared_norm_errors
-from pipeline.validation.over_temperature import is_swept, residuals_over_temperature
 from pipeline.validation.samples import samples_of_motion, samples_of_rests
 
 if TYPE_CHECKING:
@@ -39,6 +38,9 @@ if TYPE_CHECKING:
 
 LEVEL = 1e-3  # probability that a calibration as good as none is refused
 STRETCHES, FEWEST = 20, 5  # a stretch of a recording of minutes is longer than the correlation time of most wander
+WIDTH = 5.0  # degC of a bin; a bias that follows the temperature by 1 mg/degC (MPU-6050) changes by 5 mg within it
+SWEPT = 2 * WIDTH  # degC: a range that fills two bins; a unit that warms up on the bench changes by less
+FEWEST_OF_BIN = 10  # samples of a bin that is shown
 FIGURES = ("mean_abs_error", "sum_abs_error", "max_error", "min_error", "rms_error", "change_percent")
 
 
@@ -68,7 +70,7 @@ def validate(
         ``unit, samples, expected_rms_error`` (None where an effect is left out), ``noise_floor, vector_noise_floor,
         steps`` of the published file, and ``held_out`` (false: judged on the samples of the fit), ``reason`` (why),
         ``reference_rms`` (of the reference's magnitude), ``noise``, ``notes``, ``worse_than_raw`` (why the
-        calibration does harm, or None), ``over_temperature`` (``pipeline.validation.over_temperature``; only where the
+        calibration does harm, or None), ``over_temperature`` (``residuals_over_temperature``; only where the
         temperature was swept), ``limits`` and ``pass``. ``vector_rms_error`` is the root of the mean squared
         length of the difference to the reference.
 
@@ -111,7 +113,7 @@ def validate(
             part["worse_than_raw"] = _worse_than_raw(calibration, samples, expected[1], other)
         swept = residuals_over_temperature(calibration, samples, other)
         whose = "the held-out samples" if part["held_out"] else "the samples of the fit"
-        if swept is None and part["held_out"] and is_swept(recordings):
+        if swept is None and part["held_out"] and _is_swept(recordings):
             fitted, _ = _choose(sensor, recordings, noise, settings, of_fit=True)
             swept, whose = residuals_over_temperature(calibration, fitted, other), "the samples of the fit"
         if swept:
@@ -119,6 +121,44 @@ def validate(
     limits = (settings.get("limits") or {}).get(sensor) or {}
     part["limits"], part["pass"] = _check_limits(calibration, part["steps"][-1], limits)
     return part
+
+
+def residuals_over_temperature(
+    calibration: SensorCalibration, samples: Sequence[Samples], other: SensorCalibration | None
+) -> list[dict[str, Any]] | None:
+    """Return the errors of the magnitude after the last step, in bins of the temperature of the sensor.
+
+    The mean of a bin (``mean_error``, g or deg/s) shows what still depends on the temperature, ``rms_error`` what noise
+    adds; ``temperature_degc`` is a mean. None where the temperature is not recorded, or its range is below ``SWEPT``.
+    """
+    temperatures, errors = [np.zeros(0)], [np.zeros(0)]
+    for each in samples:
+        error = last_error_of_magnitude(calibration, each, other)
+        if error is None or each.temperature is None:
+            return None
+        known = each.known & np.isfinite(error) & np.isfinite(each.temperature)
+        temperatures.append(each.temperature[known])
+        errors.append(error[known])
+    warmth, error = np.concatenate(temperatures), np.concatenate(errors)
+    if len(warmth) == 0 or np.ptp(warmth) < SWEPT:
+        return None
+    place = np.floor(warmth / WIDTH)
+    return [
+        {
+            "temperature_degc": float(warmth[here].mean()),
+            "mean_error": float(error[here].mean()),
+            "rms_error": float(np.sqrt(np.mean(error[here] ** 2))),
+            "samples": int(here.sum()),
+        }
+        for number in np.unique(place)
+        if (here := place == number).sum() >= FEWEST_OF_BIN
+    ]
+
+
+def _is_swept(recordings: Sequence[Recording]) -> bool:
+    """Return whether the temperature of the recordings may have been swept: it spans ``SWEPT`` in all of them."""
+    warmth = [r.temperature[np.isfinite(r.temperature)] for r in recordings if r.temperature is not None]
+    return bool(np.ptp(np.concatenate([np.zeros(0), *warmth])) >= SWEPT) if any(map(len, warmth)) else False
 
 
 def _expected(

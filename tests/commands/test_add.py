@@ -11,7 +11,7 @@ from pipeline.config.campaign import load_campaign
 from pipeline.config.devices import set_override
 from pipeline.diagnosis.formula_discovery import effect_file
 from pipeline.errors import ConfigurationError, MissingInputError, PipelineError
-from pipeline.model.effects.files import read_effect_file
+from pipeline.model.effects import read_effect_file
 
 SHEET = """unit,serial,overrides
 U1,S1,

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from bench_session import CONTINUOUS, SIZE, K, Session, random_motion, record, values_of
 
-from pipeline.model.effects import built_in, catalogue, files
+from pipeline.model import effects
+from pipeline.model.effects import built_in, built_in_files, catalogue
 from pipeline.model.effects.base import Effect, Owner, parameter_limits
-from pipeline.model.effects.files import built_in_files
 from pipeline.model.kinematics import reference_motion
 from pipeline.records import SENSORS, Motion
 
@@ -113,7 +113,7 @@ def test_the_table_of_theory_has_a_row_for_every_effect() -> None:
 def test_one_file_adds_an_effect(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, motions: list[Motion]) -> None:
     shutil.copytree(CONFIGS, tmp_path / "effect")
     (tmp_path / "effect" / "rate_product.yaml").write_text(RATE_PRODUCT, encoding="utf-8")
-    monkeypatch.setattr(files, "FOLDER", tmp_path / "effect")
+    monkeypatch.setattr(effects, "FOLDER", tmp_path / "effect")
     built_in_files.cache_clear()
     try:
         made = catalogue()["rate_product"]

@@ -25,8 +25,7 @@ from pipeline.estimation.generalized_least_squares import fit_terms
 from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.observations import observe
 from pipeline.estimation.selection import Selection, select
-from pipeline.model.effects import forget, register
-from pipeline.model.effects.files import effect_from
+from pipeline.model.effects import effect_from, forget, register
 from pipeline.model.kinematics import reference_motion
 from pipeline.records import Recording, SensorCalibration
 from pipeline.signal.temperature import smooth_temperature

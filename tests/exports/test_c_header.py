@@ -12,9 +12,8 @@ import pytest
 from pipeline import load_calibration
 from pipeline.exports import export
 from pipeline.model.compensation import SMOOTHING_S
-from pipeline.model.effects import catalogue, effect
+from pipeline.model.effects import catalogue, effect, effect_from
 from pipeline.model.effects.base import Owner
-from pipeline.model.effects.files import effect_from
 from pipeline.records import SENSORS, FittedEffect, SensorCalibration
 
 BIAS = {"accelerometer": np.array([0.031, -0.022, 0.067]), "gyroscope": np.array([1.7, -0.9, 0.4])}

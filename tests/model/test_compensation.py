@@ -11,9 +11,8 @@ import pytest
 import pipeline
 from pipeline.errors import ConfigurationError, ConvergenceError, InputError, MissingInputError, PipelineError
 from pipeline.model.compensation import BLOCK, Compensation, load
-from pipeline.model.effects import catalogue
+from pipeline.model.effects import catalogue, effect_from
 from pipeline.model.effects.base import Owner
-from pipeline.model.effects.files import effect_from
 from pipeline.model.log_motion import ExponentialRegression
 from pipeline.model.measurement import compensate, predicted_reading
 from pipeline.records import SENSORS, FittedEffect, Motion, SensorCalibration

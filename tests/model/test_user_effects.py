@@ -21,13 +21,15 @@ from pipeline.model.effects import (
     built_in,
     catalogue,
     effect,
+    effect_from,
     effect_of,
     forget,
+    load_python_effect,
+    read_effect_file,
     register,
     register_user_effects,
 )
 from pipeline.model.effects.base import Layout, parameter_limits
-from pipeline.model.effects.files import effect_from, load_python_effect, read_effect_file
 from pipeline.model.formula import FUNCTIONS, SIGNALS
 from pipeline.model.kinematics import reference_motion
 from pipeline.records import FittedEffect, Motion, Recording, SensorCalibration

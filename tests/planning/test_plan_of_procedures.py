@@ -8,9 +8,8 @@ from typing import Any
 import pytest
 
 from pipeline.errors import ConfigurationError
-from pipeline.planning.changes import best_changes, changes
+from pipeline.planning.changes import best_changes, changes, helps_most
 from pipeline.planning.plan import of_sensor, plan_of, simulate_procedure
-from pipeline.planning.plan_text import helps_most
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription
 

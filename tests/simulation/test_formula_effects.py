@@ -11,8 +11,7 @@ import yaml
 
 from pipeline.commands.simulate import main
 from pipeline.errors import ConfigurationError
-from pipeline.model.effects import catalogue, forget, register
-from pipeline.model.effects.files import effect_from
+from pipeline.model.effects import catalogue, effect_from, forget, register
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.records import FittedEffect, SensorCalibration
-from pipeline.validation.over_temperature import residuals_over_temperature
+from pipeline.validation.heldout import residuals_over_temperature
 from pipeline.validation.samples import Samples
 
 SLOPE = 2e-3  # g/degC, of z

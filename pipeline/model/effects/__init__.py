@@ -1,25 +1,46 @@
 """The catalogue of physical effects: every file of ``configs/effect/`` that ships is one.
 
 ``catalogue()`` finds the files. Effects of users have the same schema and are registered in the process that uses them.
+A YAML file is data: it is read within limits, and its formulas are parsed. A Python file is code and is run; only the
+command line can name one.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
+import re
+import sys
 from contextlib import contextmanager
-from functools import cache, lru_cache
+from dataclasses import replace
+from functools import cache, lru_cache, partial
+from importlib import import_module
+from importlib.abc import InspectLoader
+from importlib.util import decode_source
+from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from pipeline.errors import ConfigurationError
-from pipeline.model.effects.files import built_in_files, effect_from, load_python_effect, read_effect_file
+import yaml
+
+from pipeline.errors import ConfigurationError, MissingInputError, PipelineError
+from pipeline.files import CONFIGS
+from pipeline.io.files import read_text
+from pipeline.io.yaml_file import load_yaml
+from pipeline.model.effects.base import Effect
+from pipeline.model.effects.declaration import read_declaration
+from pipeline.model.effects.formula_effect import FormulaEffect
 from pipeline.model.effects.sessions import OWN, in_session
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
-    from pipeline.model.effects.base import Effect
     from pipeline.records import FittedEffect
 
+FOLDER = CONFIGS / "effect"
+BUILT_IN = re.compile(r"^built_in: true", re.MULTILINE)
+LARGEST_BYTES, LARGEST_SIZE = 16384, 1000  # of one file; the largest that ships has 2 kB and 70 values
+OF_PYTHON = ("name", "owner", "layout", "meaning", "excitation", "experiment", "source")
 _registered: dict[str, Effect] = {}
 _left_out: set[str] = set()
 
@@ -153,3 +174,150 @@ def _defined(definition: str) -> Effect:
 def _in_session(name: str) -> Effect:
     base = name.partition("@")[0]
     return in_session(name, OWN.get(base) or effect(base))
+
+
+@cache
+def built_in_files() -> dict[str, Path]:
+    """Return the file of each effect that ships, by name; a user's file in the same folder is not one."""
+    files = sorted(FOLDER.glob("*.yaml"))
+    return {f.stem: f for f in files if BUILT_IN.search(f.read_text(encoding="utf-8", errors="replace"))}
+
+
+def read_effect_files(files: Iterable[Path]) -> dict[str, Effect]:
+    """Return the effects of YAML files, by name.
+
+    Raises
+    ------
+    ConfigurationError
+        With a line for each faulty file.
+    """
+    found: dict[str, Effect] = {}
+    problems = []
+    for file in files:
+        try:
+            found[file.stem] = read_effect_file(file)
+        except ConfigurationError as error:
+            problems.append(str(error))
+    if problems:
+        raise ConfigurationError("\n".join(problems))
+    return found
+
+
+def read_effect_file(file: Path, *, built_in: bool = False) -> Effect:
+    """Return the effect of one YAML file.
+
+    Raises
+    ------
+    ConfigurationError
+        If it is faulty, with the line.
+    """
+    text = read_text(file, LARGEST_BYTES, "an effect")
+    given = load_yaml(text, str(file), LARGEST_SIZE)
+    if not isinstance(given, dict):
+        raise ConfigurationError("an effect is expected: name, owner, sensors, meaning, terms", str(file))
+    lines = partial(_lines, text)
+    made = effect_from(given, str(file), lines, built_in=built_in)
+    if made.name != file.stem:
+        place = f"{file}:{lines().get(('name',), 1)}"
+        raise ConfigurationError(f"the effect is called {made.name}, the file {file.stem}: give both one name", place)
+    return made
+
+
+def effect_from(
+    definition: Mapping[str, Any],
+    where: str,
+    lines: Any = dict,  # noqa: ANN401  (a function that returns the line of each key)
+    *,
+    built_in: bool = False,
+) -> Effect:
+    """Return the effect that a definition describes; parameters and errors as of ``read_declaration``."""
+    declared = read_declaration(dict(definition), where, lines, built_in=built_in)
+    if built_in:
+        if not declared.python:
+            return FormulaEffect(declared)
+        module, _, name = declared.python.partition(".")
+        made: Effect = getattr(import_module(f"pipeline.model.effects.{module}"), name)(declared)
+        return made
+    if declared.name in built_in_files():
+        place = f"{where}:{line}" if (line := lines().get(("name",))) else where
+        raise ConfigurationError(f"name: a built-in effect is called {declared.name}; give yours another name", place)
+    own = replace(declared, source=declared.source or f"the user's own, {where}")
+    source = {**definition, "sensors": list(declared.sensors)}
+    return FormulaEffect(own, source | ({"axes": list(declared.axes)} if "axes" in definition else {}))
+
+
+def load_python_effect(path: str | Path, sha256: str | None = None) -> Effect:
+    """Run a Python file that the user has named, and return its ``EFFECT``.
+
+    Parameters
+    ----------
+    sha256 : str, optional
+        Of the content that is expected.
+
+    Raises
+    ------
+    MissingInputError
+        If there is no such file.
+    ConfigurationError
+        If its content differs, fails, or holds no effect of the file's name.
+    """
+    file = Path(path)
+    if file.suffix != ".py" or not file.is_file():
+        raise MissingInputError("there is no such Python file (.py) with an effect", str(file))
+    content = file.read_bytes()
+    digest = hashlib.sha256(content).hexdigest()
+    if sha256 is not None and digest != sha256:
+        raise ConfigurationError("the file has changed since the run began; start the run again", str(file))
+    module = ModuleType(f"imu_calibration_user_effect_{file.stem}")
+    sys.modules[module.__name__] = module  # dataclasses and pickle look a class up there
+    try:
+        _ThisContent(content).exec_module(module)
+    except PipelineError:
+        raise
+    except Exception as error:
+        raise ConfigurationError(f"cannot be run: {type(error).__name__}: {error}", str(file)) from error
+    found = getattr(module, "EFFECT", None)
+    problem = _problem_of(found, file.stem)
+    if not isinstance(found, Effect) or problem:
+        raise ConfigurationError(problem, str(file))
+    found.definition = {"python": file.name, "sha256": digest, "owner": str(found.owner)}
+    return found
+
+
+class _ThisContent(InspectLoader):
+    """Loads the very bytes that were hashed; reads and writes no cache of compiled code."""
+
+    def __init__(self, content: bytes) -> None:
+        self.content = content
+
+    def get_source(self, fullname: str) -> str:
+        del fullname
+        return decode_source(self.content)
+
+
+def _problem_of(found: object, name: str) -> str:
+    """Return why the ``EFFECT`` of a Python file cannot be used; empty where it can."""
+    if not isinstance(found, Effect):
+        return (
+            "holds no effect: EFFECT = MyEffect() is expected, of a class derived from "
+            "pipeline.model.effects.base.Effect (see docs/effects_of_your_own.md)"
+        )
+    lacking = [attribute for attribute in OF_PYTHON if not hasattr(found, attribute)]
+    if lacking:
+        return f"its EFFECT lacks {', '.join(lacking)}"
+    if found.name != name:
+        return f"its EFFECT is called {found.name!r}; give it the file's name, {name}"
+    if found.name in built_in_files():
+        return f"a built-in effect is called {found.name}; give yours another name"
+    return ""
+
+
+def _lines(text: str) -> dict[tuple[str, ...], int]:
+    """Return the line of each key of a YAML text, by the keys from the top."""
+    found: dict[tuple[str, ...], int] = {}
+    todo: list[tuple[tuple[str, ...], yaml.Node | None]] = [((), yaml.compose(text, yaml.SafeLoader))]
+    for path, node in todo:  # the list grows while it is walked
+        for key, value in node.value if isinstance(node, yaml.MappingNode) else ():
+            found[*path, str(key.value)] = key.start_mark.line + 1
+            todo.append(((*path, str(key.value)), value))
+    return found
