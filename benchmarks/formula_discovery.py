@@ -37,6 +37,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pipeline.model.effects.files import effect_from
 
 from pipeline.diagnosis.diagnose import diagnose
 from pipeline.errors import PipelineError
@@ -45,7 +46,6 @@ from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.observations import observe
 from pipeline.model.effects import forget, register
 from pipeline.model.effects.base import Layout, per_axis, truth
-from pipeline.model.effects.files import effect_from
 from pipeline.model.formula import parse
 from pipeline.model.kinematics import reference_motion
 from pipeline.records import SENSORS, Recording
