@@ -28,13 +28,10 @@ from pipeline.signal.temperature import temperature_of
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.estimation.noise_likelihood import Fits, Spectrum
     from pipeline.estimation.noise_search import Candidate
-    from pipeline.records import Recording
+    from pipeline.records import Recording, Values
 
-    Values = NDArray[np.float64]
     JSON = dict[str, Any]
 
 FEWEST = 60  # samples, which tell white noise to a tenth

@@ -28,11 +28,8 @@ from pipeline.estimation.noise_terms import MARKOV, fixed_shapes, markov_shape
 if TYPE_CHECKING:
     from collections.abc import Generator, Sequence
 
-    from numpy.typing import NDArray
+    from pipeline.records import Integers, Mask, Values
 
-    Values = NDArray[np.float64]
-    Whole = NDArray[np.int64]
-    Mask = NDArray[np.bool_]
 
 RATIO = 1.05  # of the edges of a bin: the spectrum of a random walk changes by a tenth, its mean by 0.2 %
 LONGEST_TIME = 0.5  # correlation time, in lengths of the recording, above which a process is a random walk
@@ -126,8 +123,8 @@ class Fits:
         Of the deterministic columns; zeros of those that are not fitted.
     """
 
-    axis: Whole
-    kinds: Whole
+    axis: Integers
+    kinds: Integers
     columns: Mask
     parameters: Values
     deviance: Values
@@ -138,11 +135,11 @@ class Fits:
     beta: Values
     beta_covariance: Values
 
-    def rows(self, index: Whole | Mask | slice) -> Fits:
+    def rows(self, index: Integers | Mask | slice) -> Fits:
         """Return some of the fits."""
         return Fits(*(getattr(self, name)[index] for name in NAMES))
 
-    def replace(self, index: Whole, others: Fits) -> None:
+    def replace(self, index: Integers, others: Fits) -> None:
         """Put other fits in the place of some."""
         for name in NAMES[3:]:
             getattr(self, name)[index] = getattr(others, name)
@@ -170,7 +167,7 @@ if TYPE_CHECKING:
     Work = Generator[list[Trial], Fits, Result]  # yields trials, receives their fits, returns a result
 
 
-def active(kinds: Whole) -> Mask:
+def active(kinds: Integers) -> Mask:
     """Return which parameters of (g, J) terms there are: (g, 2 J) array."""
     return np.concatenate([kinds >= 0, kinds == MARKOV], axis=1)
 
@@ -212,7 +209,7 @@ def evaluate(spectrum: Spectrum, trials: Sequence[Trial]) -> Fits:
     return _evaluated(spectrum, axis, kinds, columns, parameters)
 
 
-def _packed(spectrum: Spectrum, trials: Sequence[Trial]) -> tuple[Whole, Whole, Mask, Values, Mask]:
+def _packed(spectrum: Spectrum, trials: Sequence[Trial]) -> tuple[Integers, Integers, Mask, Values, Mask]:
     """Return axis, kinds, columns and parameters of trials as of ``Fits``, and which parameters are free."""
     g, terms = len(trials), max(len(trial.kinds) for trial in trials)
     kinds, parameters = np.full((g, terms), -1), np.zeros((g, 2 * terms))
@@ -232,8 +229,8 @@ def _packed(spectrum: Spectrum, trials: Sequence[Trial]) -> tuple[Whole, Whole, 
 
 def _evaluated(
     spectrum: Spectrum,
-    axis: Whole,
-    kinds: Whole,
+    axis: Integers,
+    kinds: Integers,
     columns: Mask,
     parameters: Values,
 ) -> Fits:
@@ -293,7 +290,8 @@ def maximised(spectrum: Spectrum, trials: Sequence[Trial]) -> Fits:
     for _ in range(ITERATIONS):
         now = best if len(running) == len(kinds) else best.rows(running)
         gradient = 0.5 * np.sum(now.slopes * (spectrum.count - now.power / now.total)[:, None, :], axis=2)
-        here = free[running]
+        pushed = np.where(gradient > 0.0, now.parameters <= bounds[0], now.parameters >= bounds[1])
+        here = free[running] & ~pushed  # a parameter that is pushed against its bound stays there
         information = 0.5 * (now.slopes * spectrum.count) @ now.slopes.transpose(0, 2, 1)
         information *= here[:, :, None] & here[:, None, :]
         own = information[:, diagonal, diagonal]

@@ -19,12 +19,10 @@ from pipeline.estimation.noise_search import ONE_SIDED, QUANTILE, Search
 from pipeline.estimation.noise_terms import STOCHASTIC, unit_of
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from pipeline.estimation.noise_likelihood import Spectrum
     from pipeline.estimation.noise_search import Candidate
+    from pipeline.records import Values
 
-    Values = NDArray[np.float64]
 
 STEADY_DEGC = 0.1  # a temperature that changes less is no regressor: the noise of thermometers on the chip
 STRAIGHT = 0.03  # share of a temperature's change that is no ramp, below which the two are not told apart

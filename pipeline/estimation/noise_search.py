@@ -5,9 +5,10 @@ Compositions of the terms of ``noise_terms`` are compared by
     BIC = -2 log L + p ln(n),    probability proportional to exp(-BIC / 2)
 
 with p parameters and n coefficients (``noise_likelihood``). From white noise alone the search adds, drops and swaps
-one term at a time until no step lowers the criterion. What may be added is screened by its score, the derivative of
-the likelihood at zero, so that a recording of white noise costs one fit. A ramp, sinusoids and a dependence on
-temperature are deterministic columns beside the noise. Sinusoids are found as lines of a Hann-windowed periodogram.
+one term at a time until no step lowers the criterion. A term that is certainly there stays. What may be added is
+screened by its score, the derivative of the likelihood at zero, so that a recording of white noise costs one fit. A
+ramp, sinusoids and a dependence on temperature are deterministic columns beside the noise. Sinusoids are found as lines
+of a Hann-windowed periodogram.
 
 Intervals are those of the profile likelihood (of a ramp and a sinusoid: of generalised least squares). Of a term that
 is not in the composition the upper limit is the coefficient at which the profile loses 1.645^2, one-sided 95 %.
@@ -27,16 +28,15 @@ from pipeline.estimation.noise_terms import MARKOV, SINGLE, WHITE, markov_shape
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.estimation.noise_likelihood import Spectrum, Work
+    from pipeline.records import Values
 
-    Values = NDArray[np.float64]
 
 MOST_MARKOV = 2  # processes of different correlation times; a third is not told apart by less than some 10^6 samples
 TIMES = 10  # correlation times whose score is looked at, in equal steps of their logarithm
 STARTS = 2  # of them that are fitted
 PROMISING = 0.25  # of the penalty of a term: a score that predicts less of it is not followed
+CERTAIN = 10.0  # penalties of a term: what a term gains at least, by its spread, so that it is certainly there
 SLIGHT = 2.0  # of the gain of one parameter: its penalty is ln(n), 4 and more
 QUANTILE, ONE_SIDED = 1.959964, 1.644854  # of the standard normal distribution: 95 % from two sides, from one
 NEAREST = 12  # compositions that are published, best first
@@ -81,7 +81,7 @@ class Search:
         while True:
             tries = self._added(best)
             if len(best.kinds) > 1:
-                dropped = [_without(best, j) for j in range(len(best.kinds))]
+                dropped = [_without(best, j) for j in self._dispensable(best)]
                 yield from self.fit(dropped, columns)
                 tries += [new for kinds, _ in dropped for new in self._added(self.found[kinds, columns])]
             yield from self.fit(tries, columns)
@@ -89,6 +89,11 @@ class Search:
             if new is best:
                 return best
             best = new
+
+    def _dispensable(self, candidate: Candidate) -> list[int]:
+        """Return the terms that are not certainly there: their gain is at least ``(coefficient^2 / spread)^2``."""
+        spread = np.sqrt(np.diag(candidate.fit.covariance(self.spectrum.count)[0])[: len(candidate.kinds)])
+        return np.flatnonzero(spread**-2 < CERTAIN * self.penalty).tolist()
 
     def _best(self, columns: tuple[int, ...]) -> Candidate:
         """Return the best composition so far beside these columns."""

@@ -25,9 +25,8 @@ import numpy as np
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from numpy.typing import NDArray
+    from pipeline.records import Values
 
-    Values = NDArray[np.float64]
 
 QUANTISATION, WHITE, INSTABILITY, WALK, MARKOV = range(5)
 SINGLE = (QUANTISATION, WHITE, INSTABILITY, WALK)

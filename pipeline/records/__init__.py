@@ -19,7 +19,20 @@ from pipeline.records.motion import (
     motion_at_rest,
     rate_of_attitude,
 )
-from pipeline.records.recording import AXES, SENSORS, Encoding, Noise, Note, Recording, median, noise_of_steps
+from pipeline.records.recording import (
+    AXES,
+    SENSORS,
+    Encoding,
+    Index,
+    Integers,
+    Mask,
+    Noise,
+    Note,
+    Recording,
+    Values,
+    median,
+    noise_of_steps,
+)
 
 __all__ = [
     "AXES",
@@ -30,12 +43,16 @@ __all__ = [
     "Contribution",
     "Encoding",
     "FittedEffect",
+    "Index",
+    "Integers",
+    "Mask",
     "Motion",
     "Noise",
     "Note",
     "Recording",
     "SensorCalibration",
     "StageResult",
+    "Values",
     "conjugate_product",
     "continuous",
     "coverage_factor",

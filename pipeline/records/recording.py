@@ -13,12 +13,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, TypeAlias
 
 import numpy as np
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+# The arrays of all annotations: quantities, samples that are chosen, whole numbers, places of samples.
+Values: TypeAlias = "NDArray[np.float64]"
+Mask: TypeAlias = "NDArray[np.bool_]"
+Integers: TypeAlias = "NDArray[np.int64]"
+Index: TypeAlias = "NDArray[np.intp]"
 
 AXES = ("x", "y", "z")
 SENSORS = ("accelerometer", "gyroscope")
@@ -58,12 +64,12 @@ class Encoding:
     scale: float
     offset: float = 0.0
 
-    def decode(self, counts: NDArray[np.float64]) -> NDArray[np.float64]:
+    def decode(self, counts: Values) -> Values:
         """Return the values of counts: the one formula by which counts become values, to the last bit."""
-        values: NDArray[np.float64] = (counts - self.offset) * self.scale
+        values: Values = (counts - self.offset) * self.scale
         return values
 
-    def encode(self, values: NDArray[np.float64]) -> NDArray[np.int64] | None:
+    def encode(self, values: Values) -> NDArray[np.int64] | None:
         """Return the counts that decode to exactly these values, or None where there are none."""
         with np.errstate(invalid="ignore", over="ignore"):
             counts = np.rint(values / self.scale + self.offset)
@@ -112,12 +118,12 @@ class Recording:
     role: str
     axis: str | None
     time_ns: NDArray[np.int64]
-    accelerometer: NDArray[np.float64] | None = None
-    gyroscope: NDArray[np.float64] | None = None
-    temperature: NDArray[np.float64] | None = None
-    table_angle: NDArray[np.float64] | None = None
-    table_rate: NDArray[np.float64] | None = None
-    table_attitude: NDArray[np.float64] | None = None
+    accelerometer: Values | None = None
+    gyroscope: Values | None = None
+    temperature: Values | None = None
+    table_angle: Values | None = None
+    table_rate: Values | None = None
+    table_attitude: Values | None = None
     flags: NDArray[np.uint16] | None = None
     source: dict[str, Any] = field(default_factory=dict)
     notes: tuple[Note, ...] = ()
@@ -128,9 +134,9 @@ class Recording:
     up: str = ""
 
     @cached_property
-    def time(self) -> NDArray[np.float64]:
+    def time(self) -> Values:
         """Time of each sample: (n,) array, s since power-on."""
-        seconds: NDArray[np.float64] = self.time_ns // NANOSECONDS + (self.time_ns % NANOSECONDS) / NANOSECONDS
+        seconds: Values = self.time_ns // NANOSECONDS + (self.time_ns % NANOSECONDS) / NANOSECONDS
         return seconds
 
     @property
@@ -155,7 +161,7 @@ class Recording:
             return np.ones(self.samples, bool)
         return np.asarray((self.flags & CLIPPED_OR_STUCK) == 0)
 
-    def reading(self, sensor: str) -> NDArray[np.float64] | None:
+    def reading(self, sensor: str) -> Values | None:
         """Return the (n, 3) readings of ``accelerometer`` (g) or ``gyroscope`` (deg/s), or None."""
         return self.accelerometer if sensor == "accelerometer" else self.gyroscope
 
@@ -173,8 +179,8 @@ class Noise:
     ``sqrt(correlation_time / length)``.
     """
 
-    white: NDArray[np.float64]
-    wander: NDArray[np.float64]
+    white: Values
+    wander: Values
     correlation_time: float
     source: str
     length: float = 0.0
@@ -189,7 +195,7 @@ class Noise:
         return cls(**{**data, "white": np.array(data["white"]), "wander": np.array(data["wander"])})
 
 
-def noise_of_steps(step: NDArray[np.float64], axis: int = 0, *, keepdims: bool = False) -> NDArray[np.float64]:
+def noise_of_steps(step: Values, axis: int = 0, *, keepdims: bool = False) -> Values:
     """Return the standard deviation of white noise, ``median |x[n+1] - x[n]| / 0.9539``, along an axis.
 
     ``step`` are the absolute differences of successive samples. Slow signals and outliers hardly change the result.
@@ -197,7 +203,7 @@ def noise_of_steps(step: NDArray[np.float64], axis: int = 0, *, keepdims: bool =
     return np.asarray(median(step, axis, keepdims=keepdims) / MEDIAN_STEP)
 
 
-def median(values: NDArray[np.float64], axis: int = 0, *, keepdims: bool = False) -> NDArray[np.float64]:
+def median(values: Values, axis: int = 0, *, keepdims: bool = False) -> Values:
     """Return ``numpy.median`` along an axis: for a thousand values in half of its time, for matrices in a fifth."""
     ordered, half = np.sort(values, axis), values.shape[axis] // 2
     one, two, last = (ordered.take(k, axis) for k in (half, half - 1 + values.shape[axis] % 2, -1))
