@@ -25,14 +25,11 @@ from pipeline.model.effects.base import Layout, truth
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.estimation.gauss_markov import Setting
     from pipeline.estimation.observations import Observations, Part
     from pipeline.model.effects.base import Effect
-    from pipeline.records import Motion, Noise
+    from pipeline.records import Index, Motion, Noise, Values
 
-    Values = NDArray[np.float64]
 
 BASE = 12  # bias and matrix
 REMEMBERED = 4  # motions of a part after effects of timing: base and as many terms without themselves
@@ -233,7 +230,7 @@ class Design:
         """Return the columns of one axis, the readings last: (n, q + 1) array."""
         return self.columns.columns[:, self._local[c]]
 
-    def places(self, c: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    def places(self, c: int) -> tuple[Index, Index]:
         """Return where the columns of one axis lie, and to which parameters they belong, the readings last."""
         return self._local[c], self._total[c]
 

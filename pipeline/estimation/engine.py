@@ -36,11 +36,9 @@ from pipeline.records import noise_of_steps
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.estimation.gauss_markov import Blocks, Prior
+    from pipeline.records import Index, Values
 
-    Values = NDArray[np.float64]
 
 ONE_SIGMA, COVERED = 0.6827, 0.95  # probabilities at which the mixture and Student's t agree
 FEWEST = 2.0  # degrees of freedom: Student's t has no variance below
@@ -90,7 +88,7 @@ class LinearMap:
         channels = zip(self.derivative, self.weights, change.T, strict=True)
         return np.asarray(np.sum([J @ (A @ dy) for J, A, dy in channels], axis=0))
 
-    def of_groups(self, change: Values, group: NDArray[np.intp], count: int) -> Values:
+    def of_groups(self, change: Values, group: Index, count: int) -> Values:
         """Return the change of the parameters by the change of each of ``count`` groups of readings: (p, count) array.
 
         ``change``: (n, 3). ``group``: (n,), 0 .. count - 1.

@@ -34,11 +34,8 @@ import numpy as np
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
+    from pipeline.records import Index, Integers, Noise, Values
 
-    from pipeline.records import Noise
-
-    Values = NDArray[np.float64]
 
 DEFAULT_TIME_S = 100.0  # correlation time where the data sheet gives none: of MEMS sensors, by IEEE Std 952 examples
 SHEET_WIDTH = float(np.log(3.0))  # of the logarithm of a bias instability that a data sheet gives: a factor of three
@@ -172,19 +169,19 @@ def block_covariance(start: Values, length: Values, tau: float) -> Values:
 class Blocks:
     """Blocks of consecutive rows."""
 
-    first: NDArray[np.intp]  # (m,); first row of each; a block ends where the next begins
+    first: Index  # (m,); first row of each; a block ends where the next begins
     weight: Values  # (m,); samples of each, ``1 / v``
     # each (m,), s; a block of length 0 counts as one instant: the bias does not change within it
     start: Values
     length: Values
-    clock: NDArray[np.int64]  # (m,); blocks of the same number have a known distance in time
+    clock: Integers  # (m,); blocks of the same number have a known distance in time
 
     @cached_property
-    def order(self) -> NDArray[np.intp]:
+    def order(self) -> Index:
         """Return the blocks in the order of time on each clock."""
         return np.lexsort((self.start, self.clock))
 
-    def label(self, rows: int) -> NDArray[np.intp]:
+    def label(self, rows: int) -> Index:
         """Return the block of each of n rows: (n,) array."""
         return np.repeat(np.arange(len(self.first)), np.diff(np.append(self.first, rows)))
 

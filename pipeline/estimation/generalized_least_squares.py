@@ -45,12 +45,9 @@ from pipeline.records import SensorCalibration, StageResult
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.estimation.observations import Observations
-    from pipeline.records import Noise, Recording
+    from pipeline.records import Noise, Recording, Values
 
-    Values = NDArray[np.float64]
 
 ROUNDS = 25  # of Gauss-Newton
 SMALL_STEP = 1e-3  # of a standard uncertainty

@@ -27,9 +27,8 @@ from pipeline.errors import NotObservableError
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from numpy.typing import NDArray
+    from pipeline.records import Values
 
-    Values = NDArray[np.float64]
     Function = Callable[[Values], Values]
 
 RANK_TOLERANCE = 1e-11  # of the largest singular value of unit columns: 1e5 times the rounding of a double

@@ -27,11 +27,10 @@ from pipeline.estimation.engine import Posterior, draw_normal
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
-    from pipeline.records import Contribution, SensorCalibration
+    from pipeline.records import Contribution, Mask, SensorCalibration, Values
 
-    Values = NDArray[np.float64]
     Draw = Callable[[np.random.Generator, int], Values]
 
 SEED = 101  # any number
@@ -63,7 +62,7 @@ class Comparison:
     high: Values
 
     @property
-    def borne_out(self) -> NDArray[np.bool_]:
+    def borne_out(self) -> Mask:
         """Whether both ends agree within the tolerance: (n,) array of bool."""
         return np.asarray((self.low <= self.tolerance) & (self.high <= self.tolerance))
 

@@ -63,9 +63,8 @@ from pipeline.signal.temperature import temperature_of
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
+    from pipeline.records import Integers, Mask, Values
 
-    Values = NDArray[np.float64]
 
 TIMES = np.exp2(np.arange(-6.0, 4.0))  # correlation times tried, in those of the data sheet
 SHORTEST_BLOCK = 8  # samples of a block
@@ -308,12 +307,12 @@ class _RestBlocks:
     # each (b,), s; first sample time and duration of each block
     start: Values
     length: Values
-    count: NDArray[np.int64]  # (b,); samples of each
+    count: Integers  # (b,); samples of each
     mean: Values  # (b, 3); less the mean of its rest
-    rest: NDArray[np.int64]  # (b,); the rest that each belongs to
-    clock: NDArray[np.int64]  # (b,); blocks of the same number have a known distance in time
+    rest: Integers  # (b,); the rest that each belongs to
+    clock: Integers  # (b,); blocks of the same number have a known distance in time
     # (b,); whether its rest holds two blocks or more; the mean of a single one does not show the bias move
-    cut: NDArray[np.bool_]
+    cut: Mask
     scatter: Values  # (3,); sum of squares about the block means
 
 

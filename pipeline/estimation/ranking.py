@@ -20,12 +20,10 @@ from pipeline.estimation.gauss_markov import WHITE
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.estimation.gauss_markov import Setting
     from pipeline.estimation.observations import Observations
+    from pipeline.records import Index, Values
 
-    Values = NDArray[np.float64]
 
 EXCITED = 1e-3  # share of a column's norm that the base leaves
 NEW = 1e-4  # share of the variance of a candidate's weakest direction that the chosen effects leave
@@ -84,7 +82,7 @@ class Ranking:
         """Keep of each candidate the directions that the motion excites, scaled to unit norm under white noise."""
         ends = [*starts[1:], len(sizes) - 1]
         size = np.where(sizes > 0, sizes, 1.0)
-        self.places: list[NDArray[np.intp]] = []
+        self.places: list[Index] = []
         blocks, width = [], 0
         for start, end in zip(starts, ends, strict=True):
             block = slice(start, end)
@@ -247,7 +245,7 @@ class Ranking:
         return float(np.sum(limits[:count] ** 2 * np.diag(products[setting, block, block])))
 
 
-def without(products: Values, index: NDArray[np.intp]) -> Values:
+def without(products: Values, index: Index) -> Values:
     """Return products of columns after some of them are projected out of all: (t, p, p) array, zeros in theirs.
 
     ``products``: (t, p, p). ``index``: (q,).
@@ -257,7 +255,7 @@ def without(products: Values, index: NDArray[np.intp]) -> Values:
     return products - products[:, index, :].transpose(0, 2, 1) @ projection(products, index)
 
 
-def projection(products: Values, index: NDArray[np.intp]) -> Values:
+def projection(products: Values, index: Index) -> Values:
     """Return the coefficients by which some of the columns come closest to each column: (t, q, p) array.
 
     ``products``: (t, p, p). ``index``: (q,).

@@ -45,12 +45,9 @@ from pipeline.records import AXES, SensorCalibration, StageResult
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.estimation.turns import Part
-    from pipeline.records import Recording
+    from pipeline.records import Recording, Values
 
-    Values = NDArray[np.float64]
 
 NAME = "reference_least_squares"
 COLUMNS = ("bias", *(f"matrix column {axis}" for axis in AXES))

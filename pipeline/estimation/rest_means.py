@@ -20,12 +20,9 @@ from pipeline.signal.temperature import smooth_temperature
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
-
-    from pipeline.records import Recording, SensorCalibration
+    from pipeline.records import Index, Integers, Mask, Recording, SensorCalibration, Values
     from pipeline.signal.rests import Rest
 
-    Values = NDArray[np.float64]
 
 ROLE, HELD_OUT = "rests", "validation"
 
@@ -112,9 +109,7 @@ def _creep_rate(recording: Recording, rest: Rest) -> float:
     return float(np.linalg.norm(creep_in(recording, rest.start, rest.stop).rate))
 
 
-def rest_means(
-    recording: Recording, rests: Sequence[Rest], sensor: str = "accelerometer"
-) -> tuple[Values, NDArray[np.int64]]:
+def rest_means(recording: Recording, rests: Sequence[Rest], sensor: str = "accelerometer") -> tuple[Values, Integers]:
     """Return the mean reading of each rest, without clipped, stuck or missing samples.
 
     By hand a unit may creep: the mean over its directions is too short, and is made longer by that (see
@@ -142,7 +137,7 @@ def rest_means(
     return means, counts
 
 
-def sound_samples(recording: Recording, sensor: str) -> NDArray[np.bool_]:
+def sound_samples(recording: Recording, sensor: str) -> Mask:
     """Return which samples of a sensor are neither clipped, stuck nor missing: (n,) array of bool."""
     reading = recording.reading(sensor)
     return np.zeros(recording.samples, bool) if reading is None else usable(recording, reading)
@@ -153,7 +148,7 @@ class Rests:
     """Rests of all recordings, in order."""
 
     reading: Values  # (m, 3), g or deg/s; means
-    count: NDArray[np.int64]  # (m,); samples of each
+    count: Integers  # (m,); samples of each
     share: Values  # (m,); variance of each mean by white noise, over that of a raw sample
     scatter: Values  # (m, 3); sums of squares about the means
     # each (m,), s; when each begins, how long it is, and its mean time
@@ -161,9 +156,9 @@ class Rests:
     length: Values
     time: Values
     temperature: Values  # (m,), degC; NaN where none was recorded
-    recording: NDArray[np.intp]  # (m,); index of the recording that each belongs to
-    held_out: NDArray[np.bool_]  # (m,)
-    span: NDArray[np.intp]  # (m, 2); its first sample, and the one after its last
+    recording: Index  # (m,); index of the recording that each belongs to
+    held_out: Mask  # (m,)
+    span: Index  # (m, 2); its first sample, and the one after its last
     # (m, 3), deg/s; rate across gravity at which the unit tilts, by the readings of the accelerometer; 0 where it
     # stands still
     creep: Values
@@ -171,7 +166,7 @@ class Rests:
     creep_about: Values  # (m,), deg/s; standard deviation of the rate about gravity
     clock_shared: bool  # whether the time between the recordings is known
 
-    def select(self, index: NDArray[np.bool_]) -> Self:
+    def select(self, index: Mask) -> Self:
         """Return some of the rests."""
         arrays = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "clock_shared"}
         return replace(self, **{name: values[index] for name, values in arrays.items()})
@@ -187,9 +182,9 @@ class Rests:
         return float(3 * np.sum(self.count - 1))
 
     @property
-    def joined(self) -> NDArray[np.bool_]:
+    def joined(self) -> Mask:
         """Whether the time from each rest to each other is known: (m, m) array."""
-        same: NDArray[np.bool_] = self.recording[:, None] == self.recording
+        same: Mask = self.recording[:, None] == self.recording
         return np.ones_like(same) if self.clock_shared else same
 
 

@@ -27,12 +27,9 @@ from pipeline.records import StageResult
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.estimation.engine import ResidualNoise
-    from pipeline.records import Recording, SensorCalibration
+    from pipeline.records import Recording, SensorCalibration, Values
 
-    Values = NDArray[np.float64]
 
 STAGED = {
     "accelerometer": ("orthogonality", "misalignment", "bias", "scale_factor"),

@@ -31,12 +31,9 @@ from pipeline.signal.rests import RATE_AT_REST_DPS
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.estimation.gauss_markov import Blocks
-    from pipeline.records import Motion
+    from pipeline.records import Index, Motion, Values
 
-    Values = NDArray[np.float64]
 
 ROUNDING = 1e-10  # of the largest effect of an input: a hundred thousand times the rounding of a double
 SAME_STOP_DEG = 0.02  # by which angles of one stop may differ
@@ -215,7 +212,7 @@ def _angle(reference: Reference) -> Values:
     return np.concatenate([at_stops, *(_turned(reference, motion) for motion in attitudes)], axis=1)
 
 
-def between_stops(angle: Values, rate: Values) -> tuple[NDArray[np.intp], Values, Values, int]:
+def between_stops(angle: Values, rate: Values) -> tuple[Index, Values, Values, int]:
     """Return the stop at or before each sample, its share of the way to the next, and the slope of that, 1/deg.
 
     Where a recording does not begin or end with a rest, its first or last sample stands in for one.

@@ -33,15 +33,14 @@ from pipeline.signal.temperature import temperature_of
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
     from pipeline.estimation.design import Term
     from pipeline.estimation.engine import LinearMap, ResidualNoise
     from pipeline.estimation.gauss_markov import Prior
     from pipeline.estimation.table_errors import Reference
-    from pipeline.records import Recording, SensorCalibration
+    from pipeline.records import Recording, SensorCalibration, Values
 
-    Values = NDArray[np.float64]
 
 DITHERED = 0.5  # counts of white noise above which rounding errors are independent (Widrow & Kollar 2008)
 NOISE, QUANTISATION = "noise of the readings", "quantisation"

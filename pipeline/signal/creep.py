@@ -23,11 +23,8 @@ from pipeline.signal.filters import filter_autocovariance, variance_of_mean
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
+    from pipeline.records import Recording, Values
 
-    from pipeline.records import Recording
-
-    Values = NDArray[np.float64]
 
 DEGREE = 2  # of the parabola
 SIGNIFICANT = 4.0  # standard deviations: of the two components, noise alone passes it in 3e-4

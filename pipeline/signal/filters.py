@@ -38,9 +38,7 @@ from pipeline.errors import ConfigurationError, InputError
 from pipeline.records import Note, Recording
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Values = NDArray[np.float64]
+    from pipeline.records import Integers, Values
 
 GAP = 1.5  # medians of the interval: a lost sample makes two of one
 JITTER = 0.1  # of the interval: beyond it samples count as uneven
@@ -124,7 +122,7 @@ def filter_autocovariance(recording: Recording) -> Values:
     return covariance[: far + 1]
 
 
-def variance_of_mean(covariance: Values, count: NDArray[np.int64]) -> Values:
+def variance_of_mean(covariance: Values, count: Integers) -> Values:
     """Return the variance of the mean of ``count`` successive samples of a stationary sequence.
 
     ``v_n = (r_0 + 2 sum_{l<n} (1 - l/n) r_l) / n``, r the autocovariance from lag 0; 0 beyond its end.

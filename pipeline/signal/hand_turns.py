@@ -20,11 +20,8 @@ from pipeline.signal.rests import find_rests
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from numpy.typing import NDArray
+    from pipeline.records import Recording, Values
 
-    from pipeline.records import Recording
-
-    Values = NDArray[np.float64]
 
 SCALE = 0.1  # relative: three times the largest scale factor error of the shipped data sheets (MPU-6050: 3 %)
 ACROSS = 0.25  # 15 deg between the turn and a body axis: a chip askew in its case, and a hand

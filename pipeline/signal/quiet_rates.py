@@ -35,9 +35,8 @@ from pipeline.records import median, noise_of_steps
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
+    from pipeline.records import Mask, Values
 
-    Values = NDArray[np.float64]
     Spans = list[tuple[int, int]]
 
 WINDOW_S, FEWEST = 0.2, 3  # shorter than a move; samples that have a variance
@@ -115,7 +114,7 @@ def windows(values: Values, size: int) -> tuple[Values, Values]:
     return total / size + middle, variance
 
 
-def _references(medians: Values, ends: Values) -> tuple[Values, NDArray[np.bool_]]:
+def _references(medians: Values, ends: Values) -> tuple[Values, Mask]:
     """Return the rate at rest of each stretch, and which of them mostly rest; ``ends`` are (m, 2, 3)."""
     out, resting = medians.copy(), np.ones(len(medians), bool)
     if len(medians) <= 2:
@@ -131,7 +130,7 @@ def _references(medians: Values, ends: Values) -> tuple[Values, NDArray[np.bool_
     return out, resting
 
 
-def _widened(turns: NDArray[np.bool_], half: int, samples: int) -> NDArray[np.bool_]:
+def _widened(turns: Mask, half: int, samples: int) -> Mask:
     """Return which samples lie within half a window of the middle of a window in which the unit turns."""
     near = np.zeros(samples, bool)
     for start in np.flatnonzero(turns):
@@ -139,7 +138,7 @@ def _widened(turns: NDArray[np.bool_], half: int, samples: int) -> NDArray[np.bo
     return near
 
 
-def _rests(quiet: NDArray[np.bool_], turned: Values, shortest: int) -> Spans:
+def _rests(quiet: Mask, turned: Values, shortest: int) -> Spans:
     """Return the quiet runs, of those between which the unit did not turn the longest alone."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], quiet, [False]]).astype(np.int8)))
     found = [(a, b) for a, b in edges.reshape(-1, 2).tolist() if b - a >= shortest]

@@ -34,11 +34,8 @@ from pipeline.signal.quiet_rates import RATE_LIMIT_DPS, counts_of, quiet_pieces,
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
+    from pipeline.records import Integers, Mask, Recording, Values
 
-    from pipeline.records import Recording
-
-    Values = NDArray[np.float64]
     Spans = list[tuple[int, int]]
 
 RATE_AT_REST_DPS = 0.02  # above the rate noise of a resting table
@@ -71,13 +68,13 @@ class Rest:
     reason: str = ""
 
 
-def runs(mask: NDArray[np.bool_]) -> Spans:
+def runs(mask: Mask) -> Spans:
     """Return the (start, stop) index pairs of the runs of True in a mask."""
     starts, stops = _edges(mask)
     return list(zip(starts.tolist(), stops.tolist(), strict=True))
 
 
-def _edges(mask: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _edges(mask: Mask) -> tuple[Integers, Integers]:
     """Return where the runs of True in a mask start and stop."""
     padded = np.zeros(len(mask) + 2, bool)
     padded[1:-1] = mask
@@ -85,7 +82,7 @@ def _edges(mask: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64
     return edges[::2], edges[1::2]
 
 
-def still_samples(time: Values, rate: Values, settling: float = SETTLING_S) -> NDArray[np.bool_]:
+def still_samples(time: Values, rate: Values, settling: float = SETTLING_S) -> Mask:
     """Return which samples rest and have settled, by a table's rate in deg/s: (n,) array of bool.
 
     A rest begins where |rate| falls under 0.02 deg/s; its first ``settling`` seconds are left out, unless the recording
@@ -158,7 +155,7 @@ def assess_rests(recording: Recording, intervals: Sequence[tuple[int, int]], noi
     ]
 
 
-def _spoilt(recording: Recording, size: int) -> NDArray[np.bool_]:
+def _spoilt(recording: Recording, size: int) -> Mask:
     """Return the windows with a clipped, stuck or missing reading, or over a gap as long as a window."""
     assert recording.accelerometer is not None  # noqa: S101
     bad = np.logical_not(np.all(np.isfinite(recording.accelerometer), axis=1))
@@ -242,7 +239,7 @@ def _rate_reasons(recording: Recording, rests: Sequence[Rest]) -> list[str]:
     return reasons
 
 
-def stretches_of(recording: Recording, mask: NDArray[np.bool_]) -> Spans:
+def stretches_of(recording: Recording, mask: Mask) -> Spans:
     """Return the runs of a mask, cut at gaps in time."""
     cuts = np.array(stretch_starts(recording)[1:-1], int)
     pieces: Spans = []
@@ -251,7 +248,7 @@ def stretches_of(recording: Recording, mask: NDArray[np.bool_]) -> Spans:
     return pieces
 
 
-def usable(recording: Recording, values: Values) -> NDArray[np.bool_]:
+def usable(recording: Recording, values: Values) -> Mask:
     """Return which samples are neither missing nor marked by ingest: (n,) array."""
     with np.errstate(invalid="ignore"):
         finite = np.isfinite(values @ np.ones(values.shape[1]))  # a tenth of the time of ``all`` over three columns

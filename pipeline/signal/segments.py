@@ -31,11 +31,8 @@ from pipeline.signal.rests import RATE_AT_REST_DPS, runs
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
+    from pipeline.records import Mask, Recording, Values
 
-    from pipeline.records import Recording
-
-    Values = NDArray[np.float64]
 
 FEWEST_STOPS = 4  # attitudes about one axis that determine a bias and a row of the matrix
 BESIDE_S, BESIDE_FREE_S = 30.0, 1.0  # of rest that a segment takes with it
@@ -198,7 +195,7 @@ class _Session:
         self.moves = [self._move(start, stop, step) for start, stop in runs(self.moving)]
         self.groups = self._groups()
 
-    def _handled(self) -> NDArray[np.bool_]:
+    def _handled(self) -> Mask:
         """Return the samples at which the sensor turns and the table does not."""
         if self.moving.all():
             return np.zeros(len(self.moving), bool)

@@ -30,13 +30,10 @@ from pipeline.errors import NotObservableError
 from pipeline.estimation.least_squares import solve_linear, solve_nonlinear
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from pipeline.estimation.accelerometer.orientations import Orientations
     from pipeline.estimation.least_squares import LeastSquaresResult
+    from pipeline.records import Mask, Values
 
-    Values = NDArray[np.float64]
-    Mask = NDArray[np.bool_]
 
 ROWS, COLUMNS = np.tril_indices(3)
 NAMES = [f"bias_{axis}" for axis in "xyz"] + [

@@ -52,15 +52,12 @@ from pipeline.records import SensorCalibration, StageResult, coverage_factor
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.estimation.accelerometer.ellipsoid_fit import Ellipsoid
     from pipeline.estimation.accelerometer.orientations import Orientations
     from pipeline.estimation.engine import ResidualNoise
     from pipeline.estimation.gauss_markov import Prior
-    from pipeline.records import Contribution, Motion, Recording
+    from pipeline.records import Contribution, Motion, Recording, Values
 
-    Values = NDArray[np.float64]
 
 NAME = "nonlinear_least_squares"
 MISALIGNMENT_UNKNOWN = 0.05  # rad, standard uncertainty above which the rests do not determine a misalignment

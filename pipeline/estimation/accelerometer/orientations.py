@@ -43,12 +43,9 @@ from pipeline.signal.rests import Rest, rests_from_table
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.estimation.gauss_markov import Prior
-    from pipeline.records import Contribution, Recording
+    from pipeline.records import Contribution, Index, Integers, Mask, Recording, Values
 
-    Values = NDArray[np.float64]
 
 SMALLEST_NOISE = 1e-9  # g, keeps the weights of a noise-free recording finite
 TREMORS = np.geomspace(0.1, 3.0, 10)  # of the scatter beyond white noise that the residuals show
@@ -61,11 +58,11 @@ class Orientations:
     """Rows of mean readings."""
 
     mean: Values  # (m, 3), g
-    count: NDArray[np.int64]  # (m,); samples of each row
+    count: Integers  # (m,); samples of each row
     # g; standard deviation of a raw sample about the mean of its row, averaged over the axes; 0 where no row has two
     white: float
-    parts: tuple[tuple[Recording, NDArray[np.bool_]], ...]  # the samples behind the rows, in order
-    row: NDArray[np.intp]  # (k,); row of each of these samples
+    parts: tuple[tuple[Recording, Mask], ...]  # the samples behind the rows, in order
+    row: Index  # (k,); row of each of these samples
     by_hand: bool  # whether every row is a hand-held rest
     rests: tuple[tuple[Recording, Rest], ...]  # the rest behind each row, where all are rests of a hand-held recording
     held_out: tuple[tuple[Recording, Rest], ...]
@@ -177,7 +174,7 @@ def _rows(
     )
 
 
-def _samples(recording: Recording, rests: Sequence[Rest]) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
+def _samples(recording: Recording, rests: Sequence[Rest]) -> tuple[Mask, Index]:
     """Return which samples of a recording belong to its rests, and the row of each of these."""
     edges = np.array([[rest.start, rest.stop] for rest in rests])
     inside = np.zeros(recording.samples + 1, np.intp)
@@ -202,7 +199,7 @@ class RestErrors:
     # each (m,), s
     start: Values
     length: Values
-    joined: NDArray[np.bool_]  # (m, m); whether the time between two rests is known
+    joined: Mask  # (m, m); whether the time between two rests is known
 
 
 def rest_scatter(rests: RestErrors, gain: Values, prior: Prior) -> Contribution:

@@ -53,15 +53,12 @@ from pipeline.records import AXES, FittedEffect, SensorCalibration
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.estimation.accelerometer.turn_extremes import Extremes, Turn
     from pipeline.estimation.engine import ResidualNoise
     from pipeline.estimation.gauss_markov import Prior
     from pipeline.estimation.turns import Sinusoid
-    from pipeline.records import Contribution, Recording
+    from pipeline.records import Contribution, Recording, Values
 
-    Values = NDArray[np.float64]
     Quantities = dict[str, tuple[float, str]]
 
 REPLICATES = 60  # synthetic turns: their covariance is known to a tenth

@@ -27,12 +27,9 @@ from pipeline.records import AXES
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.estimation.turns import Part, Sinusoid
-    from pipeline.records import Motion, Recording
+    from pipeline.records import Mask, Motion, Recording, Values
 
-    Values = NDArray[np.float64]
 
 OTHERS = ((1, 2), (2, 0), (0, 1))  # first and second axis of a turn about x, y, z
 
@@ -99,7 +96,7 @@ class Turn:
 
     angle: Values  # (n,), deg
     reading: Values  # (n, 3), g
-    used: list[tuple[Recording, NDArray[np.bool_]]]  # where they come from, in order
+    used: list[tuple[Recording, Mask]]  # where they come from, in order
     motions: list[Motion]  # by the table, at these samples
 
 
@@ -123,7 +120,7 @@ def turns_of(parts: Sequence[Part], *, as_printed: bool) -> list[Turn]:
     return turns
 
 
-def samples_of(part: Part, *, as_printed: bool) -> NDArray[np.bool_]:
+def samples_of(part: Part, *, as_printed: bool) -> Mask:
     """Return which samples of a part are used."""
     return part.keep if as_printed else filtered_alike(part)
 

@@ -51,12 +51,9 @@ from pipeline.signal.rests import runs
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.estimation.turns import Part
-    from pipeline.records import Motion, Recording
+    from pipeline.records import Index, Mask, Motion, Recording, Values
 
-    Values = NDArray[np.float64]
 
 NAME = "cholesky_lu"
 STEP = 1e-6  # of the central differences: truncation and rounding are below 1e-9 of the derivative
@@ -212,10 +209,10 @@ class Turns:
 
     reading: Values  # (n, 3), deg/s
     rate: Values  # (n, 3), deg/s; by the table, Earth's rotation included where it is known
-    rest: NDArray[np.bool_]  # (n,)
+    rest: Mask  # (n,)
     weight: Values  # (n,), s; of each sample in the integral of its turn; 0 at rest
-    turn: NDArray[np.intp]  # (n,); turn of each sample, -1 at rest
-    parts: tuple[tuple[Recording, NDArray[np.bool_]], ...]
+    turn: Index  # (n,); turn of each sample, -1 at rest
+    parts: tuple[tuple[Recording, Mask], ...]
     left_out: int  # turns with clipped or stuck readings
     motions: tuple[Motion, ...]  # by the table, at these samples
 

@@ -30,11 +30,8 @@ from pipeline.records import SensorCalibration, StageResult
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
+    from pipeline.records import Recording, Values
 
-    from pipeline.records import Recording
-
-    Values = NDArray[np.float64]
 
 NAME = "rests_and_moves"
 MOVED_TIMES = 2  # an error of 0.7 deg squared is 0.01 deg, as large as the noise of a move; a second time 1e-4 deg

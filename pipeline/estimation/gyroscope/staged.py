@@ -40,13 +40,10 @@ from pipeline.signal.rests import runs
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.estimation.gauss_markov import Blocks
     from pipeline.estimation.turns import Part
-    from pipeline.records import Motion, Recording
+    from pipeline.records import Mask, Motion, Recording, Values
 
-    Values = NDArray[np.float64]
 
 STEP = 1e-5  # deg/s of b, and of R, of the central differences: exact to 1e-10 for these functions of degree two
 FORGOTTEN = 1e-5  # of a change of rate, that a filter's output may still hold where a rest or a steady turn begins
@@ -297,7 +294,7 @@ def _memory(recording: Recording) -> float:
     return float(np.flatnonzero(covariance > FORGOTTEN * covariance[0])[-1] + 1) * recording.interval
 
 
-def _without_tails(part: Part, memory: float) -> NDArray[np.bool_]:
+def _without_tails(part: Part, memory: float) -> Mask:
     """Return the settled samples of the rests, without what a filter still holds of the turns before or after."""
     still, time = part.motion.still.copy(), part.motion.time
     before = memory if part.recording.filter.get("zero_phase") else 0.0

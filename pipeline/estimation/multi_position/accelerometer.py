@@ -26,14 +26,11 @@ from pipeline.estimation.rest_means import HELD_OUT, rests_of
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.estimation.design import Term
     from pipeline.estimation.multi_position.faces_and_turns import Faces
     from pipeline.estimation.rest_means import Rests
-    from pipeline.records import Motion, Noise, Recording, SensorCalibration
+    from pipeline.records import Mask, Motion, Noise, Recording, SensorCalibration, Values
 
-    Values = NDArray[np.float64]
 
 ROUNDS = 12  # of effects that depend on the force
 SETTLED = 1e-12  # g
@@ -142,7 +139,7 @@ class AccelerometerModel:
         force, _ = self.specific_force(state, self.held)
         return float(np.sqrt(np.mean((np.linalg.norm(force, axis=1) - self.gravity) ** 2)))
 
-    def without(self, held: NDArray[np.bool_]) -> AccelerometerModel:
+    def without(self, held: Mask) -> AccelerometerModel:
         """Return the model with some of its rests held out."""
         kept, judged = self.rests.select(~held), self.rests.select(held)
         faces = self.faces and self.faces.select(~held)

@@ -34,14 +34,11 @@ from pipeline.signal.hand_turns import ACROSS, multiples
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.estimation.design import Term
     from pipeline.estimation.multi_position.model import State
     from pipeline.estimation.rest_means import Rests
-    from pipeline.records import Motion, Recording, SensorCalibration
+    from pipeline.records import Index, Mask, Motion, Recording, SensorCalibration, Values
 
-    Values = NDArray[np.float64]
 
 NEAR_DEG = 15.0  # of a face's axis, within which a rest is on that face: a chip askew in its case, and a hand
 DEPARTS = 4.5  # standard uncertainties: two angles exceed it with a probability of 4e-5
@@ -52,10 +49,10 @@ FACES = [f"{sign}{axis}" for axis in AXES for sign in "+-"]
 class Faces:
     """The faces on which a unit rests."""
 
-    face: NDArray[np.intp]  # (m,); of each rest, as of ``FACES``; -1 for none
+    face: Index  # (m,); of each rest, as of ``FACES``; -1 for none
     error: float  # rad; s_f
 
-    def select(self, index: NDArray[np.bool_]) -> Faces:
+    def select(self, index: Mask) -> Faces:
         """Return the faces of some of the rests."""
         return replace(self, face=self.face[index])
 
@@ -88,7 +85,7 @@ def faces_of(rests: Rests, force: Values, settings: Mapping[str, Any]) -> Faces 
     return Faces(face, float(np.radians(stated["accuracy_deg"])))
 
 
-def face_of(force: Values) -> tuple[NDArray[np.intp], NDArray[np.intp], Values, Values]:
+def face_of(force: Values) -> tuple[Index, Index, Values, Values]:
     """Return the face of each force (m, 3), -1 for none; its nearest axis, component along it, and tilt, deg."""
     u = force / np.linalg.norm(force, axis=1, keepdims=True)
     axis = np.argmax(np.abs(u), axis=1)

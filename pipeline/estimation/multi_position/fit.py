@@ -38,14 +38,11 @@ from pipeline.estimation.multi_position.model import stepped
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
     from pipeline.estimation.multi_position.likelihood import NoiseHypothesis
     from pipeline.estimation.multi_position.model import Equations, Model, State
-    from pipeline.records import Recording
+    from pipeline.records import Recording, Values
 
-    Values = NDArray[np.float64]
     Limits = Mapping[str, Values]  # effect to the limits of its parameters, infinite where there are none
 
 ROUNDS, HALVINGS = 60, 12  # of Gauss-Newton; of a step that raises the sum of squares

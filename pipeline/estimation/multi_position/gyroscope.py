@@ -40,16 +40,13 @@ from pipeline.model.kinematics import skew
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.estimation.design import Term
     from pipeline.estimation.multi_position.faces_and_turns import Turns
     from pipeline.estimation.multi_position.fit import Fit
     from pipeline.estimation.multi_position.moves import Gravity, Moves
     from pipeline.estimation.rest_means import Rests
-    from pipeline.records import Motion, Noise, Recording, SensorCalibration
+    from pipeline.records import Mask, Motion, Noise, Recording, SensorCalibration, Values
 
-    Values = NDArray[np.float64]
 
 FEWEST_MOVES = 6  # two equations each, for the nine of the matrix
 ROUNDS = 6  # of effects that depend on the rate
@@ -160,7 +157,7 @@ class GyroscopeModel:
         out.excess = variance
         return out
 
-    def without(self, held: NDArray[np.bool_]) -> GyroscopeModel:
+    def without(self, held: Mask) -> GyroscopeModel:
         """Return the model with ``held`` of its own rests, and the moves that end at them, held out."""
         out = self.every.held_out.copy()
         out[~self.every.held_out] = held

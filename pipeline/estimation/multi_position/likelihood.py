@@ -24,13 +24,10 @@ from pipeline.estimation.gauss_markov import SURE, selection_grid
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.estimation.gauss_markov import Prior
     from pipeline.estimation.multi_position.model import Equations
-    from pipeline.records import Noise
+    from pipeline.records import Noise, Values
 
-    Values = NDArray[np.float64]
 
 NEW = 1e-3  # share of a column's norm below which it adds no direction: rounding of the columns is below 1e-8
 # The grids below were chosen by the study of 500 recordings (tests/study/test_hand_held_study.py); ``fit.refined``

@@ -38,16 +38,14 @@ from pipeline.records import Motion
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.estimation.multi_position.accelerometer import AccelerometerModel
     from pipeline.estimation.multi_position.gyroscope import GyroscopeModel
     from pipeline.estimation.multi_position.likelihood import NoiseHypothesis
     from pipeline.estimation.rest_means import Rests
     from pipeline.model.effects.base import Effect
+    from pipeline.records import Mask, Values
 
     Model: TypeAlias = AccelerometerModel | GyroscopeModel
-    Values = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -78,7 +76,7 @@ class Equations:
     # each (t,), s; the stretches of time
     start: Values
     length: Values
-    joined: NDArray[np.bool_]  # (t, t); whether the time between them is known
+    joined: Mask  # (t, t); whether the time between them is known
     error: Values  # (n,), g, deg/s or deg; standard deviation of each equation by white noise
     # each (n, n); S and D
     common: Values | None = None

@@ -53,12 +53,9 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from typing import Any
 
-    from numpy.typing import NDArray
-
     from pipeline.estimation.rest_means import Rests
-    from pipeline.records import Recording, SensorCalibration
+    from pipeline.records import Index, Mask, Recording, SensorCalibration, Values
 
-    Values = NDArray[np.float64]
 
 LONGEST_S = 60.0  # see ``moves_of``
 GAP = 3.5  # intervals without a sample, over which a rate is not interpolated
@@ -79,8 +76,8 @@ class Moves:
     """The samples of all moves, padded to the longest."""
 
     # each (k,); rests between which each move lies
-    before: NDArray[np.intp]
-    after: NDArray[np.intp]
+    before: Index
+    after: Index
     # (k, s, 3), deg/s; less what the trapezoidal rule is off by bends between samples; the last sample is repeated
     reading: Values
     time: Values  # (k, s), s
@@ -91,7 +88,7 @@ class Moves:
     # share a sample
     doubt: Values
 
-    def select(self, index: NDArray[np.bool_]) -> Moves:
+    def select(self, index: Mask) -> Moves:
         """Return some of the moves."""
         return Moves(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
@@ -255,7 +252,7 @@ class Gravity:
     # columns
     root: Values
     shared: Values  # (m, 3, 12), g; what they do to the force
-    creeping: NDArray[np.bool_]  # (m,); whether the half second next to a move is off the mean by more than 4 s
+    creeping: Mask  # (m,); whether the half second next to a move is off the mean by more than 4 s
     moved: Values  # (12,); by how many of these errors the calibration was moved before all this was computed
 
 

@@ -42,13 +42,10 @@ from pipeline.records import NORMAL, SensorCalibration, StageResult
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.estimation.multi_position.fit import Fit
     from pipeline.estimation.multi_position.model import Model
-    from pipeline.records import Contribution, Noise, Recording, SensorCalibration
+    from pipeline.records import Contribution, Noise, Recording, SensorCalibration, Values
 
-    Values = NDArray[np.float64]
 
 STEP = 0.1  # of a standard uncertainty: the columns are differentiated where they are used
 REMARK = {
