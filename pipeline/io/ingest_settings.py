@@ -12,7 +12,7 @@ A profile states what a file holds: names, units, separators and the order of co
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from fractions import Fraction
 from typing import Annotated, Any, Literal, Self, TypeVar
 
@@ -68,6 +68,11 @@ class ChannelSource(Section):
     def units(cls, channel: str) -> list[str]:
         """Return the units that are allowed for a channel."""
         return list(UNITS[channel])
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_null(cls, given: dict[str, Any]) -> dict[str, Any]:
+        return {key: value for key, value in given.items() if value is not None}
 
     @field_validator("unit", mode="before")
     @classmethod
@@ -168,13 +173,18 @@ class _Part(Section):
 
 
 S = TypeVar("S", bound=Section)
+C = TypeVar("C", bound=ChannelSource)
 
 
-def validated(model: type[S], section: Mapping[str, Any], where: str, **context: object) -> S:
-    """Return a section as its model; a refusal names the key below ``where``, its value and what is allowed."""
-    refuse_unknown(where, section, tuple(model.model_fields))
+def validated(model: type[S], section: Any, where: str, given: Mapping[str, Any] | None = None, **context: Any) -> S:  # noqa: ANN401
+    """Return a section as its model; a refusal names the key below ``where``, its value and what is allowed.
+
+    ``given``: fields that are not the user's.
+    """
+    given = given or {}
+    refuse_unknown(where, section, [k for k in model.model_fields if k not in given])
     try:
-        return model.model_validate(dict(section), context=context)
+        return model.model_validate({**section, **given}, context=context)
     except ValidationError as error:
         first = error.errors()[0]
     key = str(first["loc"][0]) if first["loc"] else ""
@@ -185,15 +195,34 @@ def validated(model: type[S], section: Mapping[str, Any], where: str, **context:
     raise ConfigurationError(f"{where}.{key} is {section.get(key)!r}; {expected}")
 
 
-def refuse_unknown(where: str, entries: Mapping[str, Any], allowed: tuple[str, ...]) -> None:
-    """Refuse an unknown key, with the nearest known one."""
+def refuse_unknown(where: str, entries: object, allowed: Iterable[str]) -> None:
+    """Refuse what is no mapping, and an unknown key, with the nearest known one."""
+    known = tuple(allowed)
     if not isinstance(entries, Mapping):
-        raise ConfigurationError(f"{where} is {entries!r}; it is a mapping with {', '.join(allowed)}")
+        raise ConfigurationError(f"{where} is {entries!r}; it is a mapping with {', '.join(known)}")
     for key in entries:
-        if key not in allowed:
-            near = difflib.get_close_matches(str(key), allowed, 1)
-            hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(allowed)}"
+        if key not in known:
+            near = difflib.get_close_matches(str(key), known, 1)
+            hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
             raise ConfigurationError(f"{where}.{key} is unknown; {hint}")
+
+
+def _channels(model: type[C], where: str, entries: Any, **context: Any) -> dict[str, C]:  # noqa: ANN401  (the user's)
+    """Return where the channels of a file or topic come from; null leaves one out."""
+    refuse_unknown(where, entries, UNITS)
+    stated = {channel: entry for channel, entry in entries.items() if entry is not None}
+    return {c: validated(model, entry, f"{where}.{c}", {"channel": c}, **context) for c, entry in stated.items()}
+
+
+def _once(where: str, groups: Iterable[Iterable[str]], what: str) -> set[str]:
+    """Return the channels of all files or topics; refuse one that stands in two, but for the time."""
+    seen: set[str] = set()
+    for channels in groups:
+        twice = seen & set(channels) - {TIME}
+        if twice:
+            raise ConfigurationError(f"{where}: {', '.join(sorted(twice))} stands in two {what}")
+        seen |= set(channels)
+    return seen
 
 
 def checks_of(ingest: Mapping[str, Any]) -> Checks:
@@ -204,60 +233,39 @@ def checks_of(ingest: Mapping[str, Any]) -> Checks:
 def csv_formats(ingest: Mapping[str, Any]) -> list[CsvFormat]:
     """Return the layout of each text file of a recording: one, or one for each of the profile's ``parts``."""
     csv: Mapping[str, Any] = ingest.get("csv") or {}
-    own = tuple(k for k in CsvFormat.model_fields if k != "own_clock")
-    refuse_unknown("ingest.csv", csv, (*own, "parts"))
+    refuse_unknown("ingest.csv", csv, [k for k in (*CsvFormat.model_fields, "parts") if k != "own_clock"])
     shared = {k: v for k, v in csv.items() if k not in ("parts", "columns")}
-    header = validated(CsvFormat, shared, "ingest.csv").header
+    header = bool(validated(CsvFormat, shared, "ingest.csv").header)
+    parts = {"ingest.csv": _Part(file="{file}", columns=csv.get("columns"))}
+    if csv.get("parts"):
+        places = {f"ingest.csv.parts[{index}]": part for index, part in enumerate(csv["parts"])}
+        parts = {place: validated(_Part, part, place) for place, part in places.items()}
     formats = []
-    for where, part in _parts(csv):
-        columns = _columns(f"{where}.columns", part.columns or {}, header=bool(header))
-        settings = {**shared, "own_clock": part.own_clock, "columns": columns}
+    for where, part in parts.items():
+        columns = _channels(Column, f"{where}.columns", part.columns or {}, header=header)
+        settings = {**shared, "own_clock": part.own_clock, "columns": tuple(columns.values())}
         formats.append(validated(CsvFormat, settings, "ingest.csv"))
     _check_channels(formats)
     return formats
 
 
-def _parts(csv: Mapping[str, Any]) -> list[tuple[str, _Part]]:
-    """Return each file of a recording with the place of its settings."""
-    if not csv.get("parts"):
-        return [("ingest.csv", _Part(file="{file}", columns=csv.get("columns")))]
-    places = [f"ingest.csv.parts[{index}]" for index in range(len(csv["parts"]))]
-    return [(place, validated(_Part, part, place)) for place, part in zip(places, csv["parts"], strict=True)]
-
-
-def _columns(where: str, columns: Mapping[str, Any], *, header: bool) -> tuple[Column, ...]:
-    refuse_unknown(where, columns, tuple(UNITS))
-    out = []
-    for channel, entry in columns.items():
-        if entry is not None:
-            refuse_unknown(f"{where}.{channel}", entry, tuple(k for k in Column.model_fields if k != "channel"))
-            stated = {k: v for k, v in entry.items() if v is not None or k in ("column", "unit")}
-            out.append(validated(Column, {"channel": channel, **stated}, f"{where}.{channel}", header=header))
-    return tuple(out)
-
-
-def _check_channels(formats: Iterable[CsvFormat]) -> None:
+def _check_channels(formats: Sequence[CsvFormat]) -> None:
     """Refuse a profile without time, without a sensor, or with an incomplete one."""
-    seen: set[str] = set()
-    readings = {*ACCELEROMETER, *GYROSCOPE}
-    for layout in formats:
-        channels = {c.channel for c in layout.columns}
-        if layout.own_clock and (channels & readings or "time" not in channels):
+    readings, channels = {*ACCELEROMETER, *GYROSCOPE}, [{c.channel for c in layout.columns} for layout in formats]
+    for layout, own in zip(formats, channels, strict=True):
+        if layout.own_clock and (own & readings or TIME not in own):
             raise ConfigurationError(
                 "ingest.csv.parts: a part with own_clock is a table's log with its time; it holds "
-                f"{', '.join(sorted(channels & readings)) or 'no time'}"
+                f"{', '.join(sorted(own & readings)) or 'no time'}"
             )
-        if ("time" in channels) == (layout.rate_hz is not None):
+        if (TIME in own) == (layout.rate_hz is not None):
             raise ConfigurationError(
                 "ingest.csv needs either a time column (columns.time) or the sampling rate (rate_hz), in every part"
             )
-        twice = seen & channels - {"time"}
-        if twice:
-            raise ConfigurationError(f"ingest.csv.parts: {', '.join(sorted(twice))} stands in two parts")
-        seen |= channels
+    seen = _once("ingest.csv.parts", channels, "parts")
     for sensor, triad in TRIADS.items():
         missing = [c for c in triad if c not in seen]
-        if 0 < len(missing) < 3:
+        if 0 < len(missing) < len(triad):
             raise ConfigurationError(f"ingest.csv.columns: {', '.join(missing)} of the {sensor} is not described")
     if not seen & readings:
         raise ConfigurationError("ingest.csv.columns describes neither an accelerometer nor a gyroscope")
@@ -274,9 +282,14 @@ def check_ingest(ingest: Mapping[str, Any], procedure: Mapping[str, Any] | None 
 
 
 class MappedField(ChannelSource):
-    """The field of a message that holds a channel."""
+    """The field of a message that holds a channel; a time is in ns by default."""
 
-    field: FieldPath
+    field: FieldPath = Field(description="a path, such as linear_acceleration.x or position[table]")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _time_in_ns(cls, given: dict[str, Any]) -> dict[str, Any]:
+        return {"unit": "ns", **given} if given["channel"] == TIME else given
 
     @field_validator("field", mode="before")
     @classmethod
@@ -313,33 +326,17 @@ def mcap_format(ingest: Mapping[str, Any]) -> McapFormat:
     section = dict(ingest.get("mcap") or {})
     topics = section.pop("topics", None) or {}
     settings = validated(McapFormat, section, "ingest.mcap")
-    return settings.model_copy(update={"topics": _topics(topics, settings.time_source)})
-
-
-def _topics(topics: Mapping[str, Any], source: str) -> dict[str, dict[str, MappedField]]:
     if not isinstance(topics, Mapping):
         raise ConfigurationError(f"ingest.mcap.topics is {topics!r}; it maps topics to channels")
-    found: dict[str, dict[str, MappedField]] = {}
-    seen: set[str] = set()
+    found = {}
     for topic, entries in topics.items():
         where = f"ingest.mcap.topics.{topic}"
-        refuse_unknown(where, entries or {}, tuple(UNITS))
-        fields = {c: _field(f"{where}.{c}", c, e) for c, e in (entries or {}).items() if e is not None}
-        if TIME not in fields and source == HEADER:
+        found[str(topic).removesuffix(FIRST)] = fields = _channels(MappedField, where, entries or {})
+        if TIME not in fields and settings.time_source == HEADER:
             raise ConfigurationError(f"{where}.time is missing: the field of the moment, or time_source=log_time")
-        twice = seen & set(fields) - {TIME}
-        if twice:
-            raise ConfigurationError(f"ingest.mcap.topics: {', '.join(sorted(twice))} stands in two topics")
-        seen |= set(fields)
-        found[str(topic).removesuffix(FIRST)] = fields
+    seen = _once("ingest.mcap.topics", found.values(), "topics")
     for triad in (*TRIADS.values(), ATTITUDE):
         missing = [c for c in triad if c not in seen]
         if 0 < len(missing) < len(triad):
             raise ConfigurationError(f"ingest.mcap.topics: {', '.join(missing)} is not described")
-    return found
-
-
-def _field(where: str, channel: str, entry: Mapping[str, Any]) -> MappedField:
-    refuse_unknown(where, entry, tuple(k for k in MappedField.model_fields if k != "channel"))
-    default = {"unit": "ns"} if channel == TIME else {"unit": None}
-    return validated(MappedField, {"channel": channel, "field": None, **default, **entry}, where)
+    return settings.model_copy(update={"topics": found})

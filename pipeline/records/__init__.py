@@ -11,14 +11,6 @@ from pipeline.records.calibration import (
     coverage_factor,
     finite,
 )
-from pipeline.records.motion import (
-    Motion,
-    conjugate_product,
-    continuous,
-    level_in_body,
-    motion_at_rest,
-    rate_of_attitude,
-)
 from pipeline.records.recording import (
     AXES,
     SENSORS,
@@ -26,12 +18,18 @@ from pipeline.records.recording import (
     Index,
     Integers,
     Mask,
+    Motion,
     Noise,
     Note,
     Recording,
     Values,
+    conjugate_product,
+    continuous,
+    level_in_body,
     median,
+    motion_at_rest,
     noise_of_steps,
+    rate_of_attitude,
 )
 
 __all__ = [
