@@ -1,1 +1,38 @@
-"""Commands for people: one module each, with ``main(argv)``."""
+"""Commands for people: one module each, with ``main(argv)``. Here: their parsers and shared options."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+SHARED: dict[str, dict[str, Any]] = {
+    "--sensor": {"metavar": "NAME", "help": "sensor model, a name in configs/sensor: full scale, counts, noise"},
+    "--ingest": {"metavar": "PROFILE", "help": "how the log is read: a name in configs/ingest, or a profile's file"},
+    "--results": {"metavar": "DIR", "default": "results", "help": "folder of all results (default: results)"},
+}
+
+
+def parser_of(
+    command: str,
+    description: str | None,
+    epilog: str = "",
+    shared: tuple[str, ...] = (),
+    **settings: Any,  # noqa: ANN401  (of argparse)
+) -> argparse.ArgumentParser:
+    """Return the parser of a command: its text as it is written, and the options of ``SHARED`` that it has."""
+    form = argparse.RawDescriptionHelpFormatter
+    about = (description or "").partition("\n\n")[0]
+    parser = argparse.ArgumentParser(
+        f"python -m pipeline {command}", description=about, epilog=epilog, formatter_class=form, **settings
+    )
+    for option in shared:
+        parser.add_argument(option, **SHARED[option])
+    return parser
+
+
+def add_run_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of every command that runs a campaign."""
+    parser.add_argument("--cores", default="2", metavar="N", help="processor cores of the run (default: 2)")
+    parser.add_argument("--results", **SHARED["--results"])
+    words = "further settings of the run, as for snakemake --config"
+    parser.add_argument("--config", nargs="+", default=[], metavar="KEY=VALUE", help=words)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 from contextlib import suppress
 from itertools import chain, count
 from pathlib import Path
@@ -10,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from pipeline.commands.run import add_run_options, run_snakemake
+from pipeline.commands import add_run_options, parser_of
+from pipeline.commands.run import run_snakemake
 from pipeline.config.campaign import find_campaign, read_layers
 from pipeline.config.devices import edit_effects, sensor_and_effect
 from pipeline.errors import ConfigurationError, MissingInputError, PipelineError
@@ -19,11 +19,15 @@ from pipeline.outcome import RESULTS, read_summary, run_command
 from pipeline.records import SENSORS
 
 if TYPE_CHECKING:
+    import argparse
     from collections.abc import Mapping, Sequence
 
     from pipeline.config.devices import Edit
 
 EPILOG = """\
+The effects are then part of the unit's model in every run. The run computes again what depends on them, and its last
+lines state how the held-out error changed.
+
 examples:
   python -m pipeline add demo mpu6050-2-hidden gyroscope.g_sensitivity
   python -m pipeline add my_bench U1 gyroscope.g_sensitivity accelerometer.lever_arm --no-run
@@ -39,19 +43,11 @@ place to edit.
 
 def main(argv: Sequence[str]) -> int:
     """Run ``python -m pipeline add CAMPAIGN UNIT SENSOR.EFFECT ...``."""
-    parser = parser_of("add", __doc__)
-    parser.add_argument(
-        "--missing",
-        nargs="?",
-        const="",
-        metavar="EFFECT",
-        help="add to every unit the effects that are missing by the last run (or only EFFECT)",
-    )
-    parser.add_argument(
-        "--suggested",
-        action="store_true",
-        help="write the formulas that the last run suggests for the unit to effects/, and add them",
-    )
+    parser = parser_of_edit("add", __doc__)
+    words = "add to each unit what its diagnosis in the last run found to be missing, or of this only EFFECT"
+    parser.add_argument("--missing", nargs="?", const="", metavar="EFFECT", help=words)
+    words = "write the formulas that the last run suggests for the unit to effects/, and add them"
+    parser.add_argument("--suggested", action="store_true", help=words)
     arguments = parser.parse_args(argv)
     if not arguments.suggested:
         return change(arguments, remove=False)
@@ -115,18 +111,13 @@ def change(arguments: argparse.Namespace, *, remove: bool) -> int:
     return run_snakemake(arguments, arguments.config)
 
 
-def parser_of(command: str, description: str | None) -> argparse.ArgumentParser:
-    """Return the options that add and remove have in common."""
-    parser = argparse.ArgumentParser(
-        prog=f"python -m pipeline {command}",
-        description=description,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def parser_of_edit(command: str, description: str | None) -> argparse.ArgumentParser:
+    """Return the parser of add and remove."""
+    parser = parser_of(command, description, EPILOG)
     parser.add_argument("campaign", metavar="CAMPAIGN", help="a campaign's name or directory")
     parser.add_argument("unit", metavar="UNIT", nargs="?", help="a unit of units.csv")
     parser.add_argument("effects", metavar="SENSOR.EFFECT", nargs="*", help="for example gyroscope.g_sensitivity")
-    parser.add_argument("--no-run", action="store_true", help="write the files only")
+    parser.add_argument("--no-run", action="store_true", help="write the files, and do not run the campaign")
     add_run_options(parser)
     return parser
 

@@ -1,12 +1,12 @@
-"""Compensate a log with a unit's calibration."""
+"""Apply a unit's calibration to a log: write calibrated readings."""
 
 from __future__ import annotations
 
-import argparse
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipeline.commands import parser_of
 from pipeline.errors import ConfigurationError, InputError
 from pipeline.field_logs.compensate import LogProfile, compensate_log, require_apart
 from pipeline.io.files import MESSAGE_FORMATS
@@ -15,16 +15,16 @@ from pipeline.model.compensation import SMOOTHING_S, load
 from pipeline.run_progress import Countdown
 
 if TYPE_CHECKING:
+    import argparse
     from collections.abc import Sequence
 
 EPILOG = """\
-CSV in, CSV out: the columns of the sensors are replaced by calibrated ones in g and deg/s (accel_x_g .. gyro_z_dps),
-every other cell is kept as it is written. MCAP in, MCAP out: every message is kept byte for byte, and a topic of
-calibrated messages is added beside that of the Imu messages.
+Of a CSV log, the columns of the sensors are replaced by calibrated ones in g and deg/s (accel_x_g .. gyro_z_dps); all
+other cells stay as they are. Of an MCAP log, all messages stay byte for byte, and a topic with calibrated Imu messages
+is added. Logs of other formats give CSV with the columns time_s, accel_x_g .. gyro_z_dps, temperature_degc.
 
-The log is read as the recordings were with which the unit was calibrated (columns, units, raw counts, axes), or by the
-ingest profile that --ingest names. Text and MCAP are read in a stream, in bounded memory. A log of another format is
-held in memory, and the output is CSV with the columns time_s, accel_x_g .. gyro_z_dps, temperature_degc.
+Columns, units, counts and axes of the log are those of the recordings with which the unit was calibrated, unless
+--ingest names another profile. CSV and MCAP are read in a stream; logs of other formats are held in memory.
 
 examples:
   python -m pipeline apply --calibration results/demo/calibrations/U1.json drive.csv -o drive_calibrated.csv
@@ -61,33 +61,26 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m pipeline apply",
-        description=__doc__,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = parser_of("apply", __doc__, EPILOG)
     add = parser.add_argument
     add("log", type=Path, metavar="LOG", help=f"the log: .mcap, {', '.join(MESSAGE_FORMATS)}, or text")
-    add("--calibration", type=Path, required=True, metavar="C.json", help="calibrations/<unit>.json")
     add(
-        "-o",
-        "--output",
+        "--calibration",
         type=Path,
         required=True,
-        metavar="OUT",
-        help="file to write: MCAP of an MCAP log, else text; - for stdout",
+        metavar="C.json",
+        help="calibration of the unit: calibrations/<unit>.json",
     )
-    add("--ingest", metavar="NAME", help="ingest profile of the log, for example canonical_csv (that of the unit)")
-    add("--topic", metavar="TOPIC", help="topic of the calibrated messages (that of the readings + _calibrated)")
-    add(
-        "--temperature-smoothing", type=float, default=SMOOTHING_S, metavar="S", dest="smoothing",
-        help="memory of the causal smoothing of the temperature, s; 0: none (default: %(default)g)",
-    )  # fmt: skip
-    add(
-        "--python-effect", action="append", default=[], metavar="FILE", dest="python_effects",
-        help="Python file of an effect of yours that the calibration was made with (it is run); may be repeated",
-    )  # fmt: skip
+    words = "file to write: MCAP for an MCAP log, else CSV; - for the standard output"
+    add("-o", "--output", type=Path, required=True, metavar="OUT", help=words)
+    words = "how the log is read: a name in configs/ingest (default: as the recordings of the unit)"
+    add("--ingest", metavar="PROFILE", help=words)
+    words = "MCAP: topic of the calibrated messages (default: that of the readings, with _calibrated at its end)"
+    add("--topic", metavar="TOPIC", help=words)
+    words = "time constant of the causal smoothing of the temperature, s; 0: none (default: %(default)g)"
+    add("--temperature-smoothing", type=float, default=SMOOTHING_S, metavar="S", dest="smoothing", help=words)
+    words = "file of an effect in Python with which the calibration was made; the file is run; may be repeated"
+    add("--python-effect", action="append", default=[], metavar="FILE", dest="python_effects", help=words)
     return parser
 
 

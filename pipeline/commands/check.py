@@ -1,8 +1,7 @@
-"""Print the content, notes and refusals of a file at ingest; propose a profile for an unknown log."""
+"""Show what a run would read from a file, with notes and errors; propose a profile for an unknown log."""
 
 from __future__ import annotations
 
-import argparse
 import re
 import sys
 import tempfile
@@ -12,6 +11,7 @@ from pathlib import Path
 from shutil import copyfile
 from typing import TYPE_CHECKING, Any
 
+from pipeline.commands import parser_of
 from pipeline.config.campaign import load_campaign
 from pipeline.config.compose import Composer
 from pipeline.config.options import Problem
@@ -30,6 +30,7 @@ from pipeline.run_progress import Countdown
 from pipeline.signal.segments import cut
 
 if TYPE_CHECKING:
+    import argparse
     from collections.abc import Sequence
 
     from pipeline.profile_detection.columns import TextLayout
@@ -41,11 +42,12 @@ SEARCHED_BYTES = 1 << 25  # of a log, for its layout
 SEARCHED_FOLDERS = 4  # the log's, and a campaign's above raw/<unit>/
 UNKNOWN_LAYOUT = ("missing_column", "no_header", "missing_topic")
 EPILOG = """\
-A file of a campaign is read by the campaign's configuration. Any other file is read by the profile --ingest (default:
-canonical_csv) and, with --sensor, the full scale of that sensor. Only --save writes a file.
+A file of a campaign is read as the campaign's configuration says. Any other file is read by the profile --ingest
+(default: canonical_csv); with --sensor, the readings are compared with the full scale of that sensor. Only --save
+writes a file.
 
-For a log that the profile does not describe, a profile is proposed, with the evidence for each line and ??? where
-you must decide. A run uses it only after you save it and name it in the configuration.
+Where the profile does not fit the log, another one is proposed, with the evidence for each line and ??? where you must
+decide. A run uses it only after you save it and name it in the configuration.
 
 examples:
   python -m pipeline check log.csv
@@ -103,22 +105,11 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m pipeline check",
-        description=__doc__,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = parser_of("check", __doc__, EPILOG, ("--ingest", "--sensor"))
     parser.add_argument(
-        "files",
-        type=Path,
-        nargs="+",
-        metavar="FILE",
-        help=f"a text log, or {', '.join(SUFFIXES[1:-1])}",
+        "files", type=Path, nargs="+", metavar="FILE", help=f"a text log, or {', '.join(SUFFIXES[1:-1])}"
     )
-    parser.add_argument("--ingest", metavar="PROFILE", help="name in configs/ingest or of a saved profile, or its file")
-    parser.add_argument("--sensor", metavar="NAME", help="name in configs/sensor, for full scale and counts")
-    parser.add_argument("--save", type=Path, metavar="FILE", help="write the proposed profile there")
+    parser.add_argument("--save", type=Path, metavar="FILE", help="write the proposed profile to this file")
     return parser
 
 

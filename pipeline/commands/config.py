@@ -6,12 +6,12 @@ branch above it, has set it; a key that stands nowhere has the schema's default.
 
 from __future__ import annotations
 
-import argparse
 from itertools import takewhile
 from typing import TYPE_CHECKING, Any
 
 import yaml
 
+from pipeline.commands import parser_of
 from pipeline.config.campaign import find_campaign, read_layers
 from pipeline.config.options import GROUPS, Problem, default_option, nearest, parse, read_option
 from pipeline.config.user_effects import PYTHON
@@ -31,11 +31,13 @@ COLUMN = 56  # where the origins stand
 
 def main(argv: Sequence[str]) -> int:
     """Run ``python -m pipeline config UNIT [OVERRIDE ...]``; what is printed is YAML."""
-    parser = argparse.ArgumentParser(prog="python -m pipeline config", description=(__doc__ or "").partition("\n")[0])
+    parser = parser_of("config", __doc__)
     parser.add_argument("unit", metavar="UNIT", help="a unit of units.csv")
-    parser.add_argument("overrides", metavar="KEY=VALUE", nargs="*", help="as overrides= of snakemake --config")
+    parser.add_argument("overrides", metavar="KEY=VALUE", nargs="*", help="further settings, as in a run")
     parser.add_argument("--campaign", default="demo", help="a campaign's name or directory (default: demo)")
-    parser.add_argument("--python-effect", action="append", default=[], metavar="FILE", help="as python_effects=")
+    parser.add_argument(
+        "--python-effect", action="append", default=[], metavar="FILE", help="file of an effect in Python, as in a run"
+    )
     arguments = parser.parse_args(argv)
     directory, unit = find_campaign(arguments.campaign), arguments.unit
     composer, all_layers = read_layers(directory, {"overrides": arguments.overrides, PYTHON: arguments.python_effect})

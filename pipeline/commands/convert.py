@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
+import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pipeline.commands import parser_of
 from pipeline.config.options import LARGEST_CONFIG
 from pipeline.errors import ConfigurationError
 from pipeline.exports import formats
@@ -16,11 +17,13 @@ from pipeline.io.yaml_file import read_yaml
 from pipeline.records import SENSORS
 
 if TYPE_CHECKING:
+    import argparse
     from collections.abc import Sequence
 
 EPILOG = """\
-The format of IN is told by its name and content, that of OUT by its name: kalibr.yaml, px4.params, calibration.json ...
-The terminal states what is lost: what is written is read back and compared with IN.
+The format of IN follows from its name and content, that of OUT from its name: kalibr.yaml, px4.params,
+calibration.json ... What is written is read back and compared with IN; the terminal states what is lost. Formats in
+counts, and those with noise densities, need --sensor where IN does not name the sensor.
 
 examples:
   python -m pipeline convert results/demo/calibrations/mpu6050-1.json px4.params
@@ -66,16 +69,11 @@ def sheets_of(sensor: str | None, found: FoundCalibration | None = None) -> dict
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m pipeline convert",
-        description=__doc__,
-        epilog=EPILOG + f"\nformats: {', '.join([CALIBRATION, *formats()])}\n",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    known = textwrap.fill(f"formats: {', '.join([CALIBRATION, *formats()])}", 118)
+    parser = parser_of("convert", __doc__, f"{EPILOG}\n{known}\n", ("--sensor",))
     add = parser.add_argument
     add("source", type=Path, metavar="IN", help="a calibration in any of the formats")
     add("target", type=Path, metavar="OUT", help="the file to write")
-    add("--from", dest="source_format", metavar="FORMAT", help="format of IN, where name and content do not tell it")
-    add("--to", dest="target_format", metavar="FORMAT", help="format of OUT, where its name does not tell it")
-    add("--sensor", metavar="NAME", help="config of the sensor, for formats in counts and for noise densities")
+    add("--from", dest="source_format", metavar="FORMAT", help="format of IN, where name and content are ambiguous")
+    add("--to", dest="target_format", metavar="FORMAT", help="format of OUT, where its name is another")
     return parser

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from pipeline.commands import parser_of
 from pipeline.commands.convert import sheets_of
 from pipeline.diagnosis.words import in_words
 from pipeline.errors import InputError, MissingInputError
@@ -23,6 +23,12 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
 JSON = dict[str, Any]
+EPILOG = """\
+examples:
+  python -m pipeline explain demo mpu6050-2-hidden                       what is missing, and the evidence
+  python -m pipeline explain results/demo/calibrations/mpu6050-1.json    how the numbers are to be used
+  python -m pipeline explain kalibr.yaml                                 the same of another program's calibration
+"""
 
 
 class Selection(NamedTuple):
@@ -36,12 +42,15 @@ class Selection(NamedTuple):
 
 def main(argv: Sequence[str]) -> int:
     """Run ``python -m pipeline explain C [UNIT ...]``."""
-    parser = argparse.ArgumentParser(prog="python -m pipeline explain", description=__doc__)
-    parser.add_argument("campaign", metavar="C", help="a campaign, its results, a diagnosis (JSON), or a calibration")
-    parser.add_argument("units", metavar="UNIT", nargs="*", help="units to explain (default: all)")
-    parser.add_argument("--from", dest="format", metavar="FORMAT", help="format of a calibration, if nothing tells it")
-    parser.add_argument("--sensor", metavar="NAME", help="config of its sensor, if its format is in counts")
-    parser.add_argument("--results", type=Path, default=Path("results"), help="where results are (default: results)")
+    parser = parser_of("explain", __doc__, EPILOG, ("--sensor", "--results"))
+    parser.add_argument(
+        "campaign",
+        metavar="WHAT",
+        help="a campaign, the folder of its results, or a file: a diagnosis or a calibration",
+    )
+    parser.add_argument("units", metavar="UNIT", nargs="*", help="units of the campaign (default: all)")
+    words = "format of a calibration, where name and content of the file are ambiguous"
+    parser.add_argument("--from", dest="format", metavar="FORMAT", help=words)
     arguments = parser.parse_args(argv)
     file = Path(arguments.campaign)
     if file.is_file() and not _is_diagnosis(file):
@@ -51,7 +60,7 @@ def main(argv: Sequence[str]) -> int:
         except InputError as error:
             raise InputError(f"is no diagnosis, and no calibration: {error.message}", error.file) from error
         return 0
-    selection = find(arguments.campaign, arguments.units, arguments.results)
+    selection = find(arguments.campaign, arguments.units, Path(arguments.results))
     documents = {unit: _diagnosis(file) for unit, file in selection.files.items()}
     texts = [
         explain(unit, document, _beside(selection.files[unit], "validations"), selection)

@@ -1,8 +1,7 @@
-"""Propose the next rest or turn of a recording by hand, from what is recorded so far, and say when it is enough."""
+"""Propose the next rest or turn of a recording by hand, and state when the recording is sufficient."""
 
 from __future__ import annotations
 
-import argparse
 import sys
 import tempfile
 import time
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from pipeline.commands import parser_of
 from pipeline.commands.check import campaign_of, config_of_log
 from pipeline.config.campaign import load_campaign
 from pipeline.errors import CannotCalibrateError, ConfigurationError, NotObservableError, PipelineError
@@ -26,6 +26,7 @@ from pipeline.signal.rests import WINDOW_S, find_rests
 from pipeline.simulation.description import BY_HAND
 
 if TYPE_CHECKING:
+    import argparse
     from collections.abc import Sequence
 
     from pipeline.planning.next_rest import Progress
@@ -37,13 +38,13 @@ STILL_RESTING_S = 1.0  # from a rest's end to that of the log, below which the r
 FIRST = Turn(0, 2, 180.0)  # about x, while nothing of the gyroscope is known
 WANDERS = 2.0  # bias wanders in the default goal: a calibration says nothing of the bias of another hour to less (95 %)
 EPILOG = """\
-The rests are found as a run finds them. The next rest is the one by which the accelerometer's calibration gains most;
-the largest expanded uncertainty (95 %) of bias, in mg, and of the matrix, in mg at 1 g, is compared with --goal. With
---gyroscope-goal, turns that tell most of the gyroscope's matrix follow (method=rests_and_moves). With --procedure
-ferraris the next missing face or turn is named. How attitudes are named: docs/record.md.
+The next rest is the one that reduces the uncertainty of the accelerometer's calibration most. The goal is reached when
+the largest expanded uncertainty (95 %) of the bias, in mg, and of the matrix, in mg at 1 g, is below --goal. With
+--gyroscope-goal, turns for the gyroscope's matrix follow (method=rests_and_moves). With --procedure ferraris, the next
+missing face or turn is named. docs/record.md shows the names of the attitudes.
 
-A recording of a campaign is read by the campaign's configuration, together with the unit's other recordings. Any other
-file is read by --sensor, --ingest and --procedure.
+A recording of a campaign is read as the campaign's configuration says, together with the unit's other recordings. Any
+other file is read by --sensor, --ingest and --procedure.
 
 examples:
   python -m pipeline guide data/my_bench/raw/U1/recording.csv --follow
@@ -106,23 +107,22 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m pipeline guide",
-        description=__doc__,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = parser_of("guide", __doc__, EPILOG, ("--sensor", "--ingest"))
     add = parser.add_argument
-    add("files", type=Path, nargs="+", metavar="RECORDING", help="of one unit by hand: .csv or other text, .mcap")
-    add("--follow", action="store_true", help="read a growing log until the goal is reached (Ctrl-C ends it)")
-    wanted = "largest expanded uncertainty, mg (default: twice the bias wander that the sensor's file states)"
+    add("files", type=Path, nargs="+", metavar="RECORDING", help="recordings of one unit, made by hand")
+    add("--follow", action="store_true", help="read the log while it grows, until the goal is reached (Ctrl-C ends it)")
+    wanted = "wanted expanded uncertainty, mg (default: twice the bias wander in the sensor's file)"
     add("--goal", type=float, metavar="MG", help=wanted)
-    wanted = "likewise of the gyroscope's matrix, by the moves between the rests (default: it is left out)"
+    wanted = "wanted expanded uncertainty of the gyroscope's matrix (default: only the accelerometer is guided)"
     add("--gyroscope-goal", type=float, metavar="PERCENT", help=wanted)
-    add("--dwell", type=float, metavar="S", default=BY_HAND.dwell_s, help="of a rest (default: %(default)g)")
-    add("--sensor", metavar="NAME", help="name in configs/sensor (default: generic)")
+    add(
+        "--dwell",
+        type=float,
+        metavar="S",
+        default=BY_HAND.dwell_s,
+        help="planned length of a rest (default: %(default)g)",
+    )
     add("--procedure", metavar="NAME", help="multi_position (default), orientations_24, six_positions or ferraris")
-    add("--ingest", metavar="PROFILE", help="name in configs/ingest or of a saved profile, or its file")
     return parser
 
 

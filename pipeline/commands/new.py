@@ -1,12 +1,12 @@
-"""Create an empty campaign with comments, and a README that says how to record it."""
+"""Create an empty campaign, with a README that states how to record it."""
 
 from __future__ import annotations
 
-import argparse
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pipeline.commands import parser_of
 from pipeline.errors import ConfigurationError, InputError
 from pipeline.files import CONFIGS
 from pipeline.model.data_sheet import range_settings
@@ -21,6 +21,13 @@ if TYPE_CHECKING:
 GROUPS = ("sensor", "table", "procedure", "method", "filter", "ingest", "certificate")
 UNITS = {"accelerometer": "g", "gyroscope": "deg/s"}
 HEADER = "unit,serial,lot,date,sensor,table,procedure,overrides"
+EPILOG = """\
+On a terminal the command asks for the sensor, the ranges, the procedure and the table that no option states.
+
+examples:
+  python -m pipeline new my_bench --sensor mpu6050 --range 4 500
+  python -m pipeline new by_hand --sensor mpu6050 --procedure multi_position
+"""
 SETTINGS = """\
 # Hydra overrides for all units of this campaign; units.csv and the command line are stronger.
 overrides:
@@ -36,14 +43,15 @@ overrides:
 
 def main(argv: Sequence[str]) -> int:
     """Run ``python -m pipeline new DIR``."""
-    parser = argparse.ArgumentParser(prog="python -m pipeline new", description=__doc__)
-    parser.add_argument("directory", type=Path, metavar="DIR", help="the campaign's directory (created if need be)")
-    parser.add_argument("--sensor", metavar="NAME", help="sensor model of the example row (default: generic)")
-    parser.add_argument("--range", type=float, nargs="+", metavar="RANGE", help="of the accelerometer in g, and of the "
-                        "gyroscope in deg/s (default: those of the sensor's file)")  # fmt: skip
-    parser.add_argument("--procedure", metavar="NAME", help="how it is recorded (default: three_axis_turns)")
-    parser.add_argument("--table", metavar="NAME", help="table of the example row (default: that of the procedure)")
-    parser.add_argument("--unit", default="U1", metavar="NAME", help="name of the example unit (default: U1)")
+    parser = parser_of("new", __doc__, EPILOG)
+    add = parser.add_argument
+    add("directory", type=Path, metavar="DIR", help="directory of the campaign; it is created if it does not exist")
+    add("--sensor", metavar="NAME", help="sensor model, a name in configs/sensor (default: generic)")
+    words = "full scale of the accelerometer in g, then of the gyroscope in deg/s (default: those of the sensor's file)"
+    add("--range", type=float, nargs="+", metavar="RANGE", help=words)
+    add("--procedure", metavar="NAME", help="how you record, a name in configs/procedure (default: three_axis_turns)")
+    add("--table", metavar="NAME", help="rate table, a name in configs/table (default: that of the procedure)")
+    add("--unit", default="U1", metavar="NAME", help="name of the first unit (default: U1)")
     arguments = parser.parse_args(argv)
     sheet = arguments.directory / "units.csv"
     if sheet.exists():

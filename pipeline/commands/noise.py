@@ -1,12 +1,12 @@
-"""Identify the noise of a unit from one log at rest: N, B, K and more of each axis, with intervals."""
+"""Identify the noise of a unit from a log at rest: white noise N, bias instability B, random walk K and more."""
 
 from __future__ import annotations
 
-import argparse
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pipeline.commands import parser_of
 from pipeline.commands.check import config_of_log
 from pipeline.errors import ConfigurationError
 from pipeline.estimation.noise_identification import identify_noise
@@ -20,12 +20,14 @@ from pipeline.report.noise_section import remarks, term_rows
 from pipeline.report.numbers import MINUS, number
 
 if TYPE_CHECKING:
+    import argparse
     from collections.abc import Sequence
 
 JSON = dict[str, Any]
 EPILOG = """\
-The unit has to rest during the whole log. Hours show the slow terms; what the log is too short for is printed as an
-upper limit (<). -o writes a consumer's file by its name (kalibr_imu.yaml, vins.yaml), or everything as .json.
+The unit must rest during the whole log. The slow terms need hours; a term for which the log is too short is printed as
+an upper limit (<). -o writes the file of another program, chosen by its name (kalibr_imu.yaml, vins.yaml), or all
+results as .json.
 
 examples:
   python -m pipeline noise static.csv
@@ -71,15 +73,8 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m pipeline noise",
-        description=__doc__,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("log", type=Path, metavar="LOG", help="a log at rest")
-    parser.add_argument("--ingest", metavar="PROFILE", help="ingest profile of the log (default: canonical_csv)")
-    parser.add_argument("--sensor", metavar="NAME", help="name in configs/sensor, for counts and full scale")
+    parser = parser_of("noise", __doc__, EPILOG, ("--ingest", "--sensor"))
+    parser.add_argument("log", type=Path, metavar="LOG", help="a log of the unit at rest")
     parser.add_argument("-o", "--output", type=Path, metavar="OUT", help="file to write, in the format of its name")
     return parser
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pipeline.commands import parser_of
 from pipeline.errors import ConfigurationError
 from pipeline.model.effects import read_effect_files, register
 from pipeline.planning.changes import best_changes, helps_most
@@ -22,9 +23,9 @@ if TYPE_CHECKING:
 
 FILE = "simulation.yaml"
 EPILOG = """\
-For each effect: the smallest size that this procedure would find in half of the units, at the noise of the sensor's
-data sheet; its share of the data sheet's limit; effects with a similar signal; and up to which size one of these would
-be named in its place.
+For each effect the plan states the smallest size that the diagnosis would find in half of the units, at the noise of
+the sensor's data sheet; its share of the data sheet's limit; effects with a similar signal; and up to which size one of
+these would be named instead.
 
 examples:
   python -m pipeline plan
@@ -64,24 +65,22 @@ def _joined(argv: Sequence[str]) -> list[str]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m pipeline plan",
-        description=__doc__,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        argument_default=argparse.SUPPRESS,
-    )
+    parser = parser_of("plan", __doc__, EPILOG, argument_default=argparse.SUPPRESS)
     add = parser.add_argument
-    add(
-        "--from", dest="source", type=Path, default=None, metavar="FILE", help="procedure as a simulation's description"
-    )
-    add("--campaign", type=Path, default=None, metavar="DIR", help=f"likewise, from DIR/{FILE}")
+    words = "take sensor, table and procedure from the description of a simulation"
+    add("--from", dest="source", type=Path, default=None, metavar="FILE", help=words)
+    add("--campaign", type=Path, default=None, metavar="DIR", help=f"likewise, from the description DIR/{FILE}")
     add("--unit", default=None, metavar="NAME", help="a unit of the description (default: the first)")
     add("--effect", dest="effects", action="append", type=Path, default=[], metavar="FILE",
         help="an effect of your own (YAML); those of the campaign are always included")  # fmt: skip
-    add("--against", default=None, metavar="OPTIONS", help="a second procedure: the options that differ, in quotes")
+    add(
+        "--against",
+        default=None,
+        metavar="OPTIONS",
+        help="compare with a second procedure: the options in which it differs, in quotes",
+    )
     add("--json", action="store_true", default=False, help="print the plan as JSON")
-    add("--no-extra", dest="extra", action="store_false", default=True, help="propose no additional recordings")
+    add("--no-extra", dest="extra", action="store_false", default=True, help="do not propose additional recordings")
     add_recording_options(parser)
     return parser
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.commands.add import change, parser_of
+from pipeline.commands.add import change, parser_of_edit
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -12,4 +12,4 @@ if TYPE_CHECKING:
 
 def main(argv: Sequence[str]) -> int:
     """Run ``python -m pipeline remove CAMPAIGN UNIT SENSOR.EFFECT ...``."""
-    return change(parser_of("remove", __doc__).parse_args(argv), remove=True)
+    return change(parser_of_edit("remove", __doc__).parse_args(argv), remove=True)

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import subprocess
 import sys
 from typing import TYPE_CHECKING
 
+from pipeline.commands import add_run_options, parser_of
 from pipeline.errors import ConfigurationError
 from pipeline.files import SHIPPED
 from pipeline.outcome import RESULTS
 
 if TYPE_CHECKING:
+    import argparse
     from collections.abc import Sequence
 
 EPILOG = """\
@@ -22,20 +23,19 @@ examples:
   imu-calibration run my_bench --config 'unit_overrides={U1: [filter.cutoff_hz=2]}'
   imu-calibration run my_bench -- --dry-run
 
-The rules are Snakemake's: what is up to date is not computed again. Options after -- go to Snakemake as they are.
+Snakemake runs the stages: what is up to date is not computed again. Options after -- are passed on to Snakemake.
 """
 
 
 def main(argv: Sequence[str]) -> int:
     """Run ``imu-calibration run CAMPAIGN [OVERRIDE ...]``; the exit code is that of the run."""
-    parser = argparse.ArgumentParser(
-        prog="imu-calibration run",
-        description=__doc__,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = parser_of("run", __doc__, EPILOG)
+    parser.add_argument(
+        "campaign",
+        metavar="CAMPAIGN",
+        help="a campaign's directory, or the name of one that is shipped: demo, published",
     )
-    parser.add_argument("campaign", metavar="CAMPAIGN", help="a campaign's directory, or demo")
-    parser.add_argument("overrides", metavar="KEY=VALUE", nargs="*", help="Hydra overrides for every unit")
+    parser.add_argument("overrides", metavar="KEY=VALUE", nargs="*", help="settings for every unit (Hydra overrides)")
     add_run_options(parser)
     at = list(argv).index("--") if "--" in argv else len(argv)
     arguments = parser.parse_args(argv[:at])
@@ -45,15 +45,6 @@ def main(argv: Sequence[str]) -> int:
             raise ConfigurationError("overrides are given twice, as KEY=VALUE and by --config; give them once")
         config.append(f"overrides={json.dumps(arguments.overrides)}")
     return run_snakemake(arguments, config, argv[at + 1 :])
-
-
-def add_run_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that every command which runs a campaign has."""
-    parser.add_argument("--cores", default="2", metavar="N", help="of the run (2)")
-    parser.add_argument("--results", default=RESULTS, metavar="DIR", help="where results go (results)")
-    parser.add_argument(
-        "--config", nargs="+", default=[], metavar="KEY=VALUE", help="further settings of the run, as for snakemake"
-    )
 
 
 def run_snakemake(arguments: argparse.Namespace, config: Sequence[str], options: Sequence[str] = ()) -> int:

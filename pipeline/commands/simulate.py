@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
+from pipeline.commands import parser_of
 from pipeline.errors import ConfigurationError
 from pipeline.model.data_sheet import assumed_figures
 from pipeline.model.effects import read_effect_files, register
@@ -29,8 +30,8 @@ if TYPE_CHECKING:
 
 FILE = "simulation.yaml"
 EPILOG = """\
-A campaign is simulated from a description, DIR/simulation.yaml or --from FILE; where there is none (or options are
-given), from the options, and the description is written to DIR/simulation.yaml.
+The campaign follows from a description: DIR/simulation.yaml or --from FILE. Where there is none, or options are given,
+it follows from the options, and their description is written to DIR/simulation.yaml.
 
 examples:
   python -m pipeline simulate data/fleet --units 100 --samples 10000 --seed 1
@@ -38,9 +39,9 @@ examples:
   python -m pipeline simulate /tmp/table --effect table_tilt=0.2 --both-directions --rate 20 60 100
   python -m pipeline simulate data/demo
 
-An effect is hidden in one sensor (accelerometer.NAME) or in both (NAME); without a size it has the typical one of the
-sensor's configuration with random signs, with one number that size, with several its parameters' values.
-An effect of your own is hidden likewise, by the name of its file DIR/effects/NAME.yaml (docs/effects_of_your_own.md).
+An effect is hidden in one sensor (accelerometer.NAME) or in both (NAME). Without a size it has the typical size of the
+sensor's configuration with random signs; one number is the size; several numbers are the values of its parameters.
+NAME may be an effect of your own, DIR/effects/NAME.yaml (docs/effects_of_your_own.md).
 In simulation.yaml a unit may also have a formula that is no effect of the campaign, to test the diagnosis:
   effects: {gyroscope.gear_mesh: {terms: {A: {formula: "cos(5 * radians(angle))", unit: deg/s}}, values: 0.03}}
 The truth is written to DIR/truth/<unit>.json.
@@ -88,22 +89,16 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m pipeline simulate",
-        description=__doc__,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        argument_default=argparse.SUPPRESS,
-    )
+    parser = parser_of("simulate", __doc__, EPILOG, argument_default=argparse.SUPPRESS)
     add = parser.add_argument
-    add("directory", type=Path, metavar="DIR", help="the campaign's directory; made if need be")
+    add("directory", type=Path, metavar="DIR", help="directory of the campaign; it is created if it does not exist")
     add("--from", dest="source", type=Path, default=None, metavar="FILE", help="description of what to simulate (YAML)")
-    add("--quiet", action="store_true", default=False, help="do not name every unit")
+    add("--quiet", action="store_true", default=False, help="print no line for each unit")
     add("--sheet-only", action="store_true", default=False, help="write units.csv, and leave the recordings to the run")
-    add("--units", type=int, metavar="N", help="number of units (1)")
-    add("--prefix", metavar="NAME", help="their names: NAME001, NAME002 ... (U)")
-    add("--seed", type=int, help="every random number follows from it (0)")
-    add("--format", choices=FORMATS, help="of the recordings (csv)")
+    add("--units", type=int, metavar="N", help="number of units (default: 1)")
+    add("--prefix", metavar="NAME", help="names of the units: NAME001, NAME002 ... (default: U)")
+    add("--seed", type=int, help="seed of all random numbers (default: 0)")
+    add("--format", choices=FORMATS, help="format of the recordings (default: csv)")
     add("--effect", action="append", metavar="[SENSOR.]NAME[=SIZE]", help="hide an effect; may be repeated")
     add_recording_options(parser)
     return parser

@@ -1,11 +1,11 @@
-"""Run the blind study of the diagnosis: hide effects at random, diagnose, count."""
+"""Run the blind study of the diagnosis: hide effects at random, diagnose them, count what is found."""
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipeline.commands import parser_of
 from pipeline.errors import ConfigurationError
 from pipeline.run_progress import Countdown
 from pipeline.study.answers import figures, numbers, reliability_diagram
@@ -28,27 +28,15 @@ change of the code. A case takes one to three seconds.
 
 def main(argv: Sequence[str]) -> int:
     """Run ``python -m pipeline study DIR``."""
-    parser = argparse.ArgumentParser(
-        prog="python -m pipeline study",
-        description=__doc__,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("directory", type=Path, metavar="DIR", help="where truth and results go")
-    parser.add_argument(
-        "--families",
-        default="single,pairs,null_normal",
-        help="with commas: a family, a first word for all of its families (null, shape), or all",
-    )
-    parser.add_argument("--n", type=int, default=100, help="cases of each family (100)")
-    parser.add_argument("--seed", type=int, default=1, help="every random number follows from it (1)")
-    parser.add_argument("--processes", type=int, default=1, help="cores to use (1)")
-    parser.add_argument(
-        "--table",
-        type=Path,
-        metavar="FILE",
-        help="write the study as a Markdown page, and its diagram to images/ beside it",
-    )
+    parser = parser_of("study", __doc__, EPILOG)
+    parser.add_argument("directory", type=Path, metavar="DIR", help="folder for the truth and the results")
+    words = "families of cases, with commas; a first word (null, shape) means all families that begin with it; or all"
+    parser.add_argument("--families", default="single,pairs,null_normal", help=words)
+    parser.add_argument("--n", type=int, default=100, help="cases of each family (default: 100)")
+    parser.add_argument("--seed", type=int, default=1, help="seed of all random numbers (default: 1)")
+    parser.add_argument("--processes", type=int, default=1, help="processor cores (default: 1)")
+    words = "write the study as a Markdown page, and its diagram to images/ beside it"
+    parser.add_argument("--table", type=Path, metavar="FILE", help=words)
     arguments = parser.parse_args(argv)
     families = _families(arguments.families)
     countdown = Countdown(0)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipeline.commands import parser_of
 from pipeline.files import write_atomically
 
 if TYPE_CHECKING:
@@ -21,18 +21,19 @@ seeds   simulates the campaign's recordings with every seed and writes FILE (dat
 
 def main(argv: Sequence[str]) -> int:
     """Run ``python -m pipeline thesis page`` or ``seeds``."""
-    parser = argparse.ArgumentParser(
-        prog="python -m pipeline thesis",
-        description=__doc__,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = parser_of("thesis", __doc__, EPILOG)
     parser.add_argument("what", choices=("page", "seeds"))
-    parser.add_argument("--campaign", type=Path, required=True, metavar="DIR", help="with simulation.yaml and printed/")
-    parser.add_argument("--results", type=Path, metavar="DIR", help="of the campaign's run (page)")
+    parser.add_argument(
+        "--campaign",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="campaign with simulation.yaml and the folder printed/",
+    )
+    parser.add_argument("--results", type=Path, metavar="DIR", help="page: results of the campaign")
     parser.add_argument("--output", type=Path, required=True, metavar="FILE", help="file to write")
-    parser.add_argument("--seeds", type=int, default=50, help="how many (50)")
-    parser.add_argument("--processes", type=int, default=1, help="cores to use (1)")
+    parser.add_argument("--seeds", type=int, default=50, help="seeds: how many (default: 50)")
+    parser.add_argument("--processes", type=int, default=1, help="processor cores (default: 1)")
     arguments = parser.parse_args(argv)
     if arguments.what == "seeds":
         _seeds(arguments.campaign, arguments.seeds, arguments.processes, arguments.output)
