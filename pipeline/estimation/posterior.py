@@ -47,6 +47,8 @@ FAR = 9.0  # of log E below the best, beyond which a set is not extended
 NEAR = 7.0  # of log E below the best, within which a set's scales are found
 MOST_NEAR, ROUNDS = 16, 3  # of these sets; of a search for the best scales, and of exchanges
 NEGLIGIBLE = 1e-5  # weight of a hypothesis or of a part of a mixture that is left out
+WIDE = 8  # columns of an effect from which on LAPACK's factorisation costs less than an elimination of all side by side
+RIDGE = 1e-12  # of a column's square: 1e4 times the rounding of a double
 CERTAIN = 0.97  # what is said of more than that: of the inclusions with 1.000, 96.6 % were right in those sensors
 ENOUGH = 0.95  # of an answer set, and of an upper limit
 LIKELY = 0.05  # share of the best probability, above which a set counts for upper limits
@@ -142,11 +144,10 @@ class Search:
         kept = np.zeros(len(self.problem.prior), bool)
         for names in seeds:
             found = Given(self.problem, dict.fromkeys(sorted(names), FIRST))
-            for each in (
-                found.alone(),
-                *(np.max(c, axis=(0, 1)) for c in found.conditionals(self._allowed(names)).values()),
-            ):
-                kept |= each > each.max() + np.log(NEGLIGIBLE)
+            blocks = found.blocks(self._allowed(names))
+            best = [np.maximum.reduceat(np.max(b.score, axis=0), b.starts, axis=1) for b in blocks]
+            each = np.concatenate([found.alone()[:, None], *best], axis=1)
+            kept |= np.any(each > each.max(axis=0) + np.log(NEGLIGIBLE), axis=1)
         self.problem = self.problem.under(kept)
 
     def _allowed(self, names: Set) -> list[str]:
@@ -189,15 +190,13 @@ class Search:
             self._finish(names)
             own = self.pool[names]
             for name, found in self.given(names).conditionals(self._allowed(names)).items():
-                each = log_sum(found, axis=2)
-                total = float(log_sum(each))
-                score = total + own.spread + ODDS * len(names | {name})
-                child, held = names | {name}, self.pool.get(names | {name})
+                total = float(np.logaddexp.reduce(found, axis=None))
+                child = names | {name}
+                score, held = total + own.spread + ODDS * len(child), self.pool.get(child)
                 if held is None or (not held.final and held.score < score):
-                    v, s = np.unravel_index(int(np.argmax(each)), each.shape)
-                    picks = {**own.picks, name: (int(v), int(s))}
-                    spread = total - float(each[v, s]) if len(child) == 1 else 0.0
-                    self.pool[child] = Found(score, picks, spread, final=len(child) == 1)
+                    best, at = _largest(found)
+                    spread = total - best if len(child) == 1 else 0.0
+                    self.pool[child] = Found(score, {**own.picks, name: at}, spread, final=len(child) == 1)
         return [names | {name} for name in self._allowed(names)]
 
     def _finish(self, names: Set) -> None:
@@ -211,15 +210,13 @@ class Search:
             before, spread = dict(picks), 0.0
             for name in picks:
                 others = {n: pick for n, pick in picks.items() if n != name}
-                each = log_sum(Given(self.problem, others).conditionals([name])[name], axis=2)
-                v, s = np.unravel_index(int(np.argmax(each)), each.shape)
-                picks[name] = int(v), int(s)
-                score = float(each[v, s])
-                spread += float(log_sum(each)) - score
+                each = Given(self.problem, others).conditionals([name])[name]
+                score, picks[name] = _largest(each)
+                spread += float(np.logaddexp.reduce(each, axis=None)) - score
             if picks == before:
                 break
         if not picks:
-            score = float(log_sum(Given(self.problem, {}).alone()))
+            score = float(np.logaddexp.reduce(Given(self.problem, {}).alone()))
         self.pool[names] = Found(score + spread + ODDS * len(names), picks, spread, final=True)
 
 
@@ -245,76 +242,100 @@ class Given:
         return self.level + self.problem.rss(self.squares)
 
     def conditionals(self, names: Sequence[str]) -> dict[str, Values]:
-        """Return log E with each of some further effects: its (versions, scales, t) array, without the prior odds."""
+        """Return log E with each of some further effects over all hypotheses, without prior odds: (versions, scales)."""
         found: dict[str, Values] = {}
-        for owners, weight, inner, cross in self._blocks(names):
-            score, _ = self._scored(weight, inner, cross)
-            for name in dict.fromkeys(owners):
-                own = [i for i, owner in enumerate(owners) if owner == name]
-                found[name] = score[:, :, own].transpose(2, 0, 1)
+        for block in self.blocks(names):
+            each = np.logaddexp.reduce(block.score, axis=1).T
+            found |= zip(block.names, np.split(each, block.starts[1:]), strict=True)
         return found
 
     def mixtures(self, names: Sequence[str]) -> dict[str, tuple[Values, Values, Values]]:
         """Return log weight, (m,), mean and standard deviation, (m, k), of effects' parameters over their limits."""
         found = {}
-        for owners, log_weight, inner, cross in self._blocks(names):
-            score, squares = self._scored(log_weight, inner, cross)
-            owner, top = np.array([owners.index(name) for name in owners]), np.full(len(owners), -np.inf)
-            np.maximum.at(top, owner, np.max(score, axis=(0, 1)))
-            kept = score > top[owner] + np.log(NEGLIGIBLE)
+        for block in self.blocks(names):
+            ends = [*block.starts[1:], block.score.shape[2]]
+            top = np.maximum.reduceat(np.max(block.score, axis=(0, 1)), block.starts)
+            owner = np.repeat(np.arange(len(ends)), np.diff([*block.starts, ends[-1]]))
+            kept = block.score > top[owner] + np.log(NEGLIGIBLE)
             s, t, m = np.nonzero(kept)
-            inverse = np.linalg.inv(inner[t, m] + SCALES[s, None, None] ** -2.0 * np.eye(inner.shape[-1]))
-            mean, weight = (inverse @ cross[t, m, :, None])[..., 0], score[kept]
-            spread = np.einsum("nkk->nk", inverse) * (squares[kept] / self.problem.free)[:, None]
+            k = block.inner.shape[-1]
+            inverse = np.linalg.inv(block.inner[t, m] + SCALES[s, None, None] ** -2.0 * np.eye(k))
+            mean, weight = (inverse @ block.cross[t, m, :, None])[..., 0], block.score[kept]
+            spread = np.einsum("nkk->nk", inverse) * (block.squares[kept] / self.problem.free)[:, None]
             deviation = np.sqrt(np.maximum(spread, 0.0))
-            for place in np.unique(owner):
+            for place, name in enumerate(block.names):
                 own = owner[m] == place
-                found[owners[place]] = weight[own], mean[own], deviation[own]
+                found[name] = weight[own], mean[own], deviation[own]
         return found
 
-    def _blocks(self, names: Sequence[str]) -> list[tuple[list[str], Values, Values, Values]]:
-        """Return owners, log weights and products of versions of each size, (t, m, k, k), also with readings."""
-        groups: dict[int, list[tuple[str, Version]]] = {}
+    def blocks(self, names: Sequence[str]) -> list[Block]:
+        """Return some further effects, those with as many columns together."""
+        sizes: dict[int, list[str]] = {}
         for name in names:
-            for version in self.problem.versions[name]:
-                groups.setdefault(len(version.columns), []).append((name, version))
+            sizes.setdefault(len(self.problem.versions[name][0].columns), []).append(name)
         out, products = [], self.problem.products
-        for members in groups.values():
-            at = np.array([version.columns for _, version in members])
+        for alike in sizes.values():
+            each = [self.problem.versions[name] for name in alike]
+            at = np.array([version.columns for versions in each for version in versions])
             inner, cross = products[:, at[:, :, None], at[:, None, :]], products[:, at, -1]
             if self._half is not None:
                 half = self._half[:, :, at].transpose(0, 2, 3, 1)
                 inner = inner - half @ half.transpose(0, 1, 3, 2)
                 cross = cross - (half @ self._half[:, None, :, -1:])[..., 0]
-            weight = np.array([version.log_weight for _, version in members])
-            out.append(([name for name, _ in members], weight, inner, cross))
+            gain, log_det = _explained(inner, cross, self.squares)
+            squares = self.squares[:, None] - gain
+            weight = SCALE_PRIOR[:, None, None] + [version.log_weight for versions in each for version in versions]
+            score = self.problem.rss(squares) - 0.5 * log_det + self.level[:, None] + weight
+            starts = np.cumsum([0, *(len(versions) for versions in each[:-1])])
+            out.append(Block(alike, starts, inner, cross, score, squares + self.problem.within))
         return out
 
-    def _scored(self, weight: Values, inner: Values, cross: Values) -> tuple[Values, Values]:
-        """Return log E with further versions, and the sum of squares that they leave: (scales, t, versions) arrays.
 
-        By elimination of ``G + D^-2``, whose pivots are not below ``D^-2``.
-        """
-        k, least = inner.shape[-1], SCALES[:, None, None] ** -2.0
-        left = np.concatenate([inner, cross[..., None]], axis=3).transpose(2, 3, 0, 1)[:, :, None]
-        left = left + np.eye(k, k + 1)[:, :, None, None, None] * least
-        gain, log_det = np.zeros(left.shape[2:]), np.full(left.shape[2:], -k * np.log(least))
-        for j in range(k):
-            pivot, row = np.maximum(left[j, j], least), left[j, j + 1 :]
-            over = row / pivot
-            gain += row[-1] * over[-1]
-            log_det += np.log(pivot)
-            left[j + 1 :, j + 1 :] -= row[:-1, None] * over
-        squares = self.squares[:, None] - gain
-        score = self.problem.rss(squares) - 0.5 * log_det + self.level[:, None] + SCALE_PRIOR[:, None, None] + weight
-        return score, squares + self.problem.within
+@dataclass(frozen=True)
+class Block:
+    """Effects with as many columns beside a set, their m versions one after the other."""
+
+    names: list[str]
+    starts: NDArray[np.intp]  # of each effect's versions
+    inner: Values  # (t, m, k, k), products of columns
+    cross: Values  # (t, m, k), with the readings
+    score: Values  # (scales, t, m), log E
+    squares: Values  # (scales, t, m), sum of squares that is left
 
 
-def log_sum(values: Values, axis: int | None = None) -> Values:
-    """Return ``log sum exp`` along an axis."""
-    top = np.max(values, axis=axis, keepdims=True)
-    total = np.log(np.sum(np.exp(values - top), axis=axis, keepdims=True)) + top
-    return np.asarray(total.ravel()[0] if axis is None else np.squeeze(total, axis))
+def _largest(each: Values) -> tuple[float, Pick]:
+    """Return the largest of (versions, scales) values, and where it is."""
+    v, s = divmod(int(np.argmax(each)), each.shape[1])
+    return float(each[v, s]), (v, s)
+
+
+def _explained(inner: Values, cross: Values, squares: Values) -> tuple[Values, Values]:
+    """Return ``c^T A^-1 c`` and ``log|A D^2|``, with ``A = G + D^-2``: (scales, t, m) arrays.
+
+    ``inner``: (t, m, k, k), G. ``cross``: (t, m, k), c. ``squares``: (t,), of the readings. Wide effects by Cholesky's
+    factor of A with c as a further row, others by elimination of all side by side; the pivots of A are not below
+    ``D^-2``.
+    """
+    k, least = inner.shape[-1], SCALES[:, None, None] ** -2.0
+    log_det = np.broadcast_to(-k * np.log(least), (len(SCALES), *inner.shape[:2])).copy()
+    if k > WIDE:
+        joined = np.zeros((*log_det.shape, k + 1, k + 1))
+        joined[..., :k, :k], joined[..., k, :k], diagonal = inner, cross, np.arange(k)
+        joined[..., diagonal, diagonal] += least[..., None] + RIDGE * np.einsum("tmkk->tmk", inner)
+        joined[..., k, k] = 1.0 + 2.0 * squares[:, None]
+        factor = np.linalg.cholesky(joined)
+        log_det += 2.0 * np.sum(np.log(np.einsum("...kk->...k", factor)[..., :k]), axis=-1)
+        return np.sum(factor[..., k, :k] ** 2, axis=-1), log_det
+    left = np.concatenate([inner, cross[..., None]], axis=3).transpose(2, 3, 0, 1)[:, :, None]
+    left = left + np.eye(k, k + 1)[:, :, None, None, None] * least
+    gain = np.zeros(log_det.shape)
+    for j in range(k):
+        pivot, row = np.maximum(left[j, j], least), left[j, j + 1 :]
+        over = row / pivot
+        gain += row[-1] * over[-1]
+        log_det += np.log(pivot)
+        left[j + 1 :, j + 1 :] -= row[:-1, None] * over
+    return gain, log_det
 
 
 def answers(searches: Sequence[Search | None], owner: Callable[[Set], int], names: Iterable[str]) -> Answers:

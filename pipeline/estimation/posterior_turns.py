@@ -23,7 +23,6 @@ from pipeline.estimation.posterior import (
     Version,
     answers,
     excluded,
-    log_sum,
 )
 from pipeline.estimation.ranking import EXCITED, without
 from pipeline.estimation.selection import DELAYS
@@ -79,7 +78,7 @@ def posterior(selection: Selection, hidden: Collection[str], others: Sequence[Ef
 def _worth_a_fit(search: Search, moving: frozenset[str], own: frozenset[str]) -> list[frozenset[str]]:
     """Return the sets of timing effects, other than those of the fit, whose sets have weight; the likeliest first."""
     pool = search.pool
-    total = float(log_sum(np.array([found.score for found in pool.values()])))
+    total = float(np.logaddexp.reduce([found.score for found in pool.values()]))
     shares: dict[frozenset[str], float] = {}
     for names, found in pool.items():
         key = names & moving
