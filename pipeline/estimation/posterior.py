@@ -43,8 +43,8 @@ INCLUSION = 0.02  # prior probability of each effect
 FIRST = 0, 3  # version and scale from which those of a set are improved
 ODDS = float(np.log(INCLUSION / (1.0 - INCLUSION)))
 BEAM, MOST = 6, 5  # sets that are extended, and their largest size
-FAR = 9.0  # of log E below the best, beyond which a set is not extended
-NEAR = 7.0  # of log E below the best, within which a set's scales are found
+FAR = 12.0  # of log E below the best, beyond which a set that a beam found is not looked at any further
+NEAR = 7.0  # of log E below the best, within which a set is extended, and its scales are found
 MOST_NEAR, ROUNDS = 16, 3  # of these sets; of a search for the best scales, and of exchanges
 NEGLIGIBLE = 1e-5  # weight of a hypothesis or of a part of a mixture that is left out
 WIDE = 8  # columns of an effect from which on LAPACK's factorisation costs less than an elimination of all side by side
@@ -158,11 +158,15 @@ class Search:
         level = [self.required]
         while level:
             children = dict.fromkeys(child for names in level for child in self._extend(names))
-            level = sorted(children, key=lambda names: -self.pool[names].score)[:BEAM]
+            level = self._near(sorted(children, key=lambda names: -self.pool[names].score)[:BEAM], FAR)
             for names in level:
                 self._finish(names)
-            top = self.pool[self.best()].score
-            level = [n for n in level if len(n) <= len(self.required) + 1 or self.pool[n].score > top - FAR]
+            level = self._near(level, NEAR)
+
+    def _near(self, level: list[Set], within: float) -> list[Set]:
+        """Return the sets that are not far below the best of all; single effects in any case."""
+        least = self.pool[self.best()].score - within
+        return [n for n in level if len(n) <= len(self.required) + 1 or self.pool[n].score > least]
 
     def _exchange(self) -> None:
         """Replace each member of the best set by every other effect."""
@@ -395,7 +399,7 @@ def quantile(weight: Values, mean: Values, deviation: Values) -> Values:
     kept = weight > NEGLIGIBLE
     weight, mean, deviation = weight[kept], np.abs(mean[kept]), np.maximum(deviation[kept], 1e-300)
     low, high = np.zeros(mean.shape[1]), np.max(mean + 5.0 * deviation, axis=0)
-    found = high
+    found = np.minimum(2.0 * np.sqrt(weight @ (mean**2 + deviation**2) / weight.sum()), high)
     for _ in range(HALVINGS):  # of Newton, or halvings where a step of it leaves the interval
         above, beneath = (np.clip((found + side * mean) / deviation, -FARTHEST, FARTHEST) for side in (-1.0, 1.0))
         off = weight @ (ndtr(above) - ndtr(-beneath)) - ENOUGH * weight.sum()
