@@ -17,7 +17,7 @@ import numpy as np
 from pipeline.diagnosis.residual_dependence import bases_of, curves_of, smooth_tests
 from pipeline.diagnosis.residual_regression import ProjectedCurves, columns_of_fit, each_explains
 from pipeline.estimation.gauss_markov import GaussMarkov, Products
-from pipeline.estimation.ranking import projection
+from pipeline.estimation.ranking import without
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -89,6 +89,5 @@ def _projected(
     """
     products = Products(observations.blocks, observations.weight, columns).products(fitted.settings)[0][1:]
     k = columns.shape[1] - 1 - SIMULATIONS - curves
-    taken = projection(products, np.arange(k))[:, :, k:]
-    rest = products[:, k:, k:] - products[:, :k, k:].transpose(0, 2, 1) @ taken
+    rest = without(products, np.arange(k))[:, k:, k:]
     return rest[:, :curves, :curves], rest[:, :curves, curves:], np.einsum("tss->ts", rest[:, curves:, curves:])

@@ -24,7 +24,7 @@ import numpy as np
 from pipeline.estimation.design import felt
 from pipeline.estimation.gauss_markov import WHITE, GaussMarkov, Products
 from pipeline.estimation.generalized_least_squares import design_at
-from pipeline.estimation.ranking import RIDGE, projection
+from pipeline.estimation.ranking import LEFT, RIDGE, projection, without
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -142,7 +142,7 @@ class ProjectedCurves(_Evidence):
             k, index = len(known), np.concatenate([known, own, model[-1:]])
             among = products[:, index[:, None], index]
             taken = projection(among, np.arange(k))[:, :, k:]
-            rest = among[:, k:, k:] - among[:, :k, k:].transpose(0, 2, 1) @ taken
+            rest = without(among, np.arange(k))[:, k:, k:]
             inner.append(rest[:, :q, :q])
             cross.append(rest[:, :q, q])
             left.append(rest[:, q, q])
@@ -259,6 +259,8 @@ class Scan(_Evidence):
         known = np.sqrt(np.einsum("pp->p", products[0, :k, :k]))
         unit = (ROUNDING * np.sqrt(self.samples / 3.0)) ** 0.5
         error = (unit * (size + np.abs(taken) @ known)).reshape(t, q // r, r)
+        own = np.sum(means**2, axis=2) + np.sum(inside**2, axis=0)
+        error = np.maximum(error, np.sqrt(LEFT * own).reshape(error.shape))
         return self._eliminated(inner, cross, error, size.reshape(q // r, r))
 
     @staticmethod

@@ -224,20 +224,22 @@ def over_limits(
     samples: float,
     least: float,
 ) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]]]:
-    """Return the change of columns to those of parameters over their limits, (p + 1, p + 1), and the limits.
+    """Return the products of columns of parameters over their limits, (t, p + 1, p + 1), and the limits.
 
-    ``places``: effect and columns, more than once for an effect of several versions. ``products``: (p + 1, p + 1), less
-    the base, readings last. ``limits``: by the data sheet. ``size, samples, least``: of ``excited, limits_or_noise``.
+    ``places``: effect and columns, more than once for an effect of several versions. ``products``: less the base,
+    readings last, the first white noise. ``limits``: by the data sheet. ``size, samples, least``: of ``excited,
+    limits_or_noise``.
     """
     found: dict[str, NDArray[np.float64]] = {}
-    change = np.zeros(products.shape)
-    change[-1, -1] = 1.0
+    changed = products.copy()
     for name, own in places:
-        inner = products[own, own]
+        inner = products[0, own, own]
         if name not in found:
             found[name] = limits_or_noise(limits.get(name), inner, samples)
-        change[own, own] = excited(inner, size[own], found[name], least)
-    return change, found
+        change = excited(inner, size[own], found[name], least)
+        changed[:, :, own] = changed[:, :, own] @ change
+        changed[:, own] = change.T @ changed[:, own]
+    return changed, found
 
 
 def time_constants(

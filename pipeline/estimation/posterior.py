@@ -246,7 +246,7 @@ class Given:
         return self.level + self.problem.rss(self.squares)
 
     def conditionals(self, names: Sequence[str]) -> dict[str, Values]:
-        """Return log E with each of some further effects over all hypotheses, without prior odds: (versions, scales)."""
+        """Return log E with each of some further effects, without prior odds: its (versions, scales) array."""
         found: dict[str, Values] = {}
         for block in self.blocks(names):
             each = np.logaddexp.reduce(block.score, axis=1).T

@@ -114,11 +114,12 @@ def _versions(sensor: str, fit: Fit, term: Term) -> list[tuple[Term, float]]:
 
 
 def _products(
-    selection: Selection, fit: Fit, listed: Sequence[tuple[str, Term, float]]
-) -> tuple[Design, Values, Values, list[slice]]:
-    """Return a design at a fit, its products, log determinants, and the place of each listed term.
+    selection: Selection, fit: Fit, listed: Sequence[tuple[str, Term, float]], known: int
+) -> tuple[Design, Values, Values, Values, list[slice]]:
+    """Return a design at a fit, products of its base, those of the rest beside it, log determinants, and places.
 
-    Where nothing is fitted beside the base, the products are those of the selection's ranking.
+    The places are those of the listed terms. Where nothing is fitted beside the base, the products are those of the
+    selection's ranking. ``known``: columns of the base.
     """
     ranking, walks = selection.ranking, random_walks(selection.settings)
     places = {
@@ -130,14 +131,14 @@ def _products(
         design = design_beside(
             selection.observations, fit, [*fit.terms[: len(selection.base.terms)], *(t for _, t, _ in listed)]
         )
-        return (
-            design,
-            *design.products([WHITE, *selection.settings, *walks]),
-            design.slices[len(selection.base.terms) :],
-        )
-    found = (ranking.stacked, ranking.logarithms), ranking.design.products(walks)
-    stacked, logarithms = (np.concatenate(pair) for pair in zip(*found, strict=True))
-    return ranking.design, stacked, logarithms, [places[key] for key in keys]
+        stacked, logarithms = design.products([WHITE, *selection.settings, *walks])
+        beside = without(stacked, np.arange(known))[:, known:, known:]
+        return design, stacked[:, :known, :known], beside, logarithms, design.slices[len(selection.base.terms) :]
+    stacked, logarithms = ranking.design.products(walks)
+    beside = without(stacked, np.arange(known))[:, known:, known:]
+    base = np.concatenate([ranking.stacked[:, :known, :known], stacked[:, :known, :known]])
+    beside = np.concatenate([ranking.beside, beside])
+    return ranking.design, base, beside, np.append(ranking.logarithms, logarithms), [places[key] for key in keys]
 
 
 def _problem(selection: Selection, fit: Fit, candidates: Mapping[str, Term]) -> Problem:
@@ -150,25 +151,28 @@ def _problem(selection: Selection, fit: Fit, candidates: Mapping[str, Term]) -> 
         for name, candidate in candidates.items()
         for term, weight in _versions(observations.sensor, fit, candidate)
     ]
-    design, stacked, logarithms, places = _products(selection, fit, listed)
+    known = BASE + sum(len(term.values) for term in configured)
+    design, base, products, logarithms, places = _products(selection, fit, listed, known)
     settings = [WHITE, *selection.settings, *random_walks(selection.settings)]
-    known = BASE + sum(s.stop - s.start for s in design.slices[: len(configured)])
     size = np.where(design.sizes() > 0.0, design.sizes(), 1.0)
-    base = stacked[:, :known, :known] / np.outer(size[:known], size[:known])
+    base = base / np.outer(size[:known], size[:known])
     prior = np.array([s.prior for s in settings]) - 0.5 * (logarithms + np.linalg.slogdet(base)[1])
-    products = without(stacked, np.arange(known))[:, known:, known:]
     own = [(name, slice(at.start - known, at.stop - known)) for (name, _, _), at in zip(listed, places, strict=True)]
     samples = 3.0 * observations.samples
-    change, limits = over_limits(own, products[0], size[known:], selection.limits, samples=samples, least=EXCITED)
     versions: dict[str, list[Version]] = {}
+    values = np.zeros(products.shape[1])
     for (name, at), (_, _, weight) in zip(own, listed, strict=True):
         if name in fitted and name not in versions:
-            change[at, -1] = fitted[name].values[: at.stop - at.start]
+            values[at] = fitted[name].values[: at.stop - at.start]
         versions.setdefault(name, []).append(Version(np.arange(at.start, at.stop), weight))
+    if fitted:
+        products[:, :, -1] += products @ values
+        products[:, -1] += values @ products
+    changed, limits = over_limits(own, products, size[known:], selection.limits, samples=samples, least=EXCITED)
     free = samples - known
     within = float(np.sum(observations.scatter / fit.scale**2))
     return Problem(
-        (change.T @ products @ change)[1:],
+        changed[1:],
         prior[1:],
         within,
         free,

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 EXCITED = 1e-3  # share of a column's norm that the base leaves
 NEW = 1e-4  # share of the variance of a candidate's weakest direction that the chosen effects leave
 RIDGE = 1e-11  # of unit columns: 1e5 times the rounding of a double
+LEFT = 1e-10  # share of a column's square, which is ten times the ridge's: what is left below it is rounding
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ class Ranking:
         self.design, self.stacked, self.logarithms = design, stacked, logarithms
         self.penalty = 0.5 * logarithms - np.array([setting.prior for setting in self.settings])
         known = BASE + sum(s.stop - s.start for s in design.slices[: len(configured)])
-        products = without(stacked, np.arange(known))[:, known:, known:]
+        self.beside = products = without(stacked, np.arange(known))[:, known:, known:]
         self._reduce(products, design.sizes()[known:], [s.start - known for s in design.slices[len(configured) :]])
 
     def _reduce(self, products: Values, sizes: Values, starts: Sequence[int]) -> None:
@@ -98,7 +99,7 @@ class Ranking:
             return np.concatenate([*own, columns[:, :, -1:]], axis=2)
 
         self.products: Values = reduced(reduced(products).transpose(0, 2, 1))
-        self.unreduced = products[:, :-1, :-1], starts, ends
+        self.spans = [slice(start, end) for start, end in zip(starts, ends, strict=True)]
 
     def indices(self, name: str) -> list[int]:
         """Return the candidates that are this effect and that the motion excites."""
@@ -239,20 +240,26 @@ class Ranking:
 
     def visibility(self, j: int, limits: Values, setting: int) -> float:
         """Return the expected gain in 2 log L of an effect whose parameters are all at their limits."""
-        products, starts, ends = self.unreduced
-        block = slice(starts[j], ends[j])
-        count = ends[j] - starts[j]
-        return float(np.sum(limits[:count] ** 2 * np.diag(products[setting, block, block])))
+        block = self.spans[j]
+        count = block.stop - block.start
+        return float(np.sum(limits[:count] ** 2 * np.diag(self.beside[setting, block, block])))
 
 
 def without(products: Values, index: Index) -> Values:
-    """Return products of columns after some of them are projected out of all: (t, p, p) array, zeros in theirs.
+    """Return products of columns after some of them are projected out of all: (t, p, p) array.
+
+    Zeros in theirs, and in those of columns of which only rounding is left; the last column, the readings, is kept.
 
     ``products``: (t, p, p). ``index``: (q,).
     """
     if len(index) == 0:
         return products
-    return products - products[:, index, :].transpose(0, 2, 1) @ projection(products, index)
+    rest = products - products[:, index, :].transpose(0, 2, 1) @ projection(products, index)
+    new = np.einsum("tpp->tp", rest) > LEFT * np.einsum("tpp->tp", products)
+    new[:, -1] = True
+    rest *= new[:, :, None]
+    rest *= new[:, None, :]
+    return np.asarray(rest)
 
 
 def projection(products: Values, index: Index) -> Values:

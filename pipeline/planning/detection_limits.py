@@ -231,15 +231,14 @@ class TurntableLimits(DetectionLimits):
 
     def _patterns(self, j: int, sizes: Values) -> Values:
         """Return patterns of signs in the candidate's own reduced columns, which are orthonormal under white noise."""
-        products, starts, ends = self.ranking.unreduced
-        block = slice(starts[j], ends[j])
-        count = ends[j] - starts[j]
+        block = self.ranking.spans[j]
+        count = block.stop - block.start
         if 2 ** (count - 1) <= MOST_SIGNS:  # up to a common sign
             bits = np.arange(2 ** (count - 1))[:, None] >> np.arange(count)
             signs = np.where(bits & 1, -1.0, 1.0)
         else:
             signs = np.random.default_rng(count).choice([-1.0, 1.0], (MOST_SIGNS, count))
-        found: Values = signs * sizes[:count] @ products[0, block, block] @ self.ranking.blocks[j]
+        found: Values = signs * sizes[:count] @ self.ranking.beside[0, block, block] @ self.ranking.blocks[j]
         return found
 
     def _explained(self, i: int, j: int, q: Values) -> Values:

@@ -85,12 +85,12 @@ def _problem(selection: Selection, effects: Mapping[str, Effect]) -> Problem:
     ends = np.cumsum([0, *(Z.shape[1] for Z in columns)]).tolist()
     places = [(name, slice(*span)) for (name, _, _), span in zip(listed, pairwise(ends), strict=True)]
     samples = len(readings)
-    change, limits = over_limits(places, products[0], size[0, known:], selection.limits, samples=samples, least=NEW)
+    products, limits = over_limits(places, products, size[0, known:], selection.limits, samples=samples, least=NEW)
     versions: dict[str, list[Version]] = {}
     for (name, at), (_, _, weight) in zip(places, listed, strict=True):
         versions.setdefault(name, []).append(Version(np.arange(at.start, at.stop), weight))
     free = float(max(samples - kept, 1))
-    return Problem(change.T @ products @ change, prior, 0.0, free, versions, limits, excluded([*effects.values()]))
+    return Problem(products, prior, 0.0, free, versions, limits, excluded([*effects.values()]))
 
 
 def _random_walks(hypotheses: Sequence[NoiseHypothesis]) -> list[NoiseHypothesis]:
