@@ -51,8 +51,8 @@ it beside the others (`pipeline/study/bench.py`). A selection asks for 40 to 100
 FIGURE_HEAD = ["figure", "n", "share", "95 % interval", "goal"]
 ANSWER_TEXT = """\
 A case counts where one answer of the 95 % answer set is exactly the hidden effects, by their own names (nothing, where
-nothing is hidden or nothing can be seen). Limits are those of effects that were not selected, each parameter by itself:
-so the cases at the detection size are those whose effect stood out less than on average."""
+nothing is hidden or nothing can be seen). Limits do not depend on what is selected. They are counted where they are
+stated: for effects that were not selected, each parameter by itself."""
 DIAGRAM = "reliability.svg"
 RELIABLE_TEXT = f"""\
 The probability of every effect in the same cases, against the share of them in which it was there.

@@ -12,6 +12,7 @@ from scipy.special import logsumexp
 
 from pipeline.estimation.candidates import excited
 from pipeline.estimation.posterior import (
+    BELOW,
     ODDS,
     SCALE_PRIOR,
     SCALES,
@@ -105,7 +106,7 @@ def test_an_upper_limit_is_the_quantile_of_draws_from_the_posterior() -> None:
     deviation = np.array([[0.5], [0.1], [1.0]])
     pick = rng.choice(3, 400_000, p=weight)
     drawn = np.abs(mean[pick, 0] + deviation[pick, 0] * rng.standard_normal(len(pick)))
-    assert quantile(weight, mean, deviation)[0] == pytest.approx(np.quantile(drawn, 0.95), rel=0.01)
+    assert quantile(weight, mean, deviation)[0] == pytest.approx(np.quantile(drawn, BELOW), rel=0.01)
 
 
 def test_limits_of_absent_effects_cover_the_true_size_as_often_as_they_say() -> None:
