@@ -1,8 +1,9 @@
 """Physics outside the catalogue as free curves, so that the posterior need not call it an effect of the catalogue.
 
-    other_temperature, other_rate : sum over n = 1 to 5 of c_n P_n(x), x the temperature or |omega| over its span
-    other_input                   : sum over n = 2 to 5 of c_n P_n(x), x the axis' own input over its largest value
-    other_angle                   : sum over n = 1 to 8 of a_n cos(n A) + b_n sin(n A), A the table's angle
+    other_temperature : sum over n = 1 to 5 of c_n P_n(x), x the temperature over its span
+    other_rate        : the same of |omega|, and d_x omega_x^2 + d_y omega_y^2, which differ with the axis of the turn
+    other_input       : sum over n = 2 to 5 of c_n P_n(x), x the axis' own input over its largest value
+    other_angle       : sum over n = 1 to 8 of a_n cos(n A) + b_n sin(n A), A the table's angle
 
 with Legendre polynomials P_n and coefficients for each axis. A curve has no limit by the data sheet: its coefficients
 have the size of the noise, times the scales of ``pipeline.estimation.posterior``. That many coefficients cost evidence,
@@ -41,7 +42,7 @@ class FreeCurve(Effect):
         self.covariate, self.name = covariate, f"{OTHER}{covariate}"
         self.middle, self.half = 0.5 * (low + high), 0.5 * (high - low)
         self.layout = Layout.PER_AXIS if covariate == "input" else Layout.EVERY_AXIS
-        self.count = {"input": DEGREE - 1, "angle": 2 * CYCLES}.get(covariate, DEGREE)
+        self.count = {"input": DEGREE - 1, "angle": 2 * CYCLES, "rate": DEGREE + 2}.get(covariate, DEGREE)
 
     def parameters(self, sensor: str) -> tuple[Parameter, ...]:
         """Return a coefficient for each curve and axis."""
@@ -60,7 +61,10 @@ class FreeCurve(Effect):
         if self.covariate == "angle":
             turns = np.radians(covariate)[:, None] * np.arange(1, CYCLES + 1)
             return np.concatenate([np.cos(turns), np.sin(turns)], axis=1)
-        return np.asarray(legvander((covariate - self.middle) / self.half, DEGREE)[:, 1:])
+        found = legvander((covariate - self.middle) / self.half, DEGREE)[:, 1:]
+        if self.covariate == "rate":
+            found = np.concatenate([found, (motion.angular_rate[:, :2] / self.half) ** 2], axis=1)
+        return np.asarray(found)
 
 
 def free_curves(sensor: str, motions: Sequence[Motion]) -> list[Effect]:
