@@ -26,12 +26,12 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    import numpy as np
     from numpy.typing import NDArray
 
     from pipeline.field_logs.mcap_log import McapLog
     from pipeline.field_logs.text_output import CsvLog, MessageLog
     from pipeline.model.compensation import Compensation
+    from pipeline.records import Values
 
     Readings = dict[str, NDArray[Any]]
 
@@ -73,7 +73,7 @@ class LogProfile:
             raise InputError(f"{told}; got {error}", file) from None
         return found
 
-    def to_body(self, sensor: str, readings: NDArray[np.float64]) -> NDArray[np.float64]:
+    def to_body(self, sensor: str, readings: Values) -> Values:
         """Return (n, 3) readings of a sensor in the body's axes."""
         return in_body_axes(self.axis_maps.get(sensor, STRAIGHT), readings)
 

@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     import pyarrow as pa
-    from numpy.typing import NDArray
 
-    Values = NDArray[np.float64]
+    from pipeline.records import Mask, Values
+
 
 DECIMALS = 12  # that ``apply`` writes: far below any sensor's resolution, above the rounding of a double
 WINDOW = 100  # samples: 0.1 to 1 s at usual rates
@@ -181,7 +181,7 @@ class LogChecks:
         return found + self._turned(table, still)
 
     @staticmethod
-    def _turned(table: Mapping[str, Values], still: NDArray[np.bool_]) -> list[str]:
+    def _turned(table: Mapping[str, Values], still: Mask) -> list[str]:
         """Compare the turns of gravity between rests with the integrated rate."""
         if not {"accelerometer", "gyroscope", "time"} <= set(table):
             return []

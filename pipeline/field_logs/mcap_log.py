@@ -31,14 +31,13 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from mcap.records import McapRecord
-    from numpy.typing import NDArray
 
     from pipeline.field_logs.compensate import LogProfile, Output, Readings, Result
     from pipeline.field_logs.log_checks import LogChecks
     from pipeline.io.ingest_settings import McapFormat
     from pipeline.io.mcap_chunk import Rows
+    from pipeline.records import Integers, Values
 
-    Values = NDArray[np.float64]
 
 LAST_ID = 0xFFFF  # ids of added definitions count down from here, those of recorders up from 0
 SUFFIX = "_calibrated"
@@ -243,8 +242,8 @@ class Temperatures:
 
     def take(self, run: list[Rows], reader: McapReader) -> None:
         """Decode the temperatures of a run."""
-        places: list[NDArray[np.int64]] = [np.zeros(0, np.int64)]
-        times: list[NDArray[np.int64]] = [np.zeros(0, np.int64)]
+        places: list[Integers] = [np.zeros(0, np.int64)]
+        times: list[Integers] = [np.zeros(0, np.int64)]
         values: list[Values] = [np.zeros(0)]
         for rows in run if not self.beside_readings else []:
             channel = reader.channels[rows.channel]
@@ -264,7 +263,7 @@ class Temperatures:
         self.places, self.times = np.concatenate(places), np.concatenate(times)
         self.values = np.concatenate(values)
 
-    def at(self, starts: NDArray[np.int64], time: Values, beside: Values | None, origin_ns: int) -> Values:
+    def at(self, starts: Integers, time: Values, beside: Values | None, origin_ns: int) -> Values:
         """Return the temperature at the readings of a run: (n,) array, degC.
 
         ``starts`` are the places of the readings in the run, ``time`` their times, s, from ``origin_ns``, ``beside``

@@ -41,12 +41,11 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
     from pipeline.field_logs.compensate import LogProfile, Output, Readings, Result
     from pipeline.field_logs.log_checks import LogChecks
     from pipeline.io.ingest_settings import Column
     from pipeline.io.text_log import Head
+    from pipeline.records import Integers, Values
 
 BLOCK_ROWS = 20_000  # of a log of messages, as a block of a text log
 SIGNALS = {**TRIADS, "temperature": ("temperature",), "time": ("time",)}
@@ -148,7 +147,7 @@ class CsvLog:
                 new[i] = CANONICAL[channel]
         return new
 
-    def _cells(self, body: bytes, lines: NDArray[np.int64]) -> list[pa.Array]:
+    def _cells(self, body: bytes, lines: Integers) -> list[pa.Array]:
         """Return the cells of a block as columns of text."""
         try:
             table = self.layout.parse(body, dict.fromkeys(range(len(self.layout.names)), pa.string()))
@@ -156,14 +155,14 @@ class CsvLog:
             raise self._refusal(body, lines, str(error)) from None
         return [column.combine_chunks() for column in table.columns]
 
-    def _refusal(self, body: bytes, lines: NDArray[np.int64], otherwise: str) -> InputError:
+    def _refusal(self, body: bytes, lines: Integers, otherwise: str) -> InputError:
         """Return the error that names the first line of a block with a cell that is no number."""
         for fault in find_faults(self.layout, body, lines, None):
             if fault.kind != "not_finite":
                 return InputError(fault.message, f"{self.source}:{fault.line}")
         return InputError(f"the log is no table of numbers: {otherwise}", f"{self.source}:{lines[0]}")
 
-    def _numbers(self, cells: pa.Array) -> NDArray[np.float64]:
+    def _numbers(self, cells: pa.Array) -> Values:
         """Return a column as numbers, NaN where a cell is empty; ``ArrowInvalid`` where one is no number."""
         text = cells if self.settings.decimal == "." else pc.replace_substring(cells, self.settings.decimal, ".")
         try:
@@ -173,7 +172,7 @@ class CsvLog:
             found = pc.cast(pc.if_else(pc.equal(text, ""), pa.scalar(None, pa.string()), text), pa.float64())
         return to_numpy(pc.fill_null(found, np.nan) if found.null_count else found)
 
-    def _signals(self, cells: list[pa.Array], body: bytes, lines: NDArray[np.int64], rows: int) -> dict[str, Any]:
+    def _signals(self, cells: list[pa.Array], body: bytes, lines: Integers, rows: int) -> dict[str, Any]:
         """Return the signals of a block in g, deg/s, degC and s, the readings in body axes."""
         out: dict[str, Any] = {}
         for signal, where in self.places.items():
@@ -247,7 +246,7 @@ def _index(column: Column, names: list[str]) -> int | None:
     return names.index(column.column) if column.column in names else None
 
 
-def _digits(values: NDArray[np.float64], decimal: str) -> pa.Array:
+def _digits(values: Values, decimal: str) -> pa.Array:
     """Return numbers as text, rounded to 1e-12."""
     text = pc.cast(to_arrow(np.round(values, DECIMALS) + 0.0), pa.string())
     return text if decimal == "." else pc.replace_substring(text, ".", decimal)

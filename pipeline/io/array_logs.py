@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from pymavlink.DFReader import DFReader_binary
 
+    from pipeline.records import Integers
+
 COPY_AGAIN = "copy the file again from its source"
 ELEMENT = re.compile(r"(.+)\[(\d+)\]")
 HEAD = 3  # bytes of a DataFlash message before its fields: two marks and its type
@@ -62,7 +64,7 @@ class Topic:
     name: str
     columns: Mapping[str, NDArray[Any]]
     units: Mapping[str, str] = field(default_factory=dict)
-    recorded_ns: NDArray[np.int64] | None = None
+    recorded_ns: Integers | None = None
 
 
 def topics_of(path: Path, notes: list[Note]) -> Iterator[Topic]:

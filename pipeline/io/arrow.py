@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.records import Recording
+    from pipeline.records import Integers, Recording
 
 BLOCKS = {"accelerometer": ACCELEROMETER, "gyroscope": GYROSCOPE, "table_attitude": ATTITUDE}
 SINGLES = ("temperature", "table_angle", "table_rate", "flags")
@@ -85,17 +85,17 @@ def write_canonical_csv(path: Path, recording: Recording, decimals: Mapping[str,
     temporary.replace(path)
 
 
-def times_as_decimals(time_ns: NDArray[np.int64], digits: int = 9) -> pa.Array:
+def times_as_decimals(time_ns: Integers, digits: int = 9) -> pa.Array:
     """Return times in s as decimals with ``digits`` after the point, which have to hold them exactly."""
     return _decimal(time_ns, 9).cast(pa.decimal128(38, digits))
 
 
-def _time_digits(time_ns: NDArray[np.int64]) -> int:
+def _time_digits(time_ns: Integers) -> int:
     """Return the fewest digits, of 3, 6 and 9, that hold the times exactly."""
     return next((d for d in (3, 6) if not np.any(time_ns % 10 ** (9 - d))), 9)
 
 
-def _decimal(units: NDArray[np.int64], digits: int) -> pa.Array:
+def _decimal(units: Integers, digits: int) -> pa.Array:
     """Return integers as decimals: ``units / 10^digits``; both words of 128 bits, the high one the sign."""
     words = np.empty((len(units), 2), np.int64)
     words[:, 0], words[:, 1] = units, units >> 63

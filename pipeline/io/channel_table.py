@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.io.ingest_settings import ChannelSource
+    from pipeline.records import Index, Integers, Values
 
 STRAIGHT = ("+x", "+y", "+z")
 
@@ -36,8 +37,8 @@ class ChannelTable:
     """
 
     path: str
-    time_ns: NDArray[np.int64]
-    values: dict[str, NDArray[np.float64]]
+    time_ns: Integers
+    values: dict[str, Values]
     source: dict[str, Any]
     line_of: Callable[[int], int]
     encodings: dict[str, Encoding] = field(default_factory=dict)
@@ -49,21 +50,21 @@ class ChannelTable:
         line = self.line_of(row)
         return f"{self.path}:{line}" if line else self.path
 
-    def note(self, code: str, rows: NDArray[np.intp], detail: str) -> Note:
+    def note(self, code: str, rows: Index, detail: str) -> Note:
         """Return a note on some rows, with their first and last line and time."""
         first, last = int(rows[0]), int(rows[-1])
         start, end = float(self.time_ns[first]) / 1e9, float(self.time_ns[last]) / 1e9
         return Note(code, int(rows.size), self.line_of(first), self.line_of(last), detail, start, end)
 
 
-def in_house_unit(source: ChannelSource, numbers: NDArray[np.float64]) -> NDArray[np.float64]:
+def in_house_unit(source: ChannelSource, numbers: Values) -> Values:
     """Return the numbers of a channel (not the time) in g, deg/s, deg or degC."""
     if source.unit == COUNTS:
         return Encoding(1.0 / source.counts_per_unit, source.offset).decode(numbers)
     return to_house_unit(source.channel, numbers, source.unit)
 
 
-def axis_matrix(axis_map: Sequence[str]) -> NDArray[np.float64]:
+def axis_matrix(axis_map: Sequence[str]) -> Values:
     """Return the (3, 3) signed permutation ``B`` of an axis map, ``body = B @ reading``."""
     entries = [str(a) for a in axis_map]
     if [a for a in entries if a[:1] not in "+-" or a[1:] not in AXES] or sorted(a[1:] for a in entries) != list(AXES):
@@ -89,12 +90,12 @@ def maps_of_log(log: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
     return {s: tuple(stated[s] if isinstance(stated, dict) else stated) for s in TRIADS}
 
 
-def in_body_axes(axis_map: Sequence[str], readings: NDArray[np.float64]) -> NDArray[np.float64]:
+def in_body_axes(axis_map: Sequence[str], readings: Values) -> Values:
     """Return (n, 3) readings in the body's axes; the same array where the map is straight."""
     if tuple(axis_map) == STRAIGHT:
         return readings
     matrix = axis_matrix(axis_map)
-    turned: NDArray[np.float64] = readings[:, np.argmax(np.abs(matrix), axis=1)] * matrix.sum(axis=1)
+    turned: Values = readings[:, np.argmax(np.abs(matrix), axis=1)] * matrix.sum(axis=1)
     return turned
 
 

@@ -32,11 +32,9 @@ from pipeline.io.encoder_log import Signals, seconds_of, signals_of
 from pipeline.io.units import TRIADS
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from pipeline.io.channel_table import ChannelTable
+    from pipeline.records import Mask, Values
 
-    Values = NDArray[np.float64]
 
 SMALLEST_CORRELATION = 0.9  # at most 19 % of the variance of the rates is not explained, 1 - 0.9^2
 BLOCKS_S = (1.0, 4.0)  # about the length of a ramp of the rate, and longer than it
@@ -78,7 +76,7 @@ class SensorSignals:
     rates: int
     noise: Values
 
-    def part(self, rows: slice | NDArray[np.bool_]) -> SensorSignals:
+    def part(self, rows: slice | Mask) -> SensorSignals:
         """Return some of the samples."""
         return SensorSignals(self.time[rows], self.readings[rows], self.rates, self.noise)
 

@@ -26,9 +26,8 @@ from pipeline.records import Note
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from numpy.typing import NDArray
+    from pipeline.records import Index, Values
 
-    Values = NDArray[np.float64]
 
 STEP_S = 0.005  # grid of the program and of its derivative, half the interval of a log at 100 Hz
 BEFORE_S = 1.0  # rest that is added at both ends
@@ -118,7 +117,7 @@ def _as_log(table: ChannelTable, knots: Values) -> ChannelTable:
 class _Placed:
     """The moves of a program, placed: which move each sample is near to, and m_j, t_j, d_j and k."""
 
-    near: NDArray[np.intp]
+    near: Index
     middle: Values
     time: Values
     shifts: Values

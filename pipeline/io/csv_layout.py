@@ -25,9 +25,8 @@ from pipeline.records import Note
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.io.ingest_settings import Column, CsvFormat
+    from pipeline.records import Integers, Values
 
 NUMBER = re.compile(r"\s*[+-]?(\d+[.,]?\d*|[.,]\d+)([eE][+-]?\d+)?\s*")
 LISTED = 5  # lines named in a refusal
@@ -167,7 +166,7 @@ class Layout:
             ),
         )
 
-    def numbers(self, body: bytes, rows: int) -> dict[int, NDArray[np.float64]] | None:
+    def numbers(self, body: bytes, rows: int) -> dict[int, Values] | None:
         """Return the columns in use as numbers, by index; None where a cell is not a finite number."""
         wanted = sorted({index for _, index in self.columns})
         if b"\0" in body or (b'"' in body and self._quoted_numbers(body)):
@@ -218,9 +217,7 @@ def refusal(layout: Layout, faults: Sequence[Fault], *, more: bool = False) -> I
     return IngestError(worst.message + said, f"{layout.path}:{worst.line}", code=worst.kind, hint=HINTS[worst.kind])
 
 
-def find_faults(
-    layout: Layout, body: bytes, lines: NDArray[np.int64], before: tuple[int, str] | None
-) -> Iterator[Fault]:
+def find_faults(layout: Layout, body: bytes, lines: Integers, before: tuple[int, str] | None) -> Iterator[Fault]:
     """Yield the faults of a block of rows; ``before`` is number and text of the valid row before it."""
     for number, raw in zip(lines.tolist(), body.split(b"\n"), strict=False):
         text = raw.decode("utf-8", "replace")

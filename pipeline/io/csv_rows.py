@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.io.ingest_settings import Checks, CsvFormat
+    from pipeline.records import Index, Integers, Values
 
 LINES_BELOW, SEARCHED_BELOW = 60, 10_000  # lines, bytes after a header without the columns, searched for another
 LINES, EXACT = -1, -2  # in place of a column's index: numbers of the lines, times in ns
@@ -61,9 +62,9 @@ class Rows:
 
     layout: Layout
     sha256: str
-    numbers: dict[int, NDArray[np.float64]]
-    lines: NDArray[np.int64]
-    exact_ns: NDArray[np.int64] | None
+    numbers: dict[int, Values]
+    lines: Integers
+    exact_ns: Integers | None
     notes: tuple[Note, ...]
     repaired: int = 0
     restarts: tuple[int, ...] = ()
@@ -73,7 +74,7 @@ class Rows:
         """Return ``path:line`` of a row."""
         return f"{self.layout.path}:{self.lines[row]}"
 
-    def select(self, index: NDArray[np.intp], *notes: Note) -> Rows:
+    def select(self, index: Index, *notes: Note) -> Rows:
         """Return some rows, in their order, with further notes."""
         numbers = {i: values[index] for i, values in self.numbers.items()}
         return replace(
@@ -109,7 +110,7 @@ class _RowReader:
         self.refused: list[Fault] = []
         self.last_row: tuple[int, str] | None = None
 
-    def add(self, body: bytes, lines: NDArray[np.int64]) -> None:
+    def add(self, body: bytes, lines: Integers) -> None:
         """Add a block of rows with these numbers of lines."""
         layout = self.layout = self.layout or self._find_layout(body, lines)
         numbers = layout.numbers(body, len(lines))
@@ -142,7 +143,7 @@ class _RowReader:
             self.layout, self.log.sha256, columns, lines, exact_ns, tuple(notes), repaired, tuple(restarts.tolist())
         )
 
-    def _find_layout(self, body: bytes, lines: NDArray[np.int64]) -> Layout:
+    def _find_layout(self, body: bytes, lines: Integers) -> Layout:
         """Return which column holds which channel."""
         head, settings = self.log.head, self.settings
         assert head is not None  # noqa: S101  (rows follow it)
@@ -154,9 +155,7 @@ class _RowReader:
         self.notes += column_notes(head.names, columns, head.line if settings.header is True else 0)
         return Layout(self.path, head.names, columns, head.delimiter, settings.decimal)
 
-    def _valid_rows(
-        self, layout: Layout, body: bytes, lines: NDArray[np.int64]
-    ) -> tuple[bytes, NDArray[np.int64], dict[int, NDArray[np.float64]]]:
+    def _valid_rows(self, layout: Layout, body: bytes, lines: Integers) -> tuple[bytes, Integers, dict[int, Values]]:
         """Return the valid rows of a block, and keep the faults of the others."""
         found = []
         for fault in find_faults(layout, body, lines, self.last_row):
@@ -176,9 +175,7 @@ class _RowReader:
             raise IngestError("cannot be read as numbers: its rows cannot be told apart", place, code="not_a_number")
         return body, lines, numbers
 
-    def _exact_times(
-        self, layout: Layout, body: bytes, numbers: dict[int, NDArray[np.float64]]
-    ) -> dict[int, NDArray[np.int64]]:
+    def _exact_times(self, layout: Layout, body: bytes, numbers: dict[int, Values]) -> dict[int, Integers]:
         """Return the times from their digits, from the first that a double does not hold to half a nanosecond."""
         if self.settings.rate_hz is not None or self.settings.tick_ns is not None:
             return {}

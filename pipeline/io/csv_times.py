@@ -26,11 +26,10 @@ from pipeline.records import Note
 if TYPE_CHECKING:
     from fractions import Fraction
 
-    from numpy.typing import NDArray
-
     from pipeline.io.csv_layout import Layout
     from pipeline.io.csv_rows import Rows
     from pipeline.io.ingest_settings import Checks, Column, CsvFormat
+    from pipeline.records import Index, Integers, Values
 
 EXACT_BELOW_S = 1e6  # half a nanosecond is 2^-53 of 4.5e6 s
 LONGEST_S = 9.2e9  # int64 nanoseconds end at 292 years
@@ -51,7 +50,7 @@ def seconds_per_unit(unit: str) -> float:
     return UNITS["time"][unit][0] / 1e9
 
 
-def exact_times(layout: Layout, body: bytes) -> NDArray[np.int64]:
+def exact_times(layout: Layout, body: bytes) -> Integers:
     """Return the times of rows in ns from their decimal digits."""
     column, index = time_column(layout)
     digits = DECIMAL_DIGITS[column.unit]
@@ -66,7 +65,7 @@ def exact_times(layout: Layout, body: bytes) -> NDArray[np.int64]:
     return words[2 * decimals.offset : 2 * (decimals.offset + len(decimals)) : 2].copy()  # low words of 128 bits
 
 
-def whole_times(values: NDArray[np.float64], unit: str, tick_ns: Fraction | None = None) -> NDArray[np.int64]:
+def whole_times(values: Values, unit: str, tick_ns: Fraction | None = None) -> Integers:
     """Return times in ns of numbers in a unit, or of counts of a tick."""
     if tick_ns is not None and tick_ns.denominator == 1 and bool(np.all(values == np.rint(values))):
         return np.asarray(values.astype(np.int64) * int(tick_ns))
@@ -74,7 +73,7 @@ def whole_times(values: NDArray[np.float64], unit: str, tick_ns: Fraction | None
     return np.asarray(np.rint(values * scale).astype(np.int64))
 
 
-def times_of(rows: Rows, settings: CsvFormat) -> NDArray[np.int64]:
+def times_of(rows: Rows, settings: CsvFormat) -> Integers:
     """Return the time of each row, ns; refuse times out of range, or that have lost their digits."""
     if settings.rate_hz is not None:
         return np.asarray(np.rint(np.arange(len(rows.lines)) * (1e9 / settings.rate_hz)).astype(np.int64))
@@ -91,7 +90,7 @@ def times_of(rows: Rows, settings: CsvFormat) -> NDArray[np.int64]:
     return rows.exact_ns
 
 
-def _refuse_coarse(values: NDArray[np.float64], exact_ns: NDArray[np.int64], unit: str, name: str, path: str) -> None:
+def _refuse_coarse(values: Values, exact_ns: Integers, unit: str, name: str, path: str) -> None:
     """Refuse times that were stored as doubles too coarse for them, as nanoseconds since 1970 are.
 
     Such times are the doubles themselves, or end in zeros where the digits of a double end.
@@ -111,9 +110,7 @@ def _refuse_coarse(values: NDArray[np.float64], exact_ns: NDArray[np.int64], uni
         raise IngestError(message, path, code="coarse_time", hint="log them as integers")
 
 
-def in_order(
-    rows: Rows, time_ns: NDArray[np.int64], settings: CsvFormat, checks: Checks
-) -> tuple[Rows, NDArray[np.int64]]:
+def in_order(rows: Rows, time_ns: Integers, settings: CsvFormat, checks: Checks) -> tuple[Rows, Integers]:
     """Return rows in the order of their times, each time once, and these times.
 
     A time that goes back otherwise than by an overflow or by displaced rows is refused, as are two rows of one time
@@ -171,7 +168,7 @@ def over_budget(error: IngestError, touched: int, rows: int, checks: Checks) -> 
     return IngestError(error.fact, error.file, code=error.code, hint=hint)
 
 
-def _repeated(rows: Rows, time_ns: NDArray[np.int64], order: NDArray[np.intp], error: IngestError) -> NDArray[np.intp]:
+def _repeated(rows: Rows, time_ns: Integers, order: Index, error: IngestError) -> Index:
     """Return the places, in order, of rows that repeat the one before them; differing rows of one time are refused."""
     twice = np.flatnonzero(np.diff(time_ns[order]) == 0) + 1
     here, before = order[twice], order[twice - 1]
@@ -187,7 +184,7 @@ def _repeated(rows: Rows, time_ns: NDArray[np.int64], order: NDArray[np.intp], e
     return np.asarray(twice, np.intp)
 
 
-def _unwrap(time_ns: NDArray[np.int64], tick_ns: float) -> tuple[NDArray[np.int64], list[tuple[int, int]]]:
+def _unwrap(time_ns: Integers, tick_ns: float) -> tuple[Integers, list[tuple[int, int]]]:
     """Return times with the overflows of their counter undone, and the row after each overflow with its modulus, ns."""
     steps = np.diff(time_ns)
     back = np.flatnonzero(steps < 0)
@@ -206,9 +203,7 @@ def _unwrap(time_ns: NDArray[np.int64], tick_ns: float) -> tuple[NDArray[np.int6
     return time_ns, []
 
 
-def _one_session(
-    rows: Rows, time_ns: NDArray[np.int64], session: int, tick_ns: float
-) -> tuple[Rows, NDArray[np.int64]]:
+def _one_session(rows: Rows, time_ns: Integers, session: int, tick_ns: float) -> tuple[Rows, Integers]:
     """Return one part of a log that was restarted: at a repeated header, or where time falls back for good."""
     steps = np.diff(time_ns)
     forward = steps[steps > 0]

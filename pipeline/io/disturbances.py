@@ -38,12 +38,8 @@ from pipeline.records import SENSOR_UNITS, conjugate_product, continuous, level_
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from numpy.typing import NDArray
+    from pipeline.records import Index, Note, Recording, Values
 
-    from pipeline.records import Note, Recording
-
-    Array = NDArray[np.float64]
-    Index = NDArray[np.intp]
 
 # 10 and 7 standard deviations: below 3e-12 by chance for normal noise; half of L as a margin.
 BEYOND, ALLOWED, JUMP = 10.0, 1.5, 7.0
@@ -67,7 +63,7 @@ LARGEST_SHARE = 0.1  # of the pieces
 
 
 def leave_out_disturbances(
-    recording: Recording, note: Callable[[str, NDArray[np.intp], str], Note], largest_share: float
+    recording: Recording, note: Callable[[str, Index, str], Note], largest_share: float
 ) -> Recording:
     """Return a recording without its disturbed samples, each event noted by ``note``, that of its ``ChannelTable``.
 
@@ -101,7 +97,7 @@ def leave_out_disturbances(
     return without_rows(recording, rows, note("N-DISTURBED", rows, detail))
 
 
-def without_rows(recording: Recording, rows: NDArray[np.intp], note: Note) -> Recording:
+def without_rows(recording: Recording, rows: Index, note: Note) -> Recording:
     """Return a recording without some samples, a gap before what follows them, and with the note that says so."""
     sound = np.ones(recording.samples, bool)
     sound[rows] = False
@@ -111,7 +107,7 @@ def without_rows(recording: Recording, rows: NDArray[np.intp], note: Note) -> Re
     return replace(kept, notes=(*kept.notes, note))
 
 
-def disturbed(recording: Recording) -> tuple[Array, list[tuple[str, str]]]:
+def disturbed(recording: Recording) -> tuple[Values, list[tuple[str, str]]]:
     """Return by how much each reading exceeds what is allowed, (n, c) array, and sensor and axis of the columns.
 
     Samples around an event of several have the excess of a rounding error, so that they go with it.
@@ -146,7 +142,7 @@ def disturbed(recording: Recording) -> tuple[Array, list[tuple[str, str]]]:
     return _widened(excess), where
 
 
-def _noise(step: Array) -> Array:
+def _noise(step: Values) -> Values:
     """Return the noise by the differences of neighbours; where most are equal, one count: (c,) array."""
     noise = noise_of_steps(step)
     if np.all(noise > 0):
@@ -154,11 +150,11 @@ def _noise(step: Array) -> Array:
     return np.where(noise > 0, noise, np.where(step > 0, step, np.inf).min(axis=0))
 
 
-def _scatter(values: Array) -> float:
+def _scatter(values: Values) -> float:
     return MEDIAN_SIZE * float(median(np.abs(values - median(values))))
 
 
-def _widened(excess: Array) -> Array:
+def _widened(excess: Values) -> Values:
     rows = np.flatnonzero(np.any(excess > 0, axis=1))
     for event in np.split(rows, np.flatnonzero(np.diff(rows) > SAME_EVENT) + 1):
         if len(event) > 2:
@@ -191,7 +187,7 @@ class _Motion:
             np.concatenate([[0.0], np.cumsum(v)]) for v in (turned, changed, pulled)
         )
 
-    def _rate(self) -> Array | None:
+    def _rate(self) -> Values | None:
         """Return the rate: (n, 1) or (n, 3) array, deg/s; None where nothing tells it."""
         r = self.recording
         if r.table_attitude is not None and np.isfinite(r.table_attitude).all():
@@ -207,7 +203,7 @@ class _Motion:
             return np.zeros((r.samples, 1))
         return None if r.gyroscope is None else r.gyroscope - median(r.gyroscope)
 
-    def unexplained(self, sensor: str, reading: Array) -> Array:
+    def unexplained(self, sensor: str, reading: Values) -> Values:
         """Return what the log does not explain of a sensor's readings: (n, 3) array."""
         r, columns = self.recording, [np.ones((self.recording.samples, 1))]
         if sensor == "gyroscope":
@@ -222,7 +218,7 @@ class _Motion:
             return reading
         return np.asarray(reading - A @ np.linalg.lstsq(A, reading, rcond=None)[0])
 
-    def change(self, sensor: str) -> Array:
+    def change(self, sensor: str) -> Values:
         """Return by how much the motion can change what is unexplained: (n,) array, infinite where nothing is known."""
         n = np.arange(self.recording.samples)
         low, high = np.maximum(n - self.half, 0), np.minimum(n + self.half, len(n) - 1)
@@ -250,7 +246,7 @@ class _Motion:
             return slice(a, b), True
         return slice(max(n - self.half, 0), min(n + self.half, last) + 1), False
 
-    def scatter_of_rests(self, values: Array) -> float | None:
+    def scatter_of_rests(self, values: Values) -> float | None:
         """Return the scatter in most rests, by some windows over the recording; None where hardly any is at rest."""
         windows = [self.around(n) for n in np.linspace(0, len(values) - 1, WINDOWS).astype(int)]
         scatters = [_scatter(values[window]) for window, resting in windows if resting]
@@ -308,7 +304,7 @@ def _pieces(recording: Recording) -> Index:
     return np.array(out, np.intp).reshape(-1, 4)
 
 
-def _excess(reading: Array, pieces: Index) -> tuple[Array, Array]:
+def _excess(reading: Values, pieces: Index) -> tuple[Values, Values]:
     """Return by how much the chi^2 of each piece exceeds its limit, and its scatter over the usual one: (p,) arrays."""
     count = np.diff(pieces, axis=1)[:, 0].astype(float)
     bounds = pieces.ravel()

@@ -23,11 +23,9 @@ from pipeline.records import Note, conjugate_product, continuous, level_in_body
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from numpy.typing import NDArray
-
     from pipeline.io.clock_alignment import ClockFit
+    from pipeline.records import Mask, Values
 
-    Values = NDArray[np.float64]
 
 TABLE_TIME = "table_time"
 FEWEST_ROWS = 6  # the quintic spline needs them
@@ -70,7 +68,7 @@ class Signals:
         """Whether the table rests throughout."""
         return bool(np.ptp(self.rates, axis=0).max() < RESTING_DPS)
 
-    def covers(self, tau: Values) -> NDArray[np.bool_]:
+    def covers(self, tau: Values) -> Mask:
         """Return which times lie within the log."""
         return np.asarray((tau >= 0) & (tau <= self.duration))
 

@@ -22,9 +22,8 @@ from pipeline.io.units import DEGREES, TRIADS
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.io.channel_table import ChannelTable
+    from pipeline.records import Values
 
 BLOCK_S = 0.25  # two blocks make the shortest rest, half a second
 SHORTEST_BLOCK = 5  # samples, for a variance
@@ -48,9 +47,9 @@ class Move:
     and ``after``: direction of the specific force at rest.
     """
 
-    turns: NDArray[np.float64]
-    before: NDArray[np.float64]
-    after: NDArray[np.float64]
+    turns: Values
+    before: Values
+    after: Values
 
     @property
     def angle_deg(self) -> float:
@@ -58,7 +57,7 @@ class Move:
         return float(np.degrees(np.arccos(np.clip(self.before @ self.after, -1.0, 1.0))))
 
 
-def rests_of(force: NDArray[np.float64], interval_s: float) -> list[tuple[int, int]]:
+def rests_of(force: Values, interval_s: float) -> list[tuple[int, int]]:
     """Return start and stop of stretches of at least half a second at rest, by (n, 3) forces in any unit."""
     width = max(SHORTEST_BLOCK, round(BLOCK_S / interval_s))
     count = len(force) // width
@@ -74,14 +73,14 @@ def rests_of(force: NDArray[np.float64], interval_s: float) -> list[tuple[int, i
     return [(a * width, b * width) for a, b in found if _keeps_its_direction(means[a:b])]
 
 
-def _keeps_its_direction(means: NDArray[np.float64]) -> bool:
+def _keeps_its_direction(means: Values) -> bool:
     """Return whether the ends of a stretch point the same way; slow motion all along is no rest."""
     first, last = means[0], means[-1]
     size = float(np.linalg.norm(first))
     return bool(np.linalg.norm(last - first) <= np.radians(LARGEST_DRIFT_DEG) * max(size, 1e-30))
 
 
-def moves_of(force: NDArray[np.float64], rate: NDArray[np.float64], time_s: NDArray[np.float64]) -> list[Move]:
+def moves_of(force: Values, rate: Values, time_s: Values) -> list[Move]:
     """Return the moves between rests in which gravity turned by more than 20 degrees; (n, 3) readings in any unit."""
     steps = np.diff(time_s, append=2 * time_s[-1] - time_s[-2])
     rests = rests_of(force, float(np.median(steps)))
@@ -102,12 +101,12 @@ def moves_of(force: NDArray[np.float64], rate: NDArray[np.float64], time_s: NDAr
     return found
 
 
-def misfit_deg(moves: Sequence[Move], scales: Sequence[float]) -> NDArray[np.float64]:
+def misfit_deg(moves: Sequence[Move], scales: Sequence[float]) -> Values:
     """Return the median over moves of ``misfits_deg``: (len(scales),) array, deg."""
     return np.asarray(np.median(misfits_deg(moves, scales), axis=0))
 
 
-def misfits_deg(moves: Sequence[Move], scales: Sequence[float]) -> NDArray[np.float64]:
+def misfits_deg(moves: Sequence[Move], scales: Sequence[float]) -> Values:
     """Return the angle between the gravity that each scale predicts after a move and the one that was read.
 
     ``scales`` are candidates of ``s``, deg/s in one unit of the gyroscope.

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from pipeline.io.ingest_settings import McapFormat
     from pipeline.io.mcap_chunk import Rows
     from pipeline.io.mcap_reader import MessageReader
+    from pipeline.records import Integers
 
     Columns = dict[str, NDArray[Any]]
 
@@ -51,7 +52,7 @@ class _Series:
     """The messages of one topic: times, increasing, and channels."""
 
     topic: str
-    time_ns: NDArray[np.int64]
+    time_ns: Integers
     values: Columns
 
 
@@ -62,8 +63,8 @@ class _Topic:
     decoder: TopicDecoder
     error: IngestError | None = None
     recorder: bool = True  # whether the messages have times of the logger
-    times: list[NDArray[np.int64]] = field(default_factory=list)
-    recorded: list[NDArray[np.int64]] = field(default_factory=list)
+    times: list[Integers] = field(default_factory=list)
+    recorded: list[Integers] = field(default_factory=list)
     values: dict[str, list[NDArray[Any]]] = field(default_factory=dict)
 
     def read(self, rows: Rows, reader: MessageReader) -> None:

@@ -28,11 +28,11 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from mcap.records import Schema
-    from numpy.typing import NDArray
 
     from pipeline.io.ingest_settings import McapFormat
     from pipeline.io.mcap_chunk import Rows
     from pipeline.io.mcap_reader import MessageReader
+    from pipeline.records import Mask
 
 MAPPED = "mapped"  # the kind of a topic whose fields the profile names; other kinds are ROS types
 KINDS = {short_name(kind): kind for kind in (IMU, TEMPERATURE, JOINT_STATE, QUATERNION_STAMPED)}
@@ -119,7 +119,7 @@ class TopicDecoder:
                 )
                 raise IngestError(message, self.path, code="other_unit", hint=f"write unit: {unit} for {channel}")
 
-    def _note_absent(self, name: str, absent: NDArray[np.bool_]) -> None:
+    def _note_absent(self, name: str, absent: Mask) -> None:
         """Refuse a quantity that some messages lack."""
         before = self._absent.setdefault(name, bool(absent[0]))
         changed = np.flatnonzero(absent != before)

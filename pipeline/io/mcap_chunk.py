@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from mcap.records import McapRecord
     from numpy.typing import NDArray
 
+    from pipeline.records import Integers
+
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_HEAD = 9  # bytes of opcode and length
 INDEX_ENTRY = 16  # bytes of a time and an offset
@@ -68,8 +70,8 @@ class Rows:
     channel: int
     data: NDArray[np.uint8]
     heads: NDArray[np.void]
-    starts: NDArray[np.int64]
-    sizes: NDArray[np.int64]
+    starts: Integers
+    sizes: Integers
     stride: int
     place: str
     offset: int
@@ -111,7 +113,7 @@ class Run:
     name: str = ""
     data: bytes | memoryview = b""
     loose: bool = False
-    index: dict[int, NDArray[np.int64]] = field(default_factory=dict)
+    index: dict[int, Integers] = field(default_factory=dict)
     records: list[tuple[bytes, bytes]] = field(default_factory=list)
     rows: list[Rows] = field(default_factory=list)
 
@@ -164,7 +166,7 @@ def split(run: Run) -> tuple[list[tuple[int, memoryview]], list[Rows]]:
 
 def _followed(
     data: bytes | memoryview, start: int, *, stop_at_message: bool = False
-) -> tuple[NDArray[np.int64], list[tuple[int, memoryview]]]:
+) -> tuple[Integers, list[tuple[int, memoryview]]]:
     """Follow the lengths from record to record: the starts of the messages, and the other records."""
     view, end, starts, others = memoryview(data), len(data), [], []
     while start < end:
@@ -198,7 +200,7 @@ def _alike(run: Run, data: NDArray[np.uint8], first: int) -> Rows | None:
     return Rows(channel, data, heads, starts, np.full(count, length - MESSAGE_HEAD), stride, run.name, run.offset)
 
 
-def _indexed(run: Run, data: NDArray[np.uint8], first: int) -> NDArray[np.int64] | None:
+def _indexed(run: Run, data: NDArray[np.uint8], first: int) -> Integers | None:
     """Return the starts that the index gives if following the lengths gives the same."""
     if not run.index:
         return None
@@ -211,11 +213,11 @@ def _indexed(run: Run, data: NDArray[np.uint8], first: int) -> NDArray[np.int64]
     return starts if fitting.all() and np.array_equal(ends, np.append(starts[1:], len(data))) else None
 
 
-def _heads(data: NDArray[np.uint8], starts: NDArray[np.int64]) -> NDArray[np.void]:
+def _heads(data: NDArray[np.uint8], starts: Integers) -> NDArray[np.void]:
     return np.asarray(sliding_window_view(data, HEAD.itemsize)[starts].view(HEAD)[:, 0])
 
 
-def _by_channel(run: Run, data: NDArray[np.uint8], starts: NDArray[np.int64]) -> list[Rows]:
+def _by_channel(run: Run, data: NDArray[np.uint8], starts: Integers) -> list[Rows]:
     heads = _heads(data, starts)
     rows = []
     for channel in np.unique(heads["channel"]).tolist():
@@ -265,7 +267,7 @@ def bytes_of(records: Iterable[McapRecord]) -> bytes:
     return bytes(builder.end())  # type: ignore[no-untyped-call]
 
 
-def message_index(content: bytes) -> tuple[int, NDArray[np.int64]]:
+def message_index(content: bytes) -> tuple[int, Integers]:
     """Return a channel and the offsets of its messages in the chunk before; ``ValueError`` if it is not an index."""
     number, size = struct.unpack_from("<HI", content)
     body = content[6 : 6 + size]

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.io.mcap_chunk import Run
+    from pipeline.records import Integers
 
 ZSTD_LEVEL = -3  # twice as fast as 1 on calibrated messages, and as small as the recorders' 3: benchmarks/apply.py
 
@@ -120,9 +121,7 @@ class McapCopy:
         self._chunk(head + body if head else body, {channel: (times, starts + len(head))})
         self._count(channel, times)
 
-    def _chunk(
-        self, data: bytes | memoryview, entries: dict[int, tuple[NDArray[np.uint64], NDArray[np.int64]]]
-    ) -> None:
+    def _chunk(self, data: bytes | memoryview, entries: dict[int, tuple[NDArray[np.uint64], Integers]]) -> None:
         """Write a chunk and the indexes of its channels: times and offsets of their messages."""
         times = np.concatenate([t for t, _ in entries.values()])
         chunk = Chunk(

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.io.mcap_chunk import Rows
+    from pipeline.records import Integers, Mask, Values
 
 T = TypeVar("T")
 SUPPORTED = "cdr with ros2msg, ros1 with ros1msg, protobuf with protobuf, and json are supported"
@@ -67,9 +68,9 @@ class Batch:
     A value is NaN where the message has an empty list in its place. ``absent`` marks these rows of a column.
     """
 
-    time_ns: NDArray[np.int64] | None
-    values: dict[str, NDArray[np.float64]]
-    absent: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
+    time_ns: Integers | None
+    values: dict[str, Values]
+    absent: dict[str, Mask] = field(default_factory=dict)
 
 
 class ChannelDecoder:
@@ -131,7 +132,7 @@ class ChannelDecoder:
         absent = {n: np.ones(count, np.bool_) for n in places if n not in numbers}
         return Batch(self._moments(columns), values, absent)
 
-    def _moments(self, columns: Mapping[str, NDArray[Any]]) -> NDArray[np.int64] | None:
+    def _moments(self, columns: Mapping[str, NDArray[Any]]) -> Integers | None:
         if SECONDS not in columns:
             return None
         if NANOSECONDS in columns:

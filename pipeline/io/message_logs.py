@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from pipeline.records import Integers
+
 
 RUN_SIZE = 4096  # messages of one topic of a bag that are decoded together
 
@@ -130,9 +132,7 @@ def _joined(channel: int, run: list[tuple[int, bytes]]) -> Rows:
     return _rows(channel, data, np.cumsum(sizes) - sizes, sizes, np.array([time for time, _ in run], np.int64))
 
 
-def _rows(
-    channel: int, data: NDArray[np.uint8], starts: NDArray[np.int64], sizes: NDArray[np.int64], times: NDArray[Any]
-) -> Rows:
+def _rows(channel: int, data: NDArray[np.uint8], starts: Integers, sizes: Integers, times: NDArray[Any]) -> Rows:
     """Return messages in ``data`` as ``McapReader`` does; ``times`` are the recorder's, ns."""
     heads = np.zeros(len(starts), HEAD)
     heads["channel"], heads["log_time"] = channel, times

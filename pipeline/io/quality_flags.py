@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from pipeline.io.channel_table import ChannelTable
     from pipeline.io.ingest_settings import Checks
-    from pipeline.records import Note
+    from pipeline.records import Index, Integers, Mask, Note, Values
 
 GAP, CLIPPED, STUCK, REPAIRED = np.uint16(1), np.uint16(2), np.uint16(4), np.uint16(8)  # bits of ``Recording.flags``
 GAP_INTERVALS = 1.5  # half way to one missing sample
@@ -75,7 +75,7 @@ def flag_gaps(table: ChannelTable, flags: NDArray[np.uint16], checks: Checks) ->
     return [table.note("N-GAP", rows, detail), *_irregular(table, steps[steps <= limit], usual)]
 
 
-def _irregular(table: ChannelTable, steps: NDArray[np.int64], usual: float) -> list[Note]:
+def _irregular(table: ChannelTable, steps: Integers, usual: float) -> list[Note]:
     if not steps.size or int(steps.max()) - int(steps.min()) <= JITTER_NOTED * usual:
         return []
     jitter = float(np.sqrt(np.mean((steps / usual - 1.0) ** 2)))
@@ -115,7 +115,7 @@ def flag_clipped(table: ChannelTable, sensor: str, full_scale: float, flags: NDA
     return notes
 
 
-def _at_rail(size: NDArray[np.float64], full_scale: float, count: float) -> NDArray[np.bool_]:
+def _at_rail(size: Values, full_scale: float, count: float) -> Mask:
     """Return which sizes lie at full scale, or at a largest value beyond it that occurs more than once.
 
     Many sensors read on past their nominal range (131 counts per deg/s reach 250.1 deg/s), some by a fifth.
@@ -159,7 +159,7 @@ def flag_stuck(table: ChannelTable, sensor: str, flags: NDArray[np.uint16]) -> l
     return notes
 
 
-def equal_share(same: NDArray[np.bool_]) -> float:
+def equal_share(same: Mask) -> float:
     """Return the 95th percentile, over windows that are not wholly equal, of the share of equal neighbours."""
     whole = len(same) // WINDOW * WINDOW
     if whole == 0:
@@ -172,7 +172,7 @@ def equal_share(same: NDArray[np.bool_]) -> float:
     return float(np.interp(place, np.arange(partial.size), np.sort(partial)))
 
 
-def _stuck_rows(same: NDArray[np.bool_], share: float) -> NDArray[np.intp]:
+def _stuck_rows(same: Mask, share: float) -> Index:
     """Return the rows in runs of equal values that are longer than chance allows."""
     if share > QUIET:
         return np.zeros(0, np.intp)
@@ -186,7 +186,7 @@ def _stuck_rows(same: NDArray[np.bool_], share: float) -> NDArray[np.intp]:
     return np.concatenate([np.arange(a, b + 1) for a, b in zip(starts[long], stops[long], strict=True)])
 
 
-def _in_a_row(same: NDArray[np.bool_], count: int) -> bool:
+def _in_a_row(same: Mask, count: int) -> bool:
     """Return whether so many neighbours in a row are equal."""
     places, further = np.flatnonzero(same), count - 1
     return bool(np.any(places[further:] - places[: max(len(places) - further, 0)] == further))

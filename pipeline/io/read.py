@@ -28,10 +28,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
     from pipeline.io.channel_table import ChannelTable
     from pipeline.io.ingest_settings import Checks, CsvFormat
+    from pipeline.records import Values
 
 
 def read_recordings(
@@ -174,7 +173,7 @@ def to_recording(
     return leave_out_disturbances(recording, table.note, checks.disturbed_rows)
 
 
-def _stack(values: dict[str, NDArray[np.float64]], channels: Sequence[str]) -> NDArray[np.float64] | None:
+def _stack(values: dict[str, Values], channels: Sequence[str]) -> Values | None:
     return np.column_stack([values.pop(c) for c in channels]) if channels[0] in values else None
 
 

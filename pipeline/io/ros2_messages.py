@@ -31,9 +31,9 @@ if TYPE_CHECKING:
     from pipeline.io.mcap_chunk import Rows
     from pipeline.io.message_decoder import ChannelDecoder
     from pipeline.io.message_layout import MessageLayout
-    from pipeline.records import Recording
+    from pipeline.records import Integers, Recording, Values
 
-    Readings = Mapping[str, NDArray[np.float64]]  # sensor to (n, 3) readings, or to the (3, 3) covariance of a sample
+    Readings = Mapping[str, Values]  # sensor to (n, 3) readings, or to the (3, 3) covariance of a sample
 
 IMU = "sensor_msgs/msg/Imu"
 TEMPERATURE = "sensor_msgs/msg/Temperature"
@@ -128,7 +128,7 @@ class _Message:
             self.places.append(len(self.data))
             self.data += bytes(8)
 
-    def fill(self, time_ns: NDArray[np.int64], numbers: NDArray[np.float64]) -> NDArray[np.uint8]:
+    def fill(self, time_ns: Integers, numbers: Values) -> NDArray[np.uint8]:
         """Return a message, a row of bytes, for each time and row of numbers."""
         table = np.tile(np.frombuffer(bytes(self.data), np.uint8), (len(time_ns), 1))
         stamps = np.stack([time_ns // SECOND_NS, time_ns % SECOND_NS], axis=1).astype("<u4")
@@ -178,7 +178,7 @@ def _streams(recording: Recording) -> dict[str, NDArray[np.uint8]]:
     return streams
 
 
-def imu_table(time_ns: NDArray[np.int64], readings: Readings, covariances: Readings | None = None) -> NDArray[np.uint8]:
+def imu_table(time_ns: Integers, readings: Readings, covariances: Readings | None = None) -> NDArray[np.uint8]:
     """Return Imu messages, rows of bytes, of (n,) times and (n, 3) readings in g and deg/s.
 
     Orientation, angular rate and acceleration each have a covariance, whose first element is -1 for what is absent;
@@ -228,9 +228,9 @@ def replaced(
     return [_one(row, rows, decoder.layout_of(row, rows), numbers, channel) for row in range(len(rows.starts))]
 
 
-def _in_ros_units(readings: Readings, covariances: Readings) -> dict[str, NDArray[np.float64]]:
+def _in_ros_units(readings: Readings, covariances: Readings) -> dict[str, Values]:
     """Return the numbers of Imu messages: path to column, (n,) or (n, 9), m/s^2 and rad/s."""
-    found: dict[str, NDArray[np.float64]] = {}
+    found: dict[str, Values] = {}
     for vector, (sensor, _unit, one) in VECTORS.items():
         if sensor in readings:
             found |= {f"{vector}.{a}": readings[sensor][:, i] * one for i, a in enumerate("xyz")}
@@ -240,9 +240,7 @@ def _in_ros_units(readings: Readings, covariances: Readings) -> dict[str, NDArra
     return found
 
 
-def _all_at_once(
-    rows: Rows, layout: MessageLayout, numbers: dict[str, NDArray[np.float64]], channel: int
-) -> NDArray[np.uint8]:
+def _all_at_once(rows: Rows, layout: MessageLayout, numbers: dict[str, Values], channel: int) -> NDArray[np.uint8]:
     """Copy all records at once, and replace their numbers."""
     size = HEAD.itemsize + len(layout.sample)
     places = {path: layout.places[path] for path in numbers}
@@ -266,7 +264,7 @@ def _all_at_once(
     return whole.view(np.uint8).reshape(len(starts), size)
 
 
-def _one(row: int, rows: Rows, layout: MessageLayout, numbers: dict[str, NDArray[np.float64]], channel: int) -> bytes:
+def _one(row: int, rows: Rows, layout: MessageLayout, numbers: dict[str, Values], channel: int) -> bytes:
     """Copy one record, and replace its numbers."""
     start, end = int(rows.starts[row]) - HEAD.itemsize, int(rows.starts[row] + rows.sizes[row])
     record = bytearray(rows.data[start:end].tobytes())
@@ -279,9 +277,7 @@ def _one(row: int, rows: Rows, layout: MessageLayout, numbers: dict[str, NDArray
     return bytes(record)
 
 
-def new_imu(
-    rows: Rows, truths: Readings, channel: int, time_ns: NDArray[np.int64], covariances: Readings
-) -> NDArray[np.uint8]:
+def new_imu(rows: Rows, truths: Readings, channel: int, time_ns: Integers, covariances: Readings) -> NDArray[np.uint8]:
     """Return records of new ROS 2 Imu messages with the times and numbers of the originals' records."""
     messages = imu_table(time_ns, truths, covariances)
     count, size = messages.shape

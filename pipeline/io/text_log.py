@@ -24,9 +24,8 @@ from pipeline.records import Note
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from numpy.typing import NDArray
-
     from pipeline.io.ingest_settings import CsvFormat
+    from pipeline.records import Integers
 
 BLOCK_BYTES = 1 << 20  # stays in the cache of the processor while it is hashed, checked and parsed
 LONGEST = 1 << 24  # bytes of a line (one of 16 MB is no row of a table), and of the lines before the first row
@@ -93,7 +92,7 @@ class TextLog:
             notes.append(Note("N-COMMENT", len(self.comments), self.comments[0], self.comments[-1], detail))
         return notes
 
-    def __iter__(self) -> Iterator[tuple[bytes, NDArray[np.int64]]]:
+    def __iter__(self) -> Iterator[tuple[bytes, Integers]]:
         """Yield the rows, each with a newline after it; a block has at least one."""
         before = b""
         for block, numbers in self._blocks:
@@ -156,7 +155,7 @@ class TextLog:
         self.head = Head(lines, header, names, delimiter, number)
         return start
 
-    def _rows(self, data: bytes, numbers: range) -> tuple[bytes, NDArray[np.int64]]:
+    def _rows(self, data: bytes, numbers: range) -> tuple[bytes, Integers]:
         """Return lines without comments and empty ones, and their numbers."""
         lines = np.arange(numbers.start, numbers.stop)
         comment, empty = self.settings.comment, b"\n\n" in data or data.startswith(b"\n")

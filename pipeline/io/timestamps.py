@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    Values = NDArray[np.float64]
+    from pipeline.records import Index, Integers, Values
 
 
 LARGEST = np.iinfo(np.int64).max
@@ -52,36 +52,34 @@ def nanoseconds(moment: tuple[int, int] | float | Decimal, unit: str) -> int:
     return found
 
 
-def of_pair(seconds: NDArray[Any], nanos: NDArray[Any]) -> NDArray[np.int64]:
+def of_pair(seconds: NDArray[Any], nanos: NDArray[Any]) -> Integers:
     """Return moments in ns of seconds and nanoseconds."""
     parts = nanos.astype(np.int64)
     wrong = np.flatnonzero((parts < 0) | (parts >= SECOND_NS))
     if wrong.size:
         row = int(wrong[0])
         raise ValueError(f"the stamp {row + 1} messages on has {parts[row]} nanoseconds; 0 to 999999999 are possible")
-    whole: NDArray[np.int64] = seconds.astype(np.int64) * SECOND_NS + parts
+    whole: Integers = seconds.astype(np.int64) * SECOND_NS + parts
     return whole
 
 
-def of_number(values: NDArray[Any], unit: str) -> NDArray[np.int64]:
+def of_number(values: NDArray[Any], unit: str) -> Integers:
     """Return moments in ns of numbers in a unit."""
     scale = int(UNITS["time"][unit][0])
     if values.dtype.kind in "iu":
         if values.size and int(max(values.max(), -int(values.min()))) > LARGEST // scale:
             raise ValueError(f"a stamp of {values.max()} {unit} is none")
-        counted: NDArray[np.int64] = values.astype(np.int64) * scale
+        counted: Integers = values.astype(np.int64) * scale
         return counted
     numbers = values.astype(np.float64)
     if not (np.abs(numbers) < LARGEST / scale).all():
         raise ValueError("a stamp is no finite number, or beyond all times")
     whole = np.floor(numbers)
-    parts: NDArray[np.int64] = whole.astype(np.int64) * scale + np.rint((numbers - whole) * scale).astype(np.int64)
+    parts: Integers = whole.astype(np.int64) * scale + np.rint((numbers - whole) * scale).astype(np.int64)
     return parts
 
 
-def check_plausible(
-    topic: str, time: NDArray[np.int64], log_time: NDArray[np.int64], difference_s: float | None, path: str
-) -> None:
+def check_plausible(topic: str, time: Integers, log_time: Integers, difference_s: float | None, path: str) -> None:
     """Refuse stamps ``time`` that no clock gave; ``log_time`` are the recorder's.
 
     ``difference_s``: how far both may be apart, beyond a constant where the stamps do not count from 1970; None: any.
@@ -113,8 +111,8 @@ def check_plausible(
 
 
 def in_order(
-    topic: str, time: NDArray[np.int64], columns: Sequence[NDArray[Any]], reorder_s: float, path: str
-) -> tuple[NDArray[np.intp] | None, list[Note]]:
+    topic: str, time: Integers, columns: Sequence[NDArray[Any]], reorder_s: float, path: str
+) -> tuple[Index | None, list[Note]]:
     """Return the order in which times increase, without messages that stand there twice; None where all is in order.
 
     ``columns`` are all that is read of the messages, for comparison: two messages of one stamp that differ are refused.
@@ -158,7 +156,7 @@ def in_order(
     return order, notes
 
 
-def check_fine(topic: str, time: NDArray[np.int64], path: str) -> None:
+def check_fine(topic: str, time: Integers, path: str) -> None:
     """Refuse times in floating-point numbers that are too coarse to differentiate."""
     if len(time) < 2:
         return
@@ -172,7 +170,7 @@ def check_fine(topic: str, time: NDArray[np.int64], path: str) -> None:
         raise IngestError(message, path, code="bad_time", hint="log integer times")
 
 
-def time_error(time_ns: NDArray[np.int64], place: str, row: int) -> IngestError:
+def time_error(time_ns: Integers, place: str, row: int) -> IngestError:
     """Return the refusal of a time that does not increase."""
     steps = np.diff(time_ns)
     repeats = steps[row - 1] == 0
@@ -186,12 +184,12 @@ def time_error(time_ns: NDArray[np.int64], place: str, row: int) -> IngestError:
     return IngestError(message, place, code=code, hint=hint)
 
 
-def slower_first(first: NDArray[np.int64], second: NDArray[np.int64]) -> bool:
+def slower_first(first: Integers, second: Integers) -> bool:
     """Return whether the first of two sensors, by the times of their messages in ns, is the slower one."""
     return float(np.median(np.diff(first))) >= float(np.median(np.diff(second)))
 
 
-def rows_covered(slow: NDArray[np.int64], fast: NDArray[np.int64], topic: str, path: str) -> NDArray[np.intp]:
+def rows_covered(slow: Integers, fast: Integers, topic: str, path: str) -> Index:
     """Return the messages of the slower sensor whose whole interval the faster one covers without a gap.
 
     Raises
@@ -213,7 +211,7 @@ def rows_covered(slow: NDArray[np.int64], fast: NDArray[np.int64], topic: str, p
     return found
 
 
-def averaged(slow: NDArray[np.int64], rows: NDArray[np.intp], fast: NDArray[np.int64], values: Values) -> Values:
+def averaged(slow: Integers, rows: Index, fast: Integers, values: Values) -> Values:
     """Return the mean of a channel of the faster sensor over the interval about each of some rows of the slower one."""
     edges = (_edges(slow) - slow[0]) / 1e9
     time = (fast - slow[0]) / 1e9
@@ -225,7 +223,7 @@ def averaged(slow: NDArray[np.int64], rows: NDArray[np.intp], fast: NDArray[np.i
     return means
 
 
-def _edges(slow: NDArray[np.int64]) -> NDArray[np.int64]:
+def _edges(slow: Integers) -> Integers:
     """Return the middles between messages: the beginning and end of each but the first and last."""
-    edges: NDArray[np.int64] = slow[:-1] + np.diff(slow) // 2
+    edges: Integers = slow[:-1] + np.diff(slow) // 2
     return edges

@@ -12,8 +12,7 @@ import re
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
+    from pipeline.records import Values
 
 STANDARD_GRAVITY = 9.80665  # m/s^2
 SECOND_NS = 1_000_000_000
@@ -76,7 +75,7 @@ def unit_in_brackets(name: str) -> str | None:
     return SPELLINGS.get(found.group(1).strip().lower().replace(" ", "")) if found else None
 
 
-def to_house_unit(channel: str, values: NDArray[np.float64], unit: str) -> NDArray[np.float64]:
+def to_house_unit(channel: str, values: Values, unit: str) -> Values:
     """Convert values of a channel to its house unit (g, deg/s, deg, degC); counts are none of its business."""
     multiplier, divisor = UNITS[channel][unit]
     if multiplier != 1.0:

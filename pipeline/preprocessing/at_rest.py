@@ -43,12 +43,9 @@ from pipeline.signal.rests import RATE_AT_REST_DPS, rests_from_table, runs
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.errors import IngestError
-    from pipeline.records import Recording
+    from pipeline.records import Index, Mask, Recording, Values
 
-    Array = NDArray[np.float64]
 
 BLOCK_S, FEWEST_OF_BLOCK = 1.0, 16  # shorter than a knock with its decay; samples, for a standard deviation
 FEWEST_OF_REST, RESTS = 8, 3  # samples of a rest, and rests of a recording, by which the usual scatter is told
@@ -82,7 +79,7 @@ def check_static(recordings: Sequence[Recording], settings: Mapping[str, Any]) -
 
 
 def _doubted(
-    recording: Recording, recordings: Sequence[Recording], rests_of: Mapping[str, Array], sheets: Mapping[str, Any]
+    recording: Recording, recordings: Sequence[Recording], rests_of: Mapping[str, Values], sheets: Mapping[str, Any]
 ) -> Recording:
     """Return a static recording, with the note ``N-REFERENCE`` where it contradicts the rests of the others."""
     others = [r for r in recordings if r.role != "static" and r.samples > 1]
@@ -126,7 +123,7 @@ def _doubted(
     return replace(recording, notes=(*recording.notes, *notes))
 
 
-def _digit(reading: Array) -> Array:
+def _digit(reading: Values) -> Values:
     """Return the smallest change of each axis between two samples, infinity where it stays: (3,) array."""
     step = np.abs(np.diff(reading, axis=0))
     return np.asarray(np.where(step > 0.0, step, np.inf).min(axis=0, initial=np.inf))
@@ -144,14 +141,14 @@ def _bias_change(recordings: Sequence[Recording], sheet: Mapping[str, Any]) -> f
     return attitude + 2.0 * EARTH_RATE_DPS + _slow(sheet, change, duration)
 
 
-def _blocks(recording: Recording, values: Array) -> Array:
+def _blocks(recording: Recording, values: Values) -> Values:
     """Return the samples in blocks of a second: (n, 3) array to (k, size, 3), (n,) array to (k, size)."""
     size = max(FEWEST_OF_BLOCK, round(BLOCK_S / recording.interval))
     count = len(values) // size
     return values[: count * size].reshape(count, size, *values.shape[1:])
 
 
-def _resting(recording: Recording, rests_of: Mapping[str, Array], sheets: Mapping[str, Any]) -> Recording:
+def _resting(recording: Recording, rests_of: Mapping[str, Values], sheets: Mapping[str, Any]) -> Recording:
     """Return the longest part of a static recording that rests."""
     if recording.samples < 2 * FEWEST_OF_BLOCK:
         return recording
@@ -194,8 +191,8 @@ def _resting(recording: Recording, rests_of: Mapping[str, Array], sheets: Mappin
 
 
 def _moving(
-    recording: Recording, sensor: str, blocks: Array, sheet: Mapping[str, Any], rests: Array
-) -> tuple[NDArray[np.bool_], str]:
+    recording: Recording, sensor: str, blocks: Values, sheet: Mapping[str, Any], rests: Values
+) -> tuple[Mask, str]:
     """Return which blocks a sensor moves in, and the largest sign of it in words."""
     unit = SENSOR_UNITS[sensor]
     means, scatter = blocks.mean(axis=1), blocks.std(axis=1, ddof=1)
@@ -233,9 +230,9 @@ def _slow(sheet: Mapping[str, Any], change: float, duration: float) -> float:
     )
 
 
-def _rests_of(recordings: Sequence[Recording]) -> dict[str, Array]:
+def _rests_of(recordings: Sequence[Recording]) -> dict[str, Values]:
     """Return for each sensor ``_moments`` of the rests of the table's log: (k, 3, 3) array; k = 0 without any."""
-    found: dict[str, list[Array]] = {sensor: [np.zeros((0, 3, 3))] for sensor in SENSORS}
+    found: dict[str, list[Values]] = {sensor: [np.zeros((0, 3, 3))] for sensor in SENSORS}
     for recording in recordings:
         if recording.role == "static" or recording.axis is None:
             continue
@@ -247,7 +244,7 @@ def _rests_of(recordings: Sequence[Recording]) -> dict[str, Array]:
     return {sensor: np.concatenate(moments) for sensor, moments in found.items()}
 
 
-def _rests_by_hand(recordings: Sequence[Recording], sensor: str) -> Array:
+def _rests_by_hand(recordings: Sequence[Recording], sensor: str) -> Values:
     """Return ``_moments`` of the quietest tenth of each recording by hand, whose mean is not known (NaN)."""
     found = [np.zeros((0, 3, 3))]
     for recording in recordings:
@@ -259,7 +256,7 @@ def _rests_by_hand(recordings: Sequence[Recording], sensor: str) -> Array:
     return np.concatenate(found)
 
 
-def _still_rows(recording: Recording) -> list[NDArray[np.intp]]:
+def _still_rows(recording: Recording) -> list[Index]:
     """Return the rows of each rest of the table's log, cut where the table stepped between two samples."""
     rows = np.concatenate([np.arange(0), *(np.arange(r.start, r.stop) for r in rests_from_table(recording))])
     angle = np.zeros(len(rows)) if recording.table_angle is None else recording.table_angle[rows]
@@ -267,7 +264,7 @@ def _still_rows(recording: Recording) -> list[NDArray[np.intp]]:
     return np.split(rows, np.flatnonzero((np.diff(rows) > 1) | stepped) + 1)
 
 
-def _moments(blocks: Array) -> Array:
+def _moments(blocks: Values) -> Values:
     """Return scatter, white noise and mean of (k, n, 3) blocks: (k, 3, 3) array.
 
     The white noise is that of successive differences, to which slow changes add nothing (J. von Neumann, Annals of
@@ -328,14 +325,14 @@ def _check_spans(recording: Recording) -> None:
             raise _stuck(recording, TRIADS["accelerometer"][i], spans[i], 1.0, "g")
 
 
-def _turned(recording: Recording, rate: Array) -> float:
+def _turned(recording: Recording, rate: Values) -> float:
     """Return the arc of a turn, deg."""
     if recording.table_angle is not None:
         return float(np.ptp(recording.table_angle))
     return float(np.ptp(np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(recording.time))))
 
 
-def _span(values: Array) -> float:
+def _span(values: Values) -> float:
     low, high = quantiles(values, *INNER)
     return float(high - low)
 

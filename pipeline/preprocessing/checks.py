@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.records import Recording
+    from pipeline.records import Index, Recording
 
 FEWEST, APART = 20, 8  # rows, see above
 DIGITS = 10  # of 16 bits of counts in any unit, 5 are significant; twice that
@@ -121,7 +121,7 @@ def _keys(recording: Recording, decimals: Sequence[int]) -> NDArray[np.uint64]:
     return key
 
 
-def _check_pair(one: Recording, two: Recording, first: NDArray[np.intp], second: NDArray[np.intp]) -> None:
+def _check_pair(one: Recording, two: Recording, first: Index, second: Index) -> None:
     """Refuse two recordings whose common rows follow each other in both."""
     order = np.argsort(first)
     first, second = first[order], second[order]

@@ -18,11 +18,8 @@ from pipeline.records import AXES, SENSORS, conjugate_product, continuous, media
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
+    from pipeline.records import Mask, Recording, Values
 
-    from pipeline.records import Recording
-
-    Array = NDArray[np.float64]
 
 GAP = 1.5  # median intervals, as pipeline.io.quality_flags
 EXPANDED = 3.0  # coverage of a stated standard uncertainty: 99.7 % of a normal distribution
@@ -98,9 +95,9 @@ class Channel:
     """
 
     name: str
-    low: Array
-    high: Array
-    turned: Array
+    low: Values
+    high: Values
+    turned: Values
     noise: float
 
     @property
@@ -109,13 +106,13 @@ class Channel:
         return len(self.low) == len(self.turned)
 
 
-def quantiles(values: Array, *shares: float) -> Array:
+def quantiles(values: Values, *shares: float) -> Values:
     """Return values below which these shares of all lie, without interpolation: numpy's takes ten times as long."""
     places = [round(share * (len(values) - 1)) for share in shares]
     return np.asarray(np.partition(values, places, axis=0)[places])
 
 
-def gaps(recording: Recording) -> NDArray[np.bool_]:
+def gaps(recording: Recording) -> Mask:
     """Return which intervals are longer than 1.5 times the usual one: (n - 1,) array."""
     return np.asarray(np.diff(recording.time_ns) > GAP * recording.interval * 1e9)
 
@@ -136,7 +133,7 @@ def of_table(recording: Recording) -> list[Channel]:
     return channels
 
 
-def spin(attitude: Array) -> Array:
+def spin(attitude: Values) -> Values:
     """Return the rotation vector, in the body, from each attitude to the next: (n - 1, 3) array, deg."""
     q = continuous(attitude)
     sine = conjugate_product(q[:-1], q[1:])
@@ -145,13 +142,13 @@ def spin(attitude: Array) -> Array:
     return np.asarray(np.degrees(np.where(size > 0, sine * angle / np.where(size > 0, size, 1.0), 0.0)))
 
 
-def _of_turned(name: str, recording: Recording, turned: Array) -> Channel:
+def _of_turned(name: str, recording: Recording, turned: Values) -> Channel:
     rate = turned / np.diff(recording.time)
     lost = gaps(recording)
     return Channel(name, np.where(lost, -np.inf, rate), np.where(lost, np.inf, rate), np.where(lost, 0.0, turned), 0.0)
 
 
-def of_rate(recording: Recording, name: str, rate: Array, known: NDArray[np.bool_] | None = None) -> Channel:
+def of_rate(recording: Recording, name: str, rate: Values, known: Mask | None = None) -> Channel:
     """Return what rates at the samples say; those that are not known allow anything."""
     dt = np.diff(recording.time)
     turned = np.where(gaps(recording), 0.0, 0.5 * (rate[1:] + rate[:-1]) * dt)
@@ -172,7 +169,7 @@ def alike(channels: list[Channel]) -> list[Channel]:
     ]
 
 
-def _alike(one: Array, two: Array) -> float:
+def _alike(one: Values, two: Values) -> float:
     """Return the correlation of two angles turned, by blocks; 0 where one does not turn."""
     starts = np.arange(0, len(one), SIGN_BLOCK)
     a, b = np.add.reduceat(one, starts), np.add.reduceat(two, starts)
@@ -180,15 +177,15 @@ def _alike(one: Array, two: Array) -> float:
     return float(a @ b) / size if size > 0.0 else 0.0
 
 
-def gravity_turned(recording: Recording) -> Array | None:
+def gravity_turned(recording: Recording) -> Values | None:
     """Return the angle by which gravity turned about the turn axis in each interval, deg; None where it does not."""
     if "gravity_turned" not in recording.cache:
         recording.cache["gravity_turned"] = _gravity_turned(recording)
-    found: Array | None = recording.cache["gravity_turned"]
+    found: Values | None = recording.cache["gravity_turned"]
     return found
 
 
-def _gravity_turned(recording: Recording) -> Array | None:
+def _gravity_turned(recording: Recording) -> Values | None:
     force, axis = recording.accelerometer, axis_index(recording)
     if force is None:
         return None
@@ -205,7 +202,7 @@ def _gravity_turned(recording: Recording) -> Array | None:
     return np.asarray(turned)
 
 
-def of_gravity(recording: Recording, turned: Array, channels: Sequence[Channel]) -> Channel:
+def of_gravity(recording: Recording, turned: Values, channels: Sequence[Channel]) -> Channel:
     """Return what gravity says, with the sign of the gyroscope, or of that channel that it is most like."""
     found = [(_alike(turned, c.turned), c.name == "gyroscope") for c in channels]
     sure = [f for f in found if f[1] and abs(f[0]) > OPPOSITE] or found
@@ -214,7 +211,7 @@ def of_gravity(recording: Recording, turned: Array, channels: Sequence[Channel])
     return replace(_of_turned("gravity", recording, sign * turned), noise=noise)
 
 
-def ratio_quartiles(one: Array, other: Array, cut: int, least: float) -> Array:
+def ratio_quartiles(one: Values, other: Values, cut: int, least: float) -> Values:
     """Return the weighted quartiles of the ratios of (n,) or (n, k) values to a channel: (3,) or (3, k) array.
 
     The weights ``|other|`` are cut off at their (1 / cut) largest value; ratios below ``least`` of that are left out.
@@ -229,13 +226,13 @@ def ratio_quartiles(one: Array, other: Array, cut: int, least: float) -> Array:
     return np.take_along_axis(ratio, np.take_along_axis(order, places, axis=0), axis=0)
 
 
-def largest_but(size: Array, cut: int) -> float:
+def largest_but(size: Values, cut: int) -> float:
     """Return the value that (1 / cut) of all reach."""
     place = max(len(size) // cut, 1)
     return float(np.partition(size, -place)[-place])
 
 
-def slopes_of(y: Array, rate: Array) -> list[tuple[float, float] | None]:
+def slopes_of(y: Values, rate: Values) -> list[tuple[float, float] | None]:
     """Return K and b of ``y = K rate + b`` for each axis of a gyroscope; None where the rate hardly changes."""
     dr = rate - median(rate)
     if largest_but(np.abs(dr), 100) < LEAST_RATE_DPS:
@@ -245,7 +242,7 @@ def slopes_of(y: Array, rate: Array) -> list[tuple[float, float] | None]:
     return [(K, b) if K != 0.0 else None for K, b in zip(gain.tolist(), bias.tolist(), strict=True)]
 
 
-def rate_of_turn(recording: Recording) -> Array | None:
+def rate_of_turn(recording: Recording) -> Values | None:
     """Return the table's rate at the samples, by its rate, else by its angle: (n,) array, deg/s."""
     if recording.table_rate is not None:
         return recording.table_rate

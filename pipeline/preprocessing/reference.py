@@ -53,12 +53,9 @@ from pipeline.records import Note
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.preprocessing.evidence import Channel
-    from pipeline.records import Recording
+    from pipeline.records import Recording, Values
 
-    Array = NDArray[np.float64]
 
 FEWEST = 32  # samples, two short stretches
 HALF = (
@@ -139,7 +136,7 @@ class _Gyroscope:
 
     def __init__(self, turns: Sequence[Recording]) -> None:
         self.slopes: dict[str, list[tuple[float, float] | None]] = {}  # of each turn: gain and bias of each axis
-        found: list[tuple[int, float, Array, Array]] = []  # axis, usual fastest rate, gain and bias
+        found: list[tuple[int, float, Values, Values]] = []  # axis, usual fastest rate, gain and bias
         for recording in turns:
             rate = rate_of_turn(recording)
             if rate is None or recording.gyroscope is None:
@@ -157,7 +154,7 @@ class _Gyroscope:
                 self.matrix[:, axis] = max(fitting, key=lambda f: f[1])[2]
         self.bias = np.median([bias for *_, bias in found], axis=0) if found else None
 
-    def along(self, recording: Recording, axis: int) -> Array | None:
+    def along(self, recording: Recording, axis: int) -> Values | None:
         """Return the rate about a turn axis: (n,) array, deg/s; its bias is that of this recording."""
         rate, slopes = rate_of_turn(recording), self.slopes.get(recording.name)
         if recording.gyroscope is None or rate is None or slopes is None:
@@ -172,7 +169,7 @@ class _Gyroscope:
         bias = np.median(reading - gain * rate) if self.bias is None else self.bias[axis]
         return np.asarray((reading - float(bias)) / gain)
 
-    def vector(self, recording: Recording) -> Array | None:
+    def vector(self, recording: Recording) -> Values | None:
         """Return the angular rate: (n, 3) array, deg/s; None where no turn tells the bias."""
         if recording.gyroscope is None or self.bias is None:
             return None
@@ -225,7 +222,7 @@ def _compare(recording: Recording, channels: Sequence[Channel], limits: Limits) 
     return notes, delay
 
 
-def _check_directions(recording: Recording, attitude: Array, vector: Array, limits: Limits) -> None:
+def _check_directions(recording: Recording, attitude: Values, vector: Values, limits: Limits) -> None:
     """Refuse an attitude whose rotation has another direction in the body than the gyroscope's."""
     turned = spin(attitude) / np.diff(recording.time)[:, None]
     seen = 0.5 * (vector[1:] + vector[:-1])
@@ -274,7 +271,7 @@ def delay_of(recording: Recording, channels: Sequence[Channel], limits: Limits) 
     return found
 
 
-def _variances(fixed: Array, moved: Array) -> Array:
+def _variances(fixed: Values, moved: Values) -> Values:
     """Return the variance of the difference to (n,) values of each n successive ones of (m,): (m - n + 1,) array."""
     n, one, two = len(fixed), fixed - fixed.mean(), moved - moved.mean()
     total, squares = (np.append(0.0, np.cumsum(v)) for v in (two, two * two))
@@ -311,7 +308,7 @@ def check_delays(found: Sequence[tuple[Recording, Delay]], limits: Limits) -> No
     )
 
 
-def _of_one_clock(intervals: Array, limits: Limits) -> bool:
+def _of_one_clock(intervals: Values, limits: Limits) -> bool:
     """Return whether one offset and one clock explain (r, 4) first and last times, least and largest delays, s."""
     start, end, low, high = intervals.T
     run_off = np.linspace(-limits.clock, limits.clock, CLOCKS)[:, None, None] * np.stack([start, end])
@@ -320,7 +317,7 @@ def _of_one_clock(intervals: Array, limits: Limits) -> bool:
     return bool(np.any(least <= most))
 
 
-def _thinned(first: Channel, other: Channel, recording: Recording) -> tuple[float, Array, Array]:
+def _thinned(first: Channel, other: Channel, recording: Recording) -> tuple[float, Values, Values]:
     """Return the step, s, and the mean rates of two channels over steps of about a twentieth of a second at least."""
     one, two = (c.low if c.of_intervals else 0.5 * (c.low[1:] + c.low[:-1]) for c in (first, other))
     known = np.isfinite(one) & np.isfinite(two)
@@ -332,7 +329,7 @@ def _thinned(first: Channel, other: Channel, recording: Recording) -> tuple[floa
     return size * recording.interval, one, two
 
 
-def _interval(squares: Array, room: float, steps: int) -> tuple[float, float, float] | None:
+def _interval(squares: Values, room: float, steps: int) -> tuple[float, float, float] | None:
     """Return the place of the minimum, and of the first and the last delay that the steps do not exclude.
 
     None where they exclude neither the first nor the last of all delays tried.
@@ -345,7 +342,7 @@ def _interval(squares: Array, room: float, steps: int) -> tuple[float, float, fl
     return best, min(best, float(open_to[0])), max(best, float(open_to[-1]))
 
 
-def _nearest_minimum(squares: Array, room: float) -> float:
+def _nearest_minimum(squares: Values, room: float) -> float:
     """Return the place, nearest to the middle, of a minimum that is not much above the least: equal steps repeat.
 
     Between the samples a minimum lies where the parabola through the least square and its neighbours is least.

@@ -27,12 +27,9 @@ from pipeline.records import Note, median
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.preprocessing.evidence import Channel, Limits
-    from pipeline.records import Recording
+    from pipeline.records import Index, Recording, Values
 
-    Array = NDArray[np.float64]
 
 BY_NOISE = 10.0  # standard deviations, as of disturbances (pipeline.io.disturbances)
 BENDS = 3.0  # of a move as long as one interval, whose second difference shows a quarter of its rate
@@ -68,7 +65,7 @@ class Comparison:
         note = self._worst_row(claim, others, doubt)
         return (False, note) if note else None
 
-    def _rows(self, claim: Channel, other: Channel, *, alone: bool) -> tuple[Array, Array]:
+    def _rows(self, claim: Channel, other: Channel, *, alone: bool) -> tuple[Values, Values]:
         """Return by how much each value is beyond what another channel allows, grossly and by noise: (m,) arrays."""
         limits, of_sensor = self.limits, other.name in OF_SENSOR
         reach = max(int(np.ceil(limits.late_s / self.interval)), 1) if of_sensor else 1
@@ -91,7 +88,7 @@ class Comparison:
             gross, stated = off - gross, off - stated
         return np.where(np.isfinite(gross), gross, -np.inf), np.where(np.isfinite(stated), stated, -np.inf)
 
-    def _worst_row(self, claim: Channel, others: list[Channel], excess: Sequence[Array]) -> Note | None:
+    def _worst_row(self, claim: Channel, others: list[Channel], excess: Sequence[Values]) -> Note | None:
         least = np.min(excess, axis=0)
         rows = np.flatnonzero(least > 0.0)
         if not rows.size:
@@ -146,7 +143,7 @@ class Comparison:
                 return self._note(message, rows.size, first, last)
         return None
 
-    def _sums(self, channel: Channel, starts: NDArray[np.intp]) -> tuple[Array, Array, Array, Array]:
+    def _sums(self, channel: Channel, starts: Index) -> tuple[Values, Values, Values, Values]:
         """Return the angle turned, its total, the square of what bends leave and the range of the rate, by stretch."""
         turned, bend = np.where(self.known, channel.turned, 0.0), np.zeros(len(self.dt))
         rate = np.where(self.known, channel.low if channel.of_intervals else channel.low[1:], 0.0)
@@ -166,7 +163,7 @@ class Comparison:
         return Note("N-REFERENCE", count, 0, 0, message, float(t[first]), float(t[last]))
 
 
-def _near(other: Channel, claim: Channel, reach: int) -> tuple[Array, Array, Array]:
+def _near(other: Channel, claim: Channel, reach: int) -> tuple[Values, Values, Values]:
     """Return smallest and largest value, and largest second difference, of a channel near each value of another."""
     m, n = len(other.low), len(claim.low)
     before, after = reach, reach
@@ -187,7 +184,7 @@ def _near(other: Channel, claim: Channel, reach: int) -> tuple[Array, Array, Arr
     return middle, middle, bend
 
 
-def _slide(values: Array, before: int, after: int, count: int, better: np.ufunc) -> Array:
+def _slide(values: Values, before: int, after: int, count: int, better: np.ufunc) -> Values:
     """Return minimum or maximum of the values from ``k - before`` to ``k + after``, by doubling: (count,) array."""
     width, have = before + after + 1, 1
     beyond = np.inf if better is np.minimum else -np.inf

@@ -38,13 +38,10 @@ from pipeline.preprocessing.evidence import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.errors import IngestError
     from pipeline.preprocessing.evidence import Limits
-    from pipeline.records import Recording
+    from pipeline.records import Mask, Recording, Values
 
-    Array = NDArray[np.float64]
     Units = Sequence[tuple[float, str]]
 
 BLOCKS = 96  # of a recording, so that each holds a part of a turn
@@ -123,7 +120,7 @@ def check_scale_of_turn(recording: Recording, limits: Limits) -> None:
             raise _wrong_time(recording, limits, factor, "the gyroscope's readings sum up to")
 
 
-def _turned(recording: Recording) -> tuple[Array | None, ...]:
+def _turned(recording: Recording) -> tuple[Values | None, ...]:
     """Return the angle turned in each block of a turn by angle, rate, gyroscope and gravity: (96,) arrays, deg."""
     found = {c.name: c.turned for c in of_table(recording)}
     gyro = None
@@ -136,7 +133,7 @@ def _turned(recording: Recording) -> tuple[Array | None, ...]:
     return tuple(map(_in_blocks, every))
 
 
-def check_scale_of_motion(recording: Recording, size: Array | None, limits: Limits) -> None:
+def check_scale_of_motion(recording: Recording, size: Values | None, limits: Limits) -> None:
     """Refuse held-out motion whose rate, attitude and gyroscope (its calibrated ``size``) contradict each other."""
     found = {c.name: _in_blocks(c.turned) for c in of_table(recording)}
     rate, attitude = found.get("table_rate"), found.get("table_attitude")
@@ -196,7 +193,7 @@ def doubt_of_scale(recording: Recording, limits: Limits) -> str | None:
     )
 
 
-def _against_phase(recording: Recording, steps: Array, even: NDArray[np.bool_]) -> tuple[float, float] | None:
+def _against_phase(recording: Recording, steps: Values, even: Mask) -> tuple[float, float] | None:
     """Return the slope of the summed rate in gravity's phase, and its standard uncertainty."""
     turned, sizes = gravity_turned(recording), np.abs(steps)
     if turned is None or float(sizes[even].sum()) < MOSTLY_EVEN * float(sizes.sum()):
@@ -228,7 +225,7 @@ def check_intervals(recordings: Sequence[Recording], limits: Limits) -> None:
             )
 
 
-def _in_blocks(turned: Array | None) -> Array | None:
+def _in_blocks(turned: Values | None) -> Values | None:
     """Return the angle turned in each block of a recording: (96,) array, deg."""
     if turned is None:
         return None
@@ -236,7 +233,7 @@ def _in_blocks(turned: Array | None) -> Array | None:
     return np.asarray(np.add.reduceat(turned, starts))
 
 
-def _ratio(one: Array | None, other: Array | None) -> _Ratio | None:
+def _ratio(one: Values | None, other: Values | None) -> _Ratio | None:
     """Return the ratio of two channels over the blocks in which the other turned; None where it did not."""
     if one is None or other is None:
         return None

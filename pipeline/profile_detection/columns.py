@@ -19,7 +19,7 @@ from pipeline.io.units import BRACKETS, CHANNELS, SPELLINGS, TRIADS, UNITS, unit
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
+    from pipeline.records import Values
 
     Triad = tuple[int, int, int]
 
@@ -268,7 +268,7 @@ class TextLayout:
     header: bool
     comment: str | None
     names: list[str]
-    numbers: dict[int, NDArray[np.float64]]
+    numbers: dict[int, Values]
     rate_hz: float | None
     rate_line: str
     odd_rows: int
@@ -330,7 +330,7 @@ def _names(lines: list[str], start: int, separator: str) -> tuple[list[str], int
     return _numbered(width), start, comment
 
 
-def _numbers(rows: list[list[str]], decimal: str) -> dict[int, NDArray[np.float64]]:
+def _numbers(rows: list[list[str]], decimal: str) -> dict[int, Values]:
     out = {}
     for index, cells in enumerate(zip(*rows, strict=True)):
         texts = [c.replace(",", ".") for c in cells] if decimal == "," else cells

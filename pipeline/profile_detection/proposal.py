@@ -33,10 +33,9 @@ from pipeline.profile_detection.unit_guesses import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.io.gravity_rotation import Move
     from pipeline.profile_detection.columns import TextLayout
+    from pipeline.records import Values
 
 UNITS_OF = {"accelerometer": ("g", "mg", "m/s^2"), "gyroscope": ("deg/s", "rad/s")}
 Entries = dict[str, dict[str, Any]]
@@ -187,7 +186,7 @@ def _csv_section(layout: TextLayout) -> dict[str, Any]:
     }
 
 
-def _time(parts: list[Columns], proposal: Proposal) -> NDArray[np.float64] | None:
+def _time(parts: list[Columns], proposal: Proposal) -> Values | None:
     """Propose where the time comes from, and return it in s; None where it is not known."""
     first = parts[0].layout
     if parts[0].arrival is not None and parts[0].counter is not None:
@@ -214,7 +213,7 @@ def _time(parts: list[Columns], proposal: Proposal) -> NDArray[np.float64] | Non
     return None
 
 
-def _counted(columns: Columns, counter: int, proposal: Proposal) -> NDArray[np.float64] | None:
+def _counted(columns: Columns, counter: int, proposal: Proposal) -> Values | None:
     """Propose a counter of samples as time, at the mean rate of times of arrival that scatter beside it."""
     layout, rate = columns.layout, None
     key, count = layout.key(counter), layout.numbers[counter]
@@ -232,9 +231,7 @@ def _counted(columns: Columns, counter: int, proposal: Proposal) -> NDArray[np.f
     return None if rate is None else (count - count[0]) / rate
 
 
-def _moves(
-    force: NDArray[np.float64] | None, rate: NDArray[np.float64], time_s: NDArray[np.float64] | None, *, steady: bool
-) -> tuple[list[Move], str]:
+def _moves(force: Values | None, rate: Values, time_s: Values | None, *, steady: bool) -> tuple[list[Move], str]:
     """Return the moves in which gravity turns, and why there are none."""
     if force is None:
         return [], "no accelerometer beside it to tell the unit by"
@@ -244,7 +241,7 @@ def _moves(
     return moves, "" if moves else "no move between rests rotates gravity, which would show the unit"
 
 
-def _by_table(columns: Columns, rate: NDArray[np.float64]) -> Guess | None:
+def _by_table(columns: Columns, rate: Values) -> Guess | None:
     """Return what the table's rate in the same rows says of the gyroscope's unit."""
     if "table_rate" not in columns.others:
         return None
@@ -254,7 +251,7 @@ def _by_table(columns: Columns, rate: NDArray[np.float64]) -> Guess | None:
     return rate_unit_by_table(rate, columns.layout.numbers[index] * multiplier / divisor)
 
 
-def _readings(sensor: str, parts: list[Columns]) -> NDArray[np.float64] | None:
+def _readings(sensor: str, parts: list[Columns]) -> Values | None:
     for columns in parts:
         if sensor in columns.triads:
             return np.column_stack([columns.layout.numbers[i] for i in columns.triads[sensor]])

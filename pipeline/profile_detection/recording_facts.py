@@ -17,9 +17,7 @@ from pipeline.signal.rests import rests_from_table, runs
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
-
-    from pipeline.records import Note, Recording
+    from pipeline.records import Note, Recording, Values
 
 ENOUGH = 500_000  # samples that rests and moves are looked for in
 FEWEST_SAMPLES = 3  # of a rest, for a variance
@@ -87,7 +85,7 @@ def _rests(recording: Recording) -> list[tuple[int, int]]:
     return rests_of(force[:ENOUGH], recording.interval)
 
 
-def _sensor(name: str, readings: NDArray[np.float64], rests: Sequence[tuple[int, int]]) -> str:
+def _sensor(name: str, readings: Values, rests: Sequence[tuple[int, int]]) -> str:
     unit = SENSOR_UNITS[name]
     spans = [f"{a} {_number(v.min())} to {_number(v.max())}" for a, v in zip(AXES, readings.T, strict=True)]
     text = f"{', '.join(spans)} {unit}"
@@ -161,7 +159,7 @@ def _clipping(recording: Recording, sensor: Mapping[str, Any]) -> str:
     return "; ".join([*found, *([f"{stuck} rows stuck"] if stuck else [])])
 
 
-def _plateaus(values: NDArray[np.float64]) -> list[str]:
+def _plateaus(values: Values) -> list[str]:
     """Return in words where a channel stays at its largest or smallest value, as one that is clipped does."""
     same = values[1:] == values[:-1]
     if same.mean() > 0.5 or equal_share(same) > 0.5:

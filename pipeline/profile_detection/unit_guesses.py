@@ -18,9 +18,8 @@ from pipeline.io.units import COUNTS, DEGREES, STANDARD_GRAVITY, UNITS
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.io.gravity_rotation import Move
+    from pipeline.records import Values
 
 UNKNOWN = "???"
 FORCE_UNITS = {"g": 1.0, "m/s^2": STANDARD_GRAVITY, "mg": 1000.0}
@@ -53,15 +52,15 @@ class Guess:
     entry: dict[str, Any]
     evidence: str
     second_s: float | None = None
-    centre: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    centre: Values = field(default_factory=lambda: np.zeros(3))
 
 
-def whole(values: NDArray[np.float64]) -> bool:
+def whole(values: Values) -> bool:
     """Return whether numbers are integers."""
     return bool(np.all(values == np.rint(values)))
 
 
-def time_unit(values: NDArray[np.float64], stated: str | None, why: str) -> Guess:
+def time_unit(values: Values, stated: str | None, why: str) -> Guess:
     """Return the unit of a time."""
     steps = np.diff(values)
     step = float(np.median(steps[steps > 0])) if np.any(steps > 0) else 0.0
@@ -87,7 +86,7 @@ def time_unit(values: NDArray[np.float64], stated: str | None, why: str) -> Gues
     return Guess({"unit": UNKNOWN}, f"steps of {step:g} suit no unit of time: s, ms, us or ns?")
 
 
-def force_unit(force: NDArray[np.float64], interval_s: float) -> Guess:
+def force_unit(force: Values, interval_s: float) -> Guess:
     """Return the unit of an (n, 3) specific force."""
     rests = rests_of(force, interval_s)
     means = np.array([force[a:b].mean(axis=0) for a, b in rests or [(0, len(force))]])
@@ -104,7 +103,7 @@ def force_unit(force: NDArray[np.float64], interval_s: float) -> Guess:
     return replace(guess, centre=centre)
 
 
-def _counts_per_g(rests: int, centre: NDArray[np.float64], radius: float, size: float, where: str) -> Guess:
+def _counts_per_g(rests: int, centre: Values, radius: float, size: float, where: str) -> Guess:
     """Return counts per g: the usual number that is near, else the radius of the sphere through the rests."""
     middle = float(np.mean(centre))
     offset = min(OFFSETS, key=lambda o: abs(middle - o))
@@ -124,7 +123,7 @@ def _counts_per_g(rests: int, centre: NDArray[np.float64], radius: float, size: 
     return Guess(entry, f"whole numbers, {where}: counts, {size:.3g} a g (no usual number)")
 
 
-def sphere(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+def sphere(points: Values) -> tuple[Values, float]:
     """Return centre and radius of the sphere through points, by linear least squares."""
     A = np.column_stack([2 * points, np.ones(len(points))])
     solution = np.linalg.lstsq(A, np.sum(points**2, axis=1), rcond=None)[0]
@@ -132,7 +131,7 @@ def sphere(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
     return centre, float(np.sqrt(max(solution[3] + centre @ centre, 0.0)))
 
 
-def rate_unit(rate: NDArray[np.float64], moves: Sequence[Move], why_none: str, *, timed: bool) -> Guess:
+def rate_unit(rate: Values, moves: Sequence[Move], why_none: str, *, timed: bool) -> Guess:
     """Return the unit of (n, 3) angular rates by the ``moves`` between rests in which gravity turns (``why_none``).
 
     Where the time is not known (``timed``), its unit is a hundredth of an interval, and only the product of scale and
@@ -150,7 +149,7 @@ def rate_unit(rate: NDArray[np.float64], moves: Sequence[Move], why_none: str, *
     return Guess({"unit": UNKNOWN}, f"up to {largest:.4g}; {why_none or 'the time is not known'}: deg/s or rad/s?")
 
 
-def rate_unit_by_table(rate: NDArray[np.float64], table_rate: NDArray[np.float64]) -> Guess | None:
+def rate_unit_by_table(rate: Values, table_rate: Values) -> Guess | None:
     """Return the unit of (n, 3) angular rates by the table's, deg/s, in the same rows; None: they do not follow it."""
     table = table_rate - table_rate.mean()
     power = float(table @ table)
