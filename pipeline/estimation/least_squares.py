@@ -10,9 +10,8 @@ where
 
 Columns are scaled to unit norm d, so that units do not matter, and factorised as ``A = Q U diag(s) V^T diag(d)``; the
 singular values s show what the data determine. The nonlinear problem is solved by Gauss-Newton steps, halved while they
-do not help. Where they fail, a trust region approaches the minimum from the same start (Branch, Coleman & Li, SIAM J.
-Sci. Comput. 21, 1999). A success flag proves nothing; the largest cosine between the residual and a column of the
-Jacobian does: it is zero at a minimum (Bates & Watts, Nonlinear Regression Analysis, 1988, section 2.2.3).
+do not help. A success flag proves nothing; the largest cosine between the residual and a column of the Jacobian does:
+it is zero at a minimum (Bates & Watts, Nonlinear Regression Analysis, 1988, section 2.2.3).
 """
 
 from __future__ import annotations
@@ -33,7 +32,6 @@ if TYPE_CHECKING:
 
 RANK_TOLERANCE = 1e-11  # of the largest singular value of unit columns: 1e5 times the rounding of a double
 PART_OF_NULL_SPACE = 1e-3  # of a unit vector of it, from which on a parameter is named as not determined
-COMPLEX_STEP = 1e-30  # there is no difference, so that nothing cancels (Squire & Trapp, SIAM Review 40, 1998)
 COSINE_AT_MINIMUM = 1e-7  # the root of rounding, about 1e-8, with a factor for sums over many residuals
 STEP_AT_MINIMUM = 1e-10  # relative; well below any uncertainty, well above rounding
 ROUNDING = 1e-10  # relative, of a sum of squares of small differences of large values
@@ -121,16 +119,6 @@ class LeastSquaresResult:
         return np.sqrt(np.diag(self.covariance))
 
 
-def complex_step_jacobian(function: Function) -> Function:
-    """Return the derivative of an analytic function (no abs, no comparison), ``Im f(x + i h e_j) / h``."""
-
-    def jacobian(x: Values) -> Values:
-        columns = [function(x + 1j * COMPLEX_STEP * e) for e in np.eye(len(x))]
-        return np.stack([np.imag(column) / COMPLEX_STEP for column in columns], axis=1)
-
-    return jacobian
-
-
 def solve_linear(
     A: Values, y: Values, sigma: float | None = None, names: Sequence[str] | None = None
 ) -> LeastSquaresResult:
@@ -150,72 +138,43 @@ def solve_linear(
 def solve_nonlinear(
     residuals: Function,
     start: Values,
-    jacobian: Function | None = None,
+    jacobian: Function,
     *,
     sigma: float | None = None,
     names: Sequence[str] | None = None,
     iterations: int = 50,
-    far: bool = True,
 ) -> LeastSquaresResult:
-    """Minimise ``|residuals(x)|``.
+    """Minimise ``|residuals(x)|`` by Gauss-Newton steps from a start nearby.
 
-    ``residuals``: (p,) to (n,). ``start``: (p,). ``jacobian``: (p,) to (n, p). None differentiates by a complex step,
-    for which ``residuals`` must be analytic. ``sigma``, ``names``: as in ``solve_linear``. ``iterations``: limit on the
-    number of Gauss-Newton steps. ``far``: whether the start may be far off, so that a trust region is tried where
-    Gauss-Newton steps fail. Where the certificate fails, ``converged`` is False; that is an outcome, no exception.
-    Raises ``NotObservableError`` if the data do not determine all parameters.
+    ``residuals``: (p,) to (n,). ``start``: (p,). ``jacobian``: (p,) to (n, p). ``sigma``, ``names``: as in
+    ``solve_linear``. ``iterations``: limit on the number of steps. Where the certificate fails, ``converged`` is False;
+    that is an outcome, no exception. Raises ``NotObservableError`` if the data do not determine all parameters.
     """
-    jacobian = jacobian or complex_step_jacobian(residuals)
     with np.errstate(all="ignore"):  # steps that overflow do not lower the sum of squares
-        first = residuals(start), jacobian(start)
-        if not all(np.all(np.isfinite(values)) for values in first):
+        x = np.array(start, float)
+        r, J = residuals(x), jacobian(x)
+        if not (np.all(np.isfinite(r)) and np.all(np.isfinite(J))):
             raise NotObservableError(
                 "residuals or their derivatives are not finite at the start: give a start nearer the solution, or "
                 "check the readings for values that are not finite"
             )
-        x, r, J, factors = _gauss_newton(residuals, jacobian, np.array(start, float), iterations)
-        if far and (factors.rank < len(x) or not _certified(x, r, J, factors)):
-            from scipy.optimize import least_squares  # noqa: PLC0415  (0.5 s that only starts from far off need)
-
-            approach = least_squares(
-                residuals,
-                start,
-                jac=jacobian,
-                method="trf",
-                x_scale="jac",
-                ftol=1e-15,
-                xtol=1e-15,
-                gtol=1e-15,
-                max_nfev=100 * iterations,
-            )
-            found = _gauss_newton(residuals, jacobian, approach.x, iterations)
-            if found[3].rank == len(x) and _certified(*found):  # else the way along a valley has no end
-                x, r, J, factors = found
+        factors, size = ScaledColumns.of(J), np.inf
+        for _ in range(iterations):
+            x_new, r_new = _halved(residuals, x, r, -factors.solve(r))
+            if x_new is None or r_new is None:
+                break
+            J_new = jacobian(x_new)
+            if not np.all(np.isfinite(J_new)):
+                break
+            small = bool(np.all(np.abs(x_new - x) <= STEP_AT_MINIMUM * np.abs(x_new)))
+            size, before = float(np.linalg.norm((x_new - x) * factors.scale)), size
+            stalled = size >= before and r_new @ r_new >= (1.0 - ROUNDING) * (r @ r)
+            x, r, J = x_new, r_new, J_new
+            factors = ScaledColumns.of(J)
+            if small or stalled:
+                break
     factors.require_full_rank(names)
     return _result(x, r, J, factors, sigma)
-
-
-def _gauss_newton(
-    residuals: Function, jacobian: Function, x: Values, iterations: int
-) -> tuple[Values, Values, Values, ScaledColumns]:
-    """Return x, r, J and its factors after Gauss-Newton steps, each halved while it does not help."""
-    r, J = residuals(x), jacobian(x)
-    factors, size = ScaledColumns.of(J), np.inf
-    for _ in range(iterations):
-        x_new, r_new = _halved(residuals, x, r, -factors.solve(r))
-        if x_new is None or r_new is None:
-            break
-        J_new = jacobian(x_new)
-        if not np.all(np.isfinite(J_new)):
-            break
-        small = bool(np.all(np.abs(x_new - x) <= STEP_AT_MINIMUM * np.abs(x_new)))
-        size, before = float(np.linalg.norm((x_new - x) * factors.scale)), size
-        stalled = size >= before and r_new @ r_new >= (1.0 - ROUNDING) * (r @ r)
-        x, r, J = x_new, r_new, J_new
-        factors = ScaledColumns.of(J)
-        if small or stalled:
-            break
-    return x, r, J, factors
 
 
 def _halved(residuals: Function, x: Values, r: Values, step: Values) -> tuple[Values | None, Values | None]:
@@ -261,14 +220,10 @@ def _cosine(r: Values, J: Values, factors: ScaledColumns) -> float:
     return float(np.max(np.abs(J.T @ r) / factors.scale) / norm) if norm > 0 else 0.0
 
 
-def _certified(x: Values, r: Values, J: Values, factors: ScaledColumns) -> bool:
-    """Return whether the residual is orthogonal to the columns, or the next step below the rounding of x."""
-    settled = bool(np.all(np.abs(factors.solve(r)) <= STEP_AT_MINIMUM * np.abs(x)))
-    return settled or _cosine(r, J, factors) <= COSINE_AT_MINIMUM
-
-
 def _result(x: Values, r: Values, J: Values, factors: ScaledColumns, sigma: float | None) -> LeastSquaresResult:
     dof = len(r) - len(x)
+    cosine = _cosine(r, J, factors)
+    settled = bool(np.all(np.abs(factors.solve(r)) <= STEP_AT_MINIMUM * np.abs(x)))
     if sigma is None:
         sigma = float(np.linalg.norm(r)) / np.sqrt(dof) if dof > 0 else 0.0
     return LeastSquaresResult(
@@ -278,6 +233,6 @@ def _result(x: Values, r: Values, J: Values, factors: ScaledColumns, sigma: floa
         degrees_of_freedom=dof,
         rank=factors.rank,
         condition=factors.condition,
-        cosine=_cosine(r, J, factors),
-        converged=_certified(x, r, J, factors),
+        cosine=cosine,
+        converged=settled or cosine <= COSINE_AT_MINIMUM,
     )

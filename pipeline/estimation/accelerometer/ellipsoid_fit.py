@@ -125,7 +125,7 @@ def _weighted_fit(y: Values, target: Values, weight: Values, start: Values, free
         return weight[:, None] * derivative_of(y, _insert(start, free, x))[:, free]
 
     names = [name for name, is_free in zip(NAMES, free, strict=True) if is_free]
-    return solve_nonlinear(residuals, start[free], jacobian, sigma=1.0, names=names, far=False)
+    return solve_nonlinear(residuals, start[free], jacobian, sigma=1.0, names=names)
 
 
 def _insert(values: Values, free: Mask, x: Values) -> Values:
