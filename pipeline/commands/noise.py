@@ -10,7 +10,7 @@ from pipeline.commands import parser_of
 from pipeline.commands.check import config_of_log
 from pipeline.errors import ConfigurationError
 from pipeline.estimation.noise_identification import identify_noise
-from pipeline.exports import export, formats
+from pipeline.exports import Subject, export, formats
 from pipeline.files import json_text, write_atomically
 from pipeline.io.ingest_settings import checks_of
 from pipeline.io.read import read_table, to_recording
@@ -66,7 +66,7 @@ def main(argv: Sequence[str]) -> int:
         if missing:
             raise ConfigurationError(f"the log holds no noise of the {' and '.join(missing)}: state --sensor", str(log))
         exported = {"sensor": known, "table": {"gravity_g": 1.0}}
-        (text,) = export(target.name, document, exported).values()
+        (text,) = export(target.name, Subject(document, exported)).values()
     write_atomically(target, text)
     print(f"written: {target}", file=sys.stderr)
     return 0

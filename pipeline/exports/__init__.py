@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -101,6 +101,32 @@ def formats() -> dict[str, tuple[Format, Template]]:
     return found
 
 
+@dataclass(frozen=True)
+class Subject:
+    """A unit to export: its documents, as in ``export_all``, and what several formats need of them."""
+
+    document: JSON
+    settings: JSON
+    validation: JSON | None = None
+    diagnosis: JSON | None = None
+
+    @cached_property
+    def calibrations(self) -> dict[str, SensorCalibration]:
+        """Of the sensors that are calibrated."""
+        return {s: SensorCalibration.from_json(s, self.document[s]) for s in SENSORS if self.document.get(s)}
+
+    @cached_property
+    def noise_remarks(self) -> list[str]:
+        """Origin and intervals of the noise parameters."""
+        return noise_remarks(self.settings, self.document, self.diagnosis)
+
+    def sensors(self, declared: Format) -> dict[str, ExportedSensor]:
+        """Return the calibrated sensors in the units of a format."""
+        sheets = self.settings.get("sensor") or {}
+        units = declared.units
+        return {s: ExportedSensor(c, units[s], sheets.get(s) or {}) for s, c in self.calibrations.items() if s in units}
+
+
 def export_all(
     calibration: JSON, settings: JSON, folder: Path, validation: JSON | None = None, diagnosis: JSON | None = None
 ) -> list[Path]:
@@ -120,63 +146,42 @@ def export_all(
         ``diagnoses/<unit>.json``, for the effective noise.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    written = []
-    for name in formats():
-        for file, text in export(name, calibration, settings, validation, diagnosis).items():
-            write_atomically(folder / file, text)
-            written.append(folder / file)
-    return written
+    subject = Subject(calibration, settings, validation, diagnosis)
+    texts = {file: text for name in formats() for file, text in export(name, subject).items()}
+    for file, text in texts.items():
+        write_atomically(folder / file, text)
+    return [folder / file for file in texts]
 
 
-def export(
-    name: str, calibration: JSON, settings: JSON, validation: JSON | None = None, diagnosis: JSON | None = None
-) -> dict[str, str]:
+def export(name: str, subject: Subject) -> dict[str, str]:
     """Return the files of one format, by name: none where it can hold nothing of this unit."""
     declared, template = formats()[name]
     parts = {
         file: replace(declared, units={s: declared.units[s]}, needs=[s]) for s, file in declared.files.items()
     } or {name: declared}
-    of_noise = noise_remarks(settings, calibration, diagnosis) if declared.noise else []
-    texts = {
-        file: _rendered(part, template, calibration, settings, validation=validation, of_noise=of_noise)
-        for file, part in parts.items()
-    }
+    texts = {file: _rendered(part, template, subject) for file, part in parts.items()}
     return {file: text for file, text in texts.items() if text is not None}
 
 
-def _rendered(
-    declared: Format,
-    template: Template,
-    document: JSON,
-    settings: JSON,
-    *,
-    validation: JSON | None,
-    of_noise: list[str],
-) -> str | None:
+def _rendered(declared: Format, template: Template, subject: Subject) -> str | None:
     """Return the text of a file, None where a sensor or its counts are missing."""
-    sheets = settings.get("sensor") or {}
-    sensors: dict[str, ExportedSensor] = {
-        s: ExportedSensor(SensorCalibration.from_json(s, document[s]), declared.units[s], sheets.get(s) or {})
-        for s in SENSORS
-        if s in declared.units and document.get(s)
-    }
+    sensors = subject.sensors(declared)
     without_counts = [s for s in declared.needs_counts if s in sensors and not sensors[s].counts]
     if without_counts or not set(declared.needs) <= set(sensors):
         return None
     return template.render(
         **{s: sensors.get(s) for s in SENSORS},
         sensors=sensors,
-        unit=document["unit"],
-        document=document,
-        settings=settings,
-        remarks=_remarks(declared, sensors, document, validation) + of_noise,
+        unit=subject.document["unit"],
+        document=subject.document,
+        settings=subject.settings,
+        remarks=_remarks(declared, sensors, subject) + (subject.noise_remarks if declared.noise else []),
     )
 
 
-def _remarks(
-    declared: Format, sensors: dict[str, ExportedSensor], document: JSON, validation: JSON | None
-) -> list[str]:
+def _remarks(declared: Format, sensors: dict[str, ExportedSensor], subject: Subject) -> list[str]:
     """Return what a reader of the file must know, a sentence or a line each."""
+    document = subject.document
     counts = {s: sensor.counts for s, sensor in sensors.items()}
     known = {"unit": document["unit"], "sensor": document["sensor"], "counts": counts, "sensors": [*sensors.values()]}
     lines = [line.format(**known) for line in declared.says] + (before_use(document) if declared.units else [])
@@ -199,7 +204,7 @@ def _remarks(
         declared.adds_with_temperature if any(x.follows_temperature for x in sensors.values()) else []
     )
     errors = declared.errors or ("With all of the calibration: {}." if partly else "The {}.")
-    of_these = [line for s in SENSORS for line in final_errors(validation, s) if s in declared.units]
+    of_these = [line for s in SENSORS for line in final_errors(subject.validation, s) if s in declared.units]
     return lines + [errors.format(line) for line in of_these]
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import ConfigurationError
-from pipeline.exports import export, formats
+from pipeline.exports import Subject, export, formats
 from pipeline.exports.reading import CALIBRATION, FoundCalibration, counts_of, read_any
 from pipeline.exports.sensors import FACTORS, ExportedSensor
 from pipeline.files import json_text, write_atomically
@@ -77,7 +77,7 @@ def convert(
         write_atomically(target, json_text(document))
         return [target], ["the noise densities and random walks"] if found.noise else []
     try:
-        texts = export(name, document, settings)
+        texts = export(name, Subject(document, settings))
     except KeyError as missing:
         raise ConfigurationError(
             f"{name} holds {missing.args[0]} of a sensor, which the input does not: state the sensor (--sensor NAME)"

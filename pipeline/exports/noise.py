@@ -22,7 +22,11 @@ from pipeline.model.calibration_file import FAST_S
 from pipeline.records import SENSORS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    Values = NDArray[np.float64]
 
 JSON = dict[str, Any]
 FACTORS = {"accelerometer": STANDARD_GRAVITY, "gyroscope": np.pi / 180.0}  # to m/s^2 and rad/s
@@ -98,25 +102,23 @@ def _figures(sensor: str, settings: Mapping[str, Any], document: Mapping[str, An
     out["walk_origin"] = converted or "for the bias wander of the sensor's configuration"
     if not axes:
         return out
-    whites = [value for terms in axes if (value := _white(terms))]
+    whites = [w for terms in axes if (w := _white(terms)) is not None]
     if whites:
-        out |= {"white": _rms(w[0] for w in whites), "white_interval": [_rms(w[k] for w in whites) for k in (1, 2)]}
+        out["white"], *out["white_interval"] = _rms(whites)
         out["white_origin"] = f"measured at rest ({found['source']}), root mean square of the axes"
     walks = [_walk(terms) for terms in axes]
-    seen = [w for w in walks if w]
-    limits = [terms["random_walk"].get("upper_limit") for terms, w in zip(axes, walks, strict=True) if not w]
+    seen = [w for w in walks if w is not None]
+    limits = [t["random_walk"].get("upper_limit") for t, w in zip(axes, walks, strict=True) if w is None]
     lesser = [least for limit in limits if (least := min((v for v in (limit, walk) if v), default=None)) is not None]
     if seen or lesser:
-        out["walk"] = _rms([*(w[0] for w in seen), *lesser])
-    if seen:
-        out["walk_origin"] = "measured at rest"
-        if lesser:
-            out["walk_origin"] += (
-                f" on {len(seen)} of {len(axes)} axes; on the others it is the lesser of the sensor's "
-            )
-            out["walk_origin"] += "configuration and the upper limit"
-        else:
-            out["walk_interval"] = [_rms(w[k] for w in seen) for k in (1, 2)]
+        out["walk"] = _rms([w[0] for w in seen] + lesser)
+    if seen and lesser:
+        out["walk_origin"] = (
+            f"measured at rest on {len(seen)} of {len(axes)} axes; on the others it is the lesser of the sensor's "
+            "configuration and the upper limit"
+        )
+    elif seen:
+        out |= {"walk_origin": "measured at rest", "walk_interval": _rms(seen)[1:]}
     elif lesser:
         most = f"{FACTORS[sensor] * max(v for v in limits if v):.3g} {SI[sensor]}/sqrt(s)"
         out["walk_origin"] = (
@@ -126,38 +128,34 @@ def _figures(sensor: str, settings: Mapping[str, Any], document: Mapping[str, An
     return out
 
 
-def _white(terms: JSON) -> tuple[float, float, float] | None:
-    """Return the white noise of an axis and its interval; None where none was seen."""
-    parts = [(terms["white"], 1.0)] if terms["white"]["value"] is not None else []
-    for part in terms["gauss_markov"]:
-        time = part["correlation_time_s"]["value"]
-        if time < FAST_S:
-            parts.append((part, np.sqrt(2.0 * time)))
-    return _sum(parts)
+def _white(terms: JSON) -> Values | None:
+    """Return the white noise of an axis and the ends of its interval, (3,); None where none was seen."""
+    processes = [(part, part["correlation_time_s"]["value"]) for part in terms["gauss_markov"]]
+    fast = [np.sqrt(2.0 * time) * _ends(part) for part, time in processes if time < FAST_S]
+    return _root_sum_square([*_seen(terms["white"]), *fast])
 
 
-def _walk(terms: JSON) -> tuple[float, float, float] | None:
-    """Return the walk of an axis and its interval; None where no slow term was seen."""
-    parts = [(terms["random_walk"], 1.0)] if terms["random_walk"]["value"] is not None else []
-    for part in terms["gauss_markov"]:
-        time = part["correlation_time_s"]["value"]
-        if time >= FAST_S:
-            parts.append((part, np.sqrt(2.0 / time)))
-    white, flicker = _white(terms), terms["bias_instability"]
-    if flicker["value"] is not None and white:
-        squares = {"value": flicker["value"] ** 2, "interval": [v**2 for v in flicker["interval"]]}
-        parts.append((squares, np.sqrt(3.0) * FLAT / white[0]))
-    return _sum(parts)
+def _walk(terms: JSON) -> Values | None:
+    """Return the walk of an axis and the ends of its interval, (3,); None where no slow term was seen."""
+    processes = [(part, part["correlation_time_s"]["value"]) for part in terms["gauss_markov"]]
+    slow = [np.sqrt(2.0 / time) * _ends(part) for part, time in processes if time >= FAST_S]
+    white = _white(terms)
+    flicker = [] if white is None else [np.sqrt(3.0) * FLAT / white[0] * b**2 for b in _seen(terms["bias_instability"])]
+    return _root_sum_square([*_seen(terms["random_walk"]), *slow, *flicker])
 
 
-def _sum(parts: list[tuple[JSON, float]]) -> tuple[float, float, float] | None:
-    """Return the root of the sum of squares of values and of the ends of their intervals, each times a factor."""
-    if not parts:
-        return None
-    value = _rms([f * p["value"] for p, f in parts]) * np.sqrt(len(parts))
-    low, high = (_rms([f * p["interval"][k] for p, f in parts]) * np.sqrt(len(parts)) for k in (0, 1))
-    return float(value), float(low), float(high)
+def _ends(term: JSON) -> Values:
+    """Return a term and the ends of its interval: (3,)."""
+    return np.array([term["value"], *term["interval"]], float)
 
 
-def _rms(values: Iterable[float]) -> float:
-    return float(np.sqrt(np.mean(np.square(list(values)))))
+def _seen(term: JSON) -> list[Values]:
+    return [] if term["value"] is None else [_ends(term)]
+
+
+def _root_sum_square(parts: list[Values]) -> Values | None:
+    return np.sqrt(np.sum(np.square(parts), axis=0)) if parts else None
+
+
+def _rms(values: Sequence[Any]) -> Any:  # noqa: ANN401  (numbers, or lists of them)
+    return np.sqrt(np.mean(np.square(values), axis=0)).tolist()
