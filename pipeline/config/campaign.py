@@ -169,7 +169,6 @@ def find_campaign(name: str) -> Path:
 
 
 def _of_run(name: str, overrides: Sequence[str]) -> Any:  # noqa: ANN401  (a setting's type is its own)
-    """Return a setting of the run."""
     value = default_of_run(name)
     for text in overrides:
         try:

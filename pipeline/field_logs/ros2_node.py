@@ -40,15 +40,13 @@ class MessageCalibrator:
     """Calibrates Imu messages one by one.
 
     ``needs_temperature``: whether an effect of the calibration follows it; messages before the first temperature are
-    then dropped, with one warning. A line through the past (memory ``smoothing``, s) bridges the time between
+    then dropped, with one warning. A line through the past (memory ``SMOOTHING_S``) bridges the time between
     temperatures. Time counts from the first message. Where stamps run backwards (a log that is played again), the
     memory of the samples before is cleared, with a warning.
     """
 
-    def __init__(
-        self, file: Path, warn: Callable[[str], Any], python_effects: Sequence[str] = (), smoothing: float = SMOOTHING_S
-    ) -> None:
-        self.compensation, self.warn, self.smoothing = load(file, python_effects), warn, smoothing
+    def __init__(self, file: Path, warn: Callable[[str], Any], python_effects: Sequence[str] = ()) -> None:
+        self.compensation, self.warn = load(file, python_effects), warn
         self.axes = {s: axis_matrix(m) for s, m in maps_of_log(read_calibration(file).get("log") or {}).items()}
         covariances = self.compensation.covariances
         self.covariances = {s: (c / FIELDS[s][2] ** 2).ravel().tolist() for s, c in covariances.items()}
@@ -59,7 +57,7 @@ class MessageCalibrator:
 
     def _start(self, first: int | None) -> None:
         """Forget the samples before; of the temperature, the last value stays."""
-        self.stream, self.line = self.compensation.stream(0.0), ExponentialRegression(self.smoothing)
+        self.stream, self.line = self.compensation.stream(0.0), ExponentialRegression(SMOOTHING_S)
         self.first, self.last = first, -1
         if self.warmth is not None:
             self._temperature_at(0.0, self.warmth)

@@ -119,7 +119,6 @@ class CsvLog:
         self.out.write(head.text(self._new_names(head.names)).encode())
 
     def _find(self, names: list[str], where: str) -> None:
-        """Find the columns of each signal."""
         for signal, channels in SIGNALS.items():
             wanted = [self.columns[c] for c in channels if c in self.columns]
             present = [c for c in wanted if _index(c, names) is not None]
@@ -140,7 +139,6 @@ class CsvLog:
             raise InputError(f"no column of a sensor; expected {expected}, got {', '.join(names)[:200]}; {told}", where)
 
     def _new_names(self, names: list[str]) -> list[str]:
-        """Return the names of the columns of the output."""
         new = list(names)
         for sensor in (s for s in SENSORS if s in self.places):
             for channel, i in zip(TRIADS[sensor], self.places[sensor], strict=True):
@@ -148,7 +146,6 @@ class CsvLog:
         return new
 
     def _cells(self, body: bytes, lines: Integers) -> list[pa.Array]:
-        """Return the cells of a block as columns of text."""
         try:
             table = self.layout.parse(body, dict.fromkeys(range(len(self.layout.names)), pa.string()))
         except pa.ArrowInvalid as error:
@@ -247,7 +244,6 @@ def _index(column: Column, names: list[str]) -> int | None:
 
 
 def _digits(values: Values, decimal: str) -> pa.Array:
-    """Return numbers as text, rounded to 1e-12."""
     text = pc.cast(to_arrow(np.round(values, DECIMALS) + 0.0), pa.string())
     return text if decimal == "." else pc.replace_substring(text, ".", decimal)
 

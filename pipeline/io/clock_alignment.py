@@ -227,7 +227,6 @@ def _linearised(
 
 
 def _standard_uncertainties(J: Values, e: Values, sensed: SensorSignals) -> Values:
-    """Return the standard uncertainties of offset and drift, by blocks of some seconds."""
     R = np.asarray(np.linalg.qr(J, mode="r"))
     inverse = np.linalg.lstsq(R, np.eye(2), rcond=None)[0]
     found: Values = np.linalg.norm(inverse, axis=1) * np.sqrt(np.mean(e**2))
@@ -237,7 +236,6 @@ def _standard_uncertainties(J: Values, e: Values, sensed: SensorSignals) -> Valu
 
 
 def _by_blocks(J: Values, e: Values, sensed: SensorSignals, covariance: Values, length: float) -> Values:
-    """Return the standard uncertainties from the scatter between blocks of a length (s)."""
     channels = sensed.readings.shape[1]
     starts = np.flatnonzero(np.diff(np.floor(sensed.time / length), prepend=-1.0))
     scores = np.add.reduceat((J * e[:, None]).reshape(channels, len(sensed.time), 2).sum(axis=0), starts)

@@ -106,7 +106,6 @@ def moves_of(knots: Values) -> list[tuple[float, float]]:
 
 
 def _as_log(table: ChannelTable, knots: Values) -> ChannelTable:
-    """Return a program as the log of a table."""
     own = np.arange(0.0, knots[-1, 0], STEP_S)
     angle, rate = at(knots, own)
     values = {"table_angle": angle, "table_rate": rate}

@@ -90,7 +90,6 @@ def _read_one(path: Path, settings: CsvFormat, checks: Checks) -> ChannelTable:
 
 
 def _joined(tables: Sequence[ChannelTable]) -> ChannelTable:
-    """Return the files of one recording as one, row by row."""
     first = tables[0]
     if len(tables) == 1:
         return first

@@ -19,7 +19,7 @@ import pyarrow as pa
 
 from pipeline.errors import IngestError
 from pipeline.io.quality_flags import REPAIRED
-from pipeline.io.timestamps import time_error
+from pipeline.io.timestamps import sorted_once, time_error
 from pipeline.io.units import UNITS
 from pipeline.records import Note
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from pipeline.io.csv_layout import Layout
     from pipeline.io.csv_rows import Rows
     from pipeline.io.ingest_settings import Checks, Column, CsvFormat
-    from pipeline.records import Index, Integers, Values
+    from pipeline.records import Integers, Values
 
 EXACT_BELOW_S = 1e6  # half a nanosecond is 2^-53 of 4.5e6 s
 LONGEST_S = 9.2e9  # int64 nanoseconds end at 292 years
@@ -122,23 +122,25 @@ def in_order(rows: Rows, time_ns: Integers, settings: CsvFormat, checks: Checks)
         rows, time_ns = _one_session(rows, time_ns, settings.session, tick_ns)
     if bool(np.all(np.diff(time_ns) > 0)):
         return rows, time_ns
-    time_ns, wraps = _unwrap(time_ns, tick_ns)
-    if wraps:
-        modulus, lines = wraps[0][1], [int(rows.lines[row]) for row, _ in wraps]
-        bits = next((b for b in (16, 24, 32) if round(2**b * tick_ns) == modulus), 32)
-        what = f"the time counter of {bits} bits started again at 0 (every {modulus / 1e9:.9g} s) and was counted on"
-        rows = replace(rows, notes=(*rows.notes, Note("N-WRAP", len(wraps), lines[0], lines[-1], what)))
+    rows, time_ns = _counted_on(rows, time_ns, tick_ns)
     back = np.flatnonzero(np.diff(time_ns) <= 0)
     if back.size == 0:
         return rows, time_ns
     first = int(back[0]) + 1
     error = time_error(time_ns, rows.place(first), first)
-    order = np.argsort(time_ns, kind="stable")
+    order, twice, same = sorted_once(time_ns, rows.numbers.values())
     displacement = int(np.abs(order - np.arange(len(order))).max())
     if displacement > LARGEST_DISPLACEMENT:
         raise error
     moved = np.flatnonzero(order != np.arange(len(order)))
-    twice = _repeated(rows, time_ns, order, error)
+    if not same.all():
+        if error.code != "duplicate_time":
+            raise error
+        place = twice[np.argmin(same)]
+        row = int(max(order[place], order[place - 1]))
+        message = f"time repeats {time_ns[row] / 1e9:.9g} s in rows that differ ({twice.size} such times)"
+        hint = "time has to increase; has the time enough digits, or were two logs merged?"
+        raise IngestError(message, rows.place(row), code="duplicate_time", hint=hint) from error
     touched = rows.repaired + moved.size + twice.size
     if touched > checks.repaired_rows * len(rows.lines):
         raise over_budget(error, touched, len(rows.lines), checks)
@@ -168,20 +170,14 @@ def over_budget(error: IngestError, touched: int, rows: int, checks: Checks) -> 
     return IngestError(error.fact, error.file, code=error.code, hint=hint)
 
 
-def _repeated(rows: Rows, time_ns: Integers, order: Index, error: IngestError) -> Index:
-    """Return the places, in order, of rows that repeat the one before them; differing rows of one time are refused."""
-    twice = np.flatnonzero(np.diff(time_ns[order]) == 0) + 1
-    here, before = order[twice], order[twice - 1]
-    for values in rows.numbers.values():
-        differ = np.flatnonzero(values[here] != values[before])
-        if differ.size:
-            if error.code != "duplicate_time":
-                raise error
-            row = int(max(here[differ[0]], before[differ[0]]))
-            message = f"time repeats {time_ns[row] / 1e9:.9g} s in rows that differ ({twice.size} such times)"
-            hint = "time has to increase; has the time enough digits, or were two logs merged?"
-            raise IngestError(message, rows.place(row), code="duplicate_time", hint=hint) from error
-    return np.asarray(twice, np.intp)
+def _counted_on(rows: Rows, time_ns: Integers, tick_ns: float) -> tuple[Rows, Integers]:
+    time_ns, wraps = _unwrap(time_ns, tick_ns)
+    if wraps:
+        modulus, lines = wraps[0][1], [int(rows.lines[row]) for row, _ in wraps]
+        bits = next((b for b in (16, 24, 32) if round(2**b * tick_ns) == modulus), 32)
+        what = f"the time counter of {bits} bits started again at 0 (every {modulus / 1e9:.9g} s) and was counted on"
+        rows = replace(rows, notes=(*rows.notes, Note("N-WRAP", len(wraps), lines[0], lines[-1], what)))
+    return rows, time_ns
 
 
 def _unwrap(time_ns: Integers, tick_ns: float) -> tuple[Integers, list[tuple[int, int]]]:

@@ -202,7 +202,6 @@ class _Log:
         return topic.series(self.settings, self.notes)
 
     def _temperature(self, series: _Series, base: _Series) -> Columns:
-        """Return the temperature at the times of the rows."""
         if np.array_equal(series.time_ns, base.time_ns):
             return series.values
         count = len(series.time_ns)
@@ -241,7 +240,6 @@ class _Log:
         return self._temperature(series, base) if channels == {"temperature"} else self._matched(series, base)
 
     def _matched(self, series: _Series, base: _Series) -> Columns:
-        """Return the channels of the messages with the stamps of the rows."""
         index = np.minimum(np.searchsorted(series.time_ns, base.time_ns), len(series.time_ns) - 1)
         if self.reader.truncated:
             self.end_ns = min(self.end_ns, int(series.time_ns[-1]))

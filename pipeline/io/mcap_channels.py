@@ -131,7 +131,6 @@ class TopicDecoder:
 
 
 def _fields_of(kind: str, settings: McapFormat) -> dict[str, MappedField]:
-    """Return the fields of a ROS type."""
     path = FieldPath.parse
     fields = {TIME: (path("header.stamp"), "ns")}
     if kind == IMU:

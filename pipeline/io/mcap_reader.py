@@ -221,7 +221,6 @@ class McapReader(MessageReader):
             self._unknown_kinds = True
 
     def _unpack(self, chunk: Chunk) -> None:
-        """Unpack a chunk and compare its checksum."""
         run = self._run
         run.offset, run.name = self._start, f"chunk {len(self.chunks) + 1}"
         run.data = unpack(chunk.data, chunk.uncompressed_size, chunk.compression)

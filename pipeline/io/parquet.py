@@ -125,7 +125,6 @@ class _StoredColumns:
         return [self._part(entry, name, start) for name in names]
 
     def _part(self, entry: dict[str, Any], name: str, start: int) -> NDArray[Any]:
-        """Return the rows of a recording in a decoded column."""
         rows, column = entry["rows"], self._columns[name]
         if not isinstance(column, np.ndarray):  # other recordings lack it: their rows are null
             column, start = to_numpy(column.slice(start, rows)), 0

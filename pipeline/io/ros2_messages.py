@@ -265,7 +265,6 @@ def _all_at_once(rows: Rows, layout: MessageLayout, numbers: dict[str, Values], 
 
 
 def _one(row: int, rows: Rows, layout: MessageLayout, numbers: dict[str, Values], channel: int) -> bytes:
-    """Copy one record, and replace its numbers."""
     start, end = int(rows.starts[row]) - HEAD.itemsize, int(rows.starts[row] + rows.sizes[row])
     record = bytearray(rows.data[start:end].tobytes())
     struct.pack_into("<H", record, CHANNEL_AT, channel)

@@ -24,11 +24,11 @@ from pipeline.io.units import SECOND_NS, SINCE_1970_NS, UNITS
 from pipeline.records import Note
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from numpy.typing import NDArray
 
-    from pipeline.records import Index, Integers, Values
+    from pipeline.records import Index, Integers, Mask, Values
 
 
 LARGEST = np.iinfo(np.int64).max
@@ -110,6 +110,21 @@ def check_plausible(topic: str, time: Integers, log_time: Integers, difference_s
         raise IngestError(message, path, code="bad_time", hint=hint)
 
 
+def sorted_once(time: Integers, columns: Iterable[NDArray[Any]]) -> tuple[Index, Index, Mask]:
+    """Return the order in which times increase, the places in it that repeat a time, and which repeat the numbers too.
+
+    NaN is equal to NaN.
+    """
+    order = np.argsort(time, kind="stable")
+    again = np.flatnonzero(np.diff(time[order]) == 0) + 1
+    one, other = order[again - 1], order[again]
+    same = np.ones(len(again), np.bool_)
+    for column in columns:
+        both_nan = np.isnan(column[one]) & np.isnan(column[other]) if column.dtype.kind == "f" else False
+        same &= (column[one] == column[other]) | both_nan
+    return order, again, same
+
+
 def in_order(
     topic: str, time: Integers, columns: Sequence[NDArray[Any]], reorder_s: float, path: str
 ) -> tuple[Index | None, list[Note]]:
@@ -132,23 +147,18 @@ def in_order(
         allowed = f"up to {reorder_s:g} s are put in order: ingest.mcap.reorder_s"
         hint = f"a log that was restarted belongs in two files ({allowed})"
         raise IngestError(message, path, code="bad_time", hint=hint)
-    order = np.argsort(time, kind="stable")
+    order, again, same = sorted_once(time, columns)
     inversions = int((steps < 0).sum())
     if inversions:
         detail = f"times on {topic} go back {inversions} times, by up to {late.max() / 1e9:.9g} s; sorted by time"
         notes.append(Note("N-SORT", inversions, 0, 0, detail))
-    again = np.flatnonzero(np.diff(time[order]) == 0) + 1
     if again.size:
-        one, other = order[again - 1], order[again]
-        same = np.ones(len(again), np.bool_)
-        for column in columns:
-            equal_nan = column.dtype.kind == "f"
-            same &= (column[one] == column[other]) | (equal_nan and np.isnan(column[one]) & np.isnan(column[other]))
         if not same.all():
-            row = int(np.argmin(same))
+            place = again[np.argmin(same)]
+            one, other = order[place - 1], order[place]
             message = (
-                f"message {int(other[row]) + 1} on {topic}: header stamp {time[other[row]] / 1e9:.9g} s as message "
-                f"{int(one[row]) + 1}, with other numbers ({int((~same).sum())} such messages)"
+                f"message {other + 1} on {topic}: header stamp {time[other] / 1e9:.9g} s as message {one + 1}, with "
+                f"other numbers ({int((~same).sum())} such messages)"
             )
             raise IngestError(message, path, code="bad_time", hint="two sensors may send on one topic")
         notes.append(Note("N-DUP", int(again.size), 0, 0, f"messages on {topic} that stand there twice were dropped"))

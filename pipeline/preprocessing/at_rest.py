@@ -149,7 +149,6 @@ def _blocks(recording: Recording, values: Values) -> Values:
 
 
 def _resting(recording: Recording, rests_of: Mapping[str, Values], sheets: Mapping[str, Any]) -> Recording:
-    """Return the longest part of a static recording that rests."""
     if recording.samples < 2 * FEWEST_OF_BLOCK:
         return recording
     count, size = _blocks(recording, recording.time).shape
@@ -326,7 +325,6 @@ def _check_spans(recording: Recording) -> None:
 
 
 def _turned(recording: Recording, rate: Values) -> float:
-    """Return the arc of a turn, deg."""
     if recording.table_angle is not None:
         return float(np.ptp(recording.table_angle))
     return float(np.ptp(np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(recording.time))))

@@ -298,7 +298,6 @@ def find_layout(data: bytes, path: str) -> TextLayout:
 
 
 def _cells(lines: Sequence[str], separator: str) -> list[list[str]]:
-    """Return the fields of lines."""
     if separator == " ":
         return [line.split() for line in lines]
     return list(csv.reader(lines, delimiter=separator, skipinitialspace=True))

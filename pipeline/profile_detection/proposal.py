@@ -274,7 +274,6 @@ def _add(sensor: str, parts: list[Columns], proposal: Proposal, guess: Guess) ->
 
 
 def _others(columns: Columns, entries: Entries, proposal: Proposal) -> None:
-    """Add temperature and the table's log."""
     layout = columns.layout
     for channel, index in columns.others.items():
         values = layout.numbers[index]
@@ -316,7 +315,6 @@ def as_yaml(proposal: Proposal, name: str) -> str:
 
 
 def _fields(columns: Entries) -> Entries:
-    """Return entries of columns as those of a topic's fields."""
     return {
         c: {"field": e["column"], **{k: v for k, v in e.items() if k not in ("column", "optional")}}
         for c, e in columns.items()

@@ -48,11 +48,11 @@ def facts(recording: Recording, sensor: Mapping[str, Any] | None = None) -> list
     return lines
 
 
-def as_text(lines: Sequence[Line], indent: str = "  ") -> str:
+def as_text(lines: Sequence[Line]) -> str:
     """Return facts as a table of text."""
     out = []
     for label, text in lines:
-        first = f"{indent}{label:<{LABEL}}"
+        first = f"  {label:<{LABEL}}"
         out += textwrap.wrap(
             text, WIDTH, initial_indent=first, subsequent_indent=" " * len(first), break_long_words=False
         )
