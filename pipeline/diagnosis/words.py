@@ -13,10 +13,8 @@ if TYPE_CHECKING:
 
     from pipeline.diagnosis.findings import Findings
 
-IN_DOUBT = (
-    "Were the whole cause in the catalogue or a smooth curve of one quantity, which the verdict doubts, this would be "
-    "missing"
-)
+ANSWERS = "What is missing, with 95 % probability"
+IN_DOUBT = "The most probable of the sets that were tried, all of which the verdict doubts"
 MOST_ANSWERS = 4  # of an answer set in a sentence
 STAYS = 1.15  # times the noise floor: two standard deviations of the rms of 100 samples, 1 / sqrt(200) each
 UNKNOWN = {
@@ -195,8 +193,8 @@ def _how_sure(part: Mapping[str, Any]) -> list[str]:
     if sets:
         said = [f"{_answer(each['effects'])} ({each['probability']:.2g})" for each in sets[:MOST_ANSWERS]]
         more = [f"{len(sets) - MOST_ANSWERS} more"] if len(sets) > MOST_ANSWERS else []
-        head = IN_DOUBT if part["verdict"] in ("unexplained", "reference_in_doubt") else "What is missing"
-        lines.append(f"{head}, with 95 % probability: {listed([*said, *more], 'or')}.")
+        head = IN_DOUBT if part["verdict"] in ("unexplained", "reference_in_doubt") else ANSWERS
+        lines.append(f"{head}: {listed([*said, *more], 'or')}.")
     if part.get("to_distinguish"):
         lines.append(f"These recordings cannot distinguish them; this one would: {part['to_distinguish']}.")
     if part.get("upper_limit"):
