@@ -261,21 +261,10 @@ class Scan(_Evidence):
         error = (unit * (size + np.abs(taken) @ known)).reshape(t, q // r, r)
         own = np.sum(means**2, axis=2) + np.sum(inside**2, axis=0)
         error = np.maximum(error, np.sqrt(LEFT * own).reshape(error.shape))
-        return self._eliminated(inner, cross, error, size.reshape(q // r, r))
-
-    @staticmethod
-    def _eliminated(inner: Values, cross: Values, error: Values, size: Values) -> Values:
-        """Return what the columns of each form explain together, 0 where base and effects hold one of them."""
-        found, new = np.zeros(cross.shape[:2]), np.ones(cross.shape[:2], bool)
-        for j in range(cross.shape[2]):
-            pivot = inner[:, :, j, j]
-            new &= (pivot > error[:, :, j] ** 2) & (pivot[0] > (NEW * size[:, j]) ** 2)
-            over = np.where(new, 1.0 / np.where(new, pivot, 1.0), 0.0)
-            found += cross[:, :, j] ** 2 * over
-            taken = inner[:, :, j] * over[:, :, None]
-            cross = cross - taken * cross[:, :, j : j + 1]
-            inner = inner - taken[:, :, :, None] * inner[:, :, j, None, :]
-        return np.asarray(np.where(new, found, 0.0)[1:])
+        error[0] = np.maximum(error[0], NEW * size.reshape(q // r, r))  # the first is white noise
+        explained, new = each_explains(inner, cross[..., None], error)
+        new &= new[0]
+        return np.asarray(np.where(new.all(axis=2), explained[..., 0].sum(axis=2), 0.0)[1:])
 
 
 def each_explains(inner: Values, cross: Values, error: Values) -> tuple[Values, NDArray[np.bool_]]:

@@ -14,16 +14,10 @@ import numpy as np
 
 from pipeline.estimation.candidates import SECOND, SECOND_SHARE, over_limits, time_constants
 from pipeline.estimation.design import BASE, Design, Start, Term
+from pipeline.estimation.evidence import Problem, Version
 from pipeline.estimation.gauss_markov import WHITE, random_walks
 from pipeline.estimation.generalized_least_squares import design_beside, fit_terms
-from pipeline.estimation.posterior import (
-    Answers,
-    Problem,
-    Search,
-    Version,
-    answers,
-    excluded,
-)
+from pipeline.estimation.posterior import Answers, Search, answers, excluded
 from pipeline.estimation.ranking import EXCITED, without
 from pipeline.estimation.selection import DELAYS
 

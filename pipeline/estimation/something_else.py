@@ -6,7 +6,7 @@
     other_angle       : sum over n = 1 to 8 of a_n cos(n A) + b_n sin(n A), A the table's angle
 
 with Legendre polynomials P_n and coefficients for each axis. A curve has no limit by the data sheet: its coefficients
-have the size of the noise, times the scales of ``pipeline.estimation.posterior``. That many coefficients cost evidence,
+have the size of the noise, times the scales of ``pipeline.estimation.evidence``. That many coefficients cost evidence,
 so that a curve is more probable than an effect only where that effect leaves more than noise.
 """
 

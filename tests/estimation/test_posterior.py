@@ -11,18 +11,8 @@ from scipy.linalg import null_space
 from scipy.special import logsumexp
 
 from pipeline.estimation.candidates import excited
-from pipeline.estimation.posterior import (
-    BELOW,
-    ODDS,
-    SCALE_PRIOR,
-    SCALES,
-    Answers,
-    Problem,
-    Search,
-    Version,
-    answers,
-    quantile,
-)
+from pipeline.estimation.evidence import SCALE_PRIOR, SCALES, Problem, Version
+from pipeline.estimation.posterior import BELOW, ODDS, Answers, Search, answers, quantile
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -1,4 +1,4 @@
-"""The posterior over effects in rests and moves by hand: the linear problem of ``pipeline.estimation.posterior``.
+"""The posterior over effects in rests and moves by hand: the linear problem of ``pipeline.estimation.evidence``.
 
 Columns are taken at the fit of what was selected, with its values put back into the residual, ``y = r + Z p``.
 """
@@ -12,16 +12,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.estimation.candidates import over_limits, time_constants
+from pipeline.estimation.evidence import Problem, Version
 from pipeline.estimation.gauss_markov import WALK_RATIO, WALK_SHARE, WALK_TIME
 from pipeline.estimation.multi_position.likelihood import NEW
-from pipeline.estimation.posterior import (
-    Answers,
-    Problem,
-    Search,
-    Version,
-    answers,
-    excluded,
-)
+from pipeline.estimation.posterior import Answers, Search, answers, excluded
 from pipeline.estimation.ranking import without
 
 if TYPE_CHECKING:
