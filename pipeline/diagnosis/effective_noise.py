@@ -25,12 +25,9 @@ from pipeline.validation.samples import samples_of_motion
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
-
-    from pipeline.records import Noise, Recording, SensorCalibration
+    from pipeline.records import Noise, Recording, SensorCalibration, Values
     from pipeline.validation.samples import Samples
 
-    Values = NDArray[np.float64]
 
 AVERAGING_S = (0.1, 1.0, 10.0)  # between two images, between key frames, between fixes of a position
 FEWEST = 8  # stretches, which tell a standard deviation to a quarter

@@ -22,14 +22,11 @@ from pipeline.model.effects import effect
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.estimation.design import Term
     from pipeline.estimation.posterior import Answers
     from pipeline.estimation.ranking import Score
-    from pipeline.records import SensorCalibration
+    from pipeline.records import SensorCalibration, Values
 
-    Values = NDArray[np.float64]
 
 LEAST_RATIO = 0.03  # of the white noise: the smallest wander of the selection's settings
 

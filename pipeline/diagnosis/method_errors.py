@@ -29,13 +29,10 @@ from pipeline.model.kinematics import table_motion
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.estimation.generalized_least_squares import Fit
     from pipeline.estimation.selection import Selection
-    from pipeline.records import Motion, Recording, SensorCalibration
+    from pipeline.records import Motion, Recording, SensorCalibration, Values
 
-    Values = NDArray[np.float64]
     Errors = dict[str, tuple[Values, Values]]  # by cause: of the vector (n, 3), and of its magnitude (n,)
 
 FREE = ("reference_least_squares", "effects")  # stages that leave bias and matrix free

@@ -31,9 +31,8 @@ if TYPE_CHECKING:
 
     from pipeline.diagnosis.residual_regression import Curves
     from pipeline.estimation.selection import Selection
-    from pipeline.records import Motion
+    from pipeline.records import Motion, Values
 
-    Values = NDArray[np.float64]
     Block = tuple[Sequence[int], int]
     Basis = tuple[str, Curves, list[Block]]
     Tests = tuple[list[str], Values, NDArray[np.intp], float]

@@ -38,9 +38,8 @@ if TYPE_CHECKING:
     from pipeline.estimation.gauss_markov import Blocks
     from pipeline.estimation.multi_position import selection as by_hand
     from pipeline.estimation.selection import Selection
-    from pipeline.records import Noise
+    from pipeline.records import Noise, Values
 
-    Values = NDArray[np.float64]
     JSON = dict[str, Any]
 
 OWN = 4  # columns of the base on each axis

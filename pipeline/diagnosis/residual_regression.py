@@ -32,9 +32,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.estimation.selection import Selection
-    from pipeline.records import Motion
+    from pipeline.records import Motion, Values
 
-    Values = NDArray[np.float64]
     Curves = Callable[[Motion], Values]
 
 NEW = 1e-3  # share of a column's norm that base and effects leave, below which it is theirs (EXCITED of the ranking)

@@ -21,9 +21,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
     from pipeline.model.checked import Check
+    from pipeline.records import Values
 
 SCHEMA_VERSION = 1  # of the files that this version writes
 # Readings in another unit or range are calibrated by a matrix of that factor: 16 between the ranges of an accelerometer
@@ -146,7 +145,7 @@ def sensor_of(document: dict[str, Any], sensor: str, file: Path) -> SensorCalibr
     return SensorCalibration.from_json(sensor, part)
 
 
-def sample_covariance(document: Mapping[str, Any], sensor: str) -> NDArray[np.float64] | None:
+def sample_covariance(document: Mapping[str, Any], sensor: str) -> Values | None:
     """Return the covariance of a calibrated sample: (3, 3) array, g^2 or (deg/s)^2.
 
         cov = M diag(N^2 / dt + 2 Q^2 / dt^2 + sum_i G_i^2) M^T

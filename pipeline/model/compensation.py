@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.model.measurement import Truths
-    from pipeline.records import FittedEffect, Motion, SensorCalibration
+    from pipeline.records import FittedEffect, Motion, SensorCalibration, Values
 
 SMOOTHING_S = 3.0  # 30 samples of a thermometer at 10 Hz; a package warms up in minutes
 BLOCK = 8192  # samples that are computed at once: their arrays stay in the processor's cache
@@ -41,8 +41,8 @@ OF_THE_PAST = {"specific_force_rate", "angular_acceleration", "direction"}
 class Compensated(NamedTuple):
     """Specific force, g, and angular rate, deg/s, of the body; None for a sensor that was not given."""
 
-    accelerometer: NDArray[np.float64] | None
-    gyroscope: NDArray[np.float64] | None
+    accelerometer: Values | None
+    gyroscope: Values | None
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ class CompensationStream:
         shaped = {s: value[0] if single else value for s, value in found.items()}
         return Compensated(shaped.get("accelerometer"), shaped.get("gyroscope"))
 
-    def _block(self, arrays: Mapping[str, NDArray[np.float64]]) -> Truths:
+    def _block(self, arrays: Mapping[str, Values]) -> Truths:
         """Return the truths of some samples."""
         readings = {s: arrays[s] for s in SENSORS if s in arrays}
         steps = {s: self.steps[s] for s in readings if s in self.steps}
@@ -210,7 +210,7 @@ class Compensation:
     accelerometer: SensorCalibration | None
     gyroscope: SensorCalibration | None
     unit: str = ""
-    covariances: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    covariances: Mapping[str, Values] = field(default_factory=dict)
 
     def apply(
         self,

@@ -24,7 +24,8 @@ from pipeline.records import median
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Values = NDArray[np.float64]
+    from pipeline.records import Values
+
 
 TIGHTEST_DEG, LOOSEST_DEG = 1e-5, 1e-3  # a good encoder's resolution; 17 ug of specific force
 GENTLE_DEG, EXACT_DEG = 1e-4, 1e-6  # smooth motion, where no bend is looked for; and an interval without any

@@ -24,9 +24,9 @@ from pipeline.errors import ConfigurationError
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from numpy.typing import NDArray
+    from pipeline.records import Values
 
-    Signals = Mapping[str, NDArray[np.float64]]
+    Signals = Mapping[str, Values]
     Evaluate = Callable[[Signals], Any]
 
 LONGEST, DEEPEST, MOST_NODES, LARGEST_POWER = 500, 40, 200, 20.0  # far above any formula of physics; bound the cost
@@ -80,15 +80,15 @@ class Function(NamedTuple):
     c: str
 
 
-def _cube(x: NDArray[np.float64]) -> NDArray[np.float64]:
+def _cube(x: Values) -> Values:
     return x * x * x
 
 
-def _step(x: NDArray[np.float64]) -> NDArray[np.float64]:
+def _step(x: Values) -> Values:
     return np.where(np.isnan(x), x, np.heaviside(x, 1.0))
 
 
-def _band(x: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
+def _band(x: Values, low: Values, high: Values) -> Values:
     return np.where(np.isnan(x), x, np.logical_and(x >= low, x <= high))
 
 
@@ -133,7 +133,7 @@ class Formula:
     _evaluate: Evaluate
     _c: str
 
-    def __call__(self, signals: Signals) -> NDArray[np.float64]:
+    def __call__(self, signals: Signals) -> Values:
         """Return the value: an array of the shape that the signals broadcast to, 0-d where it names none.
 
         What is not a number (``log(-1)``) comes out as NaN or infinite, without a warning.

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.records import Recording
+    from pipeline.records import Recording, Values
 
 VAGUE_DPS = 0.01  # the noise of a gyroscope's sample; below it a doubtful rate does no harm
 EARTH_RATE_DPS = 360.0 / 86164.0905  # a sidereal day, s
@@ -47,7 +47,7 @@ ABOUT = np.cross(np.eye(3)[:, None], np.eye(3)).transpose(0, 2, 1)  # ABOUT[a] @
 NODES, WEIGHTS = np.polynomial.laguerre.laggauss(4)  # of integrals of exp(-x) u(x), for the lag of smooth signals
 
 
-def earth_rate(latitude_deg: float, azimuth_deg: float) -> NDArray[np.float64]:
+def earth_rate(latitude_deg: float, azimuth_deg: float) -> Values:
     """Return Earth's rotation in the level frame: (3,) array, deg/s.
 
     ``Omega (cos L cos A, cos L sin A, sin L)`` with latitude L and azimuth A of level x, clockwise from north.
@@ -58,7 +58,7 @@ def earth_rate(latitude_deg: float, azimuth_deg: float) -> NDArray[np.float64]:
     return EARTH_RATE_DPS * direction
 
 
-def earth_of(table: Mapping[str, Any]) -> NDArray[np.float64] | None:
+def earth_of(table: Mapping[str, Any]) -> Values | None:
     """Return Earth's rotation in the level frame, None where the table's latitude or azimuth is not set."""
     latitude, azimuth = table.get("latitude_deg"), table.get("azimuth_deg")
     return None if latitude is None or azimuth is None else earth_rate(float(latitude), float(azimuth))
@@ -70,7 +70,7 @@ def table_motion(recording: Recording, table: Mapping[str, Any]) -> Motion | Non
 
 
 def reference_motion(
-    recording: Recording, gravity_g: float = 1.0, earth_rate_level: NDArray[np.float64] | None = None
+    recording: Recording, gravity_g: float = 1.0, earth_rate_level: Values | None = None
 ) -> Motion | None:
     """Return the motion that the table's log gives for a recording, or None where it gives none.
 
@@ -110,7 +110,7 @@ def reference_motion(
 
 
 def _motion_of_turn(
-    recording: Recording, gravity_g: float, earth: NDArray[np.float64] | None, logged: Callable[[Motion], Motion]
+    recording: Recording, gravity_g: float, earth: Values | None, logged: Callable[[Motion], Motion]
 ) -> Motion:
     assert recording.axis is not None  # noqa: S101
     assert recording.table_angle is not None  # noqa: S101
@@ -122,7 +122,7 @@ def _motion_of_turn(
     axis = AXES.index(recording.axis)
     home, still = level_at_zero(axis, recording.up), still_samples(time, rate)
 
-    def at(before: float | NDArray[np.float64], lag: float = 0.0, offset: float | NDArray[np.float64] = 0.0) -> Motion:
+    def at(before: float | Values, lag: float = 0.0, offset: float | Values = 0.0) -> Motion:
         offset = before + offset
         turn = _turn(log, axis, home, gravity_g, offset, lag)
         if earth is not None:
@@ -135,8 +135,8 @@ def _motion_of_turn(
 
 
 def _turn(  # noqa: PLR0917  (the symbols of the module's equations)
-    log: EncoderTrajectory, axis: int, home: NDArray[np.float64], gravity_g: float,
-    offset: float | NDArray[np.float64], lag: float,
+    log: EncoderTrajectory, axis: int, home: Values, gravity_g: float,
+    offset: float | Values, lag: float,
 ) -> Motion:  # fmt: skip
     """Return the motion of a turn at ``time + offset``, behind a lag."""
     angle, rate, acceleration = log.angle, log.rate, log.acceleration
@@ -166,7 +166,7 @@ def _turn(  # noqa: PLR0917  (the symbols of the module's equations)
     )
 
 
-def level_at_zero(axis: int, up: str = "") -> NDArray[np.float64]:
+def level_at_zero(axis: int, up: str = "") -> Values:
     """Return the level axes in the body frame at table angle 0, as rows: (3, 3) array.
 
     Where the turn axis stands vertical, ``up`` is the body axis, with its sign, that points up all the time; level x is
@@ -180,7 +180,7 @@ def level_at_zero(axis: int, up: str = "") -> NDArray[np.float64]:
 
 
 def _motion_of_attitude(
-    recording: Recording, gravity_g: float, earth: NDArray[np.float64] | None, logged: Callable[[Motion], Motion]
+    recording: Recording, gravity_g: float, earth: Values | None, logged: Callable[[Motion], Motion]
 ) -> Motion:
     from scipy.interpolate import make_interp_spline  # noqa: PLC0415  (0.3 s, needed by attitude logs alone)
 
@@ -188,7 +188,7 @@ def _motion_of_attitude(
     time, attitude = recording.time, continuous(recording.table_attitude)
     spline = make_interp_spline(time, attitude, k=5)
 
-    def at(before: float | NDArray[np.float64], offset: float | NDArray[np.float64] = 0.0) -> Motion:
+    def at(before: float | Values, offset: float | Values = 0.0) -> Motion:
         offset = before + offset
         there = time + offset
         q = spline(there) if np.any(offset) else attitude
@@ -215,7 +215,7 @@ def _motion_of_attitude(
     return at(0.0)
 
 
-def _rate_of(time: NDArray[np.float64], angle: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def _rate_of(time: Values, angle: Values) -> tuple[Values, NDArray[np.bool_]]:
     """Return the rate that a log of the angle alone gives, and where it is vague: (n,) arrays, deg/s and bool.
 
     In smooth motion it is the derivative of a cubic spline. Where that differs from the central difference by more than
@@ -233,7 +233,7 @@ def _rate_of(time: NDArray[np.float64], angle: NDArray[np.float64]) -> tuple[NDA
     return np.where(bent | resting, central, spline), vague
 
 
-def turn_about_axis(vector: NDArray[np.float64], axis: int, angle_deg: NDArray[np.float64]) -> NDArray[np.float64]:
+def turn_about_axis(vector: Values, axis: int, angle_deg: Values) -> Values:
     """Turn (..., 3) vectors about coordinate axis 0, 1 or 2 by each of n angles (right-handed): (n, ..., 3) array."""
     j, k = (axis + 1) % 3, (axis + 2) % 3
     angle = np.radians(angle_deg).reshape(-1, *[1] * (vector.ndim - 1))
@@ -245,7 +245,7 @@ def turn_about_axis(vector: NDArray[np.float64], axis: int, angle_deg: NDArray[n
     return out
 
 
-def turn_by_vector(phi: NDArray[np.float64]) -> NDArray[np.float64]:
+def turn_by_vector(phi: Values) -> Values:
     """Return the rotations by vectors, ``exp [phi]x`` (Rodrigues): (..., 3) array, rad, to (..., 3, 3)."""
     angle = np.linalg.norm(phi, axis=-1)
     small = angle < 1e-6
@@ -253,11 +253,11 @@ def turn_by_vector(phi: NDArray[np.float64]) -> NDArray[np.float64]:
     s = np.where(small, 1.0, np.sin(safe) / safe)
     c = np.where(small, 0.5, (1.0 - np.cos(safe)) / safe**2)
     cross = skew(phi)
-    out: NDArray[np.float64] = np.eye(3) + s[..., None, None] * cross + c[..., None, None] * (cross @ cross)
+    out: Values = np.eye(3) + s[..., None, None] * cross + c[..., None, None] * (cross @ cross)
     return out
 
 
-def skew(v: NDArray[np.float64]) -> NDArray[np.float64]:
+def skew(v: Values) -> Values:
     """Return ``[v]x``, with ``[v]x u = v x u``: (..., 3) array to (..., 3, 3)."""
     out = np.zeros((*v.shape, 3))
     out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
@@ -265,7 +265,7 @@ def skew(v: NDArray[np.float64]) -> NDArray[np.float64]:
     return out
 
 
-def attitude_matrix(q: NDArray[np.float64]) -> NDArray[np.float64]:
+def attitude_matrix(q: Values) -> Values:
     """Return the rotation matrices of unit quaternions: (n, 4) to (n, 3, 3), body vectors to level vectors."""
     cross = skew(q[:, 1:])
     return np.asarray(np.eye(3) + 2.0 * (q[:, :1, None] * cross + cross @ cross))

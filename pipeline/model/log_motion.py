@@ -32,11 +32,9 @@ from pipeline.records import Motion
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from numpy.typing import NDArray
+    from pipeline.records import FittedEffect, Values
 
-    from pipeline.records import FittedEffect
-
-    Known = tuple[float, NDArray[np.float64]]  # the last sample that is not missing: time in s, value
+    Known = tuple[float, Values]  # the last sample that is not missing: time in s, value
 
 STRETCH = 4.0  # memories: exp(4) costs two digits of the sums; shorter stretches cost time
 FARTHEST = 50.0  # memories that time may go back: exp(50) of the sums is still far from overflow
@@ -58,7 +56,7 @@ class LogEnd:
 
     force: Known | None = None
     rate: Known | None = None
-    direction: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    direction: Values = field(default_factory=lambda: np.zeros(3))
 
     def after(self, motion: Motion, used: set[str]) -> LogEnd:
         """Return the end of the next block; only what is used is kept."""
@@ -68,17 +66,17 @@ class LogEnd:
         return LogEnd(force or self.force, rate or self.rate, direction)
 
 
-def _last_known(time: NDArray[np.float64], values: NDArray[np.float64]) -> Known | None:
+def _last_known(time: Values, values: Values) -> Known | None:
     known = np.flatnonzero(np.isfinite(values).all(axis=1))
     return (float(time[known[-1]]), values[known[-1]]) if len(known) else None
 
 
 def log_motion(
-    time: NDArray[np.float64],
+    time: Values,
     *,
-    specific_force: NDArray[np.float64],
-    angular_rate: NDArray[np.float64],
-    temperature: NDArray[np.float64] | None,
+    specific_force: Values,
+    angular_rate: Values,
+    temperature: Values | None,
     used: set[str],
     end: LogEnd,
 ) -> Motion:
@@ -129,7 +127,7 @@ def fields_used(sensor: str, effects: Iterable[FittedEffect]) -> set[str]:
     return seen
 
 
-def _difference(time: NDArray[np.float64], values: NDArray[np.float64], before: Known | None) -> NDArray[np.float64]:
+def _difference(time: Values, values: Values, before: Known | None) -> Values:
     """Return the backward difference quotient: (n, 3) array; 0 at a first sample."""
     first = before is None
     t_before, v_before = (time[0], values[0]) if before is None else before
@@ -146,7 +144,7 @@ def _difference(time: NDArray[np.float64], values: NDArray[np.float64], before: 
         )
     if first:
         step[0] = 1.0
-    quotient: NDArray[np.float64] = (v[1:] - v[last]) / step[:, None]
+    quotient: Values = (v[1:] - v[last]) / step[:, None]
     quotient[np.isnan(v[last]).any(axis=1)] = 0.0  # nothing is known before
     return quotient
 
@@ -159,7 +157,7 @@ class ExponentialRegression:
         self._stretch = float("nan")
         self._sums = np.zeros(5)
 
-    def apply(self, time: NDArray[np.float64], temperature: NDArray[np.float64]) -> NDArray[np.float64]:
+    def apply(self, time: Values, temperature: Values) -> Values:
         """Return the line at each sample: (n,) array, degC; a row without a temperature (NaN) is given the line's.
 
         Raises
@@ -187,7 +185,7 @@ class ExponentialRegression:
         moved = (s0, s1 - step * s0, s2 - 2.0 * step * s1 + step * step * s0, r0, r1 - step * r0)
         self._sums = np.exp(-step / self.memory) * np.array(moved)
 
-    def _along(self, time: NDArray[np.float64], temperature: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _along(self, time: Values, temperature: Values) -> Values:
         """Return the line within a stretch; of one known sample, its temperature."""
         at = time - self._stretch * (STRETCH * self.memory)
         missing = np.isnan(temperature)

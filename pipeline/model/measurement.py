@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.model.effects.base import Effect
-    from pipeline.records import FittedEffect, Motion, SensorCalibration
+    from pipeline.records import FittedEffect, Motion, SensorCalibration, Values
 
-    Truths = dict[str, NDArray[np.float64]]
+    Truths = dict[str, Values]
 
 ROUNDS = 60  # two digits a round: far more than 1e-13 needs
 TOLERANCE = 1e-13  # relative: some hundred roundings of a double
@@ -41,22 +41,22 @@ class Part:
     """Effects with their values that are taken off the readings of a sensor, and K, the inverse of its matrix."""
 
     calibration: SensorCalibration
-    effects: tuple[tuple[Effect, NDArray[np.float64]], ...]
-    K: NDArray[np.float64]
+    effects: tuple[tuple[Effect, Values], ...]
+    K: Values
 
     @classmethod
     def of(cls, calibration: SensorCalibration, effects: Iterable[FittedEffect]) -> Self:
         """Return the part that takes off the given effects of a calibration."""
         return cls(calibration, tuple((effect_of(e), e.values) for e in effects), inverse_of(calibration))
 
-    def take_off(self, reading: NDArray[np.float64], motion: Motion) -> NDArray[np.float64]:
+    def take_off(self, reading: Values, motion: Motion) -> Values:
         """Return readings without what the effects add at a motion: (n, 3) array, g or deg/s."""
         for effect, values in self.effects:
             reading = reading - effect.reading(self.calibration.sensor, motion, self.K, values)
         return reading
 
 
-def predicted_reading(calibration: SensorCalibration, motion: Motion) -> NDArray[np.float64]:
+def predicted_reading(calibration: SensorCalibration, motion: Motion) -> Values:
     """Return ``bias + K @ truth + sum of effects``: (n, 3) array, g or deg/s; motion by the reference's clock."""
     K = inverse_of(calibration)
     for fitted in calibration.effects:
@@ -70,10 +70,10 @@ def predicted_reading(calibration: SensorCalibration, motion: Motion) -> NDArray
 
 def compensate(
     calibration: SensorCalibration,
-    reading: NDArray[np.float64],
+    reading: Values,
     motion: Motion,
     effects: Sequence[FittedEffect] | None = None,
-) -> NDArray[np.float64]:
+) -> Values:
     """Return the truth by (n, 3) readings; the rest of the motion is known.
 
     ``effects`` are taken off, by default all of the calibration that belong to the sensor. Errors as of ``solve``.
@@ -139,7 +139,7 @@ def without_effects(parts: Mapping[str, Part], readings: Truths, motion: Motion)
     return {s: linear_truth(part.calibration, part.take_off(readings[s], motion)) for s, part in parts.items()}
 
 
-def linear_truth(calibration: SensorCalibration, reading: NDArray[np.float64]) -> NDArray[np.float64]:
+def linear_truth(calibration: SensorCalibration, reading: Values) -> Values:
     """Return ``matrix @ (reading - bias)``: (n, 3) array.
 
     Each row's terms are added in their order, so that no rounding depends on how many samples there are.
@@ -152,12 +152,12 @@ def linear_truth(calibration: SensorCalibration, reading: NDArray[np.float64]) -
     return truth
 
 
-def inverse_of(calibration: SensorCalibration) -> NDArray[np.float64]:
+def inverse_of(calibration: SensorCalibration) -> Values:
     """Return K, the inverse of the calibration matrix: (3, 3) array."""
     return np.asarray(np.linalg.solve(calibration.matrix, np.eye(3)), np.float64)
 
 
-def _near(new: NDArray[np.float64], old: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _near(new: Values, old: Values) -> NDArray[np.bool_]:
     """Return which samples have not moved, relative to their size; a missing one stays missing: (n,) array."""
     far = np.abs(new - old) > TOLERANCE * np.maximum(np.abs(new), 1.0)
     return np.logical_not(far[:, 0] | far[:, 1] | far[:, 2])

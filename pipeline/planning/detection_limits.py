@@ -44,9 +44,8 @@ if TYPE_CHECKING:
     from pipeline.estimation.gauss_markov import Blocks
     from pipeline.estimation.multi_position import selection as by_hand
     from pipeline.estimation.selection import Selection
-    from pipeline.records import Noise
+    from pipeline.records import Noise, Values
 
-    Values = NDArray[np.float64]
     Squares = tuple[Values, Values, Values]  # of draws, of draws with signals, of signals
 
 STEPS = 14  # of bisection: a factor of 1e11 to 0.2 %

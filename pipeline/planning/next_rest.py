@@ -38,13 +38,10 @@ from pipeline.signal.rests import WINDOW_S
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.estimation.accelerometer.orientations import Orientations
-    from pipeline.records import Recording, SensorCalibration
+    from pipeline.records import Recording, SensorCalibration, Values
     from pipeline.signal.rests import Rest
 
-    Values = NDArray[np.float64]
 
 SHARPNESS = 8  # of the norm that stands for the largest U: within 32 % of it for nine parameters, smooth
 SWEEPS = 10  # of the exchange; it ends by itself after two or three

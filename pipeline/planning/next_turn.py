@@ -31,11 +31,7 @@ from pipeline.simulation.trajectory import rotation_by
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
-
-    from pipeline.records import Recording, SensorCalibration
-
-    Values = NDArray[np.float64]
+    from pipeline.records import Recording, SensorCalibration, Values
 
 
 TURNS_DEG = (90.0, 180.0, 270.0, 360.0)  # that a person sees without a scale

@@ -56,14 +56,8 @@ def write_campaign(
 ) -> None:
     """Simulate every unit of a description and write the campaign; files of the same names are replaced.
 
-    Parameters
-    ----------
-    description : Description
-    directory : Path
-    progress : callable
-        Gets a line for each unit that is done.
-    sheet_only : bool
-        Write ``units.csv`` without recordings and truth: for a campaign whose run makes them.
+    ``progress`` gets a line for each unit that is done. ``sheet_only``: write ``units.csv`` without recordings and
+    truth, for a campaign whose run makes them.
     """
     for name, text in programs_of(description.units).items():
         path = directory / "configs" / "procedure" / f"{name}.yaml"

@@ -36,7 +36,7 @@ from pipeline.simulation.trajectory import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from numpy.typing import NDArray
+    from pipeline.records import Values
 
 
 ONE_RECORDING, FERRARIS = "one_recording", "ferraris"
@@ -106,7 +106,7 @@ def plan(procedure: str, course: Course, rng: np.random.Generator, hand_accuracy
     if procedure in TABLE_PROCEDURES:
         planned = _turns(course) + _heldout(course, rng)
         return _with_transits(planned, course) if procedure == ONE_RECORDING else planned
-    attitudes: dict[str, Callable[[], NDArray[np.float64]]] = {
+    attitudes: dict[str, Callable[[], Values]] = {
         "orientations_24": orientations_24,
         "six_positions": six_positions,
         "multi_position": lambda: random_attitudes(course.positions, rng),
@@ -204,7 +204,7 @@ def _static(course: Course) -> list[Planned]:
     return [Planned("static", "static", None, Moves(program, np.eye(3)[:1]))]
 
 
-def _rests(attitudes: NDArray[np.float64], course: Course, rng: np.random.Generator, accuracy: float) -> Moves:
+def _rests(attitudes: Values, course: Course, rng: np.random.Generator, accuracy: float) -> Moves:
     """Return rests in the attitudes, set within ``accuracy`` deg, and the shortest move from each to the next."""
     tilt = accuracy * rng.standard_normal((len(attitudes), 3))
     size = np.linalg.norm(tilt, axis=1)
@@ -241,9 +241,9 @@ def _eased(motion: Gimbals) -> Eased:
     return Eased(motion.drift, motion.amplitude, motion.frequency, motion.phase, duration)
 
 
-def _level(plan: Planned, time: float) -> NDArray[np.float64]:
+def _level(plan: Planned, time: float) -> Values:
     """Return the attitude at a time in s of a recording: (3, 3) array."""
-    level: NDArray[np.float64] = plan.trajectory.pose(np.array([time])).level[0]
+    level: Values = plan.trajectory.pose(np.array([time])).level[0]
     return level
 
 
@@ -252,7 +252,7 @@ def _faces_and_turns(course: Course, rng: np.random.Generator, accuracy: float) 
     positions, tilt = six_positions(), accuracy * rng.standard_normal((6, 3))
     off = np.radians(course.turn_axis_error_deg) * rng.standard_normal((3, 3)) * (1.0 - np.eye(3))
     builder = ProgramBuilder(course.acceleration_dps2).rest(max(course.warm_up_rest_s, course.dwell_s))
-    axes: list[NDArray[np.float64]] = []
+    axes: list[Values] = []
     start = at = positions[0] @ _turned(tilt[0])
     upward = [int(np.argmax(positions[:, 2, axis])) for axis in range(3)]
     for face, axis in [*((f, None) for f in range(1, 6)), *zip(upward, range(3), strict=True)]:
@@ -272,7 +272,7 @@ def _faces_and_turns(course: Course, rng: np.random.Generator, accuracy: float) 
     return Moves(builder.build(), np.array(axes), start)
 
 
-def _turned(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+def _turned(vector: Values) -> Values:
     """Return the rotation by a vector in deg: (3, 3) array."""
     size = float(np.linalg.norm(vector))
     return np.asarray(rotation_about(vector / (size or 1.0), np.array([size]))[0])

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    Values = NDArray[np.float64]
+    from pipeline.records import Values
 
 
 @dataclass(frozen=True)
@@ -179,17 +179,11 @@ class TurnErrors:
 
 
 def random_errors(program: Program, rng: np.random.Generator, settings: Mapping[str, Any], axis: int) -> TurnErrors:
-    """Return the errors of one recording on a table; those that ``settings`` leave out are zero.
+    """Return the errors of one recording about an axis of a table; those that ``settings`` leave out are zero.
 
-    Parameters
-    ----------
-    program : Program
-    rng : Generator
-    settings : mapping
-        ``angle_accuracy_deg`` (standard deviation of each stop), ``rate_error`` (3,) (share by which every move falls
-        short, negative, or goes too far), ``step_deg`` (of the motor), ``ripple`` (relative amplitude),
-        ``direction_deg`` (3, 2), ``vibration_deg``, ``shaking_g``, ``vibration_hz``.
-    axis : int
+    They are ``angle_accuracy_deg`` (standard deviation of each stop), ``rate_error`` (3,) (share by which every move
+    falls short, negative, or goes too far), ``step_deg`` (of the motor), ``ripple`` (relative amplitude),
+    ``direction_deg`` (3, 2), ``vibration_deg``, ``shaking_g``, ``vibration_hz``.
     """
     phase = rng.uniform(0.0, 2.0 * np.pi)
     travelled = np.cumsum(np.diff(program.stops) * settings.get("rate_error", np.zeros(3))[axis])

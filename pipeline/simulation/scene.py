@@ -31,11 +31,9 @@ from pipeline.simulation.trajectory import Turn, mounted, rotation_by
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from numpy.typing import NDArray
-
+    from pipeline.records import Values
     from pipeline.simulation.trajectory import Gimbals, Moves, Pose
 
-    Values = NDArray[np.float64]
     Alteration = Callable[["Scene", Values], "Scene"]
 
 STANDARD_GRAVITY = 9.80665  # m/s^2, CGPM 1901

@@ -41,12 +41,9 @@ from pipeline.simulation.trajectory import rotation_about
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from numpy.typing import NDArray
-
     from pipeline.model.effects.base import Effect
-    from pipeline.records import Motion
+    from pipeline.records import Motion, Values
 
-    Values = NDArray[np.float64]
     Hidden = dict[str, tuple[Effect, Values]]  # by name: an effect and the values of its parameters
 
 KEYS = {"bias", "matrix", "scale_factor", "non_orthogonality_deg", "mounting_deg"}

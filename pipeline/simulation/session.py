@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from pipeline.records import Values
     from pipeline.simulation.description import UnitDescription
     from pipeline.simulation.sensor import Hidden, SimulatedSensor
     from pipeline.simulation.trajectory import Planned
 
-    Values = NDArray[np.float64]
 
 STREAMS = ("unit", "effects", "motion", "table", "accelerometer", "gyroscope", "temperature", "link", "bench", "room")
 NANOSECONDS = 1_000_000_000  # in a second
@@ -110,21 +110,10 @@ def record(
     pause: float,
     streams: Streams,
 ) -> list[Recording]:
-    """Make the recordings of a unit.
+    """Make the recordings of a unit, of which the sampling interval and the share of lost samples count.
 
-    Parameters
-    ----------
-    planned : sequence of Planned
-    benches : mapping
-        Role to bench; the key ``""`` is for all roles that are not named.
-    effects : mapping
-        Sensor to its effects; those of mounting, table and timing change the motion.
-    environment : Environment
-    unit : UnitDescription
-        For the sampling interval and the share of lost samples.
-    pause : float, s
-        Between the recordings, and before the first.
-    streams : Streams
+    ``benches``: role to bench, ``""`` for all roles that are not named; ``effects``: sensor to its effects, of which
+    those of mounting, table and timing change the motion; ``pause``: s, between the recordings and before the first.
     """
     times = _times(planned, unit.interval_s, pause)
     seconds = [t / NANOSECONDS for t in times]

@@ -28,14 +28,12 @@ from pipeline.simulation.trajectory import Turn
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
+    from pipeline.records import Values
     from pipeline.simulation.description import UnitDescription
     from pipeline.simulation.procedures import Course
     from pipeline.simulation.rate_table import Program
     from pipeline.simulation.trajectory import Planned
 
-    Values = NDArray[np.float64]
 
 MARGIN_S = 2.0  # by which a log of its own begins earlier and ends later than the recording
 LARGEST_OFFSET_S, DRIFT_PPM = 100.0, 50.0  # of a clock at random: the drift is a standard deviation, that of a quartz

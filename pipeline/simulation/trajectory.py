@@ -27,11 +27,9 @@ from pipeline.model.kinematics import LEVEL_AT_ZERO, attitude_matrix
 from pipeline.simulation.rate_table import TurnErrors
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from pipeline.records import Values
     from pipeline.simulation.rate_table import Program
 
-    Values = NDArray[np.float64]
 
 SWING_RMS_DEG = np.array([60.0, 42.0, 60.0])  # 42 deg of the middle gimbal: all attitudes evenly (``random_gimbals``)
 PERIOD_S = 40.0  # longest period of the sinusoids before the speed is chosen; its value cancels
@@ -60,14 +58,7 @@ def mounted(pose: Pose, rotation: Values) -> Pose:
 
 
 def rotation_about(axis: Values, angle_deg: Values) -> Values:
-    """Return ``R_u(A) = I + sin A [u]x + (1 - cos A) [u]x^2``: (n, 3, 3) array.
-
-    Parameters
-    ----------
-    axis : (3,) or (n, 3) array
-        Unit vectors.
-    angle_deg : (n,) array, deg
-    """
+    """Return ``R_u(A) = I + sin A [u]x + (1 - cos A) [u]x^2``: (n, 3, 3), for unit vectors (3,) or (n, 3)."""
     x, y, z = np.moveaxis(np.atleast_2d(axis), -1, 0)
     zero = np.zeros_like(x)
     cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)

@@ -36,11 +36,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
+    from pipeline.records import Values
     from pipeline.thesis.results import JSON, Results
 
-    Values = NDArray[np.float64]
 
 # least-squares rows of table 5.23
 TRUE_SCALE = {

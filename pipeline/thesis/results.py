@@ -18,9 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
-    from pipeline.records import Recording
+    from pipeline.records import Recording, Values
 
 JSON = dict[str, Any]
 AXES = "xyz"
@@ -119,12 +117,12 @@ class Results:
         return float(np.mean(np.abs(np.linalg.norm(corrected, axis=1) - samples.magnitude)))
 
 
-def values(row: Mapping[str, float], pattern: str) -> NDArray[np.float64]:
+def values(row: Mapping[str, float], pattern: str) -> Values:
     """Return the printed values of x, y and z, whose columns ``pattern`` names: (3,) array."""
     return np.array([row[pattern.format(axis)] for axis in AXES])
 
 
-def matrix_of(row: Mapping[str, float], letter: str) -> NDArray[np.float64]:
+def matrix_of(row: Mapping[str, float], letter: str) -> Values:
     """Return a printed matrix, of the columns ``M11`` to ``M33``: (3, 3) array."""
     return np.array([[row[f"{letter}{i}{j}"] for j in (1, 2, 3)] for i in (1, 2, 3)])
 

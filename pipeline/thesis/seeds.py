@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.estimation.turns import Part
-    from pipeline.records import Recording
+    from pipeline.records import Recording, Values
     from pipeline.simulation.description import Description, UnitDescription
 
 FOUND = ("O_y", "O_z", "M", "b_x", "b_y", "b_z", "S_x", "S_y", "S_z")
@@ -194,7 +194,7 @@ class Drawn:
         fitted = nonlinear_least_squares.fit(self.turns(), None, settings)
         return {"error": self._accelerometer_error(partial(linear_truth, fitted))}
 
-    def _accelerometer_error(self, correct: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> float:
+    def _accelerometer_error(self, correct: Callable[[Values], Values]) -> float:
         """Return the mean |e| of the held-out motion, corrected."""
         reading = self.filtered(self.held_out).accelerometer
         return float(np.mean(np.abs(np.linalg.norm(correct(np.asarray(reading)), axis=1) - 1.0)))

@@ -21,9 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
-    from pipeline.records import Recording
+    from pipeline.records import Recording, Values
     from pipeline.thesis.results import JSON, Results
 
     Cells = Iterator[JSON]
@@ -260,7 +258,7 @@ def _paper_2(positions: pd.DataFrame, results: Results) -> Iterator[tuple[str, f
         yield f"{row['axis']} up: after, g", row["mean_after_g"], after, 3
 
 
-def _rest_means(recordings: list[Recording]) -> NDArray[np.float64]:
+def _rest_means(recordings: list[Recording]) -> Values:
     rests = [(r, rest) for r in recordings for rest in find_rests(r)]
     return np.array([np.asarray(r.accelerometer)[rest.start : rest.stop].mean(axis=0) for r, rest in rests])
 
@@ -277,7 +275,7 @@ def _paper_3(rows: pd.DataFrame, results: Results) -> Iterator[tuple[str, float,
             yield name.replace("_", ""), row[axis], ours, 4
 
 
-def _paper_4(rows: pd.DataFrame, results: Results) -> Iterator[tuple[str, NDArray[np.float64], Sequence[float | None]]]:
+def _paper_4(rows: pd.DataFrame, results: Results) -> Iterator[tuple[str, Values, Sequence[float | None]]]:
     fit = results.fit(f"{PAPER}-gyro-20dps", "gyroscope")
     turns = {r.axis: r for r in results.recordings(f"{PAPER}-gyro-20dps", "gyroscope")}
     for row in rows.to_dict("records"):
@@ -289,7 +287,7 @@ def _paper_4(rows: pd.DataFrame, results: Results) -> Iterator[tuple[str, NDArra
         yield f"about {about}: {when}, deg", values(row, "{}"), ours
 
 
-def _angle_errors(recording: Recording, bias: NDArray[np.float64], matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+def _angle_errors(recording: Recording, bias: Values, matrix: Values) -> Values:
     """Return the rms error of the angle integrated over each 45 deg of a turn: (3,) array, deg."""
     error = (np.asarray(recording.gyroscope) - bias) @ matrix.T
     error[:, AXES.index(str(recording.axis))] -= np.asarray(recording.table_rate)

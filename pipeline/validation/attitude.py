@@ -35,9 +35,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.records import Noise, Recording, SensorCalibration
+    from pipeline.records import Noise, Recording, SensorCalibration, Values
 
-    Array = NDArray[np.float64]
 
 MINUTE = 60.0  # s over which a drift is stated
 STARTS = 60  # of the minutes over which a drift is averaged
@@ -98,7 +97,7 @@ def attitude(
     return found
 
 
-def integrate(time: Array, rate: Array, start: Array) -> Array:
+def integrate(time: Values, rate: Values, start: Values) -> Values:
     """Return the attitude that angular rates, deg/s, add up to from ``start`` on: unit quaternions (4, n)."""
     w, dt = np.radians(rate), np.diff(time)[:, None]
     mean = 0.5 * (w[:-1] + w[1:])
@@ -113,7 +112,7 @@ def integrate(time: Array, rate: Array, start: Array) -> Array:
     return total
 
 
-def _product(p: Array, q: Array) -> Array:
+def _product(p: Values, q: Values) -> Values:
     """Return the products of quaternions, (4, n) arrays; four times as fast as those of scipy's ``Rotation``."""
     a, b, c, d = p
     e, f, g, h = q
@@ -121,7 +120,7 @@ def _product(p: Array, q: Array) -> Array:
     return np.stack([*rows, a * h + b * g - c * f + d * e])
 
 
-def drift(time: Array, estimate: Array, reference: Array, seconds: float) -> float:
+def drift(time: Values, estimate: Values, reference: Values, seconds: float) -> float:
     """Return by how much an attitude (4, n) is off after so many seconds, root mean square over starts, deg."""
     last = int(np.searchsorted(time, time[-1] - seconds + 1e-6, "right")) - 1
     start = np.unique(np.linspace(0, max(last, 0), STARTS).astype(int))
@@ -131,18 +130,18 @@ def drift(time: Array, estimate: Array, reference: Array, seconds: float) -> flo
     return float(np.sqrt(np.mean(angle_between(turned, known) ** 2)))
 
 
-def angle_between(p: Array, q: Array) -> Array:
+def angle_between(p: Values, q: Values) -> Values:
     """Return the angle of the rotation from one attitude (4, n) to another: (n,) array, deg."""
     turned = _between(p, q)
     return np.asarray(np.degrees(2.0 * np.arctan2(np.linalg.norm(turned[1:], axis=0), np.abs(turned[0]))))
 
 
-def _between(p: Array, q: Array) -> Array:
+def _between(p: Values, q: Values) -> Values:
     """Return the rotations from some attitudes to others: (4, n) arrays."""
     return _product(p * [[1.0], [-1.0], [-1.0], [-1.0]], q)
 
 
-def _fuse(time: Array, force: Array, alone: Array) -> tuple[NDArray[np.int64], Array]:
+def _fuse(time: Values, force: Values, alone: Values) -> tuple[NDArray[np.int64], Values]:
     """Return samples about 0.1 s or 5 deg apart, and the attitude of the complementary filter there.
 
     Its rates are those of the attitude ``alone`` of the gyroscope between these samples; the first attitude is given.
@@ -177,15 +176,15 @@ def _fuse(time: Array, force: Array, alone: Array) -> tuple[NDArray[np.int64], A
     return at, q
 
 
-def _tilt_between(p: Array, q: Array) -> Array:
+def _tilt_between(p: Values, q: Values) -> Values:
     """Return the angle between the verticals of two attitudes, quaternions (n, 4): (n,) array, deg."""
     up, other = level_in_body(p), level_in_body(q)
     across = np.linalg.norm(np.cross(up, other), axis=1)
-    angle: Array = np.degrees(np.arctan2(across, np.einsum("ij,ij->i", up, other)))
+    angle: Values = np.degrees(np.arctan2(across, np.einsum("ij,ij->i", up, other)))
     return angle
 
 
-def _with_reference(recording: Recording) -> tuple[Recording, Array]:
+def _with_reference(recording: Recording) -> tuple[Recording, Values]:
     """Return the samples whose readings and attitude are known, and the attitude (n, 4) a filter delay before."""
     q = recording.table_attitude
     assert q is not None  # noqa: S101
@@ -199,7 +198,7 @@ def _with_reference(recording: Recording) -> tuple[Recording, Array]:
     return recording.select(known), np.stack([np.interp(late[known], clock, c) for c in continuous(q).T], 1)
 
 
-def _rounded(values: Array) -> list[float]:
+def _rounded(values: Values) -> list[float]:
     return [float(f"{v:.4g}") for v in values]
 
 

@@ -29,12 +29,10 @@ from pipeline.validation.samples import OTHER
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
-    from pipeline.records import FittedEffect, SensorCalibration
+    from pipeline.records import FittedEffect, SensorCalibration, Values
     from pipeline.validation.samples import Samples
 
-    Corrected = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64] | None]  # vector, magnitude, truth
+    Corrected = tuple[Values, Values, Values | None]  # vector, magnitude, truth
 
 DEGREE = 3  # of the spline through a rate: 40 deg/s that change in 5 s are followed to 1e-4 deg/s at 0.12 s
 
@@ -78,7 +76,7 @@ def last_step(calibration: SensorCalibration, samples: Samples, other: SensorCal
 
 def last_error_of_magnitude(
     calibration: SensorCalibration, samples: Samples, other: SensorCalibration | None
-) -> NDArray[np.float64] | None:
+) -> Values | None:
     """Return the error of the magnitude after the last step, (n,); None if an effect is left out."""
     found = last_step(calibration, samples, other)
     return None if found is None else np.linalg.norm(found[0], axis=1) - found[1]
@@ -90,7 +88,7 @@ def with_known_effects(calibration: SensorCalibration, samples: Samples, other: 
     return _with_effects(calibration, shown, other, samples)
 
 
-def _uncorrected(samples: Samples, readings: NDArray[np.float64]) -> Corrected:
+def _uncorrected(samples: Samples, readings: Values) -> Corrected:
     """Return readings, and the reference as it was logged."""
     return readings, samples.magnitude, None if samples.motion is None else truth(samples.sensor, samples.motion)
 
@@ -165,7 +163,7 @@ def _moved(motion: Motion, effects: Sequence[FittedEffect]) -> Motion:
     return motion
 
 
-def _moved_magnitude(samples: Samples, effects: Sequence[FittedEffect]) -> NDArray[np.float64]:
+def _moved_magnitude(samples: Samples, effects: Sequence[FittedEffect]) -> Values:
     """Return the reference's magnitude with effects that move the motion in time.
 
     That of a specific force is gravity at any time, that of a rest is 0. That of a rate is interpolated by a cubic
@@ -178,7 +176,7 @@ def _moved_magnitude(samples: Samples, effects: Sequence[FittedEffect]) -> NDArr
     time, spline = samples.time, make_interp_spline(samples.time, samples.magnitude, k=DEGREE)
     interval = float(np.median(np.diff(time)))
 
-    def motion(offset: float | NDArray[np.float64] = 0.0) -> Motion:
+    def motion(offset: float | Values = 0.0) -> Motion:
         at = np.clip(time + offset, time[0] - interval, time[-1] + interval)
         rate, nothing = np.zeros((2, len(time), 3))
         rate[:, 0] = spline(at)
@@ -186,7 +184,7 @@ def _moved_magnitude(samples: Samples, effects: Sequence[FittedEffect]) -> NDArr
         later = partial(moved_on, offset)
         return Motion(time, nothing, rate, nothing, nothing, None, None, None, None, still, at_offset=later)
 
-    def moved_on(before: float | NDArray[np.float64], offset: float | NDArray[np.float64]) -> Motion:
+    def moved_on(before: float | Values, offset: float | Values) -> Motion:
         return motion(before + offset)
 
     return np.asarray(np.abs(_moved(motion(), effects).angular_rate[:, 0]))
@@ -194,7 +192,7 @@ def _moved_magnitude(samples: Samples, effects: Sequence[FittedEffect]) -> NDArr
 
 def _from_own_signals(
     calibration: SensorCalibration, effects: Sequence[FittedEffect], samples: Samples, other: SensorCalibration | None
-) -> NDArray[np.float64]:
+) -> Values:
     """Return calibrated readings whose effects follow from the log's own calibrated signals."""
     sensor = calibration.sensor
     readings = {sensor: samples.reading}
@@ -206,7 +204,7 @@ def _from_own_signals(
     used = fields_used(sensor, effects)
     nothing = np.zeros_like(samples.reading)
 
-    def motion_of(truths: dict[str, NDArray[np.float64]], _number: int) -> Motion:
+    def motion_of(truths: dict[str, Values], _number: int) -> Motion:
         force, rate = truths.get("accelerometer", nothing), truths.get("gyroscope", nothing)
         if samples.resting:
             rate = nothing

@@ -39,12 +39,9 @@ from pipeline.validation.norm_error import mean_squares
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from numpy.typing import NDArray
-
-    from pipeline.records import Noise, SensorCalibration
+    from pipeline.records import Noise, SensorCalibration, Values
     from pipeline.validation.samples import Samples
 
-    Values = NDArray[np.float64]
 
 LACK_OF_FIT = "lack of fit"  # the part of a budget's line that no noise explains: 0 in a model that is right
 TAIL = 0.005  # probability on each side of a 99 % interval

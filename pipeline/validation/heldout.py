@@ -30,9 +30,7 @@ from pipeline.validation.samples import samples_of_motion, samples_of_rests
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
-
-    from pipeline.records import Noise, Recording, SensorCalibration
+    from pipeline.records import Noise, Recording, SensorCalibration, Values
     from pipeline.signal.rests import Rest
     from pipeline.validation.samples import Samples
 
@@ -225,7 +223,7 @@ def noise_floors(calibration: SensorCalibration, samples: Sequence[Samples]) -> 
     return floor, float(np.sqrt(np.mean(vectors)))
 
 
-def _truth(calibration: SensorCalibration, samples: Samples) -> NDArray[np.float64]:
+def _truth(calibration: SensorCalibration, samples: Samples) -> Values:
     """Return the reference's magnitude along its direction, or along that of the calibrated reading: (n, 3) array."""
     reading = linear_truth(calibration, samples.reading)
     direction = reading
@@ -234,7 +232,7 @@ def _truth(calibration: SensorCalibration, samples: Samples) -> NDArray[np.float
         direction = np.where(np.isfinite(known).all(axis=1, keepdims=True), known, reading)
     size = np.linalg.norm(direction, axis=1, keepdims=True)
     unit = np.where(size > 0, direction / np.where(size > 0, size, 1.0), [1.0, 0.0, 0.0])
-    along: NDArray[np.float64] = samples.magnitude[:, None] * unit
+    along: Values = samples.magnitude[:, None] * unit
     return along
 
 

@@ -18,9 +18,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from pipeline.records import Values
 
-    Values = NDArray[np.float64]
 
 NODES, NODE_WEIGHTS = np.polynomial.legendre.leggauss(48)  # enough for the 0.4 % of a simulation (test_norm_error)
 THETA, STEP = np.pi / 4.0 * (NODES + 1.0), np.pi / 4.0 * NODE_WEIGHTS
@@ -30,13 +29,7 @@ FAR = 30.0  # standard deviations from zero, beyond which the norm is linear to 
 def squared_norm_errors(truth: Values, matrix: Values, variance: Values) -> Values:
     """Return ``E(|t + M n| - |t|)^2`` of each sample, unit squared: (n,) array.
 
-    Parameters
-    ----------
-    truth : (n, 3) array, g or deg/s
-    matrix : (3, 3) array
-        M.
-    variance : (n, 3) array
-        Of the noise n, per reading axis.
+    ``truth``: (n, 3), g or deg/s; ``matrix``: M; ``variance``: (n, 3), of the noise n of each reading axis.
     """
     if np.all(variance == variance[:1]):  # of samples, not of means over rests
         return mean_squares(truth, (matrix * variance[0]) @ matrix.T)[0]
@@ -49,13 +42,7 @@ def squared_norm_errors(truth: Values, matrix: Values, variance: Values) -> Valu
 
 
 def mean_squares(truth: Values, S: Values) -> tuple[Values, Values]:
-    """Return ``E(|t + x| - |t|)^2`` and its weight g, for errors x of covariance S: two (n,) arrays.
-
-    Parameters
-    ----------
-    truth : (n, 3) array, g or deg/s
-    S : (3, 3) array
-    """
+    """Return ``E(|t + x| - |t|)^2`` and its weight g, for (n, 3) truths and errors x of covariance S: (n,) arrays."""
     size, total = np.linalg.norm(truth, axis=1), float(np.trace(S))
     u = truth / np.where(size > 0.0, size, 1.0)[:, None]
     along = np.einsum("ni,ij,nj->n", u, S, u)

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.records import Motion, Noise, Recording
+    from pipeline.records import Motion, Noise, Recording, Values
     from pipeline.signal.rests import Rest
 
 OTHER = {"accelerometer": "gyroscope", "gyroscope": "accelerometer"}
@@ -41,20 +41,20 @@ class Samples:
     """Samples of one recording on which a calibration is judged."""
 
     sensor: str
-    time: NDArray[np.float64]  # (n,), s
-    reading: NDArray[np.float64]  # (n, 3), g or deg/s
-    magnitude: NDArray[np.float64]  # (n,), that of the reference
-    white: NDArray[np.float64]  # (n, 3), variance of white noise behind the filter, per reading axis
-    wander: NDArray[np.float64]  # (n, 3), variance of wander
+    time: Values  # (n,), s
+    reading: Values  # (n, 3), g or deg/s
+    magnitude: Values  # (n,), that of the reference
+    white: Values  # (n, 3), variance of white noise behind the filter, per reading axis
+    wander: Values  # (n, 3), variance of wander
     motion: Motion | None  # by the reference, where the attitude is known
-    other: NDArray[np.float64] | None  # (n, 3), readings of the other sensor
-    temperature: NDArray[np.float64] | None  # (n,), degC
+    other: Values | None  # (n, 3), readings of the other sensor
+    temperature: Values | None  # (n,), degC
     resting: bool = False  # whether each sample is the mean of a rest
     alike: float = 1.0  # samples that share one value of the white noise, by the filter: sum_l r_l^2 / r_0^2 over lags
     earth_left_out: bool = False  # whether Earth's rotation is configured, but without an attitude not in the magnitude
 
     @property
-    def variance(self) -> NDArray[np.float64]:
+    def variance(self) -> Values:
         """Of the noise of each sample, per reading axis: (n, 3) array, unit squared."""
         return self.white + self.wander
 
@@ -119,7 +119,7 @@ def samples_of_rests(
         return None
     reading, counts = reading[counts > 0], counts[counts > 0]
 
-    def means(values: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+    def means(values: Values | None) -> Values | None:
         return None if values is None else np.array([np.mean(values[r.start : r.stop]) for r in rests])
 
     other, _ = rest_means(recording, rests, OTHER[sensor])
@@ -147,9 +147,7 @@ def samples_of_rests(
     )
 
 
-def _creep(
-    recording: Recording, rests: Sequence[Rest], force: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _creep(recording: Recording, rests: Sequence[Rest], force: Values) -> tuple[Values, Values]:
     """Return the rate at which the unit creeps in each rest, deg/s, and the variance of what is not known of it."""
     every = {(r.start, r.stop): creep_in(recording, r.start, r.stop) for r in (*split_rests(recording, 0).used, *rests)}
     rates, errors, about = believed_rates(list(every.values()))
@@ -173,9 +171,7 @@ def _alike(recording: Recording) -> float:
     return float((2.0 * covariance.sum() - covariance[0]) / covariance[0])
 
 
-def _rate(
-    recording: Recording, motion: Motion | None, earth: NDArray[np.float64] | None, delay: float
-) -> NDArray[np.float64] | None:
+def _rate(recording: Recording, motion: Motion | None, earth: Values | None, delay: float) -> Values | None:
     """Return the magnitude of the rate that the gyroscope should see: (n,) array, deg/s."""
     seen = None if motion is None else np.linalg.norm(truth("gyroscope", motion), axis=1)
     turned = seen

@@ -25,9 +25,8 @@ from pipeline.signal.rests import RATE_AT_REST_DPS
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
+    from pipeline.records import Values
 
-    Values = NDArray[np.float64]
 
 REFERENCE_TEMPERATURE = 25.0  # degC, that of data sheets
 STANDARD_GRAVITY = 9.80665  # m/s^2, ISO 80000-3

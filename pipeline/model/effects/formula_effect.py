@@ -20,13 +20,10 @@ from pipeline.model.formula import OF_THE_MOTION, SIGNALS, c_number
 from pipeline.records import AXES
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from pipeline.model.effects.base import Parameter
     from pipeline.model.effects.declaration import Declaration, Term
-    from pipeline.records import Motion
+    from pipeline.records import Motion, Values
 
-    Values = NDArray[np.float64]
 
 AS_DECLARED = (
     *("name", "owner", "sensors", "contains", "prior", "needs_both_directions", "meaning", "excitation", "experiment"),
@@ -40,11 +37,7 @@ TRUTHS = {"accelerometer": "specific_force", "gyroscope": "angular_rate"}
 class DeclaredEffect(Effect):
     """An effect whose name, owner, parameters and texts are those of a file; its equation is a subclass.
 
-    Parameters
-    ----------
-    declared : Declaration
-    definition : dict, optional
-        Of a user's effect, the content of the file.
+    ``definition``: of a user's effect, the content of the file.
     """
 
     def __init__(self, declared: Declaration, definition: dict[str, Any] | None = None) -> None:

@@ -29,11 +29,8 @@ from pipeline.model.kinematics import skew, turn_by_vector
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from numpy.typing import NDArray
+    from pipeline.records import Motion, Values
 
-    from pipeline.records import Motion
-
-    Values = NDArray[np.float64]
 
 ROUNDS = 6  # of a fixed point; rotations of 10 deg converge by a factor of 30 in each
 STEP_DEG = 1e-3  # of the central difference of a rotation: its error is (step^2 / 6) rad = 5e-11
@@ -41,14 +38,7 @@ VECTORS = ("specific_force", "angular_rate", "angular_acceleration", "specific_f
 
 
 def rotated(motion: Motion, rotation: Values) -> Motion:
-    """Return a motion whose vectors are rotated, now and at any offset in time.
-
-    Parameters
-    ----------
-    motion : Motion
-    rotation : (3, 3) array
-        Applied to every vector in the body frame.
-    """
+    """Return a motion whose vectors in the body frame are rotated, by (3, 3), now and at any offset in time."""
     found: dict[str, Any] = {n: v @ rotation.T for n in VECTORS if (v := getattr(motion, n)) is not None}
     for name in ("at_offset", "at_lag"):
         trajectory = getattr(motion, name)

@@ -23,11 +23,8 @@ from pipeline.model.effects.base import Effect, Layout, Owner, Parameter, truth,
 from pipeline.model.effects.mounting import rotation_columns, turned_back
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from pipeline.records import Motion, Values
 
-    from pipeline.records import Motion
-
-    Values = NDArray[np.float64]
 
 SEPARATOR = "@"
 EXPERIMENT = "the same turns in another setup"

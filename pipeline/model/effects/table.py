@@ -31,11 +31,8 @@ from pipeline.model.effects.formula_effect import DeclaredEffect
 from pipeline.model.kinematics import ABOUT, UP_AT_ZERO, skew, turn_about_axis
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from pipeline.records import Motion, Values
 
-    from pipeline.records import Motion
-
-    Values = NDArray[np.float64]
 
 UPRIGHT = 0.5  # sine of the turn axis's elevation, which is 0 or 1: gravity turns with the angle, or not at all
 SIGNS = np.array([[1.0], [-1.0]])  # of d_x and d_y in the equation above

@@ -24,11 +24,8 @@ from pipeline.model.formula import c_number
 from pipeline.model.kinematics import NODES, WEIGHTS
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from pipeline.records import Motion, Values
 
-    from pipeline.records import Motion
-
-    Values = NDArray[np.float64]
 
 STARTS_S = (60.0, 180.0, 500.0, 1500.0)  # of a part of some grams to a box of some kilograms, in steps of three
 SHORTEST_S, LONGEST_S = 1.0, 1e5  # beyond these it is a step at the start, or a drift
