@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from pipeline.diagnosis import multi_position, turntable
-from pipeline.diagnosis.findings import document_of
+from pipeline.diagnosis.findings import Case, document_of
 from pipeline.diagnosis.verdict import EXPLAINED, LIKELY, Evidence, HeldOut, judged, may_be_unknown
 from pipeline.errors import NotObservableError
 from pipeline.estimation.candidates import MOUNTING, configured_effects
@@ -83,10 +83,11 @@ def diagnose(
     by_gravity = sensor == "gyroscope" and MOUNTING in configured
     if by_gravity:
         accelerometer = mountings_by_gravity(recordings, settings)
+    case = Case(calibration, recordings, noise, settings, accelerometer, configured)
     full = (settings.get("diagnosis") or {}).get("depth") == FULL
 
     def judge(found: Findings | None, document: dict[str, Any]) -> tuple[dict[str, Any], bool]:
-        evidence = evidence_of(document, sensor, recordings, noise, settings, validation=validation, found=found)
+        evidence = evidence_of(document, case, validation, found)
         if moves and "largest_expected_rms_deg" in moves:
             evidence = replace(evidence, moves=(moves["rms_deg"]["after"], moves["largest_expected_rms_deg"]))
         if by_gravity and gravity:
@@ -95,13 +96,13 @@ def diagnose(
         return verdict, full or may_be_unknown(verdict["verdict"], evidence)
 
     try:
-        found = procedure.findings(calibration, recordings, noise, settings, configured, accelerometer=accelerometer)
+        found = procedure.findings(case)
     except NotObservableError as reason:
         return judge(None, _not_enough_data(sensor, configured, reason.message, procedure.NEEDED))[0]
-    document, unknown = judge(found, document_of(found, configured, settings["effects"][sensor]))
+    document, unknown = judge(found, document_of(found, case))
     if unknown and found.search:
         found = found.search() or found
-        document, _ = judge(found, document_of(found, configured, settings["effects"][sensor]))
+        document, _ = judge(found, document_of(found, case))
     if found.deeper and (full or document["verdict"] != "nothing_missing"):
         document |= found.deeper()
     return document
@@ -126,27 +127,21 @@ def doubts_of(sensor: str, recordings: Sequence[Recording], *, seats: bool = Tru
 
 
 def evidence_of(
-    document: Mapping[str, Any],
-    sensor: str,
-    recordings: Sequence[Recording],
-    noise: Noise | None,
-    settings: Mapping[str, Any],
-    *,
-    validation: Mapping[str, Any] | None,
-    found: Findings | None = None,
+    document: Mapping[str, Any], case: Case, validation: Mapping[str, Any] | None, found: Findings | None
 ) -> Evidence:
     """Return what decides; the held-out error of further fits only where that of the calibration is above its interval.
 
     ``document`` is the diagnosis of the selection alone, and ``found`` what it was made of; without a ``validation``, a
     free fit stands for the calibration.
     """
+    sensor, recordings, settings = case.sensor, case.recordings, case.settings
     method = settings.get("method") or {}
     free, full = (found.free, found.full) if found else (None, None)
 
     def error_of(fit: Callable[[], SensorCalibration] | None, *, smoothed: bool) -> HeldOut | None:
-        if fit is None or noise is None or found is None:
+        if fit is None or case.noise is None or found is None:
             return None
-        error = last_error(fit(), recordings, noise, settings, other=found.other, smoothed=smoothed)
+        error = last_error(fit(), recordings, case.noise, settings, other=found.other, smoothed=smoothed)
         return None if error is None else HeldOut(error[0], *error[1])
 
     accepted = ((settings.get("sensor") or {}).get(sensor) or {}).get("accept_implausible")

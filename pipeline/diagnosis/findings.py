@@ -25,10 +25,33 @@ if TYPE_CHECKING:
     from pipeline.estimation.design import Term
     from pipeline.estimation.posterior import Answers
     from pipeline.estimation.ranking import Score
-    from pipeline.records import SensorCalibration, Values
+    from pipeline.records import Noise, Recording, SensorCalibration, Values
 
 
 LEAST_RATIO = 0.03  # of the white noise: the smallest wander of the selection's settings
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is diagnosed: the calibration of a sensor, and what it was made of; see ``diagnose``."""
+
+    calibration: SensorCalibration
+    recordings: Sequence[Recording]
+    noise: Noise | None
+    settings: Mapping[str, Any]
+    accelerometer: SensorCalibration | None
+    configured: list[str]  # effects that the model holds: those that are listed, and those of the bench
+
+    @property
+    def sensor(self) -> str:
+        """The sensor."""
+        return self.calibration.sensor
+
+    @property
+    def sheet(self) -> Mapping[str, Any]:
+        """Its section of the settings."""
+        found: Mapping[str, Any] = self.settings["sensor"][self.sensor]
+        return found
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,12 +97,10 @@ class Findings:
         return float(np.clip(drop / excess, 0.0, 1.0)) if excess > 0.0 else 0.0
 
 
-def document_of(found: Findings, configured: list[str], wanted: Sequence[str] | str) -> dict[str, Any]:
-    """Return a sensor's part of ``diagnoses/<unit>.json``, with the verdict of the selection alone.
-
-    ``configured`` holds ``wanted``, the effects that are listed, and those of the bench, which need no override.
-    """
-    listed = [name for name in configured if name in wanted]
+def document_of(found: Findings, case: Case) -> dict[str, Any]:
+    """Return a sensor's part of ``diagnoses/<unit>.json``, with the verdict of the selection alone."""
+    wanted = case.settings["effects"][case.sensor]
+    listed = [name for name in case.configured if name in wanted]  # effects of the bench need no override
     others = sorted(found.alone.values(), key=lambda s: -s.delta_bic)
     unselected = [s.name for s in others if s.name not in found.selected and s.name not in found.hidden]
     ranking = [_entry(found, name) for name in (*found.selected, *unselected)]
@@ -97,7 +118,7 @@ def document_of(found: Findings, configured: list[str], wanted: Sequence[str] | 
         "suggested_effect": None,
         "next_experiment": next_experiment(verdict, ranking, found),
         "override": _override(found.sensor, [*listed, *found.selected]) if found.selected else "",
-        "configured": configured,
+        "configured": case.configured,
         "wander": _wander(found),
         "method_errors": [],
         **found.more,

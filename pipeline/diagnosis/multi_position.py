@@ -43,6 +43,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from pipeline.diagnosis.findings import Case
     from pipeline.estimation.multi_position.fit import Fit
     from pipeline.estimation.multi_position.model import Model, State
     from pipeline.estimation.multi_position.selection import Selection
@@ -59,15 +60,7 @@ MOST_NAMED = 3  # effects in a sentence
 FIRM = 2.0  # times the noise, above which the scatter of the rests is worth a word
 
 
-def findings(
-    calibration: SensorCalibration,
-    recordings: Sequence[Recording],
-    noise: Noise | None,
-    settings: Mapping[str, Any],
-    configured: list[str],
-    *,
-    accelerometer: SensorCalibration | None,
-) -> Findings:
+def findings(case: Case) -> Findings:
     """Return what the selection finds in rests and moves by hand.
 
     Raises
@@ -75,11 +68,11 @@ def findings(
     NotObservableError
         If there are no rests, or they do not determine bias and matrix.
     """
-    sensor, sheet = calibration.sensor, settings["sensor"][calibration.sensor]
-    model = _model_of_all_rests(calibration, recordings, noise, settings, accelerometer)
-    selection = select(model, calibration, configured, noise, sheet)
-    expected = _without_creep(noise, sheet)
-    hidden, unknown = not_observable_by_hand(selection, configured), dependences(selection)
+    model, calibration = _model_of_all_rests(case), case.calibration
+    given = calibration, case.configured, case.noise, case.sheet
+    selection = select(model, *given)
+    expected = _without_creep(case.noise, case.sheet)
+    hidden, unknown = not_observable_by_hand(selection, case.configured), dependences(selection)
     chi = [_chi(selection, fit, expected) for fit in selection.fits]
     over, left_over = (_over_noise(selection, selection.fits[k], expected) for k in (0, -1))
     verdict = "missing_effect" if selection.names else "nothing_missing"
@@ -88,6 +81,9 @@ def findings(
     likely = project_out(model.equations(selection.fits[-1].state), selection.hypotheses).scores()
     best = selection.hypotheses[int(np.argmax(likely))]
     signal = selection.first.signal
+
+    def calibrated(fit: Fit) -> SensorCalibration:
+        return calibration_of(model, fit, calibration, case.settings)
 
     def advice(verdict: str) -> str:
         if verdict == "not_enough_data":
@@ -98,7 +94,7 @@ def findings(
         return f"to make bias temperature observable: record {warmth.excitation}" if warmth.name in hidden else ""
 
     return Findings(
-        sensor=sensor,
+        sensor=case.sensor,
         selected=selection.names,
         verdict=verdict,
         steps=selection.steps,
@@ -120,8 +116,10 @@ def findings(
         white=float(np.sqrt(np.mean(model.white**2))),
         expected_wander=None if expected is None else float(np.sqrt(np.mean(expected.wander**2))),
         advice=advice,
-        full=(lambda: calibration_of(model, selection.fits[-1], calibration, settings)) if selection.names else None,
-        other=accelerometer if sensor == "gyroscope" else None,
+        full=(lambda: calibration_of(model, selection.fits[-1], calibration, case.settings))
+        if selection.names
+        else None,
+        other=case.accelerometer if case.sensor == "gyroscope" else None,
         on_table=False,
         departures=[text for stage in calibration.stages for text in stage.details.get("departures", ())],
         scatter={"scatter_over_noise": float(best.scatter[0])},
@@ -131,23 +129,14 @@ def findings(
                 "unexplained": [],
             },
             "method_errors": given_differences(
-                calibration,
-                lambda: calibration_of(model, selection.fits[0], calibration, settings),
-                recordings,
-                settings,
+                calibration, lambda: calibrated(selection.fits[0]), case.recordings, case.settings
             ),
-            "cross_validation": _nested(selection, lambda part: select(part, calibration, configured, noise, sheet)),
+            "cross_validation": _nested(selection, lambda part: select(part, *given)),
         },
     )
 
 
-def _model_of_all_rests(
-    calibration: SensorCalibration,
-    recordings: Sequence[Recording],
-    noise: Noise | None,
-    settings: Mapping[str, Any],
-    accelerometer: SensorCalibration | None,
-) -> Model:
+def _model_of_all_rests(case: Case) -> Model:
     """Return the model with no rest held out.
 
     The accelerometer is calibrated by all rests, which shows those that contradict the others; it is taken as it is
@@ -159,15 +148,15 @@ def _model_of_all_rests(
         if found.effects:
             return found
         try:
-            return nonlinear_least_squares.fit(recordings, None, {**every, **known})
+            return nonlinear_least_squares.fit(case.recordings, None, {**every, **known})
         except PipelineError:
             return found
 
-    every = {**settings, "procedure": {**settings["procedure"], "holdout_every": 0}}
-    if calibration.sensor == "accelerometer":
-        return require_model(recordings, with_all_rests(calibration, noise), noise, every)
-    other = accelerometer and with_all_rests(accelerometer, None)
-    return require_model(recordings, calibration, noise, every, other)
+    every = {**case.settings, "procedure": {**case.settings["procedure"], "holdout_every": 0}}
+    if case.sensor == "accelerometer":
+        return require_model(case.recordings, with_all_rests(case.calibration, case.noise), case.noise, every)
+    other = case.accelerometer and with_all_rests(case.accelerometer, None)
+    return require_model(case.recordings, case.calibration, case.noise, every, other)
 
 
 def require_model(

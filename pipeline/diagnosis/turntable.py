@@ -7,7 +7,7 @@ logged, else the rms error of the magnitude, against the noise floor of ``pipeli
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -34,25 +34,18 @@ from pipeline.validation.heldout import noise_floors
 from pipeline.validation.samples import samples_of_motion
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
+    from pipeline.diagnosis.findings import Case
     from pipeline.estimation.generalized_least_squares import Fit
     from pipeline.estimation.selection import Selection
-    from pipeline.records import Recording, SensorCalibration
+    from pipeline.records import SensorCalibration
 
 NEEDED = "record turns about all three axes on a table whose angle and rate are logged"
 CLOSE = 1.1  # mean square of a residual over that of noise, under which there is no excess to share
 
 
-def findings(
-    calibration: SensorCalibration,
-    recordings: Sequence[Recording],
-    noise: Noise | None,
-    settings: Mapping[str, Any],
-    configured: list[str],
-    *,
-    accelerometer: SensorCalibration | None,
-) -> Findings:
+def findings(case: Case) -> Findings:
     """Return what the selection finds in turns on a table.
 
     Raises
@@ -60,38 +53,28 @@ def findings(
     NotObservableError
         If the recordings do not determine bias and matrix.
     """
-    sensor, sheet = calibration.sensor, settings["sensor"][calibration.sensor]
-    observations = observe(sensor, recordings, settings["table"])
-    selection = select(observations, configured, noise, sheet, calibration, accelerometer=accelerometer)
+    observations = observe(case.sensor, case.recordings, case.settings["table"])
+    given = case.configured, case.noise, case.sheet
+    selection = select(observations, *given, case.calibration, accelerometer=case.accelerometer)
     unknown = dependent(selection)
 
-    def described(discovery: Discovery) -> Findings:
-        return _described(discovery, calibration, recordings, noise, {**settings, "configured": configured})
-
     def search() -> Findings | None:
-        found = discover(selection, unknown, configured, noise, sheet, accelerometer=accelerometer)
-        return described(found) if found.suggested else None
+        found = discover(selection, unknown, *given, accelerometer=case.accelerometer)
+        return _described(found, case) if found.suggested else None
 
-    return replace(described(Discovery(selection, selection, unknown)), search=search)
+    return replace(_described(Discovery(selection, selection, unknown), case), search=search)
 
 
-def _described(
-    discovery: Discovery,
-    calibration: SensorCalibration,
-    recordings: Sequence[Recording],
-    noise: Noise | None,
-    settings: Mapping[str, Any],
-) -> Findings:
-    """Return what was selected and discovered in common terms; ``settings`` with the ``configured`` effects."""
-    sensor, selection, reported = calibration.sensor, discovery.context, discovery.reported
-    configured = settings["configured"]
+def _described(discovery: Discovery, case: Case) -> Findings:
+    """Return what was selected and discovered in common terms."""
+    sensor, noise, selection, reported = case.sensor, case.noise, discovery.context, discovery.reported
     observations, unknown = selection.observations, discovery.unknown
     fits = _fits(reported)
-    held, floor = _held_out(reported, fits, recordings, noise, settings["table"])
+    held, floor = _held_out(reported, fits, case)
     held_out = None
     if held is not None and noise is not None:
         held_out = {"error_before": held[0], "error_after": held[-1], "floor": floor}
-    hidden = not_observable(reported, configured)
+    hidden = not_observable(reported, case.configured)
     left = [fit.residual_rms**2 for fit in fits]
     noise_square = None if noise is None else float(np.mean(noise.white**2 + noise.wander**2))
     least = left[-1] if noise_square is None else noise_square
@@ -126,7 +109,7 @@ def _described(
         return f"to make {plain(shown)} observable: record {catalogue()[shown].excitation}" if shown else ""
 
     def calibrated(fit: Fit) -> SensorCalibration:
-        return calibration_of(sensor, fit, selection.observations, None, settings)
+        return calibration_of(sensor, fit, selection.observations, None, case.settings)
 
     scores = reported.ranking.log_likelihoods(reported.chosen())
     hypotheses = list(zip(reported.ranking.settings, scores.tolist(), strict=True))[1:]  # the first is white noise
@@ -147,8 +130,8 @@ def _described(
         held_out=held or [None] * len(fits),
         hidden=hidden,
         unknown=unknown,
-        over_noise=_over_noise(selection.base, recordings, noise),
-        left_over_noise=_over_noise(selection.fit, recordings, noise),
+        over_noise=_over_noise(selection.base, case),
+        left_over_noise=_over_noise(selection.fit, case),
         noises=[(setting.ratio, setting.time, score) for setting, score in hypotheses],
         white=float(np.sqrt(white_square)),
         expected_wander=None if noise is None else float(np.sqrt(np.mean(noise.wander**2))),
@@ -160,7 +143,7 @@ def _described(
             "suggested_effect": discovery.suggested,
             "formulas": discovery.front,
             "pictures": plots(selection, unknown, noise, reported),
-            "method_errors": method_errors(calibration, reported, recordings, settings),
+            "method_errors": method_errors(case.calibration, reported, case.recordings, case.settings),
         },
         turns=turns_of(observations),
         deeper=lambda: {
@@ -186,30 +169,24 @@ def _fits(selection: Selection) -> list[Fit]:
     return [*fits, selection.fit] if selection.names else fits
 
 
-def _held_out(
-    selection: Selection,
-    fits: Sequence[Fit],
-    recordings: Sequence[Recording],
-    noise: Noise | None,
-    table: Mapping[str, Any],
-) -> tuple[list[float] | None, float]:
+def _held_out(selection: Selection, fits: Sequence[Fit], case: Case) -> tuple[list[float] | None, float]:
     """Return the held-out errors of some fits, and the noise floor of the last; None where nothing is held out.
 
     An error is the rms length of the vector's error where the attitude is known, else the rms error of the magnitude.
     """
-    sensor, known = selection.observations.sensor, noise or Noise(np.zeros(3), np.zeros(3), 1.0, "none")
-    held = [r for r in recordings if r.role == "validation"] if selection.names else []
-    samples = [s for r in held if (s := samples_of_motion(sensor, r, known, table, smoothed=True)) is not None]
-    samples = [s for s in samples if s.known.any()]
+    sensor, noise = case.sensor, case.noise or Noise(np.zeros(3), np.zeros(3), 1.0, "none")
+    held = [r for r in case.recordings if r.role == "validation"] if selection.names else []
+    found = [samples_of_motion(sensor, r, noise, case.settings["table"], smoothed=True) for r in held]
+    samples = [s for s in found if s is not None and s.known.any()]
     if not samples:
         return None, 0.0
     calibrations = [calibration_of(sensor, fit, selection.observations, None) for fit in fits]
     corrected = [[with_known_effects(calibration, each, None) for each in samples] for calibration in calibrations]
     directed = all(true is not None for each in corrected for _, _, true in each)
     errors: list[float] = []
-    for found in corrected:
+    for by_fit in corrected:
         squares = []
-        for each, (vector, magnitude, true) in zip(samples, found, strict=True):
+        for each, (vector, magnitude, true) in zip(samples, by_fit, strict=True):
             off = np.linalg.norm(vector, axis=1) - magnitude
             if directed and true is not None:
                 off = np.linalg.norm(vector - true, axis=1)
@@ -227,10 +204,10 @@ def _shares(selection: Selection, name: str) -> dict[str, float]:
     return selection.first.shares(selection.first.indices(name)[0], [], selection.alone[name].setting)
 
 
-def _over_noise(fit: Fit, recordings: Sequence[Recording], noise: Noise | None) -> float | None:
+def _over_noise(fit: Fit, case: Case) -> float | None:
     """Return the rms residual of a fit over that of noise alone."""
-    if noise is None:
+    if case.noise is None:
         return None
-    gain = max(float(r.filter.get("noise_gain", 1.0)) for r in recordings)
-    floor = float(np.sqrt(np.mean((gain * noise.white) ** 2 + noise.wander**2)))
+    gain = max(float(r.filter.get("noise_gain", 1.0)) for r in case.recordings)
+    floor = float(np.sqrt(np.mean((gain * case.noise.white) ** 2 + case.noise.wander**2)))
     return float(fit.residual_rms / floor) if floor > 0 else None
