@@ -1,8 +1,5 @@
 """The data that stages pass to each other: recordings, motions, noise and calibrations (frozen dataclasses)."""
 
-import numpy as np
-from numpy.typing import NDArray
-
 from pipeline.records.calibration import (
     NORMAL,
     RECTANGULAR,
@@ -34,8 +31,6 @@ from pipeline.records.recording import (
     noise_of_steps,
     rate_of_attitude,
 )
-
-Values = NDArray[np.float64]  # an array of floats; shape and unit stand where it is used
 
 __all__ = [
     "AXES",
