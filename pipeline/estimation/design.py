@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from pipeline.model.effects.base import Effect
     from pipeline.records import Index, Motion, Noise, Values
 
-
 BASE = 12  # bias and matrix
 REMEMBERED = 4  # motions of a part after effects of timing: base and as many terms without themselves
 BASE_NAMES = [f"bias_{a}" for a in "xyz"] + [f"matrix_{a}{b}" for a in "xyz" for b in "xyz"]

@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from pipeline.estimation.gauss_markov import Blocks, Prior
     from pipeline.records import Index, Values
 
-
 ONE_SIGMA, COVERED = 0.6827, 0.95  # probabilities at which the mixture and Student's t agree
 FEWEST = 2.0  # degrees of freedom: Student's t has no variance below
 STEPS, SMALL_STEP = 60, 1e-5  # of Newton's method for a quantile; relative

@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 
     from pipeline.records import Index, Integers, Noise, Values
 
-
 DEFAULT_TIME_S = 100.0  # correlation time where the data sheet gives none: of MEMS sensors, by IEEE Std 952 examples
 SHEET_WIDTH = float(np.log(3.0))  # of the logarithm of a bias instability that a data sheet gives: a factor of three
 SHARPEST_WIDTH = 0.15  # of the same logarithm, however long the static recording

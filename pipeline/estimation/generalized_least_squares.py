@@ -48,7 +48,6 @@ if TYPE_CHECKING:
     from pipeline.estimation.observations import Observations
     from pipeline.records import Noise, Recording, Values
 
-
 ROUNDS = 25  # of Gauss-Newton
 SMALL_STEP = 1e-3  # of a standard uncertainty
 RATIOS = (0.01, 0.03, 0.1, 0.2, 0.3, 0.5, 1.0, 3.0)  # of bias to white noise: the grid of a fit

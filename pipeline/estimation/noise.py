@@ -65,7 +65,6 @@ if TYPE_CHECKING:
 
     from pipeline.records import Integers, Mask, Values
 
-
 TIMES = np.exp2(np.arange(-6.0, 4.0))  # correlation times tried, in those of the data sheet
 SHORTEST_BLOCK = 8  # samples of a block
 FEWEST_SAMPLES = 60  # which tell white noise to a tenth

@@ -19,9 +19,17 @@ import numpy as np
 from pipeline.estimation.noise_likelihood import at_once, solved, spectrum_of
 from pipeline.estimation.noise_regression import Regression, Stretch
 from pipeline.estimation.noise_search import QUANTILE, Search, best_of, limits, ranked
-from pipeline.estimation.noise_terms import MARKOV, SINGLE, STOCHASTIC, WHITE, allan_variance, each_term, unit_of
+from pipeline.estimation.noise_terms import (
+    MARKOV,
+    SINGLE,
+    STOCHASTIC,
+    WHITE,
+    allan_deviation,
+    allan_variance,
+    each_term,
+    unit_of,
+)
 from pipeline.records import AXES, SENSOR_UNITS, SENSORS
-from pipeline.signal.allan import allan_deviation
 from pipeline.signal.rests import rest_readings, usable
 from pipeline.signal.temperature import temperature_of
 

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 
     from pipeline.records import Integers, Mask, Values
 
-
 RATIO = 1.05  # of the edges of a bin: the spectrum of a random walk changes by a tenth, its mean by 0.2 %
 LONGEST_TIME = 0.5  # correlation time, in lengths of the recording, above which a process is a random walk
 STEPS = (-4.0, 1.5)  # largest changes of a logarithm in one iteration; a term that is not there falls fast

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from pipeline.estimation.noise_search import Candidate
     from pipeline.records import Values
 
-
 STEADY_DEGC = 0.1  # a temperature that changes less is no regressor: the noise of thermometers on the chip
 STRAIGHT = 0.03  # share of a temperature's change that is no ramp, below which the two are not told apart
 LINES = 5  # sinusoids

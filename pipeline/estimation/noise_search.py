@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from pipeline.estimation.noise_likelihood import Spectrum, Work
     from pipeline.records import Values
 
-
 MOST_MARKOV = 2  # processes of different correlation times; a third is not told apart by less than some 10^6 samples
 TIMES = 10  # correlation times whose score is looked at, in equal steps of their logarithm
 STARTS = 2  # of them that are fitted

@@ -13,7 +13,12 @@ to the Allan variance at the averaging time t,
 
 where p = exp(-dt / T), x = t / T, and G is the standard deviation of the process. N^2 is the two-sided spectral density
 of white noise: ``N = sigma sqrt(dt)``, and the Allan deviation at 1 s is N. A density of a data sheet that is one-sided
-is ``sqrt(2) N``. Source: IEEE Std 952-1997, annex C.
+is ``sqrt(2) N``. The overlapping Allan deviation of N readings with the integral theta, over m intervals dt, is
+
+    sigma^2(tau) = sum_i (theta[i + 2m] - 2 theta[i + m] + theta[i])^2 / (2 tau^2 (N - 2m + 1)),   tau = m dt
+
+Of long averages every (m / ``PER_AVERAGE``)th term is summed: terms so close together are nearly the same. Sources:
+IEEE Std 952-1997, annex C; Riley, NIST SP 1065, section 5.2.4.
 """
 
 from __future__ import annotations
@@ -27,8 +32,8 @@ if TYPE_CHECKING:
 
     from pipeline.records import Values
 
-
 QUANTISATION, WHITE, INSTABILITY, WALK, MARKOV = range(5)
+PER_AVERAGE = 64  # terms of the sum that overlap in one average
 SINGLE = (QUANTISATION, WHITE, INSTABILITY, WALK)
 STOCHASTIC = ("quantisation", "white", "bias_instability", "random_walk", "gauss_markov")
 UNITS = {
@@ -86,3 +91,26 @@ def each_term(terms: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
     """Return name and content of each term that has a value, of an axis as published; not what is regressed out."""
     listed = [(name, part) for name, parts in terms.items() for part in (parts if isinstance(parts, list) else [parts])]
     return [(name, part) for name, part in listed if part["value"] is not None and name in UNITS]
+
+
+def allan_deviation(values: Values, interval: float, points_per_decade: int = 10) -> tuple[Values, Values]:
+    """Return averaging times, s, and the overlapping Allan deviation of (n,) or (n, k) readings, evenly sampled.
+
+    (m,) and (m,) or (m, k) arrays; both empty where there are fewer than 3 readings.
+    """
+    n = len(values)
+    longest = (n - 1) // 2
+    if longest < 1:
+        return np.empty(0), np.empty((0, *values.shape[1:]))
+    count = 1 + int(points_per_decade * np.log10(longest))
+    lengths = np.unique(np.geomspace(1, longest, count).astype(np.int64))
+    theta = np.zeros((values[0].size, n + 1))
+    np.cumsum((values - values.mean(axis=0)).reshape(n, -1).T, axis=1, out=theta[:, 1:])
+    twice = 2.0 * theta
+    deviation = np.empty((len(lengths), len(theta)))
+    for row, m in enumerate(lengths):
+        step = max(1, int(m) // PER_AVERAGE)
+        second = theta[:, 2 * m :: step] - twice[:, m:-m:step]
+        second += theta[:, : -2 * m : step]
+        deviation[row] = np.sqrt(np.einsum("ij,ij->i", second, second) / (2.0 * second.shape[1])) / m
+    return lengths.astype(np.float64) * interval, deviation.reshape(-1, *values.shape[1:])

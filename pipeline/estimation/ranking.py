@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from pipeline.estimation.observations import Observations
     from pipeline.records import Index, Values
 
-
 EXCITED = 1e-3  # share of a column's norm that the base leaves
 NEW = 1e-4  # share of the variance of a candidate's weakest direction that the chosen effects leave
 RIDGE = 1e-11  # of unit columns: 1e5 times the rounding of a double

@@ -48,7 +48,6 @@ if TYPE_CHECKING:
     from pipeline.estimation.turns import Part
     from pipeline.records import Recording, Values
 
-
 NAME = "reference_least_squares"
 COLUMNS = ("bias", *(f"matrix column {axis}" for axis in AXES))
 WEAKEST_DIRECTION = 1e-3  # smallest singular value of unit columns that still counts as determined

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from pipeline.records import Index, Integers, Mask, Recording, SensorCalibration, Values
     from pipeline.signal.rests import Rest
 
-
 ROLE, HELD_OUT = "rests", "validation"
 
 

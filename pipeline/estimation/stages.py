@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from pipeline.estimation.engine import ResidualNoise
     from pipeline.records import Recording, SensorCalibration, Values
 
-
 STAGED = {
     "accelerometer": ("orthogonality", "misalignment", "bias", "scale_factor"),
     "gyroscope": ("bias", "orthogonality_and_misalignment", "scale_factor"),

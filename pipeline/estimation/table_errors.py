@@ -25,7 +25,7 @@ from pipeline.estimation.engine import LinearMap
 from pipeline.model.effects import effect
 from pipeline.model.effects.base import truth
 from pipeline.model.kinematics import ABOUT, earth_rate
-from pipeline.records import NORMAL, Contribution, noise_of_steps
+from pipeline.records import NORMAL, SENSORS, Contribution, noise_of_steps
 from pipeline.signal.rests import RATE_AT_REST_DPS
 
 if TYPE_CHECKING:
@@ -34,33 +34,10 @@ if TYPE_CHECKING:
     from pipeline.estimation.gauss_markov import Blocks
     from pipeline.records import Index, Motion, Values
 
-
 ROUNDING = 1e-10  # of the largest effect of an input: a hundred thousand times the rounding of a double
 SAME_STOP_DEG = 0.02  # by which angles of one stop may differ
 COUNTED_STOPS = 4  # rests of a recording from which on it stops and goes: its steps are counted, whatever their rate
-FIELDS = {
-    "table angle": ("angle_accuracy_deg", "deg"),
-    "table rate": ("rate_accuracy", "1"),
-    "orthogonality of the table's axes": ("orthogonality_deg", "deg"),
-    "wobble of the table's axes": ("wobble_deg", "deg"),
-    "levelling": ("levelling_deg", "deg"),
-    "local gravity": ("gravity_accuracy_g", "g"),
-    "Earth's rotation": ("azimuth_accuracy_deg", "deg"),
-}
 TILTS = ("angle_accuracy_deg", "orthogonality_deg", "wobble_deg", "levelling_deg")
-IDLE = {  # sensors whose readings an input does not change
-    "table rate": (),
-    "levelling": ("gyroscope",),
-    "local gravity": ("gyroscope",),
-    "Earth's rotation": ("accelerometer",),
-}
-
-
-ESTIMATES = {
-    "orthogonality of the table's axes": ("table_axis_nonorthogonality", "mounting"),
-    "levelling": ("table_tilt",),
-    "Earth's rotation": ("earth_rotation",),
-}
 
 
 @dataclass(frozen=True)
@@ -104,26 +81,17 @@ def table_errors(reference: Reference, estimated: Sequence[str] = ()) -> tuple[l
 
     ``estimated``: effects of the fit: what one of them estimates is no input any more.
     """
-    effects = {
-        "table angle": _angle,
-        "table rate": _rate,
-        "orthogonality of the table's axes": _orthogonality,
-        "wobble of the table's axes": _wobble,
-        "levelling": _levelling,
-        "local gravity": _gravity,
-        "Earth's rotation": _azimuth,
-    }
     found, missing = [], {}
-    for source, (key, unit) in FIELDS.items():
-        if reference.sensor in IDLE.get(source, ()):
+    for source, key, unit, sensors, replaced_by, change in ACCURACIES:
+        if reference.sensor not in sensors:
             continue
         u = reference.table.get(key)
-        fitted = [name for name in ESTIMATES.get(source, ()) if _everywhere(name, estimated, reference.motions)]
+        fitted = [name for name in replaced_by if _everywhere(name, estimated, reference.motions)]
         reason = f"estimated by {fitted[0]}" if fitted else _without(source, key, reference.table)
         if reason:
             missing[source] = reason
         elif u:
-            found.append(type_b(source, NORMAL, float(u), unit, effects[source](reference)))
+            found.append(type_b(source, NORMAL, float(u), unit, change(reference)))
     return found, missing
 
 
@@ -142,14 +110,8 @@ def disturbance(
         return None
     sums = np.zeros((len(blocks.weight), len(residuals)))
     sums[blocks.label(len(residuals)), np.arange(len(residuals))] = 1.0 if weight is None else weight
-    errors, _ = table_errors(replace(reference, fit=LinearMap((sums, sums, sums), _places(len(sums)))))
+    errors, _ = table_errors(replace(reference, fit=LinearMap((sums, sums, sums), (sums, sums, sums)).first()))
     return np.sum([e.covariance for e in errors], axis=0) if errors else None
-
-
-def _places(count: int) -> tuple[Values, Values, Values]:
-    """Return what places ``count`` values of each channel one after the other."""
-    x, y, z = np.split(np.eye(3 * count), 3, axis=1)
-    return x, y, z
 
 
 def _largest(reference: Reference) -> float:
@@ -311,3 +273,18 @@ def _azimuth(reference: Reference) -> Values:
     return reference.summed(
         lambda m: None if m.level is None else np.einsum("i,nij->nj", change, m.level)[:, :, None], 1
     )
+
+
+# Source, setting of the table, unit, sensors whose readings it changes, effects that estimate it, what it does.
+ACCURACIES = (
+    ("table angle", "angle_accuracy_deg", "deg", SENSORS, (), _angle),
+    ("table rate", "rate_accuracy", "1", SENSORS, (), _rate),
+    (
+        "orthogonality of the table's axes", "orthogonality_deg", "deg", SENSORS,
+        ("table_axis_nonorthogonality", "mounting"), _orthogonality,
+    ),
+    ("wobble of the table's axes", "wobble_deg", "deg", SENSORS, (), _wobble),
+    ("levelling", "levelling_deg", "deg", ("accelerometer",), ("table_tilt",), _levelling),
+    ("local gravity", "gravity_accuracy_g", "g", ("accelerometer",), (), _gravity),
+    ("Earth's rotation", "azimuth_accuracy_deg", "deg", ("gyroscope",), ("earth_rotation",), _azimuth),
+)  # fmt: skip

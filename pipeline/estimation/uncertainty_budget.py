@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     from pipeline.estimation.table_errors import Reference
     from pipeline.records import Recording, SensorCalibration, Values
 
-
 DITHERED = 0.5  # counts of white noise above which rounding errors are independent (Widrow & Kollar 2008)
 NOISE, QUANTISATION = "noise of the readings", "quantisation"
 NOT_STATED = "one calibration does not tell it: calibrate the unit again after switching it off"

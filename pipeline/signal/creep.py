@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
     from pipeline.records import Recording, Values
 
-
 DEGREE = 2  # of the parabola
 SIGNIFICANT = 4.0  # standard deviations: of the two components, noise alone passes it in 3e-4
 FEWEST = 8  # samples from which a slope has five degrees of freedom

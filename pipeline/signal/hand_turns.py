@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
     from pipeline.records import Recording, Values
 
-
 SCALE = 0.1  # relative: three times the largest scale factor error of the shipped data sheets (MPU-6050: 3 %)
 ACROSS = 0.25  # 15 deg between the turn and a body axis: a chip askew in its case, and a hand
 HALF_S = 2.0  # of a rest that is cut in two: half a second is trimmed, a second is the shortest rest

@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 
     from pipeline.records import Mask, Recording, Values
 
-
 FEWEST_STOPS = 4  # attitudes about one axis that determine a bias and a row of the matrix
 BESIDE_S, BESIDE_FREE_S = 30.0, 1.0  # of rest that a segment takes with it
 SHORTEST_STATIC_S, SHORTEST_FREE_S = 60.0, 10.0  # shorter rests determine no bias wander, shorter motion no mean error

@@ -10,8 +10,8 @@ from scipy.signal import lfilter
 from pipeline.errors import ConfigurationError
 from pipeline.estimation.gauss_markov import block_covariance, variance_of_average
 from pipeline.estimation.noise import estimate_noise
+from pipeline.estimation.noise_terms import allan_deviation
 from pipeline.records import Recording
-from pipeline.signal.allan import allan_deviation
 from pipeline.signal.filters import apply_filter, filter_autocovariance
 
 SHEET = {"noise_density": 4e-4, "bias_wander": 1e-4, "wander_time_s": 100.0}

@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from pipeline.estimation.least_squares import LeastSquaresResult
     from pipeline.records import Mask, Values
 
-
 ROWS, COLUMNS = np.tril_indices(3)
 NAMES = [f"bias_{axis}" for axis in "xyz"] + [
     f"scale_factor_{'xyz'[i]}" if i == j else f"misalignment_{'xyz'[i]}{'xyz'[j]}"

@@ -58,7 +58,6 @@ if TYPE_CHECKING:
     from pipeline.estimation.gauss_markov import Prior
     from pipeline.records import Contribution, Motion, Recording, Values
 
-
 NAME = "nonlinear_least_squares"
 MISALIGNMENT_UNKNOWN = 0.05  # rad, standard uncertainty above which the rests do not determine a misalignment
 UNKNOWN = 0.05  # g of a bias, relative of a scale factor: beyond it nothing of them is known

@@ -46,7 +46,6 @@ if TYPE_CHECKING:
     from pipeline.estimation.gauss_markov import Prior
     from pipeline.records import Contribution, Index, Integers, Mask, Recording, Values
 
-
 SMALLEST_NOISE = 1e-9  # g, keeps the weights of a noise-free recording finite
 TREMORS = np.geomspace(0.1, 3.0, 10)  # of the scatter beyond white noise that the residuals show
 WANDERS = np.append(0.0, np.geomspace(0.125, 27.0, 14))  # of the one that is believed

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from pipeline.estimation.turns import Part, Sinusoid
     from pipeline.records import Mask, Motion, Recording, Values
 
-
 OTHERS = ((1, 2), (2, 0), (0, 1))  # first and second axis of a turn about x, y, z
 
 

@@ -54,7 +54,6 @@ if TYPE_CHECKING:
     from pipeline.estimation.turns import Part
     from pipeline.records import Index, Mask, Motion, Recording, Values
 
-
 NAME = "cholesky_lu"
 STEP = 1e-6  # of the central differences: truncation and rounding are below 1e-9 of the derivative
 MOTION_SHARE = 0.01  # of the largest rate, above which the table turns

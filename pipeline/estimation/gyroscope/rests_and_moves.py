@@ -15,23 +15,20 @@ import numpy as np
 
 from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.design import BASE_NAMES
-from pipeline.estimation.least_squares import certified
 from pipeline.estimation.multi_position.fit import fit as fit_by_hand
 from pipeline.estimation.multi_position.fit import fit_robustly
 from pipeline.estimation.multi_position.gyroscope import FEWEST_MOVES, MOVED, model_of
 from pipeline.estimation.multi_position.likelihood import NEW, prior_hypotheses
 from pipeline.estimation.multi_position.model import State
-from pipeline.estimation.multi_position.result import with_budget
+from pipeline.estimation.multi_position.result import after_stage
 from pipeline.estimation.noise import noise_of, prior_of
 from pipeline.estimation.rest_means import ROLE, is_multi_position
-from pipeline.estimation.uncertainty_budget import base_parameters
-from pipeline.records import SensorCalibration, StageResult
+from pipeline.records import SensorCalibration
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.records import Recording, Values
-
 
 NAME = "rests_and_moves"
 MOVED_TIMES = 2  # an error of 0.7 deg squared is 0.01 deg, as large as the noise of a move; a second time 1e-4 deg
@@ -77,9 +74,7 @@ def fit(
         model, found, outlying = fit_robustly(model, partial(fitted, start=found.state), recordings)
     moves = model.moves.count if model.moves else 0
     _require_known(found.covariance, moves)
-    parameters = base_parameters("gyroscope", found.state.bias, found.state.matrix, found.covariance)
     apart = found.residual[model.of_moves] * found.error[model.of_moves]
-    at_rest = found.residual[: model.rests_equations] * found.error[: model.rests_equations]
     details: dict[str, Any] = {
         "rests": len(model.rests.time),
         "moves": moves,
@@ -98,16 +93,8 @@ def fit(
         details["turns"] = model.turns.described(found.state)
         details["departures"] = model.turns.departures(found.state)
     correction = {"steps": [{"subtract": found.state.bias.tolist()}, {"matrix": found.state.matrix.tolist()}]}
-    result = StageResult(NAME, parameters, float(np.sqrt(np.mean(at_rest**2))), correction, details)
-    calibration = SensorCalibration(
-        sensor="gyroscope",
-        bias=found.state.bias,
-        matrix=found.state.matrix,
-        stages=(*(previous.stages if previous else ()), result),
-        converged=found.converged,
-        convergence=certified(found.cosine, found.condition, found.rank, len(found.covariance)),
-    )
-    return with_budget(calibration, found.covariance, found.degrees_of_freedom, model, found, settings)
+    before = SensorCalibration("gyroscope", stages=previous.stages if previous else ())
+    return after_stage(before, NAME, details, model, found, settings, correction)
 
 
 def _require_known(covariance: Values, moves: int) -> None:

@@ -44,7 +44,6 @@ if TYPE_CHECKING:
     from pipeline.estimation.turns import Part
     from pipeline.records import Mask, Motion, Recording, Values
 
-
 STEP = 1e-5  # deg/s of b, and of R, of the central differences: exact to 1e-10 for these functions of degree two
 FORGOTTEN = 1e-5  # of a change of rate, that a filter's output may still hold where a rest or a steady turn begins
 DELAYS_TO_SETTLE = 12.0  # the same for a filter that is known by its delay alone

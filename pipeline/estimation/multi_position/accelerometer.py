@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from pipeline.estimation.rest_means import Rests
     from pipeline.records import Mask, Motion, Noise, Recording, SensorCalibration, Values
 
-
 ROUNDS = 12  # of effects that depend on the force
 SETTLED = 1e-12  # g
 SMALLEST_NOISE = 1e-9  # g

@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from pipeline.estimation.rest_means import Rests
     from pipeline.records import Index, Mask, Motion, Recording, SensorCalibration, Values
 
-
 NEAR_DEG = 15.0  # of a face's axis, within which a rest is on that face: a chip askew in its case, and a hand
 DEPARTS = 4.5  # standard uncertainties: two angles exceed it with a probability of 4e-5
 FACES = [f"{sign}{axis}" for axis in AXES for sign in "+-"]

@@ -47,7 +47,6 @@ if TYPE_CHECKING:
     from pipeline.estimation.rest_means import Rests
     from pipeline.records import Mask, Motion, Noise, Recording, SensorCalibration, Values
 
-
 FEWEST_MOVES = 6  # two equations each, for the nine of the matrix
 ROUNDS = 6  # of effects that depend on the rate
 SETTLED_DPS = 1e-7  # change of the rate that ends these rounds

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from pipeline.estimation.multi_position.model import Equations
     from pipeline.records import Noise, Values
 
-
 NEW = 1e-3  # share of a column's norm below which it adds no direction: rounding of the columns is below 1e-8
 # The grids below were chosen by the study of 500 recordings (tests/study/test_hand_held_study.py); ``fit.refined``
 # closes their steps where the data say more.

@@ -56,7 +56,6 @@ if TYPE_CHECKING:
     from pipeline.estimation.rest_means import Rests
     from pipeline.records import Index, Mask, Recording, SensorCalibration, Values
 
-
 LONGEST_S = 60.0  # see ``moves_of``
 GAP = 3.5  # intervals without a sample, over which a rate is not interpolated
 ENVELOPE = 10  # samples, of which one at least is stamped without delay

@@ -46,7 +46,6 @@ if TYPE_CHECKING:
     from pipeline.estimation.multi_position.model import Model
     from pipeline.records import Contribution, Noise, Recording, SensorCalibration, Values
 
-
 STEP = 0.1  # of a standard uncertainty: the columns are differentiated where they are used
 REMARK = {
     "accelerometer": "white noise, bias wander and what the rests scatter beyond both, as the residuals tell them",
@@ -117,10 +116,6 @@ def calibration_of(
     model: Model, found: Fit, before: SensorCalibration, settings: Mapping[str, Any]
 ) -> SensorCalibration:
     """Return a fit as a calibration with the stage ``effects``."""
-    place = parameter_places(model, len(found.covariance))
-    covariance = place @ found.covariance @ place.T
-    freedom = np.min(np.where(place != 0.0, found.degrees_of_freedom, np.inf), axis=1)
-    effects, parameters = effect_parameters(model.sensor, found.state.terms, covariance)
     details = {
         "samples": round(model.samples()),
         "rests": len(model.rests.time),
@@ -131,35 +126,41 @@ def calibration_of(
         "wander_time_s": float(found.noise.time),
         "scatter_over_noise": list(found.noise.scatter),
     }
-    rests = slice(0, model.rests_equations)
-    rms = float(np.sqrt(np.mean((found.residual[rests] * found.error[rests]) ** 2)))
+    return after_stage(before, "effects", details, model, found, settings)
+
+
+def after_stage(  # noqa: PLR0917  (what a fit by hand is)
+    before: SensorCalibration,
+    name: str,
+    details: dict[str, Any],
+    model: Model,
+    found: Fit,
+    settings: Mapping[str, Any],
+    correction: dict[str, Any] | None = None,
+) -> SensorCalibration:
+    """Return a fit as a calibration after one more stage, with its uncertainty budget by the residuals.
+
+    ``settings``: sections ``table`` (``gravity_g``, ``gravity_accuracy_g``, ``clock_accuracy_ppm``), ``uncertainty``.
+    """
+    place = parameter_places(model, len(found.covariance))
+    covariance = place @ found.covariance @ place.T
+    freedom = np.min(np.where(place != 0.0, found.degrees_of_freedom, np.inf), axis=1)
+    effects, parameters = effect_parameters(model.sensor, found.state.terms, covariance)
+    parameters = parameters or base_parameters(model.sensor, found.state.bias, found.state.matrix, covariance)
+    at_rest = slice(0, model.rests_equations)
+    rms = float(np.sqrt(np.mean((found.residual[at_rest] * found.error[at_rest]) ** 2)))
     calibration = replace(
         before,
         bias=found.state.bias,
         matrix=found.state.matrix,
-        stages=(*before.stages, StageResult("effects", parameters, rms, None, details)),
+        stages=(*before.stages, StageResult(name, parameters, rms, correction, details)),
         effects=effects,
         converged=found.converged,
         convergence=certified(found.cosine, found.condition, found.rank, len(found.covariance)),
     )
-    return with_budget(calibration, covariance, freedom, model, found, settings)
-
-
-def with_budget(  # noqa: PLR0917  (what a fit by hand is)
-    calibration: SensorCalibration,
-    covariance: Values,
-    degrees_of_freedom: Values,
-    model: Model,
-    found: Fit,
-    settings: Mapping[str, Any],
-) -> SensorCalibration:
-    """Return a calibration with its uncertainty budget, of the covariance and its degrees of freedom by the residuals.
-
-    ``settings``: sections ``table`` (``gravity_g``, ``gravity_accuracy_g``, ``clock_accuracy_ppm``), ``uncertainty``.
-    """
     sensor, size, table = calibration.sensor, len(calibration.parameter_names()), settings["table"]
     scatter = scatter_contribution(covariance, np.inf, remark=REMARK[sensor])
-    lines = [scatter.with_freedom(degrees_of_freedom)]
+    lines = [scatter.with_freedom(freedom)]
     missing = dict(NOT_INCLUDED)
     if sensor == "accelerometer":
         gravity = gravity_contribution(sensor, calibration.matrix, table, size)
@@ -242,7 +243,6 @@ def fit_faces(
     prior = prior_of("accelerometer", recordings, settings)
     noises = prior_hypotheses(prior, float(np.mean(model.white)), model.kinds)
     found = fit(model, State(before.bias, before.matrix), noises, {})
-    parameters = base_parameters("accelerometer", found.state.bias, found.state.matrix, found.covariance)
     force, _ = model.specific_force(found.state, model.rests)
     off = np.degrees(np.einsum("rmc,mc->r", model.faces.weights(), force) / model.gravity).reshape(-1, 2)
     departs = zip(FACES, np.linalg.norm(off, axis=1), strict=True)
@@ -260,14 +260,4 @@ def fit_faces(
         "condition": found.condition,
         "degrees_of_freedom": float(found.degrees_of_freedom.min()),
     }
-    at_rest = slice(0, model.rests_equations)
-    rms = float(np.sqrt(np.mean((found.residual[at_rest] * found.error[at_rest]) ** 2)))
-    calibration = replace(
-        before,
-        bias=found.state.bias,
-        matrix=found.state.matrix,
-        stages=(*before.stages, StageResult(NAME, parameters, rms, None, details)),
-        converged=found.converged,
-        convergence=certified(found.cosine, found.condition, found.rank, len(found.covariance)),
-    )
-    return with_budget(calibration, found.covariance, found.degrees_of_freedom, model, found, settings)
+    return after_stage(before, NAME, details, model, found, settings)
