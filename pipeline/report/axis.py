@@ -90,7 +90,7 @@ class Axis:
     @classmethod
     def over(cls, arrays: Iterable[Values], start: float, stop: float, kind: str = "", margin: float = 0.04) -> Axis:
         """Return an axis over the finite values, wider by ``margin`` on both sides; 0 to 1 without any value."""
-        values = scaled(np.concatenate([np.zeros(0), *(np.ravel(a) for a in arrays)]), kind)
+        values = scaled(np.concatenate([np.zeros(0), *(a.ravel() for a in arrays)]), kind)
         finite = values[np.isfinite(values)]
         low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
         if high - low <= 1e-12 * max(abs(low), abs(high), 1e-300):
@@ -106,7 +106,7 @@ class Axis:
 
     def units(self, values: Values) -> NDArray[np.int64]:
         """Return the places of values in whole drawing units; values beyond the axis stand at its end."""
-        at = np.clip(scaled(values, self.kind), self.low, self.high)
+        at = np.minimum(np.maximum(scaled(values, self.kind), self.low), self.high)
         slope = SUBDIVISION * (self.stop - self.start) / (self.high - self.low)
         units: NDArray[np.int64] = np.rint((at - self.low) * slope + SUBDIVISION * self.start).astype(np.int64)
         return units
