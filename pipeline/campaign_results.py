@@ -9,7 +9,6 @@ gyroscope figures in deg/s; parameters have a column with their unit.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cached_property
@@ -19,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from pipeline.errors import InputError, MissingInputError
+from pipeline.files import read_json
 from pipeline.records import SENSORS
 from pipeline.report.parameters import fitted_parameters, reading_errors
 from pipeline.report.summary import COLUMNS
@@ -189,9 +189,9 @@ class CampaignResults:
                 near = get_close_matches(name, self.units, n=5) or self.units[:5]
                 raise InputError(f"has no unit {name!r}; there are {', '.join(near)}", str(self.folder))
             calibration, *others = (self.folder / folder / f"{name}.json" for folder in DOCUMENTS)
-            found = _read(calibration)
+            found = read_json(calibration)
             ok = found["status"] == "ok"
-            self._documents[name] = UnitResults(name, found, *(_read(file) if ok else None for file in others))
+            self._documents[name] = UnitResults(name, found, *(read_json(file) if ok else None for file in others))
         return self._documents[name]
 
     def _parts(self, document: str) -> Iterator[tuple[JSON, JSON]]:
@@ -201,13 +201,3 @@ class CampaignResults:
                 part = (getattr(unit, document) or {}).get(sensor)
                 if part:
                     yield {"unit": unit.name, "sensor": sensor}, part
-
-
-def _read(file: Path) -> JSON:
-    try:
-        document: JSON = json.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise MissingInputError("does not exist; run the campaign again", str(file)) from None
-    except ValueError as error:
-        raise InputError(f"is not JSON: {error}; run the campaign again", str(file)) from None
-    return document

@@ -32,12 +32,13 @@ examples:
 
 
 class Selection(NamedTuple):
-    """Diagnoses and failures by unit, settings of the last run, folder of all results."""
+    """Diagnoses and failures by unit, settings of the last run, folder of all results, and the campaign's in it."""
 
-    files: dict[str, Path]
+    diagnoses: dict[str, JSON]
     failures: dict[str, JSON]
     settings: JSON
     results: str
+    folder: str
 
 
 def main(argv: Sequence[str]) -> int:
@@ -53,57 +54,57 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--from", dest="format", metavar="FORMAT", help=words)
     arguments = parser.parse_args(argv)
     file = Path(arguments.campaign)
-    if file.is_file() and not _is_diagnosis(file):
+    if file.is_file() and not _is_diagnosis(_json(file)):
         counts = counts_of(sheets_of(arguments.sensor))
         try:
             sys.stdout.write(explain_calibration(read_any(file, arguments.format, counts)))
         except InputError as error:
             raise InputError(f"is no diagnosis, and no calibration: {error.message}", error.file) from error
         return 0
-    selection = find(arguments.campaign, arguments.units, Path(arguments.results))
-    documents = {unit: _diagnosis(file) for unit, file in selection.files.items()}
-    texts = [
-        explain(unit, document, _beside(selection.files[unit], "validations"), selection)
-        + _implausible(_beside(selection.files[unit], "calibrations"))
-        for unit, document in documents.items()
-    ]
-    texts += [_failed(unit, failure) for unit, failure in selection.failures.items()]
+    found = find(arguments.campaign, arguments.units, Path(arguments.results))
+    folder = Path(found.results) / found.folder
+    texts = []
+    for unit, document in found.diagnoses.items():
+        validation, calibration = (
+            _json(folder / kind / f"{unit}.json") or {} for kind in ("validations", "calibrations")
+        )
+        texts.append(explain(unit, document, validation, found))
+        texts[-1] += "".join(f"  {line}\n" for s in SENSORS for line in sentences(s, calibration.get(s)))
+    texts += [_failed(unit, failure) for unit, failure in found.failures.items()]
     if len(texts) > 1:
-        texts.insert(0, "\n".join(_summary(documents, selection)) + "\n")
+        texts.insert(0, "\n".join(_summary(found)) + "\n")
     sys.stdout.write("\n".join(texts))
     return 0
 
 
 def find(campaign: str, units: Sequence[str], results: Path) -> Selection:
-    """Return the diagnoses and failures of the units; raises ``MissingInputError`` if there are none."""
+    """Return the diagnoses and failures of the units; ``MissingInputError`` if there are none."""
     given = Path(campaign)
     if given.is_file():
-        return _selection({given.stem: given}, {}, given.parent.parent)
-    folders = [folder for folder in (given, results / given.name) if (folder / "diagnoses").is_dir()]
-    if not folders:
-        raise MissingInputError(f"no diagnoses in {given} or {results / given.name}; run the campaign first")
-    files = {file.stem: file for file in _in_order(folders[0])}
-    file = folders[0] / "failures.json"
-    failures = {failure["unit"]: failure for failure in (_json(file, "list of failures") if file.is_file() else [])}
+        folder, files, failures = given.parent.parent, {given.stem: given}, {}
+    else:
+        folders = [folder for folder in (given, results / given.name) if (folder / "diagnoses").is_dir()]
+        if not folders:
+            raise MissingInputError(f"no diagnoses in {given} or {results / given.name}; run the campaign first")
+        folder = folders[0]
+        failures = {failure["unit"]: failure for failure in _json(folder / "failures.json") or []}
+        files = {file.stem: file for file in sorted((folder / "diagnoses").glob("*.json"))}
+        order = [row["unit"] for row in read_summary(folder)] if (folder / "summary.csv").is_file() else []
+        files = {u: files[u] for u in dict.fromkeys([*order, *files]) if u in files and u not in failures}
     absent = [unit for unit in units if unit not in files and unit not in failures]
     if absent:
         known = ", ".join(sorted([*files, *failures])[:12])
         raise MissingInputError(
-            f"no diagnosis of unit {', '.join(absent)}; there are those of {known}", str(folders[0] / "diagnoses")
+            f"no diagnosis of unit {', '.join(absent)}; there are those of {known}", str(folder / "diagnoses")
         )
-    chosen = set(units) or {*files, *failures}
-    return _selection(
-        {unit: file for unit, file in files.items() if unit in chosen and unit not in failures},
-        {unit: failure for unit, failure in failures.items() if unit in chosen},
-        folders[0],
-    )
-
-
-def _in_order(folder: Path) -> list[Path]:
-    """Return the diagnoses of a campaign in the order of its sheet."""
-    files = {file.stem: file for file in sorted((folder / "diagnoses").glob("*.json"))}
-    order = [row["unit"] for row in read_summary(folder)] if (folder / "summary.csv").is_file() else []
-    return [files[unit] for unit in dict.fromkeys([*order, *files]) if unit in files]
+    diagnoses = {unit: _json(file) for unit, file in files.items() if not units or unit in units}
+    for unit, document in diagnoses.items():
+        if not _is_diagnosis(document):
+            raise InputError("is no diagnosis: it is damaged, or not of this product", str(files[unit]))
+    failures = {unit: failure for unit, failure in failures.items() if not units or unit in units}
+    entries = read_history(folder)
+    settings = (entries[-1].get("settings") if entries else None) or {"campaign": folder.name}
+    return Selection(diagnoses, failures, settings, str(folder.parent), folder.name)
 
 
 def explain(unit: str, document: JSON, validation: JSON, selection: Selection) -> str:
@@ -122,26 +123,20 @@ def explain(unit: str, document: JSON, validation: JSON, selection: Selection) -
     return "\n".join(lines) + "\n"
 
 
-def _selection(files: dict[str, Path], failures: dict[str, JSON], folder: Path) -> Selection:
-    entries = read_history(folder)
-    settings = entries[-1].get("settings") if entries else None
-    return Selection(files, failures, settings or {"campaign": folder.name}, str(folder.parent))
-
-
-def _summary(documents: Mapping[str, JSON], selection: Selection) -> list[str]:
+def _summary(found: Selection) -> list[str]:
     """Return the verdicts by sensor and effect, and how to continue."""
     findings = [
         Finding(unit, sensor, document[sensor]["verdict"], document[sensor]["selected"])
-        for unit, document in documents.items()
+        for unit, document in found.diagnoses.items()
         for sensor in SENSORS
         if document.get(sensor)
     ]
     counts = Counter(finding.verdict.replace("_", " ") for finding in findings).most_common()
     counted = ", ".join(f"{count} {verdict}" for verdict, count in counts)
-    lines = [f"{len(findings)} sensors of {len(documents)} units: {counted}", *verdict_lines(findings)]
-    if selection.failures:
-        lines.append(f"failed: {', '.join(selection.failures)}")
-    continued = next_commands(findings, selection.settings, selection.results)[:-1]  # the last is this command
+    lines = [f"{len(findings)} sensors of {len(found.diagnoses)} units: {counted}", *verdict_lines(findings)]
+    if found.failures:
+        lines.append(f"failed: {', '.join(found.failures)}")
+    continued = next_commands(findings, found.settings, found.results)[:-1]  # the last is this command
     return [*lines, *[f"{what}: {command}" for what, command in continued]]
 
 
@@ -169,31 +164,14 @@ def _implausible(calibration: JSON) -> str:
     return "".join(f"  {line}\n" for sensor in SENSORS for line in sentences(sensor, calibration.get(sensor)))
 
 
-def _beside(diagnosis: Path, folder: str) -> JSON:
-    """Return the unit's file in another folder of the same results; nothing where there is none."""
-    file = diagnosis.parent.parent / folder / diagnosis.name
-    found: JSON = _json(file, "result of a run") if file.is_file() else {}
-    return found
-
-
-def _is_diagnosis(file: Path) -> bool:
-    """Return whether a file is a diagnosis: JSON of both sensors without the status that a calibration has."""
-    try:
-        document = json.loads(file.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, json.JSONDecodeError):
-        return False
+def _is_diagnosis(document: object) -> bool:
+    """Return whether a document holds both sensors, without the status that a calibration has."""
     return isinstance(document, dict) and set(SENSORS) <= set(document) and "status" not in document
 
 
-def _diagnosis(file: Path) -> JSON:
-    document: JSON = _json(file, "diagnosis")
-    if not isinstance(document, dict) or not set(SENSORS) <= set(document):
-        raise InputError("is no diagnosis: the keys accelerometer and gyroscope are missing", str(file))
-    return document
-
-
-def _json(file: Path, what: str) -> Any:  # noqa: ANN401
+def _json(file: Path) -> Any:  # noqa: ANN401
+    """Return the content of a JSON file; None where it does not exist or is not JSON."""
     try:
         return json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise InputError(f"is no {what}: {error}", str(file)) from error
+    except (OSError, ValueError):
+        return None

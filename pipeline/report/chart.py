@@ -107,25 +107,16 @@ class Dots:
 
 
 @dataclass(frozen=True)
-class Band:
-    """The area from ``low`` to ``high`` over the whole axis x."""
-
-    low: float
-    high: float
-    colour: int = 5
-
-
-@dataclass(frozen=True)
 class Area:
-    """The area between two curves."""
+    """The area between two curves, or over the whole axis x from one value to another."""
 
-    x: Values
-    low: Values
-    high: Values
-    colour: int = 0
+    low: Values | float
+    high: Values | float
+    colour: int = 5
+    x: Values | None = None
 
 
-Layer = Line | Samples | Dots | Band | Area
+Layer = Line | Samples | Dots | Area
 
 
 @dataclass(frozen=True)
@@ -177,7 +168,7 @@ def chart(
     units : str
         List of the page's script that names what stands at x = 1, 2, ...
     """
-    values = {id(layer.x): layer.x for p in panels for layer in p.layers if not isinstance(layer, Band)}
+    values = {id(layer.x): layer.x for p in panels for layer in p.layers if layer.x is not None}
     x = Axis.over(values.values(), left, WIDTH - RIGHT, kind, margin)
     ticks = x.ticks(6, columns)
     parts, top = [], float(TOP)
@@ -226,23 +217,19 @@ def _panel(panel: Panel, x: Axis, x_ticks: list[Tick], top: float) -> str:
 
 def _heights(layer: Layer) -> list[Values]:
     """Return the values of a layer along axis y."""
-    if isinstance(layer, Band):
-        return [np.array([layer.low, layer.high])]
     if isinstance(layer, Area):
-        return [layer.low, layer.high]
+        return [np.asarray(layer.low), np.asarray(layer.high)]
     ends = (layer.low, layer.high) if isinstance(layer, Dots) else ()
     return [layer.y, *(end for end in ends if end is not None)]
 
 
 def _draw(layer: Layer, x: Axis, y: Axis) -> str:
     """Return the path elements of a layer."""
-    if isinstance(layer, Band):
-        low, high = y.units(np.array([layer.low, layer.high]))
-        left, right = SUBDIVISION * x.start, SUBDIVISION * x.stop
-        return f'<path class="band c{layer.colour}" d="M{left:g} {low}H{right:g}V{high}H{left:g}z"/>'
     if isinstance(layer, Area):
-        there = x.units(np.concatenate([layer.x, layer.x[::-1]]))
-        path = _line(there, y.units(np.concatenate([layer.low, layer.high[::-1]])))
+        ends = SUBDIVISION * np.array([x.start, x.stop])
+        at = ends.astype(np.int64) if layer.x is None else x.units(layer.x)
+        low, high = (np.broadcast_to(end, len(at)) for end in (layer.low, layer.high))
+        path = _line(np.concatenate([at, at[::-1]]), y.units(np.concatenate([low, high[::-1]])))
         return f'<path class="band c{layer.colour}" d="{path}z"/>'
     if isinstance(layer, Samples):
         columns = enumerate(np.atleast_2d(layer.y.T), layer.colour)

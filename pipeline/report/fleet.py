@@ -49,7 +49,6 @@ LEVEL = 0.001  # of the tests of drift and lots, for a whole fleet
 MOST_PAIRED = 2000  # units that the slope is taken from: it needs all pairs of them
 DAYS_OF_A_YEAR = 365.25
 SIBLINGS = ["sensor", "method"]
-STANDARD, EXPANDED = attrgetter("standard_uncertainty"), attrgetter("expanded_uncertainty")
 
 
 def unit_parameters(calibration: JSON) -> dict[str, Parameter]:
@@ -71,18 +70,12 @@ def fleet_statistics(rows: Sequence[JSON], fitted: Mapping[str, Mapping[str, Par
     out: JSON = {key: [] for key in (*STATISTICS, "repeatability")}
     fitted_units = [unit for unit in sheet.index if fitted.get(unit)]
     for (model, method), siblings in sheet.loc[fitted_units].groupby(SIBLINGS, sort=False):
-        units = {name: p.unit for unit in siblings.index for name, p in fitted[unit].items()}
-        values = pd.DataFrame(
-            [{name: p.value for name, p in fitted[unit].items()} for unit in siblings.index],
-            siblings.index,
-            list(units),
+        own = [fitted[unit] for unit in siblings.index]
+        units = {name: p.unit for parameters in own for name, p in parameters.items()}
+        values, *stated = (
+            pd.DataFrame([{n: read(p) for n, p in each.items()} for each in own], siblings.index, list(units), float)
+            for read in (attrgetter("value"), attrgetter("standard_uncertainty"), attrgetter("expanded_uncertainty"))
         )
-        stated = [
-            pd.DataFrame(
-                [{n: read(p) for n, p in fitted[unit].items()} for unit in siblings.index], siblings.index, list(units)
-            ).astype(float)
-            for read in (STANDARD, EXPANDED)
-        ]
         statistics = {key: statistic(values, siblings) for key, statistic in STATISTICS.items()}
         statistics["repeatability"] = _repeatability(values, siblings, *stated)
         for key, results in statistics.items():
@@ -229,12 +222,9 @@ def write_parameters(path: Path, rows: Sequence[JSON], fitted: Mapping[str, Mapp
     """
     arrays, fields = [], []
     for column in dict.fromkeys(key for row in rows for key in row):
-        values = [row.get(column) for row in rows]
-        kinds = {type(value) for value in values if value is not None}
-        known = {bool: pa.bool_(), int: pa.int64(), float: pa.float64()}
-        kind = known.get(kinds.pop(), pa.string()) if len(kinds) == 1 else pa.string()
-        arrays.append(pa.array(values, kind))
-        fields.append(pa.field(column, kind))
+        values = pa.array([row.get(column) for row in rows])
+        arrays.append(values if values.type != pa.null() else values.cast(pa.string()))
+        fields.append(pa.field(column, arrays[-1].type))
     units = {name: p.unit for each in fitted.values() for name, p in each.items()}
     for name, unit in units.items():
         found = [fitted.get(row["unit"], {}).get(name) for row in rows]

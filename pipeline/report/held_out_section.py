@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.records import SENSOR_UNITS, SENSORS, Noise, SensorCalibration
-from pipeline.report.chart import Band, Figure, Layer, Line, Panel, Samples, chart
+from pipeline.report.chart import Area, Figure, Layer, Line, Panel, Samples, chart
 from pipeline.report.group_charts import Point, bars
 from pipeline.report.numbers import number, plain
 from pipeline.validation.error_breakdown import with_known_effects
@@ -130,7 +130,7 @@ def held_out_over_time(
     after: list[Layer] = [Samples(x, calibrated, 2, mean=True)]
     panels = [
         Panel([Samples(x, raw, 3), Samples(x, calibrated, 2)], f"error, {unit}", 120, {"": 0.0}),
-        Panel([Band(-2 * floor, 2 * floor), *after] if floor else after, f"after, {unit}", 80),
+        Panel([Area(-2 * floor, 2 * floor), *after] if floor else after, f"after, {unit}", 80),
     ]
     rms = [number(float(np.sqrt(np.nanmean(v**2)))) for v in (raw, calibrated)]
     finding = f"In {recording.name} the error goes from {rms[0]} to {rms[1]} {unit}"

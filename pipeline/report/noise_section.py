@@ -39,7 +39,7 @@ def allan(sensor: str, noise: JSON | None, sheet: JSON, wander: JSON | None) -> 
     for axis, part in axes.items():
         curve, colour = {k: np.array(v) for k, v in part["allan"].items()}, AXES.index(axis)
         layers += [
-            Area(curve["tau_s"], curve["low"], curve["high"], colour),
+            Area(curve["low"], curve["high"], colour, curve["tau_s"]),
             Line(curve["tau_s"], curve["fit"], colour, "model"),
             Dots(curve["tau_s"], curve["deviation"], colour),
         ]

@@ -24,7 +24,7 @@ import numpy as np
 from pipeline.model.kinematics import table_motion
 from pipeline.model.measurement import predicted_reading
 from pipeline.records import AXES, SENSOR_UNITS, SensorCalibration
-from pipeline.report.chart import AXES_LEGEND, Band, Dots, Figure, Layer, Line, Panel, Samples, chart
+from pipeline.report.chart import AXES_LEGEND, Area, Dots, Figure, Layer, Line, Panel, Samples, chart
 from pipeline.report.group_charts import stems
 from pipeline.report.numbers import number
 
@@ -232,7 +232,7 @@ def _covariate(sensor: str, label: str, mean: _BinnedMean, wander: Values) -> Fi
     panels = []
     for i, axis in enumerate(AXES):
         m, U = mean.mean[:, i], 2 * mean.error[:, i]
-        layers: list[Layer] = [Band(-2 * wander[i], 2 * wander[i])] if wander[i] > 0 else []
+        layers: list[Layer] = [Area(-2 * wander[i], 2 * wander[i])] if wander[i] > 0 else []
         layers.append(Dots(mean.centre, m, i, m - U, m + U))
         panels.append(Panel(layers, f"{axis}, {unit}", height=64, levels={"": 0.0}, limits=(-top, top)))
     finding = f"Flat against {words}, within the noise"
@@ -285,7 +285,7 @@ def measurement_and_model(sensor: str, residual: Residual, noise: JSON | None) -
     top = max(float(np.abs(residual.error).max()), 2.2 * float(sigma.max()))
     panels = [Panel(layers, f"reading, {unit}")]
     for i, axis in enumerate(AXES):
-        layers = [Band(-2 * sigma[i], 2 * sigma[i]), Samples(x, residual.error[:, i], i, mean=True)]
+        layers = [Area(-2 * sigma[i], 2 * sigma[i]), Samples(x, residual.error[:, i], i, mean=True)]
         panels.append(Panel(layers, f"{axis}, {unit}", height=56, limits=(-top, top)))
     rms = np.sqrt(np.mean(residual.error**2, axis=0))
     ratio, outside = float((rms / sigma).max()), float(np.mean(np.abs(residual.error) > 2 * sigma))

@@ -118,7 +118,7 @@ def _figure(
 
 def _bar(ends: NDArray[np.float64], low: float, high: float, colour: int) -> Layer:
     """Return an area from one share to another."""
-    return Area(100.0 * np.clip(ends, -EDGE, EDGE), np.full(2, low), np.full(2, high), colour)
+    return Area(low, high, colour, 100.0 * np.clip(ends, -EDGE, EDGE))
 
 
 def _told(label: str, of: Placed) -> str:

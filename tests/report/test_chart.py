@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.report.axis import Axis, log_ticks, round_ticks, tick_label
-from pipeline.report.chart import Band, Dots, Figure, Panel, Samples, chart
+from pipeline.report.chart import Area, Dots, Figure, Panel, Samples, chart
 from pipeline.report.numbers import measured, number, typeset
 
 FIGURE = Figure("n", "t")
@@ -124,7 +124,7 @@ def test_many_samples_are_ranges_whose_means_are_a_line(count: int) -> None:
 
 def test_an_interval_and_a_band_are_drawn_at_their_ends() -> None:
     at = np.array([1.0, 2.0])
-    layers = [Band(-0.5, 0.5), Dots(at, at - 1.5, 0, at - 1.6, at - 1.4)]
+    layers = [Area(-0.5, 0.5), Dots(at, at - 1.5, 0, at - 1.6, at - 1.4)]
     svg = chart(FIGURE, "d", [Panel(layers, "y", height=100, limits=(-1.0, 1.0))], "x").svg
-    assert drawn(svg, "band") == ["M640 830H4060V330H640z"]
+    assert drawn(svg, "band") == ["M640 830l3420 0 0 -500 -3420 0z"]
     assert drawn(svg, "strokes") == ["M640 880V780M4060 380V280"]
