@@ -14,6 +14,7 @@ from pipeline.diagnosis.words import in_words
 from pipeline.errors import InputError, MissingInputError
 from pipeline.exports.explanation import explain_calibration
 from pipeline.exports.reading import counts_of, read_any
+from pipeline.files import read_json
 from pipeline.history import read_history
 from pipeline.model.plausible import sentences
 from pipeline.outcome import Finding, commands_of, next_commands, read_summary, verdict_lines
@@ -65,9 +66,8 @@ def main(argv: Sequence[str]) -> int:
     folder = Path(found.results) / found.folder
     texts = []
     for unit, document in found.diagnoses.items():
-        validation, calibration = (
-            _json(folder / kind / f"{unit}.json") or {} for kind in ("validations", "calibrations")
-        )
+        files = (folder / kind / f"{unit}.json" for kind in ("validations", "calibrations"))
+        validation, calibration = (read_json(file) if file.is_file() else {} for file in files)
         texts.append(explain(unit, document, validation, found))
         texts[-1] += "".join(f"  {line}\n" for s in SENSORS for line in sentences(s, calibration.get(s)))
     texts += [_failed(unit, failure) for unit, failure in found.failures.items()]
@@ -87,7 +87,8 @@ def find(campaign: str, units: Sequence[str], results: Path) -> Selection:
         if not folders:
             raise MissingInputError(f"no diagnoses in {given} or {results / given.name}; run the campaign first")
         folder = folders[0]
-        failures = {failure["unit"]: failure for failure in _json(folder / "failures.json") or []}
+        failed = folder / "failures.json"
+        failures = {failure["unit"]: failure for failure in (read_json(failed) if failed.is_file() else [])}
         files = {file.stem: file for file in sorted((folder / "diagnoses").glob("*.json"))}
         order = [row["unit"] for row in read_summary(folder)] if (folder / "summary.csv").is_file() else []
         files = {u: files[u] for u in dict.fromkeys([*order, *files]) if u in files and u not in failures}

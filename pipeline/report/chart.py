@@ -226,8 +226,8 @@ def _heights(layer: Layer) -> list[Values]:
 def _draw(layer: Layer, x: Axis, y: Axis) -> str:
     """Return the path elements of a layer."""
     if isinstance(layer, Area):
-        ends = SUBDIVISION * np.array([x.start, x.stop])
-        at = ends.astype(np.int64) if layer.x is None else x.units(layer.x)
+        whole = (SUBDIVISION * np.array([x.start, x.stop])).astype(np.int64)
+        at = whole if layer.x is None else x.units(layer.x)
         low, high = (np.broadcast_to(end, len(at)) for end in (layer.low, layer.high))
         path = _line(np.concatenate([at, at[::-1]]), y.units(np.concatenate([low, high[::-1]])))
         return f'<path class="band c{layer.colour}" d="{path}z"/>'
