@@ -5,7 +5,7 @@ white noise behind the filter, m bias wander (a Gauss-Markov process, and the sl
 of the fit allow), d errors of the calibration's parameters and of the scale of the table's rate (once: in the
 covariance where its budget has such a line, else as a parameter of its own), and J the derivative with respect to d.
 
-The squared error of the magnitude has the mean ``tr(W S)`` (``pipeline.validation.norm_error``); its mean over samples
+The squared error of the magnitude has the mean ``tr(W S)`` (``pipeline.validation.samples``); its mean over samples
 is a quadratic form in Gaussians, replaced by a shifted chi-square with the same cumulants (J. P. Imhof, Biometrika 48
 (1961), 419-426, section 4), C the covariance of all w, m and d, and A the form:
 
@@ -34,7 +34,7 @@ from pipeline.estimation.selection import INFLATED
 from pipeline.estimation.uncertainty_budget import DITHERED
 from pipeline.model.measurement import inverse_of
 from pipeline.validation.error_breakdown import last_step
-from pipeline.validation.norm_error import mean_squares
+from pipeline.validation.samples import mean_squares
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence

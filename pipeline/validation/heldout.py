@@ -24,8 +24,7 @@ from pipeline.model.kinematics import EARTH_RATE_DPS
 from pipeline.model.measurement import linear_truth
 from pipeline.validation.error_breakdown import direction_known, error_breakdown, last_error_of_magnitude
 from pipeline.validation.expected_error import expected_rms_error, linearized
-from pipeline.validation.norm_error import squared_norm_errors
-from pipeline.validation.samples import samples_of_motion, samples_of_rests
+from pipeline.validation.samples import samples_of_motion, samples_of_rests, squared_norm_errors
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
