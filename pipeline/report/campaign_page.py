@@ -11,6 +11,7 @@ import pandas as pd
 from pipeline.outcome import VERDICTS, findings_of, next_commands, verdict_groups
 from pipeline.records import SENSOR_UNITS, SENSORS
 from pipeline.report.chart import Dots, Figure, Layer, Panel, chart
+from pipeline.report.held_out_section import FAR
 from pipeline.report.numbers import number, plain
 from pipeline.report.pages import script_data, template
 from pipeline.report.strips import strips
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
 
 JSON = dict[str, Any]
 FIRST = 100  # rows that a browser shows at once; it shows the others when asked
-FAR = 3.0  # error over noise floor from which a unit is marked
 NAMED = 3  # units that the finding of a chart names
 FEWEST_UNITS, FAR_SHOWN = 3, 30  # units, below which a distribution says nothing; units far from the others
 MOST_LOTS = 60  # of which medians are shown lot by lot

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 JSON = dict[str, Any]
 ALIKE = 1.2  # the diagnosis's held-out error may continue the validation's steps where both agree within this factor
+FAR = 3.0  # error over noise floor from which a unit is marked, and no verdict is shown as good
 BEFORE_AFTER = (("c3", "before"), ("c2", "after"))
 SILENT = Noise(np.zeros(3), np.zeros(3), 100.0, "none")  # errors are drawn, not weighted
 

@@ -7,12 +7,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from pipeline.files import json_text
 from pipeline.model.plausible import sentences
 from pipeline.outcome import VERDICTS, commands_of, place, run_command
 from pipeline.records import SENSOR_UNITS, SENSORS
 from pipeline.report.diagnosis_section import evidence_figures, limit_rows, ranking_rows, upper_limits
 from pipeline.report.held_out_section import (
+    FAR,
     attitude_over_time,
     checks,
     error_steps,
@@ -96,7 +99,8 @@ def _sensor(
     noise, traces = found.get("noise") or held_out.get("noise"), residuals(sensor, part, recordings, table)
     first, last = first_and_last_step(held_out)
     at_rest = (calibration.get("noise") or {}).get(sensor)
-    limits = limit_rows(sensor, found, sheet)
+    limits, kind = limit_rows(sensor, found, sheet), VERDICTS.get(found.get("verdict", ""), "")
+    far = (last.get("rms_error") or 0.0) > FAR * (held_out.get("noise_floor") or np.inf)
     steps = [error_steps(sensor, held_out, found, vector=vector) for vector in (False, True)]
     return {
         "held_out": held_out,
@@ -120,7 +124,8 @@ def _sensor(
         "limits": limits,
         "limit_figures": [figure for figure in [upper_limits(sensor, limits)] if figure],
         "implausible": sentences(sensor, part),
-        "kind": VERDICTS.get(found.get("verdict", ""), ""),
+        "kind": "" if far and kind == "good" else kind,
+        "far": far,
         "commands": commands_of(found, sensor, str(calibration.get("unit")), settings.get("run") or {}),
     }
 

@@ -1,6 +1,7 @@
 """The pages: complete in themselves, true to the figures they are given, and safe against what users write."""
 
 import base64
+import copy
 import csv
 import re
 from dataclasses import replace
@@ -195,3 +196,23 @@ def test_a_chart_keeps_the_extremes_of_what_it_thins_out() -> None:
 def test_a_page_is_the_same_each_time(unit: Unit) -> None:
     assert render(*unit.arguments) == render(*unit.arguments)
     assert replace(unit).arguments == unit.arguments
+
+
+@pytest.mark.parametrize(("times", "good"), [(2.0, True), (18.0, False)])
+def test_nothing_missing_is_not_green_beside_an_error_far_above_the_noise(
+    unit: Unit, times: float, *, good: bool
+) -> None:
+    validation, diagnosis = copy.deepcopy((unit.validation, unit.diagnosis))
+    held_out = validation["gyroscope"]
+    held_out["steps"][-1]["rms_error"] = times * held_out["noise_floor"]
+    held_out["expected_rms_error"] = [0.0, 20.0 * held_out["noise_floor"]]
+    diagnosis["gyroscope"] |= {"verdict": "nothing_missing", "selected": []}
+    shown = render(unit.calibration, validation, diagnosis, unit.recordings, unit.settings)
+    card = re.search(r'<div class="card ([^"]*)">\s*<h2>Gyroscope</h2>(.*?)<a href', shown, re.DOTALL)
+    assert card is not None
+    assert (card[1] == "good") == good
+    assert ("does not show that the calibration is good" in card[2]) != good
+    row = summary_row("U1", unit.calibration, validation, diagnosis, {})
+    cell = re.search(r'<td( class="good-text")?>nothing missing', campaign_page.render("c", [row], []))
+    assert cell is not None
+    assert bool(cell[1]) == good
