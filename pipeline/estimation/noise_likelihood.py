@@ -62,8 +62,8 @@ class Spectrum:
 
     @cached_property
     def shapes(self) -> Values:
-        """Spectra of the terms without a correlation time: (4, b) array."""
-        return fixed_shapes(self.omega, self.interval)
+        """Spectra of the terms without a correlation time, and zeros for the others and for none: (6, b) array."""
+        return np.pad(fixed_shapes(self.omega, self.interval), ((0, 2), (0, 0)))
 
     @property
     def size(self) -> float:
@@ -163,7 +163,8 @@ class Fits:
 NAMES = tuple(f.name for f in fields(Fits))
 Result = TypeVar("Result")
 if TYPE_CHECKING:
-    Work = Generator[list[Trial], Fits, Result]  # yields trials, receives their fits, returns a result
+    Reply = tuple[Fits, int]  # fits, and the row of the first of one's own
+    Work = Generator[list[Trial], Reply, Result]  # yields trials, receives their fits, returns a result
 
 
 def active(kinds: Integers) -> Mask:
@@ -174,7 +175,7 @@ def active(kinds: Integers) -> Mask:
 def at_once(works: Sequence[Work[Result]]) -> Work[list[Result]]:
     """Yield the trials of several generators together; return their results."""
     results: dict[int, Result] = {}
-    replies: dict[int, Fits | None] = dict.fromkeys(range(len(works)))
+    replies: dict[int, Reply | None] = dict.fromkeys(range(len(works)))
     while True:
         asked: dict[int, list[Trial]] = {}
         for i, reply in replies.items():
@@ -184,19 +185,19 @@ def at_once(works: Sequence[Work[Result]]) -> Work[list[Result]]:
                 results[i] = end.value
         if not asked:
             return [results[i] for i in range(len(works))]
-        fits = yield [trial for trials in asked.values() for trial in trials]
-        replies, at = {}, 0
+        fits, at = yield [trial for trials in asked.values() for trial in trials]
+        replies = {}
         for i, trials in asked.items():
-            replies[i] = fits.rows(slice(at, at + len(trials)))
+            replies[i] = fits, at
             at += len(trials)
 
 
 def solved(spectrum: Spectrum, work: Work[Result]) -> Result:
     """Maximise the likelihood of all trials that a generator yields; return its result."""
-    reply: Fits | None = None
+    reply: Reply | None = None
     while True:
         try:
-            reply = maximised(spectrum, work.send(reply))  # type: ignore[arg-type]
+            reply = maximised(spectrum, work.send(reply)), 0  # type: ignore[arg-type]
         except StopIteration as end:
             found: Result = end.value
             return found
@@ -235,7 +236,7 @@ def _evaluated(
 ) -> Fits:
     terms = kinds.shape[1]
     theta, log_time = parameters[:, :terms], parameters[:, terms:]
-    shapes = np.where((kinds >= 0)[:, :, None], spectrum.shapes[np.clip(kinds, 0, MARKOV - 1)], 0.0)
+    shapes = spectrum.shapes[kinds]
     slopes = np.zeros((len(kinds), 2 * terms, len(spectrum.omega)))
     markov = kinds == MARKOV
     size = np.exp(theta)[:, :, None]
@@ -251,24 +252,19 @@ def _evaluated(
     beta, covariance, restricted = np.zeros((g, d)), np.zeros((g, d, d)), power
     used = np.flatnonzero(columns.any(axis=0))
     if used.size:
-        restricted = power.copy()
         index, n = np.append(0, used + 1), len(used)
-        unused = ~columns[:, used]
-        for a in np.unique(axis):
-            own = np.flatnonzero(axis == a)
-            products = spectrum.products[a][:, index[:, None], index].reshape(-1, (n + 1) ** 2)
-            sums = (weight[own] @ products).reshape(-1, n + 1, n + 1)
-            gone = unused[own]
-            absent = np.zeros((len(own), n, n))
-            absent[:, range(n), range(n)] = gone
-            inner = np.where(gone[:, :, None] | gone[:, None, :], absent, sums[:, 1:, 1:])
-            inverse, determinant[own] = np.linalg.inv(inner) - absent, np.linalg.slogdet(inner)[1]
-            signed = np.concatenate([np.ones((len(own), 1)), -np.einsum("gij,gj->gi", inverse, sums[:, 1:, 0])], axis=1)
-            outer = signed[:, :, None] * signed[:, None, :]
-            power[own] = np.maximum(outer.reshape(len(own), -1) @ products.T, 0.0)
-            outer[:, 1:, 1:] += inverse
-            restricted[own] = outer.reshape(len(own), -1) @ products.T
-            beta[own[:, None], used], covariance[own[:, None, None], used[:, None], used] = -signed[:, 1:], inverse
+        products = spectrum.products[:, :, index[:, None], index].reshape(*spectrum.products.shape[:2], -1)[axis]
+        sums = (weight[:, None, :] @ products).reshape(g, n + 1, n + 1)
+        gone = ~columns[:, used]
+        absent = gone[:, :, None] * np.eye(n)
+        inner = np.where(gone[:, :, None] | gone[:, None, :], absent, sums[:, 1:, 1:])
+        inverse, determinant = np.linalg.inv(inner) - absent, np.linalg.slogdet(inner)[1]
+        signed = np.concatenate([np.ones((g, 1)), -np.einsum("gij,gj->gi", inverse, sums[:, 1:, 0])], axis=1)
+        outer = signed[:, :, None] * signed[:, None, :]
+        power = np.maximum(products @ outer.reshape(g, -1, 1), 0.0)[:, :, 0]
+        outer[:, 1:, 1:] += inverse
+        restricted = (products @ outer.reshape(g, -1, 1))[:, :, 0]
+        beta[:, used], covariance[:, used[:, None], used] = -signed[:, 1:], inverse
     unrestricted = np.log(total) @ spectrum.count + np.sum(power * weight, axis=1)
     return Fits(
         axis, kinds, columns, parameters, unrestricted + determinant, unrestricted, total, restricted, slopes, beta,
@@ -301,7 +297,10 @@ def maximised(spectrum: Spectrum, trials: Sequence[Trial]) -> Fits:
         new = _evaluated(spectrum, now.axis, now.kinds, now.columns, tried)
         gain = now.deviance - new.deviance
         better = gain > 0
-        best.replace(running[better], new.rows(better))
+        if better.all() and now is best:
+            best = new
+        else:
+            best.replace(running[better], new.rows(better))
         damping[running] *= np.where(better, 0.2, 8.0)
         promised = -np.sum(gradient * step, axis=1)
         slow = better & (gain < PRECISE) & (damping[running] < 1.0)

@@ -103,9 +103,9 @@ class Search:
         trials = [Trial(self.axis, k, columns, p) for k, p in tries if (k, columns) not in self.found]
         if not trials:
             return
-        fits = yield trials
+        fits, first = yield trials
         out: dict[Composition, Candidate] = {}
-        for g, trial in enumerate(trials):
+        for g, trial in enumerate(trials, first):
             k = trial.kinds
             bic = float(fits.unrestricted[g]) + count_of(k, columns) * self.penalty
             if k not in out or bic < out[k].bic:
@@ -205,8 +205,8 @@ def _crossing(best: Candidate, trial: Trial, at: int, step: float, *, one_sided:
     parameters, inner, outer = trial.parameters.copy(), 0.0, np.inf
     for _ in range(PROFILE_STEPS):
         parameters[at] = start + sign * size
-        fits = yield [trial._replace(parameters=parameters, held=at)]
-        deviance = float(fits.deviance[0])
+        fits, row = yield [trial._replace(parameters=parameters, held=at)]
+        deviance = float(fits.deviance[row])
         least = min(least, deviance) if one_sided else least
         excess = float(np.sqrt(max(deviance - least, 1e-12))) / quantile
         if abs(excess - 1.0) < PROFILE_PRECISE or (size >= FARTHEST and excess < 1.0):
@@ -217,7 +217,7 @@ def _crossing(best: Candidate, trial: Trial, at: int, step: float, *, one_sided:
         if not inner < guess < outer:
             guess = 0.5 * (inner + outer) if np.isfinite(outer) else min(2.0 * size, size + 2.0)
         size = min(guess, FARTHEST)
-        parameters = fits.own()
+        parameters = fits.own(row)
     return sign * size
 
 
