@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from bench_session import CONTINUOUS, SIZE, K, Session, random_motion, record, values_of
 
+from pipeline.diagnosis.words import to_distinguish
 from pipeline.model import effects
 from pipeline.model.effects import built_in, built_in_files, catalogue
 from pipeline.model.effects.base import Effect, Owner, parameter_limits
@@ -100,6 +101,21 @@ def test_every_file_that_ships_is_an_effect_with_all_texts() -> None:
         assert all([effect.meaning, effect.excitation, effect.experiment, effect.source]), effect.name
         assert (CONFIGS / f"{effect.name}.yaml").read_text(encoding="utf-8").startswith("# ")  # its equation
         assert effect.definition is None
+
+
+def test_effects_that_follow_time_or_temperature_are_slow() -> None:
+    of_bias = {"bias_drift", "bias_temperature", "bias_temperature_quadratic", "warm_up"}
+    single = [e for e in built_in().values() if not e.of_turns]
+    assert {e.name for e in single if e.slow} == {*of_bias, "scale_factor_temperature"}
+    for sensor in SENSORS:
+        assert {e.name for e in single if sensor in e.sensors and e.of_the_room(sensor)} == of_bias
+
+
+def test_an_experiment_without_a_table_is_proposed_where_there_is_none() -> None:
+    sets = [{"effects": ["g_sensitivity"]}, {"effects": []}]
+    at_table, by_hand = (to_distinguish(sets, "gyroscope", on_table=on_table) for on_table in (True, False))
+    assert "rate table" in at_table
+    assert by_hand == built_in()["g_sensitivity"].experiment_by_hand != ""
 
 
 def test_the_table_of_theory_has_a_row_for_every_effect() -> None:

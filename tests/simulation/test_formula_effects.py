@@ -47,12 +47,13 @@ def test_a_formula_known_to_the_simulation_alone_is_added_to_the_reading() -> No
     assert truth["gyroscope"]["definitions"]["gear_mesh"]["terms"] == GEAR
 
 
-def test_a_registered_effect_is_hidden_by_its_name_and_has_a_typical_size() -> None:
+@pytest.mark.parametrize(("own", "share"), [({}, 0.5), ({"typical_share": 0.1}, 0.1)])
+def test_a_registered_effect_is_hidden_by_its_name_and_has_a_typical_size(own: dict[str, float], share: float) -> None:
     definition = {"name": "gear_mesh", "owner": "table", "sensors": ["gyroscope"], "meaning": "Mesh.", "terms": GEAR}
-    register(effect_from({**definition, "limits": {"A": 0.1}}, "gear_mesh.yaml"))
+    register(effect_from({**definition, **own, "limits": {"A": 0.1}}, "gear_mesh.yaml"))
     named, _, truth = gyroscope_of_y({"gyroscope.gear_mesh": None})
     sizes = truth["gyroscope"]["effects"]["gear_mesh"]
-    assert all(0.03 < abs(size) < 0.07 for size in sizes.values())
+    assert all(0.06 * share < abs(size) < 0.14 * share for size in sizes.values())
     values = list(sizes.values())
     inline, _, _ = gyroscope_of_y({"gyroscope.gear_mesh": {"terms": GEAR, "values": values}})
     np.testing.assert_array_equal(named, inline)
