@@ -129,16 +129,9 @@ def next_commands(
 
 
 def outcome(results: Path, settings: Mapping[str, Any], *, of_this_run: bool) -> str:
-    """Return the last lines of a run but those of failed units.
+    """Return the last lines of a run but those of failed units, from the results of its campaign and its settings.
 
-    Parameters
-    ----------
-    results : Path
-        Of the campaign.
-    settings : mapping
-        Of the run.
-    of_this_run : bool
-        Whether the last entry of the history is of this run.
+    ``of_this_run``: whether the last entry of the history is of this run.
     """
     rows, folder = read_summary(results), str(results.parent)
     calibrated = sum(row["status"] == "ok" for row in rows)
@@ -188,10 +181,7 @@ def _changes(entries: Sequence[JSON]) -> list[str]:
 def run_command(settings: Mapping[str, Any]) -> str:
     """Return the command of a run: ``snakemake`` in a clone, ``imu-calibration run`` where the wheel is installed.
 
-    Parameters
-    ----------
-    settings : mapping
-        As given by ``--config``: ``campaign``, ``overrides``, ``unit_overrides``, ``results`` ...
+    ``settings``: as given by ``--config``: ``campaign``, ``overrides``, ``unit_overrides``, ``results`` ...
     """
     if INSTALLED:
         return _command("run", settings, [], str(settings.get("results") or RESULTS))

@@ -130,20 +130,10 @@ class Subject:
 def export_all(
     calibration: JSON, settings: JSON, folder: Path, validation: JSON | None = None, diagnosis: JSON | None = None
 ) -> list[Path]:
-    """Write a calibration in every format; return what was written.
+    """Write a calibration in every format into a folder; return what was written.
 
-    Parameters
-    ----------
-    calibration : dict
-        ``calibrations/<unit>.json``.
-    settings : dict
-        The sections ``sensor`` and ``table`` of the unit's configuration.
-    folder : Path
-        Made if need be.
-    validation : dict, optional
-        ``validations/<unit>.json``.
-    diagnosis : dict, optional
-        ``diagnoses/<unit>.json``, for the effective noise.
+    ``calibration, validation, diagnosis``: as in the published files of the unit; ``settings``: the sections ``sensor``
+    and ``table`` of its configuration.
     """
     folder.mkdir(parents=True, exist_ok=True)
     subject = Subject(calibration, settings, validation, diagnosis)
@@ -154,7 +144,7 @@ def export_all(
 
 
 def export(name: str, subject: Subject) -> dict[str, str]:
-    """Return the files of one format, by name: none where it can hold nothing of this unit."""
+    """Return the files of one format, by name: none where the format can hold nothing of this unit."""
     declared, template = formats()[name]
     parts = {
         file: replace(declared, units={s: declared.units[s]}, needs=[s]) for s, file in declared.files.items()

@@ -61,16 +61,10 @@ def settings_of(found: FoundCalibration, sheets: Mapping[str, Any]) -> JSON:
 def convert(
     found: FoundCalibration, name: str, target: Path, sheets: Mapping[str, Any]
 ) -> tuple[list[Path], list[str]]:
-    """Write a calibration in another format; return the files and what is lost, in sentences.
+    """Write a calibration in the format ``name``; return the files and what is lost, in sentences.
 
-    Parameters
-    ----------
-    name : str
-        Of the format to write.
-    target : Path
-        The file; where a format has a file for each sensor, its stem is the beginning of their names.
-    sheets : mapping
-        Sensor to its part of the sensor's configuration, for counts and noise; may be empty.
+    ``target``: the file, or where the format has a file for each sensor, the beginning of their names; ``sheets``:
+    sensor to its part of the sensor's configuration, for counts and noise, may be empty.
     """
     document, settings = document_of(found), settings_of(found, sheets)
     if name == CALIBRATION:

@@ -70,16 +70,10 @@ class FoundCalibration:
 
 
 def read_any(file: Path, name: str | None = None, counts: Mapping[str, float | None] | None = None) -> FoundCalibration:
-    """Read a calibration in any format.
+    """Read a calibration in any format; where a format has a file for each sensor, from either of them.
 
-    Parameters
-    ----------
-    file : Path
-        Where a format has a file for each sensor, either of them.
-    name : str, optional
-        Of the format, or its beginning (``format_of``); without it, the file's name and content tell.
-    counts : mapping, optional
-        Sensor to its counts per g or deg/s, for formats in counts.
+    ``name``: of the format, or its beginning (``format_of``), found from the file's name and content where not given;
+    ``counts``: sensor to its counts per g or deg/s, for formats in counts.
 
     Raises
     ------

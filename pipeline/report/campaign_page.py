@@ -44,27 +44,11 @@ def render(
 ) -> str:
     """Return ``index.html``.
 
-    Parameters
-    ----------
-    campaign : str
-    rows : list of dict
-        One a unit, as of ``summary.summary_row``, in the order of ``units.csv``.
-    failures : list of dict
-        ``unit``, ``stage``, ``code``, ``message``, ``file`` of each failed unit.
-    comparisons : sequence, optional
-        As of ``comparison_section.section``.
-    page : str, optional
-        Name of a further page of the campaign.
-    twins : sequence of sequence of str, optional
-        Files of several units with the same content under different names.
-    statistics : dict, optional
-        As of ``fleet.fleet_statistics``.
-    placed : mapping, optional
-        Unit to its parameters against the data sheet, as of ``strips.against_limits``.
-    history : dict, optional
-        As of ``run_section.runs_data``.
-    settings : dict, optional
-        Of the run, for the commands to continue with.
+    ``rows``: one a unit, as of ``summary_row``, in the order of ``units.csv``; ``failures``: ``unit, stage, code,
+    message, file`` of each failed unit; ``comparisons``: as of ``comparison_section.section``; ``page``: name of a
+    further page; ``twins``: files of several units with the same content under different names; ``statistics``: as of
+    ``fleet_statistics``; ``placed``: unit to its parameters, as of ``against_limits``; ``history``: as of
+    ``runs_data``; ``settings``: of the run, for the commands to continue with.
     """
     findings = findings_of(rows)
     frame = pd.DataFrame(rows).reindex(columns=list(dict.fromkeys([*COLUMNS, *(k for row in rows for k in row)])))

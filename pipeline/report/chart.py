@@ -150,23 +150,11 @@ def chart(
     columns: Sequence[str] = (),
     units: str = "",
 ) -> Figure:
-    """Return a figure with its chart: panels that share the axis x.
+    """Return a figure, whose texts are given, with its chart: panels that share the axis x.
 
-    Parameters
-    ----------
-    figure : Figure
-        The texts.
-    description : str
-        What the chart shows, for screen readers.
-    panels : list of Panel
-    x_label, kind, margin
-        Of the axis x: its label, "", "angle" (deg) or "log", and by which share of their range it exceeds the values.
-    left : int, px
-        Room for the ticks of the axes y.
-    columns : sequence of str
-        Names of x = 1, 2, ...
-    units : str
-        List of the page's script that names what stands at x = 1, 2, ...
+    ``description``: what the chart shows, for screen readers; ``x_label, kind, margin``: of the axis x, its label, "",
+    "angle" (deg) or "log", and by which share of their range it exceeds the values; ``left``: room for the ticks of
+    the axes y, px; ``columns``: names of x = 1, 2, ...; ``units``: list of the page's script that names them.
     """
     values = {id(layer.x): layer.x for p in panels for layer in p.layers if layer.x is not None}
     x = Axis.over(values.values(), left, WIDTH - RIGHT, kind, margin)

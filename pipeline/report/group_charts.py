@@ -57,20 +57,11 @@ def bars(
     kind: str = "log",
     brackets: Sequence[Mapping[int, str]] = (),
 ) -> Figure:
-    """Return a figure (its texts are given) with a row for each value.
+    """Return a figure, whose texts are given, with a row for each value.
 
-    Parameters
-    ----------
-    figure : Figure
-    rows : sequence of Point
-    label : str
-        Of the values, with unit.
-    levels : mapping of str to float, optional
-        Vertical lines by their text; values above 0 are drawn.
-    kind : str
-        Of the axis: "log", or "symlog" with bars from zero.
-    brackets : sequence of mapping
-        Each joins rows: the number of a row to the text beside it.
+    ``label``: of the values, with unit; ``levels``: vertical lines by their text, those above 0 are drawn; ``kind``: of
+    the axis, "log", or "symlog" with bars from zero; ``brackets``: each joins rows, the number of a row to the text
+    beside it.
     """
     levels = {words: value for words, value in (levels or {}).items() if value > 0}
     values = [v for r in rows for v in (r.value, *(r.interval or ()), *r.units, r.floor) if v is not None]

@@ -52,12 +52,8 @@ def against_limits(calibration: JSON, sheet: JSON) -> dict[str, Placed]:
 def strips(rows: Sequence[JSON], placed: Mapping[str, Mapping[str, Placed]]) -> Strips:
     """Return the strip plots of a campaign.
 
-    Parameters
-    ----------
-    rows : sequence of dict
-        One a unit, as of ``summary_row``, in the order of the page.
-    placed : mapping of str to mapping
-        Unit to its parameters, as of ``against_limits``.
+    ``rows``: one a unit, as of ``summary_row``, in the order of the page; ``placed``: unit to its parameters, as of
+    ``against_limits``.
     """
     siblings: dict[tuple[str, str], list[int]] = {}
     for i, row in enumerate(rows):

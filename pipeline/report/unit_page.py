@@ -47,16 +47,9 @@ def render(
 ) -> str:
     """Return the page of one unit as HTML.
 
-    Parameters
-    ----------
-    calibration, validation, diagnosis : dict
-        As in their files; the last two may be None where their stage failed.
-    recordings : list of Recording
-        After the filter; may be empty.
-    settings : dict
-        The unit's resolved configuration.
-    words : dict of str to list of str, optional
-        The diagnosis of each sensor in sentences.
+    ``calibration, validation, diagnosis``: as in their files, the last two None where their stage failed;
+    ``recordings``: after the filter, may be empty; ``settings``: the unit's resolved configuration; ``words``: the
+    diagnosis of each sensor in sentences.
     """
     validation, diagnosis, words = validation or {}, diagnosis or {}, words or {}
     attitude, moves = validation.get("attitude") or {}, validation.get("gravity_direction") or {}
