@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.io.units import STANDARD_GRAVITY
+from pipeline.io.units import FORCE_UNITS
 from pipeline.records import SENSORS
 
 if TYPE_CHECKING:
@@ -42,7 +42,6 @@ DIRECTED = 0.1  # scatter over mean of a rest's specific force: its direction is
 WORSE = {"accelerometer": 1.2, "gyroscope": 3.0}
 KNOWN = 5.0  # standard errors of a rest's mean that the error after is above
 APART_DEG = 30.0  # orientations that count as different; the least turn of gravity that is compared with the rate
-GRAVITY_UNITS = {"m/s^2": STANDARD_GRAVITY, "mg": 1000.0}
 NEAR = 0.15  # a median |a| this near to a unit's factor is read in that unit
 STRANGE_G = (0.5, 2.0)  # median |a| of a log; walking, driving and flying stay within
 CELLS, LEAST_CELLS, SHARE = 200, 10, 0.6  # of a column; the share of cells with 12 decimals, 0.9 expected
@@ -145,7 +144,7 @@ class LogChecks:
         size = float(np.median(table["accelerometer size"]))
         if STRANGE_G[0] <= size <= STRANGE_G[1]:
             return []
-        alike = [unit for unit, factor in GRAVITY_UNITS.items() if abs(size / factor - 1.0) < NEAR]
+        alike = [unit for unit, factor in FORCE_UNITS.items() if abs(size / factor - 1.0) < NEAR]
         cause = f"the readings look like {alike[0]}" if alike else "another unit, another range, or no rest in the log"
         told = f"half of the log has |a| above {size:.3g} g, expected about 1 g: {cause}"
         return [f"{told}; --ingest names a profile with the unit of each column"]

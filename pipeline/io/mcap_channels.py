@@ -21,7 +21,7 @@ from pipeline.io.ingest_settings import HEADER, TIME, MappedField
 from pipeline.io.message_decoder import Batch, ChannelDecoder, Wanted
 from pipeline.io.message_layout import short_name
 from pipeline.io.ros2_messages import IMU, JOINT_STATE, QUATERNION_STAMPED, TEMPERATURE, VECTORS
-from pipeline.io.units import ATTITUDE, COUNTS, SPELLINGS, TRIADS, UNITS
+from pipeline.io.units import ATTITUDE, COUNTS, TRIADS, UNITS, unit_spelt
 from pipeline.records import Encoding
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ class TopicDecoder:
         """Refuse a unit of the profile that is not the one which the file states (``STATED``)."""
         for channel, source in self.fields.items():
             text = stated.get(f"{STATED}{source.field.base}", "")
-            unit = SPELLINGS.get(text.lower().replace(" ", ""))
+            unit = unit_spelt(text)
             if unit in UNITS[channel] and source.unit not in (unit, COUNTS):
                 message = (
                     f"topic {self.topic}: the file states {text} for {source.field.text}, the profile {source.unit}"

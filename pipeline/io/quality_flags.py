@@ -18,7 +18,7 @@ import numpy as np
 
 from pipeline.errors import IngestError
 from pipeline.io.timestamps import time_error
-from pipeline.io.units import ATTITUDE, DEGREES, TRIADS
+from pipeline.io.units import ATTITUDE, DEGREES, FORCE_UNITS, STANDARD_GRAVITY, TRIADS
 from pipeline.records import SENSOR_UNITS
 
 if TYPE_CHECKING:
@@ -262,7 +262,7 @@ def _check_force(table: ChannelTable) -> None:
     if low <= usual <= high:
         return
     hint = "is the unit or the scale right?"
-    for factor, unit in ((9.80665, "m/s^2"), (1000.0, "mg"), (1 / 9.80665, "g that were declared as m/s^2")):
+    for unit, factor in (*FORCE_UNITS.items(), ("g that were declared as m/s^2", 1.0 / STANDARD_GRAVITY)):
         if 0.7 < usual / factor < 1.4:
             hint = f"the numbers look like {unit}"
     if usual > 1500.0:

@@ -34,6 +34,7 @@ _RATE = {"deg/s": (1.0, 1.0), "rad/s": (DEGREES, 1.0), COUNTS: (1.0, 1.0)}
 _ANGLE = {"deg": (1.0, 1.0), "rad": (DEGREES, 1.0), COUNTS: (1.0, 1.0)}
 _TEMPERATURE = {"degC": (1.0, 1.0), COUNTS: (1.0, 1.0)}
 _RATIO = {"1": (1.0, 1.0)}
+FORCE_UNITS = {"g": 1.0, "m/s^2": STANDARD_GRAVITY, "mg": 1000.0}  # how many are one g
 _TIME = {"s": (1e9, 1.0), "ms": (1e6, 1.0), "us": (1e3, 1.0), "ns": (1.0, 1.0)}
 
 UNITS: dict[str, dict[str, tuple[float, float]]] = {
@@ -69,10 +70,15 @@ SPELLINGS = {
 BRACKETS = re.compile(r"[\[(]([^\])]*)[\])]\s*$")
 
 
+def unit_spelt(text: str) -> str | None:
+    """Return the unit that a text spells, None for any other text."""
+    return SPELLINGS.get(text.strip().lower().replace(" ", ""))
+
+
 def unit_in_brackets(name: str) -> str | None:
     """Return the unit that a column's name states in brackets at its end, None where it states none."""
     found = BRACKETS.search(name)
-    return SPELLINGS.get(found.group(1).strip().lower().replace(" ", "")) if found else None
+    return unit_spelt(found.group(1)) if found else None
 
 
 def to_house_unit(channel: str, values: Values, unit: str) -> Values:

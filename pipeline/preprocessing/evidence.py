@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import IngestError
+from pipeline.io.quality_flags import GAP_INTERVALS
 from pipeline.records import AXES, SENSORS, conjugate_product, continuous, median, noise_of_steps
 
 if TYPE_CHECKING:
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from pipeline.records import Mask, Recording, Values
 
 
-GAP = 1.5  # median intervals, as pipeline.io.quality_flags
 EXPANDED = 3.0  # coverage of a stated standard uncertainty: 99.7 % of a normal distribution
 OPPOSITE = 0.8  # correlation, from which two channels differ in sign alone
 SIGN_BLOCK = 8  # intervals, over which short moves show their angle in both
@@ -114,7 +114,7 @@ def quantiles(values: Values, *shares: float) -> Values:
 
 def gaps(recording: Recording) -> Mask:
     """Return which intervals are longer than 1.5 times the usual one: (n - 1,) array."""
-    return np.asarray(np.diff(recording.time_ns) > GAP * recording.interval * 1e9)
+    return np.asarray(np.diff(recording.time_ns) > GAP_INTERVALS * recording.interval * 1e9)
 
 
 def of_table(recording: Recording) -> list[Channel]:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.io.gravity_rotation import misfit_deg, rests_of
-from pipeline.io.units import COUNTS, DEGREES, STANDARD_GRAVITY, UNITS
+from pipeline.io.units import COUNTS, DEGREES, FORCE_UNITS, UNITS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from pipeline.records import Values
 
 UNKNOWN = "???"
-FORCE_UNITS = {"g": 1.0, "m/s^2": STANDARD_GRAVITY, "mg": 1000.0}
 CLOSE = 0.12  # bias and scale factor of a low-cost sensor in one position
 CLOSE_BY_TABLE = 0.05  # scale factor of a low-cost sensor (MPU-6050: 3 %), and a unit that leans on the table
 FOLLOWED = 0.3  # share of the rates' rms that the table's rate leaves at most: axes lean, and rates are noisy
