@@ -95,7 +95,8 @@ def main(argv: Sequence[str]) -> int:
             refused.append((reading, error))
     unknown = [layout for reading, error in refused for layout in _layouts(reading, error)]
     if unknown:
-        _print_proposals(propose(unknown), refused[0][0].settings["sensor"], arguments.save)
+        sensor = refused[0][0].settings["sensor"]
+        _print_proposals(propose(unknown, sensor), sensor, arguments.save)
     elif arguments.save:
         print(f"{arguments.save} was not written: no profile is proposed")
     sys.stdout.flush()
@@ -293,11 +294,11 @@ def _print_proposals(proposals: Sequence[Proposal], sensor: dict[str, Any], save
         print(textwrap.indent(text, "    "))
         if proposal.complete:
             print("With it:\n")
-            ingest = proposal.ingest(name)
+            ingest = proposal.ingest(name, sensor)
             groups = [[Path(f) for f in proposal.files]] if proposal.parts else [[Path(f)] for f in proposal.files]
             for group in groups:
                 _print_facts(_reading_of_file(group, ingest, sensor, "the proposed profile"))
-        else:
+        elif proposal.unknown():
             print(f"Fill in {UNKNOWN} for {', '.join(proposal.unknown())}.")
         if save is not None:
             write_atomically(save, text)

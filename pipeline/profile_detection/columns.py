@@ -15,6 +15,7 @@ import numpy as np
 
 from pipeline.errors import IngestError
 from pipeline.io.units import BRACKETS, CHANNELS, SPELLINGS, TRIADS, UNITS, unit_in_brackets
+from pipeline.profile_detection.unit_guesses import whole
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -121,6 +122,8 @@ def find_columns(layout: TextLayout) -> Columns:
         if triad is not None:
             found.triads[sensor] = triad
             _remark_on_other_triads(found, sensor, named)
+    for sensor, triad in _triads_by_one_letter(layout).items():
+        found.triads.setdefault(sensor, triad)
     bare = found.triads.pop("?", None)
     if bare is not None and not found.triads:
         found.triads[_sensor_of_file(layout, bare)] = bare
@@ -130,12 +133,29 @@ def find_columns(layout: TextLayout) -> Columns:
     for i, w in words.items():
         channel = _other_channel(layout.names[i], w)
         low, high = TEMPERATURE_RANGE
-        possible = channel != "temperature" or low < float(np.median(layout.numbers[i])) < high
+        values = layout.numbers[i]
+        possible = channel != "temperature" or low < float(np.median(values)) < high or whole(values)
         if channel and channel not in found.others and possible:
             found.others[channel] = i
     texts = [n for i, n in enumerate(layout.names) if i not in layout.numbers]
     if texts:
         found.remarks.append(f"left out, as not all of it is numbers: {', '.join(texts)}")
+    return found
+
+
+def _triads_by_one_letter(layout: TextLayout) -> dict[str, Triad]:
+    """Return the sensors of three names that differ in a letter x, y, z beside the sensor's name: axr, ayr, azr."""
+    groups: dict[tuple[str, str], dict[str, int]] = {}
+    for index in layout.numbers if layout.header else ():
+        name = layout.names[index].lower()
+        for at in (i for i, letter in enumerate(name) if letter in "xyz"):
+            groups.setdefault((name[:at], name[at + 1 :]), {})[name[at]] = index
+    found: dict[str, Triad] = {}
+    for (before, after), axes in groups.items():
+        beside = {*re.findall("[a-z]+$", before), *re.findall("^[a-z]+", after)}
+        for sensor, known in SENSOR_WORDS.items():
+            if len(axes) == len("xyz") and beside & known:
+                found.setdefault(sensor, (axes["x"], axes["y"], axes["z"]))
     return found
 
 

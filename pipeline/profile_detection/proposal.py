@@ -18,15 +18,25 @@ import numpy as np
 
 from pipeline.io.gravity_rotation import moves_of
 from pipeline.io.units import COUNTS, GYROSCOPE, TRIADS, UNITS
-from pipeline.profile_detection.columns import Columns, find_columns, stated_unit, words_of
+from pipeline.profile_detection.columns import (
+    TEMPERATURE_RANGE,
+    Columns,
+    find_columns,
+    stated_unit,
+    words_of,
+)
 from pipeline.profile_detection.topics import TopicLayout
 from pipeline.profile_detection.unit_guesses import (
     ASSUMED_HZ,
+    OF_SENSOR,
     UNKNOWN,
     Guess,
+    counts_of_sensor,
     force_unit,
+    other_range,
     rate_unit,
     rate_unit_by_table,
+    temperature_counts,
     time_unit,
 )
 
@@ -81,22 +91,30 @@ class Proposal:
         found = [k for k, v in self.csv.items() if v == UNKNOWN]
         return found + [c for entries in self.columns for c, e in entries.items() if UNKNOWN in e.values()]
 
-    def ingest(self, name: str) -> dict[str, Any]:
-        """Return the proposal as the section ``ingest`` of a configuration."""
+    def ingest(self, name: str, sensor: dict[str, Any]) -> dict[str, Any]:
+        """Return the proposal as the section ``ingest`` of a configuration, with what it takes from the sensor's."""
+        figures = {OF_SENSOR.format(s): sensor[s]["counts_per_unit"] for s in TRIADS if s in sensor}
+        columns = [
+            {c: {k: figures.get(v, v) for k, v in entry.items()} for c, entry in entries.items()}
+            for entries in self.columns
+        ]
         if self.topic is not None:
-            return {"name": name, "csv": {}, "mcap": {"topics": {self.topic: _fields(self.columns[0])}}}
+            return {"name": name, "csv": {}, "mcap": {"topics": {self.topic: _fields(columns[0])}}}
         if not self.parts:
-            return {"name": name, "csv": {**self.csv, "columns": self.columns[0]}, "mcap": {}}
-        parts = [{"file": f, "columns": c} for f, c in zip(self.parts, self.columns, strict=True)]
+            return {"name": name, "csv": {**self.csv, "columns": columns[0]}, "mcap": {}}
+        parts = [{"file": f, "columns": c} for f, c in zip(self.parts, columns, strict=True)]
         return {"name": name, "csv": {**self.csv, "parts": parts, "columns": {}}, "mcap": {}}
 
 
-def propose(layouts: Sequence[TextLayout]) -> list[Proposal]:
-    """Return the profiles that text logs seem to ask for, those of the same layout together."""
+def propose(layouts: Sequence[TextLayout], sensor: dict[str, Any] | None = None) -> list[Proposal]:
+    """Return the profiles that text logs seem to ask for, those of the same layout together.
+
+    ``sensor``: its configuration, where the user states one; counts that the log does not tell are taken from it.
+    """
     found = [find_columns(layout) for layout in layouts]
     proposals: list[Proposal] = []
     for columns in _joined(found):
-        new = _proposal(columns)
+        new = _proposal(columns, sensor or {})
         twin = next((p for p in proposals if _alike(p, new)), None)
         if twin is None:
             proposals.append(new)
@@ -142,7 +160,7 @@ def _fill_in(proposal: Proposal, other: Proposal) -> None:
     proposal.remarks += [r for r in other.remarks if r not in proposal.remarks]
 
 
-def _proposal(parts: list[Columns]) -> Proposal:
+def _proposal(parts: list[Columns], sensor: dict[str, Any]) -> Proposal:
     layouts = [c.layout for c in parts]
     proposal = Proposal([s.path for s in layouts], layouts, _csv_section(layouts[0]), [{} for _ in parts])
     if layouts[0].rate_hz is not None:
@@ -159,19 +177,41 @@ def _proposal(parts: list[Columns]) -> Proposal:
         interval = float(np.median(np.diff(time_s))) if time_s is not None else 1 / ASSUMED_HZ
         guess = force_unit(force, interval)
         _add("accelerometer", parts, proposal, guess)
+        proposal.remarks += other_range(guess, sensor)
         force = force - guess.centre
     rate = _readings("gyroscope", parts)
     if rate is not None:
-        moves, why_none = _moves(force, rate, time_s, steady=parts[0].steady)
-        by_table = _by_table(next(c for c in parts if "gyroscope" in c.triads), rate)
-        _add("gyroscope", parts, proposal, by_table or rate_unit(rate, moves, why_none, timed=time_s is not None))
-    if force is None and rate is None:
-        proposal.remarks.append(
-            "no three columns have the values of an accelerometer or a gyroscope: name them in columns"
-        )
+        _add("gyroscope", parts, proposal, _gyroscope(parts, force, rate, time_s, sensor))
     for columns, entries in zip(parts, proposal.columns, strict=True):
-        _others(columns, entries, proposal)
+        _others(columns, entries, proposal, str(sensor.get("name", "")))
+    if force is None and rate is None:
+        _add_template(proposal)
     return proposal
+
+
+def _add_template(proposal: Proposal) -> None:
+    """Add the lines of both sensors, to be filled in, where none was found beside other columns than a table's log."""
+    proposal.remarks.append("no three columns have the names or values of an accelerometer or a gyroscope")
+    if proposal.topic is not None or "table_rate" in proposal.columns[0]:
+        return
+    for sensor, triad in TRIADS.items():
+        proposal.columns[0] |= {c: {"column": UNKNOWN, "unit": UNKNOWN} for c in triad}
+        proposal.evidence[sensor] = (
+            f"the names of the {sensor}'s columns, and their unit: {', '.join(UNITS_OF[sensor])}, or counts with "
+            f'counts_per_unit: "{OF_SENSOR.format(sensor)}"; leave the three lines out if it is not in the log'
+        )
+
+
+def _gyroscope(
+    parts: list[Columns], force: Values | None, rate: Values, time_s: Values | None, sensor: dict[str, Any]
+) -> Guess:
+    """Return the unit of the rates by the table, by gravity, or of counts by the sensor's configuration."""
+    moves, why_none = _moves(force, rate, time_s, steady=parts[0].steady)
+    by_table = _by_table(next(c for c in parts if "gyroscope" in c.triads), rate, time_s)
+    guess = by_table or rate_unit(rate, moves, why_none, timed=time_s is not None)
+    if guess.entry["unit"] == COUNTS and guess.entry["counts_per_unit"] == UNKNOWN:
+        return counts_of_sensor(guess, "gyroscope", sensor)
+    return guess
 
 
 def _csv_section(layout: TextLayout) -> dict[str, Any]:
@@ -241,14 +281,20 @@ def _moves(force: Values | None, rate: Values, time_s: Values | None, *, steady:
     return moves, "" if moves else "no move between rests rotates gravity, which would show the unit"
 
 
-def _by_table(columns: Columns, rate: Values) -> Guess | None:
-    """Return what the table's rate in the same rows says of the gyroscope's unit."""
-    if "table_rate" not in columns.others:
+def _by_table(columns: Columns, rate: Values, time_s: Values | None) -> Guess | None:
+    """Return what the table's rate, or the slope of its angle, in the same rows says of the gyroscope's unit."""
+    channel = next((c for c in ("table_rate", "table_angle") if c in columns.others), None)
+    if channel is None or (channel == "table_angle" and not columns.steady):
         return None
-    index = columns.others["table_rate"]
-    stated, _ = stated_unit(columns.layout.names[index], "table_rate")
-    multiplier, divisor = UNITS["table_rate"][stated or "deg/s"]
-    return rate_unit_by_table(rate, columns.layout.numbers[index] * multiplier / divisor)
+    index = columns.others[channel]
+    stated, _ = stated_unit(columns.layout.names[index], channel)
+    multiplier, divisor = UNITS[channel][stated or {"table_rate": "deg/s", "table_angle": "deg"}[channel]]
+    values = columns.layout.numbers[index] * multiplier / divisor
+    if channel == "table_angle":
+        if time_s is None:
+            return None
+        values = np.gradient(np.unwrap(values, period=360.0), time_s)
+    return rate_unit_by_table(rate, values)
 
 
 def _readings(sensor: str, parts: list[Columns]) -> Values | None:
@@ -273,8 +319,8 @@ def _add(sensor: str, parts: list[Columns], proposal: Proposal, guess: Guess) ->
                 proposal.remarks.append(f"{layout.names[index]}: {why}, and yet {guess.evidence}")
 
 
-def _others(columns: Columns, entries: Entries, proposal: Proposal) -> None:
-    layout = columns.layout
+def _others(columns: Columns, entries: Entries, proposal: Proposal, sensor: str) -> None:
+    layout, (low, high) = columns.layout, TEMPERATURE_RANGE
     for channel, index in columns.others.items():
         values = layout.numbers[index]
         usual = {"temperature": "degC", "table_angle": "deg", "table_rate": "deg/s"}.get(channel, "1")
@@ -282,6 +328,10 @@ def _others(columns: Columns, entries: Entries, proposal: Proposal) -> None:
         entries[channel] = {"column": layout.key(index), "unit": stated or usual, "optional": True}
         span = f"{values.min():.6g} to {values.max():.6g}"
         proposal.evidence[channel] = f"{why}: {span}" if stated else f"{span}, so {usual}"
+        if channel == "temperature" and not low < float(np.median(values)) < high:
+            guess = temperature_counts(span, sensor)
+            entries[channel] = {"column": layout.key(index), **guess.entry, "optional": True}
+            proposal.evidence[channel] = guess.evidence
     if GYROSCOPE[0] not in entries and "table_rate" in entries and not proposal.parts:
         proposal.remarks.append("a table's log, without the sensor's readings")
 
@@ -345,4 +395,6 @@ def _scalar(value: Any) -> str:  # noqa: ANN401  (any scalar of YAML)
     keyword = value.lower() in ("true", "false", "yes", "no", "on", "off", "null", "y", "n")
     if WORD.fullmatch(value) and not keyword:
         return value
+    if value in map(OF_SENSOR.format, TRIADS):
+        return json.dumps(value)
     return json.dumps(value, ensure_ascii=False).replace("${", "\\\\${")

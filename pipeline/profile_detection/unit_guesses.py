@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from pipeline.records import Values
 
 UNKNOWN = "???"
+OF_SENSOR = "${{sensor.{}.counts_per_unit}}"  # in a profile: the figure of the sensor's configuration
+MPU60X0_TEMPERATURE = {"counts_per_unit": 340.0, "offset": -12420.2}  # MPU-6000/6050 register map 4.2, 4.18
 CLOSE = 0.12  # bias and scale factor of a low-cost sensor in one position
 CLOSE_BY_TABLE = 0.05  # scale factor of a low-cost sensor (MPU-6050: 3 %), and a unit that leans on the table
 FOLLOWED = 0.3  # share of the rates' rms that the table's rate leaves at most: axes lean, and rates are noisy
@@ -88,12 +90,13 @@ def time_unit(values: Values, stated: str | None, why: str) -> Guess:
 def force_unit(force: Values, interval_s: float) -> Guess:
     """Return the unit of an (n, 3) specific force."""
     rests = rests_of(force, interval_s)
-    means = np.array([force[a:b].mean(axis=0) for a, b in rests or [(0, len(force))]])
-    size = float(np.median(np.linalg.norm(means, axis=1)))
+    means = np.array([force[a:b].mean(axis=0) for a, b in rests])
+    at_rest = np.concatenate([force[a:b] for a, b in rests]) if rests else force
+    size = float(np.median(np.linalg.norm(at_rest, axis=1)))  # of samples: a slow turn may pass for a rest
     where = f"|a| is {size:.4g} at rest" if rests else f"|a| is {size:.4g} on the whole"
-    centre, radius = sphere(means) if len(means) >= FEWEST_RESTS_FOR_A_SPHERE else (np.zeros(3), size)
+    centre, radius = sphere(means) if len(rests) >= FEWEST_RESTS_FOR_A_SPHERE else (np.zeros(3), size)
     if whole(force):
-        guess = _counts_per_g(len(means), centre, radius, size, where)
+        guess = _counts_per_g(len(rests), centre, radius, size, where)
     else:
         guess = Guess({"unit": UNKNOWN}, f"{where}, which is neither 1 (g), 9.8 (m/s^2) nor 1000 (mg)")
         for unit, gravity in FORCE_UNITS.items():
@@ -203,3 +206,36 @@ def _counts_per_dps(moves: Sequence[Move], otherwise: str, *, timed: bool) -> Gu
         return Guess(unknown, f"counts_per_unit times the sampling rate in Hz is near {product:.3g} ({listed}), {seen}")
     entry, taken = _usual_counts(measured, CLOSE_BY_TURNS)
     return Guess(entry, f"counts, {measured:.3g} a deg/s, {seen}{taken}")
+
+
+def other_range(guess: Guess, sensor: dict[str, Any]) -> list[str]:
+    """Return a remark where the accelerometer's counts are not those of the sensor that is stated."""
+    stated, seen = sensor.get("accelerometer", {}).get("counts_per_unit"), guess.entry.get("counts_per_unit")
+    if not stated or not seen or abs(seen / stated - 1) < CLOSE:
+        return []
+    name = sensor["name"]
+    where = "sensor.accelerometer.range, and sensor.gyroscope.range"
+    return [f"sensor={name} states {stated:g} counts a g: set {where}, as the logger does"]
+
+
+def counts_of_sensor(guess: Guess, name: str, sensor: dict[str, Any]) -> Guess:
+    """Return the counts that the log does not tell by the sensor's configuration, if one is stated."""
+    figure = OF_SENSOR.format(name)
+    if name not in sensor:
+        text = f'{guess.evidence}; "{figure}" takes counts_per_unit from the configuration of the sensor and its range'
+        return Guess(guess.entry, text)
+    text = (
+        f"{guess.evidence}; counts_per_unit is that of sensor={sensor['name']}, {sensor[name]['counts_per_unit']:g}: "
+        f"sensor.{name}.range must be the range that the logger sets"
+    )
+    return Guess({**guess.entry, "counts_per_unit": figure}, text)
+
+
+def temperature_counts(span: str, sensor: str) -> Guess:
+    """Return the entry of a temperature in counts, which only the data sheet of the sensor tells."""
+    known = MPU60X0_TEMPERATURE if sensor.startswith("mpu60") else dict.fromkeys(MPU60X0_TEMPERATURE, UNKNOWN)
+    evidence = (
+        f"whole numbers {span}, so counts: degC = (counts - offset) / counts_per_unit, both in the data sheet "
+        "(MPU-6000 and MPU-6050: degC = counts / 340 + 36.53, so counts_per_unit: 340, offset: -12420.2)"
+    )
+    return Guess({"unit": COUNTS, **known}, evidence)

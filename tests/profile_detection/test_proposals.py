@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from loggers import GRAVITY, LOGGERS, Logger, motion
+from loggers import GRAVITY, INTERVAL_S, LOGGERS, Logger, motion
 
 from pipeline.config.compose import Composer
 from pipeline.errors import IngestError
@@ -143,6 +143,57 @@ def test_common_names_are_known(header: str, expected: tuple[str, ...]) -> None:
     found = [columns[c]["column"] for c in ("time", "accel_x", "gyro_z")]
     assert [found[0], columns["time"]["unit"], *found[1:]] == list(expected)
     assert (columns["time"].get("counts_per_unit") == "???") == (expected[1] == "counts")
+
+
+def counts_of_a_slow_turn(turns: float = 1.0) -> str:
+    """Write a bench's log of registers: 24 deg/s about x and back, 8192 counts a g, 65.5 a deg/s, 340 a degC."""
+    rate = 24.0 * turns * np.where(np.arange(3000) < 1500, 1.0, -1.0)
+    angle = np.cumsum(rate) * INTERVAL_S
+    force = 8192 * np.column_stack([0 * angle, np.sin(np.radians(angle)), np.cos(np.radians(angle))])
+    rates = np.column_stack([65.5 * rate, 0 * force[:, :2]]) + 90
+    noise = np.random.default_rng(3).normal(0, 3, (3000, 6))
+    readings = np.rint(np.column_stack([force, rates]) + noise).astype(int)
+    rows = (
+        f"{10_000 * i},{r[0]},{r[1]},{r[2]},-1182,{r[3]},{r[4]},{r[5]},{a:.2f}"
+        for i, (r, a) in enumerate(zip(readings, angle, strict=True))
+    )
+    return "\n".join(["t_us,axr,ayr,azr,tempC_raw,gxr,gyr,gzr,enc_deg", *rows, ""])
+
+
+def test_registers_under_names_that_differ_in_one_letter_are_read_as_counts(tmp_path: Path) -> None:
+    layout = find_layout(counts_of_a_slow_turn().encode(), "log.csv")
+    (proposal,) = propose([layout])
+    assert [proposal.columns[0][c]["column"] for c in ("accel_x", "accel_z", "gyro_y")] == ["axr", "azr", "gyr"]
+    assert proposal.unknown() == ["temperature"]
+    assert "degC = counts / 340 + 36.53" in proposal.evidence["temperature"]
+    profile = tmp_path / "configs" / "ingest" / "mine.yaml"
+    profile.parent.mkdir(parents=True)
+    config = Composer(tmp_path).unit("U1", ["sensor=mpu6050", "sensor.accelerometer.range=4"])
+    (proposal,) = propose([layout], config["sensor"])
+    profile.write_text(as_yaml(proposal, "mine"), encoding="utf-8")
+    csv = Composer(tmp_path).unit("U1", ["sensor=mpu6050", "ingest=mine"])["ingest"]["csv"]["columns"]
+    assert [csv[c]["counts_per_unit"] for c in ("accel_y", "gyro_y", "temperature")] == [8192.0, 65.5, 340.0]
+    assert (-1182 - csv["temperature"]["offset"]) / 340.0 == pytest.approx(-1182 / 340 + 36.53)
+
+
+def test_counts_that_a_log_at_rest_does_not_tell_are_those_of_the_stated_sensor(tmp_path: Path) -> None:
+    layout = find_layout(counts_of_a_slow_turn(turns=0.0).encode(), "log.csv")
+    assert propose([layout])[0].unknown() == ["gyro_x", "gyro_y", "gyro_z", "temperature"]
+    ranges = ["sensor=mpu6050", "sensor.accelerometer.range=4", "sensor.gyroscope.range=500"]
+    (proposal,) = propose([layout], Composer(tmp_path).unit("U1", ranges)["sensor"])
+    profile = tmp_path / "configs" / "ingest" / "mine.yaml"
+    profile.parent.mkdir(parents=True)
+    profile.write_text(as_yaml(proposal, "mine"), encoding="utf-8")
+    config = Composer(tmp_path).unit("U1", [*ranges, "ingest=mine"])
+    assert config["ingest"]["csv"]["columns"]["gyro_z"]["counts_per_unit"] == 65.5
+
+
+def test_a_log_without_known_names_gives_a_template() -> None:
+    text = "t_us,p,q,r,s\n" + "".join(f"{10_000 * i},1,2,{i % 3},4\n" for i in range(100))
+    (proposal,) = propose([find_layout(text.encode(), "log.csv")])
+    assert proposal.unknown() == [f"{s}_{a}" for s in ("accel", "gyro") for a in "xyz"]
+    written = yaml.safe_load(as_yaml(proposal, "mine"))["csv"]["columns"]
+    assert written["accel_x"] == {"column": "???", "unit": "???"}
 
 
 def test_a_counter_without_a_gap_goes_before_times_of_arrival_that_scatter() -> None:
