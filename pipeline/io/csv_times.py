@@ -3,9 +3,10 @@
     time = round(t * 10^9), from the decimal digits themselves where doubles are too coarse (beyond 10^6 s)
 
 A counter that overflows starts again at 0: a time that falls from within 2.5 intervals of M to within 2.5 intervals of
-0 continues at M, where M is 2^32 us or ms, or 2^16, 2^24 or 2^32 of the column's unit. Rows displaced by at most five
-are sorted and rows that repeat the one before them are dropped, within the limit of ``ingest.checks.repaired_rows``.
-Any other time that goes back belongs to another session of the logger.
+0 continues at M, where M is 2^32 us or ms, or 2^16, 2^24 or 2^32 of the column's unit. A block of rows that directly
+follows an exact copy of it is dropped. Rows displaced by at most five are sorted and rows that repeat the one before
+them are dropped, within the limit of ``ingest.checks.repaired_rows``. Any other time that goes
+back belongs to another session of the logger.
 """
 
 from __future__ import annotations
@@ -123,11 +124,11 @@ def in_order(rows: Rows, time_ns: Integers, settings: CsvFormat, checks: Checks)
     if bool(np.all(np.diff(time_ns) > 0)):
         return rows, time_ns
     rows, time_ns = _counted_on(rows, time_ns, tick_ns)
+    rows, time_ns = _once(rows, time_ns)
     back = np.flatnonzero(np.diff(time_ns) <= 0)
     if back.size == 0:
         return rows, time_ns
-    first = int(back[0]) + 1
-    error = time_error(time_ns, rows.place(first), first)
+    error = _refusal(rows, time_ns, int(back[0]) + 1)
     order, twice, same = sorted_once(time_ns, rows.numbers.values())
     displacement = int(np.abs(order - np.arange(len(order))).max())
     if displacement > LARGEST_DISPLACEMENT:
@@ -159,6 +160,54 @@ def in_order(rows: Rows, time_ns: Integers, settings: CsvFormat, checks: Checks)
     flags[moved] = REPAIRED
     rows = replace(rows.select(order[keep], *notes), flags=flags[keep] if moved.size else None)
     return rows, time_ns[order[keep]]
+
+
+def _refusal(rows: Rows, time_ns: Integers, row: int) -> IngestError:
+    """Return the refusal of a row whose time does not increase, with the earlier rows that it and the next repeat."""
+    error = time_error(time_ns, rows.place(row), row)
+    start, count = next(((a, n) for at, a, n in _repeats(rows, time_ns) if at == row), (row, 0))
+    if count <= 1:
+        return error
+    ends = rows.lines[[row, row + count - 1, start, start + count - 1]].tolist()
+    text = "lines {} to {} repeat lines {} to {} exactly: delete them, or set ingest.csv.session to read one part"
+    return IngestError(error.fact, error.file, code=error.code, hint=text.format(*ends))
+
+
+def _repeats(rows: Rows, time_ns: Integers) -> list[tuple[int, int, int]]:
+    """Return each row at which the time falls back to that of an earlier row, that row, and how many rows repeat it.
+
+    Rows repeat others where the time and all columns in use do, not more than up to the row where the time falls back.
+    """
+    order = np.argsort(time_ns, kind="stable")
+    again = np.flatnonzero(np.diff(time_ns[order]) == 0)
+    before = dict(zip(order[again + 1].tolist(), order[again].tolist(), strict=True))
+    found = []
+    for row in (np.flatnonzero(np.diff(time_ns) < 0) + 1).tolist():
+        start = before.get(row, row)
+        length = min(row - start, len(time_ns) - row)
+        same = time_ns[start : start + length] == time_ns[row : row + length]
+        for column in rows.numbers.values():
+            one, two = column[start : start + length], column[row : row + length]
+            same &= (one == two) | (np.isnan(one) & np.isnan(two))
+        found.append((row, start, length if same.all() else int(np.argmin(same))))
+    return found
+
+
+def _once(rows: Rows, time_ns: Integers) -> tuple[Rows, Integers]:
+    """Drop blocks that were written twice, one copy directly after the other: no information is lost."""
+    keep, notes = np.ones(len(time_ns), np.bool_), []
+    for row, start, count in _repeats(rows, time_ns):
+        if start + count == row and count > 0:
+            keep[row : row + count] = False
+            ends = row, row + count - 1
+            first, last = (int(rows.lines[r]) for r in ends)
+            detail = (
+                f"lines {first} to {last} repeat lines {rows.lines[start]} to {rows.lines[row - 1]} exactly, time and "
+                "all, and were dropped"
+            )
+            times = (float(time_ns[r]) / 1e9 for r in ends)
+            notes.append(Note("N-REPEAT", count, first, last, detail, *times))
+    return (rows.select(np.flatnonzero(keep), *notes), time_ns[keep]) if notes else (rows, time_ns)
 
 
 def over_budget(error: IngestError, touched: int, rows: int, checks: Checks) -> IngestError:

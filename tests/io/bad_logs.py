@@ -369,6 +369,21 @@ def cases() -> dict[str, Case]:
             says="time goes back to 2 s after 14.99 s",
             line=1502,
         ),
+        "33 part of it twice": one(
+            text([*ROWS[:1500], *ROWS[200:1000]]),
+            fault="time_back",
+            says="lines 1502 to 2301 repeat lines 202 to 1001 exactly: delete them, or set ingest.csv.session",
+            line=1502,
+        ),
+        "33 a block twice": one(text([*ROWS[:1500], *ROWS[1480:]]), notes=("N-REPEAT",), kept=ALL),
+        "33 a block three times": one(
+            text([*ROWS[:1500], *ROWS[1480:1500], *ROWS[1480:]]), notes=("N-REPEAT", "N-REPEAT"), kept=ALL
+        ),
+        "33 a block twice that differs": one(
+            text([*ROWS[:1500], *ROWS[1480:1499], ROWS[1499] + "9", *ROWS[1500:]]),
+            fault="time_back",
+            says="goes back",
+        ),
         "33 session": one(
             text([*ROWS[:1500], *ROWS[200:1000]]), notes=("N-SESSION",), kept=ALL[200:1000], settings={"csv/session": 2}
         ),
