@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 # The prior was chosen on 738 simulated sensors: docs/blind_study.md.
 SCALES = np.array([0.02, 0.06, 0.2, 0.6, 2.0, 20.0])  # of the data sheet's limits
 SCALE_PRIOR = np.log([0.2375, 0.2375, 0.2375, 0.2375, 0.03, 0.02])
-NEGLIGIBLE = 1e-5  # weight of a hypothesis or of a part of a mixture that is left out
+NEGLIGIBLE = 1e-4  # weight of a hypothesis or of a part of a mixture that is left out
 WIDE = 8  # columns of an effect from which on LAPACK's factorisation costs less than an elimination of all side by side
 RIDGE = 1e-12  # of a column's square: 1e4 times the rounding of a double
 
