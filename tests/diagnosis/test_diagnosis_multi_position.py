@@ -167,6 +167,10 @@ def test_a_part_is_json_and_is_told_in_words() -> None:
     text = " ".join(in_words(json.loads(json.dumps(part)), "accelerometer"))
     assert "misses quadratic nonlinearity" in text
     assert "there is no table" in text
+    assert "What is missing, with 95 % probability: quadratic nonlinearity" in text
+    doubted = " ".join(in_words(part | {"verdict": "unexplained"}, "accelerometer"))
+    assert "all of which the verdict doubts: quadratic nonlinearity" in doubted
+    assert "What is missing" not in doubted
 
 
 def test_a_drift_that_a_short_recording_hides_is_given_the_time_that_shows_it() -> None:

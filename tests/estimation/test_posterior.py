@@ -13,6 +13,9 @@ from scipy.special import logsumexp
 from pipeline.estimation.candidates import excited
 from pipeline.estimation.evidence import SCALE_PRIOR, SCALES, Problem, Version
 from pipeline.estimation.posterior import BELOW, ODDS, Answers, Search, answers, quantile
+from pipeline.estimation.ranking import without
+from pipeline.estimation.something_else import free_curves
+from pipeline.records import Motion
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -135,3 +138,28 @@ def test_directions_without_excitation_are_left_out() -> None:
     change = excited(Z.T @ Z, size, np.array([2.0, 2.0]), 1e-3)
     assert np.linalg.matrix_rank(Z @ change, tol=1e-9) == 1
     np.testing.assert_allclose(Z @ change, 2.0 * Z, atol=1e-12)
+
+
+def test_a_column_of_which_only_rounding_is_left_carries_no_information() -> None:
+    rng = np.random.default_rng(4)
+    base = rng.standard_normal((200, 3)) * [1.0, 1e3, 1e-3]
+    copy, near = base @ [1.0, 2e-3, -5e2], base @ [1.0, 1e-3, 0.0] + 0.1 * rng.standard_normal(200)
+    A = np.column_stack([base, copy, near, rng.standard_normal(200)])
+    rest = without((A.T @ A)[None], np.arange(3))[0]
+    assert not rest[:4].any()
+    assert not rest[:, :4].any()
+    left = near - base @ np.linalg.lstsq(base, near, rcond=None)[0]
+    assert rest[4, 4] == pytest.approx(left @ left, rel=1e-6)
+
+
+def test_the_free_curve_of_the_rate_holds_lever_arms_that_differ_by_axis() -> None:
+    rng = np.random.default_rng(6)
+    omega = np.repeat(np.eye(3), 50, axis=0) * rng.uniform(-200.0, 200.0, 150)[:, None]
+    n, zero = len(omega), np.zeros((len(omega), 3))
+    motion = Motion(np.arange(n) * 0.1, zero, omega, zero, zero, None, None, None, None, np.zeros(n, bool))
+    curve = next(c for c in free_curves("accelerometer", [motion]) if c.name == "other_rate")
+    Z = np.column_stack([np.ones(n), curve.regressors("accelerometer", motion, np.eye(3), np.zeros(0))])
+    for axis, arm in enumerate(rng.standard_normal((3, 3))):  # of the proof mass of each axis
+        felt = np.cross(omega, np.cross(omega, arm))[:, axis]
+        taken = Z @ np.linalg.lstsq(Z, felt, rcond=None)[0]
+        np.testing.assert_allclose(taken, felt, atol=1e-9 * np.abs(felt).max())
