@@ -90,7 +90,10 @@ def fit_terms(observations: Observations, terms: Sequence[Term], start: Start, s
     while rounds < ROUNDS and not converged:
         rounds += 1
         bias, K, terms, taken = _stepped(bias, K, terms, solved.step)
-        converged = linear or bool(np.all(np.abs(taken) <= _small(solved.best_covariance)))
+        small = np.maximum(
+            SMALL_STEP * np.sqrt(np.diag(solved.best_covariance)), np.where(np.arange(len(taken)) < BASE, 1e-12, 0.0)
+        )
+        converged = linear or bool(np.all(np.abs(taken) <= small))
         if not linear:
             solved = _solve(_at(observations, terms, bias, K, start.scale), observations, settings)
     residual, _ = _residual(observations, terms, bias, K)
@@ -124,13 +127,6 @@ def _stepped(bias: Values, K: Values, terms: Sequence[Term], step: Values) -> tu
         taken.append(values - term.values)
         at += size
     return bias + step[:3], K + step[3:BASE].reshape(3, 3), moved, np.concatenate(taken)
-
-
-def _small(covariance: Values) -> Values:
-    """Return the steps that no longer matter: (p,) array."""
-    rounding = np.zeros(len(covariance))
-    rounding[:BASE] = 1e-12
-    return np.asarray(np.maximum(SMALL_STEP * np.sqrt(np.diag(covariance)), rounding), np.float64)
 
 
 def _at(observations: Observations, terms: Sequence[Term], bias: Values, K: Values, scale: Values) -> Design:

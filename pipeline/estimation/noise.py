@@ -183,8 +183,7 @@ def _noise_of_rests(
     if told.sum() - len(np.unique(blocks.rest[told])) < 3 or not passed:
         expected = np.sum(blocks.count * (covariance[0] - variance_of_mean(covariance, blocks.count)))
         return _with_sheet_wander(np.sqrt(blocks.scatter / max(float(expected), 1e-300)), sheet, source)
-    found = likelihood(blocks, _nuisance(blocks, chosen, source, creeping), covariance, TIMES * _wander_time(sheet))
-    return _best(found, sheet, source)
+    return _best(blocks, _nuisance(blocks, chosen, source, creeping), covariance, sheet, source)
 
 
 def _nuisance(blocks: _RestBlocks, chosen: list[Recording], source: str, creeping: Sequence[int] = ()) -> Values:
@@ -203,23 +202,24 @@ def _nuisance(blocks: _RestBlocks, chosen: list[Recording], source: str, creepin
     return np.stack(columns, axis=1)
 
 
-def _best(found: _Likelihood, sheet: dict[str, Any], source: str) -> Noise:
+def _best(blocks: _RestBlocks, design: Values, covariance: Values, sheet: dict[str, Any], source: str) -> Noise:
     """Return the most likely noise; one ratio of wander to white noise for all axes unless they differ."""
-    gain = 2.0 * (found.log_likelihood - found.log_likelihood[:, :1])
+    times = TIMES * _wander_time(sheet)
+    log_likelihood, white = likelihood(blocks, design, covariance, times)
+    gain = 2.0 * (log_likelihood - log_likelihood[:, :1])
     pooled = gain.sum(axis=2).max(axis=1)
     row = int(np.argmax(pooled))
     sheet_row = int(np.argmin(np.abs(TIMES - 1.0)))
     if pooled[row] - pooled[sheet_row] < AGREES:
         row = sheet_row
     if pooled[row] < SEEN:
-        return _unseen(found, sheet_row, sheet, source)
+        return _unseen(gain[sheet_row], white[sheet_row, 0], sheet, source)
     columns = range(gain.shape[2])
     apart = gain[row].max(axis=0).sum() - pooled[row] > SEEN
     axes = [slice(c, c + 1) for c in columns] if apart else [slice(None)] * len(columns)
     ratio = np.array([_peak(gain[row][:, axis].sum(axis=1)) for axis in axes])
-    white = np.array([np.interp(ratio[c], RATIOS, found.white[row, :, c]) for c in columns])
-    white = np.maximum(white, SMALLEST_WHITE)
-    return Noise(white, white * ratio, float(TIMES[row] * _wander_time(sheet)), source)
+    own = np.maximum([np.interp(ratio[c], RATIOS, white[row, :, c]) for c in columns], SMALLEST_WHITE)
+    return Noise(own, own * ratio, float(times[row]), source)
 
 
 def _peak(gain: Values) -> float:
@@ -232,14 +232,12 @@ def _peak(gain: Values) -> float:
     return float(np.exp(x[1] + (0.5 * (a - c) / bend * (x[1] - x[0]) if bend < 0 else 0.0)))
 
 
-def _unseen(found: _Likelihood, row: int, sheet: dict[str, Any], source: str) -> Noise:
-    """Return the data sheet's wander where the likelihood allows it, else none."""
-    white = np.maximum(found.white[row, 0], SMALLEST_WHITE)
+def _unseen(gain: Values, white: Values, sheet: dict[str, Any], source: str) -> Noise:
+    """Return the data sheet's wander where the likelihood allows it, else none; ``gain`` is by ratio and axis."""
     noise = _with_sheet_wander(white, sheet, source)
-    column = np.argmin(np.abs(RATIOS[:, None] - noise.wander / white), axis=0)
-    each = np.arange(len(white))
-    loss = 2.0 * np.sum(found.log_likelihood[row, 0] - found.log_likelihood[row, column[each], each])
-    return noise if loss < AGREES else Noise(white, np.zeros(3), noise.correlation_time, source)
+    column = np.argmin(np.abs(RATIOS[:, None] - noise.wander / noise.white), axis=0)
+    loss = -float(np.take_along_axis(gain, column[None], axis=0).sum())
+    return noise if loss < AGREES else replace(noise, wander=np.zeros(3))
 
 
 def _wander_time(sheet: Mapping[str, Any]) -> float:
@@ -315,14 +313,6 @@ class _RestBlocks:
     scatter: Values  # (3,); sum of squares about the block means
 
 
-@dataclass(frozen=True)
-class _Likelihood:
-    """The likelihood over a grid, and white noise at each of its points."""
-
-    log_likelihood: Values  # (t, r, 3); at each correlation time, by ``RATIOS``, by axis
-    white: Values  # (t, r, 3); the estimate at each point
-
-
 def _blocks_of(rests: Sequence[Rest], shortest: int) -> _RestBlocks:
     """Cut rests into blocks.
 
@@ -366,8 +356,10 @@ def _with_scatter(blocks: _RestBlocks, more: _RestBlocks) -> _RestBlocks:
     return _RestBlocks(**{**stacked, "scatter": blocks.scatter + more.scatter})
 
 
-def likelihood(blocks: _RestBlocks, design: Values, covariance: Values, correlation_times: Values) -> _Likelihood:
-    """Return the likelihood of white noise and bias over the grid.
+def likelihood(
+    blocks: _RestBlocks, design: Values, covariance: Values, correlation_times: Values
+) -> tuple[Values, Values]:
+    """Return the log likelihood at each correlation time, by ``RATIOS``, by axis, and the white noise there: (t, r, 3).
 
     ``design``: (c, p), the nuisance columns d, at the c blocks that are ``cut``. ``covariance``: (l,), the filter's
     autocovariance r. ``correlation_times``: (t,), s.
@@ -388,4 +380,4 @@ def likelihood(blocks: _RestBlocks, design: Values, covariance: Values, correlat
     penalty = log_determinant + nu * np.log(expected)
     log_likelihood = -0.5 * (penalty[:, None] + free * np.log(variance))
     shape = (len(correlation_times), len(RATIOS), -1)
-    return _Likelihood(log_likelihood.reshape(shape), np.sqrt(variance).reshape(shape))
+    return log_likelihood.reshape(shape), np.sqrt(variance).reshape(shape)

@@ -40,6 +40,7 @@ from pipeline.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.engine import LinearMap, assess_noise, derivative
 from pipeline.estimation.generalized_least_squares import with_matrix
 from pipeline.estimation.least_squares import certified, solve_linear
+from pipeline.estimation.multi_position.moves import trapezoids
 from pipeline.estimation.noise import prior_of
 from pipeline.estimation.reference_least_squares import of_channels
 from pipeline.estimation.table_errors import Reference, disturbance
@@ -233,9 +234,7 @@ def turns_of(parts: Sequence[Part]) -> Turns:
             if not part.keep[start:stop].all():
                 left_out += 1
                 continue
-            step = np.diff(part.motion.time[start:stop])
-            weight[start : stop - 1] += 0.5 * step
-            weight[start + 1 : stop] += 0.5 * step
+            weight[start:stop] += trapezoids(part.motion.time[start:stop])
             turn[start:stop] = found
             found += 1
         rest = part.motion.still & part.keep & (turn < 0)

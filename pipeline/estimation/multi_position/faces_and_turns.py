@@ -26,7 +26,7 @@ import numpy as np
 
 from pipeline.errors import NotObservableError
 from pipeline.estimation.multi_position.model import effect_readings, motion_of
-from pipeline.estimation.multi_position.moves import sound_span
+from pipeline.estimation.multi_position.moves import sound_span, trapezoids
 from pipeline.estimation.rest_means import ROLE
 from pipeline.records import AXES
 from pipeline.signal.hand_turns import ACROSS, multiples
@@ -237,9 +237,7 @@ def _padded(
         )
         if recording.temperature is not None:
             temperature[k] = recording.temperature[at]
-        step = np.diff(time[k])
-        weight[k, :-1] += 0.5 * step
-        weight[k, 1:] += 0.5 * step
+        weight[k] = trapezoids(time[k])
     rows, value, error = [], [], []
     for k, axis in zip(*np.nonzero(stated), strict=True):
         rows.append(np.outer(np.eye(len(chosen))[k], np.eye(3)[axis]))

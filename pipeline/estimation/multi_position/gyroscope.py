@@ -274,17 +274,19 @@ class GyroscopeModel:
             return np.asarray((W @ -np.einsum("ksej,ksjp->kep", PM, Z)).reshape(n, -1))
 
         apart = np.degrees(np.einsum("kej,kj->ke", E, self.after - predicted))
+        error = np.sqrt(np.einsum("kii->ki", variance)).ravel()
         shared = np.einsum("kij,kjmc,mcp->kip", W, directions, self.shared).reshape(n, -1)
+        leaning = np.einsum("kij,kjmc,mcd->kimd", W, directions, self.across).reshape(n, -1)
         return {
             "residual": np.einsum("kij,kj->ki", W, apart).ravel() - shared @ self.known["gravity"].moved,
             "base": (W @ base).reshape(n, 12),
             "effects": [columns(term) for term in state.terms],
             "candidates": [columns(term) for term in candidates],
             "bias": bias.reshape(3, n, moves.count),
-            "error": np.sqrt(np.einsum("kii->ki", variance)).ravel(),
+            "error": error,
             "common": self._common(W, directions) + shared @ shared.T,
             "shared": shared,
-            "direction": self._of_directions(W, directions, np.sqrt(np.einsum("kii->ki", variance))),
+            "direction": float(np.median(error)) ** 2 * leaning @ leaning.T,  # errors as large as a typical white one
             "start": moves.time[:, 0],
             "length": moves.time[:, -1] - moves.time[:, 0],
             "recording": self.every.recording[moves.after],
@@ -314,11 +316,6 @@ class GyroscopeModel:
         shared[self.of_moves] = self._of_moves(found.state, ())["shared"]
         white, _ = equations.whitened(found.noise, np.column_stack([shared, equations.residual]))
         return np.asarray(-self.known["gravity"].root @ (white[:, :12].T @ white[:, 12]))
-
-    def _of_directions(self, W: Values, directions: Values, error: Values) -> Values:
-        """Return what errors of the rests' directions, as large as a typical white error, share: (2 k, 2 k) array."""
-        each = np.einsum("kij,kjmc,mcd->kimd", W, directions, self.across).reshape(2 * len(W), -1)
-        return np.asarray(float(np.median(error)) ** 2 * each @ each.T)
 
     def _turned(self, state: State) -> tuple[Motion, Values, Values]:
         """Return the motion of all samples of the moves, ``v = y - b - z`` and A."""

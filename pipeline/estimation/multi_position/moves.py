@@ -128,15 +128,18 @@ def moves_of(recordings: Sequence[Recording], rests: Rests) -> Moves | None:
         assert values is not None  # noqa: S101
         reading[row, :n], reading[row, n:] = values[span], values[span.stop - 1]
         time[row, :n], time[row, n:] = clocks[row], clocks[row][-1]
-        step = np.diff(clocks[row])
-        weight[row, : n - 1] += step / 2.0
-        weight[row, 1:n] += step / 2.0
+        weight[row, :n] = trapezoids(clocks[row])
     taken, doubt = _bends(reading, weight, BENT * float(np.linalg.norm(rests.white)))
     before, after = np.array([[i, j] for i, j, _ in found]).T
     share = (time - rests.time[before][:, None]) / (rests.time[after] - rests.time[before])[:, None]
     warm = rests.temperature[before][:, None]
     temperature = warm + share * (rests.temperature[after][:, None] - warm)
     return Moves(before, after, reading - taken, time, temperature, weight, doubt)
+
+
+def trapezoids(time: Values) -> Values:
+    """Return the weights of samples in an integral by the trapezoidal rule: (n,) array, s."""
+    return np.asarray(0.5 * (np.diff(time, prepend=time[0]) + np.diff(time, append=time[-1])))
 
 
 def _bends(reading: Values, weight: Values, least: float) -> tuple[Values, Values]:
