@@ -118,7 +118,7 @@ class McapLog:
     def _block(self, rows: Rows) -> Block:
         assert self.readings is not None  # noqa: S101  (``_holds_readings``)
         batch = self.readings.read(rows, self.reader)
-        time_ns = rows.heads["log_time"].astype(np.int64) if batch.time_ns is None else batch.time_ns
+        time_ns = batch.times(rows)
         if self.origin_ns is None:
             self.origin_ns = int(time_ns[0]) if time_ns[0] > SINCE_1970_NS else 0
         since = time_ns - self.origin_ns
@@ -242,9 +242,7 @@ class Temperatures:
 
     def take(self, run: list[Rows], reader: McapReader) -> None:
         """Decode the temperatures of a run."""
-        places: list[Integers] = [np.zeros(0, np.int64)]
-        times: list[Integers] = [np.zeros(0, np.int64)]
-        values: list[Values] = [np.zeros(0)]
+        found: list[tuple[Integers, Integers, Values]] = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))]
         for rows in run if not self.beside_readings else []:
             channel = reader.channels[rows.channel]
             if self.decoder is None:
@@ -257,11 +255,8 @@ class Temperatures:
             if channel.topic != self.topic:
                 continue
             batch = self.decoder.read(rows, reader)
-            places.append(rows.starts)
-            times.append(rows.heads["log_time"].astype(np.int64) if batch.time_ns is None else batch.time_ns)
-            values.append(batch.values["temperature"])
-        self.places, self.times = np.concatenate(places), np.concatenate(times)
-        self.values = np.concatenate(values)
+            found.append((rows.starts, batch.times(rows), batch.values["temperature"]))
+        self.places, self.times, self.values = map(np.concatenate, zip(*found, strict=True))
 
     def at(self, starts: Integers, time: Values, beside: Values | None, origin_ns: int) -> Values:
         """Return the temperature at the readings of a run: (n,) array, degC.

@@ -72,6 +72,10 @@ class Batch:
     values: dict[str, Values]
     absent: dict[str, Mask] = field(default_factory=dict)
 
+    def times(self, rows: Rows) -> Integers:
+        """Return the moments or, where none is read, the recorder's times, ns."""
+        return rows.heads["log_time"].astype(np.int64) if self.time_ns is None else self.time_ns
+
 
 class ChannelDecoder:
     """Decoder of one channel; ``path`` names the file in messages. An encoding that is not supported is refused."""
