@@ -231,7 +231,7 @@ class Monitor(logging.Handler):
         """
         take_run(self.results)
         while jobs_at_work(self.results):
-            print("Waiting for jobs that a killed run has left at work ...", file=self.stream, flush=True)
+            print("Waiting for jobs of a killed run that are still running ...", file=self.stream, flush=True)
             time.sleep(2)
         terminal = self.stream.isatty() and not plain
         if terminal or quiet:
@@ -242,7 +242,7 @@ class Monitor(logging.Handler):
     def print_edited(self, edited: Sequence[str]) -> None:
         """Print which files were edited or deleted since they were made, and are made again."""
         if edited:
-            lines = ["Changed or deleted since the last run, made again:", *_first([f"  {c}" for c in edited])]
+            lines = ["Changed or deleted since the last run, computed again:", *_first([f"  {c}" for c in edited])]
             print("\n".join(lines), file=self.stream, flush=True)
 
     def print_recovery(self) -> None:
@@ -251,22 +251,23 @@ class Monitor(logging.Handler):
         command = shlex.join(["snakemake", *sys.argv[1:]])
         lines = []
         if self.refused == "ProtectedOutputException":
-            lines += [f"\n{self.results} cannot be written; make it writable, and then:", f"  {command}"]
+            lines += [f"\n{self.results} cannot be written; make it writable, then:", f"  {command}"]
         if self.refused == "LockException":
             unlock = shlex.join(["snakemake", "--unlock", *sys.argv[1:]])
             lines += [
-                "\nAnother run works in this directory, or one was killed here. Wait until it has ended, and then:",
+                "\nAnother run uses this directory, or one was killed here. Wait until it has ended, then:",
                 f"  {command}",
-                "If none is at work:",
+                "If no run is active:",
                 f"  {unlock} && {command}",
             ]
         if self.interrupted or getattr(sys, "last_type", None) is KeyboardInterrupt:
-            lines += ["\nThe run was interrupted. Finished jobs are kept, others begin anew. To continue:"]
+            lines += ["\nThe run was interrupted. Finished jobs are kept, the others start again. To continue:"]
             lines += [f"  {command}"]
         elif self.failed:
-            lines += [f"\n{len(self.failed)} jobs broke; what they had begun is removed, all others are done:"]
+            count = f"{len(self.failed)} job{'s' * (len(self.failed) > 1)}"
+            lines += [f"\n{count} failed; incomplete output is removed, all other jobs are done:"]
             lines += _first([f"  {rule}: {_cause(log)} (all of it: {log})" for rule, log in self.failed])
-            lines += ["Mend the cause, then run the same command again:", f"  {command}"]
+            lines += ["Correct the cause, then run the same command again:", f"  {command}"]
         if lines:
             print("\n".join(lines), file=self.stream)
 

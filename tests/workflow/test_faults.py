@@ -200,7 +200,7 @@ def test_a_run_is_left_alone_by_others_and_once_interrupted_goes_on_with_the_sam
         time.sleep(0.1)
     other, code = disk.run(disk.place)
     assert code != 0
-    assert "Another run works in this directory" in other
+    assert "Another run uses this directory" in other
     elsewhere, code = disk.run(disk.place, f"results={disk.directory / 'results'}", cwd="elsewhere")
     assert code != 0
     assert f"another run works on these results (process {run.pid} on" in elsewhere
@@ -208,8 +208,8 @@ def test_a_run_is_left_alone_by_others_and_once_interrupted_goes_on_with_the_sam
     said = run.communicate(timeout=300)[0]
     (disk.directory / "held").unlink()
     assert run.returncode != 0
-    assert "The run was interrupted. Finished jobs are kept, others begin anew. To continue:" in said
-    assert "jobs broke" not in said
+    assert "The run was interrupted. Finished jobs are kept, the others start again. To continue:" in said
+    assert "incomplete output" not in said
     disk.recover(said)
     assert disk.tree() == disk.trees[disk.place]
 
@@ -242,6 +242,6 @@ def test_results_that_cannot_be_written_are_refused_before_any_job(disk: Disk) -
     finally:
         disk.remount("rw")
     assert done.returncode != 0
-    assert "results/pair cannot be written; make it writable, and then:\n  snakemake --cores 2" in done.stderr
+    assert "results/pair cannot be written; make it writable, then:\n  snakemake --cores 2" in done.stderr
     assert "rule ingest:" not in done.stderr
     assert disk.tree() == disk.trees[disk.place]
