@@ -24,7 +24,7 @@ and the variance of white noise has the relative uncertainty ``sqrt(2 / n)`` of 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import combinations_with_replacement
+from itertools import permutations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -234,7 +234,7 @@ def _form(M: Values, held_out: Sequence[LinearizedSamples], uncertain: _Uncertai
         WJ, MWM = W @ J, M.T @ W @ M
         of_parameters += share / n * np.tensordot(J, WJ, ([0, 1], [0, 1]))
         own = np.add.reduceat(MWM, first, axis=0) * share / n
-        across = np.add.reduceat(np.swapaxes(WJ, 1, 2) @ M, first, axis=0) * share / n
+        across = np.swapaxes(np.add.reduceat(WJ, first, axis=0), 1, 2) @ M * share / n
         of_blocks.append((own, across, B, block_covariance(start, length, uncertain.drift_time)))
         size += 3 * count
         Q = MWM * (each.white + uncertain.coarse)[:, None, :]
@@ -260,10 +260,11 @@ def _form(M: Values, held_out: Sequence[LinearizedSamples], uncertain: _Uncertai
     determined = noise.length / interval if noise.length > 0.0 else REST_SAMPLES
     first_order, second_order = np.trace(Q, axis1=1, axis2=2), Q.reshape(3, -1) @ transposed.T
     third_order = np.empty((3, 3, 3))
-    for i, j in combinations_with_replacement(range(3), 2):  # the trace of a product is the same in every order
+    for i, j in ((0, 0), (0, 1), (1, 1), (2, 2)):  # with each of the three: the trace is the same in every order
         held = slice(q, None) if i else slice(q)  # the columns that are not zero
-        product = (Q[i, :, held] @ Q[j, held]).ravel()
-        third_order[i, j] = third_order[j, i] = transposed @ product
+        for l, trace in enumerate(transposed @ (Q[i, :, held] @ Q[j, held]).ravel()):
+            for order in permutations((i, j, l)):
+                third_order[order] = trace
     return _QuadraticForm(white, within, 1.0 / determined, first_order, second_order, third_order)
 
 
