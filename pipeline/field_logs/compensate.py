@@ -141,7 +141,7 @@ def compensate_log(
     """
     require_apart(source, target)
     profile = profile or LogProfile()
-    checks, result = LogChecks(), Result(compensation.unit)
+    checks, result = LogChecks(compensation.calibrated_range), Result(compensation.unit)
     calibrated = {s for s in SENSORS if compensation.calibration(s) is not None}
     with replacing(target) as out:
         log: CsvLog | McapLog | MessageLog
@@ -163,7 +163,7 @@ def compensate_log(
             except PipelineError as error:
                 raise type(error)(error.message + block.place, block.file) from None
             readings = {s: getattr(found, s) for s in given}
-            checks.add(given, readings, block.signals.get("time"))
+            checks.add(given, readings, block.signals.get("time"), block.signals.get("temperature"))
             log.write(block, readings, calibrated)
             result.samples += len(next(iter(given.values())))
             result.sensors = [s for s in SENSORS if s in {*result.sensors, *given}]

@@ -15,7 +15,7 @@ fewer digits, programs that write doubles give more.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -31,6 +31,10 @@ if TYPE_CHECKING:
 
 
 DECIMALS = 12  # that ``apply`` writes: far below any sensor's resolution, above the rounding of a double
+RANGES = {"accelerometer": "specific_force_g", "gyroscope": "angular_rate_dps"}  # of ``calibrated_range``
+# Conventions: the bias of a low-cost sensor, some % of 1 g, adds to a reading in one direction and not in another; a
+# room, and a chip from one power-on to the next, change by 1 degC.
+STRONGER, WARMER = 0.1, 1.0  # share of the largest magnitude; degC
 WINDOW = 100  # samples: 0.1 to 1 s at usual rates
 MOST_WINDOWS = 20_000  # 2 million samples, 6 MB: the memory stays bounded
 QUIET, QUIETEST = 2.0, 0.1  # ratio of scatters, and share of the windows, as the module's description states
@@ -51,16 +55,23 @@ WHOLE = 10  # different whole numbers that are no chance
 class LogChecks:
     """Statistics of a log, block by block, in bounded memory.
 
-    ``compensated``: evidence that the log was compensated before; else empty.
+    ``compensated``: evidence that the log was compensated before; else empty. ``calibrated_range``: as the
+    calibration has it.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, calibrated_range: Mapping[str, Any] | None = None) -> None:
         self.samples = self.reversed = self.repeated = self.kept = 0
         self.first_reversed = ""
         self.last_time = -np.inf
         self.windows: list[dict[str, Values]] = []
         self.whole: dict[str, bool] = {}
         self.compensated = ""
+        self.ranges = {
+            key: (low, high)
+            for key, known in (calibrated_range or {}).items()
+            for low, high in [known if isinstance(known, list) else (-np.inf, known)]
+        }
+        self.extremes: dict[str, list[float]] = {}  # samples beyond, lowest and highest value
 
     def check_decimals(self, columns: Sequence[pa.Array], decimal: str) -> None:
         """Check whether the readings of a text log have the decimals that ``apply`` writes."""
@@ -74,8 +85,15 @@ class LogChecks:
         ):
             self.compensated = f"the readings have {DECIMALS} decimals, as this command writes them"
 
-    def add(self, raw: Mapping[str, Values], calibrated: Mapping[str, Values], time: Values | None) -> None:
-        """Add a block: (n, 3) readings of each sensor in g or deg/s, and (n,) times in s."""
+    def add(
+        self,
+        raw: Mapping[str, Values],
+        calibrated: Mapping[str, Values],
+        time: Values | None,
+        temperature: Values | None = None,
+    ) -> None:
+        """Add a block: (n, 3) readings of each sensor in g or deg/s, (n,) times in s and temperatures in degC."""
+        self._add_extremes(raw, temperature)
         if time is not None and len(time):
             step = np.diff(time, prepend=self.last_time)
             back = np.flatnonzero(step < 0)
@@ -92,6 +110,40 @@ class LogChecks:
                     sensor in self.whole or len(np.unique(known[: 10 * WINDOW])) >= WHOLE
                 )
         self._add_windows(raw, calibrated, time)
+
+    def _add_extremes(self, raw: Mapping[str, Values], temperature: Values | None) -> None:
+        """Count the samples beyond the calibrated range."""
+        values = {RANGES[s]: np.linalg.norm(v, axis=1) for s, v in raw.items()}
+        values |= {} if temperature is None else {"temperature_degc": temperature}
+        for key in values.keys() & self.ranges.keys():
+            low, high = self.ranges[key]
+            margin = WARMER if key == "temperature_degc" else STRONGER * high
+            beyond = values[key][(values[key] < low - margin) | (values[key] > high + margin)]
+            if len(beyond):
+                count, least, most = self.extremes.get(key, [0, np.inf, -np.inf])
+                self.extremes[key] = [count + len(beyond), min(least, beyond.min()), max(most, beyond.max())]
+
+    def _beyond(self, calibrated: set[str]) -> list[str]:
+        """Return what of the log lies beyond the calibrated range."""
+        found = []
+        for key, (count, least, most) in sorted(self.extremes.items()):
+            low, high = self.ranges[key]
+            told = f"{count:.0f} of {self.samples} samples are beyond what the recordings of the calibration contain: "
+            if key == "temperature_degc":
+                what = f"temperatures from {least:.1f} to {most:.1f} degC, calibrated from {low:.1f} to {high:.1f} degC"
+                todo = "record turns at these temperatures (procedure thermal_ramp)"
+            else:
+                sensor = next(s for s, k in RANGES.items() if k == key)
+                if sensor not in calibrated:
+                    continue
+                quantity, unit = ("specific force", "g") if sensor == "accelerometer" else ("angular rate", "deg/s")
+                what = f"{quantity} up to {most:.3g} {unit}, calibrated up to {high:.3g} {unit}"
+                todo = f"record motion that reaches this {quantity}"
+            found.append(
+                f"{told}{what}. There the calibration extrapolates, and its stated uncertainty does not hold: {todo} "
+                "and calibrate with it, or do not rely on these samples"
+            )
+        return found
 
     def _add_windows(self, raw: Mapping[str, Values], calibrated: Mapping[str, Values], time: Values | None) -> None:
         """Keep means and scatter of the windows of a block."""
@@ -129,6 +181,7 @@ class LogChecks:
             for sensor in SENSORS
             if self.whole.get(sensor)
         ]
+        found += self._beyond(calibrated)
         if self.windows:
             table = {k: np.concatenate([w[k] for w in self.windows]) for k in self.windows[0]}
             kept = np.all([np.isfinite(v.reshape(len(v), -1)).all(axis=1) for v in table.values()], axis=0)

@@ -71,8 +71,13 @@ def _sensor(unit: str) -> Check:
     return fields({**required, **optional}, required, others=True)
 
 
+_RANGE = fields({"specific_force_g": number, "angular_rate_dps": number, "temperature_degc": items(number, 2)}, ())
 _DOCUMENT = fields(
-    {"status": one_of("ok"), **{sensor: or_none(_sensor(unit)) for sensor, unit in SENSOR_UNITS.items()}},
+    {
+        "status": one_of("ok"),
+        "calibrated_range": _RANGE,
+        **{sensor: or_none(_sensor(unit)) for sensor, unit in SENSOR_UNITS.items()},
+    },
     ("status", *SENSORS),
     others=True,
 )

@@ -205,12 +205,14 @@ class Compensation:
     """The calibration of a unit, ready to be applied to arrays; readings of a sensor without one pass unchanged.
 
     ``covariances``: sensor to the covariance of a calibrated sample, (3, 3) array in g^2 or (deg/s)^2, where known.
+    ``calibrated_range``: of that name in ``calibrations/<unit>.json``; empty where it is not known.
     """
 
     accelerometer: SensorCalibration | None
     gyroscope: SensorCalibration | None
     unit: str = ""
     covariances: Mapping[str, Values] = field(default_factory=dict)
+    calibrated_range: Mapping[str, Any] = field(default_factory=dict)
 
     def apply(
         self,
@@ -259,4 +261,5 @@ def load(path: str | Path, python_effects: Sequence[str | Path] = ()) -> Compens
     document = read_calibration(file)
     accelerometer, gyroscope = (sensor_of(document, sensor, file) for sensor in SENSORS)
     covariances = {s: c for s in SENSORS if (c := sample_covariance(document, s)) is not None}
-    return Compensation(accelerometer, gyroscope, str(document.get("unit", "")), covariances)
+    known = document.get("calibrated_range", {})
+    return Compensation(accelerometer, gyroscope, str(document.get("unit", "")), covariances, known)

@@ -87,7 +87,18 @@ def _combined(serial: str, documents: Sequence[JSON]) -> JSON:
     units = [document["unit"] for document in documents]
     inputs = [entry for document in documents for entry in document["inputs"]]
     sensors = {s: _sensor(s, [d[s] for d in documents]) if documents[0][s] else None for s in SENSORS}
-    return {**documents[0], "unit": serial, "combined": units, "inputs": inputs, **sensors}
+    known = _ranges([document.get("calibrated_range") or {} for document in documents])
+    return {**documents[0], "unit": serial, "combined": units, "inputs": inputs, "calibrated_range": known, **sensors}
+
+
+def _ranges(ranges: Sequence[JSON]) -> JSON:
+    """Return the range that all calibrations together contain."""
+    found: JSON = {}
+    for key in sorted({key for known in ranges for key in known}):
+        values = [known[key] for known in ranges if key in known]
+        together = isinstance(values[0], list)
+        found[key] = [min(v[0] for v in values), max(v[1] for v in values)] if together else max(values)
+    return found
 
 
 def _sensor(sensor: str, parts: Sequence[JSON]) -> JSON:

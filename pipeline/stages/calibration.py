@@ -11,6 +11,8 @@ from functools import cache
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from pipeline import __version__
 from pipeline.errors import CannotCalibrateError
 from pipeline.estimation.noise_identification import identify_noise
@@ -47,12 +49,30 @@ def process_unit(job: Job, unit: str, settings: dict[str, Any]) -> None:
         "error": None,
         "log": {"ingest": settings["ingest"], "axis_map": axes},
         "inputs": inputs(recordings),
+        "calibrated_range": calibrated_range(recordings),
         "not_calibrated": reasons,
         "noise": identify_noise(recordings),
     }
     for sensor, fit in fits.items():
         document[sensor] = None if sensor in reasons else judged(sensor, fit, settings["sensor"][sensor])
     write_json(job.output / f"{unit}.json", document)
+
+
+def calibrated_range(recordings: Sequence[Recording]) -> dict[str, Any]:
+    """Return how far the recordings of the fits reach: largest magnitude of a reading (g, deg/s), temperatures (degC).
+
+    Magnitudes are of the readings as logged. What no recording contains is left out.
+    """
+    found: dict[str, Any] = {}
+    for sensor, key in (("accelerometer", "specific_force_g"), ("gyroscope", "angular_rate_dps")):
+        own = [r for r in recordings if r.role in {sensor, "rests"} and r.valid.any()]
+        sizes = [np.linalg.norm(v[r.valid], axis=1).max() for r in own if (v := r.reading(sensor)) is not None]
+        found |= {key: round(float(max(sizes)), 6)} if sizes else {}
+    warmth = [r.temperature for r in recordings if r.role in {*SENSORS, "rests"} and r.temperature is not None]
+    if warmth and sum(map(len, warmth)):
+        known = np.concatenate(warmth)
+        found["temperature_degc"] = [round(float(v), 3) for v in (np.nanmin(known), np.nanmax(known))]
+    return found
 
 
 def judged(sensor: str, fit: dict[str, Any], sheet: dict[str, Any]) -> dict[str, Any]:

@@ -138,6 +138,32 @@ def test_a_sensor_without_calibration_is_left_unchanged_and_said(
     assert vectors(columns(out), "accelerometer") == pytest.approx(vectors(columns(log), "accelerometer"))
 
 
+@pytest.mark.parametrize("block_bytes", [1 << 21, 2_000])
+def test_samples_beyond_the_calibrated_range_are_counted(
+    calibration: Path, log: Path, tmp_path: Path, block_bytes: int
+) -> None:
+    """Beyond by more than 10 % or 1 degC; a calibration without the range, of an earlier version, says nothing."""
+    table = columns(log)
+    force, rate = (np.linalg.norm(vectors(table, s), axis=1) for s in ("accelerometer", "gyroscope"))
+    warmth = np.array(table["temperature_degc"], float)
+    document = json.loads(calibration.read_text())
+    assert not [w for w in compensate_log(load(calibration), log, tmp_path / "o.csv").warnings if "beyond" in w]
+    document["calibrated_range"] = {
+        "specific_force_g": 1.1,
+        "angular_rate_dps": 1.01 * float(rate.max()),
+        "temperature_degc": [26.5, 29.0],
+    }
+    calibration.write_text(json.dumps(document))
+    result = compensate_log(load(calibration), log, tmp_path / "o.csv", block_bytes=block_bytes)
+    force_told, warmth_told = (w for w in result.warnings if "beyond" in w)
+    count = np.count_nonzero(force > 1.21)
+    assert force_told.startswith(f"{count} of 500 samples")
+    assert f"specific force up to {force.max():.3g} g, calibrated up to 1.1 g" in force_told
+    out = (warmth < 25.5) | (warmth > 30.0)
+    assert warmth_told.startswith(f"{np.count_nonzero(out)} of 500 samples")
+    assert f"from {warmth[out].min():.1f} to {warmth[out].max():.1f} degC, calibrated from 26.5" in warmth_told
+
+
 def test_a_calibrated_sensor_that_the_log_lacks_is_noted(calibration: Path, log: Path, tmp_path: Path) -> None:
     document = json.loads(calibration.read_text(encoding="utf-8"))
     document["accelerometer"]["effects"] = []  # they need the gyroscope
