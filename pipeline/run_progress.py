@@ -303,7 +303,6 @@ def _event(record: logging.LogRecord) -> str:
 
 
 def _cause(log: Path) -> str:
-    """Return the last line of a job's log."""
     try:
         lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
     except OSError as error:

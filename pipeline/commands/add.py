@@ -143,7 +143,6 @@ def _wanted(arguments: argparse.Namespace, campaign: str) -> dict[str, list[tupl
 
 
 def _missing(row: Mapping[str, str], only: str) -> list[tuple[str, str]]:
-    """Return what the diagnosis of a unit found to be missing."""
     effects = [
         (sensor, name)
         for sensor in SENSORS

@@ -160,7 +160,6 @@ def campaign_of(file: Path) -> Path | None:
 
 
 def _of_campaign(directory: Path | None) -> list[Reading]:
-    """Return how the recordings of a campaign are read."""
     campaign = load_campaign({"campaign": str(directory)})
     readings = []
     for name, unit in campaign.units.items():

@@ -142,7 +142,6 @@ def _summary(found: Selection) -> list[str]:
 
 
 def _failed(unit: str, failure: Mapping[str, Any]) -> str:
-    """Return why a unit failed."""
     where = f"{failure['file']}: " if failure.get("file") else ""
     return (
         f"{unit}\n  failed in stage {failure.get('stage')} ({failure.get('code')}), so there is no diagnosis:\n"
@@ -158,11 +157,6 @@ def _held_out(part: JSON | None) -> list[str]:
     ratio = f", {error / floor:.3g} times the noise floor" if floor else ""
     where = "held-out motion" if part.get("held_out", True) else "the samples of the fit"
     return [f"In this run, the rms error of the magnitude on {where} is {error:.3g} {unit}{ratio}."]
-
-
-def _implausible(calibration: JSON) -> str:
-    """Return the parameters of a calibration that are far beyond the data sheet, as lines."""
-    return "".join(f"  {line}\n" for sensor in SENSORS for line in sentences(sensor, calibration.get(sensor)))
 
 
 def _is_diagnosis(document: object) -> bool:

@@ -127,7 +127,6 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _source(arguments: argparse.Namespace) -> Source:
-    """Return where the recordings lie and how they are read."""
     for option in ("goal", "gyroscope_goal", "dwell"):
         value = getattr(arguments, option)
         if value is not None and not value > 0.0:

@@ -80,7 +80,6 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _told(sensor: str, noise: JSON) -> str:
-    """Return the terms of a sensor as a table, and the remarks."""
     lines = [sensor]
     if noise["source"]:
         lines[0] += f": {noise['samples']} samples, {number(noise['length_s'])} s without a gap"

@@ -86,7 +86,6 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _register_effects(arguments: Mapping[str, Any]) -> None:
-    """Add the user's own effects to the candidates."""
     campaign: Path | None = arguments["campaign"]
     beside = sorted((campaign / "effects").glob("*.yaml")) if campaign is not None else []
     for own in read_effect_files([*beside, *arguments["effects"]]).values():

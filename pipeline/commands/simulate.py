@@ -105,7 +105,6 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _described(arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the description that the options give."""
     effects = dict(_effect(text) for text in arguments.get("effect", ()))
     count, prefix = arguments.get("units", 1), arguments.get("prefix", "U")
     unit = {"unit": prefix if count > 1 else f"{prefix}001", "count": count, **described(arguments)}

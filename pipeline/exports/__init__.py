@@ -216,5 +216,4 @@ def _yaml(content: Any) -> str:  # noqa: ANN401
 
 
 def _numbers(values: Any, form: str = "%.17g", separator: str = " ") -> str:  # noqa: ANN401
-    """Return numbers in a row."""
     return separator.join(form % value for value in values)

@@ -123,7 +123,6 @@ def _missing(sensor: str, frame: pd.DataFrame) -> list[tuple[str, int]]:
 
 
 def _lots(frame: pd.DataFrame) -> list[JSON]:
-    """Return the medians lot by lot."""
     lots = {lot: of for lot, of in frame.groupby("lot", sort=False) if lot}
     if not 1 < len(lots) <= MOST_LOTS:
         return []

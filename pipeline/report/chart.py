@@ -212,7 +212,6 @@ def _heights(layer: Layer) -> list[Values]:
 
 
 def _draw(layer: Layer, x: Axis, y: Axis) -> str:
-    """Return the path elements of a layer."""
     if isinstance(layer, Area):
         whole = (SUBDIVISION * np.array([x.start, x.stop])).astype(np.int64)
         at = whole if layer.x is None else x.units(layer.x)

@@ -102,7 +102,6 @@ def _ranges(ranges: Sequence[JSON]) -> JSON:
 
 
 def _sensor(sensor: str, parts: Sequence[JSON]) -> JSON:
-    """Return the joint estimate of one sensor."""
     each = [SensorCalibration.from_json(sensor, part) for part in parts]
     x = np.stack([np.concatenate([c.bias, c.matrix.ravel(), *(e.values for e in c.effects)]) for c in each])
     own, common = _covariances(each, parts)

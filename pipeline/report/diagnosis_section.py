@@ -212,7 +212,6 @@ def added_variable(sensor: str, found: JSON) -> Figure | None:
 
 
 def _points(panel: JSON) -> tuple[Values, Values, Values]:
-    """Return bin centres, means and standard errors."""
     x, mean, error = (np.array(panel[key], float) for key in ("x", "mean", "standard_error"))
     return x, mean, np.maximum(error, 1e-300)
 

@@ -102,7 +102,6 @@ def _distributions(values: pd.DataFrame, _: pd.DataFrame) -> Iterable[tuple[str,
 
 
 def _far(values: pd.DataFrame, siblings: pd.DataFrame) -> Iterable[tuple[str, JSON]]:
-    """Find the units that are far from the others."""
     many = values.loc[:, values.count() >= FEWEST]
     z = (many - many.median()) / _spread(many).replace(0.0, np.nan)
     for name in many:
@@ -113,7 +112,6 @@ def _far(values: pd.DataFrame, siblings: pd.DataFrame) -> Iterable[tuple[str, JS
 
 
 def _drift(values: pd.DataFrame, siblings: pd.DataFrame) -> Iterable[tuple[str, JSON]]:
-    """Find the parameters that change with the date."""
     days = (pd.to_datetime(siblings["date"], format="%Y-%m-%d", errors="coerce") - pd.Timestamp(0)).dt.days
     for name in values:
         known = pd.DataFrame({"day": days, "value": values[name]}).dropna()

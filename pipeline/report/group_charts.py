@@ -96,7 +96,6 @@ def bars(
 
 
 def _description(points: Sequence[Point]) -> str:
-    """Return the values of points with their intervals."""
     said = []
     for p in points:
         interval = f", 95 % interval {number(p.interval[0])} to {number(p.interval[1])}" if p.interval else ""

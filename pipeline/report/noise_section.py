@@ -140,7 +140,6 @@ def _text(part: JSON | None) -> str:
 
 
 def _of_sheet(sheet: JSON, tau: np.ndarray[Any, np.dtype[np.float64]]) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Return the Allan deviation of the data sheet."""
     variance = allan_variance("white", {"value": float(sheet["noise_density"]) / np.sqrt(2.0)}, tau)
     time = {"value": float(sheet.get("wander_time_s") or DEFAULT_TIME_S)}
     wander = {"value": float(sheet.get("bias_wander") or 0.0), "correlation_time_s": time}
@@ -171,7 +170,6 @@ def _finding(axes: JSON, sheet: JSON, unit: str) -> str:
 
 
 def _needed(wander: JSON | None, unit: str) -> list[str]:
-    """Return the bias wander that the fit of the diagnosis needed."""
     if not wander or wander.get("standard_deviation") is None:
         return []
     if not wander.get("ratio"):

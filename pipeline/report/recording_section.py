@@ -68,7 +68,6 @@ def _duration(recording: Recording) -> float:
 
 
 def _motion(recording: Recording, rests: int) -> str:
-    """Return how a table moved, in words."""
     rate = recording.table_rate
     if rate is None:
         return "at rest" if recording.role == "static" else "by hand or not logged"

@@ -121,7 +121,6 @@ def _count(entry: JSON) -> str:
 
 
 def _short(state: JSON) -> JSON:
-    """Return what a comparison shows of a state."""
     if not state:
         return {"status": "not in units.csv"}
     parts = {s: state[s] for s in SENSORS if state.get(s)}

@@ -113,7 +113,6 @@ def _figure(
 
 
 def _bar(ends: NDArray[np.float64], low: float, high: float, colour: int) -> Layer:
-    """Return an area from one share to another."""
     return Area(low, high, colour, 100.0 * np.clip(ends, -EDGE, EDGE))
 
 
