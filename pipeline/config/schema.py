@@ -66,6 +66,7 @@ class Table(Section):
     gravity_g: Annotated[float, Field(gt=0.9, lt=1.1)]
     latitude_deg: Annotated[float, Field(ge=-90, le=90)] | None
     azimuth_deg: Annotated[float, Field(ge=-360, le=360)] | None
+    azimuth_of: Literal["level_x", "turn_axis"] = "level_x"
     angle_accuracy_deg: NonNegative
     rate_accuracy: NonNegative
     orthogonality_deg: NonNegative

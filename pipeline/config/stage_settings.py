@@ -36,7 +36,8 @@ BOTH = ("accelerometer", "gyroscope")
 NOISE = ("noise_density", "bias_wander", "wander_time_s")
 BY_HAND = tuple(f"procedure.{key}" for key in ("holdout_every", "faces", "turns"))
 FIT_OF_TABLE = (
-    "motion", "gravity_g", "latitude_deg", "azimuth_deg", "angle_accuracy_deg", "rate_accuracy", "orthogonality_deg",
+    "motion", "gravity_g", "latitude_deg", "azimuth_deg", "azimuth_of", "angle_accuracy_deg", "rate_accuracy",
+    "orthogonality_deg",
     "wobble_deg", "levelling_deg", "gravity_accuracy_g", "azimuth_accuracy_deg", *OF_BENCH,
 )  # fmt: skip
 FIT_OF_SENSOR = (

@@ -36,7 +36,7 @@ SCHEMA_VERSION = 2
 AGAIN = "the same command once more makes it again"
 ROW_GROUP = 1_000_000  # samples
 KEY, KEY_CRC = b"recordings", b"recordings_crc32"
-PLAIN = ("name", "role", "axis", "setup", "up", "source", "filter", "clock_shared")  # fields stored as JSON
+PLAIN = ("name", "role", "axis", "setup", "up", "sense", "source", "filter", "clock_shared")  # fields stored as JSON
 COLUMNS = ("time_ns", *CHANNELS, "flags")
 PAGE_ENCODINGS = {"f": "BYTE_STREAM_SPLIT", "i": "DELTA_BINARY_PACKED", "u": "PLAIN"}
 

@@ -28,17 +28,15 @@ import numpy as np
 from pipeline.errors import InputError
 from pipeline.model.encoder_trajectory import EncoderTrajectory
 from pipeline.records import AXES, Motion, conjugate_product, continuous
-from pipeline.signal.rests import RATE_AT_REST_DPS, still_samples
+from pipeline.signal.encoder_rate import rate_by_angle
+from pipeline.signal.rests import still_samples
 from pipeline.signal.temperature import temperature_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from numpy.typing import NDArray
-
     from pipeline.records import Recording, Values
 
-VAGUE_DPS = 0.01  # the noise of a gyroscope's sample; below it a doubtful rate does no harm
 EARTH_RATE_DPS = 360.0 / 86164.0905  # a sidereal day, s
 UP_AT_ZERO = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])  # see above
 # Rows: level x, y, z axes in the body frame at table angle 0, for turns about x, y, z.
@@ -66,11 +64,16 @@ def earth_of(table: Mapping[str, Any]) -> Values | None:
 
 def table_motion(recording: Recording, table: Mapping[str, Any]) -> Motion | None:
     """Return the motion by the table's log at its gravity, with Earth's rotation where that is known."""
-    return reference_motion(recording, float(table.get("gravity_g") or 1.0), earth_of(table))
+    one_shaft = table.get("azimuth_of") == "turn_axis"
+    return reference_motion(recording, float(table.get("gravity_g") or 1.0), earth_of(table), one_shaft=one_shaft)
 
 
 def reference_motion(
-    recording: Recording, gravity_g: float = 1.0, earth_rate_level: Values | None = None
+    recording: Recording,
+    gravity_g: float = 1.0,
+    earth_rate_level: Values | None = None,
+    *,
+    one_shaft: bool = False,
 ) -> Motion | None:
     """Return the motion that the table's log gives for a recording, or None where it gives none.
 
@@ -82,6 +85,9 @@ def reference_motion(
         Local gravity.
     earth_rate_level : (3,) array, deg/s, optional
         Earth's rotation in the level frame; None leaves it out.
+    one_shaft : bool
+        Whether level x is the axis about which the encoder counts right-handed, the same in all turns
+        (``table.azimuth_of``), and not the body's axis at angle 0.
 
     Raises
     ------
@@ -89,12 +95,12 @@ def reference_motion(
         If there are too few samples to differentiate the log.
     """
     if recording.axis is not None and recording.table_angle is not None:
-        build = _motion_of_turn
+        build = partial(_motion_of_turn, shaft=recording.sense if one_shaft else 0)
     elif recording.table_attitude is not None:
         build = _motion_of_attitude
     else:
         return None
-    key = (gravity_g, None if earth_rate_level is None else earth_rate_level.tobytes())
+    key = (gravity_g, None if earth_rate_level is None else earth_rate_level.tobytes(), one_shaft)
     if key not in recording.cache:
         if recording.samples < 6:
             raise InputError(
@@ -110,17 +116,25 @@ def reference_motion(
 
 
 def _motion_of_turn(
-    recording: Recording, gravity_g: float, earth: Values | None, logged: Callable[[Motion], Motion]
+    recording: Recording,
+    gravity_g: float,
+    earth: Values | None,
+    logged: Callable[[Motion], Motion],
+    *,
+    shaft: int,
 ) -> Motion:
     assert recording.axis is not None  # noqa: S101
     assert recording.table_angle is not None  # noqa: S101
-    time, angle = recording.time, recording.table_angle
-    rate, vague = _rate_of(time, angle) if recording.table_rate is None else (recording.table_rate, None)
+    time, angle, rate = recording.time, recording.table_angle, recording.table_rate
+    by_angle = rate_by_angle(recording)
+    if by_angle is not None:
+        angle, rate = by_angle.angle, by_angle.rate
+    assert rate is not None  # noqa: S101
     log = EncoderTrajectory(time, angle, rate)
-    if vague is not None:
-        log.valid_samples &= ~vague
+    if by_angle is not None:
+        log.valid_samples &= ~by_angle.vague
     axis = AXES.index(recording.axis)
-    home, still = level_at_zero(axis, recording.up), still_samples(time, rate)
+    home, still = level_at_zero(axis, recording.up, shaft), still_samples(time, rate)
 
     def at(before: float | Values, lag: float = 0.0, offset: float | Values = 0.0) -> Motion:
         offset = before + offset
@@ -166,14 +180,19 @@ def _turn(  # noqa: PLR0917  (the symbols of the module's equations)
     )
 
 
-def level_at_zero(axis: int, up: str = "") -> Values:
+def level_at_zero(axis: int, up: str = "", shaft: int = 0) -> Values:
     """Return the level axes in the body frame at table angle 0, as rows: (3, 3) array.
 
     Where the turn axis stands vertical, ``up`` is the body axis, with its sign, that points up all the time; level x is
-    then the body axis after it in cyclic order.
+    then the body axis after it in cyclic order. Where one level shaft turns the unit about each axis, level x is the
+    body axis times ``shaft``, 1 or -1, about which its encoder counts right-handed: so the level frame stays in the room.
     """
-    if not up:
+    if not up and not shaft:
         return np.asarray(LEVEL_AT_ZERO[axis])
+    if not up:
+        return np.array(
+            [shaft * np.eye(3)[axis], np.cross(UP_AT_ZERO[axis], shaft * np.eye(3)[axis]), UP_AT_ZERO[axis]]
+        )
     upward = np.eye(3)[AXES.index(up[1])] * (1.0 if up[0] == "+" else -1.0)
     level_x = np.eye(3)[(AXES.index(up[1]) + 1) % 3]
     return np.array([level_x, np.cross(upward, level_x), upward])
@@ -213,24 +232,6 @@ def _motion_of_attitude(
         )
 
     return at(0.0)
-
-
-def _rate_of(time: Values, angle: Values) -> tuple[Values, NDArray[np.bool_]]:
-    """Return the rate that a log of the angle alone gives, and where it is vague: (n,) arrays, deg/s and bool.
-
-    In smooth motion it is the derivative of a cubic spline. Where that differs from the central difference by more than
-    the log's own noise, the angle bends between two samples, and near it neither is the rate: a spline rings on for
-    some samples. At rest, where the angle does not change on either side, the central difference is taken.
-    """
-    from scipy.interpolate import make_interp_spline  # noqa: PLC0415  (0.3 s, needed without a rate log alone)
-
-    spline, central = make_interp_spline(time, angle, k=3)(time, 1), np.gradient(angle, time)
-    slope = np.abs(np.diff(angle) / np.diff(time))
-    resting = np.maximum(np.append(slope[0], slope), np.append(slope, slope[-1])) < RATE_AT_REST_DPS
-    miss = np.abs(spline - central)
-    bent = miss > max(VAGUE_DPS, 8.0 * float(np.percentile(miss, 10.0)))
-    vague = np.logical_and(np.convolve(bent, np.ones(9), "same") > 0.5, np.logical_not(resting))
-    return np.where(bent | resting, central, spline), vague
 
 
 def turn_about_axis(vector: Values, axis: int, angle_deg: Values) -> Values:

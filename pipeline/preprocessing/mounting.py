@@ -231,6 +231,7 @@ def _applied(turn: Turn, doubt: Note | None, departure: _Departure | None, hint:
     return replace(
         recording,
         up=bench.up if bench.vertical else "",
+        sense=bench.sense,
         table_angle=None if angle is None else bench.sense * angle + bench.offset,
         table_rate=None if rate is None else bench.sense * rate,
         encodings=encodings,

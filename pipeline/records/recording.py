@@ -119,6 +119,9 @@ class Recording:
     up : str
         ``+x``, ``-z`` ..: the body axis that points up throughout a turn about a vertical axis; empty elsewhere, where
         the table's angle says which one does.
+    sense : int
+        1 or -1: the encoder counted right-handed about the body axis, or about its opposite; angle and rate are about the
+        body axis.
     clock_shared : bool
         Whether the time between this recording and the unit's others is known (their times do not overlap).
     """
@@ -141,6 +144,7 @@ class Recording:
     clock_shared: bool = True
     setup: str = ""
     up: str = ""
+    sense: int = 1
 
     @cached_property
     def time(self) -> Values:

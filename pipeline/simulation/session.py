@@ -166,7 +166,8 @@ def _scene(plan: Planned, bench: Bench, start: float, rng: np.random.Generator) 
         if plan.role == "accelerometer" and _stops_and_goes(trajectory):
             settings["rate_error"] = (0.0, 0.0, 0.0)  # motors lose steps in fast turns only
         errors = random_errors(trajectory.program, rng, settings, trajectory.axis)
-        trajectory = Turn(trajectory.axis, trajectory.program, errors)
+        shaft = settings.get("sense", 1) if table.get("azimuth_of") == "turn_axis" else 0
+        trajectory = Turn(trajectory.axis, trajectory.program, errors, shaft)
     up = rotation_by(np.append(np.asarray(settings.get("tilt_deg", (0.0, 0.0)), float), 0.0))[2]
     placed = table["latitude_deg"] is not None and table["azimuth_deg"] is not None
     earth = earth_rate(table["latitude_deg"], table["azimuth_deg"]) if placed else None

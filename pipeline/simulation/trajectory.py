@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from pipeline.model.kinematics import LEVEL_AT_ZERO, attitude_matrix
+from pipeline.model.kinematics import attitude_matrix, level_at_zero
 from pipeline.simulation.rate_table import TurnErrors
 
 if TYPE_CHECKING:
@@ -80,6 +80,7 @@ class Turn:
     axis: int
     program: Program
     errors: TurnErrors = field(default_factory=TurnErrors)
+    shaft: int = 0  # 1 or -1: level x is the body axis times this in all turns, by the sense of the encoder
 
     @property
     def duration(self) -> float:
@@ -90,7 +91,7 @@ class Turn:
         """Return the pose at (n,) times, s."""
         angle, rate, acceleration = self.errors.motion(self.program, time)
         u = self.errors.turn_axis(self.axis)
-        level = LEVEL_AT_ZERO[self.axis] @ rotation_about(u, angle)
+        level = level_at_zero(self.axis, shaft=self.shaft) @ rotation_about(u, angle)
         move = self.program.at(time)[3]
         direction = np.append(np.sign(np.diff(self.program.stops)), 0.0)[move]
         force = self.errors.force(self.program, time)

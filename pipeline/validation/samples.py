@@ -4,8 +4,9 @@ The reference of a filtered recording is taken at ``time - delay``. Its magnitud
 
     accelerometer: gravity_g,      gyroscope: |table rate|
 
-where the table rate is that of the log, else that of the attitude's derivative; with Earth's rotation configured, it is
-changed by ``|omega + Omega| - |omega|``, which the gyroscope sees too.
+where the table rate is that of the log, else that of the attitude's derivative, else that of the angle where the unit
+turns about one fixed axis; its error by the encoder's resolution counts as white noise. With Earth's rotation
+configured, the rate is changed by ``|omega + Omega| - |omega|``, which the gyroscope sees too.
 
 The mean squared error of the magnitude of a vector t, given the covariance S of the vector's error x, is
 
@@ -34,6 +35,7 @@ from pipeline.model.effects.base import truth
 from pipeline.model.effects.timing import shifted
 from pipeline.model.kinematics import earth_of, table_motion
 from pipeline.signal.creep import believed_rates, creep_in
+from pipeline.signal.encoder_rate import FEWEST, EncoderRate, rate_by_angle
 from pipeline.signal.filters import filter_autocovariance, variance_of_mean
 
 if TYPE_CHECKING:
@@ -46,6 +48,7 @@ if TYPE_CHECKING:
 
 OTHER = {"accelerometer": "gyroscope", "gyroscope": "accelerometer"}
 RAW = 0.05  # by which scale and axes of sensors may differ before calibration: scale 3 %, cross-axis 2 % (data sheets)
+OFF_AXIS = 0.03  # of the rate about one axis: cross-axis sensitivity of data sheets, and effects, cause less off it
 NODES, NODE_WEIGHTS = np.polynomial.legendre.leggauss(48)  # enough for the 0.4 % of a simulation (test_norm_error)
 THETA, STEP = np.pi / 4.0 * (NODES + 1.0), np.pi / 4.0 * NODE_WEIGHTS
 FAR = 30.0  # standard deviations from zero, beyond which the norm is linear to 1e-3
@@ -96,8 +99,9 @@ def samples_of_motion(
     if motion is not None:
         motion = through_filter(motion, recording) if smoothed else shifted(motion, -delay)
     magnitude = np.full(recording.samples, gravity)
+    by_angle = _rate_by_angle(recording) if sensor == "gyroscope" else None
     if sensor == "gyroscope":
-        known = _rate(recording, motion, earth, delay)
+        known = _rate(recording, motion, earth, delay, by_angle)
         if known is None:
             return None
         magnitude = known
@@ -110,7 +114,8 @@ def samples_of_motion(
         recording.time,
         reading,
         magnitude,
-        np.broadcast_to((float(recording.filter.get("noise_gain", 1.0)) * noise.white) ** 2, (n, 3)),
+        np.broadcast_to((float(recording.filter.get("noise_gain", 1.0)) * noise.white) ** 2, (n, 3))
+        + (0.0 if by_angle is None else by_angle.noise[:, None] ** 2),
         np.broadcast_to(_wander_share(recording) * noise.wander**2, (n, 3)),
         motion,
         recording.reading(OTHER[sensor]),
@@ -186,19 +191,41 @@ def _alike(recording: Recording) -> float:
     return float((2.0 * covariance.sum() - covariance[0]) / covariance[0])
 
 
-def _rate(recording: Recording, motion: Motion | None, earth: Values | None, delay: float) -> Values | None:
+def _rate(
+    recording: Recording, motion: Motion | None, earth: Values | None, delay: float, by_angle: EncoderRate | None
+) -> Values | None:
     """Return the magnitude of the rate that the gyroscope should see: (n,) array, deg/s."""
     seen = None if motion is None else np.linalg.norm(truth("gyroscope", motion), axis=1)
     turned = seen
     if motion is not None and earth is not None and motion.level is not None:
         of_table = motion.angular_rate - np.einsum("i,nij->nj", earth, motion.level)
         turned = np.linalg.norm(of_table, axis=1)
-    if recording.table_rate is None:
-        return seen
-    logged = np.abs(recording.table_rate)
+    if seen is not None and recording.table_rate is None:
+        return seen if by_angle is None else np.where(by_angle.vague, np.nan, seen)
+    logged = recording.table_rate
+    if by_angle is not None:
+        logged = np.where(by_angle.vague, np.nan, by_angle.rate)
+    if logged is None:
+        return None
     if delay:
-        logged = np.abs(np.interp(recording.time - delay, recording.time, recording.table_rate))
+        logged = np.interp(recording.time - delay, recording.time, logged)
+    logged = np.abs(logged)
     return logged if seen is None or turned is None else logged + (seen - turned)
+
+
+def _rate_by_angle(recording: Recording) -> EncoderRate | None:
+    """Return the rate by the table's angle, where the table logs nothing better and turns about one fixed axis."""
+    logged = recording.table_rate is not None or (recording.axis is None and recording.table_attitude is not None)
+    if logged or recording.table_angle is None or recording.gyroscope is None:
+        return None
+    if recording.axis is None:
+        known = recording.gyroscope[np.isfinite(recording.gyroscope).all(axis=1)]
+        if len(known) < FEWEST:
+            return None
+        spread = np.linalg.eigvalsh(np.cov(known.T))
+        if spread[1] > OFF_AXIS**2 * spread[2]:
+            return None
+    return rate_by_angle(recording)
 
 
 def squared_norm_errors(truth: Values, matrix: Values, variance: Values) -> Values:

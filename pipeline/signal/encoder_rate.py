@@ -1,0 +1,190 @@
+"""The table's rate where its log holds the angle alone.
+
+A fine angle is differentiated: by a cubic spline, or by central differences where it bends between two samples. An
+encoder of the resolution q hides a rate below the noise of that: then the angle A is smoothed,
+
+    minimize  sum (y_i - A_i)^2 / R + sum (D^k A)_i^2 h / S,    R = q^2 / 12,
+
+where D^k is the k-th divided difference over times h apart. S is the density of a random acceleration (k = 2), jerk (3)
+or derivative of the jerk (4); k and S maximize the likelihood of the log. The covariance of A is ``(I / R + D^T D h / S)^-1``: a band matrix.
+
+Source: H. L. Weinert, Fast Compact Algorithms and Software for Spline Smoothing, 2013; the likelihood is that of G.
+Wahba, Annals of Statistics 13 (1985), 1378, for a noise of known variance.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.signal.rests import RATE_AT_REST_DPS, runs
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pipeline.records import Recording, Values
+
+VAGUE_DPS = 0.01  # the noise of a gyroscope's sample; below it a doubtful rate does no harm
+WHOLE = 1e-3  # of a step, to which the angles of an encoder are multiples of it: printed decimals
+ORDERS = (2, 3, 4)  # a motor that ripples, a program of constant accelerations, motion by a wheel
+EDGE = 5  # samples of rest at both ends of a motion, which say that it begins and ends at zero
+FEWEST = 6  # samples from which a rate and its derivative follow
+DENSITIES = (1e-6, 1e12)  # S, (deg/s)^2/s^(2k - 3): from a table at rest to 10,000 deg/s^2 in 0.1 s
+GAP = 1.5  # sampling intervals, above which the angle in between is not known
+
+
+@dataclass(frozen=True)
+class EncoderRate:
+    """Angle and rate of a table by the log of its angle.
+
+    Attributes
+    ----------
+    angle, rate : (n,) arrays, deg, deg/s
+        The angle is smoothed where the encoder is coarse.
+    noise : (n,) array, deg/s
+        Standard deviation of the rate by the encoder's resolution; 0 of a fine one and at rest.
+    vague : (n,) array of bool
+        Where the rate is not known: a fine angle bends between two samples, a coarse one has a gap.
+    resolution : float, deg
+        Of a coarse encoder; 0 of a fine one.
+    """
+
+    angle: Values
+    rate: Values
+    noise: Values
+    vague: NDArray[np.bool_]
+    resolution: float = 0.0
+
+
+def rate_by_angle(recording: Recording) -> EncoderRate | None:
+    """Return the rate by the angle, None where the table logs a rate or no angle, or below 6 samples."""
+    if recording.table_rate is not None or recording.table_angle is None or recording.samples < FEWEST:
+        return None
+    key = "encoder_rate"
+    if key not in recording.cache:
+        assert recording.table_angle is not None  # noqa: S101
+        recording.cache[key] = _rate_of(recording.time, recording.table_angle)
+    found: EncoderRate = recording.cache[key]
+    return found
+
+
+def _rate_of(time: Values, angle: Values) -> EncoderRate:
+    step = _resolution(angle)
+    if step / np.sqrt(6.0) > VAGUE_DPS * 2.0 * float(np.median(np.diff(time))):
+        return _smoothed(time, angle, step)
+    from scipy.interpolate import make_interp_spline  # noqa: PLC0415  (0.3 s, needed without a rate log alone)
+
+    spline, central = make_interp_spline(time, angle, k=3)(time, 1), np.gradient(angle, time)
+    slope = np.abs(np.diff(angle) / np.diff(time))
+    resting = np.maximum(np.append(slope[0], slope), np.append(slope, slope[-1])) < RATE_AT_REST_DPS
+    miss = np.abs(spline - central)
+    bent = miss > max(VAGUE_DPS, 8.0 * float(np.percentile(miss, 10.0)))
+    vague = np.logical_and(np.convolve(bent, np.ones(9), "same") > 0.5, np.logical_not(resting))
+    return EncoderRate(angle, np.where(bent | resting, central, spline), np.zeros(len(time)), vague)
+
+
+def _resolution(angle: Values) -> float:
+    """Return the step of which all changes of the angle are multiples, deg; 0 where there is none."""
+    changes = np.abs(np.diff(angle))
+    moved = changes[changes > 1e-9 * max(float(np.abs(angle).max()), 1.0)]
+    if not len(moved):
+        return 0.0
+    steps = moved / moved.min()
+    return (
+        float(moved.min())
+        if float(np.abs(steps - np.rint(steps)).max()) < WHOLE * max(1.0, float(steps.max()))
+        else 0.0
+    )
+
+
+def _smoothed(time: Values, angle: Values, step: float) -> EncoderRate:
+    """Return the smoothed log of a coarse encoder, stretch by stretch between rests: each has a motion of its own.
+
+    The table rests where the angle stays the same for longer than a step takes at the rate that counts as rest.
+    """
+    n = len(time)
+    smooth, rate, noise = angle.copy(), np.zeros(n), np.zeros(n)
+    starts = np.flatnonzero(np.diff(angle, prepend=np.nan) != 0.0)
+    lengths = np.diff(np.append(starts, n))
+    lasts = time[starts + lengths - 1] - time[starts] > step / RATE_AT_REST_DPS
+    moving = ~np.repeat(lasts, lengths)
+    apart = np.flatnonzero(np.diff(time) > GAP * float(np.median(np.diff(time)))) + 1  # each begins behind a gap
+    vague = np.zeros(n, bool)
+    for first, last in _split(runs(moving), apart.tolist()):
+        before, after = first in apart, last in apart
+        around = slice(first if before else max(first - EDGE, 0), last if after else min(last + EDGE, n))
+        vague[first : first + EDGE * before] = vague[max(last - EDGE * after, first) : last] = before or after
+        part, own = slice(first - around.start, last - around.start), slice(first, last)
+        if around.stop - around.start <= 2 * EDGE:
+            rate[own], noise[own] = np.gradient(angle[around], time[around])[part], step / np.sqrt(6.0)
+            noise[own] /= 2.0 * float(np.median(np.diff(time)))
+            continue
+        found, error = _stretch(time[around], angle[around], step)
+        smooth[own], noise[own] = found[part], error
+        rate[own] = np.gradient(found, time[around])[part]
+    return EncoderRate(smooth, rate, noise, vague, step)
+
+
+def _split(spans: list[tuple[int, int]], at: list[int]) -> list[tuple[int, int]]:
+    """Return spans of indices, cut where one of them begins anew."""
+    ends = [sorted({first, last, *(i for i in at if first < i < last)}) for first, last in spans]
+    return [pair for cut in ends for pair in itertools.pairwise(cut)]
+
+
+def _stretch(time: Values, angle: Values, step: float) -> tuple[Values, float]:
+    """Return the smoothed angle of one motion, and the standard deviation of its central differences, deg/s."""
+    from scipy.linalg import cho_solve_banded  # noqa: PLC0415  (needed for a coarse encoder alone)
+    from scipy.optimize import minimize_scalar  # noqa: PLC0415
+
+    start = angle[0]
+    smoothers = [_Smoother(time, angle - start, step**2 / 12.0, order) for order in ORDERS]
+    fits = [
+        minimize_scalar(s.loss, bounds=np.log(DENSITIES), method="bounded", options={"xatol": 0.1}) for s in smoothers
+    ]
+    best = int(np.argmin([fit.fun for fit in fits]))
+    factor, smooth = smoothers[best].solve(fits[best].x)
+    n, middle = len(time), len(time) // 2
+    ends = np.zeros((n, 2))
+    ends[[middle + 1, middle - 1], [0, 1]] = 1.0
+    P = cho_solve_banded((factor, False), ends)[[middle + 1, middle - 1]]
+    error = float(np.sqrt(P[0, 0] + P[1, 1] - 2.0 * P[0, 1])) / float(time[middle + 1] - time[middle - 1])
+    return smooth + start, error
+
+
+class _Smoother:
+    """The smoothing of an angle for one order of difference."""
+
+    def __init__(self, time: Values, angle: Values, variance: float, order: int) -> None:
+        self.angle, self.variance, self.order = angle, variance, order
+        n = len(time)
+        rows = np.ones((1, n))  # rows[j, i]: weight of A_(i + j) in the difference that begins at i
+        for k in range(1, order + 1):
+            apart = (time[k:] - time[:-k]) / k
+            rows = (np.pad(rows[:, 1:], ((1, 0), (0, 0))) - np.pad(rows[:, :-1], ((0, 1), (0, 0)))) / apart
+        self.rows, self.apart = rows, (time[order:] - time[:-order]) / order
+
+    def solve(self, log_density: float) -> tuple[Values, Values]:
+        """Return the banded Cholesky factor of ``I / R + D^T D h / S`` and the smoothed angle."""
+        from scipy.linalg import cho_solve_banded, cholesky_banded  # noqa: PLC0415
+
+        weight, n, k = self.apart * np.exp(-log_density), len(self.angle), self.order
+        bands = np.zeros((k + 1, n))
+        bands[k] = 1.0 / self.variance
+        for i in range(k + 1):
+            for j in range(i, k + 1):
+                bands[k - (j - i), j : n - k + j] += weight * self.rows[i] * self.rows[j]
+        factor = cholesky_banded(bands)
+        return factor, cho_solve_banded((factor, False), self.angle / self.variance)
+
+    def loss(self, log_density: float) -> float:
+        """Return -2 log likelihood of the density but for a constant."""
+        factor, smooth = self.solve(log_density)
+        weight = self.apart * np.exp(-log_density)
+        difference = sum(self.rows[j] * smooth[j : len(smooth) - self.order + j] for j in range(self.order + 1))
+        log_determinant = 2.0 * np.log(factor[-1]).sum() - np.log(weight * self.rows[-1] ** 2).sum()
+        return float(
+            log_determinant + np.sum((self.angle - smooth) ** 2) / self.variance + np.sum(weight * difference**2)
+        )
