@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.diagnosis import multi_position, turntable
 from pipeline.diagnosis.findings import Case, document_of
 from pipeline.diagnosis.verdict import EXPLAINED, LIKELY, Evidence, HeldOut, judged, may_be_unknown
-from pipeline.errors import NotObservableError
+from pipeline.errors import ConvergenceError, NotObservableError
 from pipeline.estimation.candidates import MOUNTING, configured_effects
 from pipeline.estimation.effects import mountings_by_gravity, of_the_angle
 from pipeline.estimation.rest_means import is_multi_position
@@ -141,7 +141,10 @@ def evidence_of(
     def error_of(fit: Callable[[], SensorCalibration] | None, *, smoothed: bool) -> HeldOut | None:
         if fit is None or case.noise is None or found is None:
             return None
-        error = last_error(fit(), recordings, case.noise, settings, other=found.other, smoothed=smoothed)
+        try:
+            error = last_error(fit(), recordings, case.noise, settings, other=found.other, smoothed=smoothed)
+        except ConvergenceError:  # the fit's effects cannot be taken off the held-out readings
+            return None
         return None if error is None else HeldOut(error[0], *error[1])
 
     accepted = ((settings.get("sensor") or {}).get(sensor) or {}).get("accept_implausible")

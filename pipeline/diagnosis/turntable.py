@@ -20,6 +20,7 @@ from pipeline.diagnosis.observability import never_shown, not_observable, one_wa
 from pipeline.diagnosis.residual_plots import plots
 from pipeline.diagnosis.verdict import verdict_of_selection
 from pipeline.diagnosis.words import FAR_OFF, plain
+from pipeline.errors import ConvergenceError
 from pipeline.estimation.candidates import turns_of
 from pipeline.estimation.design import Start
 from pipeline.estimation.generalized_least_squares import calibration_of, fit_in_mean_frame, fit_terms
@@ -60,9 +61,18 @@ def findings(case: Case) -> Findings:
 
     def search() -> Findings | None:
         found = discover(selection, unknown, *given, accelerometer=case.accelerometer)
-        return _described(found, case) if found.suggested else None
+        try:
+            return _described(found, case) if found.suggested else None
+        except ConvergenceError:  # a form that held-out readings cannot be corrected by is no effect of a sensor
+            return None
 
-    return replace(_described(Discovery(selection, selection, unknown), case), search=search)
+    plain = Discovery(selection, selection, unknown)
+    try:
+        described = _described(plain, case)
+    except ConvergenceError:  # effects so large that held-out readings cannot be corrected: found, not judged there
+        fitted = [r for r in case.recordings if r.role != "validation"]
+        described = _described(plain, replace(case, recordings=fitted))
+    return replace(described, search=search)
 
 
 def _described(discovery: Discovery, case: Case) -> Findings:

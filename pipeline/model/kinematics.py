@@ -95,7 +95,7 @@ def reference_motion(
         If there are too few samples to differentiate the log.
     """
     if recording.axis is not None and recording.table_angle is not None:
-        build = partial(_motion_of_turn, shaft=recording.sense if one_shaft else 0)
+        build: Callable[..., Motion] = partial(_motion_of_turn, shaft=recording.sense if one_shaft else 0)
     elif recording.table_attitude is not None:
         build = _motion_of_attitude
     else:
@@ -185,7 +185,7 @@ def level_at_zero(axis: int, up: str = "", shaft: int = 0) -> Values:
 
     Where the turn axis stands vertical, ``up`` is the body axis, with its sign, that points up all the time; level x is
     then the body axis after it in cyclic order. Where one level shaft turns the unit about each axis, level x is the
-    body axis times ``shaft``, 1 or -1, about which its encoder counts right-handed: so the level frame stays in the room.
+    body axis times ``shaft``, 1 or -1, about which its encoder counts right-handed: the level frame stays in the room.
     """
     if not up and not shaft:
         return np.asarray(LEVEL_AT_ZERO[axis])

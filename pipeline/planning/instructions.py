@@ -142,7 +142,7 @@ def _what(unit: UnitDescription, planned: Planned) -> str:
         return BY_HAND[unit.procedure].format(positions=course.positions) + f", {course.dwell_s:g} s each"
     fast = f"at up to {course.validation_rate_dps:g} deg/s; the table logs"
     if table.get("seat_deg"):
-        return f"the unit askew on the turn axis, turned to and fro {fast} its rate; held out of every fit"
+        return f"the unit askew on the turn axis, turned to and fro {fast} its rate or angle; held out of every fit"
     return f"random motion about all axes {fast} the magnitude of its rate, or its attitude; held out of every fit"
 
 

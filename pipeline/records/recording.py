@@ -120,8 +120,8 @@ class Recording:
         ``+x``, ``-z`` ..: the body axis that points up throughout a turn about a vertical axis; empty elsewhere, where
         the table's angle says which one does.
     sense : int
-        1 or -1: the encoder counted right-handed about the body axis, or about its opposite; angle and rate are about the
-        body axis.
+        1 or -1: the table's log counted right-handed about the body axis, or about its opposite. Angle and rate are
+        about the body axis.
     clock_shared : bool
         Whether the time between this recording and the unit's others is known (their times do not overlap).
     """

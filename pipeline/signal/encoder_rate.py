@@ -6,7 +6,8 @@ encoder of the resolution q hides a rate below the noise of that: then the angle
     minimize  sum (y_i - A_i)^2 / R + sum (D^k A)_i^2 h / S,    R = q^2 / 12,
 
 where D^k is the k-th divided difference over times h apart. S is the density of a random acceleration (k = 2), jerk (3)
-or derivative of the jerk (4); k and S maximize the likelihood of the log. The covariance of A is ``(I / R + D^T D h / S)^-1``: a band matrix.
+or derivative of the jerk (4); k and S maximize the likelihood of the log. The covariance of A is
+``(I / R + D^T D h / S)^-1``, the inverse of a band matrix.
 
 Source: H. L. Weinert, Fast Compact Algorithms and Software for Spline Smoothing, 2013; the likelihood is that of G.
 Wahba, Annals of Statistics 13 (1985), 1378, for a noise of known variance.
@@ -31,6 +32,9 @@ VAGUE_DPS = 0.01  # the noise of a gyroscope's sample; below it a doubtful rate 
 WHOLE = 1e-3  # of a step, to which the angles of an encoder are multiples of it: printed decimals
 ORDERS = (2, 3, 4)  # a motor that ripples, a program of constant accelerations, motion by a wheel
 EDGE = 5  # samples of rest at both ends of a motion, which say that it begins and ends at zero
+FEWEST_MOVED = 100  # changes of the angle: their autocorrelation is known to 0.1
+ROUNDED = -0.35  # autocorrelation, half way between that of rounding errors and that of ramps
+AROUND = 9  # second differences over which an acceleration is taken as constant
 FEWEST = 6  # samples from which a rate and its derivative follow
 DENSITIES = (1e-6, 1e12)  # S, (deg/s)^2/s^(2k - 3): from a table at rest to 10,000 deg/s^2 in 0.1 s
 GAP = 1.5  # sampling intervals, above which the angle in between is not known
@@ -87,17 +91,25 @@ def _rate_of(time: Values, angle: Values) -> EncoderRate:
 
 
 def _resolution(angle: Values) -> float:
-    """Return the step of which all changes of the angle are multiples, deg; 0 where there is none."""
+    """Return the step of an encoder whose rounding hides the rate, deg; else 0.
+
+    All changes are multiples of the step, and the second differences of a moving angle are those of rounding errors:
+    their autocorrelation at lag 1 is -2/3, where that of a program's ramps is positive. Their mean over neighbours, the
+    acceleration, is taken off.
+    """
+    rounding = 1e-9 * max(float(np.abs(angle).max()), 1.0)
     changes = np.abs(np.diff(angle))
-    moved = changes[changes > 1e-9 * max(float(np.abs(angle).max()), 1.0)]
-    if not len(moved):
+    if np.count_nonzero(changes > rounding) < FEWEST_MOVED:
         return 0.0
-    steps = moved / moved.min()
-    return (
-        float(moved.min())
-        if float(np.abs(steps - np.rint(steps)).max()) < WHOLE * max(1.0, float(steps.max()))
-        else 0.0
-    )
+    apart = np.diff(np.unique(changes), prepend=0.0)
+    step = float(np.min(apart[apart > rounding]))
+    multiples = changes / step
+    if float(np.abs(multiples - np.rint(multiples)).max()) > WHOLE * max(1.0, float(multiples.max())):
+        return 0.0
+    bent = np.diff(angle, 2)
+    bent -= np.convolve(bent, np.full(AROUND, 1.0 / AROUND), "same")
+    power = float(bent @ bent)
+    return step if power > 0.0 and float(bent[1:] @ bent[:-1]) < ROUNDED * power else 0.0
 
 
 def _smoothed(time: Values, angle: Values, step: float) -> EncoderRate:
@@ -141,9 +153,8 @@ def _stretch(time: Values, angle: Values, step: float) -> tuple[Values, float]:
 
     start = angle[0]
     smoothers = [_Smoother(time, angle - start, step**2 / 12.0, order) for order in ORDERS]
-    fits = [
-        minimize_scalar(s.loss, bounds=np.log(DENSITIES), method="bounded", options={"xatol": 0.1}) for s in smoothers
-    ]
+    low, high = np.log(DENSITIES)
+    fits = [minimize_scalar(s.loss, bounds=(low, high), method="bounded", options={"xatol": 0.1}) for s in smoothers]
     best = int(np.argmin([fit.fun for fit in fits]))
     factor, smooth = smoothers[best].solve(fits[best].x)
     n, middle = len(time), len(time) // 2

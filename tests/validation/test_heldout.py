@@ -403,3 +403,34 @@ def test_a_calibration_that_does_harm_is_told_from_one_that_does_not(sensor: str
     quiet = read(held_out(1500), 1.0, **{sensor: ideal})
     nearly = replace(ideal, matrix=ideal.matrix * (1.0 + 1e-6))
     assert validate(nearly, [quiet], noise_of(sensor), SETTINGS)["worse_than_raw"] is None
+
+
+def about_one_axis(direction: np.ndarray, *, other: float = 0.0) -> Recording:
+    """Motion about a fixed axis by an encoder of 0.01 deg; ``other`` deg/s about a second axis are not logged."""
+    time = 0.01 * np.arange(6000)
+    angle = 50.0 * np.sin(1.7 * time) + 20.0 * np.sin(3.1 * time)
+    rate = 85.0 * np.cos(1.7 * time) + 62.0 * np.cos(3.1 * time)
+    across = np.cross(direction, [0.0, 0.0, 1.0])
+    true = rate[:, None] * direction + other * np.sin(0.9 * time)[:, None] * across / np.linalg.norm(across)
+    cal = calibration("gyroscope")
+    noise = np.random.default_rng(5).normal(0.0, 0.03, (6000, 3))
+    reading = cal.bias + true @ np.linalg.inv(cal.matrix).T + noise
+    stamps = np.arange(6000) * 10_000_000
+    logged = np.rint(angle / 0.01) * 0.01
+    return Recording("validation", "validation", None, stamps, gyroscope=reading, table_angle=logged)
+
+
+def test_an_angle_about_one_fixed_axis_judges_the_gyroscope() -> None:
+    direction = np.array([2.0, -1.0, 2.0]) / 3.0
+    noise = Noise(np.full(3, 0.03), np.zeros(3), 100.0, "static")
+    part = validate(calibration("gyroscope"), [about_one_axis(direction)], noise, SETTINGS)
+    assert part["held_out"]
+    assert part["steps"][-1]["rms_error"] == pytest.approx(part["noise_floor"], rel=0.15)
+    assert part["noise_floor"] < 2.0 * 0.03
+
+
+def test_the_angle_of_one_axis_does_not_judge_a_motion_about_two() -> None:
+    direction = np.array([2.0, -1.0, 2.0]) / 3.0
+    noise = Noise(np.full(3, 0.03), np.zeros(3), 100.0, "static")
+    part = validate(calibration("gyroscope"), [about_one_axis(direction, other=20.0)], noise, SETTINGS)
+    assert not part["held_out"]
