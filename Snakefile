@@ -6,7 +6,7 @@
 #
 # ingest -> filter -> fit/{sensor}/{stage} ... -> validate, diagnose, calibration -> export -> report -> gather -> verdict
 #
-# One job handles a batch of units; each writes one file per unit below results/<campaign>/batches/<batch>/<stage>/.
+# One job handles a batch of units; each writes one file, results/<campaign>/batches/<batch>/<stage>.zip.
 
 
 include: "workflow/rules/common.smk"

@@ -19,15 +19,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.diagnosis.words import in_words
-from pipeline.files import read_json
-from pipeline.io.parquet import load_recordings
+from pipeline.pack import Pack
 from pipeline.records import SENSORS
 from pipeline.report import campaign_page
 from pipeline.report.certificate import certificate, certificate_page
 from pipeline.report.recording_section import sensor_temperature
 from pipeline.report.unit_page import render
 from pipeline.stages.batch import merge_common
-from pipeline.stages.unit_files import load_fits
+from pipeline.stages.unit_files import load_fits, recordings_of
 from pipeline.validation.attitude import attitude
 
 if TYPE_CHECKING:
@@ -59,14 +58,15 @@ def least(work: Callable[[], object], runs: int) -> float:
 
 def unit_costs(results: Path, runs: int) -> dict[str, float]:
     """Return CPU milliseconds of what is made of one unit."""
-    batch = next(results.glob(f"batches/*/report/{UNIT}.html")).parents[1]
+    batches = results.glob("batches/*")
+    batch = next(b for b in batches if b.is_dir() and f"{UNIT}.html" in Pack(b / "report.zip"))
     parts: dict[str, Any] = {}
     for file in results.glob("configs/report-*.json"):
         parts |= merge_common(json.loads(file.read_text()))["units"]
     part = parts[UNIT]
-    documents = [read_json(batch / stage / f"{UNIT}.json") for stage in ("calibration", "validate", "diagnose")]
-    recordings = load_recordings(batch / "filter" / f"{UNIT}.parquet")
-    last = {s: max((batch / "fit" / s).iterdir(), key=lambda f: f.stat().st_mtime) for s in SENSORS}
+    documents = [Pack(batch / f"{stage}.zip").json(f"{UNIT}.json") for stage in ("calibration", "validate", "diagnose")]
+    recordings = recordings_of({stage: Pack(batch / f"{stage}.zip") for stage in ("ingest", "filter")}, UNIT)
+    last = {s: Pack(max((batch / "fit" / s).glob("*.zip"), key=lambda f: f.stat().st_mtime)) for s in SENSORS}
     fits = load_fits(last, UNIT)
     words = {s: in_words(documents[2][s], s) for s in SENSORS}
 

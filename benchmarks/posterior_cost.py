@@ -20,10 +20,11 @@ import scipy.special  # noqa: F401  (imported when it is first needed)
 from pipeline.diagnosis import multi_position, turntable
 from pipeline.diagnosis.diagnose import diagnose
 from pipeline.estimation.posterior import Answers
-from pipeline.files import read_json
-from pipeline.io.parquet import load_recordings
+from pipeline.pack import Pack
 from pipeline.records import SENSORS, SensorCalibration
-from pipeline.stages.unit_files import require_noises
+from pipeline.stages.unit_files import recordings_of, require_noises
+
+NOISE = ".noise.json"
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -36,22 +37,24 @@ def main(results: Path) -> None:
         content = json.loads(file.read_text(encoding="utf-8"))
         settings |= {unit: {**content["common"], **own} for unit, own in content["units"].items()}
     total = {True: 0.0, False: 0.0}
-    for file in sorted(results.glob("batches/*/filter/*.parquet")):
-        unit, batch = file.stem, file.parents[1]
+    found = [
+        (file.parent, name) for file in sorted(results.glob("batches/*/filter.zip")) for name in Pack(file).names()
+    ]
+    for batch, unit in [(at, name.removesuffix(NOISE)) for at, name in found if name.endswith(NOISE)]:
+        packs = {stage: Pack(batch / f"{stage}.zip") for stage in ("ingest", "filter")}
         fits: dict[str, SensorCalibration | None] = {}
         for sensor in SENSORS:
-            stages = list((batch / "fit" / sensor).glob(f"*/{unit}.json"))
-            last = max(stages, key=lambda p: (len(read_json(p).get("stages", ())), p.stat().st_mtime_ns))
-            data = read_json(last)
+            stages = [Pack(file).json(f"{unit}.json") for file in (batch / "fit" / sensor).glob("*.zip")]
+            data = max(stages, key=lambda found: len(found.get("stages", ())))
             fits[sensor] = None if "not_calibrated" in data else SensorCalibration.from_json(sensor, data)
-        recordings = load_recordings(file)
-        noises = require_noises(file.parent, unit, recordings, settings[unit]["sensor"], fits)
+        recordings = recordings_of(packs, unit)
+        noises = require_noises(packs["filter"], unit, recordings, settings[unit]["sensor"], fits)
         for sensor, fit in fits.items():
             if fit is None:
                 continue
             spent = {}
             for with_it in total:
-                known = fit, load_recordings(file), noises[sensor], settings[unit], fits["accelerometer"]
+                known = fit, recordings_of(packs, unit), noises[sensor], settings[unit], fits["accelerometer"]
                 spent[with_it] = _cost(partial(diagnose, *known), with_it=with_it)
             print(f"{unit:<24} {sensor:<14} {spent[False]:6.2f} s {spent[True]:6.2f} s")
             total = {with_it: total[with_it] + spent[with_it] for with_it in total}

@@ -13,7 +13,7 @@ for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 
 COMMANDS = (
     "run", "new", "check", "plan", "guide", "explain", "add", "remove", "apply", "convert", "noise", "simulate",
-    "config", "study", "thesis",
+    "unpack", "config", "study", "thesis",
 )  # fmt: skip
 STAGES = (
     "ingest", "filter", "fit", "validate", "diagnose", "calibration", "export", "report", "gather", "verdict",

@@ -19,12 +19,15 @@ import pandas as pd
 
 from pipeline.errors import InputError, MissingInputError
 from pipeline.files import read_json
+from pipeline.published import batches_of
 from pipeline.records import SENSORS
 from pipeline.report.parameters import fitted_parameters, reading_errors
 from pipeline.report.summary import COLUMNS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
+    from pipeline.published import Batch
 
 JSON = dict[str, Any]
 DOCUMENTS = ("calibrations", "validations", "diagnoses")
@@ -188,11 +191,22 @@ class CampaignResults:
             if name not in self.units:
                 near = get_close_matches(name, self.units, n=5) or self.units[:5]
                 raise InputError(f"has no unit {name!r}; there are {', '.join(near)}", str(self.folder))
-            calibration, *others = (self.folder / folder / f"{name}.json" for folder in DOCUMENTS)
-            found = read_json(calibration)
+            calibration, *others = DOCUMENTS
+            found = self._document(calibration, name)
             ok = found["status"] == "ok"
-            self._documents[name] = UnitResults(name, found, *(read_json(file) if ok else None for file in others))
+            read = (self._document(folder, name) if ok else None for folder in others)
+            self._documents[name] = UnitResults(name, found, *read)
         return self._documents[name]
+
+    def _document(self, folder: str, name: str) -> JSON:
+        file = self.folder / folder / f"{name}.json"
+        packed = None if file.is_file() else self._batches.get(name)
+        found: JSON = packed.document(folder, name) if packed else read_json(file)
+        return found
+
+    @cached_property
+    def _batches(self) -> dict[str, Batch]:
+        return batches_of(self.folder)
 
     def _parts(self, document: str) -> Iterator[tuple[JSON, JSON]]:
         """Yield ``{unit, sensor}`` and the sensor's part of a document, where there is one."""

@@ -8,8 +8,8 @@ Publishing
     of its files and folders is then exchanged with the published one of the same name. The next run completes an
     exchange that was interrupted.
 Edited files
-    Snakemake checks only the time of a job's output folder. So each job records in ``logs/written/`` a digest of the
-    names, sizes and times of its files, and how often it was repeated because they differed:
+    Snakemake does not repeat a job whose output was edited. So each job records in ``logs/written/`` a digest of what
+    it wrote, and how often it was repeated because that differed:
     ``{"again": 0, "files": {"": "5f70bf18..."}}``. ``again`` is part of the settings of the job, so a larger number
     makes Snakemake repeat it. A folder without a record is accepted.
 """
@@ -27,13 +27,14 @@ from typing import IO, TYPE_CHECKING
 
 from pipeline.errors import PipelineError
 from pipeline.files import exchange, flush_file_system, write_atomically
+from pipeline.pack import directory_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
 PUBLISHED = (
-    "calibrations", "validations", "diagnoses", "reports", "certificates", "exports", "combined",
+    "calibrations", "validations", "diagnoses", "reports", "certificates", "exports", "combined", "packs",
     "index.html", "summary.csv", "failures.json", "parameters.parquet", "fleet.json",
 )  # fmt: skip
 RUN_LOCK, JOBS_LOCK = ".run.lock", ".jobs.lock"
@@ -152,14 +153,18 @@ def _record(results: Path, output: str) -> Path:
 
 
 def _digest(path: Path) -> str:
-    """Return a digest of the names, sizes and times of a file, or of all files below a folder."""
+    """Return a digest of the names, sizes and times of a file, or of all files below a folder.
+
+    Snakemake sets the time of a pack after its job: the checksums of its members stand for it.
+    """
     files = [f"{folder}/{name}" for folder, _, names in os.walk(path) for name in names]
     lines = []
     for file in files if path.is_dir() else [str(path)]:
         if not file.endswith(SNAKEMAKE_TIMESTAMP):
             try:
                 found = os.lstat(file)
-                state = f"{found.st_size}\0{found.st_mtime_ns}"
+                last = directory_of(file) if file.endswith(".zip") else found.st_mtime_ns
+                state = f"{found.st_size}\0{last}"
             except FileNotFoundError:
                 state = "absent"
             lines.append(f"{file}\0{state}")

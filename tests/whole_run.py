@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from pipeline.config import load_campaign, settings_file
+from pipeline.config import load_campaign, settings_of_jobs
 from pipeline.model.effects import forget
 from pipeline.results_folder import HELD
 from pipeline.stages import batch, verdict
@@ -13,53 +13,43 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from pipeline.config.campaign import Campaign
-    from pipeline.config.stage_settings import SettingsFile
 
 
-def settings_of_jobs(campaign: Campaign) -> dict[str, SettingsFile]:
-    """Return the settings file of each job, by rule, batch, sensor and stage, in an order in which the jobs can run."""
-    files = {}
-    for name, units in campaign.batches.items():
-        for stage in ("ingest", "filter"):
-            files[f"{stage}/{name}"] = settings_file(campaign, stage, units)
-        for sensor, chain in campaign.chains[name].items():
-            for stage in chain:
-                kind = stage if stage == "effects" else f"fit-{stage}"
-                files[f"fit/{name}/{sensor}/{stage}"] = settings_file(campaign, kind, units, sensor)
-        for stage in ("validate", "diagnose", "calibration", "export", "report"):
-            files[f"{stage}/{name}"] = settings_file(campaign, stage, units)
-    files["gather"] = settings_file(campaign, "gather", list(campaign.units))
-    return files
+def settings_names(campaign: Campaign) -> dict[str, str]:
+    """Return the name of the settings file of each job, by batch and by what it writes."""
+    jobs = settings_of_jobs(campaign)
+    return {f"{batch}/{output}": file.name for batch, files in jobs.items() for output, file in files.items()}
 
 
 def run_jobs(campaign: Campaign) -> int:
     """Run all jobs of a campaign and return the exit code of the run."""
-    batches = campaign.results / "batches"
-    for job, file in settings_of_jobs(campaign).items():
-        stage, _, place = job.partition("/")
-        name, _, fit = place.partition("/")
-        folder = batches / name
-        output, options = folder / stage, []
-        inputs = {of: folder / of for of in batch.INPUTS[stage] if of not in batch.FITS}
-        for sensor in set(batch.INPUTS[stage]) & set(batch.FITS):
-            inputs[sensor] = folder / "fit" / sensor / campaign.chains[name][sensor][-1]
-        if stage == "fit":
-            sensor, _, last = fit.partition("/")
-            chain = campaign.chains[name][sensor]
-            earlier = chain[: chain.index(last)]
-            previous = folder / "fit" / sensor / earlier[-1] if earlier else ""
-            output = folder / "fit" / fit
-            options = ["--sensor", sensor, "--stage", last, f"--previous={previous}"]
-            options += ["--last", "yes" if last == chain[-1] else "no"]
-        if stage == "gather":
-            output = batches / "gathered.json"
-        given = [word for of, path in inputs.items() for word in (f"--{of}", str(path))]
-        try:
-            assert batch.main(stage, ["--config", file.write(), *given, *options, "--output", str(output)]) == 0
-        finally:
-            forget()  # a job is a process of its own
-            while HELD:
-                HELD.pop().close()
+    batches, configs = campaign.results / "batches", campaign.results / "configs"
+    configs.mkdir(parents=True, exist_ok=True)
+    order = list(batch.INPUTS)
+    for name, files in settings_of_jobs(campaign).items():
+        for output in sorted(files, key=lambda output: order.index(output.partition("/")[0])):
+            (configs / files[output].name).write_bytes(files[output].content)
+            stage, sensor, last = [*output.split("/"), "", ""][:3]
+            folder = batches / name
+            inputs = {of: folder / f"{of}.zip" for of in batch.INPUTS[stage] if of not in batch.FITS}
+            for each in set(batch.INPUTS[stage]) & set(batch.FITS):
+                inputs[each] = folder / "fit" / each / f"{campaign.chains[name][each][-1]}.zip"
+            options = []
+            if stage == "fit":
+                chain = campaign.chains[name][sensor]
+                earlier = chain[: chain.index(last)]
+                previous = folder / "fit" / sensor / f"{earlier[-1]}.zip" if earlier else ""
+                options = ["--sensor", sensor, "--stage", last, f"--previous={previous}"]
+                options += ["--last", "yes" if last == chain[-1] else "no"]
+            target = batches / "gathered.json" if stage == "gather" else folder / f"{output}.zip"
+            given = [word for of, path in inputs.items() for word in (f"--{of}", str(path))]
+            try:
+                settings = ["--config", str(configs / files[output].name)]
+                assert batch.main(stage, [*settings, *given, *options, "--output", str(target)]) == 0
+            finally:
+                forget()  # a job is a process of its own
+                while HELD:
+                    HELD.pop().close()
     mark, failures = campaign.results / "complete.json", batches / "gathered.json"
     return verdict.main(["--results", str(campaign.results), "--output", str(mark), "--failures", str(failures)])
 

@@ -18,6 +18,7 @@ from pipeline.files import read_json
 from pipeline.history import read_history
 from pipeline.model.plausible import sentences
 from pipeline.outcome import Finding, commands_of, next_commands, read_summary, verdict_lines
+from pipeline.published import PACKS
 from pipeline.records import SENSORS
 
 if TYPE_CHECKING:
@@ -96,7 +97,9 @@ def find(campaign: str, units: Sequence[str], results: Path) -> Selection:
     if absent:
         known = ", ".join(sorted([*files, *failures])[:12])
         raise MissingInputError(
-            f"no diagnosis of unit {', '.join(absent)}; there are those of {known}", str(folder / "diagnoses")
+            f"no diagnosis of unit {', '.join(absent)}; there are those of {known or 'no unit'}"
+            + " (python -m pipeline unpack publishes others)" * any((folder / PACKS).glob("*")),
+            str(folder / "diagnoses"),
         )
     diagnoses = {unit: _json(file) for unit, file in files.items() if not units or unit in units}
     for unit, document in diagnoses.items():

@@ -69,6 +69,8 @@ class Campaign:
         A page that the campaign asks for beside its own.
     combine : str or None
         ``serial``: a joint estimate of units that share a serial.
+    publish_limit : int
+        Up to how many units each has published files of its own.
     """
 
     name: str
@@ -82,6 +84,7 @@ class Campaign:
     settings: Mapping[str, Any]
     page: str | None
     combine: str | None = None
+    publish_limit: int = 0
 
     @property
     def recorded(self) -> Path:
@@ -141,13 +144,13 @@ def load_campaign(settings: Mapping[str, Any]) -> Campaign:
                 problems.setdefault(line, []).append(name)
     if problems:
         raise ConfigurationError(_one_message(problems), str(directory / "units.csv"))
-    batches, chains = cut_batches(units, _batch_size(layers.of_run))
+    batches, chains = cut_batches(units, _count("batch_size", layers.of_run, 1, "auto or "))
     results = Path(str(settings.get("results", "results"))) / directory.name
     compare = resolve_comparisons(layers.campaign.compare, units, str(directory / "campaign.yaml"))
     page, simulation = layers.campaign.page, layers.simulation
-    combine = _combine(layers.of_run)
+    combine, limit = _combine(layers.of_run), _count("publish_limit", layers.of_run, 0)
     return Campaign(
-        directory.name, directory, results, units, batches, chains, compare, simulation, settings, page, combine
+        directory.name, directory, results, units, batches, chains, compare, simulation, settings, page, combine, limit
     )
 
 
@@ -187,14 +190,14 @@ def _combine(overrides: Sequence[str]) -> str | None:
     return "serial" if combine else None
 
 
-def _batch_size(overrides: Sequence[str]) -> int | None:
-    """Return the batch size that the run's overrides ask for, None for ``auto``."""
-    size = _of_run("batch_size", overrides)
-    if size == "auto":
+def _count(name: str, overrides: Sequence[str], least: int, words: str = "") -> Any:  # noqa: ANN401
+    """Return a whole number among the settings of the run, None for ``auto``."""
+    count = _of_run(name, overrides)
+    if words and count == "auto":
         return None
-    if not isinstance(size, int) or isinstance(size, bool) or size < 1:
-        raise ConfigurationError(f"batch_size={size}: auto or a whole number from 1 on is expected")
-    return size
+    if not isinstance(count, int) or isinstance(count, bool) or count < least:
+        raise ConfigurationError(f"{name}={count}: {words}a whole number from {least} on is expected")
+    return count
 
 
 def cut_batches(

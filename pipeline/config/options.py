@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 GROUPS = ("sensor", "table", "procedure", "method", "filter", "ingest", "certificate")
-RUN_SETTINGS = ("batch_size", "combine")
+RUN_SETTINGS = ("batch_size", "combine", "publish_limit")
 LARGEST_CONFIG = 10_000  # values of a group's option; the largest that ships has 160
 NUMBER = re.compile(r"([a-z_][a-z_0-9]*(?:\.[A-Za-z_][A-Za-z_0-9]*)*)=(-?(?:0|[1-9][0-9]*)(\.[0-9]+)?)")
 TOKEN = re.compile(r"(\\\$\{)|\$\{\s*([A-Za-z_]\w*(?:\.\w+)+)\s*\}|\$\{")

@@ -1,9 +1,9 @@
 """What decides whether a job is done again: the settings that its stage reads, and the code that it runs.
 
-A job reads no settings but those of a file named after its content, and that name is a parameter of its rule: a changed
-setting reruns exactly the stages that read it. Settings that all units of a batch share stand in the file once, under
-``common``. Snakemake sees the shell command of a rule, not the package that it calls, so a digest of the code is a
-parameter too.
+A job reads no settings but those of a file named after its content, which is an input of its rule: a changed setting
+reruns exactly the stages that read it. Settings that all units of a batch share stand there once, under ``common``.
+Snakemake sees the shell command of a rule, not the package that it calls, so a digest of the code is a parameter of the
+rule.
 """
 
 from __future__ import annotations
@@ -11,21 +11,22 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pipeline.config.schema import OF_BENCH
 from pipeline.config.user_effects import effects_for
-from pipeline.files import CONFIGS, write_atomically
+from pipeline.files import CONFIGS
+from pipeline.io.files import recording_files
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
-    from pipeline.config.campaign import Campaign
+    from pipeline.config.campaign import Campaign, UnitRow
 
 PACKAGE = Path(__file__).resolve().parents[1]
+CAMPAIGN = "campaign"  # no batch: their names end in a number
 EFFECTS = CONFIGS / "effect"  # what pipeline.model.effects reads
 # An import of the package, or of jinja2: module and names, or module alone. ``ast`` takes 0.5 s for all files.
 IMPORT = re.compile(
@@ -121,50 +122,68 @@ def _paths(stage: str, sensor: str) -> list[list[str]]:
     return [key.format(sensor=sensor).split(".") for key in READS.get(stage, FIT)]
 
 
-@dataclass(frozen=True)
-class SettingsFile:
-    """The settings of some units that a stage reads, as a file that is named after its content."""
+class SettingsFile(NamedTuple):
+    """The settings of a job: a file that is named after its content."""
 
-    path: Path
+    name: str
     content: bytes
 
-    def write(self) -> str:
-        """Write the file, unless it is there unchanged; return its path."""
-        if not self.path.is_file() or self.path.read_bytes() != self.content:
-            write_atomically(self.path, self.content)
-        return str(self.path)
 
+def settings_of_jobs(
+    campaign: Campaign, again: Callable[[str], int] = lambda _: 0
+) -> dict[str, dict[str, SettingsFile]]:
+    """Return the settings of every job, by batch and by what it writes: ``fit/gyroscope/bias``.
 
-def settings_file(
-    campaign: Campaign, stage: str, units: Sequence[str], sensor: str = "", again: int = 0
-) -> SettingsFile:
-    """Return the file with the settings of some units that a stage, of a fit of a sensor, reads.
-
-    ``again`` is how often the job is repeated because its output was edited (``pipeline.results_folder``).
+    Those of ``gather`` are of the batch ``CAMPAIGN``. ``again`` is how often an output, by its path below the results,
+    is repeated because it was edited (``pipeline.results_folder``).
     """
-    if stage == "gather":
-        content = _of_gather(campaign)
-    else:
-        rows = [campaign.units[u] for u in units]
-        digests = [{"config_sha256": r.config_sha256} if stage in WITH_DIGEST else {} for r in rows]
-        settings = {r.name: select_settings(r.config | d, stage, sensor) for r, d in zip(rows, digests, strict=True)}
-        if stage == "report":
-            for unit, each in settings.items():
-                row = campaign.units[unit].row
-                each["row"] = {c: row[c] for c in ("serial", "lot", "date") if row.get(c)}
-                each["run"] = campaign.run_settings(unit)
-        content = dict(zip(("common", "units"), in_common(settings), strict=True))
-        content |= effects_for(stage, sensor, [r.config for r in rows])
+    found: dict[str, dict[str, SettingsFile]] = {}
+    for batch, units in campaign.batches.items():
+        rows = [campaign.units[unit] for unit in units]
+        fits = [(s, stage) for s in BOTH for stage in campaign.chains[batch][s]]
+        outputs = {f"fit/{s}/{stage}": (stage if stage == "effects" else "fit", s) for s, stage in fits}
+        outputs |= {stage: (stage, "") for stage in READS if stage not in ("fit", "effects")}
+        found[batch] = {
+            output: _file(output, _content(campaign, rows, *of), again(f"batches/{batch}/{output}.zip"))
+            for output, of in outputs.items()
+        }
+    found[CAMPAIGN] = {"gather": _file("gather", _of_gather(campaign), again(""))}
+    return found
+
+
+def _file(output: str, content: dict[str, Any], again: int) -> SettingsFile:
+    text = _canonical(content | ({"again": again} if again else {}))
+    return SettingsFile(f"{output.replace('/', '-')}-{hashlib.sha256(text).hexdigest()[:16]}.json", text)
+
+
+def _content(campaign: Campaign, rows: Sequence[UnitRow], stage: str, sensor: str) -> dict[str, Any]:
+    """Return the settings of some units that a stage, of a fit of a sensor, reads."""
+    digests = [{"config_sha256": r.config_sha256} if stage in WITH_DIGEST else {} for r in rows]
+    settings = {r.name: select_settings(r.config | d, stage, sensor) for r, d in zip(rows, digests, strict=True)}
+    if stage == "report":
+        for row in rows:
+            own = {c: row.row[c] for c in ("serial", "lot", "date") if row.row.get(c)}
+            settings[row.name] |= {"row": own, "run": campaign.run_settings(row.name)}
+    content: dict[str, Any] = dict(zip(("common", "units"), in_common(settings), strict=True))
+    content |= effects_for(stage, sensor, [r.config for r in rows])
     if stage in ("ingest", "report"):
         content["campaign"] = campaign.name
     if stage == "ingest":
-        content["directory"] = str(campaign.recorded)
-    if again:
-        content["again"] = again
-    text = _canonical(content)
-    name = f"{stage}-{sensor}" if sensor else stage
-    path = campaign.results / "configs" / f"{name}-{hashlib.sha256(text).hexdigest()[:16]}.json"
-    return SettingsFile(path, text)
+        content |= {"directory": str(campaign.recorded), "recordings": _recordings(campaign, rows)}
+    return content
+
+
+def _recordings(campaign: Campaign, rows: Sequence[UnitRow]) -> str | None:
+    """Return a digest of the names, sizes and times of the recordings; None where the run makes them."""
+    if campaign.simulation:
+        return None
+    digest = hashlib.sha256()
+    for row in rows:
+        files = recording_files(row.config["procedure"], row.config["ingest"], campaign.folder(row.name))
+        for path in sorted({path for paths in files.values() for path in paths}):
+            found = path.stat()
+            digest.update(f"{path}\0{found.st_size}\0{found.st_mtime_ns}\0".encode())
+    return digest.hexdigest()[:16]
 
 
 def in_common(settings: Mapping[str, dict[str, Any]]) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
@@ -201,6 +220,7 @@ def _of_gather(campaign: Campaign) -> dict[str, Any]:
         "compare": campaign.compare,
         "page": campaign.page,
         "combine": campaign.combine,
+        "publish_limit": campaign.publish_limit,
         "truths": {u: str(campaign.truth(u)) for u in sorted(compared)},
         "common": common,
         "units": own,

@@ -26,7 +26,6 @@ from jinja2 import Environment, StrictUndefined, Template
 from pipeline.exports.c_effects import plan_of
 from pipeline.exports.noise import noise_remarks
 from pipeline.exports.sensors import FUNCTIONS, ExportedSensor, before_use, final_errors, plain
-from pipeline.files import write_atomically
 from pipeline.records import SENSORS, SensorCalibration
 
 JSON = dict[str, Any]
@@ -103,7 +102,7 @@ def formats() -> dict[str, tuple[Format, Template]]:
 
 @dataclass(frozen=True)
 class Subject:
-    """A unit to export: its documents, as in ``export_all``, and what several formats need of them."""
+    """A unit to export: its documents, as in ``exports``, and what several formats need of them."""
 
     document: JSON
     settings: JSON
@@ -127,20 +126,16 @@ class Subject:
         return {s: ExportedSensor(c, units[s], sheets.get(s) or {}) for s, c in self.calibrations.items() if s in units}
 
 
-def export_all(
-    calibration: JSON, settings: JSON, folder: Path, validation: JSON | None = None, diagnosis: JSON | None = None
-) -> list[Path]:
-    """Write a calibration in every format into a folder; return what was written.
+def exports(
+    calibration: JSON, settings: JSON, validation: JSON | None = None, diagnosis: JSON | None = None
+) -> dict[str, str]:
+    """Return the texts of a calibration in every format, by file.
 
     ``calibration, validation, diagnosis``: as in the published files of the unit; ``settings``: the sections ``sensor``
     and ``table`` of its configuration.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     subject = Subject(calibration, settings, validation, diagnosis)
-    texts = {file: text for name in formats() for file, text in export(name, subject).items()}
-    for file, text in texts.items():
-        write_atomically(folder / file, text)
-    return [folder / file for file in texts]
+    return {file: text for name in formats() for file, text in export(name, subject).items()}
 
 
 def export(name: str, subject: Subject) -> dict[str, str]:

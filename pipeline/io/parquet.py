@@ -10,7 +10,6 @@ bytes.
 from __future__ import annotations
 
 import json
-import os
 import zlib
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -28,7 +27,6 @@ from pipeline.records import Encoding, Note, Recording
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
-    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -41,8 +39,8 @@ COLUMNS = ("time_ns", *CHANNELS, "flags")
 PAGE_ENCODINGS = {"f": "BYTE_STREAM_SPLIT", "i": "DELTA_BINARY_PACKED", "u": "PLAIN"}
 
 
-def save_recordings(path: Path, recordings: Sequence[Recording]) -> None:
-    """Write the recordings of a unit; the file is replaced at once, never half written."""
+def to_parquet(recordings: Sequence[Recording]) -> bytes:
+    """Return the recordings of a unit as a Parquet file."""
     stored = [columns_of(r) for r in recordings]
     counts = _encode_counts(recordings, stored)
     names = [c for c in COLUMNS if any(c in s for s in stored)] or ["time_ns"]
@@ -51,9 +49,9 @@ def save_recordings(path: Path, recordings: Sequence[Recording]) -> None:
     schema = pa.schema(
         [(n, pa.from_numpy_dtype(types[n])) for n in names], metadata=_metadata(recordings, stored, counts)
     )
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    sink = pa.BufferOutputStream()
     with parquet.ParquetWriter(
-        temporary,
+        sink,
         schema,
         compression="lz4",
         use_dictionary=False,
@@ -69,16 +67,16 @@ def save_recordings(path: Path, recordings: Sequence[Recording]) -> None:
             for r, columns in zip(recordings, stored, strict=True)
         ]
         writer.write_table(pa.concat_tables(tables) if tables else schema.empty_table(), row_group_size=ROW_GROUP)
-    temporary.replace(path)
+    return sink.getvalue().to_pybytes()  # type: ignore[no-any-return]
 
 
-def load_recordings(path: Path) -> list[Recording]:
-    """Read the recordings of a unit, each bit as it was saved.
+def from_parquet(content: bytes, name: str) -> list[Recording]:
+    """Return the recordings of a unit, each bit as it was saved; errors have the name.
 
     The times are read at once, every other channel when it is used first: a stage decodes what it needs, once. Damage
     raises ``InputError``, here or then.
     """
-    stored = _StoredColumns(path)
+    stored = _StoredColumns(content, name)
     recordings: list[Recording] = []
     start = 0
     for entry in stored.entries:
@@ -92,11 +90,13 @@ def load_recordings(path: Path) -> list[Recording]:
 class _StoredColumns:
     """The columns of a file, each decoded once for all recordings."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = str(path)
+    def __init__(self, content: bytes, path: str) -> None:
+        self.path = path
         with self._guarded():
             # a file of some MB is read fastest by the thread that needs it
-            self._file = parquet.ParquetFile(path, page_checksum_verification=True, pre_buffer=False)
+            self._file = parquet.ParquetFile(
+                pa.BufferReader(content), page_checksum_verification=True, pre_buffer=False
+            )
             metadata, self.rows = self._file.schema_arrow.metadata or {}, self._file.metadata.num_rows
         self._columns: dict[str, Any] = {}
         text = metadata.get(KEY)

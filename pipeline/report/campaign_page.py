@@ -41,6 +41,7 @@ def render(
     placed: Mapping[str, Mapping[str, Placed]] | None = None,
     history: JSON | None = None,
     settings: JSON | None = None,
+    packed: bool = False,
 ) -> str:
     """Return ``index.html``.
 
@@ -48,7 +49,8 @@ def render(
     message, file`` of each failed unit; ``comparisons``: as of ``comparison_section.section``; ``page``: name of a
     further page; ``twins``: files of several units with the same content under different names; ``statistics``: as of
     ``fleet_statistics``; ``placed``: unit to its parameters, as of ``against_limits``; ``history``: as of
-    ``runs_data``; ``settings``: of the run, for the commands to continue with.
+    ``runs_data``; ``settings``: of the run, for the commands to continue with; ``packed``:
+    whether the pages of the units are published on request only.
     """
     findings = findings_of(rows)
     frame = pd.DataFrame(rows).reindex(columns=list(dict.fromkeys([*COLUMNS, *(k for row in rows for k in row)])))
@@ -57,6 +59,7 @@ def render(
     strip = strips(rows, placed or {})
     text: str = template("campaign.html").render(
         campaign=campaign,
+        packed=packed,
         rows=rows,
         failures=failures,
         twins=twins,

@@ -1,14 +1,12 @@
 """Runs a stage on a batch of units, one after the other; a unit that fails does not stop the others.
 
-A failed unit leaves ``<unit>.failed.json`` in the stage's folder. The stages after it copy the file, and ``verdict``
-turns it into the exit code. All files are complete or absent, and on the disk when the job ends.
+A job reads and writes one file for each stage, a ``pipeline.pack``. A failed unit has ``<unit>.failed.json`` in it. The
+stages after it copy that, and ``verdict`` turns it into the exit code.
 """
 
 from __future__ import annotations
 
 import argparse
-import os
-import shutil
 import sys
 import traceback
 from contextlib import suppress
@@ -18,24 +16,25 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import DamagedFileError, PipelineError
-from pipeline.files import flushed_together, read_json, write_json
+from pipeline.files import read_json
+from pipeline.pack import Files, Pack, as_bytes, new_pack
+from pipeline.published import FAILED
 from pipeline.results_folder import hold_as_job, record_written
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from types import ModuleType
 
-FAILED = ".failed.json"
 FITS = ("accelerometer", "gyroscope")
-INPUTS: dict[str, tuple[str, ...]] = {  # stage: the stages whose folders it reads
+INPUTS: dict[str, tuple[str, ...]] = {  # stage: the stages whose packs it reads
     "ingest": (),
     "filter": ("ingest",),
-    "fit": ("filter",),
-    "validate": ("filter", *FITS),
-    "diagnose": ("filter", *FITS, "validate"),
+    "fit": ("ingest", "filter"),
+    "validate": ("ingest", "filter", *FITS),
+    "diagnose": ("ingest", "filter", *FITS, "validate"),
     "calibration": ("ingest", *FITS, "validate"),
     "export": ("calibration", "validate", "diagnose"),
-    "report": ("filter", "calibration", "validate", "diagnose", "export"),
+    "report": ("ingest", "filter", "calibration", "validate", "diagnose", "export"),
     "gather": (),
 }
 OPTIONS = {"fit": ("sensor", "stage", "previous", "last")}
@@ -51,10 +50,10 @@ class Job:
         Unit to its settings.
     run : dict
         Settings that are not a unit's, and the options of the command line.
-    inputs : dict of str to Path
-        Stage to its folder.
+    inputs : dict of str to Pack
+        Stage to the files that it wrote.
     output : Path
-        Folder, or file, to write.
+        File to write.
     results : Path
         Of the campaign.
     """
@@ -62,7 +61,7 @@ class Job:
     stage: str
     units: dict[str, dict[str, Any]]
     run: dict[str, Any]
-    inputs: dict[str, Path]
+    inputs: dict[str, Pack]
     output: Path
     results: Path
 
@@ -70,7 +69,8 @@ class Job:
 def main(stage: str, argv: Sequence[str]) -> int:
     """Run a stage: ``process_unit(job, unit, settings)`` of its module for each unit, or its ``process_batch(job)``.
 
-    A module may have ``process_failed(job, unit, settings, failure)`` for units that failed, here or in a stage before.
+    ``process_unit`` returns the files of the unit. A module may have ``process_failed(job, unit, settings, failure)``,
+    which returns those of a unit that failed, here or in a stage before.
     Returns 0 even if units have failed: their failures are part of the output.
     """
     module = import_module(f"pipeline.stages.{stage}")
@@ -78,29 +78,21 @@ def main(stage: str, argv: Sequence[str]) -> int:
     if hasattr(module, "process_batch"):
         module.process_batch(job)
         return 0
-    job.output.mkdir(parents=True, exist_ok=True)
-    with flushed_together(job.output):
+    with new_pack(job.output) as add:
         for number, (unit, settings) in enumerate(job.units.items(), 1):
             print(f"{stage}: {unit} ({number} of {len(job.units)})", file=sys.stderr, flush=True)
-            failed = job.output / f"{unit}{FAILED}"
-            earlier = [f for f in (folder / failed.name for folder in job.inputs.values()) if f.is_file()]
-            if earlier:
-                shutil.copyfile(earlier[0], failed)
-            else:
-                _run_unit(module, job, unit, settings)
-            if hasattr(module, "process_failed") and failed.is_file():
-                module.process_failed(job, unit, settings, read_json(failed))
+            add(_files_of(module, job, unit, settings))
     record_output(job, job.output)
     return 0
 
 
 def parse_job(stage: str, argv: Sequence[str]) -> Job:
-    """Read a stage's command line: ``--config SETTINGS.json --output DIR``, a folder for each input, and options."""
+    """Read a stage's command line: ``--config SETTINGS --output FILE``, a pack for each input, and options."""
     parser = argparse.ArgumentParser(prog=f"python -m pipeline {stage}", description=f"The stage {stage} on a batch.")
     parser.add_argument("--config", type=Path, required=True, help="the stage's settings (JSON)")
-    parser.add_argument("--output", type=Path, required=True, help="folder or file to write")
+    parser.add_argument("--output", type=Path, required=True, help="file to write")
     for name in INPUTS[stage]:
-        parser.add_argument(f"--{name}", type=Path, required=True, help=f"folder of the stage {name}")
+        parser.add_argument(f"--{name}", type=Path, required=True, help=f"pack of the stage {name}")
     for name in OPTIONS.get(stage, ()):
         parser.add_argument(f"--{name}", default="", help=f"{name} of this stage")
     arguments = vars(parser.parse_args(argv))
@@ -113,7 +105,7 @@ def parse_job(stage: str, argv: Sequence[str]) -> Job:
 
         register_user_effects(content["user_effects"])
     units, output = content.pop("units"), arguments.pop("output")
-    inputs = {name: arguments.pop(name) for name in INPUTS[stage]}
+    inputs = {name: Pack(arguments.pop(name)) for name in INPUTS[stage]}
     return Job(stage, units, content | arguments, inputs, output, results)
 
 
@@ -148,21 +140,26 @@ def failure_of(error: Exception, unit: str, stage: str) -> dict[str, Any]:
     return {"unit": unit, "stage": stage, "code": code, "message": message, "file": file}
 
 
-def _run_unit(module: ModuleType, job: Job, unit: str, settings: dict[str, Any]) -> None:
+def _files_of(module: ModuleType, job: Job, unit: str, settings: dict[str, Any]) -> dict[str, bytes]:
+    """Return the files of a unit; one that failed, here or in a stage before, has the record of its failure."""
+    name = unit + FAILED
     try:
-        module.process_unit(job, unit, settings)
+        earlier = next((pack for pack in job.inputs.values() if name in pack), None)
+        if not earlier:
+            return _encoded(module.process_unit(job, unit, settings))
+        failure = earlier.json(name)
     except Exception as error:
-        if isinstance(error, OSError):
-            name = error.filename
-            if name is None or Path(str(name)).is_relative_to(job.output):
-                raise  # a full disk or a folder that cannot be written concerns the run, not the unit
+        if isinstance(error, OSError) and error.filename is None:
+            raise  # a full disk concerns the run, not the unit
         if isinstance(error, DamagedFileError):
-            with suppress(OSError):
-                os.utime(str(error.file))  # the next run sees that the file is not as it was written
-        for leftover in job.output.glob(f"{unit}.*"):
-            if leftover.stem == unit and leftover.is_file():
-                leftover.unlink()
+            with suppress(OSError), Path(str(error.file)).open("ab") as stream:
+                stream.write(b"\0")  # another size: the next run sees that the file is not as it was written
         stage = "/".join([job.stage, *(str(job.run[k]) for k in ("sensor", "stage") if job.run.get(k))])
         failure = failure_of(error, unit, stage)
-        write_json(job.output / f"{unit}{FAILED}", failure)
         print(f"{stage}: {unit} FAILED: {failure['message']}", file=sys.stderr, flush=True)
+    files = module.process_failed(job, unit, settings, failure) if hasattr(module, "process_failed") else {}
+    return _encoded({name: failure} | files)
+
+
+def _encoded(files: Files) -> dict[str, bytes]:
+    return {name: as_bytes(content) for name, content in files.items()}

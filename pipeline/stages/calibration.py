@@ -16,25 +16,25 @@ import numpy as np
 from pipeline import __version__
 from pipeline.errors import CannotCalibrateError
 from pipeline.estimation.noise_identification import identify_noise
-from pipeline.files import read_json, write_json
 from pipeline.io.channel_table import axis_maps
-from pipeline.io.parquet import load_recordings
 from pipeline.model.plausible import implausible
 from pipeline.records import SENSORS
+from pipeline.stages.unit_files import recordings_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from pipeline.pack import Files
     from pipeline.records import Recording
     from pipeline.stages.batch import Job
 
 LIBRARIES = ("numpy", "scipy", "pyarrow", "mcap")
 
 
-def process_unit(job: Job, unit: str, settings: dict[str, Any]) -> None:
-    """Write the calibration document of a unit; raises ``CannotCalibrateError`` if no sensor is calibrated."""
-    fits = {sensor: read_json(job.inputs[sensor] / f"{unit}.json") for sensor in SENSORS}
-    validation = read_json(job.inputs["validate"] / f"{unit}.json")
+def process_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
+    """Return the calibration document of a unit; raises ``CannotCalibrateError`` if no sensor is calibrated."""
+    fits = {sensor: job.inputs[sensor].json(f"{unit}.json") for sensor in SENSORS}
+    validation = job.inputs["validate"].json(f"{unit}.json")
     reasons = {s: f["not_calibrated"] for s, f in fits.items() if "not_calibrated" in f}
     if not settings["method"]["as_printed"]:  # printed errata are shown as they are; the verdict is left_by_method
         fitted = {s: validation[s] for s in SENSORS if s not in reasons}
@@ -43,7 +43,7 @@ def process_unit(job: Job, unit: str, settings: dict[str, Any]) -> None:
         told = "; ".join(f"{sensor}: {reason}" for sensor, reason in reasons.items())
         raise CannotCalibrateError(f"no sensor could be calibrated. {told}")
     axes = {s: list(m) for s, m in axis_maps(settings["sensor"]).items()}
-    recordings = load_recordings(job.inputs["ingest"] / f"{unit}.parquet")
+    recordings = recordings_of({"ingest": job.inputs["ingest"]}, unit)
     document = header(unit, settings) | {
         "status": "ok",
         "error": None,
@@ -55,7 +55,7 @@ def process_unit(job: Job, unit: str, settings: dict[str, Any]) -> None:
     }
     for sensor, fit in fits.items():
         document[sensor] = None if sensor in reasons else judged(sensor, fit, settings["sensor"][sensor])
-    write_json(job.output / f"{unit}.json", document)
+    return {f"{unit}.json": document}
 
 
 def calibrated_range(recordings: Sequence[Recording]) -> dict[str, Any]:

@@ -7,21 +7,21 @@ from typing import TYPE_CHECKING, Any
 from pipeline.diagnosis.diagnose import diagnose
 from pipeline.diagnosis.effective_noise import effective_noise
 from pipeline.diagnosis.formula_discovery import effect_file
-from pipeline.files import read_json, write_atomically, write_json
-from pipeline.io.parquet import load_recordings
-from pipeline.stages.unit_files import load_fits, require_noises
+from pipeline.stages.unit_files import load_fits, recordings_of, require_noises
 
 if TYPE_CHECKING:
+    from pipeline.pack import Files
     from pipeline.stages.batch import Job
 
 
-def process_unit(job: Job, unit: str, settings: dict[str, Any]) -> None:
+def process_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
     """Diagnose both sensors; an effect suggested for unknown physics is written as a file of its own."""
-    recordings = load_recordings(job.inputs["filter"] / f"{unit}.parquet")
+    recordings = recordings_of(job.inputs, unit)
     fits = load_fits(job.inputs, unit)
     noises = require_noises(job.inputs["filter"], unit, recordings, settings["sensor"], fits)
-    validation = read_json(job.inputs["validate"] / f"{unit}.json")
+    validation = job.inputs["validate"].json(f"{unit}.json")
     document: dict[str, Any] = {"schema_version": 1, "unit": unit}
+    files: Files = {f"{unit}.json": document}
     for sensor, calibration in fits.items():
         document[sensor] = found = calibration and diagnose(
             calibration,
@@ -40,5 +40,5 @@ def process_unit(job: Job, unit: str, settings: dict[str, Any]) -> None:
             )
         if found and found.get("suggested_effect"):
             found["suggested_file"] = f"{unit}_{sensor}_unknown.yaml"
-            write_atomically(job.output / found["suggested_file"], effect_file(found["suggested_effect"], unit))
-    write_json(job.output / f"{unit}.json", document)
+            files[found["suggested_file"]] = effect_file(found["suggested_effect"], unit)
+    return files

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from pipeline.exports import export_all
-from pipeline.files import read_json
+from pipeline.exports import exports
 
 if TYPE_CHECKING:
+    from pipeline.pack import Files
     from pipeline.stages.batch import Job
 
 
-def process_unit(job: Job, unit: str, settings: dict[str, Any]) -> None:
-    """Write every format into the unit's folder."""
+def process_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
+    """Return the files of every format."""
     stages = ("calibration", "validate", "diagnose")
-    calibration, validation, diagnosis = (read_json(job.inputs[stage] / f"{unit}.json") for stage in stages)
-    export_all(calibration, settings, job.output / unit, validation, diagnosis)
+    calibration, validation, diagnosis = (job.inputs[stage].json(f"{unit}.json") for stage in stages)
+    written = exports(calibration, settings, validation, diagnosis)
+    return {f"{unit}/{file}": text for file, text in written.items()}

@@ -6,17 +6,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.io.parquet import save_recordings
+from pipeline.io.parquet import to_parquet
 from pipeline.io.read import read_recordings
 from pipeline.preprocessing.checks import check_recordings
 from pipeline.signal.hand_turns import held_out_windows
 from pipeline.signal.segments import cut
 
 if TYPE_CHECKING:
+    from pipeline.pack import Files
     from pipeline.stages.batch import Job
 
 
-def process_unit(job: Job, unit: str, settings: dict[str, Any]) -> None:
+def process_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
     """Read, cut and check the recordings; files are named by their path below the campaign's directory."""
     directory, procedure = Path(job.run["directory"]), settings["procedure"]
     recordings = []
@@ -35,4 +36,4 @@ def process_unit(job: Job, unit: str, settings: dict[str, Any]) -> None:
         path = Path(recording.source["file"])
         file = str(path.relative_to(directory)) if path.is_relative_to(directory) else str(path)
         named.append(replace(recording, source=recording.source | {"file": file}))
-    save_recordings(job.output / f"{unit}.parquet", named)
+    return {f"{unit}.parquet": to_parquet(named)}

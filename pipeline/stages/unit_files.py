@@ -1,40 +1,47 @@
-"""Files of a unit that several stages read: the fit of each sensor and its noise."""
+"""Files of a unit that several stages read: its recordings, the fit of each sensor and its noise."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
 from pipeline.estimation.noise import estimate_noise, noise_of
-from pipeline.files import read_json, write_json
+from pipeline.io.parquet import from_parquet
 from pipeline.records import SENSORS, Noise, SensorCalibration
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-    from pathlib import Path
 
+    from pipeline.pack import Files, Pack
     from pipeline.records import Recording
 
 
-def load_fits(folders: Mapping[str, Path], unit: str) -> dict[str, SensorCalibration | None]:
+def recordings_of(packs: Mapping[str, Pack], unit: str) -> list[Recording]:
+    """Return the filtered recordings of a unit; those of ingest where there is no filter, or it has not run yet."""
+    name = f"{unit}.parquet"
+    pack = packs["filter"] if "filter" in packs and name in packs["filter"] else packs["ingest"]
+    return from_parquet(pack.read(name), str(pack.path))
+
+
+def load_fits(packs: Mapping[str, Pack], unit: str) -> dict[str, SensorCalibration | None]:
     """Return each sensor's calibration, None for one that could not be calibrated."""
-    found = {sensor: read_json(folders[sensor] / f"{unit}.json") for sensor in SENSORS}
+    found = {sensor: packs[sensor].json(f"{unit}.json") for sensor in SENSORS}
     return {s: None if "not_calibrated" in data else SensorCalibration.from_json(s, data) for s, data in found.items()}
 
 
-def save_noises(folder: Path, unit: str, recordings: list[Recording], settings: dict[str, Any]) -> None:
-    """Estimate and write the noise of each sensor, null where neither recordings nor data sheet determine it."""
+def noise_file(unit: str, recordings: list[Recording], settings: dict[str, Any]) -> Files:
+    """Return the file with the noise of each sensor, null where neither recordings nor data sheet determine it."""
     found = {sensor: noise_of(sensor, recordings, settings) for sensor in SENSORS}
-    write_json(folder / f"{unit}.noise.json", {sensor: noise and noise.to_json() for sensor, noise in found.items()})
+    return {f"{unit}.noise.json": {sensor: noise and noise.to_json() for sensor, noise in found.items()}}
 
 
-def load_noises(folder: Path, unit: str) -> dict[str, Noise | None]:
-    """Read the noise of each sensor, as ``save_noises`` wrote it."""
-    found = read_json(folder / f"{unit}.noise.json")
+def load_noises(pack: Pack, unit: str) -> dict[str, Noise | None]:
+    """Read the noise of each sensor, as ``noise_file`` returned it."""
+    found = pack.json(f"{unit}.noise.json")
     return {sensor: data and Noise.from_json(data) for sensor, data in found.items()}
 
 
 def require_noises(
-    folder: Path,
+    pack: Pack,
     unit: str,
     recordings: list[Recording],
     sheets: dict[str, dict[str, Any]],
@@ -44,5 +51,5 @@ def require_noises(
 
     Raises ``ConfigurationError`` if nothing determines it; ``estimate_noise`` names what is missing.
     """
-    found = load_noises(folder, unit)
+    found = load_noises(pack, unit)
     return {s: found[s] or estimate_noise(s, recordings, sheets[s]) for s, fit in fits.items() if fit is not None}

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from pipeline.files import write_json
-from pipeline.io.parquet import load_recordings
-from pipeline.stages.unit_files import load_fits, require_noises
+from pipeline.stages.unit_files import load_fits, recordings_of, require_noises
 from pipeline.validation.attitude import attitude, gravity_direction
 from pipeline.validation.heldout import validate
 
 if TYPE_CHECKING:
+    from pipeline.pack import Files
     from pipeline.stages.batch import Job
 
 
-def process_unit(job: Job, unit: str, settings: dict[str, Any]) -> None:
+def process_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
     """Validate both sensors, and the attitude that they give together."""
-    recordings = load_recordings(job.inputs["filter"] / f"{unit}.parquet")
+    recordings = recordings_of(job.inputs, unit)
     fits = load_fits(job.inputs, unit)
     noises = require_noises(job.inputs["filter"], unit, recordings, settings["sensor"], fits)
     document: dict[str, Any] = {"schema_version": 1, "unit": unit}
@@ -27,4 +26,4 @@ def process_unit(job: Job, unit: str, settings: dict[str, Any]) -> None:
     document["gravity_direction"] = gravity_direction(
         **fits, recordings=recordings, noise=noises.get("gyroscope"), settings=settings
     )
-    write_json(job.output / f"{unit}.json", document)
+    return {f"{unit}.json": document}

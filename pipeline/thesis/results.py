@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from pipeline.io.parquet import load_recordings
+from pipeline.pack import Pack
 from pipeline.records import Noise
+from pipeline.stages.unit_files import recordings_of
 from pipeline.validation.samples import samples_of_motion
 
 if TYPE_CHECKING:
@@ -95,8 +96,11 @@ class Results:
 
     def recordings(self, unit: str, role: str) -> list[Recording]:
         """Return the filtered recordings of a role; none where the unit failed."""
-        files = list(self.folder.glob(f"batches/*/filter/{unit}.parquet"))
-        return [r for r in load_recordings(files[0]) if r.role == role] if files else []
+        for folder in self.folder.glob("batches/*"):
+            packs = {stage: Pack(folder / f"{stage}.zip") for stage in ("ingest", "filter")}
+            if f"{unit}.noise.json" in packs["filter"]:
+                return [r for r in recordings_of(packs, unit) if r.role == role]
+        return []
 
     def with_printed(self, name: str, sensor: str, parameters: Mapping[str, float]) -> float | None:
         """Return the mean |e| that printed parameters leave on the held-out motion of a set of recordings.

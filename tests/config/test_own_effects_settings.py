@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from pipeline.config import Campaign, load_campaign
-from pipeline.config.stage_settings import settings_file
+from pipeline.config.stage_settings import settings_of_jobs
 from pipeline.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -52,8 +52,9 @@ def load(bench: Path, **settings: object) -> Campaign:
     return load_campaign({"campaign": str(bench), "results": str(bench.parent / "results"), **settings})
 
 
-def carried(campaign: Campaign, stage: str, sensor: str = "") -> tuple[list[str], int]:
-    content: dict[str, Any] = json.loads(settings_file(campaign, stage, list(campaign.units), sensor).content)
+def carried(campaign: Campaign, output: str) -> tuple[list[str], int]:
+    files = settings_of_jobs(campaign)[next(iter(campaign.batches))]
+    content: dict[str, Any] = json.loads(files[output].content)
     part = content.get("user_effects", {"formulas": [], "python": []})
     return [d["name"] for d in part["formulas"]], len(part["python"])
 
@@ -77,24 +78,23 @@ def test_a_configuration_directory_of_the_campaign_may_hold_formulas_too(bench: 
 
 
 def test_a_stage_is_given_the_effects_that_it_needs(bench: Path) -> None:
-    plain = load(bench, overrides="effects.gyroscope=[bend]", python_effects=[str(bench.parent / "mine.py")])
-    assert carried(plain, "effects", "gyroscope") == (["bend"], 0)
-    assert carried(plain, "effects", "accelerometer") == ([], 0)
-    assert carried(plain, "fit-reference_least_squares", "gyroscope") == ([], 0)
+    asked = ["effects.gyroscope=[bend]", "effects.accelerometer=[warm_up]"]
+    plain = load(bench, overrides=asked, python_effects=[str(bench.parent / "mine.py")])
+    assert carried(plain, "fit/gyroscope/effects") == (["bend"], 0)
+    assert carried(plain, "fit/accelerometer/effects") == ([], 0)
+    assert carried(plain, "fit/gyroscope/reference_least_squares") == ([], 0)
     assert carried(plain, "diagnose") == carried(plain, "report") == (["bend", "tip"], 1)
     assert carried(plain, "validate") == carried(plain, "export") == carried(plain, "filter") == ([], 0)
     auto = load(bench, unit_overrides={"U2": ["effects.gyroscope=auto"]}, python_effects=str(bench.parent / "mine.py"))
-    assert carried(auto, "effects", "gyroscope") == (["bend", "tip"], 1)
+    assert carried(auto, "fit/gyroscope/effects") == (["bend", "tip"], 1)
     assert carried(auto, "validate") == ([], 1)
 
 
 def test_a_changed_formula_or_python_file_changes_the_parts_that_hold_it(bench: Path) -> None:
     def parts() -> list[str]:
         found = load(bench, overrides="effects.gyroscope=[bend]", python_effects=[str(bench.parent / "mine.py")])
-        return [
-            settings_file(found, stage, ["U1"], s).path.name
-            for stage, s in (("effects", "gyroscope"), ("diagnose", ""))
-        ]
+        files = settings_of_jobs(found)[next(iter(found.batches))]
+        return [files[output].name for output in ("fit/gyroscope/effects", "diagnose")]
 
     before = parts()
     (bench / "effects" / "tip.yaml").write_text(TIP.replace("u**2", "u**4"))
@@ -124,7 +124,7 @@ def test_an_effect_is_refused_for_a_sensor_that_it_does_not_name(bench: Path) ->
 def test_python_comes_from_the_command_line_alone(bench: Path) -> None:
     code = bench.parent / "mine.py"
     found = load(bench, overrides="effects.gyroscope=[mine]", python_effects=[str(code)])
-    assert carried(found, "effects", "gyroscope") == ([], 1)
+    assert carried(found, "fit/gyroscope/effects") == ([], 1)
     (bench / "effects" / "evil.py").write_text("raise SystemExit(3)")
     with pytest.raises(ConfigurationError, match="no effect is called 'evil'"):
         load(bench, overrides="effects.gyroscope=[evil]")

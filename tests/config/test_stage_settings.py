@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 import pytest
-from whole_run import settings_of_jobs
+from whole_run import settings_names
 
 from pipeline.config import load_campaign
 
@@ -19,8 +19,8 @@ REFERENCE, STAGED = "reference_least_squares-0001", "staged-0001"
 def changed(directory: Path, **settings: object) -> set[str]:
     """Return the jobs whose settings differ from those of the sheet alone."""
     given = {"campaign": str(directory)}
-    before, after = (settings_of_jobs(load_campaign(given | more)) for more in ({}, settings))
-    return {job for job, file in after.items() if file.path != before[job].path}
+    before, after = (settings_names(load_campaign(given | more)) for more in ({}, settings))
+    return {job for job, name in after.items() if name != before[job]}
 
 
 @pytest.fixture
@@ -30,7 +30,7 @@ def bench(tmp_path: Path) -> Path:
 
 
 def of(batch: str, *stages: str) -> set[str]:
-    return {f"{stage}/{batch}" for stage in stages}
+    return {f"{batch}/{stage}" for stage in stages}
 
 
 # A job whose input is made again runs too: here are those that read the setting itself.
@@ -46,26 +46,26 @@ def of(batch: str, *stages: str) -> set[str]:
         (
             "A2",
             "effects.gyroscope=[bias_temperature]",
-            of(REFERENCE, "diagnose", "calibration", "report") | {f"fit/{REFERENCE}/gyroscope/effects"},
+            of(REFERENCE, "diagnose", "calibration", "report") | {f"{REFERENCE}/fit/gyroscope/effects"},
         ),
         (
             "A1",
             "sensor.gyroscope.effects.quadratic_nonlinearity=2e-4",
             of(REFERENCE, "validate", "diagnose", "calibration", "export", "report")
-            | {f"fit/{REFERENCE}/gyroscope/effects"},
+            | {f"{REFERENCE}/fit/gyroscope/effects"},
         ),
     ],
 )
 def test_a_setting_of_a_unit_concerns_the_jobs_of_its_batch_that_read_it(
     bench: Path, unit: str, override: str, expected: set[str]
 ) -> None:
-    assert changed(bench, unit_overrides={unit: [override]}) == expected | {"gather"}
+    assert changed(bench, unit_overrides={unit: [override]}) == expected | {"campaign/gather"}
 
 
 def test_a_setting_of_the_run_concerns_every_batch(bench: Path) -> None:
     stages = ("validate", "calibration", "report")
     assert changed(bench, overrides="limits.gyroscope.bias=20") == of(REFERENCE, *stages) | of(STAGED, *stages) | {
-        "gather"
+        "campaign/gather"
     }
 
 
@@ -73,12 +73,11 @@ def test_a_change_of_sheet_or_device_concerns_the_batch_of_the_unit(tmp_path: Pa
     sheet, device = tmp_path / "units.csv", tmp_path / "devices" / "U7.yaml"
     plain = "unit,overrides\n" + "".join(f"U{i},\n" for i in range(10))
 
-    def settings() -> dict[str, Path]:
-        found = settings_of_jobs(load_campaign({"campaign": str(tmp_path), "overrides": "batch_size=6"}))
-        return {job: file.path for job, file in found.items()}
+    def settings() -> dict[str, str]:
+        return settings_names(load_campaign({"campaign": str(tmp_path), "overrides": "batch_size=6"}))
 
     def batches() -> set[str]:
-        jobs = {job for job, path in settings().items() if before.get(job) != path}
+        jobs = {job for job, name in settings().items() if before.get(job) != name}
         return {found[1] for job in jobs if (found := re.search(r"-(\d{4})", job))}
 
     sheet.write_text(plain)

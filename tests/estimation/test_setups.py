@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from bench_session import BIAS, CONTINUOUS, STOP_AND_GO, K, Session, record
 from scipy.spatial.transform import Rotation
+from stage_files import load_recordings, save_recordings
 
 from pipeline.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.generalized_least_squares import fit_joint
-from pipeline.io.parquet import load_recordings, save_recordings
 from pipeline.model.effects import effect
 from pipeline.model.effects.base import truth
 from pipeline.model.kinematics import reference_motion

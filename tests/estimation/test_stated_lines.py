@@ -8,14 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from stage_files import documents, write_pack
 from table_turns import Bench, settings
 
 from pipeline.estimation import reference_least_squares
 from pipeline.estimation.uncertainty_budget import with_stated
-from pipeline.io.parquet import save_recordings
+from pipeline.io.parquet import to_parquet
 from pipeline.records import FittedEffect
 from pipeline.stages import batch
-from pipeline.stages.unit_files import save_noises
+from pipeline.stages.unit_files import noise_file
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -106,15 +107,15 @@ def test_a_chain_of_stages_counts_what_is_stated_once(tmp_path: Path) -> None:
     still = replace(bench.turns_at([0.0])[0], name="static", role="static")
     part = settings() | {"sensor": sheet(repeatability_bias=0.02)["sensor"] | {"accelerometer": {}}, "effects": {}}
     (tmp_path / "part.json").write_text(json.dumps({"units": {"U": part}}))
-    filtered, stages = tmp_path / "filter", [tmp_path / "bias", tmp_path / "cholesky_lu"]
-    filtered.mkdir()
-    save_recordings(filtered / "U.parquet", [*turns, still])
-    save_noises(filtered, "U", [*turns, still], settings())
+    stages = [tmp_path / "bias", tmp_path / "cholesky_lu"]
+    ingested = write_pack(tmp_path / "ingest.zip", {"U.parquet": to_parquet([*turns, still])})
+    filtered = write_pack(tmp_path / "filter.zip", noise_file("U", [*turns, still], settings()))
     for stage, previous, last in zip(stages, ["", str(stages[0])], ["no", "yes"], strict=True):
         chosen = ["--sensor", "gyroscope", "--stage", stage.name, "--previous", previous, "--last", last]
-        folders = ["--config", str(tmp_path / "part.json"), "--filter", str(filtered), "--output", str(stage)]
+        folders = ["--config", str(tmp_path / "part.json"), "--output", str(stage)]
+        folders += ["--ingest", str(ingested), "--filter", str(filtered)]
         batch.main("fit", [*folders, *chosen])
-    first, last_one = (json.loads((stage / "U.json").read_text()) for stage in stages)
+    first, last_one = (documents(stage)["U.json"] for stage in stages)
     u = [np.sqrt(np.diag(np.array(found["covariance"]["values"])))[:3] for found in (first, last_one)]
     assert u[0].max() < 0.005  # the bias of the rest, without what is stated
     assert u[1] == pytest.approx(np.full(3, 0.02), rel=0.05)

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 import yaml
 from pydantic import TypeAdapter
+from stage_files import export_all
 
 from pipeline import load_calibration
-from pipeline.exports import Format, export_all, formats
+from pipeline.exports import Format, formats
 from pipeline.records import SENSORS, FittedEffect, SensorCalibration
 
 G0, RADIAN = 9.80665, np.pi / 180.0

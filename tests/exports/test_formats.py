@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from stage_files import export_all
 
 from pipeline import exports
-from pipeline.exports import export_all, formats
+from pipeline.exports import formats
 from pipeline.exports.sensors import lower_times_rotation
 from pipeline.model.effects import effect
 from pipeline.records import FittedEffect, SensorCalibration

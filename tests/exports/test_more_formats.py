@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from stage_files import export_all
 
 from pipeline import load_calibration
-from pipeline.exports import export_all
 from pipeline.exports.sensors import ExportedSensor
 from pipeline.records import FittedEffect, SensorCalibration
 

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 import yaml
 from scipy.signal import lfilter
+from stage_files import export_all
 
 from pipeline.estimation.noise_identification import identify_noise
 from pipeline.estimation.noise_terms import allan_variance, each_term
-from pipeline.exports import Subject, export, export_all
+from pipeline.exports import Subject, export
 from pipeline.exports.conversion import document_of, settings_of
 from pipeline.exports.noise import FLAT, noise
 from pipeline.exports.reading import read_any

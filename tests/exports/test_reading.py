@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from stage_files import export_all
 from test_consumer_formats import BIAS, COUNTS, MATRIX, SCALED, SENSITIVE, SETTINGS, WARM, WARMER
 
 from pipeline import load_calibration
 from pipeline.commands.convert import main
 from pipeline.errors import ConfigurationError, InputError
-from pipeline.exports import export_all, formats
+from pipeline.exports import formats
 from pipeline.exports.explanation import SAMPLE, explain_calibration
 from pipeline.exports.reading import read_any
 from pipeline.records import SENSORS, SensorCalibration

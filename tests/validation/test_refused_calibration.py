@@ -6,51 +6,52 @@ from typing import Any
 
 import pytest
 from bench_session import Session, record
+from stage_files import documents, write_pack
 
 from pipeline.config.compose import Composer
-from pipeline.io.parquet import save_recordings
+from pipeline.io.parquet import to_parquet
 from pipeline.records import SENSORS, SensorCalibration
 from pipeline.stages import batch
 
 HARM = "the calibration makes held-out motion worse"
 
 
-def documents(folder: Path, harmed: list[str], absent: list[str], *, as_printed: bool = False) -> dict[str, Any]:
+def run_stage(folder: Path, harmed: list[str], absent: list[str], *, as_printed: bool = False) -> dict[str, Any]:
     """Run the stage on one unit and return its files by name."""
     settings = [f"method.as_printed={str(as_printed).lower()}"]
     part = Composer(folder).unit("U1", settings) | {"config_sha256": "0"}
     (folder / "part.json").write_text(json.dumps({"units": {"U1": part}}))
-    folders = {name: folder / name for name in ("ingest", *SENSORS, "validate")}
-    for each in folders.values():
-        each.mkdir()
-    save_recordings(folders["ingest"] / "U1.parquet", record(Session(1))[:1])
+    said = {s: None if s in absent else {"worse_than_raw": HARM if s in harmed else None} for s in SENSORS}
+    files: dict[str, Any] = {
+        "ingest": {"U1.parquet": to_parquet(record(Session(1))[:1])},
+        "validate": {"U1.json": said},
+    }
     for sensor in SENSORS:
         fit = {"not_calibrated": "no angle is logged"} if sensor in absent else SensorCalibration(sensor).to_json()
-        (folders[sensor] / "U1.json").write_text(json.dumps(fit))
-    said = {s: None if s in absent else {"worse_than_raw": HARM if s in harmed else None} for s in SENSORS}
-    (folders["validate"] / "U1.json").write_text(json.dumps(said))
-    given = [word for name, each in folders.items() for word in (f"--{name}", str(each))]
+        files[sensor] = {"U1.json": fit}
+    packs = {name: write_pack(folder / f"{name}.zip", each) for name, each in files.items()}
+    given = [word for name, each in packs.items() for word in (f"--{name}", str(each))]
     assert (
         batch.main("calibration", ["--config", str(folder / "part.json"), *given, "--output", str(folder / "out")]) == 0
     )
-    return {file.name: json.loads(file.read_text()) for file in (folder / "out").iterdir()}
+    return documents(folder / "out")
 
 
 def test_a_sensor_that_does_harm_is_null_and_the_other_is_not(tmp_path: Path) -> None:
-    found = documents(tmp_path, ["gyroscope"], [])["U1.json"]
+    found = run_stage(tmp_path, ["gyroscope"], [])["U1.json"]
     assert (found["status"], found["gyroscope"], found["not_calibrated"]) == ("ok", None, {"gyroscope": HARM})
     assert found["accelerometer"]["unit"] == "g"
 
 
 def test_printed_errata_are_published_as_they_are(tmp_path: Path) -> None:
-    found = documents(tmp_path, ["gyroscope"], [], as_printed=True)["U1.json"]
+    found = run_stage(tmp_path, ["gyroscope"], [], as_printed=True)["U1.json"]
     assert found["not_calibrated"] == {}
     assert found["gyroscope"]["unit"] == "deg/s"
 
 
 @pytest.mark.parametrize(("harmed", "absent"), [(["gyroscope"], ["accelerometer"]), ([], list(SENSORS))])
 def test_a_unit_without_a_calibrated_sensor_has_failed(tmp_path: Path, harmed: list[str], absent: list[str]) -> None:
-    found = documents(tmp_path, harmed, absent)
+    found = run_stage(tmp_path, harmed, absent)
     assert set(found) == {"U1.failed.json"}
     failure = found["U1.failed.json"]
     assert failure["code"] == "cannot_calibrate"

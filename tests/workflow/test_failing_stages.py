@@ -11,9 +11,13 @@ from typing import Any
 import pytest
 from whole_run import run_campaign, run_jobs
 
+import pipeline
 from pipeline import results_folder
-from pipeline.config import load_campaign, settings_file
+from pipeline.commands import unpack
+from pipeline.config import load_campaign, settings_of_jobs
 from pipeline.config.campaign import Campaign
+from pipeline.errors import DamagedFileError
+from pipeline.results_folder import HELD
 from pipeline.stages import batch, gather, verdict
 from pipeline.stages import report as report_stage
 
@@ -30,16 +34,21 @@ def published(tmp_path_factory: pytest.TempPathFactory, simulated: Path) -> tupl
         shutil.copytree(simulated, directory / "raw" / name)
     (directory / "units.csv").write_text("unit\n" + "\n".join(names) + "\n")
     campaign = load_campaign({"campaign": str(directory), "results": str(directory.parent / "results")})
-    run_unit, read_unit, render = batch._run_unit, gather._read_unit, report_stage.render
+    files_of, read_unit, render = batch._files_of, gather._read_unit, report_stage.render
 
-    def faulty(module: Any, job: batch.Job, unit: str, settings: dict[str, Any]) -> None:
+    def faulty(module: Any, job: batch.Job, unit: str, settings: dict[str, Any]) -> Any:
+        real = module
+
         def fails(job: batch.Job, unit: str, settings: dict[str, Any]) -> None:
-            module.process_unit(job, unit, settings)
+            real.process_unit(job, unit, settings)
             raise MemoryError(f"no room for {unit}") if job.stage == "export" else RuntimeError(f"fault at {unit}")
 
-        run_unit(SimpleNamespace(process_unit=fails) if unit == f"at_{job.stage}" else module, job, unit, settings)
+        if unit == f"at_{job.stage}":
+            after = {"process_failed": module.process_failed} if hasattr(module, "process_failed") else {}
+            module = SimpleNamespace(process_unit=fails, **after)
+        return files_of(module, job, unit, settings)
 
-    def faulty_gather(job: batch.Job, folder: Path, row: dict[str, str]) -> gather.Gathered:
+    def faulty_gather(job: batch.Job, folder: Any, row: dict[str, str]) -> gather.Gathered:
         if row["unit"] == "at_gather":
             raise RuntimeError("fault at at_gather")
         return read_unit(job, folder, row)
@@ -50,7 +59,7 @@ def published(tmp_path_factory: pytest.TempPathFactory, simulated: Path) -> tupl
         return render(document, *rest, **more)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(batch, "_run_unit", faulty)
+        patch.setattr(batch, "_files_of", faulty)
         patch.setattr(gather, "_read_unit", faulty_gather)
         patch.setattr(report_stage, "render", faulty_render)
         assert run_jobs(campaign) == 1
@@ -182,6 +191,38 @@ def test_what_a_killed_gather_leaves_is_the_old_set(published: tuple[Campaign, P
     assert not (results / ".new").exists()
 
 
+def test_units_beyond_the_limit_are_published_on_request_with_the_same_bytes(
+    published: tuple[Campaign, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    campaign, results = published
+    run_gather(campaign)
+    apart = shutil.copytree(results, tmp_path / "results" / results.name)
+    packed = load_campaign(dict(campaign.settings) | {"results": str(apart.parent), "overrides": "publish_limit=9"})
+    run_gather(packed)
+    files = {file.relative_to(apart).parts[0] for file in apart.rglob("*") if file.is_file()}
+    assert files.isdisjoint(FOLDERS)
+    assert (apart / "summary.csv").read_bytes() == (results / "summary.csv").read_bytes()
+    assert f"imu-calibration unpack {apart.name}" in (apart / "index.html").read_text()
+    found, ordinary = (pipeline.load_campaign(folder) for folder in (apart, results))
+    assert [vars(found.unit(u)) for u in packed.units] == [vars(ordinary.unit(u)) for u in packed.units]
+    for unit in packed.units:
+        unpack.main([str(apart), unit])
+        HELD.pop().close()
+        assert f"reports/{unit}.html" in capsys.readouterr().out
+    unpacked = contents(apart)
+    assert {k for k, v in contents(results).items() if unpacked.get(k) != v} == {"index.html"}
+    assert results_folder.repetitions(apart, "") == (0, [])
+    run_gather(packed)
+    assert contents(apart) == unpacked
+    pack = next(apart.glob("packs/*/calibration.zip"))
+    pack.write_bytes(pack.read_bytes().replace(b"PK", b"KP"))
+    shutil.rmtree(apart / "calibrations")
+    with pytest.raises(DamagedFileError, match=r"calibration\.zip"):
+        pipeline.load_campaign(apart).unit("good")
+
+
 def run_gather(campaign: Campaign) -> None:
-    part = settings_file(campaign, "gather", list(campaign.units)).write()
-    batch.main("gather", ["--config", part, "--output", str(campaign.results / "batches" / "gathered.json")])
+    file = settings_of_jobs(campaign)["campaign"]["gather"]
+    part = campaign.results / "configs" / file.name
+    part.write_bytes(file.content)
+    batch.main("gather", ["--config", str(part), "--output", str(campaign.results / "batches" / "gathered.json")])

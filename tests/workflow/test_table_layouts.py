@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from whole_run import run_campaign
 
-from pipeline.io.parquet import load_recordings
+from pipeline.pack import Pack
+from pipeline.stages.unit_files import recordings_of
 
 from .conftest import ROOT, Bench
 
@@ -87,8 +88,9 @@ def test_the_page_tells_clock_program_and_segments(done: Bench) -> None:
 
 
 def test_windows_in_the_configuration_take_the_place_of_what_is_found(done: Bench) -> None:
-    ingested = next(done.results.glob("batches/*/ingest/windows.parquet"))
-    found = {r.name: float(r.time[-1] - r.time[0]) for r in load_recordings(ingested)}
+    packs = map(Pack, done.results.glob("batches/*/ingest.zip"))
+    ingested = next(pack for pack in packs if "windows.parquet" in pack)
+    found = {r.name: float(r.time[-1] - r.time[0]) for r in recordings_of({"ingest": ingested}, "windows")}
     spans = {
         f"{s}_{axis}": b - a for axis, at in TIMES.items() for s, (a, b) in zip(("accel", "gyro"), at, strict=True)
     }

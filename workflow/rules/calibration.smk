@@ -1,12 +1,13 @@
 # Both sensors' fits, the inputs and the software in one document.
 rule calibration:
     input:
-        ingest=f"{BATCH}/ingest",
+        settings=settings_of("calibration"),
+        ingest=f"{BATCH}/ingest.zip",
         accelerometer=last_fit("accelerometer"),
         gyroscope=last_fit("gyroscope"),
-        validate=f"{BATCH}/validate",
+        validate=f"{BATCH}/validate.zip",
     output:
-        directory(f"{BATCH}/calibration"),
+        f"{BATCH}/calibration.zip",
     log:
         f"{LOG}/calibration.log",
     threads: 1
@@ -14,8 +15,7 @@ rule calibration:
         mem_mb=1000,
         runtime=10,
     params:
-        config=settings_of("calibration"),
         code=code_digest("pipeline.stages.calibration"),
     shell:
-        "{RUN} calibration --config {params.config:q} --ingest {input.ingest:q} --accelerometer {input.accelerometer:q}"
+        "{RUN} calibration --config {input.settings:q} --ingest {input.ingest:q} --accelerometer {input.accelerometer:q}"
         " --gyroscope {input.gyroscope:q} --validate {input.validate:q} --output {output:q} > {log:q} 2>&1"

@@ -19,20 +19,17 @@ if Path(workflow.basedir, "pipeline").is_dir():
     own = [workflow.basedir, os.getenv("PYTHONPATH", "")]
     os.environ.update(PYTHONPATH=os.pathsep.join(filter(None, own)))
 
-from pipeline.config import code_digest, load_campaign, settings_file
+from pipeline.config import code_digest, load_campaign, settings_of_jobs
 from pipeline.errors import PipelineError
+from pipeline.files import write_atomically
 from pipeline.estimation.stages import stage_module
-from pipeline.io.files import recording_files
 from pipeline.outcome import outcome
+from pipeline.published import STAGES as PUBLISHED_STAGES
 from pipeline.results_folder import finish_publishing, repetitions
 from pipeline.run_progress import Monitor
 from pipeline.stages.job_server import COMMAND, start_server
 
-try:
-    CAMPAIGN = load_campaign(config)
-except PipelineError as error:
-    raise WorkflowError(str(error)) from None
-gc.freeze()  # the campaign stays: looking for garbage in thousands of configurations takes seconds
+RUNNING = not workflow.is_main_process
 
 
 def without_braces(path):
@@ -48,28 +45,57 @@ def without_braces(path):
     return str(link)
 
 
-if "{" in str(CAMPAIGN.results):
-    CAMPAIGN.results.mkdir(parents=True, exist_ok=True)
-RUN = shlex.join(COMMAND)
-RESULTS = without_braces(CAMPAIGN.results)
-BATCH = f"{RESULTS}/batches/{{batch}}"
-LOG = f"{RESULTS}/logs/{{batch}}"
-SENSORS = ["accelerometer", "gyroscope"]
-STARTED = time.time()
-WAITING = {}  # settings files, written when jobs are run, not in a dry run
-AGAIN = {}  # output to how often it has been repeated because files of it were edited
-EDITED = []  # those files and folders
-RUNNING = not workflow.is_main_process
+def again(output):
+    """Return how often an output is repeated because files of it were edited."""
+    number, edited = repetitions(CAMPAIGN.results, output)
+    EDITED.extend(edited)
+    return number
+
+
+PLAN_FILE = Path(
+    ".snakemake",
+    "imu-calibration",
+    f"{hashlib.sha256(repr(sorted(config.items())).encode()).hexdigest()[:16]}.json",
+)
 if RUNNING:
-    # A job group on another machine: the main process has looked at the files before any job.
-    seen = Path(RESULTS, "configs", "again.json")
-    AGAIN = json.loads(seen.read_text()) if seen.is_file() else {}
+    # A job on another machine: the main process has resolved the campaign and looked at the results.
+    PLAN = json.loads(PLAN_FILE.read_text())
 else:
+    try:
+        CAMPAIGN = load_campaign(config)
+    except PipelineError as error:
+        raise WorkflowError(str(error)) from None
+    gc.freeze()  # the campaign stays: looking for garbage in thousands of configurations takes seconds
+    if "{" in str(CAMPAIGN.results):
+        CAMPAIGN.results.mkdir(parents=True, exist_ok=True)
+    EDITED = []  # files and folders of the results that were edited
+    SETTINGS = settings_of_jobs(CAMPAIGN, again)
+    PLAN = {
+        "results": without_braces(CAMPAIGN.results),
+        "directory": without_braces(CAMPAIGN.directory),
+        "simulation": CAMPAIGN.simulation and without_braces(CAMPAIGN.simulation),
+        "page": CAMPAIGN.page,
+        "chains": CAMPAIGN.chains,
+        "settings": {
+            batch: {output: file.name for output, file in files.items()}
+            for batch, files in SETTINGS.items()
+        },
+    }
+    write_atomically(PLAN_FILE, json.dumps(PLAN))
+    workflow.configfiles.append(str(PLAN_FILE))  # sent to jobs without a shared disk
     MONITOR = Monitor(
         CAMPAIGN.results,
         {batch: len(units) for batch, units in CAMPAIGN.batches.items()},
         logger,
     )
+# In a container the interpreter of this machine does not exist; elsewhere each machine parses this file with its own.
+DEPLOYED = workflow.deployment_settings.deployment_method
+RUN = "python -m pipeline" if DEPLOYED else shlex.join(COMMAND)
+RESULTS = PLAN["results"]
+BATCH = f"{RESULTS}/batches/{{batch}}"
+LOG = f"{RESULTS}/logs/{{batch}}"
+SENSORS = ["accelerometer", "gyroscope"]
+STARTED = time.time()
 
 
 wildcard_constraints:
@@ -78,26 +104,37 @@ wildcard_constraints:
     stage="[a-z0-9_]+",
 
 
-def settings_of(stage):
-    """Return the function of a rule's params that names the settings file of the stage."""
-    return lambda wildcards: settings_path(
-        stage,
-        CAMPAIGN.batches[wildcards.batch],
-        f"batches/{wildcards.batch}/{stage}",
-    )
+def settings_of(output):
+    """Return the input function that names the settings file of what a rule writes for a batch."""
+    return lambda wildcards: settings_file(wildcards.batch, output.format(**wildcards))
 
 
-def settings_path(stage, units, output, sensor=""):
-    """Return the path of a stage's settings file; it exists once jobs are run."""
-    if output not in AGAIN and not RUNNING:
-        AGAIN[output], edited = repetitions(Path(RESULTS), output)
-        EDITED.extend(edited)
-    file = settings_file(CAMPAIGN, stage, units, sensor, AGAIN.get(output, 0))
-    path = f"{RESULTS}/configs/{file.path.name}"
+def settings_file(batch, output):
+    """Return the settings file of a job; it exists but for a dry run, which writes nothing."""
+    path = f"{RESULTS}/configs/{PLAN['settings'][batch][output]}"
     if RUNNING:
-        file.write()
-    else:
-        WAITING[path] = file
+        return path
+    given, stored = workflow.storage_settings, None
+    there = os.path.exists(path)
+    if given.default_storage_provider:
+        provider = workflow.storage_registry.default_storage_provider
+        stored = provider.object(f"{given.default_storage_prefix}/{path}")
+        there = there and stored.exists()
+    if not there and workflow.dryrun:
+        return []
+    if not there:
+        try:
+            write_atomically(Path(path), SETTINGS[batch][output].content)
+        except OSError as error:
+            MONITOR.refused = (
+                "ProtectedOutputException"  # as Snakemake says of its own files
+            )
+            raise WorkflowError(
+                f"{CAMPAIGN.results} cannot be written: {error}"
+            ) from None
+        if stored:
+            stored.set_local_path(Path(path))
+            stored.store_object()
     return path
 
 
@@ -115,38 +152,26 @@ def begin_run():
         )
         RUNNING = True
         finish_publishing(CAMPAIGN.results)
-        for file in WAITING.values():
-            file.write()
         if workflow.local_exec:
             atexit.register(start_server())
         MONITOR.print_edited(EDITED)
-        Path(RESULTS, "configs", "again.json").write_text(json.dumps(AGAIN))
     except PipelineError as error:
         raise WorkflowError(str(error)) from None
     except OSError as error:
         raise WorkflowError(f"{CAMPAIGN.results} cannot be written: {error}") from None
-    WAITING.clear()
 
 
 def last_fit(sensor):
-    """Return the input function that names the folder of a sensor's last stage."""
+    """Return the input function that names the output of a sensor's last stage."""
     return (
-        lambda wildcards: f"{BATCH}/fit/{sensor}/{CAMPAIGN.chains[wildcards.batch][sensor][-1]}"
+        lambda wildcards: f"{BATCH}/fit/{sensor}/{PLAN['chains'][wildcards.batch][sensor][-1]}.zip"
     )
 
 
 def stage_before(wildcards):
-    chain = CAMPAIGN.chains[wildcards.batch][wildcards.sensor]
+    chain = PLAN["chains"][wildcards.batch][wildcards.sensor]
     i = chain.index(wildcards.stage)
-    return f"{BATCH}/fit/{{sensor}}/{chain[i - 1]}".format(**wildcards) if i else []
-
-
-def settings_of_fit(wildcards):
-    stage = "effects" if wildcards.stage == "effects" else f"fit-{wildcards.stage}"
-    output = "batches/{batch}/fit/{sensor}/{stage}".format(**wildcards)
-    return settings_path(
-        stage, CAMPAIGN.batches[wildcards.batch], output, wildcards.sensor
-    )
+    return f"{BATCH}/fit/{{sensor}}/{chain[i - 1]}.zip".format(**wildcards) if i else []
 
 
 def code_of_fit(wildcards):
@@ -158,22 +183,8 @@ def code_of_fit(wildcards):
 
 
 def is_last_stage(wildcards):
-    chain = CAMPAIGN.chains[wildcards.batch][wildcards.sensor]
+    chain = PLAN["chains"][wildcards.batch][wildcards.sensor]
     return "yes" if wildcards.stage == chain[-1] else "no"
-
-
-def recordings(wildcards):
-    """Return a digest of the names, sizes and times of a batch's recordings, which are too many to be listed."""
-    digest = hashlib.sha256()
-    for unit in [] if CAMPAIGN.simulation else CAMPAIGN.batches[wildcards.batch]:
-        config = CAMPAIGN.units[unit].config
-        files = recording_files(
-            config["procedure"], config["ingest"], CAMPAIGN.folder(unit)
-        )
-        for path in sorted({path for paths in files.values() for path in paths}):
-            found = path.stat()
-            digest.update(f"{path}\0{found.st_size}\0{found.st_mtime_ns}\0".encode())
-    return digest.hexdigest()[:16]
 
 
 def pages(wildcards):
@@ -186,12 +197,12 @@ def pages(wildcards):
         ),
     }
     paths = {f"{RESULTS}/{name}": options for name, options in shown.items()}
-    return [report(p, **o) for p, o in paths.items() if os.path.exists(p)]
+    return [local(report(p, **o)) for p, o in paths.items() if os.path.exists(p)]
 
 
 def of_batches(stage):
-    """Return a stage's folder for every batch."""
-    return [f"{RESULTS}/batches/{batch}/{stage}" for batch in CAMPAIGN.batches]
+    """Return a stage's output for every batch."""
+    return [f"{RESULTS}/batches/{batch}/{stage}.zip" for batch in PLAN["chains"]]
 
 
 def print_at_the_end(text):

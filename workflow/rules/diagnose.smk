@@ -1,12 +1,14 @@
 # Which physical effect is missing.
 rule diagnose:
     input:
-        filter=f"{BATCH}/filter",
+        settings=settings_of("diagnose"),
+        ingest=f"{BATCH}/ingest.zip",
+        filter=f"{BATCH}/filter.zip",
         accelerometer=last_fit("accelerometer"),
         gyroscope=last_fit("gyroscope"),
-        validate=f"{BATCH}/validate",
+        validate=f"{BATCH}/validate.zip",
     output:
-        directory(f"{BATCH}/diagnose"),
+        f"{BATCH}/diagnose.zip",
     log:
         f"{LOG}/diagnose.log",
     threads: 1
@@ -14,8 +16,7 @@ rule diagnose:
         mem_mb=1000,
         runtime=10,
     params:
-        config=settings_of("diagnose"),
         code=code_digest("pipeline.stages.diagnose"),
     shell:
-        "{RUN} diagnose --config {params.config:q} --filter {input.filter:q} --accelerometer {input.accelerometer:q}"
+        "{RUN} diagnose --config {input.settings:q} --ingest {input.ingest:q} --filter {input.filter:q} --accelerometer {input.accelerometer:q}"
         " --gyroscope {input.gyroscope:q} --validate {input.validate:q} --output {output:q} > {log:q} 2>&1"

@@ -1,11 +1,12 @@
 # The calibration in the formats of those who use it.
 rule export:
     input:
-        calibration=f"{BATCH}/calibration",
-        validate=f"{BATCH}/validate",
-        diagnose=f"{BATCH}/diagnose",
+        settings=settings_of("export"),
+        calibration=f"{BATCH}/calibration.zip",
+        validate=f"{BATCH}/validate.zip",
+        diagnose=f"{BATCH}/diagnose.zip",
     output:
-        directory(f"{BATCH}/export"),
+        f"{BATCH}/export.zip",
     log:
         f"{LOG}/export.log",
     threads: 1
@@ -13,8 +14,7 @@ rule export:
         mem_mb=1000,
         runtime=10,
     params:
-        config=settings_of("export"),
         code=code_digest("pipeline.stages.export"),
     shell:
-        "{RUN} export --config {params.config:q} --calibration {input.calibration:q} --validate {input.validate:q}"
+        "{RUN} export --config {input.settings:q} --calibration {input.calibration:q} --validate {input.validate:q}"
         " --diagnose {input.diagnose:q} --output {output:q} > {log:q} 2>&1"

@@ -1,9 +1,10 @@
 # The readings of every recording through the configured filter.
 rule filter:
     input:
-        ingest=f"{BATCH}/ingest",
+        settings=settings_of("filter"),
+        ingest=f"{BATCH}/ingest.zip",
     output:
-        directory(f"{BATCH}/filter"),
+        f"{BATCH}/filter.zip",
     log:
         f"{LOG}/filter.log",
     threads: 1
@@ -11,7 +12,6 @@ rule filter:
         mem_mb=1000,
         runtime=10,
     params:
-        config=settings_of("filter"),
         code=code_digest("pipeline.stages.filter"),
     shell:
-        "{RUN} filter --config {params.config:q} --ingest {input.ingest:q} --output {output:q} > {log:q} 2>&1"
+        "{RUN} filter --config {input.settings:q} --ingest {input.ingest:q} --output {output:q} > {log:q} 2>&1"

@@ -3,10 +3,12 @@
 
 rule fit:
     input:
-        filter=f"{BATCH}/filter",
+        settings=settings_of("fit/{sensor}/{stage}"),
+        ingest=f"{BATCH}/ingest.zip",
+        filter=f"{BATCH}/filter.zip",
         previous=stage_before,
     output:
-        directory(f"{BATCH}/fit/{{sensor}}/{{stage}}"),
+        f"{BATCH}/fit/{{sensor}}/{{stage}}.zip",
     log:
         f"{LOG}/fit-{{sensor}}-{{stage}}.log",
     threads: 1
@@ -14,10 +16,9 @@ rule fit:
         mem_mb=1000,
         runtime=10,
     params:
-        config=settings_of_fit,
         code=code_of_fit,
         last=is_last_stage,
     shell:
-        "{RUN} fit --config {params.config:q} --sensor {wildcards.sensor} --stage {wildcards.stage}"
-        " --last {params.last} --filter {input.filter:q} --previous={input.previous:q} --output {output:q}"
+        "{RUN} fit --config {input.settings:q} --sensor {wildcards.sensor} --stage {wildcards.stage}"
+        " --last {params.last} --ingest {input.ingest:q} --filter {input.filter:q} --previous={input.previous:q} --output {output:q}"
         " > {log:q} 2>&1"

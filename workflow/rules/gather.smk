@@ -4,8 +4,8 @@
 # replaces them by a complete new set; what is changed or deleted by hand is found by `pipeline.results_folder`.
 rule gather:
     input:
-        of_batches("report"),
-        of_batches("export"),
+        settings=lambda wildcards: local(settings_file("campaign", "gather")),
+        packs=[of_batches(stage) for stage in PUBLISHED_STAGES],
     output:
         f"{RESULTS}/batches/gathered.json",
     log:
@@ -15,7 +15,6 @@ rule gather:
         mem_mb=1000,
         runtime=10,
     params:
-        config=lambda wildcards: settings_path("gather", list(CAMPAIGN.units), ""),
         code=code_digest("pipeline.stages.gather"),
     shell:
-        "{RUN} gather --config {params.config:q} --output {output:q} > {log:q} 2>&1"
+        "{RUN} gather --config {input.settings:q} --output {output:q} > {log:q} 2>&1"

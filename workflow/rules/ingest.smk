@@ -1,11 +1,12 @@
-# A unit's files -> one Parquet file. Files that do not exist are no input: their unit fails, the others go on.
-
-
+# A unit's files -> one Parquet file. Names, sizes and times of the recordings are part of the settings; those that do not
+# exist are no input: their unit fails, the others go on. Snakemake runs a rule with a local input where it was started, not
+# on another machine that does not share a disk with this one: there the packs of ingest replace the recordings.
 rule ingest:
     input:
-        SIMULATED if CAMPAIGN.simulation else [],
+        settings=lambda wildcards: local(settings_file(wildcards.batch, "ingest")),
+        simulated=local(SIMULATED) if PLAN["simulation"] else [],
     output:
-        directory(f"{BATCH}/ingest"),
+        f"{BATCH}/ingest.zip",
     log:
         f"{LOG}/ingest.log",
     threads: 1
@@ -13,8 +14,6 @@ rule ingest:
         mem_mb=1000,
         runtime=10,
     params:
-        config=settings_of("ingest"),
-        recordings=recordings,
         code=code_digest("pipeline.stages.ingest"),
     shell:
-        "{RUN} ingest --config {params.config:q} --output {output:q} > {log:q} 2>&1"
+        "{RUN} ingest --config {input.settings:q} --output {output:q} > {log:q} 2>&1"

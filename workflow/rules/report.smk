@@ -1,13 +1,15 @@
 # One page a unit, those that failed included.
 rule report:
     input:
-        filter=f"{BATCH}/filter",
-        calibration=f"{BATCH}/calibration",
-        validate=f"{BATCH}/validate",
-        diagnose=f"{BATCH}/diagnose",
-        export=f"{BATCH}/export",
+        settings=settings_of("report"),
+        ingest=f"{BATCH}/ingest.zip",
+        filter=f"{BATCH}/filter.zip",
+        calibration=f"{BATCH}/calibration.zip",
+        validate=f"{BATCH}/validate.zip",
+        diagnose=f"{BATCH}/diagnose.zip",
+        export=f"{BATCH}/export.zip",
     output:
-        directory(f"{BATCH}/report"),
+        f"{BATCH}/report.zip",
     log:
         f"{LOG}/report.log",
     threads: 1
@@ -15,9 +17,8 @@ rule report:
         mem_mb=1000,
         runtime=10,
     params:
-        config=settings_of("report"),
         code=code_digest("pipeline.stages.report"),
     shell:
-        "{RUN} report --config {params.config:q} --filter {input.filter:q} --calibration {input.calibration:q}"
+        "{RUN} report --config {input.settings:q} --ingest {input.ingest:q} --filter {input.filter:q} --calibration {input.calibration:q}"
         " --validate {input.validate:q} --diagnose {input.diagnose:q}"
         " --export {input.export:q} --output {output:q} > {log:q} 2>&1"

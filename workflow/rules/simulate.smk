@@ -1,13 +1,13 @@
 # The recordings of a simulated campaign (simulate: true in its campaign.yaml).
 SIMULATED = f"{RESULTS}/simulated"
 
-if CAMPAIGN.simulation:
+if PLAN["simulation"]:
 
     rule simulate:
         input:
-            without_braces(CAMPAIGN.simulation),
+            local(PLAN["simulation"]),
         output:
-            directory(SIMULATED),
+            local(directory(SIMULATED)),
         log:
             f"{RESULTS}/logs/simulate.log",
         threads: 1

@@ -1,26 +1,30 @@
 # The results of the thesis's campaign compared with what it printed (page: thesis in campaign.yaml).
-if CAMPAIGN.page == "thesis":
+if PLAN["page"] == "thesis":
 
     rule thesis:
         input:
             rules.gather.output,
-            collect(
-                f"{without_braces(CAMPAIGN.directory)}/{{file}}",
-                file=[
-                    "seeds.csv",
-                    "printed/accel_parameters.csv",
-                    "printed/gyro_parameters.csv",
-                    "printed/errors.csv",
-                    "printed/method_comparison.csv",
-                    "printed/conference_paper.csv",
-                    "printed/conference_paper_six_positions.csv",
-                ],
+            local(
+                collect(
+                    f"{PLAN['directory']}/{{file}}",
+                    file=[
+                        "seeds.csv",
+                        "printed/accel_parameters.csv",
+                        "printed/gyro_parameters.csv",
+                        "printed/errors.csv",
+                        "printed/method_comparison.csv",
+                        "printed/conference_paper.csv",
+                        "printed/conference_paper_six_positions.csv",
+                    ],
+                )
             ),
         output:
-            report(
-                f"{RESULTS}/thesis.html",
-                category="Campaign",
-                labels={"page": "beside what was printed"},
+            local(
+                report(
+                    f"{RESULTS}/thesis.html",
+                    category="Campaign",
+                    labels={"page": "beside what was printed"},
+                )
             ),
         log:
             f"{RESULTS}/logs/thesis.log",

@@ -1,11 +1,13 @@
 # The error on held-out motion after each step.
 rule validate:
     input:
-        filter=f"{BATCH}/filter",
+        settings=settings_of("validate"),
+        ingest=f"{BATCH}/ingest.zip",
+        filter=f"{BATCH}/filter.zip",
         accelerometer=last_fit("accelerometer"),
         gyroscope=last_fit("gyroscope"),
     output:
-        directory(f"{BATCH}/validate"),
+        f"{BATCH}/validate.zip",
     log:
         f"{LOG}/validate.log",
     threads: 1
@@ -13,8 +15,7 @@ rule validate:
         mem_mb=1000,
         runtime=10,
     params:
-        config=settings_of("validate"),
         code=code_digest("pipeline.stages.validate"),
     shell:
-        "{RUN} validate --config {params.config:q} --filter {input.filter:q} --accelerometer {input.accelerometer:q}"
+        "{RUN} validate --config {input.settings:q} --ingest {input.ingest:q} --filter {input.filter:q} --accelerometer {input.accelerometer:q}"
         " --gyroscope {input.gyroscope:q} --output {output:q} > {log:q} 2>&1"

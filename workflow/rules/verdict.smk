@@ -2,7 +2,7 @@
 rule verdict:
     input:
         failures=f"{RESULTS}/batches/gathered.json",
-        page=f"{RESULTS}/{CAMPAIGN.page}.html" if CAMPAIGN.page else [],
+        page=local(f"{RESULTS}/{PLAN['page']}.html") if PLAN["page"] else [],
     output:
         f"{RESULTS}/complete.json",
     log:
