@@ -6,7 +6,7 @@ JASA 90, 1995). Sets are found by a beam, then by exchange of each member.
 
 An upper limit is the ``BELOW`` quantile of a parameter's absolute value, given that its effect is there, over sets,
 scales and noises, whatever was selected. It is stated where the effect was not found: at the detection size in two of
-three units (26 of 39 simulated ones), so that a share of 1/30 of all limits is 5 % of the stated ones.
+three units (26 of 40 simulated ones), so that a share of 1/30 of all limits is 5 % of the stated ones.
 Source: Hoeting et al., Statistical Science 14 (1999), 382-417; conjugate prior of Zellner.
 """
 
