@@ -11,7 +11,6 @@ freedom m is normal with mean 1 - 2/(9m) and variance 2/(9m) (Wilson & Hilferty,
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,7 +33,7 @@ from pipeline.signal.rests import rest_readings, usable
 from pipeline.signal.temperature import temperature_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     from pipeline.estimation.noise_likelihood import Fits, Spectrum
     from pipeline.estimation.noise_search import Candidate
@@ -73,13 +72,13 @@ def identify_noise(recordings: Sequence[Recording]) -> dict[str, JSON]:
         for c in range(3):
             steps = np.concatenate([np.abs(np.diff(s.reading[:, c])) for s in stretches])
             if steps.any():
-                regression = Regression(stretches, c, told["sampling_interval_s"], steps, single=single)
+                regression = Regression(told["unit"], stretches, c, told["sampling_interval_s"], steps, single=single)
                 key = (regression.interval, len(regression.optional), *(len(s.time) for s in stretches))
                 alike.setdefault(key, []).append((sensor, regression))
     for pairs in alike.values():
         axes = _axes([regression for _, regression in pairs])
         for (sensor, regression), axis in zip(pairs, axes, strict=True):
-            found[sensor][0]["axes"][AXES[regression.column]] = axis(SENSOR_UNITS[sensor])
+            found[sensor][0]["axes"][AXES[regression.column]] = axis
     return {sensor: told for sensor, (told, _) in found.items()}
 
 
@@ -153,8 +152,8 @@ def _rests(sensor: str, recording: Recording) -> list[Stretch]:
     return [Stretch(time, reading) for time, reading in found if len(time) >= SHORTEST]
 
 
-def _axes(regressions: Sequence[Regression]) -> list[Callable[[str], JSON]]:
-    """Return the noise of axes of the same sampling, which are fitted side by side, as functions of their unit."""
+def _axes(regressions: Sequence[Regression]) -> list[JSON]:
+    """Return the noise of axes of the same sampling, which are fitted side by side."""
     columns = [[r.columns(r.stretches[i]) for r in regressions] for i in range(len(regressions[0].stretches))]
     most = max(values.shape[1] for values in columns[0])  # an axis with fewer sinusoids has columns of zeros
     padded = [np.stack([np.pad(v, ((0, 0), (0, most - v.shape[1]))) for v in of_axes]) for of_axes in columns]
@@ -167,28 +166,27 @@ def _axes(regressions: Sequence[Regression]) -> list[Callable[[str], JSON]]:
     tau, measured = allan_deviation(np.stack(longest, axis=1), spectrum.interval, PER_DECADE)
     shown = tau <= SHOWN * len(longest[0]) * spectrum.interval
     return [
-        partial(_axis, r, s, candidate, bound, (tau[shown], curve[shown]))
+        _axis(r, s, candidate, bound, (tau[shown], curve[shown]))
         for (s, r), candidate, bound, curve in zip(pairs, best, bounds, measured.T, strict=True)
     ]
 
 
-def _axis(  # noqa: PLR0917  (what was found of an axis)
+def _axis(
     regression: Regression,
     search: Search,
     best: Candidate,
     bounds: tuple[Values, dict[int, float]],
     measured: tuple[Values, Values],
-    unit: str,
 ) -> JSON:
     """Return the noise of one axis as published."""
-    spectrum = search.spectrum
+    spectrum, unit = search.spectrum, regression.unit
     p_value = _p_value(spectrum, best.fit)
     doubts = []
     if p_value < IMPLAUSIBLE:
         doubts.append(f"no composition fits the spectrum (p = {p_value:.1g}): a filter, vibration or a disturbance")
     if regression.scale < COARSE * regression.count:
         doubts.append(f"the readings are rounded to {regression.count:.3g} {unit}, which is coarser than their noise")
-    terms = _terms(unit, spectrum, best, bounds, regression) | regression.terms(unit, best, spectrum)
+    terms = _terms(spectrum, best, bounds, regression) | regression.terms(best, spectrum)
     return {
         "terms": terms,
         "reason": None,
@@ -252,10 +250,10 @@ def _p_value(spectrum: Spectrum, fit: Fits) -> float:
 
 
 def _terms(
-    unit: str, spectrum: Spectrum, best: Candidate, bounds: tuple[Values, dict[int, float]], regression: Regression
+    spectrum: Spectrum, best: Candidate, bounds: tuple[Values, dict[int, float]], regression: Regression
 ) -> JSON:
     """Return the stochastic terms."""
-    (within, upper), scale, names = bounds, regression.scale, regression.names(best)
+    (within, upper), scale, names, unit = bounds, regression.scale, regression.names(best), regression.unit
     kinds, n = best.kinds, len(best.kinds)
     out: JSON = {}
     for kind in SINGLE:

@@ -57,14 +57,16 @@ class _Sinusoid:
 
 
 class Regression:
-    """The deterministic columns of one axis, in units of ``scale``.
+    """The deterministic columns of one axis, fitted in units of ``scale``.
 
     ``steps``: sizes of the differences of successive readings. ``single``: one recording, in which a ramp and sinusoids
     show.
     """
 
-    def __init__(self, stretches: list[Stretch], column: int, interval: float, steps: Values, *, single: bool) -> None:
-        self.stretches, self.column, self.interval = stretches, column, interval
+    def __init__(
+        self, unit: str, stretches: list[Stretch], column: int, interval: float, steps: Values, *, single: bool
+    ) -> None:
+        self.unit, self.stretches, self.column, self.interval = unit, stretches, column, interval
         self.scale = float(np.sqrt(np.mean(steps**2) / 2.0))  # the standard deviation, if it is white
         self.count = float(steps[steps > 1e-9 * self.scale].min())
         start, end = stretches[0].time[0], stretches[-1].time[-1]
@@ -97,8 +99,9 @@ class Regression:
         deterministic = [known[c - 1] for c in sorted(candidate.columns)]
         return [STOCHASTIC[k] for k in candidate.kinds] + [name for name in deterministic if name]
 
-    def terms(self, unit: str, best: Candidate, spectrum: Spectrum) -> dict[str, Any]:
+    def terms(self, best: Candidate, spectrum: Spectrum) -> dict[str, Any]:
         """Return ramp, temperature and sinusoids, as published."""
+        unit = self.unit
         beta, covariance = self.scale * best.fit.beta[0], self.scale**2 * best.fit.beta_covariance[0]
         out: dict[str, Any] = {
             "ramp": self._slope(best, spectrum, "ramp", unit_of("ramp", unit), self.span),
