@@ -83,6 +83,8 @@ def diagnose(
     by_gravity = sensor == "gyroscope" and MOUNTING in configured
     if by_gravity:
         accelerometer = mountings_by_gravity(recordings, settings)
+    elif not by_hand:  # its own mountings are no prior
+        accelerometer = None
     case = Case(calibration, recordings, noise, settings, accelerometer, configured)
     full = (settings.get("diagnosis") or {}).get("depth") == FULL
 

@@ -34,7 +34,7 @@ def goodness_of_fit(selection: Selection) -> dict[str, Any]:
     """Return ``share_worse``, the share of simulations that fit worse, and ``simulations``, their number."""
     from scipy.special import chdtrc  # noqa: PLC0415  (0.1 s that only a diagnosis pays)
 
-    bases, observations = bases_of(selection), selection.observations
+    bases, observations = bases_of(selection), selection.observations.weakened
     curves = curves_of(bases)
     fitted = ProjectedCurves(selection, curves)
     draws = _draws(selection)
@@ -69,7 +69,7 @@ def goodness_of_fit(selection: Selection) -> dict[str, Any]:
 
 def _draws(selection: Selection) -> Values:
     """Return draws from the noise of the fit, in units of the white noise of one sample: (3, n, s) array."""
-    observations, rng = selection.observations, np.random.default_rng(0)
+    observations, rng = selection.observations.weakened, np.random.default_rng(0)
     blocks, weight = observations.blocks, observations.weight
     label, noise = blocks.label(len(weight)), GaussMarkov(blocks, [selection.fit.setting])
     found = []

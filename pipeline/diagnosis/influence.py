@@ -51,7 +51,7 @@ def influence(selection: Selection, names: Sequence[str]) -> list[JSON]:
     for term in selection.fit.terms:
         own[term.effect.name] = term, np.arange(at, at + len(term.values))
         at += len(term.values)
-    design = design_at(selection.observations, selection.fit)
+    design = design_at(selection.observations.weakened, selection.fit)
     whole = design.products([selection.fit.setting])[0]
     without_each = _without_each(selection)
     found = []
@@ -77,7 +77,7 @@ def _gone(recording: JSON) -> bool:
 
 def _gains_of_blocks(selection: Selection, design: Design, whole: Values, term: Term, own: NDArray[np.intp]) -> Values:
     """Return the share of each block in what an effect gains: (m,) array. ``whole``: products of the fit's design."""
-    observations, fit = selection.observations, selection.fit
+    observations, fit = selection.observations.weakened, selection.fit
     described = term.effect.parameters(observations.sensor)
     change = np.zeros(design.count)
     linear = [term.effect.moves or p.name not in term.effect.nonlinear for p in described]
@@ -102,7 +102,7 @@ def _gains_of_blocks(selection: Selection, design: Design, whole: Values, term: 
 def _without_each(selection: Selection) -> list[tuple[Values, float, float]]:
     """Return for each recording the products of the fit without it, the scatter within rows, and the samples."""
     found = []
-    for rest in without_each_recording(selection.observations):
+    for rest in without_each_recording(selection.observations.weakened):
         products = design_at(rest, selection.fit).products([selection.fit.setting])[0]
         found.append((products, float(np.sum(rest.scatter / selection.fit.scale**2)), 3.0 * rest.samples))
     return found

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.estimation.candidates import MOUNTING, ZERO
 from pipeline.estimation.multi_position.model import refusal
 from pipeline.estimation.selection import GATE_BIC
 from pipeline.model.effects import catalogue, effect
@@ -94,6 +95,19 @@ def not_observable(selection: Selection, configured: Sequence[str]) -> dict[str,
 
     earth = ["earth_rotation"] if observations.earth else []
     return _hidden(observations.sensor, [*configured, *selection.names, *earth], reason)
+
+
+def alike_with_zeros(selection: Selection) -> dict[str, str]:
+    """Return the effects that differ from a selected one by a zero of the angle alone, where zeros are estimated."""
+    of_angle = next((t.effect.name for t in selection.base.terms if t.effect.name in (MOUNTING, ZERO)), None)
+    if of_angle is None:
+        return {}
+    known = "it needs turns whose zeros are known: mount the unit once for all turns, by the convention"
+    return {
+        other: f"it differs from {name}, which is selected, by a zero of the angle, which {of_angle} contains; {known}"
+        for name in selection.names
+        for other in selection.first.same_as(selection.first.indices(name)[0])
+    }
 
 
 def _reason(this: Effect, selection: Selection) -> str:

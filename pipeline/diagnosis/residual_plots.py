@@ -239,7 +239,8 @@ class _Columns:
     """The columns of each axis and the residual of a selection's fit, with their products."""
 
     def __init__(self, selection: Selection) -> None:
-        self.observations, self.weight = selection.observations, selection.observations.weight
+        self.observations = selection.observations.weakened
+        self.weight = self.observations.weight
         self.design = design_at(self.observations, selection.fit)
         of_axis = [self.design.of_axis(c) for c in range(3)]
         self.columns = [found[:, :-1] for found in of_axis]

@@ -55,8 +55,9 @@ class _Evidence:
 
     def __init__(self, selection: Selection) -> None:
         self.scale = selection.start.scale
-        self.samples = 3.0 * selection.observations.samples
-        self.within = float(np.sum(selection.observations.scatter / self.scale**2))
+        self.observations = selection.observations.weakened
+        self.samples = 3.0 * self.observations.samples
+        self.within = float(np.sum(self.observations.scatter / self.scale**2))
         self.settings = [WHITE, *selection.settings]
         self.left: Values = np.zeros((len(selection.settings), 3))
         self.penalty: Values = np.zeros(len(selection.settings))
@@ -124,7 +125,7 @@ class ProjectedCurves(_Evidence):
 
     def __init__(self, selection: Selection, curves: Curves, explained: Curves | None = None) -> None:
         super().__init__(selection)
-        observations, (A, places) = selection.observations, columns_of_fit(selection, explained, curves)
+        observations, (A, places) = self.observations, columns_of_fit(selection, explained, curves)
         self.size = np.sqrt(np.einsum("i,ij,ij->j", observations.weight, A, A))[places[0][-1]]
         stacked, logarithms = Products(observations.blocks, observations.weight, A).products(self.settings)
         self._project(stacked, places)
@@ -201,7 +202,7 @@ class Scan(_Evidence):
 
     def __init__(self, selection: Selection, explained: Curves | None = None) -> None:
         super().__init__(selection)
-        observations, (A, places) = selection.observations, columns_of_fit(selection, explained)
+        observations, (A, places) = self.observations, columns_of_fit(selection, explained)
         self.blocks, self.weight = observations.blocks, observations.weight
         self._label = self.blocks.label(len(self.weight))
         self._noise = GaussMarkov(self.blocks, self.settings)
@@ -287,7 +288,7 @@ def each_explains(inner: Values, cross: Values, error: Values) -> tuple[Values, 
 
 def columns_of_fit(selection: Selection, *further: Curves | None) -> tuple[Values, list[list[NDArray[np.intp]]]]:
     """Return the columns of a selection's fit, its residual and those of curves, and where those of each axis lie."""
-    design = design_at(selection.observations, selection.fit)
+    design = design_at(selection.observations.weakened, selection.fit)
     motions = [felt(part, selection.fit.terms) for part in selection.observations.parts]
     columns, places = [design.columns.columns], [[design.places(c)[0]] for c in range(3)]
     for curves in filter(None, further):

@@ -16,7 +16,7 @@ from pipeline.diagnosis.formula_discovery import Discovery, dependent, discover
 from pipeline.diagnosis.goodness_of_fit import goodness_of_fit
 from pipeline.diagnosis.influence import influence
 from pipeline.diagnosis.method_errors import method_errors
-from pipeline.diagnosis.observability import never_shown, not_observable, one_way
+from pipeline.diagnosis.observability import alike_with_zeros, never_shown, not_observable, one_way
 from pipeline.diagnosis.residual_plots import plots
 from pipeline.diagnosis.verdict import verdict_of_selection
 from pipeline.diagnosis.words import FAR_OFF, plain
@@ -138,7 +138,7 @@ def _described(discovery: Discovery, case: Case) -> Findings:
         drop_alone=drop_alone,
         excess=excess,
         held_out=held or [None] * len(fits),
-        hidden=hidden,
+        hidden={**hidden, **alike_with_zeros(reported)},
         unknown=unknown,
         over_noise=_over_noise(selection.base, case),
         left_over_noise=_over_noise(selection.fit, case),

@@ -8,6 +8,11 @@ axis and those that the axes share differ by effect (``Layout``); each is built 
     A = [1, u, every-axis regressors | y_x, its own and shared | y_y, ... | y_z, ...]
 
 so that all products of the 3 n rows are found in ``A^T A``.
+
+Errors e of the angle at the stops of the table (``pipeline.estimation.table_errors``) are further parameters, of
+``N(0, u^2)``. With their columns T, scaled by u, they are eliminated from all products:
+
+    A^T C^-1 A - A^T C^-1 T (1 + T^T C^-1 T)^-1 T^T C^-1 A
 """
 
 from __future__ import annotations
@@ -20,6 +25,7 @@ import numpy as np
 from pipeline.errors import NotObservableError
 from pipeline.estimation.engine import LinearMap, scaled_inverse
 from pipeline.estimation.gauss_markov import Products
+from pipeline.estimation.table_errors import errors_of_stops
 from pipeline.model.effects.base import Layout, truth
 
 if TYPE_CHECKING:
@@ -177,6 +183,26 @@ class Design:
             inner = Q.T @ (root * A[:, 4:])
             A[:, 4:] -= A[:, :4] @ np.linalg.solve(R, inner)
         self.columns = Products(observations.blocks, weight, A)
+        self.stops, self._own, self._at = 0, [self.columns] * 3, list(self._local)
+        if observations.angle_deg > 0.0:
+            self._add_stops(observations, terms, K)
+        width, count = self._own[0].columns.shape[1], self.count + 1 + self.stops
+        self._from = [np.add.outer(at * width, at).ravel() for at in self._at]
+        self._to = [np.add.outer(index * count, index).ravel() for index in self._total]
+
+    def _add_stops(self, observations: Observations, terms: Sequence[Term], K: Values) -> None:
+        """Add the errors of the angle, as parameters after the readings; each axis has columns of its own."""
+        motions = [felt(part, terms) for part in observations.parts]
+        before, after, group, last = errors_of_stops(observations.sensor, motions, K)
+        self.stops = last + 1
+        A, rows, blocks = self.columns.columns, np.arange(len(group)), observations.blocks
+        for c in range(3):
+            T = np.zeros((len(rows), self.stops))
+            T[rows, group] = observations.angle_deg * before[:, c]
+            T[rows, group + 1] = observations.angle_deg * after[:, c]
+            self._own[c] = Products(blocks, observations.weight, np.hstack([A[:, self._local[c]], T]))
+            self._total[c] = np.append(self._total[c], self.count + 1 + np.arange(self.stops))
+            self._at[c] = np.arange(len(self._total[c]))
 
     def _place(self, sensor: str, terms: Sequence[Term]) -> None:
         """Lay out the columns: where each lies in A, and which of all parameters it belongs to, for each axis."""
@@ -210,8 +236,6 @@ class Design:
         self._width = width + 3
         self._local = [np.array(index) for index in local]
         self._total = [np.array(index) for index in total]
-        self._from = [np.add.outer(index * self._width, index).ravel() for index in self._local]
-        self._to = [np.add.outer(index * (parameters + 1), index).ravel() for index in self._total]
 
     def _fill(self, A: Values, sensor: str, part: Part, terms: Sequence[Term], K: Values) -> None:
         *motions, everything = motions_of(part, terms)
@@ -231,50 +255,67 @@ class Design:
 
     def places(self, c: int) -> tuple[Index, Index]:
         """Return where the columns of one axis lie, and to which parameters they belong, the readings last."""
-        return self._local[c], self._total[c]
+        return self._local[c], self._total[c][: len(self._local[c])]
 
     def products(self, settings: Sequence[Setting]) -> tuple[Values, Values]:
         """Return all products of parameters' columns and, last, the readings, (g, p + 1, p + 1); and log det C, (g,).
 
-        Those of the priors are added. The determinant is known up to a constant.
+        Those of the priors are added, errors of the angle eliminated. The determinant is known up to a constant.
         """
-        local, logarithm = self.columns.products(settings)
-        total = np.zeros((len(settings), (self.count + 1) ** 2))
-        flat = local.reshape(len(settings), -1)
-        for c in range(3):
+        whole, logarithms = self._with_stops(settings)
+        if not self.stops:
+            return whole, logarithms
+        p = self.count + 1
+        cross, inner = whole[:, p:, :p], whole[:, p:, p:]
+        left = whole[:, :p, :p] - cross.transpose(0, 2, 1) @ np.linalg.solve(inner, cross)
+        return left, logarithms + np.linalg.slogdet(inner)[1]
+
+    def _with_stops(self, settings: Sequence[Setting]) -> tuple[Values, Values]:
+        """Return the same with the errors of the angle as the last parameters."""
+        count = self.count + 1 + self.stops
+        total = np.zeros((len(settings), count**2))
+        of_settings = {id(own): own.products(settings) for own in self._own}
+        for c, own in enumerate(self._own):
+            flat = of_settings[id(own)][0].reshape(len(settings), -1)
             total[:, self._to[c]] += flat[:, self._from[c]] / self.scale[c] ** 2
-        square = total.reshape(-1, self.count + 1, self.count + 1)
+        square = total.reshape(-1, count, count)
+        last = self.count
         for at, term in self._priors:  # as readings of the parameters themselves
             prior = term.prior
             assert prior is not None  # noqa: S101
             rest = prior.mean - term.values
             square[:, at, at] += prior.precision
-            square[:, at, -1] += prior.precision @ rest
-            square[:, -1, at] += prior.precision @ rest
-            square[:, -1, -1] += rest @ prior.precision @ rest
-        return square, 3.0 * logarithm
+            square[:, at, last] += prior.precision @ rest
+            square[:, last, at] += prior.precision @ rest
+            square[:, last, last] += rest @ prior.precision @ rest
+        of_stops = np.arange(last + 1, count)
+        square[:, of_stops, of_stops] += 1.0
+        return square, np.sum([of_settings[id(own)][1] for own in self._own], axis=0)
 
     def linear_map(self, setting: Setting) -> LinearMap:
         """Return what small changes of the readings do to the parameters, solved under a noise setting."""
-        inverse = self._inverse(setting)
-        influence = self.columns.influence(setting)
-        weights = [influence[index[:-1]] for index in self._local]
-        back = [inverse[:, index[:-1]] / s**2 for index, s in zip(self._total, self.scale, strict=True)]
+        inverse, influence = self._inverse(setting), {id(own): own.influence(setting) for own in self._own}
+        weights, back = [], []
+        for own, at, total, scale in zip(self._own, self._at, self._total, self.scale, strict=True):
+            free = total != self.count  # the readings lie between parameters and stops
+            weights.append(influence[id(own)][at[free]])
+            back.append(inverse[: self.count, (total - (total > self.count))[free]] / scale**2)
         return LinearMap((weights[0], weights[1], weights[2]), (back[0], back[1], back[2]))
 
     def prior_covariances(self, setting: Setting) -> dict[str, Values]:
         """Return what the prior of each effect contributes to the covariance of the parameters: (p, p) arrays."""
-        inverse = self._inverse(setting)
+        inverse = self._inverse(setting)[: self.count, : self.count]
         return {t.effect.name: inverse[:, at] @ t.prior.precision @ inverse[at] for at, t in self._priors if t.prior}
 
     def _inverse(self, setting: Setting) -> Values:
-        """Return the inverse of the products of the parameters' columns: (p, p) array."""
-        gram = self.products([setting])[0][0, :-1, :-1]
-        return scaled_inverse(gram)
+        """Return the inverse of the products of the parameters' columns and those of the stops: (q, q) array."""
+        gram = self._with_stops([setting])[0][0]
+        return scaled_inverse(np.delete(np.delete(gram, self.count, 0), self.count, 1))
 
     def sizes(self) -> Values:
         """Return the norm of each parameter's column before the base was taken out: (p + 1,) array."""
         squares = np.zeros(self.count + 1)
         for c in range(3):
-            squares[self._total[c]] += (self.size[self._local[c]] / self.scale[c]) ** 2  # each index once
+            local, total = self.places(c)
+            squares[total] += (self.size[local] / self.scale[c]) ** 2  # each index once
         return np.sqrt(squares)

@@ -97,7 +97,8 @@ def fit_terms(observations: Observations, terms: Sequence[Term], start: Start, s
         if not linear:
             solved = _solve(_at(observations, terms, bias, K, start.scale), observations, settings)
     residual, _ = _residual(observations, terms, bias, K)
-    squares = np.sum(observations.weight[:, None] * residual**2) + np.sum(observations.scatter)
+    noise = observations.weakened
+    squares = np.sum(noise.weight[:, None] * residual**2) + np.sum(noise.scatter)
     covariance, freedom = solved.posterior.averaged()
     return Fit(
         bias,
@@ -107,7 +108,7 @@ def fit_terms(observations: Observations, terms: Sequence[Term], start: Start, s
         solved.log_likelihood,
         solved.setting,
         float(freedom.min()),
-        float(np.sqrt(squares / (3.0 * observations.samples))),
+        float(np.sqrt(squares / (3.0 * noise.samples))),
         rounds,
         converged,
         solved.condition,
@@ -219,19 +220,18 @@ def _residual_noise(
     design: Design, observations: Observations, settings: Sequence[Setting], reference: Reference
 ) -> ResidualNoise:
     """Weight hypotheses about the noise by their restricted likelihood, given a design of full rank at its solution."""
-    own = observations.by_noise
-    blocks, white = own.blocks, design.scale
-    disturbed = disturbance(reference, observations.reading, blocks, own.weight, white)
+    weight, blocks, white = observations.weight, observations.blocks, design.scale
+    disturbed = disturbance(reference, observations.reading, blocks, weight, white)
     if disturbed is not None:
         columns = np.zeros((3, len(blocks.weight), design.count + 1))
         for c in range(3):
-            columns[c][:, design.places(c)[1]] = blocks.sums(own.weight[:, None] * design.of_axis(c))
+            columns[c][:, design.places(c)[1]] = blocks.sums(weight[:, None] * design.of_axis(c))
         means = columns[:, :, -1].T / blocks.weight[:, None]
         columns /= (np.sqrt(blocks.weight) * white[:, None])[:, :, None]
         X = columns[:, :, :-1].reshape(-1, design.count)
         U, s, _ = np.linalg.svd(X / np.maximum(np.linalg.norm(X, axis=0), 1e-300))
         rank = int(np.sum(s > AVERAGED_OUT * s[0]))
-        return noise_beside(U[:, rank:], means, blocks, settings, white, disturbed, own.weight)
+        return noise_beside(U[:, rank:], means, blocks, settings, white, disturbed, weight)
     size = np.where(design.sizes()[:-1] > 0, design.sizes()[:-1], 1.0)
     products, logarithms = design.products(settings)
     gram, rhs = products[:, :-1, :-1] / np.outer(size, size), products[:, :-1, -1] / size

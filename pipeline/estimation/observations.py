@@ -41,6 +41,9 @@ BLOCKS = 300  # of the bias: their length is below a tenth of the shortest corre
 SHORTEST_BLOCK_S = 4.0  # a fraction of the shortest correlation time of the grid
 FORGOTTEN, FORGOTTEN_DPS = 1e-5, 1e-4  # share of the largest rate that a filter may still hold of a doubtful one
 LONGEST_RESPONSE = 400  # samples
+# Variance of the angle's errors at a stop over that of noise, below which they stay noise: a gain in 2 log L by chance
+# is then a tenth larger, of 10 and more that the gates of ``selection`` ask for.
+HIDDEN_ANGLE = 0.1
 LEFT_OUT = 1e-9  # weight of rows that are left out: their information vanishes, and no block is empty
 
 
@@ -57,7 +60,6 @@ class Part:
     scatter: Values  # (3,); sum of squares about the means, weighted
     clock_shared: bool
     interval: float  # s; between the recording's samples
-    by_noise: Part | None = None  # weighted by noise alone, where errors of the angle take information from it
     moved: dict[tuple[tuple[str, bytes], ...], Motion] = field(default_factory=dict, compare=False, repr=False)
 
 
@@ -71,8 +73,8 @@ class Observations:
     # standard deviations of what the bench adds, by effect (``bench_priors``)
     bench: Mapping[str, float] = field(default_factory=dict)
     mounting_in_doubt: bool = False  # whether one mounting does not explain all turns (note ``N-SEATS``)
-    # deg; standard uncertainty of the angle at each stop, where the unit is mounted anew for each turn; else 0
-    angle_deg: float = 0.0
+    angle_deg: float = 0.0  # standard uncertainty of the angle at each stop; 0 where noise hides it
+    white: float = 0.0  # standard deviation of a sample's white noise, mean of the axes; 0: not known
 
     @cached_property
     def reading(self) -> Values:
@@ -85,9 +87,12 @@ class Observations:
         return np.concatenate([part.weight for part in self.parts])
 
     @cached_property
-    def by_noise(self) -> Observations:
-        """The same observations, weighted by noise alone, without errors of the angle."""
-        return replace(self, parts=tuple(part.by_noise or part for part in self.parts))
+    def weakened(self) -> Observations:
+        """The same, with weights that allow for the errors of the angle, for sums in which these are noise."""
+        parts = self.parts
+        if self.angle_deg > 0.0:
+            parts = tuple(_without_stops(part, _lost_at_stops(part, self)) for part in parts)
+        return replace(self, parts=parts, angle_deg=0.0)
 
     @cached_property
     def scatter(self) -> Values:
@@ -154,17 +159,21 @@ def without_each_recording(observations: Observations) -> Iterator[Observations]
 
 
 def weighted(observations: Observations, noise: Noise | None) -> Observations:
-    """Return observations whose weights say how much correlated noise leaves of their information."""
+    """Return observations whose weights say how much correlated noise leaves of their information.
+
+    Errors of the angle are left aside where noise hides them.
+    """
     parts = []
     for part in observations.parts:
         share = information(noise, part.interval)
-        fewer = part if share == 1.0 else replace(part, weight=share * part.weight, scatter=share * part.scatter)
-        parts.append(_with_stops(fewer, observations, float(np.mean(noise.white))) if noise is not None else fewer)
-    return replace(observations, parts=tuple(parts))
+        parts.append(part if share == 1.0 else replace(part, weight=share * part.weight, scatter=share * part.scatter))
+    found = replace(observations, parts=tuple(parts), white=0.0 if noise is None else float(np.mean(noise.white)))
+    lost = [_lost_at_stops(part, found).max(initial=0.0) for part in parts]
+    return found if max(lost, default=0.0) > HIDDEN_ANGLE else replace(found, angle_deg=0.0)
 
 
-def _with_stops(part: Part, observations: Observations, white: float) -> Part:
-    """Return a part whose weights allow for the errors of the angle at the stops.
+def _lost_at_stops(part: Part, observations: Observations) -> Values:
+    """Return by how much errors of the angle exceed the noise of the stop of each row, as variances: (m,) array.
 
     Rows at one stop, or in the turn from it to the next, share an error ``d``. Together they contain the information of
     ``W / (1 + W d^2 / s^2)`` samples of white noise s. W is their weight, u the standard uncertainty of the angle and r
@@ -172,20 +181,22 @@ def _with_stops(part: Part, observations: Observations, white: float) -> Part:
 
         accelerometer: d = u |f|        gyroscope: d = sqrt(2) u r / way, 0 at rest
     """
-    motion, u = part.motion, np.radians(observations.angle_deg)
+    motion, u, white = part.motion, observations.angle_deg, observations.white
     if u == 0.0 or white <= 0.0 or motion.axis is None or motion.angle is None or motion.rate is None:
-        return part
+        return np.zeros(len(part.weight))
     stop, _, slope, stops = between_stops(motion.angle, motion.rate)
-    moving = slope != 0.0
-    group = 2 * stop + moving
-    error = u * length(motion.specific_force)
+    group = 2 * stop + (slope != 0.0)
+    error = np.radians(u) * length(motion.specific_force)
     if observations.sensor == "gyroscope":
-        error = np.sqrt(2.0) * observations.angle_deg * np.abs(motion.rate * slope)
+        error = np.sqrt(2.0) * u * np.abs(motion.rate * slope)
     together = np.bincount(group, part.weight * (error / white) ** 2, 2 * stops)
-    weight = part.weight / (1.0 + together[group])
-    rests = ~moving
+    return np.asarray(together[group], np.float64)
+
+
+def _without_stops(part: Part, lost: Values) -> Part:
+    weight, rests = part.weight / (1.0 + lost), part.motion.still
     share = float(weight[rests].sum() / part.weight[rests].sum()) if rests.any() else 1.0
-    return replace(part, weight=weight, scatter=share * part.scatter, by_noise=part)
+    return replace(part, weight=weight, scatter=share * part.scatter)
 
 
 def observe(sensor: str, recordings: Sequence[Recording], table: Mapping[str, Any]) -> Observations:
@@ -203,7 +214,7 @@ def observe(sensor: str, recordings: Sequence[Recording], table: Mapping[str, An
     parts.sort(key=_in_time)
     doubt = any(note.code == "N-SEATS" for recording in recordings for note in recording.notes)
     bench = stated_priors(table)
-    angle = float(table.get("angle_accuracy_deg") or 0.0) if "mounting" in bench else 0.0
+    angle = float(table.get("angle_accuracy_deg") or 0.0) if table.get("motion") == "logged" else 0.0
     return Observations(sensor, tuple(parts), earth_of(table) is not None, bench, doubt, angle)
 
 

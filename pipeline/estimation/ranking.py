@@ -227,6 +227,15 @@ class Ranking:
             found[term.effect.name] = max(found.get(term.effect.name, 0.0), min(share, 1.0))
         return found
 
+    def same_as(self, j: int) -> set[str]:
+        """Return the effects all of whose signals a candidate reproduces beside the base."""
+        left = self.chosen([j])[0]
+        return {
+            term.effect.name
+            for i, (term, at) in enumerate(zip(self.candidates, self.places, strict=True))
+            if i != j and len(at) and np.linalg.eigvalsh(left[np.ix_(at, at)])[-1] < NEW
+        }
+
     def explained(self, selected: Sequence[int]) -> Values:
         """Return the whitened sum of squares that each candidate takes from base and selected, white noise: (c,)."""
         products = self.chosen(selected)[0]

@@ -143,9 +143,25 @@ def _without(source: str, key: str, table: Mapping[str, Any]) -> str:
 
 def _angle(reference: Reference) -> Values:
     """Return what an error of each stop's angle does: (p, stops) array."""
-    sensor, K = reference.sensor, reference.K
+    left, right, group, count = errors_of_stops(reference.sensor, reference.motions, reference.K)
+    fit = reference.fit
+    at_stops = fit.of_groups(left, group, count + 1)
+    at_stops += fit.of_groups(right, group + 1, count + 1)
+    attitudes = [m for m in reference.motions if m.axis is None and m.level is not None]
+    if not attitudes:
+        return at_stops
+    return np.concatenate([at_stops, *(_turned(reference, motion) for motion in attitudes)], axis=1)
+
+
+def errors_of_stops(
+    sensor: str, motions: Sequence[Motion], K: Values
+) -> tuple[Values, Values, NDArray[np.intp], int]:
+    """Return what an error of the angle at the stop before and after each sample adds to its reading, per deg.
+
+    Returns two (n, 3) arrays, the number of the stop before, (n,), that after being the next, and the number of stops.
+    """
     left, right, groups, count = [], [], [], 0
-    for motion in reference.motions:
+    for motion in motions:
         n = len(motion.time)
         if motion.axis is None or motion.angle is None or motion.rate is None:
             left.append(np.zeros((n, 3)))
@@ -164,14 +180,7 @@ def _angle(reference: Reference) -> Values:
             right.append(faster)
         groups.append(stop + count)
         count += stops
-    group = np.concatenate(groups)
-    fit = reference.fit
-    at_stops = fit.of_groups(np.concatenate(left), group, count + 1)
-    at_stops += fit.of_groups(np.concatenate(right), group + 1, count + 1)
-    attitudes = [m for m in reference.motions if m.axis is None and m.level is not None]
-    if not attitudes:
-        return at_stops
-    return np.concatenate([at_stops, *(_turned(reference, motion) for motion in attitudes)], axis=1)
+    return np.concatenate(left), np.concatenate(right), np.concatenate(groups), count
 
 
 def between_stops(angle: Values, rate: Values) -> tuple[Index, Values, Values, int]:

@@ -135,6 +135,7 @@ def judged(kind: str, seed: int, number: int, hidden: float) -> dict[str, Any]:
         line["sensors"][sensor] = {
             "error_over_U": (error / U).tolist(), "over_floor": held["steps"][-1]["rms_error"] / held["noise_floor"],
             "inside": bool(inside), "verdict": said["verdict"], "selected": said["selected"], "reason": said["reason"],
+            "not_observable": [entry["effect"] for entry in said["not_observable"]],
         }  # fmt: skip
     return line
 
