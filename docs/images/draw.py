@@ -142,6 +142,27 @@ def mounting(picture: Picture, *, one_axis: bool) -> None:
         picture.text(centre[0], 318, f"up: {up[0]}; at +90 deg: {up[1]}", 14, "#374151")
 
 
+def benches(picture: Picture) -> None:
+    """Draw the kinds of benches: their turn axes, and the setting of each."""
+    level, upward = turned(0, 0.0), np.eye(3)[2]
+    for k, (title, axes, settings) in enumerate((
+        ("three turn axes", np.eye(3), ("table=acutronic, or your own", "mounted once for all turns")),
+        ("one level turn axis", level[:, :1].T, ("table=single_axis", "mounted anew for each turn")),
+        ("a vertical turn axis", upward[None], ("procedure.recordings.gyro_z.up=+z", "gyroscope alone")),
+        ("no table", np.zeros((0, 3)), ("table=hand", "rests, moves and turns by hand")),
+    )):  # fmt: skip
+        centre = (130.0 + 260.0 * k, 175.0)
+        for along in axes:
+            picture.line(place([-1.4 * along, 1.7 * along], centre, 75.0), TURN, 1.5, stroke_dasharray="6 4")
+        tilted = level if len(axes) else level @ rotation(1, 35.0) @ rotation(0, -20.0)
+        unit(picture, tilted, centre, 75.0)
+        for along in axes:
+            turn_arrow(picture, along, 1.7, centre, 75.0)
+        picture.text(centre[0], 30, title, 17, font_weight="bold")
+        for row, words in enumerate(settings):
+            picture.text(centre[0], 318 + 20 * row, words, 14, "#374151")
+
+
 def attitudes(picture: Picture) -> None:
     """Draw attitudes by hand, with the words of the command guide."""
     for k, wanted in enumerate(np.array([[0, 0, 1], [1, 0, 1], [1, 1, 1], [0, -1, 0]], float)):
@@ -244,6 +265,7 @@ def drawings() -> dict[str, str]:
          "A box in the three turns at angle 0: body axes, turn axis and the direction in which the angle counts"),
         ("single_axis", (900, 335), lambda p: mounting(p, one_axis=True),
          "The box on a table with one level turn axis, mounted anew for the turns about x, y and z"),
+        ("benches", (1040, 350), benches, "Benches with three turn axes, one level axis, a vertical axis, and no table"),
         ("attitudes", (1030, 360), attitudes, "Attitudes by hand: a face, an edge or a corner of the case points up"),
         ("faces_and_turns", (900, 540), ferraris, "Six faces up, and turns about the vertical with +x, +y and +z up"),
         ("session", (960, 500), session, "Table angle over time in the recordings of three_axis_turns"),

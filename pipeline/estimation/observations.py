@@ -20,10 +20,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.estimation.gauss_markov import Blocks, information
-from pipeline.estimation.table_errors import between_stops
+from pipeline.estimation.table_errors import errors_of_stops
 from pipeline.estimation.turns import Rows, followed, rows_of
 from pipeline.model.effects import stated_priors
-from pipeline.model.effects.base import length, turning_direction
+from pipeline.model.effects.base import turning_direction
 from pipeline.model.kinematics import earth_of, table_motion
 from pipeline.signal.filters import apply_filter
 
@@ -175,22 +175,16 @@ def weighted(observations: Observations, noise: Noise | None) -> Observations:
 def _lost_at_stops(part: Part, observations: Observations) -> Values:
     """Return by how much errors of the angle exceed the noise of the stop of each row, as variances: (m,) array.
 
-    Rows at one stop, or in the turn from it to the next, share an error ``d``. Together they contain the information of
-    ``W / (1 + W d^2 / s^2)`` samples of white noise s. W is their weight, u the standard uncertainty of the angle and r
-    the rate:
-
-        accelerometer: d = u |f|        gyroscope: d = sqrt(2) u r / way, 0 at rest
+    Rows at one stop, or in the turn from it to the next, share an error of the size d. Together they contain the
+    information of ``W / (1 + W d^2 / s^2)`` samples of white noise s. W is their weight.
     """
-    motion, u, white = part.motion, observations.angle_deg, observations.white
-    if u == 0.0 or white <= 0.0 or motion.axis is None or motion.angle is None or motion.rate is None:
+    angle, white = observations.angle_deg, observations.white
+    if angle == 0.0 or white <= 0.0:
         return np.zeros(len(part.weight))
-    stop, _, slope, stops = between_stops(motion.angle, motion.rate)
-    group = 2 * stop + (slope != 0.0)
-    error = np.radians(u) * length(motion.specific_force)
-    if observations.sensor == "gyroscope":
-        error = np.sqrt(2.0) * u * np.abs(motion.rate * slope)
-    together = np.bincount(group, part.weight * (error / white) ** 2, 2 * stops)
-    return np.asarray(together[group], np.float64)
+    before, after, stop, stops = errors_of_stops(observations.sensor, [part.motion], np.eye(3))
+    group = 2 * stop + np.any(after != 0.0, axis=1)
+    squares = (angle / white) ** 2 * np.sum(before**2 + after**2, axis=1)
+    return np.asarray(np.bincount(group, part.weight * squares, 2 * stops)[group], np.float64)
 
 
 def _without_stops(part: Part, lost: Values) -> Part:

@@ -76,11 +76,12 @@ def check_mounting(recordings: Sequence[Recording], settings: Mapping[str, Any])
     turned = any(d.code in {"wrong_axis", "wrong_face"} for d in departures.values())
     if _negated(found, tolerance.angle_deg) or (mapped and turned):  # an axis map that is stated may be wrong
         refused = list(departures.values())
-    hint = _hint(refused or list(departures.values()), known, accelerometer, maps) if departures else ""
+    zeros = refined_zeros(found) if departures else {}
+    hint = _hint(refused or list(departures.values()), len(known), zeros, accelerometer, maps) if departures else ""
     if refused:
         raise _refusal(refused, hint)
-    zeros = refined_zeros(found) if departures and table.get("seat_deg") is None else {}
-    used = {t.name: _as_found(t, departures.get(t.name), zeros) for t in known}
+    applied = zeros if table.get("seat_deg") is None else {}
+    used = {t.name: _as_found(t, departures.get(t.name), applied) for t in known}
     recordings = [_turned_attitude(r) if departures else r for r in recordings]
     doubts = seat_notes(list(used.values()), table, sensor) if table.get("seat_deg") is None else {}
     return [
@@ -133,17 +134,17 @@ def _refusal(departures: Sequence[_Departure], hint: str) -> IngestError:
 
 def _hint(
     departures: Sequence[_Departure],
-    turns: Sequence[Turn],
+    turns: int,
+    zeros: Mapping[str, float],
     accelerometer: NDArray[np.float64] | None,
     maps: Mapping[str, Sequence[str]],
 ) -> str:
     """Return the settings that describe the bench as it is found, or the axis map under which it is as stated."""
-    zeros = refined_zeros(turns)
     found = [
         d.settings | {k: f"{zeros[d.turn.name]:.2f}" for k in d.settings if k == "zero_deg" and d.turn.name in zeros}
         for d in departures
     ]
-    alike = len(departures) == len(turns) > 1 and all(f == found[0] for f in found)
+    alike = len(departures) == turns > 1 and all(f == found[0] for f in found)
     ways = []
     if alike and found[0] and set(found[0]) <= {"sense", "zero_deg"}:
         ways.append(", ".join(f"table.{k}={v}" for k, v in found[0].items()))

@@ -22,14 +22,16 @@ Turns that do not fit together get the note ``N-SEATS``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.model.effects import effect
 from pipeline.model.kinematics import UP_AT_ZERO, level_at_zero, skew, turn_about_axis, turn_by_vector
 from pipeline.preprocessing.bench import ACROSS, angle_ahead, by_convention, unit
 from pipeline.records import AXES, Note
+from pipeline.records.motion import motion_at_rest
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -51,6 +53,7 @@ CLEARLY, OF_TWO_MORE = 1.0, 4.0  # chi-square by which leans have to be better t
 FITS = 33.0  # chi-square of at most 13 degrees of freedom with a probability of 0.002
 GAUGE = 1e-6  # weight that makes the seats those of the smallest sum of squares
 QUARTERS = np.array([0.0, 90.0, 180.0, 270.0])
+TABLE = ("table_tilt", "table_axis_nonorthogonality")
 # Largest plausible tilt (deg), lean (deg) and time offset (s) where the sensor's config states none.
 LIMITS = {"table_tilt": 1.0, "table_axis_nonorthogonality": 1.0, "time_offset": 0.04}
 
@@ -123,7 +126,8 @@ def _zeros(turns: Sequence[_Conventional], seats: Vector) -> tuple[Vector, Vecto
 
 def _table_explains(turns: Sequence[_Conventional], K: Vector, limits: Sequence[float]) -> bool:
     """Return whether tilt, leaning axes and a time offset within limits explain the turns, and seats do not better."""
-    tilt, lean, late = (np.stack([one(t) for t in turns]) for one in (_tilt_columns, _lean_columns, _offset_columns))
+    tilt, lean = (np.stack([_columns_of(name, t) for t in turns]) for name in TABLE)
+    late = np.stack([_offset_columns(t) for t in turns])
     seat = np.zeros((len(turns), 3, 3, 3 * len(turns)))
     for k, turn in enumerate(turns):
         seat[k, 1:, :, 3 * k : 3 * k + 3] = [np.radians(skew(ideal)) for ideal in turn.ideal]
@@ -155,28 +159,16 @@ def _fit(turns: Sequence[_Conventional], K: Vector, columns: Vector, limits: Seq
     return float("inf") if exceeded else float(np.sum((y - A @ values) ** 2))
 
 
-def _of_quarters(values: Vector) -> Vector:
-    """Return c, p and q of a function of the angle at 0, 90, 180 and 270 deg: (4, 3, m) array to (3, 3, m)."""
-    at_0, at_90, at_180, at_270 = values
-    return np.stack([values.mean(axis=0), (at_0 - at_180) / 2.0, (at_90 - at_270) / 2.0])
-
-
-def _tilt_columns(turn: _Conventional) -> Vector:
-    """Return the derivative by the tilt about level x and y, 1/deg: (3, 3, 2) array, as ``effects/table_tilt.py``."""
-    level = turn_about_axis(level_at_zero(turn.axis), turn.axis, -QUARTERS)
-    return _of_quarters(np.radians(np.stack([level[:, 1], -level[:, 0]], axis=2)))
-
-
-def _lean_columns(turn: _Conventional) -> Vector:
-    """Return the derivative by six leans, 1/deg: (3, 3, 6) array, as ``effects/table_axis_nonorthogonality.py``."""
-    out = np.zeros((4, 3, 6))
-    up = UP_AT_ZERO[turn.axis]
-    force = turn_about_axis(up, turn.axis, -QUARTERS)
-    for step in (1, 2):
-        theta = np.radians(np.cross(np.eye(3)[turn.axis], np.eye(3)[(turn.axis + step) % 3]))
-        home = turn_about_axis(np.cross(theta, up), turn.axis, -QUARTERS)
-        out[:, :, 2 * turn.axis + step - 1] = np.cross(theta, force) - home
-    return _of_quarters(out)
+def _columns_of(name: str, turn: _Conventional) -> Vector:
+    """Return the derivative of c, p and q by the m parameters of a table effect, 1/deg: (3, 3, m) array."""
+    force, level = (turn_about_axis(v, turn.axis, -QUARTERS) for v in (turn.ideal[0], level_at_zero(turn.axis)))
+    rest = motion_at_rest(QUARTERS)
+    motion = replace(rest, specific_force=force, level=level, axis=turn.axis, angle=QUARTERS, rate=np.zeros(4))
+    of = effect(name)
+    at_0, at_90, at_180, at_270 = of.regressors(
+        "accelerometer", motion, np.eye(3), np.zeros(len(of.parameters("accelerometer")))
+    )
+    return np.stack([(at_0 + at_90 + at_180 + at_270) / 4.0, (at_0 - at_180) / 2.0, (at_90 - at_270) / 2.0])
 
 
 def _offset_columns(turn: _Conventional) -> Vector:
