@@ -265,7 +265,7 @@ def drawings() -> dict[str, str]:
          "A box in the three turns at angle 0: body axes, turn axis and the direction in which the angle counts"),
         ("single_axis", (900, 335), lambda p: mounting(p, one_axis=True),
          "The box on a table with one level turn axis, mounted anew for the turns about x, y and z"),
-        ("benches", (1040, 350), benches, "Benches with three turn axes, one level axis, a vertical axis, and no table"),
+        ("benches", (1040, 350), benches, "Benches with three turn axes, one level axis, a vertical axis, no table"),
         ("attitudes", (1030, 360), attitudes, "Attitudes by hand: a face, an edge or a corner of the case points up"),
         ("faces_and_turns", (900, 540), ferraris, "Six faces up, and turns about the vertical with +x, +y and +z up"),
         ("session", (960, 500), session, "Table angle over time in the recordings of three_axis_turns"),

@@ -153,7 +153,7 @@ def _angle(reference: Reference) -> Values:
     return np.concatenate([at_stops, *(_turned(reference, motion) for motion in attitudes)], axis=1)
 
 
-def errors_of_stops(sensor: str, motions: Sequence[Motion], K: Values) -> tuple[Values, Values, NDArray[np.intp], int]:
+def errors_of_stops(sensor: str, motions: Sequence[Motion], K: Values) -> tuple[Values, Values, Index, int]:
     """Return what an error of the angle at the stop before and after each sample adds to its reading, per deg.
 
     Returns two (n, 3) arrays, the number of the stop before, (n,), that after being the next, and the number of stops.

@@ -30,8 +30,7 @@ import numpy as np
 from pipeline.model.effects import effect
 from pipeline.model.kinematics import UP_AT_ZERO, level_at_zero, skew, turn_about_axis, turn_by_vector
 from pipeline.preprocessing.bench import ACROSS, angle_ahead, by_convention, unit
-from pipeline.records import AXES, Note
-from pipeline.records.motion import motion_at_rest
+from pipeline.records import AXES, Note, motion_at_rest
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
