@@ -206,18 +206,28 @@ def _named(line: dict[str, Any]) -> bool:
 
 
 def _in_pairs(kind: str, lines: list[dict[str, Any]], every: list[dict[str, Any]]) -> list[str]:
-    """Return how often the hidden effect is named here and on the bench by the convention, for the same units."""
+    """Return how often the hidden effect is named here and on the bench by the convention, for the same units.
+
+    An effect that is named there alone, and reported as not observable here, is counted by itself.
+    """
     plain = {(o["seed"], o["number"]): o for o in every if o["kind"] == KINDS[kind] != kind and not o["refused"]}
-    pairs = [(_named(line), _named(plain[line["seed"], line["number"]])) for line in lines
+    pairs = [(line, plain[line["seed"], line["number"]]) for line in lines
              if line["hidden"] and (line["seed"], line["number"]) in plain]  # fmt: skip
     if not pairs:
         return []
-    here, there = (sum(side) for side in zip(*pairs, strict=True))
-    change = np.diff(np.array(pairs, float), axis=1)
+    named = np.array([(_named(here), _named(there)) for here, there in pairs], float)
+    reported = sum(named[k, 0] < named[k, 1] and _reported(here) for k, (here, _) in enumerate(pairs))
+    change = np.diff(named, axis=1)
     error = 1.96 * change.std(ddof=1) / np.sqrt(len(pairs)) if len(pairs) > 1 else np.inf
-    return [
-        f"  named {here} of {len(pairs)}, on {KINDS[kind]} {there}: {-100 * change.mean():+.1f} +- {100 * error:.1f} %"
-    ]
+    here, there = named.sum(axis=0)
+    text = f"  named {here:.0f} of {len(pairs)}, on {KINDS[kind]} {there:.0f}: {-100 * change.mean():+.1f}"
+    lost = f"{reported} of those that are named there alone are reported as not observable"
+    return [f"{text} +- {100 * error:.1f} %; {lost}"]
+
+
+def _reported(line: dict[str, Any]) -> bool:
+    sensor, _, effect = line["hidden"].partition(".")
+    return effect in line["sensors"][sensor]["not_observable"]
 
 
 def main() -> None:
