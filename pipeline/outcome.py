@@ -12,7 +12,7 @@ import re
 import shlex
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from pipeline.files import INSTALLED
+from pipeline.files import INSTALLED, read_json
 from pipeline.history import SENSORS, difference, dropped, of_units, read_history
 
 if TYPE_CHECKING:
@@ -138,6 +138,7 @@ def outcome(results: Path, settings: Mapping[str, Any], *, of_this_run: bool) ->
     failed = f", failed: {len(rows) - calibrated}" if calibrated < len(rows) else ""
     findings = findings_of(rows)
     lines = [f"units calibrated: {calibrated}{failed}; look at {results}/index.html", *verdict_lines(findings)]
+    lines += _first(_not_held_out(results, [row["unit"] for row in rows]), "reasons")
     entries = read_history(results) if of_this_run else []
     if entries:
         lines += _first(_changes(entries), "sensors that changed")
@@ -149,6 +150,21 @@ def outcome(results: Path, settings: Mapping[str, Any], *, of_this_run: bool) ->
         lines += _first(no_longer, "units that no longer have an effect")
     lines += [f"{what}: {command}" for what, command in next_commands(findings, settings, folder)]
     return "\n".join(lines) + "\n"
+
+
+def _not_held_out(results: Path, units: Sequence[str]) -> list[str]:
+    """Return why sensors were not judged on held-out motion, with the units, by the published validations."""
+    groups: dict[str, list[str]] = {}
+    files = {unit: results / "validations" / f"{unit}.json" for unit in units}
+    for unit, file in files.items():
+        document = read_json(file) if file.is_file() else {}
+        for sensor in SENSORS:
+            if reason := (document.get(sensor) or {}).get("reason"):
+                groups.setdefault(f"{sensor}, {reason}", []).append(unit)
+    return [
+        f"{what}: {', '.join(names[:NAMED])}{f' and {len(names) - NAMED} more' * (len(names) > NAMED)}"
+        for what, names in groups.items()
+    ]
 
 
 def _first(lines: Sequence[str], of: str) -> list[str]:

@@ -62,18 +62,24 @@ def test_a_run_that_drops_an_effect_is_told_with_what_it_cost_and_how_to_keep_it
     assert dropped(entries) == {("U1", 2): ["gyroscope.g_sensitivity"]}
     columns = "unit,status,accelerometer_verdict,accelerometer_selected,gyroscope_verdict,gyroscope_selected"
     (results / "summary.csv").write_text(f"{columns}\nU1,ok,,,missing_effect,g_sensitivity\nU2,failed,,,,\n")
+    (results / "validations").mkdir()
+    reason = "no held-out recording holds readings of the gyroscope and a reference for them"
+    (results / "validations" / "U1.json").write_text(
+        json.dumps({"accelerometer": None, "gyroscope": {"reason": reason}})
+    )
     add = f"python -m pipeline add bench U1 gyroscope.g_sensitivity --results {tmp_path}"
     told = outcome(results, SETTINGS, of_this_run=True).splitlines()
     assert told[:2] == [
         f"units calibrated: 1, failed: 1; look at {results}/index.html",
         "gyroscope, g_sensitivity missing: U1",
     ]
+    assert told.pop(2) == f"gyroscope, {reason}: U1"
     assert told[2:5] == [
         "U1, gyroscope: - g_sensitivity; held-out error 0.011 -> 0.12 deg/s, 12 times the noise floor",
         f"U1: this run no longer has gyroscope.g_sensitivity, which run 2 had; to have it in every run: {add}",
         f"to add what is missing: {add}",
     ]
-    assert len(outcome(results, SETTINGS, of_this_run=False).splitlines()) == len(told) - 2
+    assert len(outcome(results, SETTINGS, of_this_run=False).splitlines()) == len(told) - 1
 
 
 @pytest.mark.parametrize("content", ["", "[]", '{"run": "one", "units": {}}'])

@@ -159,7 +159,9 @@ def _held_out(part: JSON | None) -> list[str]:
     error, floor, unit = part["steps"][-1]["rms_error"], part["noise_floor"], part["unit"]
     ratio = f", {error / floor:.3g} times the noise floor" if floor else ""
     where = "held-out motion" if part.get("held_out", True) else "the samples of the fit"
-    return [f"In this run, the rms error of the magnitude on {where} is {error:.3g} {unit}{ratio}."]
+    why = [f"Not judged on held-out motion: {part['reason']}."] if part.get("reason") else []
+    notes = [f"{note[:1].upper()}{note[1:]}." for note in part.get("notes") or []]
+    return [f"In this run, the rms error of the magnitude on {where} is {error:.3g} {unit}{ratio}.", *why, *notes]
 
 
 def _is_diagnosis(document: object) -> bool:

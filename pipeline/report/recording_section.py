@@ -22,6 +22,8 @@ LEFT, LANE, LETTERS = 86, 17, 13  # px of the names, px of a lane, letters of a 
 USES = {"used": 1, "held out": 2, "left out": 0}  # of the rests that a fit found by itself, with their colours
 LOGGED = 4  # colour of rests from a table's log
 NARROWEST = 0.002  # of the axis: a shorter rest is drawn so wide
+ANGLE_STEP_S = 0.2  # over which a rate is taken from an angle: an encoder of 0.01 deg gives it to 0.05 deg/s
+STILL_ANGLE = 0.1  # deg/s, two steps of such an encoder
 STILL = 0.02  # deg/s, below which a table's log is noise of its rate
 MARKS = ("after a gap", "clipped", "stuck", "repaired")  # of samples, by the bits of their flags
 
@@ -68,14 +70,20 @@ def _duration(recording: Recording) -> float:
 
 
 def _motion(recording: Recording, rests: int) -> str:
-    rate = recording.table_rate
+    rate, by = recording.table_rate, ""
+    if rate is None and recording.table_angle is not None and recording.samples > 1:
+        every = max(1, round(ANGLE_STEP_S / recording.interval)) if recording.interval > 0 else 1
+        kept = recording.select(slice(None, None, every))
+        assert kept.table_angle is not None  # noqa: S101  (as of the whole)
+        rate, by = np.diff(kept.table_angle) / np.maximum(np.diff(kept.time), every * 1e-9), ", by its angle"
     if rate is None:
-        return "at rest" if recording.role == "static" else "by hand or not logged"
+        logged = "the attitude is logged" if recording.table_attitude is not None else "by hand or not logged"
+        return "at rest" if recording.role == "static" else logged
     fastest = float(np.max(np.abs(rate), initial=0.0))
-    if fastest < STILL:
+    if fastest < (STILL_ANGLE if by else STILL):
         return "at rest"
     kind = "stop-and-go" if rests > 2 else "continuous"
-    return f"{kind}, {rests} rest{'s' if rests != 1 else ''}, up to {number(fastest)} deg/s"
+    return f"{kind}, {rests} rest{'s' if rests != 1 else ''}, up to {number(fastest)} deg/s{by}"
 
 
 def _range(values: NDArray[np.float64] | None) -> str:

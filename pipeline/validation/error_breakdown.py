@@ -74,6 +74,12 @@ def last_step(calibration: SensorCalibration, samples: Samples, other: SensorCal
     return _with_effects(calibration, calibration.effects, other, samples)
 
 
+def left_out(calibration: SensorCalibration, samples: Sequence[Samples]) -> str:
+    """Return the effects that some of the samples cannot show, with a verb: ``a, b are``."""
+    names = [e.name for e in calibration.effects if any(_lack(calibration, e, s) for s in samples)]
+    return f"{', '.join(names)} {'is' if len(names) == 1 else 'are'}"
+
+
 def last_error_of_magnitude(
     calibration: SensorCalibration, samples: Samples, other: SensorCalibration | None
 ) -> Values | None:

@@ -22,7 +22,7 @@ from pipeline.estimation.rest_means import held_out_rests, split_rests
 from pipeline.model.effects.base import truth, unit_of
 from pipeline.model.kinematics import EARTH_RATE_DPS
 from pipeline.model.measurement import linear_truth
-from pipeline.validation.error_breakdown import direction_known, error_breakdown, last_error_of_magnitude
+from pipeline.validation.error_breakdown import direction_known, error_breakdown, last_error_of_magnitude, left_out
 from pipeline.validation.expected_error import expected_rms_error, linearized
 from pipeline.validation.samples import samples_of_motion, samples_of_rests, squared_norm_errors
 
@@ -167,14 +167,15 @@ def _expected(
     *,
     other: SensorCalibration | None,
 ) -> tuple[list[float] | None, list[str]]:
-    """Return the interval of the last step's rms error (None where an effect is left out), and notes on it.
+    """Return the interval of the last step's rms error (None where an effect is left out), and notes on it or why not.
 
     Earth's rotation, where it is left out of a magnitude, changes the rms error by its rate at most.
     """
     parts = [linearized(calibration, s, _truth(calibration, s), other) for s in samples if s.known.any()]
     known = [p for p in parts if p is not None]
     if len(known) < len(parts):
-        return None, []
+        lack = left_out(calibration, samples)
+        return None, [f"the expected error is not stated, because {lack} left out of the held-out error"]
     own = [r for r in recordings if r.role in {calibration.sensor, "rests"} and r.samples]
     fitted_s = sum(float(r.time[-1] - r.time[0]) for r in own if r.reading(calibration.sensor) is not None)
     low, high = expected_rms_error(calibration, known, noise, settings, fitted_s)

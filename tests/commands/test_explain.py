@@ -56,6 +56,19 @@ def test_a_parameter_beyond_the_data_sheet_is_told(results: Path, capsys: pytest
     assert said in capsys.readouterr().out
 
 
+def test_why_the_error_is_not_that_of_held_out_motion_is_told(
+    results: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = results / "bench" / "validations"
+    folder.mkdir()
+    judged = {"steps": [{"rms_error": 0.1}], "noise_floor": 0.05, "unit": "deg/s", "held_out": False}
+    judged |= {"reason": "no reference", "notes": ["the expected error is not stated"]}
+    (folder / "U1.json").write_text(json.dumps({"accelerometer": None, "gyroscope": judged}))
+    main([str(results / "bench"), "U1"])
+    said = capsys.readouterr().out
+    assert "Not judged on held-out motion: no reference.\n    The expected error is not stated.\n" in said
+
+
 def test_the_missing_effect_is_named_with_its_size_and_the_commands_that_add_it(
     results: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
