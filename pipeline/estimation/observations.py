@@ -25,6 +25,7 @@ from pipeline.estimation.turns import Rows, followed, rows_of
 from pipeline.model.effects import stated_priors
 from pipeline.model.effects.base import turning_direction
 from pipeline.model.kinematics import earth_of, table_motion
+from pipeline.signal.encoder_rate import rate_by_angle
 from pipeline.signal.filters import apply_filter
 
 if TYPE_CHECKING:
@@ -60,6 +61,7 @@ class Part:
     scatter: Values  # (3,); sum of squares about the means, weighted
     clock_shared: bool
     interval: float  # s; between the recording's samples
+    rounding: Values | None = None  # (m,); variance of the rate by a coarse encoder, (deg/s)^2; None of a fine one
     moved: dict[tuple[tuple[str, bytes], ...], Motion] = field(default_factory=dict, compare=False, repr=False)
 
 
@@ -166,10 +168,19 @@ def weighted(observations: Observations, noise: Noise | None) -> Observations:
     parts = []
     for part in observations.parts:
         share = information(noise, part.interval)
-        parts.append(part if share == 1.0 else replace(part, weight=share * part.weight, scatter=share * part.scatter))
+        fewer = part if share == 1.0 else replace(part, weight=share * part.weight, scatter=share * part.scatter)
+        parts.append(fewer if noise is None else _behind_encoder(fewer, float(np.mean(noise.white))))
     found = replace(observations, parts=tuple(parts), white=0.0 if noise is None else float(np.mean(noise.white)))
     lost = [_lost_at_stops(part, found).max(initial=0.0) for part in parts]
     return found if max(lost, default=0.0) > HIDDEN_ANGLE else replace(found, angle_deg=0.0)
+
+
+def _behind_encoder(part: Part, white: float) -> Part:
+    """Return a part whose rows weigh ``1 / (1 + r^2 / s^2)`` as much: r is the noise of the rate, s of a sample."""
+    if part.rounding is None or white <= 0.0:
+        return part
+    weight = part.weight / (1.0 + part.rounding / white**2)
+    return replace(part, weight=weight, scatter=float(weight.sum() / part.weight.sum()) * part.scatter)
 
 
 def _lost_at_stops(part: Part, observations: Observations) -> Values:
@@ -238,7 +249,13 @@ def _part(sensor: str, recording: Recording, table: Mapping[str, Any]) -> Part |
     information = min(float(recording.filter.get("noise_gain", 1.0)) ** 2, 1.0)
     means = rows.means(reading)
     kept = reading[rows.kept]
-    within = np.sum((kept - np.repeat(means, rows.count.astype(int), axis=0)) ** 2, axis=0)
+    squares = (kept - np.repeat(means, rows.count.astype(int), axis=0)) ** 2
+    by_angle = rate_by_angle(recording) if sensor == "gyroscope" and recording.axis is not None else None
+    rounding = None if by_angle is None or not by_angle.noise.any() else rows.means(by_angle.noise**2)
+    known = np.ones(len(kept), bool)
+    if rounding is not None and (rounding == 0.0).any():  # the scatter at rest is that of the sensor alone
+        known = np.repeat(rounding == 0.0, rows.count.astype(int))
+    within = np.sum(squares[known], axis=0) * (len(kept) / np.count_nonzero(known))
     return Part(
         recording.name,
         recording.role,
@@ -248,6 +265,7 @@ def _part(sensor: str, recording: Recording, table: Mapping[str, Any]) -> Part |
         within * information,
         recording.clock_shared,
         recording.interval,
+        rounding=rounding,
     )
 
 

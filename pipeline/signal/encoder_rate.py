@@ -7,7 +7,8 @@ encoder of the resolution q hides a rate below the noise of that: then the angle
 
 where D^k is the k-th divided difference over times h apart. S is the density of a random acceleration (k = 2), jerk (3)
 or derivative of the jerk (4); k and S maximize the likelihood of the log. The covariance of A is
-``(I / R + D^T D h / S)^-1``, the inverse of a band matrix.
+``(I / R + D^T D h / S)^-1``, the inverse of a band matrix. The rate is the central difference of A. In addition to its
+covariance, the rate varies between the samples about this mean, by ``S h^(2k - 3) / (2 (2k - 1) (k - 1)!^2)``.
 
 Source: H. L. Weinert, Fast Compact Algorithms and Software for Spline Smoothing, 2013; the likelihood is that of G.
 Wahba, Annals of Statistics 13 (1985), 1378, for a noise of known variance.
@@ -17,6 +18,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from math import factorial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -161,8 +163,11 @@ def _stretch(time: Values, angle: Values, step: float) -> tuple[Values, float]:
     ends = np.zeros((n, 2))
     ends[[middle + 1, middle - 1], [0, 1]] = 1.0
     P = cho_solve_banded((factor, False), ends)[[middle + 1, middle - 1]]
-    error = float(np.sqrt(P[0, 0] + P[1, 1] - 2.0 * P[0, 1])) / float(time[middle + 1] - time[middle - 1])
-    return smooth + start, error
+    apart = float(time[middle + 1] - time[middle - 1])
+    by_angle = (P[0, 0] + P[1, 1] - 2.0 * P[0, 1]) / apart**2
+    order, density = ORDERS[best], float(np.exp(fits[best].x))
+    within = 0.5 * density * (0.5 * apart) ** (2 * order - 3) / ((2 * order - 1) * factorial(order - 1) ** 2)
+    return smooth + start, float(np.sqrt(by_angle + within))
 
 
 class _Smoother:
