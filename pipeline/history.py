@@ -144,10 +144,11 @@ def difference(before: JSON, after: JSON) -> Change:
         other.append("calibrated again")
     if all(calibrated) and before.get("recordings") != after.get("recordings"):
         other.append("other recordings")
-    same = not (settings or other or any(added.values()) or any(removed.values()))
-    if before and same:
-        moved = before.get("config_sha256") != after.get("config_sha256")
-        other.append("other values in the files of the configuration" if moved else "computed again")
+    moved = before.get("config_sha256") != after.get("config_sha256")
+    if all(calibrated) and moved and not (settings or any(added.values()) or any(removed.values())):
+        other.append("other values in the files of the configuration")
+    elif before and not (settings or other or any(added.values()) or any(removed.values())):
+        other.append("computed again")
     return Change(added, removed, settings, other)
 
 

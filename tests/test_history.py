@@ -53,6 +53,10 @@ def test_what_differs_is_told_in_words() -> None:
     assert difference(before, before | {"config_sha256": "x"}).words() == [
         "other values in the files of the configuration"
     ]
+    assert difference(before, before | {"recordings": "cd", "config_sha256": "x"}).words() == [
+        "other recordings",
+        "other values in the files of the configuration",
+    ]
 
 
 def test_a_run_that_drops_an_effect_is_told_with_what_it_cost_and_how_to_keep_it(tmp_path: Path) -> None:

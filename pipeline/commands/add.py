@@ -15,12 +15,13 @@ from pipeline.config.campaign import find_campaign, read_layers
 from pipeline.config.devices import edit_effects, sensor_and_effect
 from pipeline.errors import ConfigurationError, MissingInputError, PipelineError
 from pipeline.files import read_json, write_atomically
+from pipeline.model.effects import catalogue
 from pipeline.outcome import RESULTS, read_summary, run_command
 from pipeline.records import SENSORS
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from pipeline.config.devices import Edit
 
@@ -100,6 +101,8 @@ def change(arguments: argparse.Namespace, *, remove: bool) -> int:
     edits = [edit_effects(unit, effects, layers, composer, remove=remove) for unit, effects in wanted.items()]
     for edit in edits:
         _apply(edit)
+    if not remove and (told := _of_the_bench(chain.from_iterable(wanted.values()))):
+        print(told)
     settings = {"campaign": arguments.campaign, **given}
     if arguments.results != RESULTS:
         settings["results"] = arguments.results
@@ -109,6 +112,17 @@ def change(arguments: argparse.Namespace, *, remove: bool) -> int:
         return 0
     print(f"runs: {command}", flush=True)
     return run_snakemake(arguments, arguments.config)
+
+
+def _of_the_bench(effects: Iterable[tuple[str, str]]) -> str:
+    """Return which effects belong to the bench, and what they are good for; empty where all are the sensor's."""
+    known = {name: catalogue().get(name.partition("@")[0]) for _, name in effects}
+    names = sorted(name for name, this in known.items() if this is not None and this.owner != "sensor")
+    if not names:
+        return ""
+    what = "an effect of the bench (table, mounting, place or one recording), not of the sensor"
+    use = "It frees the fit from an error of the bench; apply does not correct it in field logs"
+    return f"note: {', '.join(names)}: {what}. {use}"
 
 
 def parser_of_edit(command: str, description: str | None) -> argparse.ArgumentParser:

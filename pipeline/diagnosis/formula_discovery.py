@@ -48,6 +48,8 @@ if TYPE_CHECKING:
 
     Values = NDArray[np.float64]
 
+LEAST_STABLE = 0.5  # share of resamples, a convention: below it, other formulas together are the best more often
+NEEDED = {"temperature": "bias_temperature"}  # covariate: the effect that is observable where the covariate varies
 FINALISTS = 8  # forms that compete in the resamples
 FOLDS = 5  # parts of every recording that are left out in turn
 LISTED = 6  # entries of the front
@@ -62,6 +64,17 @@ class Discovery:
     unknown: list[dict[str, Any]]  # covariates on which the residual depends, the form first
     suggested: dict[str, Any] | None = None  # the effect's definition
     front: list[dict[str, Any]] = field(default_factory=list)
+
+
+def why_not_suggested(found: Discovery, hidden: Mapping[str, str]) -> str | None:
+    """Return why a form that was found is not offered as an effect: not stable, or of a signal that shows no effect."""
+    covariate = found.unknown[0]["covariate"]
+    if covariate in NEEDED and NEEDED[covariate] in hidden:
+        return f"effects of the {covariate} are not observable: {hidden[NEEDED[covariate]]}"
+    stability = found.front[0]["stability"] if found.front else None
+    if stability is not None and stability < LEAST_STABLE:
+        return f"it is not stable: another formula is the best in {100 * (1 - stability):.0f} % of the resamples"
+    return None
 
 
 def dependent(selection: Selection) -> list[dict[str, Any]]:

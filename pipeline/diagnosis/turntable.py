@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.diagnosis.findings import Findings
-from pipeline.diagnosis.formula_discovery import Discovery, dependent, discover
+from pipeline.diagnosis.formula_discovery import Discovery, dependent, discover, why_not_suggested
 from pipeline.diagnosis.goodness_of_fit import goodness_of_fit
 from pipeline.diagnosis.influence import influence
 from pipeline.diagnosis.method_errors import method_errors
@@ -62,7 +62,7 @@ def findings(case: Case) -> Findings:
     def search() -> Findings | None:
         found = discover(selection, unknown, *given, accelerometer=case.accelerometer)
         try:
-            return _described(found, case) if found.suggested else None
+            return _offered(_described(found, case), found) if found.suggested else None
         except ConvergenceError:  # a form that held-out readings cannot be corrected by is no effect of a sensor
             return None
 
@@ -73,6 +73,16 @@ def findings(case: Case) -> Findings:
         fitted = [r for r in case.recordings if r.role != "validation"]
         described = _described(plain, replace(case, recordings=fitted))
     return replace(described, search=search)
+
+
+def _offered(described: Findings, found: Discovery) -> Findings:
+    """Return findings without the suggestion where the form is no firm one, and with the reason."""
+    reason = why_not_suggested(found, described.hidden)
+    if reason is None:
+        return described
+    formulas = [{**formula, "suggested": False} for formula in found.front]
+    more = {"suggested_effect": None, "not_suggested": reason, "formulas": formulas}
+    return replace(described, more={**described.more, **more})
 
 
 def _described(discovery: Discovery, case: Case) -> Findings:

@@ -159,6 +159,8 @@ def _unknown(part: Mapping[str, Any], sensor: str) -> list[str]:
         which = "remaining residual" if part["selected"] else "residual"
         lines.append(f"The {which} depends on {plain(found['covariate'])} ({p}){form}.")
     effect = part.get("suggested_effect")
+    if part.get("not_suggested"):
+        lines.append(f"This formula is not offered as an effect: {part['not_suggested']}.")
     if effect:
         file = part.get("suggested_file", f"<unit>_{sensor}_unknown.yaml")
         stability = (part.get("formulas") or [{}])[0].get("stability")

@@ -68,7 +68,7 @@ def _chart(sensor: str, entries: Sequence[JSON]) -> Figure | None:
 
 def _row(entry: JSON, part: JSON, sensor: str) -> Point:
     change, floor = entry["change"], part["floor"]
-    words = change.words(sensor) if change else [f"+ {name}" for name in part["effects"]]
+    words = change.words(sensor) or change.words() if change else [f"+ {name}" for name in part["effects"]]
     label = f"run {entry['run']}" + (f": {plain(', '.join(words))}" if words else "")
     label = label if len(label) <= LABEL else f"{label[: LABEL - 1]}…"
     label += f", {number(part['error'] / floor)} × floor" if floor else ""

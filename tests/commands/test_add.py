@@ -52,6 +52,15 @@ def test_an_override_is_put_into_a_file_that_keeps_the_rest(before: str, after: 
     assert set_override(before, KEY, NEW, "U1.yaml") == after
 
 
+def test_an_effect_of_the_bench_is_said_to_be_left_by_apply(campaign: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert add.main([str(campaign), "U1", "gyroscope.g_sensitivity", "gyroscope.low_pass_lag", "--no-run"]) == 0
+    said = capsys.readouterr().out
+    assert "note: low_pass_lag: an effect of the bench" in said
+    assert "apply does not correct it in field logs" in said
+    assert add.main([str(campaign), "U1", "gyroscope.g_sensitivity", "--no-run"]) == 0
+    assert "note:" not in capsys.readouterr().out
+
+
 def test_a_form_that_cannot_be_edited_in_place_is_refused() -> None:
     with pytest.raises(ConfigurationError, match=r"U1.yaml: cannot be edited in place: write 'eff"):
         set_override("overrides: [\n  a=1  # one\n]\n", KEY, NEW, "U1.yaml")

@@ -15,7 +15,14 @@ from bench_session import CONTINUOUS, SIZE, STOP_AND_GO, Course, Session, record
 
 from pipeline.diagnosis import turntable
 from pipeline.diagnosis.diagnose import diagnose
-from pipeline.diagnosis.formula_discovery import dependent, discover, effect_file, suggested_effect
+from pipeline.diagnosis.formula_discovery import (
+    Discovery,
+    dependent,
+    discover,
+    effect_file,
+    suggested_effect,
+    why_not_suggested,
+)
 from pipeline.diagnosis.functional_forms import Factor, Form, Span, columns_of, harmonic, power, step
 from pipeline.diagnosis.residual_regression import ProjectedCurves, Scan
 from pipeline.diagnosis.words import in_words
@@ -309,3 +316,25 @@ def test_nothing_is_guessed_in_sixty_units_without_anything_unknown(sensor: str,
             9000 + seed, courses[seed % 3], wander=wander, static=bool(seed % 2), ramp=15.0 * (seed % 5 == 0)
         )
         assert dependent(selection_of(sensor, record(session))) == [], seed
+
+
+@pytest.mark.parametrize(
+    ("covariate", "stability", "hidden", "reason"),
+    [
+        ("angle", 0.9, {}, None),
+        ("angle", None, {"bias_temperature": "it varies by 0.08 degC"}, None),
+        ("angle", 0.1, {}, "it is not stable: another formula is the best in 90 % of the resamples"),
+        (
+            "temperature",
+            0.9,
+            {"bias_temperature": "it varies by 0.08 degC"},
+            "effects of the temperature are not observable: it varies by 0.08 degC",
+        ),
+    ],
+)
+def test_a_form_that_is_not_stable_or_of_a_signal_that_hardly_varies_is_not_offered(
+    covariate: str, stability: float | None, hidden: dict[str, str], reason: str | None
+) -> None:
+    selection: Any = None
+    found = Discovery(selection, selection, [{"covariate": covariate}], {"name": "f"}, [{"stability": stability}])
+    assert why_not_suggested(found, hidden) == reason
