@@ -160,7 +160,7 @@ def _held_out(part: JSON | None) -> list[str]:
     ratio = f", {error / floor:.3g} times the noise floor" if floor else ""
     where = "held-out motion" if part.get("held_out", True) else "the samples of the fit"
     why = [f"Not judged on held-out motion: {part['reason']}."] if part.get("reason") else []
-    notes = [f"{note[:1].upper()}{note[1:]}." for note in part.get("notes") or []]
+    notes = [f"Held-out error: {note}." for note in part.get("notes") or []]
     return [f"In this run, the rms error of the magnitude on {where} is {error:.3g} {unit}{ratio}.", *why, *notes]
 
 

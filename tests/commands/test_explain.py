@@ -66,7 +66,9 @@ def test_why_the_error_is_not_that_of_held_out_motion_is_told(
     (folder / "U1.json").write_text(json.dumps({"accelerometer": None, "gyroscope": judged}))
     main([str(results / "bench"), "U1"])
     said = capsys.readouterr().out
-    assert "Not judged on held-out motion: no reference.\n    The expected error is not stated.\n" in said
+    assert (
+        "Not judged on held-out motion: no reference.\n    Held-out error: the expected error is not stated.\n" in said
+    )
 
 
 def test_the_missing_effect_is_named_with_its_size_and_the_commands_that_add_it(
