@@ -363,9 +363,14 @@ def test_a_python_file_without_an_effect_is_refused(code: str, message: str, tmp
 
 def test_the_page_on_effects_of_ones_own_holds(tmp_path: Path) -> None:
     page = (Path(__file__).parents[2] / "docs" / "effects_of_your_own.md").read_text()
-    example, vector = (yaml.safe_load(text) for text in re.findall(r"```yaml\n(.*?)```", page, re.DOTALL))
+    example, vector, of_level_frame = (
+        yaml.safe_load(text) for text in re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
+    )
     assert effect_from(example, "page").name == "gear_mesh"
     assert effect_from({**example, **vector, "limits": {"pull": 1}}, "page").layout == Layout.SHARED
+    rate = effect_from({**example, **of_level_frame, "limits": dict.fromkeys(("E_x", "E_y", "E_z"), 1.0)}, "page")
+    assert rate.layout == catalogue()["earth_rotation"].layout
+    assert [p.name for p in rate.parameters("gyroscope")] == ["E_x", "E_y", "E_z"]
     (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     (tmp_path / "loose_part.py").write_text(code)
     assert load_python_effect(tmp_path / "loose_part.py").limits("accelerometer") == {"loose_part": 0.05}
