@@ -136,7 +136,7 @@ class _Gyroscope:
 
     def __init__(self, turns: Sequence[Recording]) -> None:
         self.slopes: dict[str, list[tuple[float, float] | None]] = {}  # of each turn: gain and bias of each axis
-        found: list[tuple[int, float, Values, Values]] = []  # axis, usual fastest rate, gain and bias
+        found: list[tuple[int, float, Values, Values]] = []  # axis turned about, usual fastest rate, gain and bias
         for recording in turns:
             rate = rate_of_turn(recording)
             if rate is None or recording.gyroscope is None:
@@ -144,7 +144,8 @@ class _Gyroscope:
             slopes = self.slopes[recording.name] = slopes_of(recording.gyroscope, rate)
             if None not in slopes:
                 gain, bias = np.array(slopes, np.float64).T
-                found.append((axis_index(recording), float(quantiles(np.abs(rate), 0.9)[0]), gain, bias))
+                turned = int(np.argmax(np.abs(gain)))  # the stated axis may be another: a matter of the mounting
+                found.append((turned, float(quantiles(np.abs(rate), 0.9)[0]), gain, bias))
         gains = [abs(gain[axis]) for axis, _, gain, _ in found]
         self.usual = float(np.median(gains)) if len(gains) > 2 else 1.0
         self.matrix = self.usual * np.eye(3)

@@ -119,6 +119,8 @@ def test_another_turn_axis_is_used_where_gravity_shows_it_and_else_refused() -> 
     exchanged = [replace(r, axis={"x": "y", "y": "x"}.get(str(r.axis), r.axis)) for r in recordings]
     found = check_mounting(exchanged, settings_of(exchanged))
     assert [r.axis for r in found] == [r.axis for r in recordings]
+    fast = [r for r in exchanged if r.role == "gyroscope"]
+    assert [r.axis for r in check_recordings(fast, settings_of(fast))] == ["x", "y", "z"]
     said = next(n.detail for r in found for n in r.notes if r.name == "accel_x" and n.code == "N-FOUND")
     assert "said to turn about y, and gravity turns about x" in said
     assert "accel_x.axis=x" in said
