@@ -21,7 +21,7 @@ import pytest
 from stage_files import documents, write_pack
 
 ROOT = Path(__file__).parents[2]
-pytestmark = pytest.mark.workflow
+pytestmark = [pytest.mark.workflow, pytest.mark.faults]
 
 # Found by the process whose copies run the jobs: disturbs the first report before it renames its first file.
 # A shell that starts a job in the background ignores SIGINT for it, and children inherit that: Ctrl-C is set here.
