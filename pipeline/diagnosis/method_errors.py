@@ -309,9 +309,7 @@ def _size(name: str, difference: _Difference, own: Values, recordings: Sequence[
 
 def _fastest(recording: Recording) -> float:
     """Return the largest rate of a turn, deg/s."""
-    rate = recording.table_rate
-    if rate is None and recording.table_angle is not None:
-        rate = np.gradient(recording.table_angle, recording.time)
+    rate = recording.logged_rate
     return 0.0 if rate is None else float(np.abs(rate).max())
 
 

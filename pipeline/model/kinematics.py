@@ -190,9 +190,8 @@ def level_at_zero(axis: int, up: str = "", shaft: int = 0) -> Values:
     if not up and not shaft:
         return np.asarray(LEVEL_AT_ZERO[axis])
     if not up:
-        return np.array(
-            [shaft * np.eye(3)[axis], np.cross(UP_AT_ZERO[axis], shaft * np.eye(3)[axis]), UP_AT_ZERO[axis]]
-        )
+        along, upward = shaft * np.eye(3)[axis], UP_AT_ZERO[axis]
+        return np.array([along, np.cross(upward, along), upward])
     upward = np.eye(3)[AXES.index(up[1])] * (1.0 if up[0] == "+" else -1.0)
     level_x = np.eye(3)[(AXES.index(up[1]) + 1) % 3]
     return np.array([level_x, np.cross(upward, level_x), upward])

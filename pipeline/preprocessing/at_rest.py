@@ -36,7 +36,7 @@ import numpy as np
 
 from pipeline.io.units import TRIADS
 from pipeline.model.kinematics import EARTH_RATE_DPS
-from pipeline.preprocessing.evidence import LEAST_RATE_DPS, axis_index, place, quantiles, rate_of_turn, refusal
+from pipeline.preprocessing.evidence import LEAST_RATE_DPS, axis_index, place, quantiles, refusal
 from pipeline.records import SENSOR_UNITS, SENSORS, Note, median
 from pipeline.signal.rests import RATE_AT_REST_DPS, rests_from_table, runs
 
@@ -305,7 +305,7 @@ def _check_copies(recording: Recording) -> None:
 
 
 def _check_spans(recording: Recording) -> None:
-    rate, axis = rate_of_turn(recording), axis_index(recording)
+    rate, axis = recording.logged_rate, axis_index(recording)
     if rate is None:
         return
     if recording.gyroscope is not None:

@@ -242,15 +242,6 @@ def slopes_of(y: Values, rate: Values) -> list[tuple[float, float] | None]:
     return [(K, b) if K != 0.0 else None for K, b in zip(gain.tolist(), bias.tolist(), strict=True)]
 
 
-def rate_of_turn(recording: Recording) -> Values | None:
-    """Return the table's rate at the samples, by its rate, else by its angle: (n,) array, deg/s."""
-    if recording.table_rate is not None:
-        return recording.table_rate
-    if recording.table_angle is None:
-        return None
-    return np.asarray(np.gradient(recording.table_angle, recording.time))
-
-
 def axis_index(recording: Recording) -> int:
     """Return the index of the axis that a recording turns about."""
     return AXES.index(str(recording.axis))

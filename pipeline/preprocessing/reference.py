@@ -36,7 +36,6 @@ from pipeline.preprocessing.evidence import (
     of_rate,
     of_table,
     quantiles,
-    rate_of_turn,
     refusal,
     slopes_of,
     spin,
@@ -138,7 +137,7 @@ class _Gyroscope:
         self.slopes: dict[str, list[tuple[float, float] | None]] = {}  # of each turn: gain and bias of each axis
         found: list[tuple[int, float, Values, Values]] = []  # axis turned about, usual fastest rate, gain and bias
         for recording in turns:
-            rate = rate_of_turn(recording)
+            rate = recording.logged_rate
             if rate is None or recording.gyroscope is None:
                 continue
             slopes = self.slopes[recording.name] = slopes_of(recording.gyroscope, rate)
@@ -157,7 +156,7 @@ class _Gyroscope:
 
     def along(self, recording: Recording, axis: int) -> Values | None:
         """Return the rate about a turn axis: (n,) array, deg/s; its bias is that of this recording."""
-        rate, slopes = rate_of_turn(recording), self.slopes.get(recording.name)
+        rate, slopes = recording.logged_rate, self.slopes.get(recording.name)
         if recording.gyroscope is None or rate is None or slopes is None:
             return None
         reading, slope = recording.gyroscope[:, axis], slopes[axis]

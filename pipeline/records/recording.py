@@ -167,6 +167,13 @@ class Recording:
         """Results computed from this recording that several steps use: smoothed temperature, reference motions."""
         return {}
 
+    @cached_property
+    def logged_rate(self) -> Values | None:
+        """Rate of the table, deg/s: as logged, else by central differences of its angle; None without either."""
+        if self.table_rate is not None or self.table_angle is None or self.samples < 2:
+            return self.table_rate
+        return np.asarray(np.gradient(self.table_angle, self.time))
+
     @property
     def valid(self) -> NDArray[np.bool_]:
         """Which samples ingest did not flag as clipped or stuck: (n,) array. A sample after a gap is valid."""

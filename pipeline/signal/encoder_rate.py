@@ -71,7 +71,6 @@ def rate_by_angle(recording: Recording) -> EncoderRate | None:
         return None
     key = "encoder_rate"
     if key not in recording.cache:
-        assert recording.table_angle is not None  # noqa: S101
         recording.cache[key] = _rate_of(recording.time, recording.table_angle)
     found: EncoderRate = recording.cache[key]
     return found

@@ -102,11 +102,8 @@ def rests_from_table(recording: Recording) -> list[Rest]:
 
     Their first 0.3 s, and the delay of the recording's filter, are left out.
     """
-    if recording.table_rate is not None:
-        rate = recording.table_rate
-    elif recording.table_angle is not None and recording.samples > 1:
-        rate = np.gradient(recording.table_angle, recording.time)
-    else:
+    rate = recording.logged_rate
+    if rate is None:
         return []
     still = still_samples(recording.time, rate, SETTLING_S + float(recording.filter.get("delay_s", 0.0)))
     return [Rest(start, stop) for start, stop in runs(still)]

@@ -172,12 +172,8 @@ def _find_segments(recording: Recording) -> list[Segment]:
 
 def _rate_of_table(recording: Recording) -> Values | None:
     """Return the rate of the table, its size where only that is known: (n,) array, deg/s."""
-    if recording.table_rate is not None:
-        return recording.table_rate
-    if recording.table_angle is not None:
-        return np.asarray(np.gradient(recording.table_angle, recording.time))
-    if recording.table_attitude is None:
-        return None
+    if recording.logged_rate is not None or recording.table_attitude is None:
+        return recording.logged_rate
     return rate_of_attitude(recording.time, recording.table_attitude)
 
 

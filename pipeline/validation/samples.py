@@ -215,17 +215,16 @@ def _rate(
 
 def _rate_by_angle(recording: Recording) -> EncoderRate | None:
     """Return the rate by the table's angle, where the table logs nothing better and turns about one fixed axis."""
-    logged = recording.table_rate is not None or (recording.axis is None and recording.table_attitude is not None)
-    if logged or recording.table_angle is None or recording.gyroscope is None:
+    found = rate_by_angle(recording)
+    if found is None or recording.axis is not None:
+        return found
+    if recording.table_attitude is not None or recording.gyroscope is None:
         return None
-    if recording.axis is None:
-        known = recording.gyroscope[np.isfinite(recording.gyroscope).all(axis=1)]
-        if len(known) < FEWEST:
-            return None
-        spread = np.linalg.eigvalsh(np.cov(known.T))
-        if spread[1] > OFF_AXIS**2 * spread[2]:
-            return None
-    return rate_by_angle(recording)
+    known = recording.gyroscope[np.isfinite(recording.gyroscope).all(axis=1)]
+    if len(known) < FEWEST:
+        return None
+    spread = np.linalg.eigvalsh(np.cov(known.T))
+    return found if spread[1] <= OFF_AXIS**2 * spread[2] else None
 
 
 def squared_norm_errors(truth: Values, matrix: Values, variance: Values) -> Values:
