@@ -193,15 +193,20 @@ def _turned_attitude(recording: Recording) -> Recording:
 
 
 def _negated(turns: Sequence[Turn], tolerance: float) -> bool:
-    """Return whether each turn shows the opposite face at the stated zero: rather a negated accelerometer."""
+    """Return whether each turn shows the opposite face at the stated zero: rather a negated accelerometer.
+
+    A unit that is turned over shows the opposite sense about one axis or two of the three; a negated accelerometer
+    shows none of them so, or, on a table that counts left-handed, all.
+    """
     found = [(t.found, t.stated) for t in turns if t.recording.role == "accelerometer"]
     signs = {"+": "-", "-": "+"}
-    return bool(found) and all(
+    opposite = bool(found) and all(
         f is not None
         and (f.axis, f.up) == (s.axis, signs[s.up[0]] + s.up[1])
         and abs(f.zero_deg - s.zero_deg) <= tolerance
         for f, s in found
     )
+    return opposite and len({f.sense * s.sense for f, s in found if f is not None}) == 1
 
 
 def _as_found(turn: Turn, departure: _Departure | None, zeros: Mapping[str, float]) -> Turn:

@@ -136,6 +136,22 @@ def test_a_unit_turned_as_a_whole_is_told_the_axis_map_that_may_be_right() -> No
     assert any("or sensor.axis_map=[-y,+x,+z]" in n.detail for r in found for n in r.notes)
 
 
+@pytest.mark.parametrize("sense", [1, -1])
+def test_a_unit_turned_over_is_used_and_a_negated_accelerometer_is_refused(sense: int) -> None:
+    turns = [r for r in recordings_of({a: Setup(a, sense=sense) for a in "xyz"}) if r.role == "accelerometer"]
+    over = [_mapped(r, np.diag([-1.0, 1.0, -1.0])) for r in turns]  # by half a turn about y: each face is the opposite
+    right = recordings_of({})
+    for used, by_convention in zip(check_mounting(over, settings_of(over)), right, strict=False):
+        motion, usual = reference_motion(used), reference_motion(by_convention)
+        assert motion is not None
+        assert usual is not None
+        turned = usual.specific_force @ np.diag([-1.0, 1.0, -1.0])
+        assert np.max(np.abs(motion.specific_force - turned)) < np.radians(0.1)
+    negated = [replace(_mapped(r, -np.eye(3)), gyroscope=None) for r in turns]
+    with pytest.raises(IngestError, match="is mounted otherwise than stated"):
+        check_mounting(negated, settings_of(negated))
+
+
 def _mapped(recording: Recording, accelerometer: Any, gyroscope: Any = None) -> Recording:
     """Return a recording as a sensor reads it whose axes are turned or mirrored by a signed permutation."""
     maps = np.array(accelerometer, float), np.array(accelerometer if gyroscope is None else gyroscope, float)
