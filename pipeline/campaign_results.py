@@ -19,7 +19,7 @@ import pandas as pd
 
 from pipeline.errors import InputError, MissingInputError
 from pipeline.files import read_json
-from pipeline.published import batches_of
+from pipeline.pack import batches_of
 from pipeline.records import SENSORS
 from pipeline.report.parameters import fitted_parameters, reading_errors
 from pipeline.report.summary import COLUMNS
@@ -27,7 +27,7 @@ from pipeline.report.summary import COLUMNS
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from pipeline.published import Batch
+    from pipeline.pack import Batch
 
 JSON = dict[str, Any]
 DOCUMENTS = ("calibrations", "validations", "diagnoses")

@@ -12,7 +12,7 @@ from pipeline.model.effects import effect
 from pipeline.model.effects.base import truth
 from pipeline.records import AXES, Motion, Recording
 from pipeline.simulation.procedures import Course, plan
-from pipeline.simulation.scene import ALTERATIONS, Scene, alter
+from pipeline.simulation.sensor import ALTERATIONS, Scene, alter
 from pipeline.simulation.session import Environment
 
 if TYPE_CHECKING:

@@ -10,9 +10,8 @@ import numpy as np
 
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.gyroscope import rests_and_moves
-from pipeline.signal.hand_turns import held_out_windows
 from pipeline.signal.rests import find_rests
-from pipeline.signal.segments import cut
+from pipeline.signal.segments import cut, held_out_windows
 from pipeline.simulation.campaign import simulate_unit
 from pipeline.simulation.description import UnitDescription, read_config
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.model.kinematics import LEVEL_AT_ZERO
-from pipeline.planning.next_rest import in_words
+from pipeline.planning.guide import in_words
 from pipeline.signal.rests import SETTLING_S
 from pipeline.simulation.procedures import Course, plan
 from pipeline.simulation.trajectory import rotation_about

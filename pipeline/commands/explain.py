@@ -12,13 +12,13 @@ from pipeline.commands import parser_of
 from pipeline.commands.convert import sheets_of
 from pipeline.diagnosis.words import in_words
 from pipeline.errors import InputError, MissingInputError
-from pipeline.exports.explanation import explain_calibration
+from pipeline.exports.conversion import explain_calibration
 from pipeline.exports.reading import counts_of, read_any
 from pipeline.files import read_json
 from pipeline.history import read_history
-from pipeline.model.plausible import sentences
+from pipeline.model.calibration_file import sentences
 from pipeline.outcome import Finding, commands_of, next_commands, read_summary, verdict_lines
-from pipeline.published import PACKS
+from pipeline.pack import PACKS
 from pipeline.records import SENSORS
 
 if TYPE_CHECKING:

@@ -19,8 +19,7 @@ from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.io.files import MESSAGE_FORMATS, candidate_files, recording_files
 from pipeline.io.ingest_settings import checks_of
 from pipeline.io.read import read_table, to_recording
-from pipeline.planning.next_rest import MOST, in_words, progress_of, propose
-from pipeline.planning.next_turn import Turn, most_informative_turn, next_face_or_turn
+from pipeline.planning.guide import MOST, Turn, in_words, most_informative_turn, next_face_or_turn, progress_of, propose
 from pipeline.preprocessing.checks import check_recordings
 from pipeline.signal.rests import WINDOW_S, find_rests
 from pipeline.simulation.description import BY_HAND
@@ -29,7 +28,7 @@ if TYPE_CHECKING:
     import argparse
     from collections.abc import Sequence
 
-    from pipeline.planning.next_rest import Progress
+    from pipeline.planning.guide import Progress
     from pipeline.records import Recording
     from pipeline.signal.rests import Rest
 

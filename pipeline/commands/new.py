@@ -11,7 +11,7 @@ from pipeline.errors import ConfigurationError, InputError
 from pipeline.files import CONFIGS
 from pipeline.model.data_sheet import range_settings
 from pipeline.outcome import run_command
-from pipeline.planning.instructions import readme
+from pipeline.planning.changes import readme
 from pipeline.simulation.description import UnitDescription, read_option
 from pipeline.simulation.procedures import TABLE_PROCEDURES
 

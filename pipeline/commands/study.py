@@ -8,11 +8,18 @@ from typing import TYPE_CHECKING
 from pipeline.commands import parser_of
 from pipeline.errors import ConfigurationError
 from pipeline.run_progress import Countdown
-from pipeline.study.answers import figures, numbers, reliability_diagram
 from pipeline.study.cases import FAMILIES
 from pipeline.study.page import DIAGRAM, page
 from pipeline.study.run import RESULTS, TRUTH, read_lines, run_study
-from pipeline.study.scores import all_figures, cases_of, in_the_catalogue, mean_excess_gone
+from pipeline.study.scores import (
+    all_figures,
+    cases_of,
+    figures,
+    in_the_catalogue,
+    mean_excess_gone,
+    numbers,
+    reliability_diagram,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

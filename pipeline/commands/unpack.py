@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from pipeline.errors import MissingInputError
 from pipeline.files import flushed_together, write_atomically
 from pipeline.history import read_history
-from pipeline.published import batches_of
+from pipeline.pack import batches_of
 from pipeline.results_folder import PUBLISHED, record_written, repetitions, take_run
 from pipeline.stages.gather import publish_histories
 

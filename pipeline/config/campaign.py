@@ -12,10 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.config.comparisons import resolve_comparisons
 from pipeline.config.compose import Composer
-from pipeline.config.layers import as_list, load_layers
+from pipeline.config.layers import as_list, load_layers, read_sheet
 from pipeline.config.options import Problem, default_of_run, nearest, parse
 from pipeline.config.schema import OF_BENCH
-from pipeline.config.sheet import read_sheet
 from pipeline.config.stage_settings import config_sha256
 from pipeline.config.user_effects import GIVEN, PYTHON
 from pipeline.errors import ConfigurationError

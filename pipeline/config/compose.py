@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
 INSTANCE = "${ingest.instance}"
 NOT_WANTED = "not_wanted"  # stage of a sensor whose method is null
-OF_A_SETUP = ("mounting", "bias")  # effects that exist as one setup's own alone (pipeline.model.effects.sessions)
+OF_A_SETUP = ("mounting", "bias")  # effects that exist as one setup's own alone (pipeline.model.effects.mounting)
 
 
 class Composer:

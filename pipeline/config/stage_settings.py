@@ -270,8 +270,7 @@ def _imports(file: Path) -> tuple[Path, ...]:
     found: list[Path | None] = []
     if file.name == "__init__.py" and b"import_module(" in source:
         found += [f for f in file.parent.rglob("*") if f.is_file() and f.suffix != ".pyc"]
-    if file == PACKAGE / "model" / "effects" / "files.py":
-        found += [*file.parent.glob("*.py")]  # classes that the files name
+    if file == PACKAGE / "model" / "effects" / "__init__.py":
         found += [f for f in sorted(EFFECTS.glob("*.yaml")) if b"\nbuilt_in: true" in f.read_bytes()]
     for module, names, whole in IMPORT.findall(source.decode()):
         if module == "jinja2":

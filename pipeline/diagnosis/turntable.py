@@ -13,8 +13,7 @@ import numpy as np
 
 from pipeline.diagnosis.findings import Findings
 from pipeline.diagnosis.formula_discovery import Discovery, dependent, discover, why_not_suggested
-from pipeline.diagnosis.goodness_of_fit import goodness_of_fit
-from pipeline.diagnosis.influence import influence
+from pipeline.diagnosis.influence import goodness_of_fit, influence
 from pipeline.diagnosis.method_errors import method_errors
 from pipeline.diagnosis.observability import alike_with_zeros, never_shown, not_observable, one_way
 from pipeline.diagnosis.residual_plots import plots

@@ -11,7 +11,7 @@ from pipeline.errors import ConfigurationError, NotObservableError
 from pipeline.estimation.design import NormalPrior, Term
 from pipeline.model.effects import catalogue, effect, stated_priors
 from pipeline.model.effects.base import parameter_limits
-from pipeline.model.effects.sessions import OWN
+from pipeline.model.effects.mounting import OWN
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -55,10 +55,9 @@ from pipeline.estimation.gauss_markov import (
     variance_of_average,
 )
 from pipeline.records import Noise, Recording, median
-from pipeline.signal.creep import along_gravity, creep_of
-from pipeline.signal.filters import filter_autocovariance, variance_of_mean
+from pipeline.signal.filters import filter_autocovariance, temperature_of, variance_of_mean
+from pipeline.signal.quiet_motion import along_gravity, creep_of
 from pipeline.signal.rests import rest_readings, stretches_of, usable
-from pipeline.signal.temperature import temperature_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

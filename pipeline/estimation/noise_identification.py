@@ -29,8 +29,8 @@ from pipeline.estimation.noise_terms import (
     unit_of,
 )
 from pipeline.records import AXES, SENSOR_UNITS, SENSORS
+from pipeline.signal.filters import temperature_of
 from pipeline.signal.rests import rest_readings, usable
-from pipeline.signal.temperature import temperature_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -12,10 +12,9 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from pipeline.signal.creep import believed_rates, creep_in
-from pipeline.signal.filters import filter_autocovariance, variance_of_mean
+from pipeline.signal.filters import filter_autocovariance, smooth_temperature, variance_of_mean
+from pipeline.signal.quiet_motion import believed_rates, creep_in
 from pipeline.signal.rests import find_rests, rests_from_table, usable
-from pipeline.signal.temperature import smooth_temperature
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -112,7 +111,7 @@ def rest_means(recording: Recording, rests: Sequence[Rest], sensor: str = "accel
     """Return the mean reading of each rest, without clipped, stuck or missing samples.
 
     By hand a unit may creep: the mean over its directions is too short, and is made longer by that (see
-    ``pipeline.signal.creep``).
+    ``pipeline.signal.quiet_motion``).
 
     Returns ``means`` (m, 3), g or deg/s: NaN where a rest has no sound sample; ``counts`` (m,): number of samples
     averaged.

@@ -28,7 +28,7 @@ from pipeline.estimation.design import BASE, BASE_NAMES
 from pipeline.estimation.monte_carlo import beside_trials, through, trials_of
 from pipeline.estimation.table_errors import table_errors, type_b
 from pipeline.records import NORMAL, RECTANGULAR, SENSOR_UNITS, Contribution, FittedEffect, coverage_factor, finite
-from pipeline.signal.temperature import temperature_of
+from pipeline.signal.filters import temperature_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

@@ -12,9 +12,9 @@ import numpy as np
 
 from pipeline.exports.noise import noise
 from pipeline.io.channel_table import STRAIGHT, maps_of_log
+from pipeline.model.calibration_file import sentences
 from pipeline.model.effects import owner_of
 from pipeline.model.effects.base import REFERENCE_TEMPERATURE, STANDARD_GRAVITY, Owner
-from pipeline.model.plausible import sentences
 from pipeline.records import SENSORS
 
 if TYPE_CHECKING:

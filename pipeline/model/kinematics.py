@@ -29,8 +29,8 @@ from pipeline.errors import InputError
 from pipeline.model.encoder_trajectory import EncoderTrajectory
 from pipeline.records import AXES, Motion, conjugate_product, continuous
 from pipeline.signal.encoder_rate import rate_by_angle
+from pipeline.signal.filters import temperature_of
 from pipeline.signal.rests import still_samples
-from pipeline.signal.temperature import temperature_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

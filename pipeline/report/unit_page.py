@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.files import json_text
-from pipeline.model.plausible import sentences
+from pipeline.model.calibration_file import sentences
 from pipeline.outcome import VERDICTS, commands_of, place, run_command
 from pipeline.records import SENSOR_UNITS, SENSORS
 from pipeline.report.diagnosis_section import evidence_figures, limit_rows, ranking_rows, upper_limits

@@ -12,7 +12,7 @@ where
           that of rounding, by the smallest step between successive readings
     m   : the multiple, from the widest range over which the number of rests stays the same
 
-A rest is trimmed by W at its start. A gyroscope must be quiet, too (``pipeline.signal.quiet_rates``), as a turn about
+A rest is trimmed by W at its start. A gyroscope must be quiet, too (``pipeline.signal.quiet_motion``), as a turn about
 the vertical does not change the specific force. A rest in which the sensor still turned or shook is refused: its
 angular rate departs from that of the neighbouring rests, its direction moves, or it scatters beyond the noise. A turn
 by theta shortens the mean of a vector by theta^2 / 24, for 2 deg by 5e-5: 0.05 mg.
@@ -27,9 +27,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.records import median, noise_of_steps
-from pipeline.signal.creep import creep_in
 from pipeline.signal.filters import filter_autocovariance, stretch_starts
-from pipeline.signal.quiet_rates import RATE_LIMIT_DPS, counts_of, quiet_pieces, windows
+from pipeline.signal.quiet_motion import RATE_LIMIT_DPS, counts_of, creep_in, quiet_pieces, windows
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -48,8 +47,8 @@ MULTIPLES = np.geomspace(4.0, 1000.0, 25)  # of a variance: 2 to 30 times the no
 SMALLEST_VARIANCE = 1e-12  # g^2, keeps the multiple of a noise-free recording above rounding
 NEIGHBOURS = 5  # rests: their median withstands two that turned
 TURN_LIMIT_DEG = 2.0  # 0.05 mg, see above
-# A steady tilt is modelled up to this rate (``pipeline.signal.creep``); units in real hands and on soft seats creep by
-# up to 0.3 deg/s.
+# A steady tilt is modelled up to this rate (``pipeline.signal.quiet_motion``); units in hands or on soft seats
+# creep by up to 0.3 deg/s.
 CREEP_LIMIT_DPS, STEADY_LIMIT_DEG = 0.5, 10.0
 SCATTER_LIMIT = 3.0  # times the noise; noise alone stays below 1.3 in the 100 samples of a rest at 100 Hz
 SMALLEST_SCATTER_G2 = 3e-6  # 1 mg on each axis, so that a quiet sensor may settle by 0.1 deg

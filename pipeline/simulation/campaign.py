@@ -29,10 +29,12 @@ from pipeline.simulation.session import (
     TEMPERATURE_DECIMALS,
     Bench,
     Streams,
+    columns_of,
+    programs_of,
     random_environment,
     record,
+    with_table_log,
 )
-from pipeline.simulation.table_logs import columns_of, programs_of, with_table_log
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import DamagedFileError, PipelineError
 from pipeline.files import read_json
-from pipeline.pack import Files, Pack, as_bytes, new_pack
-from pipeline.published import FAILED
+from pipeline.pack import FAILED, Files, Pack, as_bytes, new_pack
 from pipeline.results_folder import hold_as_job, record_written
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from pipeline import __version__
 from pipeline.errors import CannotCalibrateError
 from pipeline.estimation.noise_identification import identify_noise
 from pipeline.io.channel_table import axis_maps
-from pipeline.model.plausible import implausible
+from pipeline.model.calibration_file import implausible
 from pipeline.records import SENSORS
 from pipeline.stages.unit_files import recordings_of
 

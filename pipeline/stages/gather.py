@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.errors import PipelineError
 from pipeline.files import flushed_together, read_json, write_atomically, write_json
 from pipeline.history import of_units, record, unit_state
-from pipeline.published import PACKS, STAGES, Batch
+from pipeline.pack import PACKS, STAGES, Batch
 from pipeline.report.campaign_page import render
 from pipeline.report.combined import combined_calibrations
 from pipeline.report.comparison_section import section, unit_figures

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.io.parquet import to_parquet
 from pipeline.io.read import read_recordings
 from pipeline.preprocessing.checks import check_recordings
-from pipeline.signal.hand_turns import held_out_windows
-from pipeline.signal.segments import cut
+from pipeline.signal.segments import cut, held_out_windows
 
 if TYPE_CHECKING:
     from pipeline.pack import Files

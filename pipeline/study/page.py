@@ -8,15 +8,17 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from pipeline.model.effects import effect
-from pipeline.study.answers import figures, numbers, reliability
 from pipeline.study.cases import FAINT, SIZES
 from pipeline.study.scores import (
     Z,
     all_figures,
+    figures,
     first_is_right,
     in_the_catalogue,
     mean_excess_gone,
     named,
+    numbers,
+    reliability,
     warned,
     wilson,
 )

@@ -13,9 +13,8 @@ import pandas as pd
 
 from pipeline.report.numbers import MINUS, NOTHING
 from pipeline.report.pages import template
-from pipeline.thesis.agreement import agreements, scatters
 from pipeline.thesis.conclusions import KINDS, conclusions
-from pipeline.thesis.errata import errata
+from pipeline.thesis.errata import agreements, errata, scatters
 from pipeline.thesis.figures import all_figures
 from pipeline.thesis.results import DEVICES, Results
 from pipeline.thesis.seeds import CAUSES, LOST

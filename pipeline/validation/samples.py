@@ -34,9 +34,9 @@ from pipeline.estimation.rest_means import rest_means, split_rests
 from pipeline.model.effects.base import truth
 from pipeline.model.effects.timing import shifted
 from pipeline.model.kinematics import earth_of, table_motion
-from pipeline.signal.creep import believed_rates, creep_in
 from pipeline.signal.encoder_rate import FEWEST, EncoderRate, rate_by_angle
 from pipeline.signal.filters import filter_autocovariance, variance_of_mean
+from pipeline.signal.quiet_motion import believed_rates, creep_in
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -131,7 +131,7 @@ def samples_of_rests(
     """Return the mean readings of rests, or None where there are none.
 
     Of a gyroscope they are less the rate at which the unit creeps, as far as the accelerometer shows it; what it does
-    not show counts as noise of the rest (``pipeline.signal.creep``).
+    not show counts as noise of the rest (``pipeline.signal.quiet_motion``).
     """
     reading, counts = rest_means(recording, rests, sensor)
     rests = [rest for rest, count in zip(rests, counts, strict=False) if count]

@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 from whole_run import settings_names
 
-from pipeline.config import load_campaign
+from pipeline.config import load_campaign, stage_settings
+from pipeline.model.effects import built_in
 
 SHEET = """unit,method,overrides
 A1,,
@@ -91,3 +92,9 @@ def test_a_change_of_sheet_or_device_concerns_the_batch_of_the_unit(tmp_path: Pa
     device.unlink()
     sheet.write_text(plain + "".join(f"V{i},\n" for i in range(10)))
     assert batches() == {"0002", "0003", "0004"}
+
+
+@pytest.mark.parametrize("stage", ["validate", "diagnose"])
+def test_the_digest_of_a_stage_contains_the_files_of_the_built_in_effects(stage: str) -> None:
+    read = {file.name for file in stage_settings._closure(f"pipeline.stages.{stage}")}
+    assert {f"{name}.yaml" for name in built_in()} <= read

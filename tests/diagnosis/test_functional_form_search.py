@@ -35,7 +35,7 @@ from pipeline.estimation.selection import Selection, select
 from pipeline.model.effects import effect_from, forget, register
 from pipeline.model.kinematics import reference_motion
 from pipeline.records import Recording, SensorCalibration
-from pipeline.signal.temperature import smooth_temperature
+from pipeline.signal.filters import smooth_temperature
 from pipeline.study.cases import draw
 from pipeline.study.run import judge
 

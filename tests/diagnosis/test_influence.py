@@ -10,8 +10,7 @@ import pytest
 import yaml
 from bench_session import STOP_AND_GO, Session, record
 
-from pipeline.diagnosis.goodness_of_fit import goodness_of_fit
-from pipeline.diagnosis.influence import influence
+from pipeline.diagnosis.influence import goodness_of_fit, influence
 from pipeline.estimation.design import Start
 from pipeline.estimation.generalized_least_squares import fit_terms
 from pipeline.estimation.noise import estimate_noise

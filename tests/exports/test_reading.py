@@ -15,7 +15,7 @@ from pipeline import load_calibration
 from pipeline.commands.convert import main
 from pipeline.errors import ConfigurationError, InputError
 from pipeline.exports import formats
-from pipeline.exports.explanation import SAMPLE, explain_calibration
+from pipeline.exports.conversion import SAMPLE, explain_calibration
 from pipeline.exports.reading import read_any
 from pipeline.records import SENSORS, SensorCalibration
 

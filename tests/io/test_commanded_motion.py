@@ -13,8 +13,7 @@ from pipeline.errors import IngestError
 from pipeline.io.commanded_motion import follow_program
 from pipeline.records import Recording
 from pipeline.simulation.procedures import Course, plan
-from pipeline.simulation.session import Streams
-from pipeline.simulation.table_logs import as_program
+from pipeline.simulation.session import Streams, as_program
 from pipeline.simulation.trajectory import Turn
 
 if TYPE_CHECKING:

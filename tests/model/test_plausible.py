@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.model.plausible import implausible, sentences
+from pipeline.model.calibration_file import implausible, sentences
 from pipeline.records import FittedEffect, SensorCalibration
 from pipeline.stages.calibration import judged
 

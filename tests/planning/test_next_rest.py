@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pipeline.planning.next_rest import attitudes, in_words, progress_of, propose
+from pipeline.planning.guide import attitudes, in_words, progress_of, propose
 from pipeline.records import Recording
 from pipeline.simulation.description import read_config
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pipeline.planning.next_turn import TURNS_DEG, Turn, most_informative_turn
+from pipeline.planning.guide import TURNS_DEG, Turn, most_informative_turn
 from pipeline.records import SensorCalibration
 
 

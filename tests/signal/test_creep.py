@@ -9,7 +9,7 @@ from hand_simulator import Hand, draw
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.gyroscope import rests_and_moves
 from pipeline.estimation.noise import estimate_noise
-from pipeline.signal.creep import believed_rates, creep_of
+from pipeline.signal.quiet_motion import believed_rates, creep_of
 from pipeline.validation.heldout import validate
 
 QUIET = {"accelerometer": 3e-4, "gyroscope": 0.01}  # white noise of a sample, g and deg/s

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.signal.temperature import smooth_temperature
+from pipeline.signal.filters import smooth_temperature
 
 TIME = np.arange(0.0, 120.0, 0.12)
 NOISE = 0.03

@@ -15,8 +15,7 @@ from pipeline.records import rate_of_attitude
 from pipeline.simulation.campaign import simulate_unit, write_campaign
 from pipeline.simulation.description import UnitDescription, description_from
 from pipeline.simulation.procedures import Course, plan
-from pipeline.simulation.session import Streams
-from pipeline.simulation.table_logs import as_program
+from pipeline.simulation.session import Streams, as_program
 from pipeline.simulation.trajectory import Turn
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from pipeline.model.effects.base import Owner, truth
 from pipeline.model.effects.formula_effect import FormulaEffect
 from pipeline.model.kinematics import earth_rate
 from pipeline.simulation.rate_table import ProgramBuilder, TurnErrors
-from pipeline.simulation.scene import ALTERATIONS, STANDARD_GRAVITY, Scene, alter
+from pipeline.simulation.sensor import ALTERATIONS, STANDARD_GRAVITY, Scene, alter
 from pipeline.simulation.trajectory import Turn, random_gimbals, rotation_by
 
 SIZES = {

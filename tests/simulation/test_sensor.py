@@ -6,8 +6,7 @@ import pytest
 from pipeline.model.effects import effect
 from pipeline.records import Motion
 from pipeline.simulation.description import read_config
-from pipeline.simulation.scene import Scene
-from pipeline.simulation.sensor import SimulatedSensor, bias_wander, decimals_of
+from pipeline.simulation.sensor import Scene, SimulatedSensor, bias_wander, decimals_of
 from pipeline.simulation.trajectory import random_gimbals
 
 SHEETS = read_config("sensor", "mpu6050")

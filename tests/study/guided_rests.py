@@ -18,12 +18,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.planning.next_rest import progress_of, propose
+from pipeline.planning.guide import progress_of, propose
 from pipeline.records import Recording, coverage_factor
 from pipeline.simulation.description import read_config
 
 if TYPE_CHECKING:
-    from pipeline.planning.next_rest import Progress
+    from pipeline.planning.guide import Progress
 
 RATE_HZ, MOVE_S, SETTLES_S = 20.0, 2.5, 0.5  # a rest is found half a second late
 HAND_DEG = 1.0  # as configs/table/hand.yaml

@@ -6,18 +6,23 @@ from typing import Any
 
 import pytest
 
-from pipeline.study.answers import figures, in_the_set, numbers, ratios, reliability, reliability_diagram
 from pipeline.study.page import by_signal, confusions, found_at, instead, of_shapes, page, table_of
 from pipeline.study.scores import (
     all_figures,
     cases_of,
     exact,
     excess_gone,
+    figures,
     first_is_right,
     hard_to_replace,
     in_the_catalogue,
+    in_the_set,
     mean_excess_gone,
     not_silent,
+    numbers,
+    ratios,
+    reliability,
+    reliability_diagram,
 )
 
 

@@ -9,8 +9,8 @@ import pytest
 
 from pipeline.records import Recording
 from pipeline.signal.filters import apply_filter
-from pipeline.thesis.agreement import agreements, scatters
 from pipeline.thesis.conclusions import CONFIRMED, REFUTED, conclusions, gain_of_filter
+from pipeline.thesis.errata import agreements, scatters
 from pipeline.thesis.page import EXPLANATIONS, key_of, render
 from pipeline.thesis.results import Results
 from pipeline.thesis.seeds import INTERVAL_S, TIME_CONSTANT_S, sets_of

@@ -24,7 +24,7 @@ from pipeline.errors import PipelineError
 from pipeline.files import write_atomically
 from pipeline.estimation.stages import stage_module
 from pipeline.outcome import outcome
-from pipeline.published import STAGES as PUBLISHED_STAGES
+from pipeline.pack import STAGES as PUBLISHED_STAGES
 from pipeline.results_folder import finish_publishing, repetitions
 from pipeline.run_progress import Monitor
 from pipeline.stages.job_server import COMMAND, start_server

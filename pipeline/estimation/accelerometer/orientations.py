@@ -37,7 +37,7 @@ from pipeline.estimation.rest_means import holdout_interval, rest_means, sound_s
 from pipeline.estimation.turns import stop_and_go
 from pipeline.estimation.uncertainty_budget import scatter_contribution
 from pipeline.model.kinematics import table_motion
-from pipeline.signal.creep import creep_in
+from pipeline.signal.quiet_motion import creep_in
 from pipeline.signal.rests import Rest, rests_from_table
 
 if TYPE_CHECKING:

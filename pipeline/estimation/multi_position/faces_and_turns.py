@@ -29,7 +29,7 @@ from pipeline.estimation.multi_position.model import effect_readings, motion_of
 from pipeline.estimation.multi_position.moves import sound_span, trapezoids
 from pipeline.estimation.rest_means import ROLE
 from pipeline.records import AXES
-from pipeline.signal.hand_turns import ACROSS, multiples
+from pipeline.signal.segments import ACROSS, multiples
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -27,7 +27,7 @@ The direction of gravity before and after every move, by the calibrated accelero
 where
 
     u_mean : direction of the rest's mean, T its length
-    w      : rate at which the unit creeps (``pipeline.signal.creep.believed_rates``)
+    w      : rate at which the unit creeps (``pipeline.signal.quiet_motion.believed_rates``)
     s      : standard deviation of the mean of the half second by white noise, across u
 
 A unit in a hand or on a soft support creeps after it was set down, not always steadily. The half second next to a move

@@ -30,7 +30,7 @@ from pipeline.io.yaml_file import load_yaml
 from pipeline.model.effects.base import Effect
 from pipeline.model.effects.declaration import read_declaration
 from pipeline.model.effects.formula_effect import FormulaEffect
-from pipeline.model.effects.sessions import OWN, in_session
+from pipeline.model.effects.mounting import OWN, in_session
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -112,7 +112,7 @@ def forget(*names: str) -> None:
 
 
 def effect(name: str) -> Effect:
-    """Return one effect by name; ``<effect>@<setup>`` is that of one session (``pipeline.model.effects.sessions``).
+    """Return one effect by name; ``<effect>@<setup>`` is that of one session (``pipeline.model.effects.mounting``).
 
     Raises
     ------

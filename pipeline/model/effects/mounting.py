@@ -1,4 +1,4 @@
-"""How the unit sits on the table in each recording: rotations of its mounting, and zeros of the table's angle.
+"""Effects of a recording or a session: rotations of its mounting, and zeros of the table's angle.
 
     mounting:      u' = exp([theta_k]x)^T u,   theta_k the rotation of the unit in recording k, body frame
     encoder_zero:  u' = exp([zero_k e_a]x) u,  e_a the axis of turn k: the unit is at A - zero_k where the log says A
@@ -10,6 +10,19 @@ that the other effects act on what the rotated sensor senses.
 A rotation that all recordings share is a part of K. A prior chooses it: ``theta_k ~ N(0, s^2)``, so that the frame of
 the calibration is the mean of the mountings. Gravity determines the others: in turns about three axes, the constant and
 the two first harmonics of the accelerometer are 27 numbers against 9 of K, 3 of b and 6 of the mountings.
+
+An effect of one session is that of one table, mounting or switching-on, where the recordings come from several:
+
+    z = z_effect in the recordings of that session, 0 in the others
+
+A procedure names the session of each recording (``setup``); ``<effect>@<setup>`` is the effect there. Recordings of
+several sessions then give one estimate of a sensor and the errors of each table. Two effects exist in a session only;
+in a single session they are part of the matrix and of the bias:
+
+    mounting : z = K (exp([theta]x)^T - 1) u: the unit is rotated by the vector theta, deg, against the other sessions
+    bias     : z = db: the bias has changed, as after switching off and on
+
+One session is without them: the reference of the others. The leans of a table's axes contain the mounting.
 """
 
 from __future__ import annotations
@@ -22,7 +35,8 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from pipeline.model.effects.base import Layout, Parameter, truth
+from pipeline.errors import ConfigurationError
+from pipeline.model.effects.base import Effect, Layout, Owner, Parameter, truth, unit_of
 from pipeline.model.effects.formula_effect import DeclaredEffect
 from pipeline.model.kinematics import skew, turn_by_vector
 
@@ -30,7 +44,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from pipeline.records import Motion, Values
-
 
 ROUNDS = 6  # of a fixed point; rotations of 10 deg converge by a factor of 30 in each
 STEP_DEG = 1e-3  # of the central difference of a rotation: its error is (step^2 / 6) rad = 5e-11
@@ -186,3 +199,100 @@ class EncoderZero(_OfRecordings):
         """Return ``exp([zero e_a]x)``."""
         assert motion.axis is not None  # noqa: S101
         return turn_by_vector(np.radians(values) * np.eye(3)[motion.axis])
+
+
+SEPARATOR = "@"
+EXPERIMENT = "the same turns in another setup"
+AS_THE_BASE = (
+    *("owner", "layout", "sensors", "unseen", "needs", "needs_clock", "needs_motion", "needs_both_directions"),
+    *("meaning", "excitation", "experiment", "source"),
+)
+
+
+class _Mounting(Effect):
+    """The mounting of a session against that of the others."""
+
+    name = "mounting"
+    owner = Owner.MOUNTING
+    layout = Layout.SHARED
+    meaning = "The unit sits turned in this setup, against the others."
+    excitation = "turns about all three axes in this setup, and in another one that has no mounting of its own"
+    experiment = EXPERIMENT
+    source = "rotation of the body frame"
+
+    def parameters(self, sensor: str) -> tuple[Parameter, ...]:
+        """Return theta."""
+        del sensor
+        return tuple(Parameter(f"theta_{a}", "deg", f"turn of the unit, its part about body {a}") for a in "xyz")
+
+    def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
+        """Return the derivative by differences that are exact to 1e-8."""
+        return rotation_columns(sensor, motion, K, turned_back, values)
+
+    def reading(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
+        """Return what the turn adds, however large it is."""
+        return np.asarray(truth(sensor, motion) @ (K @ (turned_back(values) - np.eye(3))).T)
+
+
+class _Bias(Effect):
+    """The difference of the bias of a session to that of the others."""
+
+    name = "bias"
+    owner = Owner.MOUNTING
+    layout = Layout.EVERY_AXIS
+    meaning = "The bias in this setup is another one, as after switching off and on."
+    excitation = "another setup that has no bias of its own"
+    experiment = EXPERIMENT
+    source = "IEEE Std 1554-2005, turn-on to turn-on repeatability"
+
+    def parameters(self, sensor: str) -> tuple[Parameter, ...]:
+        """Return db."""
+        return tuple(Parameter(f"db_{a}", unit_of(sensor), f"difference of the bias of {a}") for a in "xyz")
+
+    def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
+        """Return ones."""
+        del sensor, K, values
+        return np.ones((len(motion.time), 1))
+
+
+OWN: dict[str, Effect] = {effect.name: effect for effect in (_Mounting(), _Bias())}
+
+
+class _InSession(Effect):
+    """An effect in one session, linear in its parameters; ``name`` is ``<base>@<session>``."""
+
+    def __init__(self, name: str, base: Effect) -> None:
+        self.base, self.session = base, name.partition(SEPARATOR)[2]
+        for attribute in AS_THE_BASE:
+            setattr(self, attribute, getattr(base, attribute))
+        self.name = name
+
+    def parameters(self, sensor: str) -> tuple[Parameter, ...]:
+        """Return those of the effect."""
+        return self.base.parameters(sensor)
+
+    def regressors(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
+        """Return those of the effect in its session, zeros elsewhere."""
+        found = self.base.regressors(sensor, motion, K, values)
+        return found if motion.setup == self.session else np.zeros_like(found)
+
+    def reading(self, sensor: str, motion: Motion, K: Values, values: Values) -> Values:
+        """Return what the effect adds in its session, zeros elsewhere."""
+        if motion.setup == self.session:
+            return self.base.reading(sensor, motion, K, values)
+        return np.zeros((len(motion.time), 3))
+
+
+def in_session(name: str, base: Effect) -> Effect:
+    """Return the effect ``<base>@<session>``.
+
+    Raises
+    ------
+    ConfigurationError
+        If the effect moves the motion in time, or is not linear in its parameters.
+    """
+    if base.moves or base.nonlinear:
+        raise ConfigurationError(
+            f"effect {name}: {base.name} cannot be one setup's own, as the fit is not linear in it; name {base.name}"
+        )
+    return _InSession(name, base)

@@ -14,7 +14,7 @@ from pipeline.errors import NotObservableError
 from pipeline.estimation.multi_position.gyroscope import model_of
 from pipeline.estimation.multi_position.model import State
 from pipeline.estimation.noise import estimate_noise, noise_of
-from pipeline.signal.hand_turns import multiples
+from pipeline.signal.segments import multiples
 from pipeline.validation.attitude import gravity_direction
 
 FACE = np.radians(PROCEDURE["faces"]["accuracy_deg"])

@@ -1,4 +1,6 @@
-"""The rest by which a calibration of the accelerometer by hand gains most, and how many more rests a goal needs.
+"""What a recording by hand still lacks: the next rest for the accelerometer, the next face or turn for the gyroscope.
+
+The next rest is that by which the calibration of the accelerometer gains most:
 
     F = P + sum_i J_i^T J_i / s_i^2,    U_p = k_p sqrt(g_p (F^-1)_pp)
 
@@ -16,13 +18,25 @@ n - 1: rests are added one by one, and each planned rest is exchanged for a bett
 (Fedorov, Theory of Optimal Experiments, 1972). Next goes the planned rest with the largest gain in log det F,
 ``log(1 + J F^-1 J^T / s^2)``. The attitudes are the 26 in which a face, an edge or a corner of the case points up,
 since a person finds them by a few words.
+
+Faces and turns (procedure ``ferraris``): each of the six faces needs a rest, and each body axis a turn by the stated
+angle from rest to rest; where turns are held out, enough of them that one is. They are recognised as in the fit.
+
+Rests and moves: of turns by A about a level body axis a, from the vertical u, the one with the largest gain
+
+    log det (I + H S H^T / s^2),    H = d (exp(-[A (e_a + m)]x) u) / dm
+
+where
+
+    m, S : (3,) error of column a of the gyroscope's matrix, and its covariance by the fit
+    s    : rad; standard deviation of the direction of the vertical at two rests
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from itertools import product
+from itertools import pairwise, product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -31,9 +45,12 @@ from pipeline.errors import CannotCalibrateError, NotObservableError
 from pipeline.estimation.accelerometer import nonlinear_least_squares
 from pipeline.estimation.accelerometer.ellipsoid_fit import COLUMNS, IDEAL, ROWS, derivative_of, triangle
 from pipeline.estimation.accelerometer.orientations import orientations_of
-from pipeline.estimation.rest_means import holdout_interval
+from pipeline.estimation.multi_position.faces_and_turns import FACES, face_of
+from pipeline.estimation.rest_means import ROLE, holdout_interval, rest_means
 from pipeline.records import AXES, coverage_factor
-from pipeline.signal.rests import WINDOW_S
+from pipeline.signal.rests import WINDOW_S, find_rests
+from pipeline.signal.segments import multiples
+from pipeline.simulation.trajectory import rotation_by
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -41,7 +58,6 @@ if TYPE_CHECKING:
     from pipeline.estimation.accelerometer.orientations import Orientations
     from pipeline.records import Recording, SensorCalibration, Values
     from pipeline.signal.rests import Rest
-
 
 SHARPNESS = 8  # of the norm that stands for the largest U: within 32 % of it for nine parameters, smooth
 SWEEPS = 10  # of the exchange; it ends by itself after two or three
@@ -251,3 +267,83 @@ def _planned(progress: Progress, X: Values, goal: float) -> tuple[list[int], Val
         if progress.used + len(planned) > FEWEST and progress.largest(F, len(planned)) <= goal:
             break
     return planned, F
+
+
+TURNS_DEG = (90.0, 180.0, 270.0, 360.0)  # that a person sees without a scale
+STEP = 1e-5  # relative, of a difference quotient: its error is 1e-10
+
+
+@dataclass(frozen=True)
+class Turn:
+    """A turn about a body axis that stays level."""
+
+    axis: int
+    up: int  # body axis that points up before it
+    angle: float  # deg
+
+    def in_words(self, dwell: float) -> str:
+        """Return what to do."""
+        turn = f"turn it by {self.angle:g} deg about its {AXES[self.axis]} axis, which stays level"
+        return f"+{AXES[self.up]} up; rest it for {dwell:g} s, {turn}, rest it for {dwell:g} s again"
+
+    def sensitivity(self) -> Values:
+        """Return H: (3, 3) array."""
+        turned = self.angle * np.eye(3)[self.axis]
+
+        def vertical(m: Values) -> Values:
+            return np.asarray(rotation_by(-(turned + self.angle * m)) @ np.eye(3)[self.up])
+
+        steps = STEP * np.eye(3)
+        return np.column_stack([(vertical(m) - vertical(-m)) / (2.0 * STEP) for m in steps])
+
+
+def most_informative_turn(gyroscope: SensorCalibration, direction: float) -> Turn:
+    """Return the turn that tells most of the gyroscope's matrix.
+
+    ``gyroscope``: its calibration so far, with a covariance. ``direction``: rad, s.
+    """
+    assert gyroscope.covariance is not None  # noqa: S101
+    S = gyroscope.covariance
+
+    def gain(turn: Turn) -> float:
+        own = 3 + 3 * np.arange(3) + turn.axis
+        H = turn.sensitivity() / direction
+        return float(np.linalg.slogdet(np.eye(3) + H @ S[np.ix_(own, own)] @ H.T)[1])
+
+    turns = [Turn(a, b, angle) for a in range(3) for b in range(3) if a != b for angle in TURNS_DEG]
+    return max(turns, key=gain)
+
+
+def next_face_or_turn(recordings: Sequence[Recording], procedure: Mapping[str, Any]) -> tuple[bool, list[str]]:
+    """Return whether all faces and turns are there, and lines that say what is there and what comes next."""
+    stated = procedure["turns"]
+    faces, turns, angle = dict.fromkeys(FACES, 0), dict.fromkeys(AXES, 0), float(stated["angle_deg"])
+    for recording in (r for r in recordings if r.role == ROLE):
+        rests = [rest for rest in find_rests(recording) if rest.accepted]
+        for on in face_of(rest_means(recording, rests)[0])[0].tolist():
+            if on >= 0:
+                faces[FACES[on]] += 1
+        if recording.gyroscope is None:
+            continue
+        for before, after in pairwise(rests):
+            move = slice(before.stop - 1, after.start + 1)
+            rate = recording.gyroscope
+            bias = 0.5 * sum(rate[r.start : r.stop].mean(axis=0) for r in (before, after))
+            axis, count = multiples(np.trapezoid(rate[move] - bias, recording.time[move], axis=0), angle)
+            turns[AXES[axis]] += bool(count)
+    every = int(stated["holdout_every"])
+    held_elsewhere = any(r.role == "validation" for r in recordings)
+    needed = 1 if held_elsewhere or not every else every
+    lines = [
+        "faces: " + ", ".join(f"{name} {count}" for name, count in faces.items()) + " rests",
+        f"turns by {angle:g} deg: " + ", ".join(f"{axis} {count}" for axis, count in turns.items()) + f" of {needed}",
+    ]
+    face = next((name for name, count in faces.items() if not count), None)
+    if face is not None:
+        return False, [*lines, f"next: {face} up; rest it for 4 s or more"]
+    about = next((name for name, count in turns.items() if count < needed), None)
+    if about is None:
+        return True, [*lines, "enough: all faces and turns are there"]
+    back = "back " if turns[about] % 2 else ""
+    turn = f"turn it {back}by {angle:g} deg about the vertical"
+    return False, [*lines, f"next: +{about} up; rest it for 4 s, {turn}, rest it for 4 s again"]
