@@ -274,7 +274,8 @@ class Design:
         """Return the same with the errors of the angle as the last parameters."""
         count = self.count + 1 + self.stops
         total = np.zeros((len(settings), count**2))
-        of_settings = {id(own): own.products(settings) for own in self._own}
+        distinct = {id(own): own for own in self._own}  # without stops, one for all axes
+        of_settings = {key: own.products(settings) for key, own in distinct.items()}
         for c, own in enumerate(self._own):
             flat = of_settings[id(own)][0].reshape(len(settings), -1)
             total[:, self._to[c]] += flat[:, self._from[c]] / self.scale[c] ** 2
@@ -294,7 +295,8 @@ class Design:
 
     def linear_map(self, setting: Setting) -> LinearMap:
         """Return what small changes of the readings do to the parameters, solved under a noise setting."""
-        inverse, influence = self._inverse(setting), {id(own): own.influence(setting) for own in self._own}
+        inverse, distinct = self._inverse(setting), {id(own): own for own in self._own}
+        influence = {key: own.influence(setting) for key, own in distinct.items()}
         weights, back = [], []
         for own, at, total, scale in zip(self._own, self._at, self._total, self.scale, strict=True):
             free = total != self.count  # the readings lie between parameters and stops
