@@ -8,6 +8,8 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
+from pipeline.stages import MODULES as STAGES
+
 for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(threads, "1")  # a job is one core; set before numpy is imported
 
@@ -15,24 +17,22 @@ COMMANDS = (
     "run", "new", "check", "plan", "guide", "explain", "add", "remove", "apply", "convert", "noise", "simulate",
     "unpack", "config", "study", "thesis",
 )  # fmt: skip
-STAGES = (
-    "ingest", "filter", "fit", "validate", "diagnose", "calibration", "export", "report", "gather", "verdict",
-)  # fmt: skip
 HERE = Path(__file__).parent
 PROGRAM = "imu-calibration" if Path(sys.argv[0]).name == "imu-calibration" else "python -m pipeline"
 
 
-def _summary(module: str) -> str:
-    """Return the first line of a module's docstring, without importing it."""
-    source = HERE.joinpath(*module.split(".")).with_suffix(".py").read_text(encoding="utf-8")
-    return (ast.get_docstring(ast.parse(source)) or "").splitlines()[0]
+def _summary(module: str, function: str = "") -> str:
+    """Return the first line of the docstring of a module or of a function in it, without importing it."""
+    tree = ast.parse(HERE.joinpath(*module.split(".")).with_suffix(".py").read_text(encoding="utf-8"))
+    functions = (node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name.startswith(function))
+    return (ast.get_docstring(next(functions) if function else tree) or "").splitlines()[0]
 
 
 def _help() -> str:
     lines = [f"usage: {PROGRAM} COMMAND ... (COMMAND --help says more; --version)", "", "commands:"]
     lines += [f"  {name:<12} {_summary(f'commands.{name}')}" for name in COMMANDS]
     lines += ["", "stages, which the rules of the workflow call:"]
-    lines += [f"  {name:<12} {_summary(f'stages.{name}').partition(': ')[2]}" for name in STAGES]
+    lines += [f"  {name:<12} {_summary(f'stages.{module}', name)}" for name, module in STAGES.items()]
     return "\n".join(lines)
 
 
@@ -49,7 +49,7 @@ def main(argv: list[str] | None = None) -> int:
 
         from pipeline.stages.job_server import serve  # noqa: PLC0415
 
-        return serve(socket.socket(fileno=int(rest[0])), STAGES, run_command)
+        return serve(socket.socket(fileno=int(rest[0])), run_command)
     if command not in (*COMMANDS, *STAGES):
         known = ", ".join((*COMMANDS, *STAGES))
         print(f"{PROGRAM}: no command {command!r}; known: {known}", file=sys.stderr)
@@ -63,9 +63,8 @@ def run_command(words: list[str]) -> int:
 
     command, *rest = words
     try:
-        if command in COMMANDS or command == "verdict":
-            package = "commands" if command in COMMANDS else "stages"
-            return int(import_module(f"pipeline.{package}.{command}").main(rest))
+        if command in COMMANDS:
+            return int(import_module(f"pipeline.commands.{command}").main(rest))
         return int(import_module("pipeline.stages.batch").main(command, rest))
     except PipelineError as error:
         print(f"{PROGRAM} {command}: {error}", file=sys.stderr)

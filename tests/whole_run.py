@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.config import load_campaign, settings_of_jobs
 from pipeline.model.effects import forget
 from pipeline.results_folder import HELD
-from pipeline.stages import batch, verdict
+from pipeline.stages import batch
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -51,7 +51,7 @@ def run_jobs(campaign: Campaign) -> int:
                 while HELD:
                     HELD.pop().close()
     mark, failures = campaign.results / "complete.json", batches / "gathered.json"
-    return verdict.main(["--results", str(campaign.results), "--output", str(mark), "--failures", str(failures)])
+    return batch.verdict(["--results", str(campaign.results), "--output", str(mark), "--failures", str(failures)])
 
 
 def run_campaign(directory: Path, **settings: Any) -> tuple[Campaign, int]:

@@ -1,1 +1,14 @@
-"""One module per stage: read the files of a unit, call the library, write files; ``batch`` runs a stage on a batch."""
+"""The stages of a run: a function each, which reads the files of a unit, calls the library, and returns files."""
+
+MODULES = {  # stage: the module of its function ``<stage>_unit`` or ``<stage>_batch``, in the order of a run
+    "ingest": "ingest",
+    "filter": "ingest",
+    "fit": "fit",
+    "validate": "evaluate",
+    "diagnose": "evaluate",
+    "calibration": "documents",
+    "export": "documents",
+    "report": "documents",
+    "gather": "gather",
+    "verdict": "batch",
+}

@@ -16,9 +16,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import DamagedFileError, PipelineError
-from pipeline.files import read_json
+from pipeline.files import read_json, write_json
 from pipeline.pack import FAILED, Files, Pack, as_bytes, new_pack
 from pipeline.results_folder import hold_as_job, record_written
+from pipeline.stages import MODULES
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -66,16 +67,18 @@ class Job:
 
 
 def main(stage: str, argv: Sequence[str]) -> int:
-    """Run a stage: ``process_unit(job, unit, settings)`` of its module for each unit, or its ``process_batch(job)``.
+    """Run the function ``<stage>_unit(job, unit, settings)`` for each unit, or ``<stage>_batch(job)`` for all.
 
-    ``process_unit`` returns the files of the unit. A module may have ``process_failed(job, unit, settings, failure)``,
-    which returns those of a unit that failed, here or in a stage before.
+    ``<stage>_unit`` returns the files of the unit, ``<stage>_failed(job, unit, settings, failure)``, where it exists,
+    those of a unit that failed, here or in a stage before.
     Returns 0 even if units have failed: their failures are part of the output.
     """
-    module = import_module(f"pipeline.stages.{stage}")
+    if stage == "verdict":
+        return verdict(argv)
+    module = import_module(f"pipeline.stages.{MODULES[stage]}")
     job = parse_job(stage, argv)
-    if hasattr(module, "process_batch"):
-        module.process_batch(job)
+    if hasattr(module, f"{stage}_batch"):
+        getattr(module, f"{stage}_batch")(job)
         return 0
     with new_pack(job.output) as add:
         for number, (unit, settings) in enumerate(job.units.items(), 1):
@@ -145,7 +148,7 @@ def _files_of(module: ModuleType, job: Job, unit: str, settings: dict[str, Any])
     try:
         earlier = next((pack for pack in job.inputs.values() if name in pack), None)
         if not earlier:
-            return _encoded(module.process_unit(job, unit, settings))
+            return _encoded(getattr(module, f"{job.stage}_unit")(job, unit, settings))
         failure = earlier.json(name)
     except Exception as error:
         if isinstance(error, OSError) and error.filename is None:
@@ -156,9 +159,31 @@ def _files_of(module: ModuleType, job: Job, unit: str, settings: dict[str, Any])
         stage = "/".join([job.stage, *(str(job.run[k]) for k in ("sensor", "stage") if job.run.get(k))])
         failure = failure_of(error, unit, stage)
         print(f"{stage}: {unit} FAILED: {failure['message']}", file=sys.stderr, flush=True)
-    files = module.process_failed(job, unit, settings, failure) if hasattr(module, "process_failed") else {}
-    return _encoded({name: failure} | files)
+    of_failed = getattr(module, f"{job.stage}_failed", None)
+    return _encoded({name: failure} | (of_failed(job, unit, settings, failure) if of_failed else {}))
 
 
 def _encoded(files: Files) -> dict[str, bytes]:
     return {name: as_bytes(content) for name, content in files.items()}
+
+
+def verdict(argv: Sequence[str]) -> int:
+    """Report the failed units, and set the exit code of the run.
+
+    Without a failed unit it is 0, and the mark of a complete campaign is written.
+    """
+    parser = argparse.ArgumentParser(prog="python -m pipeline verdict", description="Report the failed units.")
+    parser.add_argument("--failures", type=Path, required=True, help="the failures that gather found")
+    parser.add_argument("--results", type=Path, required=True, help="of the campaign, as the user names them")
+    parser.add_argument("--output", type=Path, required=True, help="mark that is written where no unit has failed")
+    arguments = parser.parse_args(argv)
+    failures = read_json(arguments.failures)
+    if not failures:
+        write_json(arguments.output, {"failed": 0})
+        return 0
+    page, plural = arguments.results / "index.html", "s" * (len(failures) > 1)
+    print(f"{len(failures)} unit{plural} failed (all others are done; see {page}):", file=sys.stderr)
+    for f in failures:
+        where = f"{f['file']}: " if f["file"] else ""
+        print(f"  {f['unit']}: {where}{f['message']} [{f['code']} in {f['stage']}]", file=sys.stderr)
+    return 1

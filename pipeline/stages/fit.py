@@ -1,7 +1,4 @@
-"""Stage fit: one sensor, one stage of its method, on the result of the stage before it.
-
-``pipeline.estimation.stages`` finds the module that does the work.
-"""
+"""Stage fit: ``pipeline.estimation.stages`` finds the module that fits a stage of a method."""
 
 from __future__ import annotations
 
@@ -22,8 +19,11 @@ if TYPE_CHECKING:
 NOT_LAST = "no"  # value of the option --last
 
 
-def process_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
-    """Fit the parameters of the stage; ``{"not_calibrated": reason}`` where the recordings cannot determine them."""
+def fit_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
+    """Fit one stage of a method to one sensor, on the result of the stage before it.
+
+    The result is ``{"not_calibrated": reason}`` where the recordings cannot determine the parameters.
+    """
     sensor, stage, previous = (job.run[key] for key in ("sensor", "stage", "previous"))
     file = f"{unit}.json"
     before = Pack(Path(previous)).json(file) if previous else None

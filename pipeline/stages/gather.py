@@ -1,4 +1,4 @@
-"""Stage gather: publish every unit's files under their stable paths, and write the summary and the campaign page.
+"""Stage gather: every unit's files under their stable paths, the summary and the page of the campaign.
 
 The whole set is made in a folder of its own and replaces the published one when it is complete, so that the published
 files are always those of one run.
@@ -51,8 +51,11 @@ class Gathered:
     figures: list[JSON] = field(default_factory=list)
 
 
-def process_batch(job: Job) -> None:
-    """Publish all units; the output, the list of failures, is written last."""
+def gather_batch(job: Job) -> None:
+    """Publish the files of all units, the summary and the page of the campaign.
+
+    The output, the list of failures, is written last.
+    """
     results = job.results
     finish_publishing(results)
     new = results / NEW

@@ -1,4 +1,8 @@
-"""Stage ingest: a unit's files to one Parquet file with all its recordings."""
+"""Stages ingest and filter: a unit's files become one Parquet file with its recordings, and their noise.
+
+The noise is estimated once, of the filtered readings, for all stages after it (``<unit>.noise.json``). Without a filter
+the readings are those of ingest (``unit_files.recordings_of``).
+"""
 
 from __future__ import annotations
 
@@ -9,15 +13,20 @@ from typing import TYPE_CHECKING, Any
 from pipeline.io.parquet import to_parquet
 from pipeline.io.read import read_recordings
 from pipeline.preprocessing.checks import check_recordings
+from pipeline.signal.filters import apply_filter
 from pipeline.signal.segments import cut, held_out_windows
+from pipeline.stages.unit_files import noise_file, recordings_of
 
 if TYPE_CHECKING:
     from pipeline.pack import Files
     from pipeline.stages.batch import Job
 
 
-def process_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
-    """Read, cut and check the recordings; files are named by their path below the campaign's directory."""
+def ingest_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
+    """Read, cut and check the recordings of a unit.
+
+    Files are named by their path below the campaign's directory.
+    """
     directory, procedure = Path(job.run["directory"]), settings["procedure"]
     recordings = []
     folder = directory / procedure["folder"]
@@ -36,3 +45,12 @@ def process_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
         file = str(path.relative_to(directory)) if path.is_relative_to(directory) else str(path)
         named.append(replace(recording, source=recording.source | {"file": file}))
     return {f"{unit}.parquet": to_parquet(named)}
+
+
+def filter_unit(job: Job, unit: str, settings: dict[str, Any]) -> Files:
+    """Filter the readings of a unit as configured, and estimate their noise."""
+    recordings, files = recordings_of(job.inputs, unit), {}
+    if settings["filter"]["name"] != "none":
+        recordings = [apply_filter(r, settings["filter"]) for r in recordings]
+        files = {f"{unit}.parquet": to_parquet(recordings)}
+    return files | noise_file(unit, recordings, settings)

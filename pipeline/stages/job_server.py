@@ -12,10 +12,11 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
+from pipeline.stages import MODULES
 from pipeline.stages.job_command import ADDRESS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable
 
 COMMAND = [sys.executable, "-PS", str(Path(__file__).with_name("job_command.py"))]  # imports no package
 # glibc returns freed memory to the system by default, and clearing it anew is 8 % of the time of the stages.
@@ -48,14 +49,14 @@ def start_server() -> Callable[[], None]:
     return end
 
 
-def serve(listener: socket.socket, stages: Sequence[str], run_command: Callable[[list[str]], int]) -> int:
+def serve(listener: socket.socket, run_command: Callable[[list[str]], int]) -> int:
     """Serve until the standard input is closed, also by a killed run; run a command in each forked process."""
     import gc  # noqa: PLC0415
     import shutil  # noqa: PLC0415
     import signal  # noqa: PLC0415
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the jobs receive it too
-    _prepare(stages)
+    _prepare()
     gc.freeze()
     request = _next_job(listener)
     listener.close()
@@ -66,13 +67,12 @@ def serve(listener: socket.socket, stages: Sequence[str], run_command: Callable[
     return _run_job(run_command, *request)
 
 
-def _prepare(stages: Sequence[str]) -> None:
+def _prepare() -> None:
     """Import what the stages use and compile the templates."""
     from importlib import import_module  # noqa: PLC0415
 
-    for stage in stages:
-        if stage != "gather":  # runs once, and imports pandas
-            import_module(f"pipeline.stages.{stage}")
+    for module in {*MODULES.values()} - {"gather"}:  # runs once, and imports pandas
+        import_module(f"pipeline.stages.{module}")
     for module in ("scipy.interpolate", "scipy.spatial.transform", "imufusion"):
         import_module(module)  # stages import them where they need them
 

@@ -94,7 +94,7 @@ def test_a_change_of_sheet_or_device_concerns_the_batch_of_the_unit(tmp_path: Pa
     assert batches() == {"0002", "0003", "0004"}
 
 
-@pytest.mark.parametrize("stage", ["validate", "diagnose"])
+@pytest.mark.parametrize("stage", ["evaluate", "documents"])
 def test_the_digest_of_a_stage_contains_the_files_of_the_built_in_effects(stage: str) -> None:
     read = {file.name for file in stage_settings._closure(f"pipeline.stages.{stage}")}
     assert {f"{name}.yaml" for name in built_in()} <= read

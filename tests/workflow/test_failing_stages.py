@@ -18,8 +18,7 @@ from pipeline.config import load_campaign, settings_of_jobs
 from pipeline.config.campaign import Campaign
 from pipeline.errors import DamagedFileError
 from pipeline.results_folder import HELD
-from pipeline.stages import batch, gather, verdict
-from pipeline.stages import report as report_stage
+from pipeline.stages import batch, documents, gather
 
 STAGES = ("ingest", "filter", "fit", "calibration", "validate", "diagnose", "export", "report", "gather")
 FOLDERS = ("calibrations", "validations", "diagnoses", "reports", "certificates", "exports")
@@ -34,18 +33,17 @@ def published(tmp_path_factory: pytest.TempPathFactory, simulated: Path) -> tupl
         shutil.copytree(simulated, directory / "raw" / name)
     (directory / "units.csv").write_text("unit\n" + "\n".join(names) + "\n")
     campaign = load_campaign({"campaign": str(directory), "results": str(directory.parent / "results")})
-    files_of, read_unit, render = batch._files_of, gather._read_unit, report_stage.render
+    files_of, read_unit, render = batch._files_of, gather._read_unit, documents.render
 
     def faulty(module: Any, job: batch.Job, unit: str, settings: dict[str, Any]) -> Any:
-        real = module
+        real = getattr(module, f"{job.stage}_unit")
 
         def fails(job: batch.Job, unit: str, settings: dict[str, Any]) -> None:
-            real.process_unit(job, unit, settings)
+            real(job, unit, settings)
             raise MemoryError(f"no room for {unit}") if job.stage == "export" else RuntimeError(f"fault at {unit}")
 
         if unit == f"at_{job.stage}":
-            after = {"process_failed": module.process_failed} if hasattr(module, "process_failed") else {}
-            module = SimpleNamespace(process_unit=fails, **after)
+            module = SimpleNamespace(**vars(module) | {f"{job.stage}_unit": fails})
         return files_of(module, job, unit, settings)
 
     def faulty_gather(job: batch.Job, folder: Any, row: dict[str, str]) -> gather.Gathered:
@@ -61,7 +59,7 @@ def published(tmp_path_factory: pytest.TempPathFactory, simulated: Path) -> tupl
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(batch, "_files_of", faulty)
         patch.setattr(gather, "_read_unit", faulty_gather)
-        patch.setattr(report_stage, "render", faulty_render)
+        patch.setattr(documents, "render", faulty_render)
         assert run_jobs(campaign) == 1
     return campaign, campaign.results
 
@@ -94,13 +92,13 @@ def test_a_run_with_failed_units_ends_with_1_and_names_each(
 ) -> None:
     mark = tmp_path / "complete.json"
     given = ["--results", str(published[1]), "--output", str(mark), "--failures"]
-    assert verdict.main([*given, str(published[1] / "batches" / "gathered.json")]) == 1
+    assert batch.verdict([*given, str(published[1] / "batches" / "gathered.json")]) == 1
     said = capsys.readouterr().err
     assert all(f"  at_{stage}: " in said for stage in STAGES)
     assert "good" not in said
     assert not mark.exists()
     (tmp_path / "none.json").write_text("[]")
-    assert verdict.main([*given, str(tmp_path / "none.json")]) == 0
+    assert batch.verdict([*given, str(tmp_path / "none.json")]) == 0
     assert mark.exists()
 
 
