@@ -5,8 +5,10 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+OF_RANGE = "full scale of the accelerometer in g, then of the gyroscope in deg/s (default: those of the sensor's file)"
 SHARED: dict[str, dict[str, Any]] = {
     "--sensor": {"metavar": "NAME", "help": "sensor model, a name in configs/sensor: full scale, counts, noise"},
+    "--range": {"type": float, "nargs": "+", "metavar": "RANGE", "help": OF_RANGE},
     "--ingest": {"metavar": "PROFILE", "help": "how the log is read: a name in configs/ingest, or a profile's file"},
     "--results": {"metavar": "DIR", "default": "results", "help": "folder of all results (default: results)"},
 }

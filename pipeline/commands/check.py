@@ -2,49 +2,48 @@
 
 from __future__ import annotations
 
-import re
 import sys
-import tempfile
 import textwrap
-from dataclasses import dataclass
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from shutil import copyfile
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pipeline.commands import parser_of
-from pipeline.config.campaign import load_campaign
-from pipeline.config.compose import Composer
-from pipeline.config.options import Problem
+from pipeline.commands.readings import Reading, absolute, campaign_of, config_of_log, grouped
+from pipeline.commands.trial import try_unit
+from pipeline.config.campaign import find_campaign, load_campaign
+from pipeline.config.options import nearest
 from pipeline.errors import ConfigurationError, IngestError, PipelineError
-from pipeline.files import CONFIGS, write_atomically
-from pipeline.io.files import FILE, MESSAGE_FORMATS, SUFFIXES, candidate_files
-from pipeline.io.ingest_settings import checks_of
-from pipeline.io.read import read_table, to_recording
-from pipeline.preprocessing.checks import check_recordings
+from pipeline.files import write_atomically
+from pipeline.io.files import SUFFIXES, candidate_files, recording_files
+from pipeline.model.data_sheet import settings_of_ranges
 from pipeline.profile_detection.columns import find_layout
 from pipeline.profile_detection.proposal import as_yaml, propose
 from pipeline.profile_detection.recording_facts import as_text, facts
 from pipeline.profile_detection.topics import topic_lines, topics_of
 from pipeline.profile_detection.unit_guesses import UNKNOWN
 from pipeline.run_progress import Countdown
-from pipeline.signal.segments import cut
 
 if TYPE_CHECKING:
     import argparse
     from collections.abc import Sequence
 
+    from pipeline.commands.trial import Trial
+    from pipeline.config.campaign import Campaign
     from pipeline.profile_detection.columns import TextLayout
     from pipeline.profile_detection.proposal import Proposal
-    from pipeline.records import Recording
+    from pipeline.profile_detection.recording_facts import Line
 
-DEFAULT_PROFILE = "canonical_csv"
 SEARCHED_BYTES = 1 << 25  # of a log, for its layout
-SEARCHED_FOLDERS = 4  # the log's, and a campaign's above raw/<unit>/
 UNKNOWN_LAYOUT = ("missing_column", "no_header", "missing_topic")
 EPILOG = """\
-A file of a campaign is read as the campaign's configuration says. Any other file is read by the profile --ingest
-(default: canonical_csv); with --sensor, the readings are compared with the full scale of that sensor. Only --save
-writes a file.
+Recordings of a campaign are checked as a run would do it: with the settings of their unit, compared with the other
+recordings of the unit, and fitted. --campaign without files checks every unit of a campaign, with its effects and its
+held-out motion. What check refuses, a run refuses, and the other way round, but for the diagnosis.
+
+Any other file is read alone: as the units of --campaign, or by the profile --ingest (default: canonical_csv); with
+--sensor, the readings are compared with the full scale of that sensor, or with --range. Only --save writes a file.
 
 Where the profile does not fit the log, another one is proposed, with the evidence for each line and ??? where you must
 decide. A run uses it only after you save it and name it in the configuration.
@@ -52,208 +51,227 @@ decide. A run uses it only after you save it and name it in the configuration.
 examples:
   python -m pipeline check log.csv
   python -m pipeline check log.csv --save my_bench/configs/ingest/my_logger.yaml
-  python -m pipeline check log.csv --ingest my_logger
-  python -m pipeline check raw/*.mcap --sensor mpu6050
+  python -m pipeline check log.csv --ingest my_logger --sensor mpu6050 --range 4 500
+  python -m pipeline check log.csv --campaign my_bench
+  python -m pipeline check my_bench/raw/U1/*.csv
+  python -m pipeline check --campaign my_bench
   snakemake --cores 2 --config campaign=my_bench 'overrides=[ingest=my_logger]'
 
-exit code: 0 if ingest reads every file, 2 if a file is refused or its layout is unknown.
+exit code: 0 if a run would use every file or unit, 2 if one is refused or its layout is unknown.
 """
 
 
-@dataclass
-class Reading:
-    """Files that are read as one recording, and the sections of the configuration by which they are read."""
+class Refused(NamedTuple):
+    """What is refused of a log or, where ``reading`` is None, of a unit."""
 
-    files: list[Path]
-    settings: dict[str, Any]
-    said: str
-
-    @property
-    def has_topics(self) -> bool:
-        """Whether the recording is a log of messages: MCAP, or a format that an extra reads."""
-        return self.files[0].suffix.lower() in (".mcap", *MESSAGE_FORMATS)
+    code: str
+    message: str
+    place: str
+    reading: Reading | None = None
 
 
-def _reading_of_file(files: list[Path], ingest: dict[str, Any], sensor: dict[str, Any], said: str) -> Reading:
-    """Return how files that belong to no campaign are read: as rests without a table."""
-    recordings = {files[0].stem: {"role": "rests", "axis": None}}
-    settings = {"procedure": {"recordings": recordings}, "table": {}, "sensor": sensor, "ingest": ingest}
-    return Reading(files, settings, said)
+Told = tuple[str, list[Refused]]  # what is printed of a log or a unit, and what is refused
 
 
 def main(argv: Sequence[str]) -> int:
     """Run ``python -m pipeline check FILE...``."""
     arguments = _parser().parse_args(argv)
-    refused: list[tuple[Reading, PipelineError]] = []
-    readings = _readings(arguments.files, arguments.ingest, arguments.sensor)
-    sizes = [sum(f.stat().st_size for f in reading.files if f.is_file()) for reading in readings]
-    countdown = Countdown(sum(sizes))
-    for number, reading in enumerate(readings):
-        countdown(sum(sizes[:number]), f"reading {reading.files[0]} ({number + 1} of {len(readings)})")
-        error = _print_facts(reading, countdown)
-        if error is not None:
-            refused.append((reading, error))
-    unknown = [layout for reading, error in refused for layout in _layouts(reading, error)]
+    tasks = _tasks(arguments)
+    countdown, refused = Countdown(len(tasks)), list[Refused]()
+    for number, (what, task) in enumerate(tasks):
+        countdown(number, f"checking {what} ({number + 1} of {len(tasks)})")
+        text, found = task()
+        countdown.end()
+        print(f"{text}\n")
+        refused += found
+    unknown = [(r.reading, layout) for r in refused if r.reading for layout in _layouts(r.reading, r.code)]
     if unknown:
-        sensor = refused[0][0].settings["sensor"]
-        _print_proposals(propose(unknown, sensor), sensor, arguments.save)
+        sensor = unknown[0][0].settings["sensor"]
+        _print_proposals(propose([layout for _, layout in unknown], sensor), sensor, arguments.save)
     elif arguments.save:
         print(f"{arguments.save} was not written: no profile is proposed")
     sys.stdout.flush()
-    for reading, error in refused:
-        print(f"python -m pipeline check: {error.file or reading.files[0]}: refused ({error.code})", file=sys.stderr)
+    for one in refused:
+        print(f"python -m pipeline check: {one.place}: refused ({one.code})", file=sys.stderr)
     return 2 if refused else 0
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = parser_of("check", __doc__, EPILOG, ("--ingest", "--sensor"))
-    parser.add_argument(
-        "files", type=Path, nargs="+", metavar="FILE", help=f"a text log, or {', '.join(SUFFIXES[1:-1])}"
+    parser = parser_of("check", __doc__, EPILOG, ("--ingest", "--sensor", "--range"))
+    add = parser.add_argument
+    add("files", type=Path, nargs="*", metavar="FILE", help=f"a text log, or {', '.join(SUFFIXES[1:-1])}")
+    add(
+        "--campaign",
+        metavar="CAMPAIGN",
+        help="a campaign's name or directory: its settings, or without files its units",
     )
-    parser.add_argument("--save", type=Path, metavar="FILE", help="write the proposed profile to this file")
+    add("--unit", metavar="UNIT", help="this unit of the campaign alone")
+    add("--save", type=Path, metavar="FILE", help="write the proposed profile to this file")
     return parser
 
 
-def _readings(files: Sequence[Path], profile: str | None, sensor: str | None) -> list[Reading]:
-    """Return how each file, or the files of one recording, are to be read."""
-    as_campaigns_say = profile is None and sensor is None
-    directories = {campaign_of(f) for f in files} - {None} if as_campaigns_say else set()
-    known: dict[Path, Reading] = {}
-    for reading in (r for directory in directories for r in _of_campaign(directory)):
-        for file in reading.files:
-            known.setdefault(file, reading)
-    readings, others = [], []
-    for file in files:
-        found = known.get(file.resolve())
-        if found is None:
-            others.append(file)
-        elif found not in readings:
-            readings.append(found)
-    if others:
-        config = config_of_log(others[0], profile, sensor)
-        ingest, sheet = config["ingest"], config["sensor"]
-        said = f"ingest={ingest['name']}" + (f", sensor={sensor}" if sensor else "")
-        parts = [p["file"] for p in (ingest["csv"] or {}).get("parts") or []]
-        readings += [_reading_of_file(g, ingest, sheet if sensor else {}, said) for g in _grouped(others, parts)]
-    return readings
-
-
-def _grouped(files: Sequence[Path], parts: Sequence[str]) -> list[list[Path]]:
-    """Return the files of each recording: one, or one for each part of the profile."""
-    groups: dict[Path, list[Path]] = {}
-    for file in files:
-        if not parts or file.suffix.lower() in SUFFIXES[1:]:
-            groups[file] = [file]
+def _tasks(arguments: argparse.Namespace) -> list[tuple[str, partial[Told]]]:
+    """Return what is to be checked, in words and as a function: units of campaigns, then logs alone."""
+    given = find_campaign(arguments.campaign) if arguments.campaign else None
+    own_profile = arguments.ingest is not None or arguments.sensor is not None
+    if arguments.range and arguments.sensor is None:
+        raise ConfigurationError("--range is that of --sensor; a campaign states it in campaign.yaml")
+    if not arguments.files and given is None:
+        raise ConfigurationError("expected files, or a campaign: check FILE, or check --campaign CAMPAIGN")
+    places: dict[Path | None, list[Path]] = {} if arguments.files else {given: []}
+    for file in arguments.files:
+        places.setdefault(given or campaign_of(file), []).append(file)
+    units, logs = [], []
+    for directory, files in places.items():
+        if directory is None or own_profile:
+            logs += _logs(files, directory, arguments)
             continue
-        patterns = [re.escape(p).replace(re.escape(FILE), "(.+)") for p in parts]
-        found = next((m for p in patterns if (m := re.fullmatch(p, file.name))), None)
-        if found is None:
-            raise ConfigurationError(f"matches none of the profile's parts ({', '.join(parts)})", str(file))
-        stem = found.group(1) if found.groups() else ""
-        groups[file.parent / stem] = [file.parent / p.replace(FILE, stem) for p in parts]
-    return list(groups.values())
+        campaign = load_campaign({"campaign": str(directory)})
+        known = [arguments.unit] if arguments.unit else list(campaign.units)
+        if known[0] not in campaign.units:
+            raise ConfigurationError(
+                f"no unit {known[0]!r}{nearest(known[0], campaign.units)}", str(directory / "units.csv")
+            )
+        chosen, others = _recordings_of(files, campaign, known) if files else ({unit: [] for unit in known}, [])
+        units += [(f"unit {unit}", partial(_check_unit, campaign, unit, names)) for unit, names in chosen.items()]
+        logs += _logs_of_campaign(others, campaign, known) if others else []
+    return [*units, *((str(log.files[0]), partial(_check_log, log)) for log in logs)]
 
 
-def campaign_of(file: Path) -> Path | None:
-    """Return the campaign that a file lies in, None where it lies in none."""
-    return next((d for d in file.resolve().parents if (d / "units.csv").is_file()), None)
+def _recordings_of(
+    files: Sequence[Path], campaign: Campaign, units: Sequence[str]
+) -> tuple[dict[str, list[str]], list[Path]]:
+    """Return which recordings of which units files are, and the files that are none."""
+    known: dict[Path, tuple[str, str]] = {}
+    for unit in units:
+        config, folder = campaign.units[unit].config, campaign.folder(unit)
+        for name, candidates in candidate_files(config["procedure"], config["ingest"]).items():
+            for file in (folder / f for parts in candidates for f in parts):
+                known.setdefault(absolute(file), (unit, name))
+                known.setdefault(file.resolve(), (unit, name))
+    chosen: dict[str, list[str]] = {}
+    others = []
+    for file in files:
+        unit, name = known.get(absolute(file)) or known.get(file.resolve()) or ("", "")
+        if not unit:
+            others.append(file)
+        elif name not in chosen.setdefault(unit, []):
+            chosen[unit].append(name)
+    return chosen, others
 
 
-def _of_campaign(directory: Path | None) -> list[Reading]:
-    campaign = load_campaign({"campaign": str(directory)})
-    readings = []
-    for name, unit in campaign.units.items():
-        config, folder = unit.config, campaign.folder(name)
-        for recording, candidates in candidate_files(config["procedure"], config["ingest"]).items():
-            entry = config["procedure"]["recordings"][recording]
-            said = f"unit {name} of campaign {campaign.name}, recording {recording}: "
-            said += f"ingest={config['ingest']['name']}, sensor={config['sensor']['name']}"
-            tolerance = config["procedure"]["mounting_tolerance_deg"]
-            procedure = {"recordings": {recording: entry}, "mounting_tolerance_deg": tolerance}
-            settings = {"procedure": procedure, **{k: config[k] for k in ("table", "sensor", "ingest")}}
-            readings += [Reading([(folder / f).resolve() for f in files], settings, said) for files in candidates]
-    return readings
+def _logs(files: Sequence[Path], campaign: Path | None, arguments: argparse.Namespace) -> list[Reading]:
+    """Return how logs are read by a profile and a sensor."""
+    profile, sensor = arguments.ingest, arguments.sensor
+    config = config_of_log(files[0], profile, sensor, campaign=campaign)
+    if arguments.range:
+        ranges = settings_of_ranges(config["sensor"], arguments.range)
+        config = config_of_log(files[0], profile, sensor, ranges, campaign)
+    said = f"ingest={config['ingest']['name']}" + (f", sensor={sensor}" if sensor else "")
+    ingest, sheet = config["ingest"], config["sensor"] if sensor else {}
+    return [Reading.alone(group, ingest, sheet, said) for group in grouped(files, ingest)]
 
 
-def config_of_log(file: Path, profile: str | None, sensor: str | None, more: Sequence[str] = ()) -> dict[str, Any]:
-    """Return the configuration by which a log is read alone: by a profile (default: ``DEFAULT_PROFILE``) and a sensor.
-
-    The options of the campaign that the log lies in, if any, may be named too. ``more``: further overrides.
-    """
-    campaign = campaign_of(file)
-    return composed(named(profile, file, campaign) if profile else DEFAULT_PROFILE, sensor, campaign, more)
-
-
-def named(profile: str, file: Path, campaign: Path | None) -> str:
-    """Return a profile as it is to be read: a name that is known, or the only saved file of that name.
-
-    A file is looked for in the working directory, in the folders about the log, and in ``configs/ingest`` of each of
-    these and of the campaigns below the working directory.
-
-    Raises
-    ------
-    ConfigurationError
-        If files of that name hold different profiles.
-    """
-    known = [root / "ingest" / f"{profile}.yaml" for root in (CONFIGS, *([campaign / "configs"] if campaign else []))]
-    if Path(profile).suffix in (".yaml", ".yml") or any(place.is_file() for place in known):
-        return profile
-    folders = [Path.cwd(), *list(file.resolve().parents)[:SEARCHED_FOLDERS]]
-    places = [place for folder in folders for place in (folder, folder / "configs" / "ingest")]
-    places += sorted(Path.cwd().glob("*/configs/ingest"))
-    found = {f.resolve(): f.read_bytes() for place in places if (f := place / f"{profile}.yaml").is_file()}
-    if len(set(found.values())) > 1:
-        raise ConfigurationError(f"--ingest {profile} is one of {', '.join(map(str, found))}; name its path")
-    return str(next(iter(found), profile))
+def _logs_of_campaign(files: Sequence[Path], campaign: Campaign, units: Sequence[str]) -> list[Reading]:
+    """Return how logs that are no recordings of a campaign are read by its settings."""
+    first, *others = (campaign.units[unit].config for unit in units)
+    if any(first[section] != other[section] for other in others for section in ("ingest", "sensor")):
+        message = "the units are read by different settings (ingest, sensor): choose one by --unit"
+        raise ConfigurationError(message, str(campaign.directory / "units.csv"))
+    ingest, sensor = first["ingest"], first["sensor"]
+    said = f"campaign {campaign.name}, as no recording of a unit: ingest={ingest['name']}, sensor={sensor['name']}"
+    return [Reading.alone(group, ingest, sensor, said) for group in grouped(files, ingest)]
 
 
-def composed(profile: str, sensor: str | None, campaign: Path | None, more: Sequence[str] = ()) -> dict[str, Any]:
-    """Return a configuration with a profile, and with ``more`` overrides."""
-    path = Path(profile)
-    layers = ["procedure=multi_position", *([f"sensor={sensor}"] if sensor else []), *more]
-    with tempfile.TemporaryDirectory() as folder:
-        own = campaign or Path(folder)
-        if path.suffix in (".yaml", ".yml"):
-            if not path.is_file():
-                raise ConfigurationError("there is no such file", profile)
-            own = Path(folder)
-            (own / "configs" / "ingest").mkdir(parents=True)
-            copyfile(path, own / "configs" / "ingest" / f"{path.stem}.yaml")
-        try:
-            return Composer(own).unit("check", [*layers, f"ingest={path.stem}"])
-        except Problem as problem:
-            raise ConfigurationError(str(problem), profile if own == Path(folder) else None) from None
-
-
-def _print_facts(reading: Reading, countdown: Countdown | None = None) -> PipelineError | None:
-    """Print content and notes of a recording, or its refusal, which is returned."""
-    settings = reading.settings
-    ((name, entry),) = settings["procedure"]["recordings"].items()
-    refused: PipelineError | None = None
+def _check_log(reading: Reading) -> Told:
+    """Return content and notes of a log that is checked alone, or its refusal."""
     try:
-        table = read_table(reading.files, settings["ingest"])
-        recording = to_recording(name, entry, table, settings["sensor"], checks_of(settings["ingest"]))
-        parts = cut(recording, entry.get("windows")) if recording.role == "session" else []
-        checked = check_recordings(parts or [recording], settings)
-        parts, recording = (checked, recording) if parts else ([], checked[0])
+        recording = reading.checked()
+        return _told_of(reading, [*_topics(reading), *facts(recording, reading.settings["sensor"])]), []
     except PipelineError as error:
-        refused = error
-    if countdown is not None:
-        countdown.end()
-    print(f"{', '.join(map(str, reading.files))}\n  {'read with':<16}{reading.said}")
-    if refused is not None:
-        topics = topic_lines(reading.files[0], fields=refused.code == "missing_topic") if reading.has_topics else []
-        place = _place(refused.file, reading.files)
-        print(as_text([("REFUSED", f"{place}{refused.message}"), ("code", refused.code), *topics]) + "\n")
-        return refused
-    topics = topic_lines(reading.files[0], fields=False) if reading.has_topics else []
-    segments = [("segments" if i == 0 else "", f"{p.name}: {_segment(p)}") for i, p in enumerate(parts)]
-    print(as_text([*topics, *facts(recording, settings["sensor"]), *segments]) + "\n")
-    return None
+        return _refusal_of(reading, error)
 
 
-def _segment(part: Recording) -> str:
-    return next(n.detail for n in part.notes if n.code == "N-SEGMENT")
+def _check_unit(campaign: Campaign, unit: str, names: Sequence[str]) -> Told:
+    """Return what a run would make of a unit: content and notes of the recordings that are named, or a line of all."""
+    trial, missing = try_unit(campaign, unit, "fit" if names else "calibration"), ""
+    if names and trial.failure and trial.failure["code"] == "missing_file":
+        missing = (
+            f"a run needs more recordings of unit {unit}; they are not compared before: {trial.failure['message']}"
+        )
+        trial = try_unit(campaign, unit, "ingest", incomplete=True)
+    read = _readings_of(campaign, unit)
+    told = []
+    refused: list[Refused] = []
+    for name in names or (read if not trial.recordings else ()):
+        try:
+            lines = _facts_of_recording(read[name], campaign, trial)
+            told += [_told_of(read[name], lines)] if names else []
+        except PipelineError as error:
+            text, found = _refusal_of(read[name], error)
+            told.append(text)
+            refused += found
+    if trial.failure and not refused:
+        place = trial.failure["file"] or f"unit {unit}"
+        refused.append(Refused(trial.failure["code"], trial.failure["message"], place))
+        file = [("file", trial.failure["file"])] if trial.failure["file"] else []
+        lines = [*file, ("REFUSED", trial.failure["message"]), ("code", trial.failure["code"])]
+        told.append(f"unit {unit} of campaign {campaign.name}\n{as_text(lines)}")
+    elif not names and not refused:
+        notes = [
+            f"{r.name} {', '.join(codes)}"
+            for r in trial.recordings
+            if (codes := dict.fromkeys(n.code for n in r.notes))
+        ]
+        lines = [(sensor, f"null: {reason}") for sensor, reason in trial.not_calibrated.items()]
+        lines += [("notes", "; ".join(notes))] if notes else []
+        told.append(
+            "\n".join(
+                [f"unit {unit}: {len(trial.recordings)} recordings, no refusal", *([as_text(lines)] if lines else [])]
+            )
+        )
+    return "\n\n".join([*told, *([missing] if missing else [])]), refused
+
+
+def _readings_of(campaign: Campaign, unit: str) -> dict[str, Reading]:
+    """Return the recordings of a unit that exist."""
+    config = campaign.units[unit].config
+    sections = {key: config[key] for key in ("table", "sensor", "ingest")}
+    used = ", ".join(f"{key}={config[key]['name']}" for key in ("ingest", "sensor", "table"))
+    found = {}
+    for name, files in recording_files(config["procedure"], config["ingest"], campaign.folder(unit)).items():
+        procedure = {**config["procedure"], "recordings": {name: config["procedure"]["recordings"][name]}}
+        said = f"unit {unit} of campaign {campaign.name}, recording {name}: {used}"
+        found[name] = Reading(files, {"procedure": procedure, **sections}, said)
+    return found
+
+
+def _facts_of_recording(reading: Reading, campaign: Campaign, trial: Trial) -> list[Line]:
+    """Return what a recording holds, as ingest leaves it; of one that ingest cuts, the parts as well."""
+    ((name, _),) = reading.settings["procedure"]["recordings"].items()
+    parts = [r for r in trial.recordings if campaign.recorded / r.source["file"] == reading.files[0]]
+    if [part.name for part in parts] == [name]:
+        return [*_topics(reading), *facts(parts[0], reading.settings["sensor"])]
+    whole = reading.recording()
+    notes = dict.fromkeys(n for r in (whole, *parts) for n in r.notes if n.code != "N-SEGMENT")
+    segments = [f"{p.name}: {n.detail}" for p in parts for n in p.notes if n.code == "N-SEGMENT"]
+    lines = facts(replace(whole, notes=tuple(notes)), reading.settings["sensor"])
+    return _topics(reading) + lines + [("segments" if i == 0 else "", text) for i, text in enumerate(segments)]
+
+
+def _told_of(reading: Reading, lines: Sequence[Line]) -> str:
+    """Return how a log is read, and what it holds, as text."""
+    return f"{', '.join(map(str, reading.files))}\n  {'read with':<16}{reading.said}\n{as_text(lines)}"
+
+
+def _topics(reading: Reading, *, fields: bool = False) -> list[Line]:
+    return topic_lines(reading.files[0], fields=fields) if reading.has_topics else []
+
+
+def _refusal_of(reading: Reading, error: PipelineError) -> Told:
+    lines = [("REFUSED", f"{_place(error.file, reading.files)}{error.message}"), ("code", error.code)]
+    refused = Refused(error.code, error.message, error.file or str(reading.files[0]), reading)
+    return _told_of(reading, [*lines, *_topics(reading, fields=error.code == "missing_topic")]), [refused]
 
 
 def _place(file: str | None, files: Sequence[Path]) -> str:
@@ -264,9 +282,9 @@ def _place(file: str | None, files: Sequence[Path]) -> str:
     return f"line {line}: " if line.isdigit() else f"{file}: "
 
 
-def _layouts(reading: Reading, error: PipelineError) -> list[TextLayout]:
+def _layouts(reading: Reading, code: str) -> list[TextLayout]:
     """Return the layout of each log that the profile does not describe; of a log of messages, that of one topic."""
-    if not isinstance(error, IngestError) or error.code not in UNKNOWN_LAYOUT:
+    if code not in UNKNOWN_LAYOUT:
         return []
     found = []
     for file in reading.files:
@@ -296,7 +314,7 @@ def _print_proposals(proposals: Sequence[Proposal], sensor: dict[str, Any], save
             ingest = proposal.ingest(name, sensor)
             groups = [[Path(f) for f in proposal.files]] if proposal.parts else [[Path(f)] for f in proposal.files]
             for group in groups:
-                _print_facts(_reading_of_file(group, ingest, sensor, "the proposed profile"))
+                print(f"{_check_log(Reading.alone(group, ingest, sensor, 'the proposed profile'))[0]}\n")
         elif proposal.unknown():
             print(f"Fill in {UNKNOWN} for {', '.join(proposal.unknown())}.")
         if save is not None:

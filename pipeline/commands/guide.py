@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from pipeline.commands import parser_of
-from pipeline.commands.check import campaign_of, config_of_log
+from pipeline.commands.readings import campaign_of, config_of_log
 from pipeline.config.campaign import load_campaign
 from pipeline.errors import CannotCalibrateError, ConfigurationError, NotObservableError, PipelineError
 from pipeline.estimation.gyroscope import rests_and_moves

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.commands import parser_of
 from pipeline.errors import ConfigurationError, InputError
 from pipeline.files import CONFIGS
-from pipeline.model.data_sheet import range_settings
+from pipeline.model.data_sheet import settings_of_ranges
 from pipeline.outcome import run_command
 from pipeline.planning.changes import readme
 from pipeline.simulation.description import UnitDescription, read_option
@@ -43,12 +43,10 @@ overrides:
 
 def main(argv: Sequence[str]) -> int:
     """Run ``python -m pipeline new DIR``."""
-    parser = parser_of("new", __doc__, EPILOG)
+    parser = parser_of("new", __doc__, EPILOG, ("--range",))
     add = parser.add_argument
     add("directory", type=Path, metavar="DIR", help="directory of the campaign; it is created if it does not exist")
     add("--sensor", metavar="NAME", help="sensor model, a name in configs/sensor (default: generic)")
-    words = "full scale of the accelerometer in g, then of the gyroscope in deg/s (default: those of the sensor's file)"
-    add("--range", type=float, nargs="+", metavar="RANGE", help=words)
     add("--procedure", metavar="NAME", help="how you record, a name in configs/procedure (default: three_axis_turns)")
     add("--table", metavar="NAME", help="rate table, a name in configs/table (default: that of the procedure)")
     add("--unit", default="U1", metavar="NAME", help="name of the first unit (default: U1)")
@@ -120,10 +118,7 @@ def _chosen_ranges(sensor: dict[str, Any], given: list[float] | None) -> list[fl
             given = [float(word) for word in input(f"ranges, g and deg/s [{shown}]: ").split()]
         except ValueError:
             raise ConfigurationError(f"ranges: expected two numbers such as {shown}") from None
-    wanted = [*(given or []), *held[len(given or []) :]]
-    if len(wanted) > len(held) or not all(value > 0.0 for value in wanted):
-        raise ConfigurationError("--range takes that of the accelerometer in g, then that of the gyroscope in deg/s")
-    return wanted
+    return [*(given or []), *held[len(given or []) :]]
 
 
 def _ranges_of(sensor: dict[str, Any]) -> list[float]:
@@ -132,16 +127,15 @@ def _ranges_of(sensor: dict[str, Any]) -> list[float]:
 
 def _ranges(name: str, sensor: dict[str, Any], wanted: list[float]) -> str:
     """Return the settings of the ranges, as comments where they are those of the sensor's file."""
-    sheets = {s: sensor[s] for s in UNITS if sensor.get(s)}
-    held = ", ".join(f"{s} +-{sheet['full_scale']:g} {UNITS[s]}" for s, sheet in sheets.items())
-    pairs = list(zip(sheets, wanted, strict=True))
-    other = [(part, value) for part, value in pairs if value != float(sheets[part]["full_scale"])]
-    mark = "" if other else "# "
+    sheets = [sensor[s] for s in UNITS if sensor.get(s)]
+    held = ", ".join(f"{s} +-{sensor[s]['full_scale']:g} {UNITS[s]}" for s in UNITS if sensor.get(s))
+    other = [None if value == float(h["full_scale"]) else value for h, value in zip(sheets, wanted, strict=False)]
+    settings = settings_of_ranges(sensor, [*other, *wanted[len(other) :]])
+    mark = "" if settings else "# "
     lines = ["", f"# The file of the sensor {name} states the ranges {held}."]
-    lines += [] if other else ["# Example for larger ones:"]
+    lines += [] if settings else ["# Example for larger ones:"]
     lines += [f"{mark}models:", f"{mark}  {name}:"]
-    for part, value in other or [(part, _larger(sheets[part])) for part in sheets]:
-        lines += [f"{mark}    - {setting}" for setting in _settings_of_range(part, sheets[part], value)]
+    lines += [f"{mark}    - {s}" for s in settings or settings_of_ranges(sensor, [_larger(sheet) for sheet in sheets])]
     return "\n".join(lines) + "\n"
 
 
@@ -150,15 +144,6 @@ def _larger(sheet: dict[str, Any]) -> float:
     full_scale = float(sheet["full_scale"])
     listed = [float(r) for r in sheet.get("ranges") or ()] or [2.0 * full_scale]
     return min((r for r in listed if r > full_scale), default=full_scale)
-
-
-def _settings_of_range(part: str, sheet: dict[str, Any], value: float) -> list[str]:
-    """Return the overrides that set a range: ``range`` of those that the file lists, else full scale and counts."""
-    if sheet.get("ranges"):
-        range_settings(f"sensor.{part}.range", value, {part: sheet})  # refuses what the file does not list
-        return [f"sensor.{part}.range={value:g}"]
-    counts = float(sheet["counts_per_unit"]) * float(sheet["full_scale"]) / value
-    return [f"sensor.{part}.full_scale={value:g}", f"sensor.{part}.counts_per_unit={counts:.10g}"]
 
 
 def _options() -> str:

@@ -7,14 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.commands import parser_of
-from pipeline.commands.check import config_of_log
+from pipeline.commands.readings import Reading, config_of_log
 from pipeline.errors import ConfigurationError
 from pipeline.estimation.noise_identification import identify_noise
 from pipeline.exports import Subject, export, formats
 from pipeline.files import json_text, write_atomically
-from pipeline.io.ingest_settings import checks_of
-from pipeline.io.read import read_table, to_recording
-from pipeline.preprocessing.checks import check_recordings
 from pipeline.records import AXES, SENSORS
 from pipeline.report.noise_section import remarks, term_rows
 from pipeline.report.numbers import MINUS, number
@@ -47,11 +44,7 @@ def main(argv: Sequence[str]) -> int:
     log: Path = arguments.log
     config = config_of_log(log, arguments.ingest, arguments.sensor)
     ingest, sheet = config["ingest"], config["sensor"] if arguments.sensor else {}
-    entry = {"role": "static", "axis": None}
-    table = read_table([log], ingest)
-    recording = to_recording("static", entry, table, sheet, checks_of(ingest))
-    settings = {"procedure": {"recordings": {"static": entry}}, "table": {}, "sensor": sheet, "ingest": ingest}
-    (recording,) = check_recordings([recording], settings)
+    recording = Reading.alone([log], ingest, sheet, role="static").checked()
     found = identify_noise([recording])
     print("\n\n".join(_told(sensor, found[sensor]) for sensor in SENSORS).replace(MINUS, "-"))
     if target is None:

@@ -13,7 +13,7 @@ from pipeline.errors import ConfigurationError
 from pipeline.history import SENSORS
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
 NEEDED = ("noise_density", "bias_wander", "wander_time_s", "bias", "scale_factor", "cross_axis", "effects")
 
@@ -47,6 +47,31 @@ def range_settings(key: str, value: Any, sensor: Mapping[str, Any]) -> list[tupl
         known = ", ".join(f"{full:g}" for full in sorted(ranges)) or "none: set full_scale and counts_per_unit"
         raise ConfigurationError(f"{key}={value}: the sensor's file lists the ranges {known}")
     return [(f"sensor.{part}.full_scale", float(value)), (f"sensor.{part}.counts_per_unit", ranges[float(value)])]
+
+
+def settings_of_ranges(sensor: Mapping[str, Any], wanted: Sequence[float | None]) -> list[str]:
+    """Return the overrides that set the range of the accelerometer, g, then of the gyroscope, deg/s; None: as it is.
+
+    They are ``range`` of a sensor whose file lists its ranges, else full scale and counts per unit.
+
+    Raises
+    ------
+    ConfigurationError
+        If there are more ranges than sensors, one is not positive, or the file does not list it.
+    """
+    parts = [part for part in SENSORS if sensor.get(part)]
+    if len(wanted) > len(parts) or not all(value is None or value > 0.0 for value in wanted):
+        raise ConfigurationError("--range takes that of the accelerometer in g, then that of the gyroscope in deg/s")
+    found = []
+    for part, value in zip(parts, wanted, strict=False):
+        sheet = sensor[part]
+        if value is not None and sheet.get("ranges"):
+            range_settings(f"sensor.{part}.range", value, sensor)  # refuses what the file does not list
+            found.append(f"sensor.{part}.range={value:g}")
+        elif value is not None:
+            counts = float(sheet["counts_per_unit"]) * float(sheet["full_scale"]) / value
+            found += [f"sensor.{part}.full_scale={value:g}", f"sensor.{part}.counts_per_unit={counts:.10g}"]
+    return found
 
 
 def assumed_figures(name: str, sensor: Mapping[str, Any]) -> str:

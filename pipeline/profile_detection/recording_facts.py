@@ -54,7 +54,12 @@ def as_text(lines: Sequence[Line]) -> str:
     for label, text in lines:
         first = f"  {label:<{LABEL}}"
         out += textwrap.wrap(
-            text, WIDTH, initial_indent=first, subsequent_indent=" " * len(first), break_long_words=False
+            text,
+            WIDTH,
+            initial_indent=first,
+            subsequent_indent=" " * len(first),
+            break_long_words=False,
+            break_on_hyphens=False,
         )
     return "\n".join(out)
 
@@ -76,13 +81,19 @@ def _time(recording: Recording) -> str:
 
 
 def _rests(recording: Recording) -> list[tuple[int, int]]:
-    by_table = rests_from_table(recording)
+    turns = _turns(recording)
+    by_table = rests_from_table(recording) if turns else []
     if by_table:
         return [(r.start, r.stop) for r in by_table if r.stop - r.start >= FEWEST_SAMPLES]
     force = recording.accelerometer
-    if force is None or recording.samples < 20 or recording.table_rate is not None:
+    if force is None or recording.samples < 20 or (turns and recording.table_rate is not None):
         return []
     return rests_of(force[:ENOUGH], recording.interval)
+
+
+def _turns(recording: Recording) -> bool:
+    """Return whether the table's log changes: that of an encoder that is not connected does not."""
+    return any(log is not None and np.ptp(log) > 0.0 for log in (recording.table_angle, recording.table_rate))
 
 
 def _sensor(name: str, readings: Values, rests: Sequence[tuple[int, int]]) -> str:
@@ -105,8 +116,8 @@ def _sensor(name: str, readings: Values, rests: Sequence[tuple[int, int]]) -> st
 def _table(recording: Recording) -> list[Line]:
     found = []
     if recording.table_angle is not None:
-        angle = recording.table_angle
-        found.append(f"angle {_number(float(angle.min()))} to {_number(float(angle.max()))} deg")
+        low, high = float(recording.table_angle.min()), float(recording.table_angle.max())
+        found.append(f"angle {_number(low)}{f' to {_number(high)}' if high > low else ''} deg")
     if recording.table_rate is not None:
         rate = recording.table_rate
         text = f"rate {_number(float(rate.min()))} to {_number(float(rate.max()))} deg/s"
@@ -116,12 +127,14 @@ def _table(recording: Recording) -> list[Line]:
             if abs(alike[axis]) > 0.9:
                 slope = float(np.polyfit(rate, recording.gyroscope[:, axis], 1)[0])
                 text += f" (the gyroscope's {AXES[axis]} reads {slope:.3f} of it, correlation {alike[axis]:.4f})"
-        found.append(text if np.any(rate) else "at rest throughout")
+        found.append(text if np.any(rate) else "rate 0 deg/s")
     if recording.table_attitude is not None:
         found.append("attitude")
     clock = recording.source.get("table_clock")
     if clock:
         found.append(f"a clock of its own, {clock['offset_s']:.6g} s ahead and gaining {clock['drift_ppm']:.3g} ppm")
+    if found and recording.table_attitude is None and not _turns(recording):
+        found.append("it does not change: the table did not turn, or its encoder is not connected")
     return [("table", "; ".join(found))] if found else []
 
 

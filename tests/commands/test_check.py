@@ -219,3 +219,68 @@ def test_one_long_recording_is_told_with_its_segments(tmp_path: Path, capsys: py
     assert checked.code == 0
     assert "segments accel_x: 12 steps about x at" in checked.words
     assert "static: a long rest, from" in checked.words
+
+
+@pytest.fixture
+def linked(tmp_path: Path) -> Path:
+    """Return a campaign of one unit whose recordings are links to files elsewhere."""
+    (tmp_path / "bench" / "raw" / "U").mkdir(parents=True)
+    (tmp_path / "bench" / "units.csv").write_text("unit,sensor,overrides\nU,mpu6050,sensor.gyroscope.range=500\n")
+    for file in (DEMO / "mpu6050-1").iterdir():
+        (tmp_path / "bench" / "raw" / "U" / file.name).symlink_to(file)
+    return tmp_path / "bench"
+
+
+def test_a_link_in_a_campaign_and_a_file_elsewhere_are_read_as_the_campaign_says(
+    linked: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    checked = Checked(capsys, linked / "raw" / "U" / "gyro_x.csv")
+    assert checked.code == 0
+    assert "unit U of campaign bench, recording gyro_x: ingest=canonical_csv, sensor=mpu6050" in checked.words
+    assert "of 500 deg/s" in checked.words
+    elsewhere = Checked(capsys, DEMO / "mpu6050-2" / "gyro_x.csv", "--campaign", linked)
+    assert elsewhere.code == 0
+    assert "campaign bench, as no recording of a unit: ingest=canonical_csv, sensor=mpu6050" in elsewhere.words
+    assert "of 500 deg/s" in elsewhere.words
+    alone = Checked(capsys, DEMO / "mpu6050-2" / "gyro_x.csv", "--sensor", "mpu6050", "--range", "4", "500")
+    assert "of 4 g; gyroscope" in alone.words
+    assert "of 500 deg/s" in alone.words
+
+
+def test_a_unit_is_refused_for_what_its_recordings_show_together(
+    linked: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "unit U: 8 recordings, no refusal" in Checked(capsys, "--campaign", linked).out
+    copy = linked / "raw" / "U" / "static.csv"
+    copy.unlink()
+    lines = (DEMO / "mpu6050-1" / "validation.csv").read_text().splitlines()
+    copy.write_text("\n".join(lines[:1000]) + "\n")
+    for checked in (Checked(capsys, "--campaign", linked), Checked(capsys, linked / "raw" / "U" / "gyro_x.csv")):
+        assert checked.code == 2
+        assert "unit U of campaign bench" in checked.out
+        assert "code shared_rows" in checked.words
+    copy.unlink()
+    (linked / "raw" / "U" / "validation.csv").unlink()
+    checked = Checked(capsys, linked / "raw" / "U" / "gyro_x.csv")
+    assert checked.code == 0
+    assert "a run needs more recordings of unit U" in checked.words
+    assert Checked(capsys, "--campaign", linked, "--unit", "U").code == 2
+
+
+def test_an_encoder_that_is_not_connected_is_told_and_refused_where_a_run_needs_it(
+    linked: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for file in [f for f in (linked / "raw" / "U").iterdir() if f.stem not in {"validation", "static"}]:
+        lines = file.read_text().splitlines()
+        names = lines[0].split(",")
+        angle, rate = names.index("table_angle_deg"), names.index("table_rate_dps")
+        rows = [line.split(",") for line in lines[1:]]
+        for row in rows:
+            row[angle] = row[rate] = "0"
+        file.unlink()
+        file.write_text("\n".join([lines[0], *(",".join(row) for row in rows)]) + "\n")
+    checked = Checked(capsys, linked / "raw" / "U" / "gyro_z.csv", "--ingest", "canonical_csv")
+    assert checked.code == 0
+    assert "the table did not turn, or its encoder is not connected" in checked.words
+    assert "the sensor did not move" not in checked.words
+    assert Checked(capsys, linked / "raw" / "U" / "gyro_z.csv").code == 2

@@ -1,0 +1,141 @@
+"""How a log is read that a command names: its files, and the configuration that its campaign or its options give."""
+
+from __future__ import annotations
+
+import os
+import re
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from shutil import copyfile
+from typing import TYPE_CHECKING, Any
+
+from pipeline.config.compose import Composer
+from pipeline.config.options import Problem
+from pipeline.errors import ConfigurationError
+from pipeline.files import CONFIGS
+from pipeline.io.files import FILE, MESSAGE_FORMATS, SUFFIXES
+from pipeline.io.ingest_settings import checks_of
+from pipeline.io.read import read_table, to_recording
+from pipeline.preprocessing.checks import check_recordings
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.records import Recording
+
+DEFAULT_PROFILE = "canonical_csv"
+SEARCHED_FOLDERS = 4  # the log's, and a campaign's above raw/<unit>/
+
+
+@dataclass
+class Reading:
+    """Files that are read as one recording, and the sections of the configuration by which they are read."""
+
+    files: list[Path]
+    settings: dict[str, Any]
+    said: str
+
+    @classmethod
+    def alone(
+        cls, files: list[Path], ingest: dict[str, Any], sensor: dict[str, Any], said: str = "", role: str = "rests"
+    ) -> Reading:
+        """Return how files are read that belong to no campaign: without a table."""
+        recordings = {files[0].stem: {"role": role, "axis": None}}
+        settings = {"procedure": {"recordings": recordings}, "table": {}, "sensor": sensor, "ingest": ingest}
+        return cls(files, settings, said)
+
+    @property
+    def has_topics(self) -> bool:
+        """Whether the recording is a log of messages: MCAP, or a format that an extra reads."""
+        return self.files[0].suffix.lower() in (".mcap", *MESSAGE_FORMATS)
+
+    def recording(self) -> Recording:
+        """Return the recording, not compared with others."""
+        ((name, entry),) = self.settings["procedure"]["recordings"].items()
+        table = read_table(self.files, self.settings["ingest"])
+        return to_recording(name, entry, table, self.settings["sensor"], checks_of(self.settings["ingest"]))
+
+    def checked(self) -> Recording:
+        """Return the recording, checked alone."""
+        return check_recordings([self.recording()], self.settings)[0]
+
+
+def grouped(files: Sequence[Path], ingest: dict[str, Any]) -> list[list[Path]]:
+    """Return the files of each recording: one, or one for each part of the profile."""
+    parts = [part["file"] for part in (ingest["csv"] or {}).get("parts") or []]
+    groups: dict[Path, list[Path]] = {}
+    for file in files:
+        if not parts or file.suffix.lower() in SUFFIXES[1:]:
+            groups[file] = [file]
+            continue
+        patterns = [re.escape(p).replace(re.escape(FILE), "(.+)") for p in parts]
+        found = next((m for p in patterns if (m := re.fullmatch(p, file.name))), None)
+        if found is None:
+            raise ConfigurationError(f"matches none of the profile's parts ({', '.join(parts)})", str(file))
+        stem = found.group(1) if found.groups() else ""
+        groups[file.parent / stem] = [file.parent / p.replace(FILE, stem) for p in parts]
+    return list(groups.values())
+
+
+def absolute(file: Path) -> Path:
+    """Return an absolute path in which links are not followed."""
+    return Path(os.path.abspath(file))  # noqa: PTH100  (resolve() follows links)
+
+
+def campaign_of(file: Path) -> Path | None:
+    """Return the campaign that a file, or the link to it, lies in; None where it lies in none."""
+    above = [*absolute(file).parents, *file.resolve().parents]
+    return next((d for d in above if (d / "units.csv").is_file()), None)
+
+
+def config_of_log(
+    file: Path, profile: str | None, sensor: str | None, more: Sequence[str] = (), campaign: Path | None = None
+) -> dict[str, Any]:
+    """Return the configuration by which a log is read alone: by a profile (default: ``DEFAULT_PROFILE``) and a sensor.
+
+    The options of the campaign that is named, or that the log lies in, may be named too. ``more``: further overrides.
+    """
+    campaign = campaign or campaign_of(file)
+    return composed(named(profile, file, campaign) if profile else DEFAULT_PROFILE, sensor, campaign, more)
+
+
+def named(profile: str, file: Path, campaign: Path | None) -> str:
+    """Return a profile as it is to be read: a name that is known, or the only saved file of that name.
+
+    A file is looked for in the working directory, in the folders about the log, and in ``configs/ingest`` of each of
+    these and of the campaigns below the working directory.
+
+    Raises
+    ------
+    ConfigurationError
+        If files of that name hold different profiles.
+    """
+    known = [root / "ingest" / f"{profile}.yaml" for root in (CONFIGS, *([campaign / "configs"] if campaign else []))]
+    if Path(profile).suffix in (".yaml", ".yml") or any(place.is_file() for place in known):
+        return profile
+    folders = [Path.cwd(), *list(file.resolve().parents)[:SEARCHED_FOLDERS]]
+    places = [place for folder in folders for place in (folder, folder / "configs" / "ingest")]
+    places += sorted(Path.cwd().glob("*/configs/ingest"))
+    found = {f.resolve(): f.read_bytes() for place in places if (f := place / f"{profile}.yaml").is_file()}
+    if len(set(found.values())) > 1:
+        raise ConfigurationError(f"--ingest {profile} is one of {', '.join(map(str, found))}; name its path")
+    return str(next(iter(found), profile))
+
+
+def composed(profile: str, sensor: str | None, campaign: Path | None, more: Sequence[str] = ()) -> dict[str, Any]:
+    """Return a configuration with a profile, and with ``more`` overrides."""
+    path = Path(profile)
+    layers = ["procedure=multi_position", *([f"sensor={sensor}"] if sensor else []), *more]
+    with tempfile.TemporaryDirectory() as folder:
+        own = campaign or Path(folder)
+        if path.suffix in (".yaml", ".yml"):
+            if not path.is_file():
+                raise ConfigurationError("there is no such file", profile)
+            own = Path(folder)
+            (own / "configs" / "ingest").mkdir(parents=True)
+            copyfile(path, own / "configs" / "ingest" / f"{path.stem}.yaml")
+        try:
+            return Composer(own).unit("check", [*layers, f"ingest={path.stem}"])
+        except Problem as problem:
+            raise ConfigurationError(str(problem), profile if own == Path(folder) else None) from None

@@ -1,0 +1,88 @@
+"""A trial of a unit: the stages of a run from ``ingest`` to ``calibration``, in this process and a temporary folder.
+
+What a run refuses is refused here, by the same functions with the same settings. Diagnosis, exports and pages are left
+out.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from dataclasses import dataclass, field, replace
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.config.campaign import cut_batches
+from pipeline.config.stage_settings import settings_of_jobs
+from pipeline.io.parquet import from_parquet
+from pipeline.model.effects import forget, register_user_effects
+from pipeline.pack import Pack, as_bytes, new_pack
+from pipeline.stages import MODULES
+from pipeline.stages.batch import FITS, Job, failure_of, merge_common
+
+if TYPE_CHECKING:
+    from pipeline.config.campaign import Campaign
+    from pipeline.records import Recording
+
+
+@dataclass
+class Trial:
+    """What came of a unit.
+
+    ``recordings``: as ingest leaves them. ``failure``: the record of what a run would refuse, None where it calibrates
+    the unit. ``not_calibrated``: the reason of each sensor that would be null.
+    """
+
+    recordings: list[Recording] = field(default_factory=list)
+    failure: dict[str, Any] | None = None
+    not_calibrated: dict[str, str] = field(default_factory=dict)
+
+
+def try_unit(campaign: Campaign, unit: str, until: str = "calibration", *, incomplete: bool = False) -> Trial:
+    """Return what a run would make of a unit.
+
+    ``until``: the last stage that is tried: ``ingest``, ``fit`` (without the stage ``effects``, which takes longest) or
+    ``calibration``. ``incomplete``: recordings that do not exist are left out.
+    """
+    row = campaign.units[unit]
+    if incomplete:
+        procedure = row.config["procedure"]
+        there = {name: entry | {"optional": True} for name, entry in procedure["recordings"].items()}
+        row = replace(row, config=row.config | {"procedure": procedure | {"recordings": there}})
+    batches, chains = cut_batches({unit: row}, 1)
+    ((batch, _),) = batches.items()
+    files = settings_of_jobs(replace(campaign, units={unit: row}, batches=batches, chains=chains, compare=[]))[batch]
+    fits = [f"fit/{sensor}/{stage}" for sensor in FITS for stage in chains[batch][sensor]]
+    base = [fit for fit in fits if not fit.endswith("/effects")]
+    outputs = {"ingest": ["ingest"], "fit": ["ingest", "filter", *base]}.get(
+        until, ["ingest", "filter", *fits, "validate", "calibration"]
+    )
+    packs: dict[str, Pack] = {}
+    found = Trial()
+    with tempfile.TemporaryDirectory() as folder:
+        for output in outputs:
+            stage, sensor, name = [*output.split("/"), "", ""][:3]
+            content = merge_common(json.loads(files[output].content))
+            (settings,) = content.pop("units").values()
+            last = "yes" if sensor and name == chains[batch][sensor][-1] else "no"
+            previous = str(packs[sensor].path) if sensor in packs else ""
+            content |= {"sensor": sensor, "stage": name, "previous": previous, "last": last}
+            path = Path(folder) / f"{output.replace('/', '-')}.zip"
+            register_user_effects(content.get("user_effects", {}))
+            try:
+                job = Job(stage, {unit: settings}, content, packs, path, Path(folder))
+                made = getattr(import_module(f"pipeline.stages.{MODULES[stage]}"), f"{stage}_unit")(job, unit, settings)
+            except Exception as error:  # noqa: BLE001  (as a run: it stops this unit alone)
+                found.failure = failure_of(error, unit, output)
+                break
+            finally:
+                forget()
+            with new_pack(path) as add:
+                add({file: as_bytes(member) for file, member in made.items()})
+            packs[sensor or stage] = Pack(path)
+            if stage == "ingest":
+                found.recordings = from_parquet(packs["ingest"].read(f"{unit}.parquet"), str(path))
+            if stage == "calibration":
+                found.not_calibrated = packs["calibration"].json(f"{unit}.json")["not_calibrated"]
+    return found
