@@ -226,36 +226,51 @@ def _upper_limits(names: Sequence[str], likely: Sequence[tuple[Search, Set]]) ->
             for name, (weight, mean, deviation) in search.given(members, members - kept).mixtures(own).items():
                 limit = search.problem.limits[name]
                 parts.setdefault(name, []).append((weight + ODDS * len(kept), mean * limit, deviation * limit))
-    found = {}
+    mixtures = {}
     for name in (n for n in names if n in parts):
         weight, mean, deviation = (np.concatenate(each) for each in zip(*parts[name], strict=True))
         weight = np.exp(weight - weight.max())
-        found[name] = quantile(weight / weight.sum(), mean, deviation)
-    return found
+        weight /= weight.sum()
+        kept = weight > NEGLIGIBLE
+        mixtures[name] = weight[kept], mean[kept], deviation[kept]
+    return dict(zip(mixtures, quantiles([*mixtures.values()]), strict=True))
 
 
-def quantile(weight: Values, mean: Values, deviation: Values) -> Values:
-    """Return the ``BELOW`` quantile of the absolute values of a mixture of normal distributions: (k,) array.
+def quantiles(mixtures: Sequence[tuple[Values, Values, Values]]) -> list[Values]:
+    """Return the ``BELOW`` quantiles of the absolute values of k quantities, mixtures of m normal distributions.
 
-    ``weight``: (m,). ``mean, deviation``: (m, k).
+    ``mixtures``: weights (m,), means and standard deviations (m, k). Returns a (k,) array of each.
     """
     from scipy.special import ndtr  # noqa: PLC0415  (0.1 s that only a diagnosis pays)
 
-    kept = weight > NEGLIGIBLE
-    weight, mean, deviation = weight[kept], np.abs(mean[kept]), np.maximum(deviation[kept], 1e-300)
-    low, high = np.zeros(mean.shape[1]), np.max(mean + 5.0 * deviation, axis=0)
-    found = np.minimum(2.0 * np.sqrt(weight @ (mean**2 + deviation**2) / weight.sum()), high)
+    if not mixtures:
+        return []
+    counts = [mean.shape[1] for _, mean, _ in mixtures]
+    sizes = np.repeat([len(weight) for weight, _, _ in mixtures], counts)  # all side by side, of every quantity
+    first, of = np.cumsum(sizes) - sizes, np.repeat(np.arange(len(sizes)), sizes)
+    weight = np.concatenate([np.tile(each[0], k) for each, k in zip(mixtures, counts, strict=True)])
+    mean = np.abs(np.concatenate([each.T.ravel() for _, each, _ in mixtures]))
+    deviation = np.maximum(np.concatenate([each.T.ravel() for _, _, each in mixtures]), 1e-300)
+
+    def total(values: Values) -> Values:
+        return np.asarray(np.add.reduceat(weight * values, first))
+
+    whole = np.add.reduceat(weight, first)
+    low, high = np.zeros(len(sizes)), np.maximum.reduceat(mean + 5.0 * deviation, first)
+    found = np.minimum(2.0 * np.sqrt(total(mean**2 + deviation**2) / whole), high)
     for _ in range(HALVINGS):  # of Newton, or halvings where a step of it leaves the interval
-        above, beneath = (np.clip((found + side * mean) / deviation, -FARTHEST, FARTHEST) for side in (-1.0, 1.0))
-        off = weight @ (ndtr(above) - ndtr(-beneath)) - BELOW * weight.sum()
-        density = weight @ ((np.exp(-0.5 * above**2) + np.exp(-0.5 * beneath**2)) / deviation) / np.sqrt(2.0 * np.pi)
+        above, beneath = (
+            np.clip((found[of] + side * mean) / deviation, -FARTHEST, FARTHEST) for side in (-1.0, 1.0)
+        )
+        off = total(ndtr(above) - ndtr(-beneath)) - BELOW * whole
+        density = total((np.exp(-0.5 * above**2) + np.exp(-0.5 * beneath**2)) / deviation) / np.sqrt(2.0 * np.pi)
         low, high = np.where(off < 0.0, found, low), np.where(off < 0.0, high, found)
         following = found - off / np.maximum(density, 1e-300)
         following = np.where((following > low) & (following < high), following, 0.5 * (low + high))
         if np.all(np.abs(following - found) <= EXACT * high):
             break
         found = following
-    return np.asarray(following)
+    return np.split(following, np.cumsum(counts)[:-1])
 
 
 def excluded(effects: Sequence[Effect]) -> dict[str, Set]:
