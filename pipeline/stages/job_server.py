@@ -68,17 +68,19 @@ def serve(listener: socket.socket, run_command: Callable[[list[str]], int]) -> i
 
 
 def _prepare() -> None:
-    """Import what the stages use and compile the templates."""
+    """Import what the stages use, read the built-in effects and compile the templates."""
     from importlib import import_module  # noqa: PLC0415
 
     for module in {*MODULES.values()} - {"gather"}:  # runs once, and imports pandas
         import_module(f"pipeline.stages.{module}")
-    for module in ("scipy.interpolate", "scipy.spatial.transform", "imufusion"):
+    for module in ("scipy.interpolate", "scipy.spatial.transform", "imufusion", "pipeline.io.csv_read"):
         import_module(module)  # stages import them where they need them
 
     from pipeline.exports import formats  # noqa: PLC0415
+    from pipeline.model.effects import built_in  # noqa: PLC0415
     from pipeline.report.pages import compile_templates  # noqa: PLC0415
 
+    built_in()
     formats()
     compile_templates()
 
