@@ -259,9 +259,7 @@ def quantiles(mixtures: Sequence[tuple[Values, Values, Values]]) -> list[Values]
     low, high = np.zeros(len(sizes)), np.maximum.reduceat(mean + 5.0 * deviation, first)
     found = np.minimum(2.0 * np.sqrt(total(mean**2 + deviation**2) / whole), high)
     for _ in range(HALVINGS):  # of Newton, or halvings where a step of it leaves the interval
-        above, beneath = (
-            np.clip((found[of] + side * mean) / deviation, -FARTHEST, FARTHEST) for side in (-1.0, 1.0)
-        )
+        above, beneath = (np.clip((found[of] + side * mean) / deviation, -FARTHEST, FARTHEST) for side in (-1.0, 1.0))
         off = total(ndtr(above) - ndtr(-beneath)) - BELOW * whole
         density = total((np.exp(-0.5 * above**2) + np.exp(-0.5 * beneath**2)) / deviation) / np.sqrt(2.0 * np.pi)
         low, high = np.where(off < 0.0, found, low), np.where(off < 0.0, high, found)

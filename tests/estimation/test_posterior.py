@@ -12,7 +12,7 @@ from scipy.special import logsumexp
 
 from pipeline.estimation.candidates import excited
 from pipeline.estimation.evidence import SCALE_PRIOR, SCALES, Problem, Version
-from pipeline.estimation.posterior import BELOW, ODDS, Answers, Search, answers, quantile
+from pipeline.estimation.posterior import BELOW, ODDS, Answers, Search, answers, quantiles
 from pipeline.estimation.ranking import without
 from pipeline.estimation.something_else import free_curves
 from pipeline.records import Motion
@@ -99,7 +99,11 @@ def test_an_upper_limit_is_the_quantile_of_draws_from_the_posterior() -> None:
     deviation = np.array([[0.5], [0.1], [1.0]])
     pick = rng.choice(3, 400_000, p=weight)
     drawn = np.abs(mean[pick, 0] + deviation[pick, 0] * rng.standard_normal(len(pick)))
-    assert quantile(weight, mean, deviation)[0] == pytest.approx(np.quantile(drawn, BELOW), rel=0.01)
+    alone = np.ones(1), np.zeros((1, 2)), np.array([[1.0, 2.0]])
+    of_two, of_three, again = quantiles([alone, (weight, mean, deviation), alone])
+    assert of_three == pytest.approx([np.quantile(drawn, BELOW)], rel=0.01)
+    assert of_two == pytest.approx([2.128045, 4.256090], rel=1e-6)  # of a normal distribution: 59/60 from one side
+    assert again.tolist() == of_two.tolist()
 
 
 def test_limits_of_absent_effects_cover_the_true_size_as_often_as_they_say() -> None:
