@@ -13,24 +13,29 @@ from pipeline.stages import MODULES as STAGES
 for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(threads, "1")  # a job is one core; set before numpy is imported
 
-COMMANDS = (
-    "run", "new", "check", "plan", "guide", "explain", "add", "remove", "apply", "convert", "noise", "simulate",
-    "unpack", "config", "study", "thesis",
-)  # fmt: skip
+COMMANDS = {  # name: module and function in pipeline/commands
+    **{name: (name, "main") for name in ("run", "new", "check", "plan", "guide", "explain", "add")},
+    "remove": ("add", "remove"),
+    **{name: (name, "main") for name in ("apply", "convert", "noise", "simulate", "unpack", "config")},
+    "study": ("research", "study"),
+    "thesis": ("research", "thesis"),
+}
 HERE = Path(__file__).parent
 PROGRAM = "imu-calibration" if Path(sys.argv[0]).name == "imu-calibration" else "python -m pipeline"
 
 
-def _summary(module: str, function: str = "") -> str:
-    """Return the first line of the docstring of a module or of a function in it, without importing it."""
+def _summary(module: str, function: str) -> str:
+    """Return the first line of the docstring of a function, of ``main`` that of its module, without importing it."""
     tree = ast.parse(HERE.joinpath(*module.split(".")).with_suffix(".py").read_text(encoding="utf-8"))
     functions = (node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name.startswith(function))
-    return (ast.get_docstring(next(functions) if function else tree) or "").splitlines()[0]
+    return (ast.get_docstring(tree if function == "main" else next(functions)) or "").splitlines()[0]
 
 
 def _help() -> str:
     lines = [f"usage: {PROGRAM} COMMAND ... (COMMAND --help says more; --version)", "", "commands:"]
-    lines += [f"  {name:<12} {_summary(f'commands.{name}')}" for name in COMMANDS]
+    lines += [
+        f"  {name:<12} {_summary(f'commands.{module}', function)}" for name, (module, function) in COMMANDS.items()
+    ]
     lines += ["", "stages, which the rules of the workflow call:"]
     lines += [f"  {name:<12} {_summary(f'stages.{module}', name)}" for name, module in STAGES.items()]
     return "\n".join(lines)
@@ -64,7 +69,8 @@ def run_command(words: list[str]) -> int:
     command, *rest = words
     try:
         if command in COMMANDS:
-            return int(import_module(f"pipeline.commands.{command}").main(rest))
+            module, function = COMMANDS[command]
+            return int(getattr(import_module(f"pipeline.commands.{module}"), function)(rest))
         return int(import_module("pipeline.stages.batch").main(command, rest))
     except PipelineError as error:
         print(f"{PROGRAM} {command}: {error}", file=sys.stderr)

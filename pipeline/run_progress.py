@@ -1,4 +1,4 @@
-"""What the terminal shows of a run beside Snakemake's log: progress, time left, failed jobs, the command that recovers.
+"""What the terminal shows of a run in addition to Snakemake's log: progress, failed jobs, the command that recovers.
 
     time left = sum over stages of (units left * seconds a unit) / jobs at a time
 

@@ -1,4 +1,4 @@
-"""Commands for people: one module each, with ``main(argv)``. Here: their parsers and shared options."""
+"""The commands: a function of ``argv`` each (``pipeline.__main__.COMMANDS``). Here: their parsers and options."""
 
 from __future__ import annotations
 

@@ -44,21 +44,26 @@ place to edit.
 
 def main(argv: Sequence[str]) -> int:
     """Run ``python -m pipeline add CAMPAIGN UNIT SENSOR.EFFECT ...``."""
-    parser = parser_of_edit("add", __doc__)
+    parser = _parser("add", __doc__)
     words = "add to each unit what its diagnosis in the last run found to be missing, or of this only EFFECT"
     parser.add_argument("--missing", nargs="?", const="", metavar="EFFECT", help=words)
     words = "write the formulas that the last run suggests for the unit to effects/, and add them"
     parser.add_argument("--suggested", action="store_true", help=words)
     arguments = parser.parse_args(argv)
     if not arguments.suggested:
-        return change(arguments, remove=False)
+        return _change(arguments)
     written, arguments.effects = _write_suggested(arguments)
     try:
-        return change(arguments, remove=False)
+        return _change(arguments)
     except PipelineError:
         for file in written:
             file.unlink()
         raise
+
+
+def remove(argv: Sequence[str]) -> int:
+    """Remove effects of a unit from <campaign>/devices/<unit>.yaml, and run the campaign: undoes add."""
+    return _change(_parser("remove", remove.__doc__).parse_args(argv), undo=True)
 
 
 def _write_suggested(arguments: argparse.Namespace) -> tuple[list[Path], list[str]]:
@@ -92,16 +97,16 @@ def _write_suggested(arguments: argparse.Namespace) -> tuple[list[Path], list[st
     return written, names
 
 
-def change(arguments: argparse.Namespace, *, remove: bool) -> int:
+def _change(arguments: argparse.Namespace, *, undo: bool = False) -> int:
     """Edit the device files and run the campaign; the exit code is that of the run."""
     given = _settings(arguments.config)
     directory = find_campaign(arguments.campaign)
     composer, layers = read_layers(directory, given)
     wanted = _wanted(arguments, directory.name)
-    edits = [edit_effects(unit, effects, layers, composer, remove=remove) for unit, effects in wanted.items()]
+    edits = [edit_effects(unit, effects, layers, composer, remove=undo) for unit, effects in wanted.items()]
     for edit in edits:
         _apply(edit)
-    if not remove and (told := _of_the_bench(chain.from_iterable(wanted.values()))):
+    if not undo and (told := _of_the_bench(chain.from_iterable(wanted.values()))):
         print(told)
     settings = {"campaign": arguments.campaign, **given}
     if arguments.results != RESULTS:
@@ -125,7 +130,7 @@ def _of_the_bench(effects: Iterable[tuple[str, str]]) -> str:
     return f"note: {', '.join(names)}: {what}. {use}"
 
 
-def parser_of_edit(command: str, description: str | None) -> argparse.ArgumentParser:
+def _parser(command: str, description: str | None) -> argparse.ArgumentParser:
     """Return the parser of add and remove."""
     parser = parser_of(command, description, EPILOG)
     parser.add_argument("campaign", metavar="CAMPAIGN", help="a campaign's name or directory")

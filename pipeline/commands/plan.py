@@ -87,8 +87,8 @@ def _parser() -> argparse.ArgumentParser:
 
 def _register_effects(arguments: Mapping[str, Any]) -> None:
     campaign: Path | None = arguments["campaign"]
-    beside = sorted((campaign / "effects").glob("*.yaml")) if campaign is not None else []
-    for own in read_effect_files([*beside, *arguments["effects"]]).values():
+    of_campaign = sorted((campaign / "effects").glob("*.yaml")) if campaign is not None else []
+    for own in read_effect_files([*of_campaign, *arguments["effects"]]).values():
         register(own)
 
 

@@ -69,8 +69,8 @@ def main(argv: Sequence[str]) -> int:
         text = "# Read by: python -m pipeline simulate\n" + yaml.safe_dump(data, sort_keys=False)
         (directory / FILE).write_text(text, encoding="utf-8")
     directory.mkdir(parents=True, exist_ok=True)
-    beside = directory if source is None else source.parent
-    for own in read_effect_files(sorted((beside / "effects").glob("*.yaml"))).values():
+    folder = directory if source is None else source.parent
+    for own in read_effect_files(sorted((folder / "effects").glob("*.yaml"))).values():
         register(own)
     total = len(description.units)
     countdown, done = Countdown(total), count(1)

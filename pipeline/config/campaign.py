@@ -65,7 +65,7 @@ class Campaign:
     settings : mapping
         What ``snakemake --config`` gave.
     page : str or None
-        A page that the campaign asks for beside its own.
+        A page that the campaign asks for in addition to its own.
     combine : str or None
         ``serial``: a joint estimate of units that share a serial.
     publish_limit : int

@@ -15,8 +15,8 @@ where
     models: {mpu6050: [filter=none]}  # of the units of a sensor model
     lots: {"12": [filter.order=2]}    # of the units of a production lot
     compare: [[U1, U2]]               # what the campaign's page compares; see pipeline.config.comparisons
-    simulate: true                    # the run makes the recordings, from simulation.yaml beside this file
-    page: thesis                      # the run makes this page too, beside the campaign's own
+    simulate: true                    # the run makes the recordings, from simulation.yaml in this folder
+    page: thesis                      # the run makes this page in addition to the campaign's own
 """
 
 from __future__ import annotations
@@ -264,7 +264,9 @@ def load_layers(directory: Path, settings: Mapping[str, Any], sheet: Sheet, sens
     on_command_line, command = _split(as_list(settings.get("overrides", []), "overrides"))
     simulation = path.with_name(SIMULATION) if file.simulate else None
     if simulation and not os.path.lexists(simulation):
-        raise ConfigurationError(f"simulate: true needs {SIMULATION} beside it, which does not exist", str(path))
+        raise ConfigurationError(
+            f"simulate: true needs {SIMULATION} in the same folder, which does not exist", str(path)
+        )
     problem = not_regular(simulation) if simulation else None
     if problem:
         raise ConfigurationError(problem, str(simulation))

@@ -1,6 +1,6 @@
 """The schema of one unit's configuration: names, types and ranges, in one place.
 
-What each key means stands beside it in ``configs/``. Unknown keys are refused everywhere but in ``ingest`` column maps
+Comments in ``configs/`` state what each key means. Unknown keys are refused everywhere but in ``ingest`` column maps
 and effect limits, whose keys are names of channels and parameters.
 """
 

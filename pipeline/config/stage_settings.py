@@ -241,8 +241,8 @@ def _canonical(value: Any) -> bytes:  # noqa: ANN401  (any JSON value)
 def code_digest(module: str) -> str:
     """Return a digest of a module's source and of every module of the package that it imports, at any depth.
 
-    A package counts with all that lies beside its ``__init__`` where it finds its modules on disk (exports), a module
-    that imports jinja2 with the ``templates`` beside it, the effects with their files in ``configs/effect/``.
+    A package counts with all files in its folder where it finds its modules on disk, a module
+    that imports jinja2 with its folder ``templates``, the effects with their files in ``configs/effect/``.
     """
     digest = hashlib.sha256()
     for file in sorted(_closure(module)):

@@ -1,6 +1,6 @@
-"""What a campaign brings beside its settings: effects of the user's own, and calibrations that are given.
+"""What a campaign brings in addition to its settings: effects of the user's own, and calibrations that are given.
 
-Formulas stand beside the campaign, Python files are named by the command line alone. The content of the calibration
+Formulas are files of the campaign, Python files are named on the command line only. The content of the calibration
 that ``method=given`` takes from a file is a setting: where it changes, exactly the stages that read it run again.
 """
 
@@ -54,7 +54,7 @@ class UserEffects:
         return {"user_effects": {"formulas": formulas, "python": list(self.python.values())}}
 
     def add_limits(self, sheets: dict[str, Any]) -> None:
-        """Put the effects' limits beside those of the data sheets, which go before them."""
+        """Add the effects' limits to those of the data sheets, which take precedence."""
         for each in self.effects.values():
             for sensor in each.sensors:
                 given = sheets[sensor]["effects"]

@@ -1,8 +1,8 @@
 """The formula of physics that the catalogue does not hold, judged against catalogue and recordings, as an effect file.
 
-The search (``pipeline.diagnosis.functional_form_search``) is made beside the selected effects, and again without them,
-since they may have been selected in place of the form. With each form in the base, effects are selected again. Of these
-models, and that of the catalogue alone, the one with the least
+The search (``pipeline.diagnosis.functional_form_search``) is made in addition to the selected effects, and again
+without them, since they may have been selected in place of the form. With each form in the base, effects are selected
+again. Of these models, and that of the catalogue alone, the one with the least
 
     -2 log L + k log N + 2 C log 10
 
@@ -91,7 +91,7 @@ def discover(
     *,
     accelerometer: SensorCalibration | None = None,
 ) -> Discovery:
-    """Search for a formula beside base, configured and selected effects.
+    """Search for a formula in addition to base, configured and selected effects.
 
     ``unknown`` is what ``dependent`` returned of the selection. Where the residual stays far above the noise with the
     best form, the form is not what is missing, and none is suggested.
@@ -126,7 +126,7 @@ def _worth(selection: Selection, terms: Sequence[Scored]) -> float:
 
 
 def _beside(context: Selection, form: Effect) -> Fit:
-    """Fit a form beside what a selection holds."""
+    """Fit a form in addition to the effects of a selection."""
     terms = [*context.fit.terms, Term(form, np.zeros(len(form.parameters(context.observations.sensor))))]
     return fit_terms(context.observations, terms, context.start, context.settings)
 

@@ -20,7 +20,7 @@ import numpy as np
 from pipeline.diagnosis import functional_forms as forms
 from pipeline.diagnosis.functional_forms import Form, Span
 from pipeline.diagnosis.residual_regression import ProjectedCurves, Scan
-from pipeline.estimation.design import felt
+from pipeline.estimation.design import true_motion
 from pipeline.model.effects import catalogue
 from pipeline.model.effects.base import truth
 from pipeline.model.formula import parse
@@ -68,11 +68,11 @@ class Scored:
 
 
 class Forms:
-    """The forms of the grammar that a unit's recordings can show, and what each gains beside a fit."""
+    """The forms of the grammar that a unit's recordings can show, and what each gains in addition to a fit."""
 
     def __init__(self, selection: Selection) -> None:
         self.selection, self.sensor = selection, selection.observations.sensor
-        motions = [felt(part, selection.fit.terms) for part in selection.observations.parts]
+        motions = [true_motion(part, selection.fit.terms) for part in selection.observations.parts]
         self._signals = [(forms.signals_of(motion), truth(self.sensor, motion)) for motion in motions]
         self._known: dict[str, Values] = {}
         self.explain(())
@@ -227,7 +227,7 @@ def _best_of_each(scored: Iterable[Scored]) -> list[Scored]:
 
 
 def search(selection: Selection) -> tuple[list[Scored], list[Scored]]:
-    """Return the terms of the best form beside what is selected, none where none is clear, and all forms ranked."""
+    """Return the terms of the best form given the selected effects, none if none is clear, and all forms ranked."""
     terms: list[Scored] = []
     grammar = Forms(selection)
     first = found = grammar.ranked()

@@ -185,7 +185,7 @@ class Form:
         return self.factor.complexity + (self.modulator.complexity if self.modulator else 0)
 
     def refines(self, other: Form) -> bool:
-        """Return whether it differs from another form by its constants alone: a step beside a step."""
+        """Return whether it differs from another form by its constants alone, as two steps do."""
         same = self.factor.kind == other.factor.kind and self.factor.signal == other.factor.signal
         return same and bool(self.factor.constants)
 

@@ -145,7 +145,7 @@ def _of_recordings(
 
 
 def _weakest(products: Values, own: NDArray[np.intp]) -> float:
-    """Return the least information on an effect's parameters beside all others, columns scaled as they are given."""
+    """Return the least information on an effect's parameters given all others, columns scaled as they are given."""
     others = np.setdiff1d(np.arange(products.shape[1] - 1), own)
     size = np.sqrt(np.maximum(np.diag(products[0])[own], 1e-300))
     return float(np.linalg.eigvalsh(without(products, others)[0][np.ix_(own, own)] / np.outer(size, size))[0])
@@ -158,12 +158,12 @@ def _refitted(fit: Fit, own: NDArray[np.intp], least: float, rest: tuple[Values,
     others = np.setdiff1d(np.arange(p), own)
     if _weakest(products, own) < DETERMINED * least:
         return {}
-    beside = without(products, others)
+    given = without(products, others)
     model = np.zeros(p)
     model[own] = np.concatenate([term.values for term in fit.terms])[own - BASE]
-    step = projection(beside, own)[0][:, -1]  # about the values of the fit, whose residual is the last column
-    left = float(without(beside, own)[0, -1, -1])
-    size = beside[0][np.ix_(own, own)]
+    step = projection(given, own)[0][:, -1]  # about the values of the fit, whose residual is the last column
+    left = float(without(given, own)[0, -1, -1])
+    size = given[0][np.ix_(own, own)]
     alone = left + float((step + model[own]) @ size @ (step + model[own]))
     gain = samples * float(np.log((alone + within) / (left + within)))
     uncertainty = np.sqrt(np.clip(np.diag(fit.covariance)[own], 1e-300, None))

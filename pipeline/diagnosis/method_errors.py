@@ -63,9 +63,9 @@ MEANINGS = {
         "the body's"
     ),
     ("gyroscope", "orthogonality_and_misalignment", "bias"): (
-        "the bias is the mean of the rests beside the turns (eqs 3.47-3.48), wherever it has wandered since"
+        "the bias is the mean of the rests before and after the turns (eqs 3.47-3.48), wherever it has wandered since"
     ),
-    ("gyroscope", "cholesky_lu", "bias"): "the bias is the mean of the rests beside the turns",
+    ("gyroscope", "cholesky_lu", "bias"): "the bias is the mean of the rests before and after the turns",
 }
 PLAIN = {
     "bias": "the method's bias is not that of a free fit of the same recordings",

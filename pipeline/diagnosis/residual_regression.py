@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.estimation.design import felt
+from pipeline.estimation.design import true_motion
 from pipeline.estimation.gauss_markov import WHITE, GaussMarkov, Products
 from pipeline.estimation.generalized_least_squares import design_at
 from pipeline.estimation.ranking import LEFT, RIDGE, projection, without
@@ -268,7 +268,7 @@ class Scan(_Evidence):
 
 
 def each_explains(inner: Values, cross: Values, error: Values) -> tuple[Values, NDArray[np.bool_]]:
-    """Return what each of r curves explains beside those before it, (..., r, s), and whether it is independent of them.
+    """Return what each of r curves adds to those before it, (..., r, s), and whether it is independent of them.
 
     ``inner``: (..., r, r), products of the curves. ``cross``: (..., r, s), their products with s residuals. ``error``:
     (..., r), the rounding error e; a curve that leaves less explains nothing.
@@ -289,7 +289,7 @@ def each_explains(inner: Values, cross: Values, error: Values) -> tuple[Values, 
 def columns_of_fit(selection: Selection, *further: Curves | None) -> tuple[Values, list[list[NDArray[np.intp]]]]:
     """Return the columns of a selection's fit, its residual and those of curves, and where those of each axis lie."""
     design = design_at(selection.observations.weakened, selection.fit)
-    motions = [felt(part, selection.fit.terms) for part in selection.observations.parts]
+    motions = [true_motion(part, selection.fit.terms) for part in selection.observations.parts]
     columns, places = [design.columns.columns], [[design.places(c)[0]] for c in range(3)]
     for curves in filter(None, further):
         values = np.concatenate([curves(motion) for motion in motions])

@@ -44,7 +44,7 @@ GIVEN_DIFFERS = "The model explains the {sensor}; the given calibration is not t
 def in_words(part: Mapping[str, Any] | None, sensor: str, most_values: int | None = None) -> list[str]:
     """Return a sensor's part of ``diagnoses/<unit>.json``, None where it was not calibrated, as sentences.
 
-    Effects with more than ``most_values`` parameters are stated without their values: a table beside lists them.
+    Effects with more than ``most_values`` parameters are stated without their values, which the page lists in a table.
     """
     if part is None:
         return [f"The {sensor} was not calibrated, so there is nothing to diagnose."]

@@ -72,8 +72,8 @@ class Term:
         return of(sensor, motion, K, self.values)
 
 
-def felt(part: Part, terms: Sequence[Term], but: Effect | None = None) -> Motion:
-    """Return the motion that the sensor felt, after all effects of timing but one."""
+def true_motion(part: Part, terms: Sequence[Term], but: Effect | None = None) -> Motion:
+    """Return the true motion of the sensor at the time stamps, by all effects of timing but one."""
     movers = [term for term in terms if term.effect.moves and term.effect is not but and np.any(term.values)]
     if not movers:
         return part.motion
@@ -90,9 +90,11 @@ def felt(part: Part, terms: Sequence[Term], but: Effect | None = None) -> Motion
 
 def motions_of(part: Part, terms: Sequence[Term]) -> list[Motion]:
     """Return the motion that each term acts on, and last that of the base."""
-    everything = felt(part, terms)
+    everything = true_motion(part, terms)
     moves = [term.effect.moves and bool(np.any(term.values)) for term in terms]
-    acted = [felt(part, terms, term.effect) if move else everything for term, move in zip(terms, moves, strict=True)]
+    acted = [
+        true_motion(part, terms, term.effect) if move else everything for term, move in zip(terms, moves, strict=True)
+    ]
     return [*acted, everything]
 
 
@@ -192,7 +194,7 @@ class Design:
 
     def _add_stops(self, observations: Observations, terms: Sequence[Term], K: Values) -> None:
         """Add the errors of the angle, as parameters after the readings; each axis has columns of its own."""
-        motions = [felt(part, terms) for part in observations.parts]
+        motions = [true_motion(part, terms) for part in observations.parts]
         before, after, group, last = errors_of_stops(observations.sensor, motions, K)
         self.stops = last + 1
         A, rows, blocks = self.columns.columns, np.arange(len(group)), observations.blocks

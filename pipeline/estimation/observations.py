@@ -1,6 +1,6 @@
 """The samples that a fit against a table's motion uses, of every recording of a unit.
 
-Kept are, where readings and log are sound,
+Kept are, where readings and log are valid,
 
 * rests that have settled, as means over at most 1 s: within one the motion does not change, so nothing but white noise
   is lost, and its sum of squares is kept;
@@ -21,7 +21,7 @@ import numpy as np
 
 from pipeline.estimation.gauss_markov import Blocks, information
 from pipeline.estimation.table_errors import errors_of_stops
-from pipeline.estimation.turns import Rows, followed, rows_of
+from pipeline.estimation.turns import Rows, reference_valid, rows_of
 from pipeline.model.effects import stated_priors
 from pipeline.model.effects.base import turning_direction
 from pipeline.model.kinematics import earth_of, table_motion
@@ -239,13 +239,13 @@ def _part(sensor: str, recording: Recording, table: Mapping[str, Any]) -> Part |
     motion = replace(motion, direction=turning_direction(motion))
     filtered = recording.filter["name"] != "none"
     if filtered:
-        sure = _remembered(motion, recording) if sensor == "gyroscope" else followed(motion)
+        sure = _filter_settled(motion, recording) if sensor == "gyroscope" else reference_valid(motion)
         motion = replace(through_filter(motion, recording), reference_valid=sure)
-    sound = np.logical_and(np.all(np.isfinite(reading), axis=1), recording.valid)
-    rows = rows_of(motion, sound, together=not filtered).settled(reading)
+    valid = np.logical_and(np.all(np.isfinite(reading), axis=1), recording.valid)
+    rows = rows_of(motion, valid, together=not filtered).settled(reading)
     if len(rows.first) == 0:
         return None
-    felt = rows.motion(motion) if filtered else _shared(recording, motion, rows)
+    seen = rows.motion(motion) if filtered else _shared(recording, motion, rows)
     information = min(float(recording.filter.get("noise_gain", 1.0)) ** 2, 1.0)
     means = rows.means(reading)
     kept = reading[rows.kept]
@@ -259,7 +259,7 @@ def _part(sensor: str, recording: Recording, table: Mapping[str, Any]) -> Part |
     return Part(
         recording.name,
         recording.role,
-        felt,
+        seen,
         means,
         rows.count * information,
         within * information,
@@ -308,14 +308,14 @@ def through_filter(motion: Motion, recording: Recording) -> Motion:
     )
 
 
-def _remembered(motion: Motion, recording: Recording) -> NDArray[np.bool_]:
+def _filter_settled(motion: Motion, recording: Recording) -> NDArray[np.bool_]:
     """Return at which samples the log says what a filtered rate is: (n,) array of bool.
 
     Where no rate is logged, that of a sample at which the log does not follow the table is wrong by up to half of the
     rate's bend there, and a filter holds on to it: where the bends, through the filter's absolute impulse response,
     leave more than 1e-5 of the largest rate, the sample is left out.
     """
-    sure = followed(motion)
+    sure = reference_valid(motion)
     if (recording.table_rate is not None and motion.axis is not None) or sure.all():
         return sure
     rate = motion.angular_rate

@@ -55,7 +55,7 @@ WEAKEST_DIRECTION = 1e-3  # smallest singular value of unit columns that still c
 MEAN_S = 1.0  # a mean hides no motion at rest, and keeps the readings' change with temperature
 MEDIAN_OF_DIFFERENCES = 0.9099  # median of (w[n+1] - w[n])^2 of white noise of variance 1: 2 times that of chi-square
 SCATTERED = 6.0  # standard deviations of a chi-square above its mean, and half its square for the tail of few samples
-BEND_DPS, BEND_SHARE = 0.05, 1e-3  # see ``followed``
+BEND_DPS, BEND_SHARE = 0.05, 1e-3  # see ``reference_valid``
 ARRAYS = (
     "time",
     "specific_force",
@@ -302,18 +302,18 @@ class Rows:
         return self.motion(motion)
 
 
-def rows_of(motion: Motion, sound: NDArray[np.bool_], *, together: bool = True) -> Rows:
+def rows_of(motion: Motion, valid: NDArray[np.bool_], *, together: bool = True) -> Rows:
     """Choose the samples of a fit and group those of a rest.
 
-    ``sound``: (n,), samples whose readings can be used. ``together``: whether the samples of a rest are alike; after a
+    ``valid``: (n,), samples whose readings can be used. ``together``: whether the samples of a rest are alike; after a
     filter they are not.
     """
     moving = np.linalg.norm(motion.angular_rate, axis=1) > RATE_AT_REST_DPS
     if motion.rate is not None:
         moving = np.abs(motion.rate) > RATE_AT_REST_DPS
-    kept = np.flatnonzero(sound & (motion.still | moving) & followed(motion))
+    kept = np.flatnonzero(valid & (motion.still | moving) & reference_valid(motion))
     if len(kept) == 0:
-        return Rows(kept, kept, np.zeros(0), len(sound))
+        return Rows(kept, kept, np.zeros(0), len(valid))
     still, time = motion.still[kept], motion.time[kept]
     alike = still[1:] & still[:-1] & (np.diff(kept) == 1) & together
     rest = np.concatenate([[0], np.cumsum(~alike)])
@@ -321,10 +321,10 @@ def rows_of(motion: Motion, sound: NDArray[np.bool_], *, together: bool = True) 
     piece = np.floor((time - begin[rest]) / MEAN_S + 1e-9)
     new = np.concatenate([[True], ~alike | (np.diff(piece) != 0)])
     first = np.flatnonzero(new)
-    return Rows(kept, first, np.diff(np.append(first, len(kept))).astype(float), len(sound))
+    return Rows(kept, first, np.diff(np.append(first, len(kept))).astype(float), len(valid))
 
 
-def followed(motion: Motion) -> NDArray[np.bool_]:
+def reference_valid(motion: Motion) -> NDArray[np.bool_]:
     """Return at which samples the log follows the table: (n,) array of bool.
 
     Both intervals beside a sample of a turn must be explained; with an attitude log, the rate must be the cubic through

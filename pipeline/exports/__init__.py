@@ -24,8 +24,7 @@ import yaml
 from jinja2 import Environment, StrictUndefined, Template
 
 from pipeline.exports.c_effects import plan_of
-from pipeline.exports.noise import noise_remarks
-from pipeline.exports.sensors import FUNCTIONS, ExportedSensor, before_use, final_errors, plain
+from pipeline.exports.sensors import FUNCTIONS, ExportedSensor, before_use, final_errors, noise_remarks, plain
 from pipeline.records import SENSORS, SensorCalibration
 
 JSON = dict[str, Any]

@@ -15,7 +15,7 @@ import numpy as np
 from pipeline.errors import ConfigurationError
 from pipeline.exports import Subject, export, formats
 from pipeline.exports.reading import CALIBRATION, FoundCalibration, counts_of, read_any
-from pipeline.exports.sensors import FACTORS, ExportedSensor, before_use
+from pipeline.exports.sensors import FACTORS, SI, ExportedSensor, before_use
 from pipeline.files import json_text, write_atomically
 from pipeline.model.compensation import Compensation
 from pipeline.model.effects import effect_of
@@ -59,7 +59,7 @@ def document_of(found: FoundCalibration) -> JSON:
 def settings_of(found: FoundCalibration, sheets: Mapping[str, Any]) -> JSON:
     """Return the settings that exports read: the sensor's configuration, with the noise that the file states."""
     sensor: JSON = {s: dict(sheets.get(s) or {}) for s in SENSORS}
-    for s, unit in (("accelerometer", "m/s^2"), ("gyroscope", "rad/s")):
+    for s, unit in SI.items():
         density, walk = (found.noise.get(f"{s}_{what}") for what in ("noise_density", "random_walk"))
         if density is not None and walk is not None:
             sensor[s] |= {"noise_density": np.sqrt(2.0) * density / FACTORS[unit], "wander_time_s": WALK_S}  # one-sided

@@ -54,7 +54,7 @@ class FoundCalibration:
     sensors : dict of str to SensorCalibration
         Those that the file holds; the covariance is None where it states no uncertainty.
     noise : dict
-        Kalibr's four noise parameters (``pipeline.exports.noise``), as far as the file states them.
+        Kalibr's four noise parameters (``pipeline.exports.sensors``), as far as the file states them.
     notes : list of str
         What was taken for granted or not read.
     document : dict or None
@@ -102,7 +102,7 @@ def read_any(file: Path, name: str | None = None, counts: Mapping[str, float | N
 
 
 def _files_of(file: Path, declared: Format) -> list[Path]:
-    """Return the file, and that of the other sensor beside it, where each has its own."""
+    """Return the file, and that of the other sensor in the same folder, where each has its own."""
     ends = [name.rpartition("_")[2] for name in declared.files.values()]
     own = next((end for end in ends if file.name.endswith(end)), None)
     if own is None:

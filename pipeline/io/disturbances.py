@@ -99,11 +99,11 @@ def leave_out_disturbances(
 
 def without_rows(recording: Recording, rows: Index, note: Note) -> Recording:
     """Return a recording without some samples, a gap before what follows them, and with the note that says so."""
-    sound = np.ones(recording.samples, bool)
-    sound[rows] = False
+    undisturbed = np.ones(recording.samples, bool)
+    undisturbed[rows] = False
     flags = np.zeros(recording.samples, np.uint16) if recording.flags is None else recording.flags.copy()
     flags[np.minimum(rows + 1, recording.samples - 1)] |= GAP
-    kept = replace(recording, flags=flags).select(sound)
+    kept = replace(recording, flags=flags).select(undisturbed)
     return replace(kept, notes=(*kept.notes, note))
 
 

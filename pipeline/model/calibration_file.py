@@ -9,7 +9,7 @@ Parameters that no sensor of the configured model has nearly always mean another
 
 where
 
-    P : (3, 3) symmetric, ``(K K^T)^(1/2)``: scale factors on its diagonal, cross-axis sensitivities beside it
+    P : (3, 3) symmetric, ``(K K^T)^(1/2)``: scale factors on its diagonal, cross-axis sensitivities off it
     R : (3, 3) rotation, of the unit against the table or its case: no property of the sensor
 
 A parameter p with the expanded uncertainty U and the data-sheet limit L is implausible where

@@ -88,7 +88,7 @@ def _check_at(recordings: Sequence[Recording], decimals: Sequence[int]) -> None:
     value = np.concatenate(keys)
     owner = np.repeat(np.arange(len(keys)), [len(k) for k in keys])
     row = np.concatenate([np.arange(len(k)) for k in keys])
-    order = np.argsort(value, kind="stable")  # equal rows beside each other, in the order of recordings
+    order = np.argsort(value, kind="stable")  # equal rows next to each other, in the order of recordings
     value, owner, row = value[order], owner[order], row[order]
     same = value[1:] == value[:-1]
     if np.count_nonzero(same) < FEWEST - 1:

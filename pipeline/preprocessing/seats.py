@@ -111,7 +111,7 @@ def _find_seats(turns: Sequence[_Conventional]) -> _Seats:
 
 
 def _zeros(turns: Sequence[_Conventional], seats: Vector) -> tuple[Vector, Vector | None]:
-    """Return a common seat and the zeros that explain the seats beside it, or their mean and None where none do."""
+    """Return a common seat and the zeros that explain the other seats, or their mean and None where none do."""
     design = np.zeros((seats.size, 3 + len(turns)))
     for k, turn in enumerate(turns):
         design[3 * k : 3 * k + 3, :3] = np.eye(3)

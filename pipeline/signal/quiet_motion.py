@@ -236,7 +236,7 @@ def quiet_pieces(rate: Values, stretches: Sequence[tuple[int, int]], interval: f
 def counts_of(differences: Values) -> Values:
     """Return the smallest step between successive readings of each axis, (k,), by their absolute differences (n, k).
 
-    Of coarse readings it is one count, of fine ones nothing beside their noise.
+    Of coarse readings it is one count; of fine ones it is negligible against their noise.
     """
     smallest = np.min(differences, axis=0, where=differences > 0.0, initial=np.inf)
     return np.asarray(np.where(np.isfinite(smallest), smallest, 0.0))

@@ -1,6 +1,6 @@
 """Segmentation of one long recording: moves of a table, or turns by hand that are held out.
 
-Moves of one kind about one axis make a segment, with the rests beside them. Steps that stop in four attitudes or more
+Moves of one kind about one axis make a segment, with the adjacent rests. Steps that stop in four attitudes or more
 are for the accelerometer, turns for the gyroscope; where an axis has one kind only it serves both, and of turns about
 one axis in two segments the slower ones are for the accelerometer. Motion about several axes is held out, a rest of a
 minute or more determines the noise. Where the sensor moves and the table does not, the unit is being mounted: no
@@ -263,14 +263,14 @@ class _Session:
         return ["accelerometer"] if rate < min(rates) else ["gyroscope"]
 
     def _extent(self, group: list[Move]) -> tuple[int, int]:
-        """Return the samples of a group with half of the rests beside it, 30 s at most, and nothing handled."""
+        """Return the samples of a group with half of the adjacent rests, 30 s at most, and nothing handled."""
         first, last = group[0].start, group[-1].stop
-        beside = int((BESIDE_S if group[0].axis is not None else BESIDE_FREE_S) / self.recording.interval)
+        margin = int((BESIDE_S if group[0].axis is not None else BESIDE_FREE_S) / self.recording.interval)
         before = max((m.stop for m in self.moves if m.stop <= first), default=-first)  # none: from the first sample
         after = min(
             (m.start for m in self.moves if m.start >= last), default=2 * self.recording.samples - last
         )  # none: to the last
-        start, stop = max((before + first) // 2, first - beside), min((last + after) // 2, last + beside)
+        start, stop = max((before + first) // 2, first - margin), min((last + after) // 2, last + margin)
         early = np.flatnonzero(self.handled[start:first])
         late = np.flatnonzero(self.handled[last:stop])
         start = start + int(early[-1]) + 1 + self.margin if early.size else start
@@ -305,8 +305,8 @@ def multiples(angle: Values, stated_deg: float) -> tuple[int, int]:
     along = float(angle[axis])
     count = round(along / stated_deg)
     off, across = abs(along - count * stated_deg), float(np.linalg.norm(np.delete(angle, axis)))
-    sound = off < min(SCALE * abs(count) * stated_deg, 0.25 * stated_deg) and across < ACROSS * abs(along)
-    return axis, count if sound else 0
+    agrees = off < min(SCALE * abs(count) * stated_deg, 0.25 * stated_deg) and across < ACROSS * abs(along)
+    return axis, count if agrees else 0
 
 
 def held_out_windows(recording: Recording, turns: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -96,7 +96,7 @@ def excess_gone(case: JSON) -> float | None:
 
 
 def stands_out(case: JSON) -> bool:
-    """Return whether each hidden effect leaves a signal of lambda >= 100 beside the others; see ``signal_left``."""
+    """Return whether each hidden effect has lambda >= 100 (``signal_left``)."""
     left = case.get("signal_left") or {}
     return bool(left) and min(left.values()) >= STANDS_OUT
 

@@ -1,26 +1,35 @@
-"""The page of the thesis: its tables and figures beside ours, its errata, and a verdict on each conclusion.
+"""The page of the thesis: its tables and figures compared with ours, its errata, and a verdict on each conclusion.
 
-Each cell that differs from the printed one by more than a quarter has a letter that stands for the reason.
+Each cell that differs from the printed one by more than a quarter has a letter that stands for the reason. The figures
+are those of chapter 5: error per procedure, held-out motion, error before and after, and the comparison of methods.
 """
 
 from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
 import pandas as pd
 
-from pipeline.report.numbers import MINUS, NOTHING
+from pipeline.estimation.stages import apply_correction
+from pipeline.records import SENSOR_UNITS
+from pipeline.report.chart import AXES_LEGEND, Figure, Panel, Samples, chart
+from pipeline.report.group_charts import Point, curves, stems
+from pipeline.report.held_out_section import held_out_over_time
+from pipeline.report.numbers import MINUS, NOTHING, number
 from pipeline.report.pages import template
-from pipeline.thesis.conclusions import KINDS, conclusions
+from pipeline.thesis.conclusions import KINDS, Errors, conclusions
 from pipeline.thesis.errata import agreements, errata, scatters
-from pipeline.thesis.figures import all_figures
-from pipeline.thesis.results import DEVICES, Results
-from pipeline.thesis.seeds import CAUSES, LOST
+from pipeline.thesis.results import CONTINUOUS, DEVICES, RATES, SILENT, STOPS, Results, in_words, read_printed
+from pipeline.thesis.seeds import CAUSES, LOST, device_of
 from pipeline.thesis.tables import all_tables
+from pipeline.validation.samples import samples_of_motion
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
     from pathlib import Path
 
     from pipeline.report.comparison import Estimate
@@ -228,3 +237,163 @@ def key_of(table: str, block: str, row: str, column: str) -> str:
     """Return the key of the first explanation that holds for a cell, or nothing."""
     place = f"{table}|{block}|{row}|{column}"
     return next((e.key for e in EXPLANATIONS if re.search(e.where, place)), "")
+
+
+PROCEDURES = {"accelerometer": (*STOPS, *CONTINUOUS), "gyroscope": RATES}
+BELOW = {
+    "accelerometer": "stop and go, rest in s; continuous, deg/s",
+    "gyroscope": "rate, deg/s",
+}
+FILTERS = {
+    "staged": "RC low-pass",
+    "same-gain": "the same gain without delay",
+    "zero-phase": "run both ways, the gain twice",
+    "unfiltered": "no filter",
+}
+OURS = ("printed", "ours, as printed", "ours, errata corrected")
+
+
+def all_figures(printed: Path, results: Results, rows: pd.DataFrame, scatter: pd.DataFrame) -> list[Figure]:
+    """Return the figures in the order of the thesis's groups; ``rows``: of the study over seeds."""
+    errors = read_printed(printed, "errors")
+    told = errors[errors["metric"] == "mean_abs_error"].set_index("set")["after"]
+    methods = read_printed(printed, "method_comparison").set_index(["sensor", "device", "method"])["mean_error_after"]
+    out: list[Figure | None] = []
+    for sensor, shown in (("accelerometer", ("stop-10s", "continuous-1dps")), ("gyroscope", ("gyro-100dps",))):
+        for device in DEVICES:
+            out.append(_motion(results, device, sensor, shown[0]))
+            out += [_before_and_after(results, f"{device}-{p}", sensor) for p in shown]
+            out.append(_per_procedure(results, told, device, sensor))
+        own = "stop-1s" if sensor == "accelerometer" else "gyro-60dps"
+        out.append(_before_and_after(results, f"mpu6050-1-mark2-{own}", sensor))
+        out.append(_methods(results, methods[sensor], sensor))
+    out += [_tables(results, told), _speed(rows), _scatter(scatter, "O"), _scatter(scatter, "S")]
+    return [figure for figure in out if figure is not None]
+
+
+def _motion(results: Results, device: str, sensor: str, procedure: str) -> Figure | None:
+    """Draw what the sensor read in the held-out motion."""
+    held_out = results.recordings(f"{device}-{procedure}-printed", "validation")
+    if not held_out:
+        return None
+    recording = held_out[0]
+    reading, x = np.asarray(recording.reading(sensor)), recording.time - recording.time[0]
+    caption = f"{recording.samples} samples that reached the logger, in {number(float(x[-1]))} s; no fit sees them."
+    finding = f"{DEVICES[device]}, {sensor}: the held-out motion"
+    return chart(
+        Figure(f"motion-{device}-{sensor}", finding, caption, AXES_LEGEND),
+        f"{recording.samples} samples in {number(float(x[-1]))} s.",
+        [Panel([Samples(x, reading)], f"reading, {SENSOR_UNITS[sensor]}", 150)],
+        "time, s",
+    )
+
+
+def _before_and_after(results: Results, name: str, sensor: str) -> Figure | None:
+    """Draw e before and after calibration over the held-out motion."""
+    held_out = results.recordings(f"{name}-printed", "validation")
+    samples = samples_of_motion(sensor, held_out[0], SILENT, {"gravity_g": 1.0}) if held_out else None
+    if samples is None:
+        return None
+    corrected = apply_correction(results.correction(f"{name}-printed", sensor), samples.reading)
+    before, after = (np.linalg.norm(v, axis=1) - samples.magnitude for v in (samples.reading, corrected))
+    drawn = held_out_over_time(f"held-out-{name}", sensor, held_out[0], before, after)
+    means = [number(float(np.mean(np.abs(e)))) for e in (before, after)]
+    finding = f"{_in_words(name)}: mean |e| goes from {means[0]} to {means[1]} {SENSOR_UNITS[sensor]}"
+    return replace(drawn, finding=finding, caption="Staged, as printed; below, after alone.")
+
+
+def _in_words(name: str) -> str:
+    device = device_of(name)
+    procedure = name.removeprefix(f"{device}-")
+    table = ", home-made table" if procedure.startswith("mark2-") else ""
+    return f"{DEVICES[device]}{table}, {in_words(procedure.removeprefix('mark2-'))}"
+
+
+def _legend(texts: Iterable[str]) -> tuple[tuple[str, str], ...]:
+    return tuple((f"c{i}", text) for i, text in enumerate(texts))
+
+
+def _after(results: Results, name: str, sensor: str, methods: Sequence[str]) -> list[float]:
+    """Return the mean |e| after calibration by each method; 0 where a unit failed."""
+    return [results.error(f"{name}-{method}", sensor) or 0.0 for method in methods]
+
+
+def _per_procedure(results: Results, told: pd.Series[float], device: str, sensor: str) -> Figure:
+    """Draw the error after calibration by procedure: printed, and ours in both readings."""
+    groups = {}
+    for procedure in PROCEDURES[sensor]:
+        name = f"{device}-{procedure}"
+        groups[_short(procedure)] = [told[name], *_after(results, name, sensor, ("printed", "staged"))]
+    finding = f"{DEVICES[device]}, {sensor}: error after calibration by procedure"
+    figure = Figure(f"procedures-{device}-{sensor}", finding, legend=_legend(OURS))
+    return stems(figure, groups, f"mean |e| after, {SENSOR_UNITS[sensor]}", BELOW[sensor])
+
+
+def _short(procedure: str) -> str:
+    value = procedure.partition("-")[2]
+    return value.removesuffix("dps") if value.endswith("dps") else f"{value[:-1]} s"
+
+
+def _methods(results: Results, told: pd.Series[float], sensor: str) -> Figure:
+    """Draw the change of the error by the methods of tables 5.24 and 5.26."""
+    if sensor == "accelerometer":
+        procedure, other, methods = "stop-1s", "nonlinear_least_squares", ("printed", "staged", "least-squares")
+        legend = ("printed: staged", "printed: least squares", "staged, as printed", "staged, errata corrected",
+                  "least squares")  # fmt: skip
+        finding = "Accelerometer: the corrected stages leave little more than least squares"
+    else:
+        procedure, other, methods = "gyro-20dps", "cholesky_lu", ("staged", "cholesky-printed", "cholesky")
+        legend = ("printed: staged", "printed: Cholesky", "staged", "Cholesky and LU, forward matrix",
+                  "Cholesky and LU, inverted")  # fmt: skip
+        finding = "Gyroscope: inverted, Cholesky and LU leave what the stages leave"
+    groups = {
+        name: [told[device, m] for m in ("staged", other)] + _after(results, f"{device}-{procedure}", sensor, methods)
+        for device, name in DEVICES.items()
+    }
+    figure = Figure(f"methods-{sensor}", finding, f"From the recordings of {procedure}.", _legend(legend))
+    return stems(figure, groups, f"mean |e| after, {SENSOR_UNITS[sensor]}", "device")
+
+
+def _tables(results: Results, told: pd.Series[float]) -> Figure:
+    """Draw the error after calibration on both tables, as a share of that before."""
+    groups = {}
+    for sensor, procedure, printed_before in (
+        ("accelerometer", "stop-1s", 0.069),
+        ("gyroscope", "gyro-60dps", 1.724),
+    ):
+        before = results.error(f"mpu6050-1-{procedure}-printed", sensor, "raw") or 1.0
+        short = {"accelerometer": "accel.", "gyroscope": "gyro"}[sensor]
+        for table, infix in (("", ""), (", home", "mark2-")):
+            name = f"mpu6050-1-{infix}{procedure}"
+            ours = [v / before for v in _after(results, name, sensor, ("printed", "staged"))]
+            groups[f"{short}{table}"] = [100.0 * v for v in (told[name] / printed_before, *ours)]
+    figure = Figure("tables", "The home-made table leaves more of the error", "MPU6050 (1).", _legend(OURS))
+    return stems(figure, groups, "after, % of before", "sensor; home: on the home-made table")
+
+
+def _speed(rows: pd.DataFrame) -> Figure:
+    """Draw the error of continuous rotation by rate, behind each filter."""
+    errors = Errors(rows)
+    points = []
+    for method, name in FILTERS.items():
+        for procedure in CONTINUOUS:
+            mean = errors.mean(f"mpu6050-2-{procedure}", method)
+            rate = _short(procedure)
+            low, high = (v / 1000.0 for v in mean.interval)
+            points.append(Point(rate, mean.value / 1000.0, interval=(low, high), x=float(rate), series=name))
+    caption = (
+        "MPU6050 (2), errata corrected; means over seeds with their 95 % intervals. The filter is on the turns and on "
+        "the held-out motion, so without one more noise is left there; how an error grows with the rate is its own."
+    )
+    finding = "With the filter's gain the error grows at 30 deg/s, and more where it runs twice"
+    figure = Figure("speed", finding, caption, _legend(FILTERS.values()))
+    return curves(figure, points, "mean |e| after, g", "rate, deg/s", named=False)
+
+
+def _scatter(scatter: pd.DataFrame, quantity: str) -> Figure:
+    """Draw the printed scatter and what picking explains, cause by cause."""
+    own = scatter[scatter["quantity"] == quantity].set_index("device")[["printed", *CAUSES]]
+    groups = {DEVICES[str(device)]: list(row) for device, row in own.iterrows()}
+    finding = f"Scatter of {quantity}: printed, and by picking single samples"
+    figure = Figure(f"scatter-{quantity}", finding, legend=_legend(own.columns))
+    return stems(figure, groups, f"rms deviation of {quantity}", "device")

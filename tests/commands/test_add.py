@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.commands import add, remove
+from pipeline.commands import add
 from pipeline.config.campaign import load_campaign
 from pipeline.config.devices import set_override
 from pipeline.diagnosis.formula_discovery import effect_file
@@ -77,16 +77,16 @@ def test_what_was_added_is_removed_and_the_file_is_as_before(
     assert f"then: snakemake --cores 2 --config 'campaign={campaign}'" in capsys.readouterr().out
     assert add.main(words) == 0
     assert "has g_sensitivity already" in capsys.readouterr().out
-    assert remove.main(words) == 0
+    assert add.remove(words) == 0
     assert not file.exists()
     assert (campaign / "devices").exists()  # S3.yaml is in it
 
     file.write_text("# the first of its lot\noverrides:\n  - filter.order=1  # as measured\n")
     before = file.read_text()
     add.main(words)
-    remove.main(words)
+    add.remove(words)
     assert file.read_text() == before
-    remove.main([str(campaign), "U1", "accelerometer.lever_arm", "--no-run"])  # of campaign.yaml
+    add.remove([str(campaign), "U1", "accelerometer.lever_arm", "--no-run"])  # of campaign.yaml
     assert effects(campaign, "U1")["accelerometer"] == []
 
 

@@ -15,8 +15,8 @@ from pipeline.estimation.noise_identification import identify_noise
 from pipeline.estimation.noise_terms import allan_variance, each_term
 from pipeline.exports import Subject, export
 from pipeline.exports.conversion import document_of, settings_of
-from pipeline.exports.noise import FLAT, noise
 from pipeline.exports.reading import read_any
+from pipeline.exports.sensors import FLAT, noise
 from pipeline.records import SENSORS, Recording, SensorCalibration
 
 if TYPE_CHECKING:

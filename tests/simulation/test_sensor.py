@@ -1,13 +1,169 @@
+"""Exact geometry and simulated readings against physics worked out by hand."""
+
+from __future__ import annotations
+
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
-from pipeline.model.effects import effect
-from pipeline.records import Motion
+from pipeline.model.effects import catalogue, effect
+from pipeline.model.effects.base import Owner, truth
+from pipeline.model.effects.formula_effect import FormulaEffect
+from pipeline.model.kinematics import earth_rate
 from pipeline.simulation.description import read_config
-from pipeline.simulation.sensor import Scene, SimulatedSensor, bias_wander, decimals_of
-from pipeline.simulation.trajectory import random_gimbals
+from pipeline.simulation.rate_table import ProgramBuilder, TurnErrors
+from pipeline.simulation.sensor import (
+    ALTERATIONS,
+    STANDARD_GRAVITY,
+    Scene,
+    SimulatedSensor,
+    alter,
+    bias_wander,
+    decimals_of,
+)
+from pipeline.simulation.trajectory import Turn, random_gimbals, rotation_by
+
+if TYPE_CHECKING:
+    from pipeline.records import Motion
+
+SIZES = {
+    "lever_arm": 0.05, "time_offset": 1e-4, "clock_rate": 1.0, "low_pass_lag": 1e-4, "earth_rotation": 4e-3,
+    "table_tilt": 1e-3, "table_axis_nonorthogonality": 1e-3, "table_encoder_error": 1e-3, "table_rate_ripple": 1e-5,
+    "table_backlash": 1e-3,
+}  # fmt: skip
+
+
+def turn_scene(axis: int = 2, rate: float = 200.0, acceleration: float = 100.0) -> Scene:
+    builder = ProgramBuilder(acceleration).rest(1.0).turn_with_plateau(360.0, rate).rest(1.0)
+    return Scene(Turn(axis, builder.turn_with_plateau(-360.0, rate).rest(1.0).build()), axis=axis)
+
+
+def test_a_lever_arm_of_5_cm_at_200_deg_s_reads_omega_squared_r() -> None:
+    scene = alter(turn_scene(), {"lever_arm": np.array([0.05, 0.0, 0.0])})
+    time = np.array([3.3])  # on the plateau: 1 s rest, 2 s ramp, 1.8 s plateau
+    added = scene.motion(time).specific_force - turn_scene().motion(time).specific_force
+    expected = -(np.radians(200.0) ** 2) * 0.05 / 9.80665  # toward the axis
+    np.testing.assert_allclose(added, [[expected, 0.0, 0.0]], atol=1e-12)
+    assert -expected == pytest.approx(0.0621, abs=1e-4)
+
+
+def test_a_lever_arm_reads_the_tangential_acceleration_of_a_ramp() -> None:
+    scene = alter(turn_scene(), {"lever_arm": np.array([0.05, 0.0, 0.0])})
+    time = np.array([1.0])  # the ramp begins: no rate yet
+    added = scene.motion(time).specific_force - turn_scene().motion(time).specific_force
+    np.testing.assert_allclose(added, [[0.0, np.radians(100.0) * 0.05 / STANDARD_GRAVITY, 0.0]], atol=1e-12)
+
+
+@pytest.mark.parametrize("offset", [-0.02, 0.013])
+def test_a_time_offset_shows_the_motion_of_another_time_exactly(offset: float) -> None:
+    scene = turn_scene()
+    time = np.arange(0.0, 12.0, 0.12)
+    late = alter(scene, {"time_offset": np.array([offset])}).motion(time)
+    there = scene.motion(time + offset)
+    assert np.array_equal(late.time, time)
+    for name in ("specific_force", "angular_rate", "angular_acceleration", "specific_force_rate"):
+        assert np.array_equal(getattr(late, name), getattr(there, name))
+
+
+def test_a_lag_of_a_steady_ramp_is_a_delay_by_its_time_constant() -> None:
+    scene = alter(turn_scene(), {"low_pass_lag": np.array([0.02])})
+    time = np.array([2.5])  # 1.5 s into the ramp of 100 deg/s^2
+    assert scene.motion(time).angular_rate[0, 2] == pytest.approx(100.0 * (1.5 - 0.02), abs=1e-5)
+
+
+def test_a_lag_turns_gravity_by_the_gain_and_phase_of_a_first_order_filter() -> None:
+    tau, rate = 0.05, np.radians(200.0)
+    scene = alter(turn_scene(axis=0), {"low_pass_lag": np.array([tau])})
+    time = np.array([4.7])  # 1.7 s after the ramp: the transient is gone
+    y, z = scene.motion(time).specific_force[0, 1:]
+    plain_y, plain_z = turn_scene(axis=0).motion(time).specific_force[0, 1:]
+    answer = complex(z, y) / complex(plain_z, plain_y)
+    assert abs(answer) == pytest.approx(1.0 / np.hypot(1.0, rate * tau), abs=1e-6)
+    assert np.angle(answer) == pytest.approx(-np.arctan(rate * tau), abs=1e-6)
+
+
+def test_a_lag_rounds_the_corner_of_a_ramp_as_a_first_order_filter_does() -> None:
+    tau = 0.02
+    scene = alter(turn_scene(), {"low_pass_lag": np.array([tau])})
+    time = np.linspace(1.0, 1.3, 200)  # the ramp of 100 deg/s^2 begins at 1 s
+    s = time - 1.0
+    expected = 100.0 * (s - tau * (1.0 - np.exp(-s / tau)))
+    np.testing.assert_allclose(scene.motion(time).angular_rate[:, 2], expected, atol=5e-4)
+
+
+def test_earth_rotation_is_sensed_along_the_body_axes() -> None:
+    level = earth_rate(13.7, 30.0)
+    scene = alter(Scene(random_gimbals(60.0, 40.0, np.random.default_rng(2))), {"earth_rotation": level})
+    time = np.linspace(0.0, 60.0, 50)
+    plain = Scene(scene.trajectory).motion(time)
+    added = scene.motion(time).angular_rate - plain.angular_rate
+    np.testing.assert_allclose(np.linalg.norm(added, axis=1), 360.0 / 86164.0905, rtol=1e-9)
+    # the vertical part is what is sensed along gravity
+    np.testing.assert_allclose(np.sum(added * plain.specific_force, axis=1), level[2], atol=1e-12)
+
+
+def test_effects_of_timing_and_of_the_table_in_python_have_exact_geometry() -> None:
+    physical = {name: kind for name, kind in catalogue().items() if kind.owner in (Owner.MOUNTING, Owner.TABLE)}
+    in_python = {name for name, kind in physical.items() if not isinstance(kind, FormulaEffect) and not kind.of_turns}
+    assert in_python <= set(ALTERATIONS) <= set(physical)
+    assert set(ALTERATIONS) == set(SIZES)
+    assert {name for name, kind in physical.items() if kind.of_turns} == {"mounting", "encoder_zero"}  # tested below
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_mounting_and_a_zero_of_one_recording_are_the_rotations_of_their_effects(axis: int) -> None:
+    time, plain = np.arange(0.03, 12.0, 0.12), turn_scene(axis=axis)
+    theta, zero = np.array([1.5, -2.0, 0.7]), 3.0
+    program = plain.trajectory.program
+    turned = replace(plain, trajectory=Turn(axis, replace(program, angle=program.angle + zero)))
+    for name, values, log, true in (
+        ("mounting", theta, plain, replace(plain, mounting=rotation_by(theta))),
+        ("encoder_zero", np.array([zero]), turned, plain),
+    ):
+        kind = effect(name).of_recordings(["turn"])
+        moved = kind.moved(replace(log.motion(time), recording="turn"), values)
+        exact = true.motion(time)
+        for vector in ("specific_force", "angular_rate", "angular_acceleration", "specific_force_rate"):
+            np.testing.assert_allclose(getattr(moved, vector), getattr(exact, vector), atol=1e-11)
+
+
+@pytest.mark.parametrize("name", sorted(ALTERATIONS))
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_exact_geometry_agrees_with_the_columns_of_the_catalogue_at_small_sizes(name: str, axis: int) -> None:
+    kind, scene = effect(name), turn_scene(axis=axis)
+    time = np.arange(0.03, 12.0, 0.12)
+    knots = scene.trajectory.program.knots
+    # a lag remembers the corners of the ramps for some time constants; elsewhere its column holds
+    time = time[np.array([np.all((t - knots < -1e-2) | (t - knots > 1e-2)) for t in time])]
+    plain = scene.motion(time)
+    values = SIZES[name] * np.random.default_rng(5).uniform(0.3, 1.0, len(kind.parameters(kind.sensors[0])))
+    for sensor in kind.sensors:
+        exact = truth(sensor, alter(scene, {name: values}).motion(time)) - truth(sensor, plain)
+        linear = kind.columns(sensor, plain, np.eye(3), np.zeros(len(values))) @ values
+        scale = max(np.abs(exact).max(), 1e-12)
+        np.testing.assert_allclose(linear, exact, atol=2e-3 * scale)
+
+
+def test_errors_of_a_turn_leave_other_motions_alone() -> None:
+    scene = Scene(random_gimbals(60.0, 40.0, np.random.default_rng(2)))
+    assert alter(scene, {"table_encoder_error": np.ones(6), "table_backlash": np.ones(3)}) is scene
+
+
+def test_a_shaking_plate_is_felt_while_it_turns_only() -> None:
+    scene = turn_scene()
+    shaken = replace(
+        scene, trajectory=replace(scene.trajectory, errors=TurnErrors(shaking=0.05, vibration_frequency=7.3))
+    )
+    time = np.arange(0.0, 12.0, 0.01)
+    plain, motion = scene.motion(time), shaken.motion(time)
+    added = motion.specific_force - plain.specific_force
+    moving = plain.rate != 0.0
+    assert np.all(added[~moving] == 0.0)
+    np.testing.assert_allclose(np.std(added[moving], axis=0), 0.05 / np.sqrt(2.0), rtol=0.02)
+    np.testing.assert_array_equal(motion.angular_rate, plain.angular_rate)
+
 
 SHEETS = read_config("sensor", "mpu6050")
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from pipeline.commands.study import main
+from pipeline.commands.research import study as main
 from pipeline.errors import ConfigurationError
 from pipeline.model.effects import catalogue
 from pipeline.records import SENSORS

@@ -1,0 +1,147 @@
+"""Research on the product: the blind study of the diagnosis, and the comparison with the thesis."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pipeline.commands import parser_of
+from pipeline.errors import ConfigurationError
+from pipeline.files import write_atomically
+from pipeline.run_progress import Countdown
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+STUDY = """\
+families: {}
+
+The truth is written to DIR/truth.jsonl, which the diagnosis never reads; the diagnoses to DIR/results.jsonl. A case
+with a result is not run again, so the same command continues an interrupted study; use a new directory after a
+change of the code. A case takes one to three seconds.
+"""
+THESIS = """\
+page    what a run of the campaign does: compares the results in DIR with the printed figures of the campaign
+seeds   simulates the campaign's recordings with every seed and writes FILE (data/thesis/seeds.csv is made by
+        python -m pipeline thesis seeds --campaign data/thesis --output data/thesis/seeds.csv; 10 minutes)
+"""
+
+
+def study(argv: Sequence[str]) -> int:
+    """Run the blind study of the diagnosis: hide effects at random, diagnose them, count what is found."""
+    from pipeline.study.cases import FAMILIES  # noqa: PLC0415  (what a comparison with the thesis does not need)
+    from pipeline.study.page import DIAGRAM, page  # noqa: PLC0415
+    from pipeline.study.run import RESULTS, TRUTH, read_lines, run_study  # noqa: PLC0415
+    from pipeline.study.scores import (  # noqa: PLC0415
+        all_figures,
+        cases_of,
+        figures,
+        in_the_catalogue,
+        mean_excess_gone,
+        numbers,
+        reliability_diagram,
+    )
+
+    parser = parser_of("study", study.__doc__, STUDY.format(", ".join(FAMILIES)))
+    parser.add_argument("directory", type=Path, metavar="DIR", help="folder for the truth and the results")
+    words = "families of cases, with commas; a first word (null, shape) means all families that begin with it; or all"
+    parser.add_argument("--families", default="single,pairs,null_normal", help=words)
+    parser.add_argument("--n", type=int, default=100, help="cases of each family (default: 100)")
+    parser.add_argument("--seed", type=int, default=1, help="seed of all random numbers (default: 1)")
+    parser.add_argument("--processes", type=int, default=1, help="processor cores (default: 1)")
+    words = "write the study as a Markdown page, and its diagram to images/ beside it"
+    parser.add_argument("--table", type=Path, metavar="FILE", help=words)
+    arguments = parser.parse_args(argv)
+    families = _families(arguments.families, FAMILIES)
+    countdown = Countdown(0)
+
+    def progress(done: int, total: int) -> None:
+        countdown.total = total
+        countdown(done, f"{done} of {total} cases")
+
+    run_study(
+        arguments.directory, families, arguments.n, arguments.seed, processes=arguments.processes, progress=progress
+    )
+    countdown.end()
+    cases = cases_of(read_lines(arguments.directory / TRUTH), read_lines(arguments.directory / RESULTS))
+    for figure in [*all_figures(cases), *figures(cases)]:
+        low, high = figure.interval
+        print(
+            f"{figure.name:<75} {figure.hits:>4} of {figure.total:<4} {100 * low:5.1f} to {100 * high:5.1f} %"
+            f"  {figure.goal:<8} {' '.join(figure.misses[:8])}"
+        )
+    for each in numbers(cases):
+        print(f"{each.name}: {each.value:.2g} (n = {each.total})  {each.goal}")
+    mean = mean_excess_gone(in_the_catalogue(cases))
+    if mean.total > 1:
+        print(
+            f"held-out excess that is gone: {100 * mean.value:.1f} % +- {196 * mean.error:.1f} %, "
+            f"least {100 * mean.least:.0f} % (n = {mean.total})"
+        )
+    if arguments.table:
+        command = f"python -m pipeline study DIR --families {arguments.families} --n {arguments.n}"
+        diagram = arguments.table.parent / "images" / DIAGRAM
+        diagram.parent.mkdir(exist_ok=True)
+        diagram.write_text(reliability_diagram(cases), encoding="utf-8")
+        arguments.table.write_text(page(cases, f"{command} --seed {arguments.seed}"), encoding="utf-8")
+    return 0
+
+
+def _families(text: str, known: Sequence[str]) -> list[str]:
+    """Return the families that are asked for, each once."""
+    found: list[str] = []
+    for name in text.split(","):
+        these = [f for f in known if name in (f, "all")] or [f for f in known if f.startswith(f"{name}_")]
+        if not these:
+            raise ConfigurationError(f"no family is called {name!r}; known: {', '.join(known)}")
+        found += [family for family in these if family not in found]
+    return found
+
+
+def thesis(argv: Sequence[str]) -> int:
+    """Compare the results with those printed in the thesis, and judge its conclusions over many seeds."""
+    parser = parser_of("thesis", thesis.__doc__, THESIS)
+    parser.add_argument("what", choices=("page", "seeds"))
+    parser.add_argument(
+        "--campaign",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="campaign with simulation.yaml and the folder printed/",
+    )
+    parser.add_argument("--results", type=Path, metavar="DIR", help="page: results of the campaign")
+    parser.add_argument("--output", type=Path, required=True, metavar="FILE", help="file to write")
+    parser.add_argument("--seeds", type=int, default=50, help="seeds: how many (default: 50)")
+    parser.add_argument("--processes", type=int, default=1, help="processor cores (default: 1)")
+    arguments = parser.parse_args(argv)
+    if arguments.what == "seeds":
+        _seeds(arguments.campaign, arguments.seeds, arguments.processes, arguments.output)
+        return 0
+    if arguments.results is None:
+        parser.error("page needs --results DIR, of a run of the campaign")
+    from pipeline.thesis.page import render  # noqa: PLC0415  (the study needs no page)
+
+    write_atomically(arguments.output, render(arguments.campaign, arguments.results))
+    return 0
+
+
+def _seeds(campaign: Path, count: int, processes: int, output: Path) -> None:
+    from concurrent.futures import ProcessPoolExecutor  # noqa: PLC0415
+    from functools import partial  # noqa: PLC0415
+
+    from pipeline.thesis.seeds import sets_of, write_rows  # noqa: PLC0415  (the page needs none of the estimators)
+
+    rows = []
+    sets = sets_of(campaign)
+    with ProcessPoolExecutor(processes) as pool:
+        for name, found in zip(sets, pool.map(partial(_study, campaign, count), sets), strict=True):
+            rows += found
+            print(f"{name}: {len(found)} rows", file=sys.stderr, flush=True)
+    write_rows(output, rows)
+
+
+def _study(campaign: Path, count: int, name: str) -> list[dict[str, object]]:
+    from pipeline.thesis.seeds import study as rows_of  # noqa: PLC0415
+
+    return list(rows_of(campaign, [name], range(count)))
