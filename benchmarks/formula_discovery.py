@@ -37,14 +37,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pipeline.model.effects.files import effect_from
 
 from pipeline.diagnosis.diagnose import diagnose
 from pipeline.errors import PipelineError
 from pipeline.estimation.candidates import candidates_for
 from pipeline.estimation.noise import estimate_noise
 from pipeline.estimation.observations import observe
-from pipeline.model.effects import forget, register
+from pipeline.model.effects import effect_from, forget, register
 from pipeline.model.effects.base import Layout, per_axis, truth
 from pipeline.model.formula import parse
 from pipeline.model.kinematics import reference_motion

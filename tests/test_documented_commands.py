@@ -6,6 +6,7 @@ tutorial has a test of its own (``tests/workflow/test_tutorial.py``). ``.ci/run`
 """
 
 import argparse
+import ast
 import os
 import re
 import shlex
@@ -157,3 +158,16 @@ def test_the_commands_run(document: Path, copy: Path) -> None:
         done = run(command + " --dry-run" * command.startswith(LONG), copy)
         allowed = {0, *(code for start, code in MAY_END_WITH.items() if command.startswith(start))}
         assert done.returncode in allowed, f"{command}\n{done.stdout}"
+
+
+SCRIPTS = [*sorted((ROOT / "benchmarks").glob("*.py")), *sorted((ROOT / "tests" / "study").glob("*.py"))]
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
+def test_what_a_benchmark_or_a_study_imports_from_the_package_exists(script: Path) -> None:
+    tree = ast.parse(script.read_text(encoding="utf-8"))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and str(node.module).split(".")[0] == "pipeline":
+            module = import_module(str(node.module))
+            for name in node.names:
+                assert hasattr(module, name.name) or import_module(f"{node.module}.{name.name}")
