@@ -10,6 +10,7 @@ from pipeline.results_folder import HELD
 from pipeline.stages import batch
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
     from pathlib import Path
 
     from pipeline.config.campaign import Campaign
@@ -21,13 +22,14 @@ def settings_names(campaign: Campaign) -> dict[str, str]:
     return {f"{batch}/{output}": file.name for batch, files in jobs.items() for output, file in files.items()}
 
 
-def run_jobs(campaign: Campaign) -> int:
-    """Run all jobs of a campaign and return the exit code of the run."""
+def run_jobs(campaign: Campaign, stages: Collection[str] = tuple(batch.INPUTS)) -> int:
+    """Run the jobs of a campaign, all or those of some stages, and return the exit code of the run."""
     batches, configs = campaign.results / "batches", campaign.results / "configs"
     configs.mkdir(parents=True, exist_ok=True)
     order = list(batch.INPUTS)
     for name, files in settings_of_jobs(campaign).items():
-        for output in sorted(files, key=lambda output: order.index(output.partition("/")[0])):
+        wanted = [output for output in files if output.partition("/")[0] in stages]
+        for output in sorted(wanted, key=lambda output: order.index(output.partition("/")[0])):
             (configs / files[output].name).write_bytes(files[output].content)
             stage, sensor, last = [*output.split("/"), "", ""][:3]
             folder = batches / name
@@ -50,6 +52,8 @@ def run_jobs(campaign: Campaign) -> int:
                 forget()  # a job is a process of its own
                 while HELD:
                     HELD.pop().close()
+    if "gather" not in stages:
+        return 0
     mark, failures = campaign.results / "complete.json", batches / "gathered.json"
     return batch.verdict(["--results", str(campaign.results), "--output", str(mark), "--failures", str(failures)])
 

@@ -87,7 +87,7 @@ class Findings:
     departures: Sequence[str] = ()  # of faces and turns by hand from what is stated
     scatter: Mapping[str, float] = field(default_factory=dict)  # further entries of ``wander``
     more: Mapping[str, Any] = field(default_factory=dict)  # further entries of the document
-    turns: Sequence[str] = ()  # recordings that some effects have parameters for
+    turns: Mapping[str, str] = field(default_factory=dict)  # recordings that some effects have parameters for: setups
     search: Callable[[], Findings | None] | None = None  # looks for a formula outside the catalogue; None: found none
     deeper: Callable[[], dict[str, Any]] | None = None  # further entries of the document where something is missing
 

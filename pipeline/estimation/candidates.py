@@ -64,7 +64,7 @@ def starts_of(
     twice, contained in another, or not one of this sensor.
     """
     sensor = observed if isinstance(observed, str) else observed.sensor
-    recordings = [] if isinstance(observed, str) else turns_of(observed)
+    recordings = {} if isinstance(observed, str) else turns_of(observed)
     if len(set(names)) != len(names):
         raise ConfigurationError(f"effects.{sensor} names an effect twice: {', '.join(names)}")
     for name in names:
@@ -89,9 +89,9 @@ def starts_of(
     return combinations
 
 
-def turns_of(observations: Observations) -> list[str]:
-    """Return the names of the recordings of turns."""
-    return [part.name for part in observations.parts if part.motion.axis is not None]
+def turns_of(observations: Observations) -> dict[str, str]:
+    """Return the names of the recordings of turns, and the setup of each."""
+    return {part.name: part.motion.setup for part in observations.parts if part.motion.axis is not None}
 
 
 def prior_of(this: Effect, observed: Observations, accelerometer: SensorCalibration | None) -> NormalPrior | None:
@@ -105,23 +105,24 @@ def prior_of(this: Effect, observed: Observations, accelerometer: SensorCalibrat
     if this.name != MOUNTING:
         stated = observed.bench.get(this.name)
         return None if stated is None else NormalPrior(np.zeros(1), np.full((1, 1), stated**-2))
-    recordings, seat_deg = turns_of(observed), observed.bench.get(MOUNTING, SEAT_DEG)
-    size = 3 * len(recordings)
+    assert this.definition is not None  # noqa: S101
+    mine, seat_deg = this.definition["recordings"], observed.bench.get(MOUNTING, SEAT_DEG)
+    size = 3 * len(mine)
     mean = np.zeros(size)
     found = None if accelerometer is None else next((e for e in accelerometer.effects if e.name == MOUNTING), None)
     if accelerometer is None or accelerometer.covariance is None or found is None or found.definition is None:
         return NormalPrior(mean, np.eye(size) / seat_deg**2)
     theirs, names = found.definition["recordings"], accelerometer.parameter_names()
     first = names.index(f"{MOUNTING}.{next(iter(found.parameters))}")
-    mine = [(k, theirs.index(name)) for k, name in enumerate(recordings) if name in theirs]
-    if not mine:
+    shared = [(k, theirs.index(name)) for k, name in enumerate(mine) if name in theirs]
+    if not shared:
         return NormalPrior(mean, np.eye(size) / seat_deg**2)
-    here = np.concatenate([np.arange(3 * k, 3 * k + 3) for k, _ in mine])
-    there = np.concatenate([np.arange(3 * k, 3 * k + 3) for _, k in mine])
+    here = np.concatenate([np.arange(3 * k, 3 * k + 3) for k, _ in shared])
+    there = np.concatenate([np.arange(3 * k, 3 * k + 3) for _, k in shared])
     mean[here] = found.values[there]
     covariance = seat_deg**2 * np.eye(size)
     covariance[np.ix_(here, here)] = accelerometer.covariance[np.ix_(first + there, first + there)]
-    covariance += np.kron(np.full((len(recordings),) * 2, np.diag(covariance)[here].mean()), np.eye(3))
+    covariance += np.kron(np.full((len(mine),) * 2, np.diag(covariance)[here].mean()), np.eye(3))
     return NormalPrior(mean, np.asarray(np.linalg.inv(covariance), np.float64))
 
 

@@ -159,7 +159,7 @@ def _with_effects(
 def direction_known(calibration: SensorCalibration, samples: Samples) -> bool:
     """Return whether the attitude log shows the direction: not where this recording may have another mounting."""
     anew = [e for fitted in calibration.effects if isinstance(e := effect_of(fitted), Mounting)]
-    return samples.motion is not None and all(samples.motion.recording in e.recordings for e in anew)
+    return samples.motion is not None and all(e.covers(samples.motion) for e in anew)
 
 
 def _moved(motion: Motion, effects: Sequence[FittedEffect]) -> Motion:

@@ -40,7 +40,7 @@ BOTH = [
     "encoder_zero",
 ]
 OF_TABLE = {"time_offset", "low_pass_lag", "clock_rate", "mounting", "encoder_zero"}
-TURNS = ["accel_x", "accel_y", "accel_z", "gyro_x", "gyro_y", "gyro_z"]
+TURNS = dict.fromkeys(("accel_x", "accel_y", "accel_z", "gyro_x", "gyro_y", "gyro_z"), "")
 ACCELEROMETER = ["cross_axis_nonlinearity", "hysteresis", "inner_lever_arms", "rate_dependence", "lever_arm"]
 GYROSCOPE = ["g_sensitivity", "g_squared_sensitivity", "earth_rotation"]
 OWNERS = {

@@ -71,6 +71,22 @@ def test_gravity_determines_the_mountings_of_both_sensors_to_their_uncertainty()
         assert np.abs(z).max() < 4.0
 
 
+def test_recordings_of_one_setup_share_a_mounting_and_the_gyroscope_is_better_known() -> None:
+    seats = np.tile(np.random.default_rng(7).standard_normal((3, 3)), (2, 1))
+    made = [Setup(a, seat=s).recording(role, 5) for (role, a), s in zip(TURNS, seats, strict=True)]
+    clamped = [replace(r, setup=f"on_{axis}") for r, (_, axis) in zip(made, TURNS, strict=True)]
+    u = {}
+    for name, recordings in (("apart", made), ("shared", clamped)):
+        found = fit("gyroscope", recordings, None, settings())
+        assert np.abs(errors_over_u(found, seats)).max() < 4.0
+        assert found.covariance is not None
+        u[name] = np.sqrt(np.diag(found.covariance)[3:12].reshape(3, 3)[~np.eye(3, dtype=bool)])
+    (mounting,) = found.effects
+    assert list(mounting.parameters) == [f"on_{a}_{b}" for a in "xyz" for b in "xyz"]
+    assert np.allclose(mounting.values.reshape(-1, 3), seats[:3] - seats.mean(axis=0), atol=0.12)
+    assert np.all(u["shared"] < u["apart"])
+
+
 def test_a_mounting_is_as_uncertain_for_the_gyroscope_as_gravity_leaves_it() -> None:
     recordings, _ = seated_anew(0, 3.0)
     by_gravity = fit("accelerometer", recordings, None, settings())
@@ -119,7 +135,7 @@ def test_a_zero_that_is_found_is_estimated_with_the_matrix() -> None:
 @pytest.mark.parametrize("name", ["mounting", "encoder_zero"])
 def test_columns_are_the_derivative_and_the_calibration_carries_the_recordings(name: str) -> None:
     recordings = seated_anew(0, 1.0)[0][:2]
-    this = effect(name).of_recordings([r.name for r in recordings])
+    this = effect(name).of_recordings({r.name: r.setup for r in recordings})
     motion = reference_motion(recordings[1])
     assert motion is not None
     values = 2.0 * np.random.default_rng(3).standard_normal(len(this.parameters("accelerometer")))

@@ -122,7 +122,7 @@ def test_a_mounting_and_a_zero_of_one_recording_are_the_rotations_of_their_effec
         ("mounting", theta, plain, replace(plain, mounting=rotation_by(theta))),
         ("encoder_zero", np.array([zero]), turned, plain),
     ):
-        kind = effect(name).of_recordings(["turn"])
+        kind = effect(name).of_recordings({"turn": ""})
         moved = kind.moved(replace(log.motion(time), recording="turn"), values)
         exact = true.motion(time)
         for vector in ("specific_force", "angular_rate", "angular_acceleration", "specific_force_rate"):

@@ -139,7 +139,7 @@ def effect_of(fitted: FittedEffect) -> Effect:
     if fitted.definition is None:
         return effect(fitted.name)
     if "recordings" in fitted.definition:
-        return effect(fitted.name).of_recordings(fitted.definition["recordings"])
+        return effect(fitted.name).of_recordings(dict.fromkeys(fitted.definition["recordings"], ""))
     if "python" not in fitted.definition:
         return _defined(json.dumps(fitted.definition, sort_keys=True))
     found = _registered.get(fitted.name)

@@ -23,7 +23,7 @@ from pipeline.records import SENSOR_UNITS, SENSORS, Motion
 from pipeline.signal.rests import RATE_AT_REST_DPS
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
 
     from pipeline.records import Values
 
@@ -116,9 +116,9 @@ class Effect(abc.ABC):
             added += regressors[:, :, j] * coefficients[..., j]
         return added
 
-    def of_recordings(self, names: Sequence[str]) -> Effect:
-        """Return the effect with the parameters that it has in these recordings; most have the same in all."""
-        del names
+    def of_recordings(self, setups: Mapping[str, str]) -> Effect:
+        """Return the effect with its parameters in these recordings, name to setup; most have the same in all."""
+        del setups
         return self
 
     def moved(self, motion: Motion, values: Values) -> Motion:

@@ -1,6 +1,6 @@
 """Effects of a recording or a session: rotations of its mounting, and zeros of the table's angle.
 
-    mounting:      u' = exp([theta_k]x)^T u,   theta_k the rotation of the unit in recording k, body frame
+    mounting:      u' = exp([theta_k]x)^T u,   theta_k the rotation of the unit in recording or setup k, body frame
     encoder_zero:  u' = exp([zero_k e_a]x) u,  e_a the axis of turn k: the unit is at A - zero_k where the log says A
 
 and ``reading = b + K u' + ...`` with u the truth by the log. Both have parameters for each recording, so that they are
@@ -41,7 +41,7 @@ from pipeline.model.effects.formula_effect import DeclaredEffect
 from pipeline.model.kinematics import skew, turn_by_vector
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping
 
     from pipeline.records import Motion, Values
 
@@ -83,7 +83,7 @@ def _rotated_at(trajectory: Callable[..., Motion | None], rotation: Values, **at
 
 
 class _OfRecordings(DeclaredEffect):
-    """A rotation of the motion in each recording: ``each`` parameters, deg, for a recording."""
+    """A rotation of the motion in each recording, by parameters in deg."""
 
     layout = Layout.SHARED
     of_turns = True
@@ -91,12 +91,21 @@ class _OfRecordings(DeclaredEffect):
     suffixes: tuple[str, ...]
     what: str
 
-    def of_recordings(self, names: Sequence[str]) -> Self:
-        """Return the effect with parameters for these recordings."""
+    def of_recordings(self, setups: Mapping[str, str]) -> Self:
+        """Return the effect with parameters for these recordings, name to setup."""
         bound = copy(self)
-        bound.recordings = tuple(names)
-        bound.definition = {"name": self.name, "recordings": list(names)}
+        bound.recordings = tuple(dict.fromkeys(self.owner_of(*pair) for pair in setups.items()))
+        bound.definition = {"name": self.name, "recordings": list(bound.recordings)}
         return bound
+
+    def owner_of(self, recording: str, setup: str) -> str:
+        """Return what has the parameters of a recording: the recording itself."""
+        del setup
+        return recording
+
+    def covers(self, motion: Motion) -> bool:
+        """Return whether there are parameters for a recording."""
+        return self.owner_of(motion.recording, motion.setup) in self.recordings
 
     def parameters(self, sensor: str) -> tuple[Parameter, ...]:
         """Return the parameters of each recording, one recording after the other."""
@@ -130,18 +139,22 @@ class _OfRecordings(DeclaredEffect):
 
     def _own(self, motion: Motion) -> slice:
         """Return the place of a recording's parameters; empty where it has none."""
-        if motion.recording not in self.recordings:
+        if not self.covers(motion):
             return slice(0, 0)
         size = len(self.suffixes)
-        at = size * self.recordings.index(motion.recording)
+        at = size * self.recordings.index(self.owner_of(motion.recording, motion.setup))
         return slice(at, at + size)
 
 
 class Mounting(_OfRecordings):
-    """The rotation of the unit in each recording: three parameters a recording."""
+    """The rotation of the unit in each recording, one for all recordings of a setup: three parameters each."""
 
     suffixes = ("_x", "_y", "_z")
     what = "rotation of the unit"
+
+    def owner_of(self, recording: str, setup: str) -> str:
+        """Return the setup, or the recording where none is named."""
+        return setup or recording
 
     def rotation(self, motion: Motion, values: Values) -> Values:
         """Return ``exp([theta]x)^T``."""
