@@ -235,6 +235,8 @@ def _residual_noise(
     size = np.where(design.sizes()[:-1] > 0, design.sizes()[:-1], 1.0)
     products, logarithms = design.products(settings)
     gram, rhs = products[:, :-1, :-1] / np.outer(size, size), products[:, :-1, -1] / size
+    unseen = np.einsum("gpp->gp", gram) <= RANK  # an axis on which a selected effect adds nothing
+    gram = gram + unseen[:, :, None] * np.eye(gram.shape[-1])
     steps = np.linalg.solve(gram, rhs[:, :, None])[:, :, 0]
     within = float(np.sum(observations.scatter / design.scale**2))
     rss = np.maximum(products[:, -1, -1] - np.sum(steps * rhs, axis=1), 0.0) + within

@@ -16,6 +16,8 @@ from pipeline.diagnosis.diagnose import diagnose
 from pipeline.diagnosis.words import in_words
 from pipeline.estimation.effects import fit as fit_effects
 from pipeline.estimation.noise import estimate_noise
+from pipeline.model.effects import effect_from, forget, register
+from pipeline.model.kinematics import table_motion
 from pipeline.records import Recording, SensorCalibration
 from pipeline.signal.filters import apply_filter
 
@@ -277,6 +279,25 @@ def test_at_most_two_of_a_hundred_sessions_without_an_effect_invent_one(sensor: 
         if (part := diagnosed(sensor, record(Session(seed + 5000, course, wander=1.0 + 4.0 * (seed % 2)))))["selected"]
     ]
     assert len(invented) <= 2, invented
+
+
+def test_an_effect_that_one_axis_does_not_show_is_diagnosed_by_the_others() -> None:
+    definition = {"name": "of_force", "owner": "sensor", "sensors": ["gyroscope"], "meaning": "Scale factor by force."}
+    register(effect_from({**definition, "terms": {"k": {"formula": "u * fz", "unit": "1/g"}}}, "of_force.yaml"))
+    recordings = []
+    for recording in record(Session(1, STOP_AND_GO, {})):
+        motion = table_motion(recording, TABLE)
+        if motion is not None and recording.gyroscope is not None:
+            reading = recording.gyroscope + 0.01 * motion.angular_rate * motion.specific_force[:, 2:]
+            recording = replace(recording, gyroscope=reading)  # noqa: PLW2901
+        recordings.append(recording)
+    try:
+        part = diagnosed("gyroscope", recordings)
+    finally:
+        forget()
+    assert part["selected"][:1] == ["of_force"]
+    found = next(e for e in part["ranking"] if e["effect"] == "of_force")
+    assert found["parameters"]["k_x"]["value"] == pytest.approx(0.01, rel=0.05)
 
 
 @pytest.mark.study
