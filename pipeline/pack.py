@@ -109,7 +109,7 @@ def as_bytes(content: Any) -> bytes:  # noqa: ANN401
     return (content if isinstance(content, str) else json_text(content) + "\n").encode()
 
 
-PACKS = "packs"
+PACKS, WITH_PRIOR = "packs", "combined"
 STAGES = ("calibration", "validate", "diagnose", "export", "report")
 FAILED = ".failed.json"
 STAGE_OF = {"calibrations": "calibration", "validations": "validate", "diagnoses": "diagnose"}
@@ -151,6 +151,14 @@ class Batch:
         for name in export.names():
             if name.startswith(f"{unit}/"):
                 yield f"exports/{name}", export.read(name)
+        yield from self._with_prior(unit)
+
+    def _with_prior(self, unit: str) -> Iterator[tuple[str, bytes]]:
+        """Yield the files that the prior of a lot adds, or that replace those without it."""
+        combined = Pack(self.packs["report"].path.with_name(f"{WITH_PRIOR}.zip"))
+        for name in combined.names() if combined.path.is_file() else ():
+            if name.startswith(f"{unit}/"):
+                yield name.removeprefix(f"{unit}/"), combined.read(name)
 
 
 def batches_of(results: Path) -> dict[str, Batch]:

@@ -67,7 +67,7 @@ class Campaign:
     page : str or None
         A page that the campaign asks for in addition to its own.
     combine : str or None
-        ``serial``: a joint estimate of units that share a serial.
+        ``serial``: a joint estimate of units that share a serial; ``lot``: each unit with the prior of its lot.
     publish_limit : int
         Up to how many units each has published files of its own.
     """
@@ -184,9 +184,9 @@ def _of_run(name: str, overrides: Sequence[str]) -> Any:  # noqa: ANN401  (a set
 def _combine(overrides: Sequence[str]) -> str | None:
     """Return by which column of the sheet calibrations are combined; None: not at all."""
     combine = _of_run("combine", overrides)
-    if combine not in (None, "serial"):
-        raise ConfigurationError(f"combine={combine}: serial or null is expected")
-    return "serial" if combine else None
+    if combine not in (None, "serial", "lot"):
+        raise ConfigurationError(f"combine={combine}: serial, lot or null is expected")
+    return combine if combine is None else str(combine)
 
 
 def _count(name: str, overrides: Sequence[str], least: int, words: str = "") -> Any:  # noqa: ANN401

@@ -209,7 +209,13 @@ def in_common(settings: Mapping[str, dict[str, Any]]) -> tuple[dict[str, Any], d
 
 
 def _of_gather(campaign: Campaign) -> dict[str, Any]:
-    common, own = in_common({name: {"sensor": _limits(unit.config["sensor"])} for name, unit in campaign.units.items()})
+    exported = campaign.combine == "lot"  # gather writes the exports with the prior
+    common, own = in_common(
+        {
+            name: select_settings(unit.config, "export") if exported else {"sensor": _limits(unit.config["sensor"])}
+            for name, unit in campaign.units.items()
+        }
+    )
     compared = {u for c in campaign.compare for g in c["groups"] for u in g["units"]}
     return {
         "campaign": campaign.name,
@@ -224,6 +230,7 @@ def _of_gather(campaign: Campaign) -> dict[str, Any]:
         "truths": {u: str(campaign.truth(u)) for u in sorted(compared)},
         "common": common,
         "units": own,
+        **(effects_for("export", "", [unit.config for unit in campaign.units.values()]) if exported else {}),
     }
 
 

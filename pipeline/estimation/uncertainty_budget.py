@@ -142,7 +142,8 @@ def combined(
         "contributions": [c.to_json() for c in contributions],
     }
     reasons = {**not_included, "repeatability": f"{NOT_STATED}, and compare"}
-    left = [{"source": source, "reason": reason} for source, reason in reasons.items()]
+    lines = {c.source for c in contributions}
+    left = [{"source": source, "reason": reason} for source, reason in reasons.items() if source not in lines]
     return _with_uncertainty(calibration, covariance, freedom, head, left)
 
 

@@ -298,6 +298,9 @@ def before_use(document: dict[str, Any]) -> list[str]:
         if axis_map != STRAIGHT:
             pairs = ", ".join(f"{a} along body {b}" for a, b in zip("xyz", axis_map, strict=True))
             lines.append(f"Turn the readings to body axes first: the {sensor}'s {pairs}.")
+    for sensor, prior in (document.get("lot_prior") or {}).items():
+        told = prior["refused"] or f"{prior['siblings']} siblings; held-out errors are those without it"
+        lines.append(f"With{'out' if prior['refused'] else ''} the prior of {prior['lot']}, {sensor}: {told}.")
     return lines + [line for s in SENSORS for line in sentences(s, document.get(s))]
 
 

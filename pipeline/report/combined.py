@@ -26,7 +26,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.estimation.engine import scaled_inverse
-from pipeline.estimation.uncertainty_budget import effective_degrees_of_freedom
+from pipeline.estimation.uncertainty_budget import NOISE
+from pipeline.estimation.uncertainty_budget import combined as budget_of
 from pipeline.io.files import wrong_name
 from pipeline.records import NORMAL, SENSORS, Contribution, SensorCalibration, StageResult
 
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
 
 JSON = dict[str, Any]
 KIND = np.array([0, 0, 0, 1, 2, 2, 2, 1, 2, 2, 2, 1])  # of bias, diagonal and other elements of the matrix
+BENCH = "stated accuracies of the bench"
 SAME = ("sensor", "method", "table")  # what the calibrations of one estimate have in common
 
 
@@ -103,9 +105,10 @@ def _ranges(ranges: Sequence[JSON]) -> JSON:
 
 def _sensor(sensor: str, parts: Sequence[JSON]) -> JSON:
     each = [SensorCalibration.from_json(sensor, part) for part in parts]
-    x = np.stack([np.concatenate([c.bias, c.matrix.ravel(), *(e.values for e in c.effects)]) for c in each])
-    own, common = _covariances(each, parts)
-    kind = np.concatenate([KIND, *(np.full(len(e.values), 3 + k) for k, e in enumerate(each[0].effects))])
+    x = np.stack([values_of(c) for c in each])
+    found = [covariances(c, part) for c, part in zip(each, parts, strict=True)]
+    own, common = [A for A, _ in found], np.mean([B for _, B in found], axis=0)
+    kind = kinds_of(each[0])
     r2 = repeatability(x, np.stack([np.diag(A) for A in own]), kind) ** 2
     weights = [scaled_inverse(A + np.diag(r2)) for A in own]
     covariance = scaled_inverse(np.sum(weights, axis=0))
@@ -115,53 +118,49 @@ def _sensor(sensor: str, parts: Sequence[JSON]) -> JSON:
     alone = scaled_inverse(np.sum([scaled_inverse(A) for A in own], axis=0))
     scatter = np.where(r2 > 0.0, np.bincount(kind)[kind] * (len(x) - 1.0), np.inf)
     lines = [
-        Contribution("noise of the readings", "A", "Student's t", alone, freedom),
-        Contribution("stated accuracies of the bench", "B", NORMAL, common, np.full(len(theta), np.inf)),
+        Contribution(NOISE, "A", "Student's t", alone, freedom),
+        Contribution(BENCH, "B", NORMAL, common, np.full(len(theta), np.inf)),
         Contribution("repeatability", "A", "Student's t", covariance - alone + np.diag(r2), scatter),
     ]
-    total = np.sum([line.covariance for line in lines], axis=0)
-    effective = effective_degrees_of_freedom(
-        np.stack([line.standard_uncertainty for line in lines]), np.stack([line.degrees_of_freedom for line in lines])
-    )
+    result = StageResult("combined", {}, None, None, {"calibrations": len(each), "repeatability": np.sqrt(r2).tolist()})
+    first = replace(each[0], stages=(result,), converged=all(c.converged for c in each), convergence=None)
+    return with_values(first, theta, lines).to_json()
+
+
+def values_of(calibration: SensorCalibration) -> Values:
+    """Return bias, matrix and effects of a sensor, in the order of the covariance's rows."""
+    return np.concatenate([calibration.bias, calibration.matrix.ravel(), *(e.values for e in calibration.effects)])
+
+
+def kinds_of(calibration: SensorCalibration) -> NDArray[np.intp]:
+    """Return the kind of each parameter, 0 ..: bias, scale factors, cross-axis elements, then each effect."""
+    return np.concatenate([KIND, *(np.full(len(e.values), 3 + k) for k, e in enumerate(calibration.effects))])
+
+
+def with_values(calibration: SensorCalibration, theta: Values, lines: Sequence[Contribution]) -> SensorCalibration:
+    """Return a calibration with other values, as of ``values_of``, and the budget of these contributions."""
     effects, at = [], 12
-    for effect in each[0].effects:
+    for effect in calibration.effects:
         values = theta[at : at + len(effect.parameters)].tolist()
         described = {n: {**p, "value": v} for (n, p), v in zip(effect.parameters.items(), values, strict=True)}
         effects.append(replace(effect, parameters=described))
         at += len(described)
-    first = each[0]
-    result = StageResult("combined", {}, None, None, {"calibrations": len(each), "repeatability": np.sqrt(r2).tolist()})
-    names = first.parameter_names()
-    budget = {"parameters": names, "contributions": [line.to_json() for line in lines], "not_included": []}
-    joint = replace(
-        first,
-        bias=theta[:3],
-        matrix=theta[3:12].reshape(3, 3),
-        effects=tuple(effects),
-        stages=(result,),
-        covariance=total,
-        degrees_of_freedom=float(effective.min()),
-        freedom=effective,
-        converged=all(c.converged for c in each),
-        convergence=None,
-        budget=budget,
-    )
-    return joint.to_json()
+    changed = replace(calibration, bias=theta[:3], matrix=theta[3:12].reshape(3, 3), effects=tuple(effects))
+    return budget_of(changed, lines, {})
 
 
-def _covariances(each: Sequence[SensorCalibration], parts: Sequence[JSON]) -> tuple[list[Values], Values]:
-    """Return the covariance of each calibration by its own readings, and the mean of those by the bench."""
-    own, common = [], []
-    for calibration, part in zip(each, parts, strict=True):
-        C = calibration.covariance
-        assert C is not None  # noqa: S101  (from_json)
-        total = np.maximum(np.diag(C), 1e-300)
-        lines = (part.get("uncertainty_budget") or {}).get("contributions", [])
-        stated = np.sum([np.square(c["contribution"]) for c in lines if c["type"] == "B"] or [0.0 * total], axis=0)
-        share = np.clip(stated / total, 0.0, 1.0)
-        own.append(C * np.sqrt(np.outer(1.0 - share, 1.0 - share)))
-        common.append(C * np.sqrt(np.outer(share, share)))
-    return own, np.asarray(np.mean(common, axis=0))
+def covariances(calibration: SensorCalibration, part: JSON) -> tuple[Values, Values]:
+    """Return the covariance of a calibration by its own readings, and that by the bench; together the published one.
+
+    ``part``: the sensor's part of the document, whose budget tells the two apart.
+    """
+    C = calibration.covariance
+    assert C is not None  # noqa: S101  (from_json)
+    total = np.maximum(np.diag(C), 1e-300)
+    lines = (part.get("uncertainty_budget") or {}).get("contributions", [])
+    stated = np.sum([np.square(c["contribution"]) for c in lines if c["type"] == "B"] or [0.0 * total], axis=0)
+    share = np.clip(stated / total, 0.0, 1.0)
+    return C * np.sqrt(np.outer(1.0 - share, 1.0 - share)), C * np.sqrt(np.outer(share, share))
 
 
 def repeatability(x: Values, variance: Values, kind: NDArray[np.intp]) -> Values:

@@ -8,18 +8,22 @@ from __future__ import annotations
 
 import os
 import shutil
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.errors import PipelineError
+from pipeline.errors import DamagedFileError, PipelineError
+from pipeline.exports import exports
 from pipeline.files import flushed_together, read_json, write_atomically, write_json
 from pipeline.history import of_units, record, unit_state
-from pipeline.pack import PACKS, STAGES, Batch
+from pipeline.pack import PACKS, STAGE_OF, STAGES, WITH_PRIOR, Batch, as_bytes, new_pack
+from pipeline.records import SENSORS
 from pipeline.report.campaign_page import render
 from pipeline.report.combined import combined_calibrations
 from pipeline.report.comparison_section import section, unit_figures
 from pipeline.report.fleet import fleet_statistics, unit_parameters, write_parameters
+from pipeline.report.lot import calibration_with_prior, estimates, priors_of, with_card
 from pipeline.report.pages import failure_page
 from pipeline.report.run_section import runs_data, times_of, with_history
 from pipeline.report.strips import Placed, against_limits
@@ -30,6 +34,8 @@ from pipeline.stages.batch import failure_of, record_output
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
+    from pipeline.pack import Files
+    from pipeline.report.lot import Prior
     from pipeline.report.parameters import Parameter
     from pipeline.stages.batch import Job
 
@@ -69,18 +75,56 @@ def gather_batch(job: Job) -> None:
     with flushed_together(results):
         rows = {row["unit"]: row for row in job.run["rows"]}
         gathered = {}
+        told = _with_lots(job, rows)
         for name, units in job.run["batches"].items():
             folder = job.output.parent / name
             batch = Batch(folder)
             for unit in units:
                 gathered[unit] = _gather_unit(job, batch, rows[unit], new, publish=not packed or unit in asked)
-            for stage in STAGES if packed else ():
+            for stage in (*STAGES, *([WITH_PRIOR] if told else [])) if packed else ():
                 _link(folder / f"{stage}.zip", new / PACKS / name / f"{stage}.zip")
         units = {unit: gathered[unit] for unit in rows}
-        _write_campaign(job, units, new, packed=packed)
+        _write_campaign(job, units, new, told, packed=packed)
     publish_all(new, results)
     record_output(job, results, PUBLISHED)
     write_json(job.output, [u.failure for u in units.values() if u.failure])
+
+
+def _with_lots(job: Job, rows: Mapping[str, dict[str, str]]) -> list[JSON]:
+    """Write what the priors of the lots change, ``combined.zip`` of each batch; return what ``fleet.json`` tells."""
+    batches = {name: Batch(job.output.parent / name) for name in job.run["batches"]}
+    if job.run["combine"] != "lot":
+        for name in batches:
+            (job.output.parent / name / f"{WITH_PRIOR}.zip").unlink(missing_ok=True)
+        return []
+    found = []
+    for name, units in job.run["batches"].items():
+        for unit in units:
+            with suppress(DamagedFileError):  # the unit fails where its files are published
+                if not batches[name].failure(unit):
+                    documents = (batches[name].document(of, unit) for of in ("calibrations", "diagnoses"))
+                    found += estimates(rows[unit], *documents)
+    priors, told = priors_of(found)
+    for name, units in job.run["batches"].items():
+        with new_pack(job.output.parent / name / f"{WITH_PRIOR}.zip") as add:
+            for unit in units:
+                if own := {s: priors[unit, s] for s in SENSORS if (unit, s) in priors}:
+                    files = _files_with_prior(job, batches[name], unit, own)
+                    add({f"{unit}/{path}": as_bytes(content) for path, content in files.items()})
+    return told
+
+
+def _files_with_prior(job: Job, batch: Batch, unit: str, priors: Mapping[str, Prior]) -> Files:
+    """Return the files of a unit that its priors add or change."""
+    calibration, validation, diagnosis = (batch.document(folder, unit) for folder in STAGE_OF)
+    document = calibration_with_prior(calibration, priors)
+    page = batch.packs["report"].read(f"{unit}.html").decode()
+    files: Files = {f"reports/{unit}.html": with_card(page, calibration, document, priors)}
+    if document:
+        files[f"combined/{unit}.json"] = document
+        written = exports(document, job.units[unit], validation, diagnosis)
+        files |= {f"exports/{unit}/{file}": text for file, text in written.items()}
+    return files
 
 
 def _gather_unit(job: Job, batch: Batch, row: dict[str, str], new: Path, *, publish: bool) -> Gathered:
@@ -122,7 +166,7 @@ def _gathered(
         failure,
         unit_state(calibration, validation, diagnosis, job.run["overrides"].get(unit, {})),
         [{key: file[key] for key in ("file", "sha256")} for file in calibration.get("inputs") or []],
-        calibration if job.run["combine"] else None,
+        calibration if job.run["combine"] == "serial" else None,
     )
 
 
@@ -142,12 +186,14 @@ def _failed_unit(job: Job, batch: Batch, row: dict[str, str], error: Exception, 
     return _gathered(job, row, failure, (calibration, None, None))
 
 
-def _write_campaign(job: Job, units: Mapping[str, Gathered], new: Path, *, packed: bool) -> None:
-    """Write the files about all units."""
+def _write_campaign(job: Job, units: Mapping[str, Gathered], new: Path, lots: list[JSON], *, packed: bool) -> None:
+    """Write the files about all units; ``lots``: what ``fleet.json`` tells of their priors."""
     run, rows = job.run, [u.row for u in units.values()]
     fitted = {name: u.fitted for name, u in units.items()}
     failures, statistics = [u.failure for u in units.values() if u.failure], fleet_statistics(rows, fitted)
-    if run["combine"]:
+    if lots:
+        statistics["combined"] = lots
+    if run["combine"] == "serial":
         joint, told = combined_calibrations(rows, {name: u.calibration for name, u in units.items() if u.calibration})
         statistics["combined"] = told
         for serial, document in joint.items():

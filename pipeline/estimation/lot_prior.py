@@ -1,0 +1,204 @@
+"""The lot of a unit as a prior of its parameters: estimated from the other units, applied after the fits.
+
+    x_i = theta_i + b + e_i,    cov(e_i) = A_i,    theta_i ~ N(mu, diag(tau^2)) within a lot
+    theta_i = x_i - G (x_i - m),    G = A_i (A_i + V)^-1,    cov = (1 - G) A_i (1 - G)^T + G V G^T + cov(b)
+
+x_i is the published estimate of unit i, A_i its covariance by its own readings. b is the error of the table, which the
+units of a lot share: m contains it as x_i does, so that no G reduces it, and cov(b) is added as it is. Where b is not
+shared, the spread of the estimates contains it, and the result is wider than necessary (docs/uncertainty.md).
+m and V (diagonal) are mean and variance of the prediction of a further unit from its siblings, the unit itself left
+out: mu and tau have flat densities (Gelman, Bayesian Analysis 1 (2006) 515), mu is integrated out in closed form and
+tau on a grid. The degrees of freedom of V are those of Student's t with the kurtosis of the prediction.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from pipeline.estimation.engine import scaled_inverse
+from pipeline.estimation.uncertainty_budget import effective_degrees_of_freedom
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Places = NDArray[np.intp]
+    Values = NDArray[np.float64]
+    Mask = NDArray[np.bool_]
+
+FEWEST = 8  # siblings
+LEVEL = 0.05  # the largest share of a lot that loses the prior by chance, which is no harm (measured: docs/fleet.md)
+GRID = np.geomspace(0.01, 10.0, 64)  # of tau, over the spread of the estimates; steps of 12 %
+OMEGA = 0.5  # of log tau within a kind: axes differ by a factor of 1.6 (assumption; docs/fleet.md has other factors)
+ALIKE = np.exp(-0.5 * (np.log(GRID[:, None] / GRID) / OMEGA) ** 2)
+ALIKE /= ALIKE.sum(axis=1, keepdims=True)  # (common tau of the kind, tau of a parameter)
+ROBUST = 1.4826  # median absolute deviation to standard deviation, of normal values
+FAR = 5.0  # robust standard deviations beyond which a unit is at first no sibling; all are tested again after that
+ROUNDS = 20  # at most, until the siblings stay the same; 2 to 4 in the study (benchmarks/lot_prior.py)
+
+
+class Prediction(NamedTuple):
+    """Mean, variance and degrees of freedom of parameters as their siblings predict them: (p,) or (n, p) arrays."""
+
+    mean: Values
+    variance: Values
+    freedom: Values
+
+
+@dataclass(frozen=True)
+class LotPrior:
+    """The prior of each of n units of a lot with p parameters, and the test of each unit against its own prior.
+
+    Attributes
+    ----------
+    predicted : Prediction
+        Of the parameters of each unit from its siblings: (n, p) arrays.
+    siblings : (n,) array
+        Number of them.
+    deviation : (n, p) array
+        Estimate less prediction, over the standard uncertainty of the difference.
+    probability : (n,) array
+        Of a difference as large as the unit's, in the largest deviation or in all together.
+    """
+
+    predicted: Prediction
+    siblings: NDArray[np.intp]
+    deviation: Values
+    probability: Values
+
+    @property
+    def outlier(self) -> Mask:
+        """Whether a unit differs from its siblings, ``probability < LEVEL``: (n,) array."""
+        return self.probability < LEVEL
+
+
+@dataclass(frozen=True)
+class WithPrior:
+    """An estimate with its prior: values (p,), and what the readings and the lot contribute to its covariance.
+
+    ``lot_freedom``: (p,), degrees of freedom of the lot's part; ``share``: (p,), of the prior in each value.
+    """
+
+    values: Values
+    own: Values
+    lot: Values
+    lot_freedom: Values
+    share: Values
+
+
+def lot_priors(x: Values, own: Values, freedom: Values, able: Mask, numbers: tuple[Places, Places]) -> LotPrior:
+    """Return the prior of each unit of a lot, from siblings that are no outliers.
+
+    Parameters
+    ----------
+    x : (n, p) array
+        Estimates.
+    own : (n, p, p) array
+        A_i; the degrees of freedom of its diagonals are ``freedom``, (n, p).
+    able : (n,) array
+        Which units may be siblings.
+    numbers : (n,) and (p,) arrays
+        Of the device of each unit: of several calibrations of a device the first counts, and none for the others.
+        Of the kind of each parameter: the tau of one kind are alike.
+    """
+    device, kind = numbers
+    _, first = np.unique(np.where(able, device, -1), return_index=True)
+    able = able & np.isin(np.arange(len(x)), first)
+    away = np.abs(x - np.median(x[able], axis=0))
+    near = able & np.all(away <= FAR * ROBUST * np.median(away[able], axis=0), axis=1)
+    siblings = near if near.sum() > FEWEST else able
+    for _ in range(ROUNDS):
+        of_device = np.full(int(device.max()) + 1, -1)
+        of_device[device[siblings]] = np.flatnonzero(siblings)
+        itself = of_device[device]
+        predicted = _predicted(x, np.diagonal(own, axis1=1, axis2=2), siblings, itself, kind)
+        z, probability = _tested(x, own, freedom, predicted)
+        found = LotPrior(predicted, siblings.sum() - (itself >= 0), z, probability)
+        again = able & ~found.outlier
+        if np.array_equal(again, siblings) or again.sum() <= FEWEST:
+            break
+        siblings = again
+    return found
+
+
+def _predicted(x: Values, v: Values, siblings: Mask, itself: Places, kind: Places) -> Prediction:
+    """Return the prediction of each unit; ``itself``: the sibling that is the unit's own device, or -1."""
+    found = Prediction(*(np.empty(x.shape) for _ in range(3)))
+    for each in np.unique(kind):
+        columns = np.flatnonzero(kind == each)
+        y = x[:, columns] - np.median(x[siblings][:, columns], axis=0)
+        tau2 = (max(float(np.std(y[siblings])), 1e-300) * GRID) ** 2
+        at = [_given_tau(y[:, [k]], v[:, [j]], siblings, itself, tau2) for k, j in enumerate(columns)]
+        of_kind = [np.log(likelihood @ ALIKE.T) for *_, likelihood in at]
+        for k, j in enumerate(columns):
+            others = np.sum([m for i, m in enumerate(of_kind) if i != k], axis=0) + np.log(GRID)
+            tau = _normalized(others) @ ALIKE * at[k][2]
+            tau /= tau.sum(axis=1, keepdims=True)
+            middle, each_variance, _ = at[k]
+            m = np.sum(tau * middle, axis=1, keepdims=True)
+            off = (middle - m) ** 2
+            variance = np.sum(tau * (each_variance + off), axis=1)
+            fourth = np.sum(tau * (3.0 * each_variance**2 + 6.0 * each_variance * off + off**2), axis=1)
+            found.mean[:, j] = m[:, 0] + np.median(x[siblings, j])
+            found.variance[:, j] = variance
+            found.freedom[:, j] = 4.0 + 6.0 / np.maximum(fourth / variance**2 - 3.0, 1e-6)
+    return found
+
+
+def _given_tau(y: Values, v: Values, siblings: Mask, itself: Places, tau2: Values) -> tuple[Values, Values, Values]:
+    """Return mean and variance of each unit's prediction for each tau, and the likelihood of tau: (n, k) arrays."""
+    total = np.maximum(v + tau2, 1e-12 * tau2[-1])
+    w, log = siblings[:, None] / total, np.where(siblings[:, None], np.log(total), 0.0)
+    terms = (w, w * y, w * y**2, log)
+    s = [t.sum(axis=0) - np.where(itself[:, None] >= 0, t[itself], 0.0) for t in terms]  # without the unit itself
+    mean = s[1] / s[0]
+    return mean, tau2 + 1.0 / s[0], _normalized(-0.5 * (s[3] + np.log(s[0]) + s[2] - s[1] * mean))
+
+
+def _normalized(log: Values) -> Values:
+    """Return what is proportional to exp(log), with the largest of each row 1."""
+    return np.asarray(np.exp(log - np.max(log, axis=-1, keepdims=True)))
+
+
+def _tested(x: Values, own: Values, own_freedom: Values, predicted: Prediction) -> tuple[Values, Values]:
+    """Return the deviations of each unit, and the probability of such: the smaller p of two tests, times two.
+
+    The largest deviation by Student's t, times the number of parameters; all together by Hotelling's form of F.
+    """
+    from scipy.special import fdtrc, stdtr  # noqa: PLC0415  (0.1 s that only lots need)
+
+    mean, variance, freedom = predicted
+    v, size = np.diagonal(own, axis1=1, axis2=2), x.shape[1]
+    u = np.sqrt(v + variance)
+    parts = np.sqrt(np.stack([v, variance])).reshape(2, -1)
+    nu = effective_degrees_of_freedom(parts, np.stack([own_freedom, freedom]).reshape(2, -1)).reshape(x.shape)
+    z = (x - mean) / u
+    one = size * 2.0 * stdtr(np.minimum(nu, 1e9), -np.abs(z)).min(axis=1)
+    correlation = (own + variance[:, :, None] * np.eye(size)) / (u[:, :, None] * u[:, None, :])
+    squared = np.einsum("ij,ij->i", z, np.linalg.solve(correlation, z[..., None])[..., 0])
+    together = fdtrc(size, 1.0 / np.maximum(np.mean(1.0 / nu, axis=1), 1e-9), squared / size)
+    return z, np.minimum(1.0, 2.0 * np.minimum(one, together))
+
+
+def with_prior(x: Values, own: Values, predicted: Prediction, known: Mask) -> WithPrior:
+    """Return an estimate with its prior.
+
+    ``x``, ``own``: (p,), (p, p) of all parameters; ``known``: (p,), the q of them that are ``predicted``, (q,) arrays.
+    The others follow by their correlation.
+    """
+    mean, variance, freedom = predicted
+    gain = own[:, known] @ scaled_inverse(own[np.ix_(known, known)] + np.diag(variance))
+    rest = np.eye(len(x))
+    rest[:, known] -= gain
+    lines = np.abs(gain * np.sqrt(variance)).T
+    share = np.zeros(len(x))
+    share[known] = np.diag(gain[known])
+    return WithPrior(
+        x - gain @ (x[known] - mean),
+        rest @ own @ rest.T,
+        (gain * variance) @ gain.T,
+        effective_degrees_of_freedom(lines, freedom),
+        share,
+    )

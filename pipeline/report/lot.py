@@ -1,0 +1,220 @@
+"""Calibrations with the prior of their lot (``combine=lot``): which units are siblings, their documents, the card.
+
+A lot is the units of a sensor model with one value of the column ``lot``. Siblings have the same table, procedure,
+method, axes and parameters: these then mean the same, in one frame, and contain the same error of the table. Effects of
+the recording, the mounting and the table have no prior. The estimate is that of ``pipeline.estimation.lot_prior``.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from pipeline.estimation.lot_prior import FEWEST, LotPrior, Prediction, lot_priors, with_prior
+from pipeline.estimation.uncertainty_budget import NOISE
+from pipeline.model.effects import owner_of
+from pipeline.model.effects.base import Owner
+from pipeline.records import NORMAL, SENSORS, Contribution, SensorCalibration, StageResult
+from pipeline.report.combined import BENCH, covariances, kinds_of, values_of, with_values
+from pipeline.report.numbers import number, plain
+from pipeline.report.pages import template
+from pipeline.report.parameters import fitted_parameters
+from pipeline.report.run_section import MARK
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from numpy.typing import NDArray
+
+    Mask = NDArray[np.bool_]
+    Values = NDArray[np.float64]
+
+JSON = dict[str, Any]
+LINE = "prior of the lot"
+NONE = np.empty(0)
+DOUBTFUL = ("reference_in_doubt", "missing_effect", "unexplained")  # verdicts: the uncertainty does not hold the error
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What the prior of a lot needs of a sensor of a unit."""
+
+    unit: str
+    sensor: str
+    lot: str
+    comparable: str  # equal for units that may be siblings
+    device: str
+    refused: str | None
+    values: Values
+    own: Values
+    freedom: Values
+    bench: Values
+    kind: NDArray[np.intp]
+    known: Mask  # the sensor's own parameters, of a stated uncertainty
+
+
+class Prior(NamedTuple):
+    """The prior of a sensor of a unit, or why it has none."""
+
+    lot: str
+    siblings: int = 0
+    refused: str | None = None
+    outlier: bool = False
+    probability: float | None = None
+    deviation: Values = NONE  # of the parameters that are known
+    predicted: Prediction = Prediction(NONE, NONE, NONE)
+    known: Mask = NONE.astype(bool)
+    bench: Values = NONE  # mean standard uncertainty of the siblings by the bench
+
+
+def estimates(row: Mapping[str, Any], calibration: JSON, diagnosis: JSON) -> list[Estimate]:
+    """Return what a calibrated unit brings to the priors of its lot: one estimate for each sensor.
+
+    ``row``: of ``units.csv``; ``calibration``, ``diagnosis``: as published.
+    """
+    found = []
+    name, lot = calibration["sensor"], row.get("lot")
+    for sensor in SENSORS:
+        part = calibration[sensor]
+        if not part:
+            continue
+        fit = SensorCalibration.from_json(sensor, part)
+        own, bench = covariances(fit, part)
+        share = np.diag(own) / np.maximum(np.diag(own + bench), 1e-300)
+        mine = [True] * 12 + [owner_of(e) == Owner.SENSOR for e in fit.effects for _ in e.parameters]
+        same = [calibration[key] for key in ("table", "procedure")] + [calibration["methods"][sensor]]
+        verdict = (diagnosis.get(sensor) or {}).get("verdict")
+        refused = f"the diagnosis of its {sensor}: {plain(verdict)}" if verdict in DOUBTFUL else None
+        refused = refused if fit.converged else f"the fit of its {sensor} did not converge"
+        x = values_of(fit)
+        found.append(
+            Estimate(
+                unit=calibration["unit"],
+                sensor=sensor,
+                lot=f"{name}, lot {lot}" if lot else name,
+                comparable=json.dumps([*same, (calibration.get("log") or {}).get("axis_map"), fit.parameter_names()]),
+                device=str(row.get("serial") or x.tobytes()),  # one recording in two units is one device
+                refused=refused,
+                values=x,
+                own=own,
+                freedom=fit.effective_freedom() * share**2,  # Welch and Satterthwaite: that of the readings alone
+                bench=np.sqrt(np.diag(bench)),
+                kind=kinds_of(fit),
+                known=np.array(mine) & (np.diag(own) > 0.0),
+            )
+        )
+    return found
+
+
+def priors_of(found: Iterable[Estimate]) -> tuple[dict[tuple[str, str], Prior], list[JSON]]:
+    """Return the prior of each unit and sensor, and for each lot and sensor what ``fleet.json`` tells."""
+    lots: dict[tuple[str, str], dict[str, list[Estimate]]] = {}
+    for estimate in found:
+        lots.setdefault((estimate.lot, estimate.sensor), {}).setdefault(estimate.comparable, []).append(estimate)
+    priors: dict[tuple[str, str], Prior] = {}
+    told = []
+    for (lot, sensor), kinds in lots.items():
+        own = {e.unit: p for kind in kinds.values() for e, p in zip(kind, _priors(kind, len(kinds)), strict=True)}
+        priors |= {(unit, sensor): prior for unit, prior in own.items()}
+        without = {unit: p.refused for unit, p in own.items() if p.refused}
+        outliers = [unit for unit, p in own.items() if p.outlier]
+        told.append(
+            {"lot": lot, "sensor": sensor, "units": list(own), "with_prior": len(own) - len(without),
+             "outliers": outliers, "without": without}
+        )  # fmt: skip
+    return priors, told
+
+
+def _priors(kind: list[Estimate], kinds: int) -> list[Prior]:
+    """Return the priors of units that may be siblings; ``kinds``: how many such groups the lot has."""
+    able, known = np.array([e.refused is None for e in kind]), np.all([e.known for e in kind], axis=0)
+    names = {device: i for i, device in enumerate(dict.fromkeys(e.device for e in kind))}
+    device = np.array([names[e.device] for e in kind])
+    count, lot = len(set(device[able])), kind[0].lot
+    if not known.any():
+        return [Prior(lot, refused=f"the method states no uncertainty of the {e.sensor}") for e in kind]
+    if count <= FEWEST:
+        others = "; the other units of the lot differ in table, procedure, method, axes or effects" if kinds > 1 else ""
+        few = f"{count} devices of the lot can be compared, {FEWEST + 1} or more are needed{others}"
+        return [Prior(lot, refused=e.refused or few) for e in kind]
+    x, own = np.stack([e.values[known] for e in kind]), np.stack([e.own[np.ix_(known, known)] for e in kind])
+    lots = lot_priors(x, own, np.stack([e.freedom[known] for e in kind]), able, (device, kind[0].kind[known]))
+    bench = np.mean([e.bench for e, a in zip(kind, able, strict=True) if a], axis=0)
+    return [_prior(e, lots, i, known, bench) for i, e in enumerate(kind)]
+
+
+def _prior(estimate: Estimate, lots: LotPrior, i: int, known: Mask, bench: Values) -> Prior:
+    siblings, p, refused = int(lots.siblings[i]), float(lots.probability[i]), estimate.refused
+    outlier = not refused and bool(lots.outlier[i])
+    if outlier:
+        refused = f"it differs from its {siblings} siblings (p = {number(p, 2)})"
+    elif not refused and siblings < FEWEST:
+        refused = f"without outliers {siblings} siblings are left, {FEWEST} or more are needed"
+    predicted = Prediction(*(values[i] for values in lots.predicted))
+    return Prior(estimate.lot, siblings, refused, outlier, p, lots.deviation[i], predicted, known, bench)
+
+
+def calibration_with_prior(calibration: JSON, priors: Mapping[str, Prior]) -> JSON | None:
+    """Return a calibration with the priors of its sensors, in the form of ``calibrations/<unit>.json``.
+
+    ``lot_prior`` of each sensor holds the prior, or the reason why the sensor has none. None where no sensor has one.
+    """
+    if all(prior.refused for prior in priors.values()):
+        return None
+    document = {**calibration, "lot_prior": {}}
+    for sensor, prior in priors.items():
+        document["lot_prior"][sensor] = {"lot": prior.lot, "siblings": prior.siblings, "refused": prior.refused}
+        if not prior.refused:
+            document[sensor], added = _sensor(sensor, calibration[sensor], prior)
+            document["lot_prior"][sensor] |= added
+    return document
+
+
+def _sensor(sensor: str, part: JSON, prior: Prior) -> tuple[JSON, JSON]:
+    fit = SensorCalibration.from_json(sensor, part)
+    own, common = covariances(fit, part)
+    known, u = prior.known, np.sqrt(np.diag(common))
+    found = with_prior(values_of(fit), own, prior.predicted, known)
+    grown = np.divide(np.maximum(u, prior.bench), u, out=np.ones(len(u)), where=u > 0.0)
+    share = np.diag(own) / np.maximum(np.diag(own + common), 1e-300)
+    remark = f"of {prior.lot}: mean and spread of {prior.siblings} siblings"
+    lines = [
+        Contribution(NOISE, "A", "Student's t", found.own, fit.effective_freedom() * share**2),
+        Contribution(LINE, "A", "Student's t", found.lot, found.lot_freedom, remark=remark),
+        Contribution(BENCH, "B", NORMAL, common * np.outer(grown, grown), np.full(len(u), np.inf)),
+    ]
+    stage = StageResult("lot_prior", {}, None, None, {"lot": prior.lot, "siblings": prior.siblings})
+    after = with_values(replace(fit, stages=(*fit.stages, stage)), found.values, lines)
+    budget = {**(after.budget or {}), "not_included": (part.get("uncertainty_budget") or {}).get("not_included", [])}
+    added = {
+        "parameters": [name for name, k in zip(fit.parameter_names(), known, strict=True) if k],
+        "mean": prior.predicted.mean.tolist(),
+        "standard_deviation": np.sqrt(prior.predicted.variance).tolist(),
+        "share": found.share[known].tolist(),
+        "probability": prior.probability,
+    }
+    return replace(after, budget=budget).to_json() | {
+        key: value for key, value in part.items() if key.startswith("implausible")
+    }, added
+
+
+def with_card(page: str, calibration: JSON, document: JSON | None, priors: Mapping[str, Prior]) -> str:
+    """Return a unit's page with the card on its prior, before the section on its runs."""
+    sensors = []
+    for sensor, prior in priors.items():
+        shown: JSON = {"name": sensor, "prior": prior, "rows": []}
+        if document and not prior.refused:
+            added = document["lot_prior"][sensor]
+            lot = zip(*(added[key] for key in ("parameters", "mean", "standard_deviation", "share")), strict=True)
+            both = [{p.name: p for p in fitted_parameters(of[sensor])} for of in (calibration, document)]
+            shown["rows"] = [(*(of[name] for of in both), *rest) for name, *rest in lot]
+        elif prior.outlier:
+            names = np.array(calibration[sensor]["covariance"]["parameters"])[prior.known]
+            worst = int(np.argmax(np.abs(prior.deviation)))
+            shown["worst"] = f"{plain(names[worst])} by {number(abs(float(prior.deviation[worst])))}"
+        sensors.append(shown)
+    section = template("lot.html").render(unit=calibration["unit"], document=document, sensors=sensors)
+    return page.replace(MARK, section + MARK, 1)
