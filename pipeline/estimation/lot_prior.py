@@ -13,7 +13,6 @@ tau on a grid. The degrees of freedom of V are those of Student's t with the kur
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -30,12 +29,15 @@ if TYPE_CHECKING:
 
 FEWEST = 8  # siblings
 LEVEL = 0.05  # the largest share of a lot that loses the prior by chance, which is no harm (measured: docs/fleet.md)
+FAR_LEVEL = 0.001  # below it a unit is no sibling of others; 0.05 would leave out 4 % and make the spread 10 % smaller
 GRID = np.geomspace(0.01, 10.0, 64)  # of tau, over the spread of the estimates; steps of 12 %
 OMEGA = 0.5  # of log tau within a kind: axes differ by a factor of 1.6 (assumption; docs/fleet.md has other factors)
 ALIKE = np.exp(-0.5 * (np.log(GRID[:, None] / GRID) / OMEGA) ** 2)
 ALIKE /= ALIKE.sum(axis=1, keepdims=True)  # (common tau of the kind, tau of a parameter)
 ROBUST = 1.4826  # median absolute deviation to standard deviation, of normal values
-FAR = 5.0  # robust standard deviations beyond which a unit is at first no sibling; all are tested again after that
+FAR_AT_FIRST = (
+    5.0  # robust standard deviations beyond which a unit is at first no sibling; all are tested again after that
+)
 ROUNDS = 20  # at most, until the siblings stay the same; 2 to 4 in the study (benchmarks/lot_prior.py)
 
 
@@ -47,24 +49,15 @@ class Prediction(NamedTuple):
     freedom: Values
 
 
-@dataclass(frozen=True)
-class LotPrior:
+class LotPrior(NamedTuple):
     """The prior of each of n units of a lot with p parameters, and the test of each unit against its own prior.
 
-    Attributes
-    ----------
-    predicted : Prediction
-        Of the parameters of each unit from its siblings: (n, p) arrays.
-    siblings : (n,) array
-        Number of them.
-    deviation : (n, p) array
-        Estimate less prediction, over the standard uncertainty of the difference.
-    probability : (n,) array
-        Of a difference as large as the unit's, in the largest deviation or in all together.
+    ``predicted``: (n, p) arrays; ``siblings``: (n,), their number; ``deviation``: (n, p), estimate less prediction over
+    the standard uncertainty of the difference; ``probability``: (n,), of a difference as large as the unit's.
     """
 
     predicted: Prediction
-    siblings: NDArray[np.intp]
+    siblings: Places
     deviation: Values
     probability: Values
 
@@ -74,8 +67,7 @@ class LotPrior:
         return self.probability < LEVEL
 
 
-@dataclass(frozen=True)
-class WithPrior:
+class WithPrior(NamedTuple):
     """An estimate with its prior: values (p,), and what the readings and the lot contribute to its covariance.
 
     ``lot_freedom``: (p,), degrees of freedom of the lot's part; ``share``: (p,), of the prior in each value.
@@ -98,7 +90,7 @@ def lot_priors(x: Values, own: Values, freedom: Values, able: Mask, numbers: tup
     own : (n, p, p) array
         A_i; the degrees of freedom of its diagonals are ``freedom``, (n, p).
     able : (n,) array
-        Which units may be siblings.
+        Whether a unit may be a sibling.
     numbers : (n,) and (p,) arrays
         Of the device of each unit: of several calibrations of a device the first counts, and none for the others.
         Of the kind of each parameter: the tau of one kind are alike.
@@ -107,7 +99,7 @@ def lot_priors(x: Values, own: Values, freedom: Values, able: Mask, numbers: tup
     _, first = np.unique(np.where(able, device, -1), return_index=True)
     able = able & np.isin(np.arange(len(x)), first)
     away = np.abs(x - np.median(x[able], axis=0))
-    near = able & np.all(away <= FAR * ROBUST * np.median(away[able], axis=0), axis=1)
+    near = able & np.all(away <= FAR_AT_FIRST * ROBUST * np.median(away[able], axis=0), axis=1)
     siblings = near if near.sum() > FEWEST else able
     for _ in range(ROUNDS):
         of_device = np.full(int(device.max()) + 1, -1)
@@ -116,7 +108,7 @@ def lot_priors(x: Values, own: Values, freedom: Values, able: Mask, numbers: tup
         predicted = _predicted(x, np.diagonal(own, axis1=1, axis2=2), siblings, itself, kind)
         z, probability = _tested(x, own, freedom, predicted)
         found = LotPrior(predicted, siblings.sum() - (itself >= 0), z, probability)
-        again = able & ~found.outlier
+        again = able & (probability >= FAR_LEVEL)
         if np.array_equal(again, siblings) or again.sum() <= FEWEST:
             break
         siblings = again

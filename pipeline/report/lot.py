@@ -8,7 +8,7 @@ the recording, the mounting and the table have no prior. The estimate is that of
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -38,14 +38,13 @@ NONE = np.empty(0)
 DOUBTFUL = ("reference_in_doubt", "missing_effect", "unexplained")  # verdicts: the uncertainty does not hold the error
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """What the prior of a lot needs of a sensor of a unit."""
+class Estimate(NamedTuple):
+    """What the prior of a lot needs of a sensor of a unit; units with the same ``comparable`` may be siblings."""
 
     unit: str
     sensor: str
     lot: str
-    comparable: str  # equal for units that may be siblings
+    comparable: str
     device: str
     refused: str | None
     values: Values
@@ -53,6 +52,7 @@ class Estimate:
     freedom: Values
     bench: Values
     kind: NDArray[np.intp]
+    names: list[str]
     known: Mask  # the sensor's own parameters, of a stated uncertainty
 
 
@@ -64,7 +64,7 @@ class Prior(NamedTuple):
     refused: str | None = None
     outlier: bool = False
     probability: float | None = None
-    deviation: Values = NONE  # of the parameters that are known
+    worst: str = ""  # what an outlier differs in most
     predicted: Prediction = Prediction(NONE, NONE, NONE)
     known: Mask = NONE.astype(bool)
     bench: Values = NONE  # mean standard uncertainty of the siblings by the bench
@@ -75,12 +75,9 @@ def estimates(row: Mapping[str, Any], calibration: JSON, diagnosis: JSON) -> lis
 
     ``row``: of ``units.csv``; ``calibration``, ``diagnosis``: as published.
     """
-    found = []
-    name, lot = calibration["sensor"], row.get("lot")
-    for sensor in SENSORS:
+    found, lot = [], row.get("lot")
+    for sensor in [s for s in SENSORS if calibration[s]]:
         part = calibration[sensor]
-        if not part:
-            continue
         fit = SensorCalibration.from_json(sensor, part)
         own, bench = covariances(fit, part)
         share = np.diag(own) / np.maximum(np.diag(own + bench), 1e-300)
@@ -94,7 +91,7 @@ def estimates(row: Mapping[str, Any], calibration: JSON, diagnosis: JSON) -> lis
             Estimate(
                 unit=calibration["unit"],
                 sensor=sensor,
-                lot=f"{name}, lot {lot}" if lot else name,
+                lot=calibration["sensor"] + (f", lot {lot}" if lot else ""),
                 comparable=json.dumps([*same, (calibration.get("log") or {}).get("axis_map"), fit.parameter_names()]),
                 device=str(row.get("serial") or x.tobytes()),  # one recording in two units is one device
                 refused=refused,
@@ -103,6 +100,7 @@ def estimates(row: Mapping[str, Any], calibration: JSON, diagnosis: JSON) -> lis
                 freedom=fit.effective_freedom() * share**2,  # Welch and Satterthwaite: that of the readings alone
                 bench=np.sqrt(np.diag(bench)),
                 kind=kinds_of(fit),
+                names=fit.parameter_names(),
                 known=np.array(mine) & (np.diag(own) > 0.0),
             )
         )
@@ -147,14 +145,18 @@ def _priors(kind: list[Estimate], kinds: int) -> list[Prior]:
 
 
 def _prior(estimate: Estimate, lots: LotPrior, i: int, known: Mask, bench: Values) -> Prior:
-    siblings, p, refused = int(lots.siblings[i]), float(lots.probability[i]), estimate.refused
+    siblings, p, refused, worst = int(lots.siblings[i]), float(lots.probability[i]), estimate.refused, ""
     outlier = not refused and bool(lots.outlier[i])
     if outlier:
+        most = int(np.argmax(np.abs(lots.deviation[i])))
+        worst = (
+            f"{plain(estimate.names[np.flatnonzero(known)[most]])} by {number(abs(float(lots.deviation[i, most])), 2)}"
+        )
         refused = f"it differs from its {siblings} siblings (p = {number(p, 2)})"
     elif not refused and siblings < FEWEST:
         refused = f"without outliers {siblings} siblings are left, {FEWEST} or more are needed"
     predicted = Prediction(*(values[i] for values in lots.predicted))
-    return Prior(estimate.lot, siblings, refused, outlier, p, lots.deviation[i], predicted, known, bench)
+    return Prior(estimate.lot, siblings, refused, outlier, p, worst, predicted, known, bench)
 
 
 def calibration_with_prior(calibration: JSON, priors: Mapping[str, Prior]) -> JSON | None:
@@ -203,18 +205,11 @@ def _sensor(sensor: str, part: JSON, prior: Prior) -> tuple[JSON, JSON]:
 
 def with_card(page: str, calibration: JSON, document: JSON | None, priors: Mapping[str, Prior]) -> str:
     """Return a unit's page with the card on its prior, before the section on its runs."""
-    sensors = []
-    for sensor, prior in priors.items():
-        shown: JSON = {"name": sensor, "prior": prior, "rows": []}
-        if document and not prior.refused:
-            added = document["lot_prior"][sensor]
-            lot = zip(*(added[key] for key in ("parameters", "mean", "standard_deviation", "share")), strict=True)
-            both = [{p.name: p for p in fitted_parameters(of[sensor])} for of in (calibration, document)]
-            shown["rows"] = [(*(of[name] for of in both), *rest) for name, *rest in lot]
-        elif prior.outlier:
-            names = np.array(calibration[sensor]["covariance"]["parameters"])[prior.known]
-            worst = int(np.argmax(np.abs(prior.deviation)))
-            shown["worst"] = f"{plain(names[worst])} by {number(abs(float(prior.deviation[worst])))}"
-        sensors.append(shown)
-    section = template("lot.html").render(unit=calibration["unit"], document=document, sensors=sensors)
+    rows: dict[str, list[Any]] = {}
+    found = document or {"lot_prior": {}}
+    for sensor, added in found["lot_prior"].items():
+        both = [{p.name: p for p in fitted_parameters(of[sensor])} for of in (calibration, found)]
+        shown = (added.get(key, []) for key in ("parameters", "mean", "standard_deviation", "share"))
+        rows[sensor] = [(*(of[name] for of in both), *rest) for name, *rest in zip(*shown, strict=True)]
+    section = template("lot.html").render(unit=calibration["unit"], document=document, priors=priors, rows=rows)
     return page.replace(MARK, section + MARK, 1)
