@@ -7,6 +7,7 @@ import os
 
 for _threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_threads, "1")  # before numpy is imported
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # programs that tests start are compiled once, as installed ones are
 
 import pytest  # noqa: E402
 from hypothesis import HealthCheck, settings  # noqa: E402
