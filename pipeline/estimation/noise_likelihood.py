@@ -138,7 +138,7 @@ class Fits:
         """Return some of the fits."""
         return Fits(*(getattr(self, name)[index] for name in NAMES))
 
-    def replace(self, index: Integers, others: Fits) -> None:
+    def replace(self, index: Integers | Mask, others: Fits) -> None:
         """Put other fits in the place of some."""
         for name in NAMES[3:]:
             getattr(self, name)[index] = getattr(others, name)
@@ -279,32 +279,35 @@ def maximised(spectrum: Spectrum, trials: Sequence[Trial]) -> Fits:
     low = np.log(spectrum.interval)
     high = max(np.log(LONGEST_TIME * spectrum.length), low + 1e-6)
     bounds = np.repeat([[LOG_LEAST, low], [np.inf, high]], terms, axis=1)
-    best = _evaluated(spectrum, axis, kinds, columns, start)
-    damping, running = np.full(len(kinds), 1e-2), np.arange(len(kinds))
+    now = best = _evaluated(spectrum, axis, kinds, columns, start)
+    damping, running = np.full(len(kinds), 1e-2), np.arange(len(kinds))  # those of ``now``
     diagonal = np.arange(2 * terms)
     for _ in range(ITERATIONS):
-        now = best if len(running) == len(kinds) else best.rows(running)
         gradient = 0.5 * np.sum(now.slopes * (spectrum.count - now.power / now.total)[:, None, :], axis=2)
         pushed = np.where(gradient > 0.0, now.parameters <= bounds[0], now.parameters >= bounds[1])
-        here = free[running] & ~pushed  # a parameter that is pushed against its bound stays there
+        here = free & ~pushed  # a parameter that is pushed against its bound stays there
         information = 0.5 * (now.slopes * spectrum.count) @ now.slopes.transpose(0, 2, 1)
         information *= here[:, :, None] & here[:, None, :]
         own = information[:, diagonal, diagonal]
-        information[:, diagonal, diagonal] += np.where(here, damping[running, None] * own + 1e-9, 1.0)
+        information[:, diagonal, diagonal] += np.where(here, damping[:, None] * own + 1e-9, 1.0)
         gradient = np.where(here, gradient, 0.0)
         step = np.clip(-np.linalg.solve(information, gradient[:, :, None])[:, :, 0], *STEPS)
         tried = np.where(here, np.clip(now.parameters + step, *bounds), now.parameters)
         new = _evaluated(spectrum, now.axis, now.kinds, now.columns, tried)
         gain = now.deviance - new.deviance
         better = gain > 0
-        if better.all() and now is best:
-            best = new
+        if better.all():
+            now = new
         else:
-            best.replace(running[better], new.rows(better))
-        damping[running] *= np.where(better, 0.2, 8.0)
+            now.replace(better, new.rows(better))
+        damping *= np.where(better, 0.2, 8.0)
         promised = -np.sum(gradient * step, axis=1)
-        slow = better & (gain < PRECISE) & (damping[running] < 1.0)
-        running = running[(promised > PRECISE) & ~slow & (damping[running] < LARGEST_DAMPING)]
-        if not running.size:
-            break
+        slow = better & (gain < PRECISE) & (damping < 1.0)
+        going = (promised > PRECISE) & ~slow & (damping < LARGEST_DAMPING)
+        if not going.all():
+            best.replace(running[~going], now.rows(~going))
+            running, now, free, damping = running[going], now.rows(going), free[going], damping[going]
+            if not running.size:
+                return best
+    best.replace(running, now)
     return best
