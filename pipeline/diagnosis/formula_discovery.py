@@ -37,16 +37,12 @@ from pipeline.model.formula import SIGNALS, parse
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.diagnosis.functional_form_search import Scored
     from pipeline.estimation.generalized_least_squares import Fit
     from pipeline.estimation.observations import Observations
     from pipeline.estimation.selection import Selection
     from pipeline.model.effects.base import Effect
-    from pipeline.records import Noise, SensorCalibration
-
-    Values = NDArray[np.float64]
+    from pipeline.records import Noise, SensorCalibration, Values
 
 LEAST_STABLE = 0.5  # share of resamples, a convention: below it, other formulas together are the best more often
 NEEDED = {"temperature": "bias_temperature"}  # covariate: the effect that is observable where the covariate varies

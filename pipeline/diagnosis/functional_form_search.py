@@ -28,14 +28,11 @@ from pipeline.model.formula import parse
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.diagnosis.functional_forms import Factor
     from pipeline.diagnosis.residual_regression import Gain
     from pipeline.estimation.gauss_markov import Setting
     from pipeline.estimation.selection import Selection
-
-    Values = NDArray[np.float64]
+    from pipeline.records import Values
 
 PRICE = 2.0 * float(np.log(10.0))  # of a choice: log prior of one of about ten signals, functions or powers
 CLEARLY = 10.0  # score of a form, and of a further term: "very strong" (Raftery, Sociological Methodology 25, 1995)

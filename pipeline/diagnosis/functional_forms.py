@@ -25,14 +25,10 @@ from pipeline.model.formula import parse
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.diagnosis.residual_regression import Curves
     from pipeline.estimation.observations import Observations
     from pipeline.model.formula import Formula
-    from pipeline.records import Motion
-
-    Values = NDArray[np.float64]
+    from pipeline.records import Motion, Values
 
 CYCLES = range(1, 13)
 POWERS = range(1, 6)

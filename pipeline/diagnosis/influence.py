@@ -43,8 +43,8 @@ if TYPE_CHECKING:
     from pipeline.estimation.design import Design, Term
     from pipeline.estimation.generalized_least_squares import Fit
     from pipeline.estimation.selection import Selection
+    from pipeline.records import Values
 
-    Values = NDArray[np.float64]
     JSON = dict[str, Any]
     from pipeline.estimation.observations import Observations
 

@@ -235,15 +235,13 @@ def _residual_noise(
     size = np.where(design.sizes()[:-1] > 0, design.sizes()[:-1], 1.0)
     products, logarithms = design.products(settings)
     gram, rhs = products[:, :-1, :-1] / np.outer(size, size), products[:, :-1, -1] / size
-    unseen = np.einsum("gpp->gp", gram) <= RANK  # an axis on which a selected effect adds nothing
-    gram = gram + unseen[:, :, None] * np.eye(gram.shape[-1])
+    gram += (np.einsum("gpp->gp", gram) <= RANK)[:, :, None] * np.eye(len(size))  # columns of zeros
     steps = np.linalg.solve(gram, rhs[:, :, None])[:, :, 0]
     within = float(np.sum(observations.scatter / design.scale**2))
     rss = np.maximum(products[:, -1, -1] - np.sum(steps * rhs, axis=1), 0.0) + within
     free = max(3.0 * observations.samples - design.count, 1.0)
     variance = np.maximum(rss / free, np.finfo(float).tiny)[:, None]
-    logarithms = logarithms + np.linalg.slogdet(gram)[1]
-    found = ResidualNoise.of(observations.blocks, settings, logarithms, variance, free, observations.weight)
+    found = ResidualNoise.of(blocks, settings, logarithms + np.linalg.slogdet(gram)[1], variance, free, weight)
     return replace(found, white_variance=found.white_variance * design.scale**2)
 
 

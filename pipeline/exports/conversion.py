@@ -26,12 +26,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
     from pipeline.exports.reading import FoundCalibration
-    from pipeline.records import SensorCalibration
-
-    Values = NDArray[np.float64]
+    from pipeline.records import SensorCalibration, Values
 
 JSON = dict[str, Any]
 KEPT = 1e-9  # relative to 1 and in g or deg/s: what differs less is kept

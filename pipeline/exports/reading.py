@@ -31,11 +31,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
     from pipeline.exports import Format
-
-    Values = NDArray[np.float64]
+    from pipeline.records import Values
 
 CALIBRATION = "calibration.json"  # the name of the product's own format among the formats
 LARGEST_BYTES = 50_000_000  # of a file to read; a calibration has some kilobytes, a vehicle's parameters 100

@@ -31,10 +31,7 @@ from pipeline.records import SENSORS
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
-
-    Values = NDArray[np.float64]
-    from pipeline.records import SensorCalibration
+    from pipeline.records import SensorCalibration, Values
 
 JSON = dict[str, Any]
 FACTORS = {"g": 1.0, "m/s^2": STANDARD_GRAVITY, "deg/s": 1.0, "rad/s": float(np.pi / 180.0)}

@@ -23,9 +23,7 @@ from pipeline.model.effects.base import REFERENCE_TEMPERATURE
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from numpy.typing import NDArray
-
-    Values = NDArray[np.float64]
+    from pipeline.records import Values
 
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 ARRAY = re.compile(r"(\w+)\s*(?:\[\d*\]\s*)*=\s*(\{[^;]*\})\s*;")

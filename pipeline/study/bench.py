@@ -52,12 +52,8 @@ from pipeline.study.cases import COURSES, OF_TEMPERATURE
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
-
-    from pipeline.records import Recording
+    from pipeline.records import Recording, Values
     from pipeline.study.cases import Case
-
-    Values = NDArray[np.float64]
 
 INTERVAL_S = 0.12  # the default of ``UnitDescription``
 PERFECT = {"angle_accuracy_deg": 0.0, "rate_error": (0.0, 0.0, 0.0), "direction_deg": [[0.0, 0.0]] * 3}

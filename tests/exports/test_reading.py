@@ -12,7 +12,7 @@ from stage_files import export_all
 from test_consumer_formats import BIAS, COUNTS, MATRIX, SCALED, SENSITIVE, SETTINGS, WARM, WARMER
 
 from pipeline import load_calibration
-from pipeline.commands.convert import main
+from pipeline.commands.explain import convert as main
 from pipeline.errors import ConfigurationError, InputError
 from pipeline.exports import formats
 from pipeline.exports.conversion import SAMPLE, explain_calibration
