@@ -5,11 +5,12 @@ before, so that a fleet's history grows with what changes. A run that changes no
 
 A unit's state is::
 
-    {"status", "error", "config_sha256", "recordings", "overrides": {key: value},
-     "accelerometer": {"effects", "error", "floor", "verdict", "selected"} or null, "gyroscope": likewise}
+    {"status", "error", "config_sha256", "config": {section: digest}, "recordings": {file: digest},
+     "overrides": {key: value}, "accelerometer": {"effects", "error", "floor", "verdict", "selected"} or null,
+     "gyroscope": likewise}
 
-where ``error`` is the held-out rms error of the last step and ``floor`` its noise floor, in g or deg/s, and
-``recordings`` is a digest of the digests of the files that were read.
+where ``error`` is the held-out rms error of the last step and ``floor`` its noise floor, in g or deg/s. The values of a
+section stand once, under its digest, in ``sections`` of the first entry that has it.
 """
 
 from __future__ import annotations
@@ -29,6 +30,10 @@ if TYPE_CHECKING:
 
 JSON = dict[str, Any]
 FOLDER = "history"
+VALUES = "values"  # of the sections of a state that was read, by key
+DIGITS = 16  # of a digest
+LONGEST = 60  # letters of a value; a longer one ends in a digest
+NAMED = 4  # changed values and recordings
 SENSORS = ("accelerometer", "gyroscope")
 
 
@@ -55,16 +60,39 @@ class Change:
         return [*told, *self.settings, *self.other]
 
 
+def digest(value: Any) -> str:  # noqa: ANN401  (any JSON value)
+    """Return a digest of a value."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:DIGITS]
+
+
+def flat(value: Any, above: str = "") -> dict[str, str]:  # noqa: ANN401  (any JSON value)
+    """Return the values of a section by dotted key, as texts."""
+    if isinstance(value, dict) and (value or not above):
+        return {
+            k: v for key, below in value.items() for k, v in flat(below, f"{above}.{key}" if above else key).items()
+        }
+    text = value if isinstance(value, str) else json.dumps(value)
+    return {above: text if len(text) <= LONGEST else f"{text[: LONGEST - DIGITS]}... ({digest(value)})"}
+
+
 def unit_state(
-    calibration: JSON, validation: JSON | None, diagnosis: JSON | None, overrides: Mapping[str, str]
+    calibration: JSON,
+    validation: JSON | None,
+    diagnosis: JSON | None,
+    overrides: Mapping[str, str],
+    config: Mapping[str, str] | None = None,
 ) -> JSON:
-    """Return the state of a unit, from its published documents and the overrides of its settings (key to value)."""
-    files = "".join(str(f.get("sha256")) for f in calibration.get("inputs") or [])
+    """Return the state of a unit.
+
+    It follows from its published documents, the overrides of its settings (key to value) and the digest of each section
+    of its configuration.
+    """
     state = {
         "status": calibration.get("status"),
         "error": (calibration.get("error") or {}).get("code"),
         "config_sha256": calibration.get("config_sha256"),
-        "recordings": hashlib.sha256(files.encode()).hexdigest()[:16] if files else None,
+        "config": dict(config or {}),
+        "recordings": {f["file"]: str(f.get("sha256"))[:DIGITS] for f in calibration.get("inputs") or []},
         "overrides": dict(overrides),
     }
     for sensor in SENSORS:
@@ -96,19 +124,36 @@ def read_history(results: Path) -> list[JSON]:
     return sorted(entries, key=lambda e: int(e["run"]))
 
 
-def record(results: Path, units: Mapping[str, JSON], settings: Mapping[str, Any]) -> list[JSON]:
+def record(
+    results: Path,
+    units: Mapping[str, JSON],
+    settings: Mapping[str, Any],
+    sections: Mapping[str, Mapping[str, str]] | None = None,
+) -> list[JSON]:
     """Append the states of the units (name to state) that differ from the last ones; return all entries.
 
-    ``results`` are those of the campaign, ``settings`` those of the run. Raises ``InputError`` as ``read_history``.
+    ``results`` are those of the campaign, ``settings`` those of the run, ``sections`` the values behind each digest.
+    Raises ``InputError`` as ``read_history``.
     """
     entries = read_history(results)
-    before = {unit: states[-1][1] for unit, states in of_units(entries).items()}
+    last = {unit: states[-1][1] for unit, states in of_units(entries).items()}
+    before = {unit: {k: v for k, v in state.items() if k != VALUES} for unit, state in last.items()}
     changed = {unit: state for unit, state in units.items() if before.get(unit) != state}
     gone = [unit for unit, state in before.items() if unit not in units and state]
     if changed or gone:
         number = entries[-1]["run"] + 1 if entries else 1
         now = datetime.now(UTC).isoformat(timespec="seconds")
-        entry = {"run": number, "time": now, "settings": dict(settings), "units": changed, "gone": gone}
+        told = {key for entry in entries for key in entry.get("sections") or {}}
+        used = {key for state in changed.values() for key in (state.get("config") or {}).values()} - told
+        new = {key: dict(values) for key, values in (sections or {}).items() if key in used}
+        entry = {
+            "run": number,
+            "time": now,
+            "settings": dict(settings),
+            "units": changed,
+            "gone": gone,
+            "sections": new,
+        }
         write_json(results / FOLDER / f"{number:04d}.json", entry)
         entries.append(entry)
     return entries
@@ -117,9 +162,12 @@ def record(results: Path, units: Mapping[str, JSON], settings: Mapping[str, Any]
 def of_units(entries: Sequence[JSON]) -> dict[str, list[tuple[int, JSON]]]:
     """Return the states of each unit with the run that brought them; ``{}`` stands for a unit that has gone."""
     found: dict[str, list[tuple[int, JSON]]] = {}
+    sections: JSON = {}
     for entry in entries:
+        sections |= entry.get("sections") or {}
         for unit, state in entry["units"].items():
-            found.setdefault(unit, []).append((entry["run"], state))
+            values = {name: sections.get(key, {}) for name, key in (state.get("config") or {}).items()}
+            found.setdefault(unit, []).append((entry["run"], state | {VALUES: values}))
         for unit in entry.get("gone") or []:
             found.setdefault(unit, []).append((entry["run"], {}))
     return found
@@ -143,13 +191,38 @@ def difference(before: JSON, after: JSON) -> Change:
     elif before and calibrated == [False, True]:
         other.append("calibrated again")
     if all(calibrated) and before.get("recordings") != after.get("recordings"):
-        other.append("other recordings")
+        other.append(_named("other recordings", _changed_recordings(before, after)))
     moved = before.get("config_sha256") != after.get("config_sha256")
-    if all(calibrated) and moved and not (settings or any(added.values()) or any(removed.values())):
-        other.append("other values in the files of the configuration")
+    values = [v for v in _changed_values(before, after) if v.partition(":")[0] not in keys]
+    if all(calibrated) and moved and (values or not (settings or any(added.values()) or any(removed.values()))):
+        other.append(_named("other values in the files of the configuration", values))
     elif before and not (settings or other or any(added.values()) or any(removed.values())):
         other.append("computed again")
     return Change(added, removed, settings, other)
+
+
+def _named(what: str, names: Sequence[str]) -> str:
+    more = [f"and {len(names) - NAMED} more"] if len(names) > NAMED else []
+    return f"{what}: {', '.join([*names[:NAMED], *more])}" if names else what
+
+
+def _changed_recordings(before: JSON, after: JSON) -> list[str]:
+    """Return the files whose content differs; nothing where a state of an older version does not name them."""
+    old, new = before.get("recordings"), after.get("recordings")
+    if not (isinstance(old, dict) and isinstance(new, dict)):
+        return []
+    return [file for file in dict.fromkeys([*old, *new]) if old.get(file) != new.get(file)]
+
+
+def _changed_values(before: JSON, after: JSON) -> list[str]:
+    """Return the values of the configuration that differ, but for effects, each as ``key: before -> after``."""
+    old, new = (
+        {f"{s}.{k}": v for s, part in (state.get(VALUES) or {}).items() for k, v in part.items()}
+        for state in (before, after)
+    )
+    keys = [k for k in dict.fromkeys([*old, *new]) if old.get(k) != new.get(k)] if old and new else []
+    arrow = "\N{RIGHTWARDS ARROW}"
+    return [f"{k}: {old.get(k, 'absent')} {arrow} {new.get(k, 'absent')}" for k in keys if not k.startswith("effects.")]
 
 
 def dropped(entries: Sequence[JSON]) -> dict[tuple[str, int], list[str]]:

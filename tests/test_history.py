@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from pipeline.errors import InputError
-from pipeline.history import difference, dropped, of_units, read_history, record, unit_state
+from pipeline.history import difference, digest, dropped, flat, of_units, read_history, record, unit_state
 from pipeline.outcome import outcome
 
 SETTINGS = {"campaign": "bench"}
@@ -18,7 +18,7 @@ def state(effects: list[str], error: float, **overrides: str) -> dict[str, Any]:
     calibration = {
         "status": "ok",
         "config_sha256": json.dumps([effects, overrides]),
-        "inputs": [{"sha256": "ab"}],
+        "inputs": [{"file": "raw/U/gyro_x.csv", "sha256": "ab"}],
         "accelerometer": None,
         "gyroscope": {"effects": [{"name": name} for name in effects]},
     }
@@ -46,7 +46,10 @@ def test_what_differs_is_told_in_words() -> None:
     before, after = state(["a"], 0.1, **{"filter.order": "1"}), state(["a", "b"], 0.1, **{"filter.order": "2"})
     assert difference(before, after).words("gyroscope") == ["+ b", "filter.order: 1 → 2"]
     assert difference(after, before).words() == ["− gyroscope.b", "filter.order: 2 → 1"]
-    assert difference(before, before | {"recordings": "cd"}).words() == ["other recordings"]
+    assert difference(before, before | {"recordings": "cd"}).words() == ["other recordings"]  # of an older version
+    assert difference(before, before | {"recordings": {"raw/U/gyro_x.csv": "cd"}}).words() == [
+        "other recordings: raw/U/gyro_x.csv"
+    ]
     failed = unit_state({"status": "failed", "error": {"code": "bad_input"}}, None, None, {"filter.order": "1"})
     assert difference(before, failed).words() == ["not calibrated: bad_input"]
     assert difference(failed, before).words()[-1] == "calibrated again"
@@ -57,6 +60,19 @@ def test_what_differs_is_told_in_words() -> None:
         "other recordings",
         "other values in the files of the configuration",
     ]
+
+
+def test_a_value_that_a_file_changes_is_named(tmp_path: Path) -> None:
+    tables = [{"name": "bench", "seat_deg": seat, "zeros": [0.0] * 40} for seat in (0.5, 2.0)]
+    for table in tables:
+        found = state([], 0.1) | {"config": {"table": digest(table)}, "config_sha256": digest(table)}
+        record(tmp_path, {"U1": found}, SETTINGS, {digest(table): flat(table), "other": {}})
+    entries = read_history(tmp_path)
+    assert [list(e["sections"]) for e in entries] == [[digest(t)] for t in tables]
+    (_, before), (_, after) = of_units(entries)["U1"]
+    words = ["other values in the files of the configuration: table.seat_deg: 0.5 → 2.0"]
+    assert difference(before, after).words() == words
+    assert record(tmp_path, {"U1": found}, SETTINGS) == entries
 
 
 def test_a_run_that_drops_an_effect_is_told_with_what_it_cost_and_how_to_keep_it(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from pipeline.config.schema import OF_BENCH
 from pipeline.config.user_effects import effects_for
 from pipeline.files import CONFIGS
+from pipeline.history import digest, flat
 from pipeline.io.files import recording_files
 
 if TYPE_CHECKING:
@@ -210,12 +211,13 @@ def in_common(settings: Mapping[str, dict[str, Any]]) -> tuple[dict[str, Any], d
 
 def _of_gather(campaign: Campaign) -> dict[str, Any]:
     exported = campaign.combine == "lot"  # gather writes the exports with the prior
-    common, own = in_common(
-        {
-            name: select_settings(unit.config, "export") if exported else {"sensor": _limits(unit.config["sensor"])}
-            for name, unit in campaign.units.items()
-        }
-    )
+    configs, sections = _sections(campaign)
+    settings = {
+        name: {"config": configs[name]}
+        | (select_settings(unit.config, "export") if exported else {"sensor": _limits(unit.config["sensor"])})
+        for name, unit in campaign.units.items()
+    }
+    common, own = in_common(settings)
     compared = {u for c in campaign.compare for g in c["groups"] for u in g["units"]}
     return {
         "campaign": campaign.name,
@@ -223,6 +225,7 @@ def _of_gather(campaign: Campaign) -> dict[str, Any]:
         "rows": [unit.row for unit in campaign.units.values()],
         "overrides": {name: unit.overrides for name, unit in campaign.units.items() if unit.overrides},
         "run": campaign.run_settings(),
+        "sections": sections,
         "compare": campaign.compare,
         "page": campaign.page,
         "combine": campaign.combine,
@@ -232,6 +235,24 @@ def _of_gather(campaign: Campaign) -> dict[str, Any]:
         "units": own,
         **(effects_for("export", "", [unit.config for unit in campaign.units.values()]) if exported else {}),
     }
+
+
+def _sections(campaign: Campaign) -> tuple[dict[str, dict[str, str]], dict[str, dict[str, str]]]:
+    """Return the digest of each section of each unit's configuration, and the values behind each digest."""
+    known: dict[int, str] = {}  # units share the sections that no override of theirs changes
+    values: dict[str, dict[str, str]] = {}
+    found: dict[str, dict[str, str]] = {}
+    for name, unit in campaign.units.items():
+        found[name] = {}
+        for section, content in unit.config.items():
+            if section in ("unit", "certificate"):
+                continue
+            own = {k: v for k, v in content.items() if k != "folder"} if section == "procedure" else content
+            if section == "procedure" or id(content) not in known:
+                known[id(content)] = digest(own)
+                values.setdefault(known[id(content)], flat(own))
+            found[name][section] = known[id(content)]
+    return found, values
 
 
 def _limits(sensor: Mapping[str, Any]) -> dict[str, Any]:

@@ -164,7 +164,7 @@ def _gathered(
     return Gathered(
         summary_row(unit, calibration, validation, diagnosis, row),
         failure,
-        unit_state(calibration, validation, diagnosis, job.run["overrides"].get(unit, {})),
+        unit_state(calibration, validation, diagnosis, job.run["overrides"].get(unit, {}), job.units[unit]["config"]),
         [{key: file[key] for key in ("file", "sha256")} for file in calibration.get("inputs") or []],
         calibration if job.run["combine"] == "serial" else None,
     )
@@ -203,7 +203,7 @@ def _write_campaign(job: Job, units: Mapping[str, Gathered], new: Path, lots: li
     write_parameters(new / "parameters.parquet", rows, fitted)
     write_json(new / "fleet.json", statistics)
     figures = [figure for u in units.values() for figure in u.figures]
-    entries = record(job.results, {name: u.state for name, u in units.items()}, run["run"])
+    entries = record(job.results, {name: u.state for name, u in units.items()}, run["run"], run["sections"])
     publish_histories(new, entries, units)
     page = render(
         run["campaign"],
