@@ -1,8 +1,9 @@
 """All recordings of one unit: files found, read, checked, turned into body axes, their clocks compared.
 
 Times of a unit count from power-on. Where the times of two files overlap they cannot be of one clock (each file starts
-at 0), and the time between the recordings is unknown. Times since 1970 are counted from the unit's first sample
-instead, as a double resolves 1.7*10^9 s to 2*10^-7 s only, too coarse to differentiate.
+at 0), and the time between the recordings is unknown, as where some count from 1970 and others from power-on. Times
+since 1970 are counted from the first sample instead, as a double resolves 1.7*10^9 s to 2*10^-7 s only, too coarse to
+differentiate.
 """
 
 from __future__ import annotations
@@ -192,11 +193,16 @@ def _check_different(recordings: Sequence[Recording]) -> None:
 
 def _compare_clocks(recordings: list[Recording]) -> list[Recording]:
     """Count times from power-on where they count from 1970, and say whether the recordings share a clock."""
-    if recordings and all(r.time_ns[0] > SINCE_1970_NS for r in recordings):
-        origin = min(int(r.time_ns[0]) for r in recordings)
-        detail = f"times count from the unit's first sample, {origin} ns in the clock of the files"
-        note = Note("N-EPOCH", len(recordings), 0, 0, detail)
-        recordings = [replace(r, time_ns=r.time_ns - origin, notes=(*r.notes, note)) for r in recordings]
+    since_1970 = [r for r in recordings if r.time_ns[0] > SINCE_1970_NS]
+    if since_1970:
+        origin = min(int(r.time_ns[0]) for r in since_1970)
+        all_of_unit = len(since_1970) == len(recordings)
+        first = "the unit's first sample" if all_of_unit else "the first sample since 1970 (other files: another clock)"
+        detail = f"times count from {first}, {origin} ns in the clock of the files"
+        note = Note("N-EPOCH", len(since_1970), 0, 0, detail)
+        moved = {r.name: replace(r, time_ns=r.time_ns - origin, notes=(*r.notes, note)) for r in since_1970}
+        recordings = [moved.get(r.name, r) for r in recordings]
     spans = sorted((int(r.time_ns[0]), int(r.time_ns[-1])) for r in recordings)
     overlap = any(start <= end for (_, end), (start, _) in itertools.pairwise(spans))
-    return [replace(r, clock_shared=False) for r in recordings] if overlap else recordings
+    apart = overlap or 0 < len(since_1970) < len(recordings)
+    return [replace(r, clock_shared=False) for r in recordings] if apart else recordings

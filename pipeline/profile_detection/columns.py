@@ -306,13 +306,14 @@ def find_layout(data: bytes, path: str) -> TextLayout:
     names, skip, comment = _names(lines, start, separator)
     kept = lines[start : start + MOST_ROWS]
     rows = [cells for cells in _cells(kept, separator) if len(cells) == len(names)]
-    if width < FEWEST_COLUMNS or len(rows) < FEWEST_ROWS:
+    numbers = _numbers(rows, decimal)
+    if width < FEWEST_COLUMNS or len(rows) < FEWEST_ROWS or not numbers:
         first = " / ".join(lines[:3])[:150]
         raise IngestError(f"no table of numbers was found in it; it starts with {first!r}", path, code="no_table")
     stated = ((found, line.strip()) for line in lines[:start] if RATE_KEY.search(line) and (found := _rate_of(line)))
     rate_hz, rate_line = next(stated, (None, ""))
     return TextLayout(
-        path, separator, decimal, skip, names != _numbered(len(names)), comment, names, _numbers(rows, decimal),
+        path, separator, decimal, skip, names != _numbered(len(names)), comment, names, numbers,
         rate_hz, rate_line, len(kept) - len(rows),
     )  # fmt: skip
 

@@ -188,7 +188,7 @@ def test_a_campaigns_own_configs_are_options(tmp_path: Path) -> None:
 
 def test_a_campaign_whose_run_makes_the_recordings_reads_them_among_the_results(tmp_path: Path) -> None:
     directory = campaign(tmp_path, "unit\nA\n", "simulate: true\n")
-    with pytest.raises(ConfigurationError, match=r"needs simulation.yaml beside it"):
+    with pytest.raises(ConfigurationError, match=r"needs simulation.yaml in the same folder"):
         load(directory)
     (directory / "simulation.yaml").write_text("units: [{unit: A}]\n")
     loaded = load(directory, results=str(tmp_path / "out"))

@@ -132,6 +132,11 @@ def test_times_since_1970_count_from_the_first_sample(tmp_path: Path, canonical:
     assert (first.time_ns[0], second.time_ns[0]) == (0, 100 * 10**9)
     assert [n.code for n in first.notes] == ["N-EPOCH"]
     assert first.clock_shared
+    write_canonical_csv(tmp_path / "c.csv", make_recording(start_ns=2_000 * 10**9, seed=3, name="c"))
+    *_, last = mixed = read_recordings(procedure("a", "b", "c"), canonical, SENSOR, tmp_path)
+    assert [r.time_ns[0] for r in mixed] == [0, 100 * 10**9, 2_000 * 10**9]
+    assert [len(r.notes) for r in mixed] == [1, 1, 0]
+    assert not last.clock_shared  # 54 years lie between power-on and these files
 
 
 def test_units_are_converted(tmp_path: Path, canonical: dict[str, Any]) -> None:
