@@ -95,7 +95,8 @@ def _described(discovery: Discovery, case: Case) -> Findings:
         held_out = {"error_before": held[0], "error_after": held[-1], "floor": floor}
     hidden = not_observable(reported, case.configured)
     left = [fit.residual_rms**2 for fit in fits]
-    noise_square = None if noise is None else float(np.mean(noise.white**2 + noise.wander**2))
+    reference = observations.weakened.expected_square
+    noise_square = None if noise is None else float(np.mean(reference * noise.white**2 + noise.wander**2))
     least = left[-1] if noise_square is None else noise_square
     at_noise = not reported.names and left[0] < CLOSE * least
     excess = left[0] if at_noise else max(left[0] - least, left[0] - left[-1])
@@ -149,8 +150,8 @@ def _described(discovery: Discovery, case: Case) -> Findings:
         held_out=held or [None] * len(fits),
         hidden={**hidden, **alike_with_zeros(reported)},
         unknown=unknown,
-        over_noise=_over_noise(selection.base, case),
-        left_over_noise=_over_noise(selection.fit, case),
+        over_noise=_over_noise(selection.base, case, reference),
+        left_over_noise=_over_noise(selection.fit, case, reference),
         noises=[(setting.ratio, setting.time, score) for setting, score in hypotheses],
         white=float(np.sqrt(white_square)),
         expected_wander=None if noise is None else float(np.sqrt(np.mean(noise.wander**2))),
@@ -223,10 +224,10 @@ def _shares(selection: Selection, name: str) -> dict[str, float]:
     return selection.first.shares(selection.first.indices(name)[0], [], selection.alone[name].setting)
 
 
-def _over_noise(fit: Fit, case: Case) -> float | None:
-    """Return the rms residual of a fit over that of noise alone."""
+def _over_noise(fit: Fit, case: Case, reference: float) -> float | None:
+    """Return the rms residual of a fit over that of noise alone; ``reference``: ``Observations.expected_square``."""
     if case.noise is None:
         return None
     gain = max(float(r.filter.get("noise_gain", 1.0)) for r in case.recordings)
-    floor = float(np.sqrt(np.mean((gain * case.noise.white) ** 2 + case.noise.wander**2)))
+    floor = float(np.sqrt(np.mean(reference * (gain * case.noise.white) ** 2 + case.noise.wander**2)))
     return float(fit.residual_rms / floor) if floor > 0 else None

@@ -38,6 +38,10 @@ VERDICTS = {
     "left_by_method": "The model explains the {sensor}; approximations of method or filter cause errors above noise.",
 }
 
+PLUS_MINUS = (
+    "+- is two standard uncertainties by the noise of these recordings. In the calibration, the accuracies of the bench "
+    "are added, and each parameter has its coverage factor for 95 %."
+)
 GIVEN_DIFFERS = "The model explains the {sensor}; the given calibration is not that of these recordings."
 
 
@@ -52,6 +56,8 @@ def in_words(part: Mapping[str, Any] | None, sensor: str, most_values: int | Non
     entries = {entry["effect"]: entry for entry in part["ranking"]}
     for name in part["selected"]:
         lines += _selected(entries[name], sensor, most_values, with_form=bool(part.get("suggested_effect")))
+    if part["selected"]:
+        lines.append(PLUS_MINUS)
     lines += _unknown(part, sensor)
     lines += [_driven(entry) for entry in part.get("influence") or [] if entry["recordings"]]
     lines += _goodness(part.get("goodness_of_fit"))
@@ -78,8 +84,11 @@ def _verdict(part: Mapping[str, Any], sensor: str) -> str:
     ratio = part["residual_over_noise"]
     if ratio is None:
         return text
-    subject = "Without it, the residual" if part["verdict"] == "missing_effect" else "The residual"
-    return f"{text} {subject} is {ratio:.3g} times the noise."
+    size = f"is {ratio:.3g} times the noise"
+    if part["verdict"] != "missing_effect":
+        return f"{text} The residual {size}."
+    which = "this effect" if len(part["selected"]) == 1 else "these effects"
+    return f"{text} The residual of the fit, which does not contain {which}, {size}."
 
 
 def plain(name: str) -> str:
@@ -265,10 +274,17 @@ def next_experiment(verdict: str, ranking: Sequence[Mapping[str, Any]], found: F
     if not found.selected:
         return found.advice(verdict) or "none is needed: nothing that these recordings can show is missing"
     entries = {entry["effect"]: entry for entry in ranking}
-    name = next((n for n in found.selected if entries[n]["look_alikes"]), found.selected[0])
+    alike = {n: [a["effect"] for a in entries[n]["look_alikes"] if not _contains(a["effect"], n)] for n in found.selected}
+    name = next((n for n in found.selected if alike[n]), found.selected[0])
     experiment = _experiment(name, on_table=found.on_table)
-    others = listed([plain(a["effect"]) for a in entries[name]["look_alikes"][:2]], "or")
+    others = listed([plain(other) for other in alike[name][:2]], "or")
     return f"to {f'distinguish {plain(name)} from {others}' if others else f'confirm {plain(name)}'}: {experiment}"
+
+
+def _contains(other: str, name: str) -> bool:
+    """Return whether an effect is another one with more parameters: there is nothing to distinguish."""
+    known = catalogue().get(other)
+    return known is not None and name in known.contains
 
 
 def of_unknown(unknown: Sequence[Mapping[str, Any]]) -> str:

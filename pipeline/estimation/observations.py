@@ -110,6 +110,13 @@ class Observations:
         return float(sum(part.weight.sum() for part in self.parts))
 
     @cached_property
+    def expected_square(self) -> float:
+        """Mean square of the residual over that of white noise s: 1, and what a coarse encoder adds about one axis."""
+        parts = [part for part in self.parts if part.rounding is not None] if self.white > 0.0 else []
+        added = sum(float(np.sum(part.weight * part.rounding)) for part in parts) / (3.0 * self.white**2)
+        return 1.0 + added / self.samples
+
+    @cached_property
     def blocks(self) -> Blocks:
         """Short stretches of time in which the bias is taken as constant, new ones for each recording."""
         span = sum(float(np.ptp(part.motion.time)) for part in self.parts)
@@ -179,8 +186,7 @@ def _behind_encoder(part: Part, white: float) -> Part:
     """Return a part whose rows weigh ``1 / (1 + r^2 / s^2)`` as much: r is the noise of the rate, s of a sample."""
     if part.rounding is None or white <= 0.0:
         return part
-    weight = part.weight / (1.0 + part.rounding / white**2)
-    return replace(part, weight=weight, scatter=float(weight.sum() / part.weight.sum()) * part.scatter)
+    return replace(part, weight=part.weight / (1.0 + part.rounding / white**2))  # the scatter is that of rests
 
 
 def _lost_at_stops(part: Part, observations: Observations) -> Values:
@@ -252,10 +258,7 @@ def _part(sensor: str, recording: Recording, table: Mapping[str, Any]) -> Part |
     squares = (kept - np.repeat(means, rows.count.astype(int), axis=0)) ** 2
     by_angle = rate_by_angle(recording) if sensor == "gyroscope" and recording.axis is not None else None
     rounding = None if by_angle is None or not by_angle.noise.any() else rows.means(by_angle.noise**2)
-    known = np.ones(len(kept), bool)
-    if rounding is not None and (rounding == 0.0).any():  # the scatter at rest is that of the sensor alone
-        known = np.repeat(rounding == 0.0, rows.count.astype(int))
-    within = np.sum(squares[known], axis=0) * (len(kept) / np.count_nonzero(known))
+    within = np.sum(squares, axis=0)
     return Part(
         recording.name,
         recording.role,

@@ -313,7 +313,9 @@ def _axis(turn: Turn, tolerance: float) -> _Departure | None:
         listed = ", ".join(f"{b} {g:+.3g}" for b, g in zip(AXES, direction, strict=True))
         problem = f"in {name} the table is said to turn about {axis}, and {who} about {nearest[1]} ({listed})"
         bench = found_bench(fit, nearest[1]) if off <= tolerance else None
-        return _Departure(turn, "wrong_axis", problem, {"axis": nearest[1]}, bench)
+        as_before = replace(turn.stated, axis=nearest[1], up=usual_up(nearest[1]))
+        more = {} if bench is None else _differing(bench, as_before, tolerance)
+        return _Departure(turn, "wrong_axis", problem, {"axis": nearest[1], **more}, bench)
     if fit.turn_axis is not None and off > tolerance:
         problem = (
             f"in {name} gravity turns about an axis that is {off:.1f} deg off body {axis}; {tolerance:g} deg are "
@@ -348,12 +350,17 @@ def _face(turn: Turn, found: Bench, tolerance: _Tolerance) -> _Departure | None:
         f"{turn.name} is mounted otherwise than stated, which is {words(stated)}, to {allowed:.2g} deg "
         "(procedure.mounting_tolerance_deg)"
     )
+    return _Departure(turn, code, problem, _differing(found, stated, tolerance.angle_deg), found)
+
+
+def _differing(found: Bench, stated: Bench, tolerance: float) -> dict[str, str]:
+    """Return the settings in which the bench that is found differs from the stated one."""
     differing = {
         "up": (found.up != stated.up, found.up),
         "sense": (found.sense != stated.sense, f"{found.sense}"),
-        "zero_deg": (abs(found.zero_deg - stated.zero_deg) > tolerance.angle_deg, f"{found.zero_deg:.1f}"),
+        "zero_deg": (abs(found.zero_deg - stated.zero_deg) > tolerance, f"{found.zero_deg:.1f}"),
     }
-    return _Departure(turn, code, problem, {k: text for k, (differs, text) in differing.items() if differs}, found)
+    return {k: text for k, (differs, text) in differing.items() if differs}
 
 
 def _upright(turn: Turn) -> _Departure | None:

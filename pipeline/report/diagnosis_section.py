@@ -200,7 +200,7 @@ def added_variable(sensor: str, found: JSON) -> Figure | None:
     x_unit = _column_unit(best["unit"], unit)
     caption = (
         "Readings less what bias, matrix, other effects and bias wander explain, in bins with ±2 standard errors; the "
-        f"slope of the line is the parameter ({slopes}; ± covers 95 %)."
+        f"slope of the line is the parameter ({slopes}; ±: two standard uncertainties by the noise)."
     )
     return chart(
         Figure(f"{sensor}-added-variable", finding, caption, (("c5", "slope = parameter"),)),

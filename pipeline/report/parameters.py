@@ -16,6 +16,7 @@ from pipeline.records import AXES
 from pipeline.report.numbers import measured, number, plain, unit_text
 
 JSON = dict[str, Any]
+LEFT_OUT = "marked ones, and those that the method does not use: beside rests or steady turns, or where the log is vague"
 NO_UNCERTAINTY: JSON = {"bias": [None] * 3, "matrix": [[None] * 3] * 3}
 
 
@@ -111,7 +112,10 @@ def parameter_rows(part: JSON, sheet: JSON) -> list[JSON]:
 def stage_details(stage: JSON) -> list[str]:
     """Return the details of a stage of the fit that are one value each, in words."""
     details = {k: v for k, v in (stage.get("details") or {}).items() if isinstance(v, int | float | str | bool)}
-    return [f"{plain(k)}: {number(v, 4) if isinstance(v, float) else v}" for k, v in details.items()]
+    texts = {k: f"{plain(k)}: {number(v, 4) if isinstance(v, float) else v}" for k, v in details.items()}
+    if details.get("samples_left_out"):
+        texts["samples_left_out"] += f" ({LEFT_OUT})"
+    return list(texts.values())
 
 
 def parameter_texts(parameters: JSON | None) -> list[str]:

@@ -27,6 +27,7 @@ from pipeline.records import AXES, SENSOR_UNITS, SensorCalibration
 from pipeline.report.chart import AXES_LEGEND, Area, Dots, Figure, Layer, Line, Panel, Samples, chart
 from pipeline.report.group_charts import stems
 from pipeline.report.numbers import number
+from pipeline.signal.encoder_rate import rate_by_angle
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -54,6 +55,7 @@ class Residual:
     motion: Motion
     reading: Values
     predicted: Values
+    reference_noise: Values  # (3,), rms of what a coarse encoder leaves open of the rate, by axis
 
     @cached_property
     def error(self) -> Values:
@@ -75,7 +77,11 @@ def residuals(sensor: str, part: JSON, recordings: list[Recording], table: JSON)
         motion = table_motion(recording, table)
         if motion is not None:
             predicted = _filtered(recording, predicted_reading(calibration, motion))
-            out.append(Residual(recording, motion, reading, predicted))
+            vague = np.zeros(3)
+            by_angle = rate_by_angle(recording) if sensor == "gyroscope" else None
+            if by_angle is not None and motion.axis is not None:
+                vague[motion.axis] = np.sqrt(np.mean(by_angle.noise**2))
+            out.append(Residual(recording, motion, reading, predicted, vague))
     return out
 
 
@@ -93,12 +99,13 @@ def _filtered(recording: Recording, predicted: Values) -> Values:
 
 
 def white_noise(residual: Residual, noise: JSON | None) -> Values:
-    """Return the standard deviation of a sample's white noise after the filter: (3,) array, g or deg/s.
+    """Return the standard deviation of a sample's white noise after the filter, and of the reference's: (3,) array.
 
     Without a noise model ``1.4826 median |e[n+1] - e[n]| / sqrt(2)``, which slow errors and outliers do not change.
     """
     if noise and noise.get("white"):
-        return float(residual.recording.filter.get("noise_gain", 1.0)) * np.array(noise["white"], float)
+        gain = float(residual.recording.filter.get("noise_gain", 1.0))
+        return np.asarray(np.hypot(gain * np.array(noise["white"], float), residual.reference_noise))
     sigma: Values = 1.4826 * np.median(np.abs(np.diff(residual.error, axis=0)), axis=0) / np.sqrt(2.0)
     return sigma
 
@@ -292,6 +299,12 @@ def measurement_and_model(sensor: str, residual: Residual, noise: JSON | None) -
     finding = f"{name}: reading minus model is {number(ratio)} × the noise"
     finding += "" if ratio > NOISE else ", so nothing is left"
     caption = f"{100 * outside:.1f} % of the residuals lie outside the band; white noise alone puts 4.6 % there."
+    if known and residual.reference_noise.any():
+        most = int(np.argmax(residual.reference_noise))
+        caption += (
+            f" On {AXES[most]} the noise includes {number(float(residual.reference_noise[most]), 2)} {unit} rms of the "
+            "reference: the steps of the encoder, not the sensor, limit what this recording shows of the rate."
+        )
     caption += "" if known else " Its σ is taken from the sample-to-sample scatter."
     return chart(
         Figure(f"{sensor}-{name}", finding, caption, (*AXES_LEGEND, ("c5", "model"))),

@@ -68,8 +68,8 @@ def _chart(sensor: str, entries: Sequence[JSON]) -> Figure | None:
 
 def _row(entry: JSON, part: JSON, sensor: str) -> Point:
     change, floor = entry["change"], part["floor"]
-    words = change.words(sensor) or change.words() if change else [f"+ {name}" for name in part["effects"]]
-    label = f"run {entry['run']}" + (f": {plain(', '.join(words))}" if words else "")
+    words = change.words(sensor) or change.words() if change else part["effects"]
+    label = f"run {entry['run']}" + (f"{':' if change else ' with'} {plain(', '.join(words))}" if words else "")
     label = label if len(label) <= LABEL else f"{label[: LABEL - 1]}…"
     label += f", {number(part['error'] / floor)} × floor" if floor else ""
     return Point(label, part["error"], 1 if floor and part["error"] < NEAR_FLOOR * floor else 3)

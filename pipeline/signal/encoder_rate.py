@@ -8,7 +8,9 @@ encoder of the resolution q hides a rate below the noise of that: then the angle
 where D^k is the k-th divided difference over times h apart. S is the density of a random acceleration (k = 2), jerk (3)
 or derivative of the jerk (4); k and S maximize the likelihood of the log. The covariance of A is
 ``(I / R + D^T D h / S)^-1``, the inverse of a band matrix. The rate is the central difference of A. In addition to its
-covariance, the rate varies between the samples about this mean, by ``S h^(2k - 3) / (2 (2k - 1) (k - 1)!^2)``.
+covariance, the rate varies between the samples about this mean, by ``S h^(2k - 3) / (2 (2k - 1) (k - 1)!^2)``. Where
+most of a motion is at a steady rate, that part alone says so too, and the larger noise counts: ramps make k = 3 likely,
+which has no room for the ripple of a motor.
 
 Source: H. L. Weinert, Fast Compact Algorithms and Software for Spline Smoothing, 2013; the likelihood is that of G.
 Wahba, Annals of Statistics 13 (1985), 1378, for a noise of known variance.
@@ -38,6 +40,7 @@ FEWEST_MOVED = 100  # changes of the angle: their autocorrelation is known to 0.
 ROUNDED = -0.35  # autocorrelation, half way between that of rounding errors and that of ramps
 AROUND = 9  # second differences over which an acceleration is taken as constant
 FEWEST = 6  # samples from which a rate and its derivative follow
+STEADY, MOSTLY = 0.05, 0.5  # of the median rate, within which a rate is steady; share of a motion that then judges it
 DENSITIES = (1e-6, 1e12)  # S, (deg/s)^2/s^(2k - 3): from a table at rest to 10,000 deg/s^2 in 0.1 s
 GAP = 1.5  # sampling intervals, above which the angle in between is not known
 
@@ -136,9 +139,19 @@ def _smoothed(time: Values, angle: Values, step: float) -> EncoderRate:
             noise[own] /= 2.0 * float(np.median(np.diff(time)))
             continue
         found, error = _stretch(time[around], angle[around], step)
-        smooth[own], noise[own] = found[part], error
-        rate[own] = np.gradient(found, time[around])[part]
+        slope = np.gradient(found, time[around])
+        first, last = _steady(slope)
+        if last - first >= MOSTLY * len(slope):
+            error = max(error, _stretch(time[around][first:last], angle[around][first:last], step)[1])
+        smooth[own], noise[own], rate[own] = found[part], error, slope[part]
     return EncoderRate(smooth, rate, noise, vague, step)
+
+
+def _steady(rate: Values) -> tuple[int, int]:
+    """Return where the rate stays longest near its median."""
+    usual = float(np.median(rate))
+    spans = runs(np.abs(rate - usual) < STEADY * abs(usual))
+    return max(spans, key=lambda span: span[1] - span[0], default=(0, 0))
 
 
 def _split(spans: list[tuple[int, int]], at: list[int]) -> list[tuple[int, int]]:

@@ -96,8 +96,8 @@ class Results:
 
     def recordings(self, unit: str, role: str) -> list[Recording]:
         """Return the filtered recordings of a role; none where the unit failed."""
-        for folder in self.folder.glob("batches/*"):
-            packs = {stage: Pack(folder / f"{stage}.zip") for stage in ("ingest", "filter")}
+        for file in self.folder.glob("batches/*/filter.zip"):
+            packs = {stage: Pack(file.with_name(f"{stage}.zip")) for stage in ("ingest", "filter")}
             if f"{unit}.noise.json" in packs["filter"]:
                 return [r for r in recordings_of(packs, unit) if r.role == role]
         return []

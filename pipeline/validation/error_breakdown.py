@@ -21,6 +21,7 @@ from pipeline.estimation.stages import apply_correction
 from pipeline.model.effects import effect_of
 from pipeline.model.effects.base import truth
 from pipeline.model.effects.mounting import Mounting
+from pipeline.model.effects.sessions import SEPARATOR
 from pipeline.model.log_motion import LogEnd, fields_used, log_motion
 from pipeline.model.measurement import Part, linear_truth, solve
 from pipeline.records import Motion
@@ -119,6 +120,8 @@ def _figures(name: str, corrected: Sequence[Corrected]) -> dict[str, Any]:
 
 def _lack(calibration: SensorCalibration, fitted: FittedEffect, samples: Samples) -> str | None:
     """Say what the held-out recording lacks for an effect to be taken off, or None."""
+    if _elsewhere(fitted, samples):
+        return None
     found = effect_of(fitted)
     if samples.motion is not None:
         missing = [need for need in found.needs if getattr(samples.motion, need) is None]
@@ -138,10 +141,16 @@ def _lack(calibration: SensorCalibration, fitted: FittedEffect, samples: Samples
     return None
 
 
+def _elsewhere(fitted: FittedEffect, samples: Samples) -> bool:
+    """Return whether an effect is that of another session than the held-out recording's, in which it is zero."""
+    return SEPARATOR in fitted.name and fitted.name.partition(SEPARATOR)[2] != samples.setup
+
+
 def _with_effects(
     calibration: SensorCalibration, effects: Sequence[FittedEffect], other: SensorCalibration | None, samples: Samples
 ) -> Corrected:
     """Return calibrated readings, magnitude and vector of the reference with some effects."""
+    effects = [fitted for fitted in effects if not _elsewhere(fitted, samples)]
     if not effects:
         return _uncorrected(samples, linear_truth(calibration, samples.reading))
     own = [fitted for fitted in effects if not effect_of(fitted).moves]

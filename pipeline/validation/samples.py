@@ -69,6 +69,7 @@ class Samples:
     temperature: Values | None  # (n,), degC
     resting: bool = False  # whether each sample is the mean of a rest
     alike: float = 1.0  # samples that share one value of the white noise, by the filter: sum_l r_l^2 / r_0^2 over lags
+    setup: str = ""  # session of the recording
     earth_left_out: bool = False  # whether Earth's rotation is configured, but without an attitude not in the magnitude
 
     @property
@@ -121,6 +122,7 @@ def samples_of_motion(
         recording.reading(OTHER[sensor]),
         temperature,
         alike=_alike(recording),
+        setup=recording.setup,
         earth_left_out=sensor == "gyroscope" and earth is not None and motion is None,
     )
 
@@ -164,6 +166,7 @@ def samples_of_rests(
         other if len(other) else None,
         means(recording.temperature),
         resting=True,
+        setup=recording.setup,
     )
 
 

@@ -52,9 +52,13 @@ def test_rows_of_a_turn_weigh_less_by_the_noise_of_the_rate() -> None:
         expected = share[resting][0] / (1.0 + part.rounding / WHITE**2)
         np.testing.assert_allclose(share, expected)
         assert share[~resting].max() < share[resting][0]
-        np.testing.assert_allclose(np.sqrt(plain.scatter / plain.weight.sum()), WHITE, rtol=0.1)
+        np.testing.assert_allclose(np.sqrt(plain.scatter / np.sum(plain.weight - 1.0)), WHITE, rtol=0.1)
+        np.testing.assert_array_equal(part.scatter, plain.scatter)
 
 
 def test_rounding_and_ripple_are_no_effect_of_the_sensor() -> None:
     observations = observe("gyroscope", recordings(), {"gravity_g": 1.0})
-    assert select(observations, (), NOISE, SHEET).names == []
+    selection = select(observations, (), NOISE, SHEET)
+    assert selection.names == []
+    expected = WHITE * np.sqrt(selection.observations.weakened.expected_square)
+    assert 0.95 * expected < selection.fit.residual_rms < 1.15 * expected

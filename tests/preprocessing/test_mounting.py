@@ -124,6 +124,12 @@ def test_another_turn_axis_is_used_where_gravity_shows_it_and_else_refused() -> 
     said = next(n.detail for r in found for n in r.notes if r.name == "accel_x" and n.code == "N-FOUND")
     assert "said to turn about y, and gravity turns about x" in said
     assert "accel_x.axis=x" in said
+    assert "sense" not in said
+    left_handed = recordings_of({"x": Setup("x", sense=-1)})
+    exchanged = [replace(r, axis={"x": "y", "y": "x"}.get(str(r.axis), r.axis)) for r in left_handed]
+    found = check_mounting(exchanged, settings_of(exchanged))
+    said = next(n.detail for r in found for n in r.notes if r.name == "accel_x" and n.code == "N-FOUND")
+    assert "accel_x.axis=x, procedure.recordings.accel_x.sense=-1" in said
     blind = [replace(r, accelerometer=None) for r in exchanged if r.role == "gyroscope"]
     with pytest.raises(IngestError, match="said to turn about y, and the gyroscope turns about x") as caught:
         check_mounting(blind, settings_of(blind))

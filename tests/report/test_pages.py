@@ -78,7 +78,7 @@ def test_the_unit_page_asks_no_other_host_for_anything(page: str) -> None:
 def test_the_unit_page_says_the_figures_it_was_given(page: str) -> None:
     text = Text(page).text
     for expected in (
-        "0.0689 → 0.00310 g rms, held out",
+        "0.0689 → 0.00310 g rms of the magnitude, held out",
         "Quadratic nonlinearity is missing.",
         "effects.accelerometer=[quadratic_nonlinearity]",
         "the table turned too slowly",

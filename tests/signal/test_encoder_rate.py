@@ -47,6 +47,20 @@ def test_a_motor_that_ripples_is_known_to_the_noise_that_is_stated() -> None:
     assert 0.7 * rate.noise[3000] < error < 1.3 * rate.noise[3000]
 
 
+def test_ramps_do_not_hide_that_a_motor_ripples() -> None:
+    rng = np.random.default_rng(5)
+    ripple = np.zeros(1400)
+    for i in range(1, len(ripple)):  # correlated over 0.1 s
+        ripple[i] = 0.9 * ripple[i - 1] + np.sqrt(1.0 - 0.9**2) * rng.normal()
+    steps = np.repeat(np.concatenate([np.zeros(100), np.linspace(0, 360, 180), np.full(840, 360.0)]), 10)
+    speed = np.concatenate([steps, np.repeat(np.linspace(360, 0, 180), 10), np.zeros(1000)])
+    fine = speed * (1.0 + 0.004 * np.interp(np.arange(len(speed)) / 10.0, np.arange(len(ripple)), ripple))
+    angle = cumulative_trapezoid(fine, dx=INTERVAL / 10.0, initial=0.0)[::10]
+    rate = found(angle, 0.01)
+    error = float(np.sqrt(np.mean((rate.rate - fine[::10])[300:1100] ** 2)))
+    assert 0.7 * rate.noise[700] < error < 1.3 * rate.noise[700]
+
+
 def test_a_fine_angle_keeps_its_derivative() -> None:
     angle, true = by_hand(np.arange(3000) * INTERVAL)
     rate = found(angle, 1e-6)

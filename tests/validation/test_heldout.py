@@ -9,7 +9,7 @@ import pytest
 from scipy.signal import lfilter
 
 from pipeline.errors import ConfigurationError
-from pipeline.model.effects import catalogue
+from pipeline.model.effects import catalogue, effect
 from pipeline.model.kinematics import earth_rate, reference_motion
 from pipeline.model.measurement import compensate, predicted_reading
 from pipeline.records import FittedEffect, Noise, Recording, SensorCalibration, StageResult
@@ -61,7 +61,7 @@ def fitted(name: str, sensor: str, size: float) -> FittedEffect:
     rng = np.random.default_rng(1)
     values = {
         p.name: {"value": size * rng.uniform(0.5, 1.0), "unit": p.unit, "expanded_uncertainty": 0.0}
-        for p in catalogue()[name].parameters(sensor)
+        for p in effect(name).parameters(sensor)
     }
     return FittedEffect(name, values)
 
@@ -226,6 +226,27 @@ def test_an_effect_that_the_held_out_log_cannot_show_is_left_out_and_said() -> N
         "the expected error is not stated, because bias_temperature is left out of the held-out error",
     ]
     assert part["steps"][2]["rms_error"] == part["steps"][1]["rms_error"]
+
+
+def test_an_effect_of_another_session_leaves_the_expected_error_as_it_is() -> None:
+    plain = calibration("gyroscope")
+    recording = replace(read(held_out(300), gyroscope=plain), table_attitude=None, setup="B")
+    without = validate(plain, [recording], noise_of("gyroscope"), SETTINGS)
+    for name in ("mounting", "table_tilt"):
+        parts = {
+            session: validate(
+                calibration("gyroscope", fitted(f"{name}@{session}", "gyroscope", 0.5)),
+                [recording],
+                noise_of("gyroscope"),
+                SETTINGS,
+            )
+            for session in "AB"
+        }
+        assert parts["A"]["notes"] == []
+        np.testing.assert_allclose(parts["A"]["expected_rms_error"], without["expected_rms_error"], rtol=0.02)
+        assert parts["A"]["steps"][-1]["rms_error"] == without["steps"][-1]["rms_error"]
+        assert parts["B"]["expected_rms_error"] is None
+        assert f"because {name}@B is left out" in parts["B"]["notes"][1]
 
 
 @pytest.mark.parametrize(("name", "size"), [("time_offset", 0.03), ("low_pass_lag", 0.03), ("clock_rate", 300.0)])
