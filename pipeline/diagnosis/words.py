@@ -206,6 +206,11 @@ def _how_sure(part: Mapping[str, Any]) -> list[str]:
         more = [f"{len(sets) - MOST_ANSWERS} more"] if len(sets) > MOST_ANSWERS else []
         head = IN_DOUBT if part["verdict"] in ("unexplained", "reference_in_doubt") else ANSWERS
         lines.append(f"{head}: {listed([*said, *more], 'or')}.")
+        if part["verdict"] == "nothing_missing" and sets[0]["effects"]:
+            lines.append(
+                f"The verdict is that of the selection, whose thresholds {_answer(sets[0]['effects'])} does not pass: "
+                "probabilities and selection disagree, and only further recordings decide."
+            )
     if part.get("to_distinguish"):
         lines.append(f"These recordings cannot distinguish them; this one would: {part['to_distinguish']}.")
     if part.get("upper_limit"):
@@ -274,10 +279,13 @@ def next_experiment(verdict: str, ranking: Sequence[Mapping[str, Any]], found: F
     if not found.selected:
         return found.advice(verdict) or "none is needed: nothing that these recordings can show is missing"
     entries = {entry["effect"]: entry for entry in ranking}
-    alike = {n: [a["effect"] for a in entries[n]["look_alikes"] if not _contains(a["effect"], n)] for n in found.selected}
-    name = next((n for n in found.selected if alike[n]), found.selected[0])
+
+    def alike(name: str) -> list[str]:
+        return [a["effect"] for a in entries[name]["look_alikes"] if not _contains(a["effect"], name)]
+
+    name = next((n for n in found.selected if alike(n)), found.selected[0])
     experiment = _experiment(name, on_table=found.on_table)
-    others = listed([plain(other) for other in alike[name][:2]], "or")
+    others = listed([plain(other) for other in alike(name)[:2]], "or")
     return f"to {f'distinguish {plain(name)} from {others}' if others else f'confirm {plain(name)}'}: {experiment}"
 
 

@@ -112,9 +112,10 @@ class Observations:
     @cached_property
     def expected_square(self) -> float:
         """Mean square of the residual over that of white noise s: 1, and what a coarse encoder adds about one axis."""
-        parts = [part for part in self.parts if part.rounding is not None] if self.white > 0.0 else []
-        added = sum(float(np.sum(part.weight * part.rounding)) for part in parts) / (3.0 * self.white**2)
-        return 1.0 + added / self.samples
+        if self.white <= 0.0:
+            return 1.0
+        added = [float(part.weight @ part.rounding) for part in self.parts if part.rounding is not None]
+        return 1.0 + sum(added) / (3.0 * self.white**2 * self.samples)
 
     @cached_property
     def blocks(self) -> Blocks:

@@ -16,7 +16,7 @@ from pipeline.records import AXES
 from pipeline.report.numbers import measured, number, plain, unit_text
 
 JSON = dict[str, Any]
-LEFT_OUT = "marked ones, and those that the method does not use: beside rests or steady turns, or where the log is vague"
+LEFT_OUT = "marked ones, and those that the method does not use: beside rests or steady turns, or of a vague log"
 NO_UNCERTAINTY: JSON = {"bias": [None] * 3, "matrix": [[None] * 3] * 3}
 
 

@@ -140,9 +140,9 @@ def _smoothed(time: Values, angle: Values, step: float) -> EncoderRate:
             continue
         found, error = _stretch(time[around], angle[around], step)
         slope = np.gradient(found, time[around])
-        first, last = _steady(slope)
-        if last - first >= MOSTLY * len(slope):
-            error = max(error, _stretch(time[around][first:last], angle[around][first:last], step)[1])
+        start, stop = _steady(slope)
+        if stop - start >= MOSTLY * len(slope):
+            error = max(error, _stretch(time[around][start:stop], angle[around][start:stop], step)[1])
         smooth[own], noise[own], rate[own] = found[part], error, slope[part]
     return EncoderRate(smooth, rate, noise, vague, step)
 

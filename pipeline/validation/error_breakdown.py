@@ -120,11 +120,9 @@ def _figures(name: str, corrected: Sequence[Corrected]) -> dict[str, Any]:
 
 def _lack(calibration: SensorCalibration, fitted: FittedEffect, samples: Samples) -> str | None:
     """Say what the held-out recording lacks for an effect to be taken off, or None."""
-    if _elsewhere(fitted, samples):
-        return None
     found = effect_of(fitted)
-    if samples.motion is not None:
-        missing = [need for need in found.needs if getattr(samples.motion, need) is None]
+    if samples.motion is not None or _elsewhere(fitted, samples):
+        missing = [need for need in found.needs if samples.motion and getattr(samples.motion, need) is None]
         return f"the held-out recording holds no {' and no '.join(missing)}" if missing else None
     if found.moves:
         few = not samples.resting and len(samples.time) <= DEGREE

@@ -9,7 +9,7 @@ import pytest
 from scipy.signal import lfilter
 
 from pipeline.errors import ConfigurationError
-from pipeline.model.effects import catalogue, effect
+from pipeline.model.effects import effect
 from pipeline.model.kinematics import earth_rate, reference_motion
 from pipeline.model.measurement import compensate, predicted_reading
 from pipeline.records import FittedEffect, Noise, Recording, SensorCalibration, StageResult

@@ -52,6 +52,7 @@ if (contents) {
   addEventListener("scroll", () => requestAnimationFrame(follow), { passive: true });
   follow();
 }
+if (matchMedia("(max-width: 700px)").matches) for (const part of document.querySelectorAll("details.fold")) part.open = false;
 // On a phone, a table that is too wide shows each row as a block (page.css). The names of the columns are rules of a style sheet, as
 // the rows of a list change.
 const narrow = matchMedia("(max-width: 700px)"), names_ = document.createElement("style");
@@ -61,7 +62,8 @@ const fit = new ResizeObserver((entries) => requestAnimationFrame(() => {
     if (target.clientWidth === target.fitted) continue;
     target.fitted = target.clientWidth;
     table.classList.remove("folded");
-    table.classList.toggle("folded", narrow.matches && target.scrollWidth > target.clientWidth + 1);
+    const column = [...table.rows].some((row) => row.offsetHeight > 200); // of a word a line
+    table.classList.toggle("folded", narrow.matches && (column || target.scrollWidth > target.clientWidth + 1));
   }
 }));
 document.querySelectorAll(".scroll").forEach((box, i) => {

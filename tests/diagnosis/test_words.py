@@ -1,0 +1,57 @@
+"""What a diagnosis says: no sentence contradicts another, and no experiment is one that the unit already has."""
+
+from typing import Any
+
+import pytest
+
+from pipeline.diagnosis.words import PLUS_MINUS, in_words, next_experiment
+from pipeline.model.effects import catalogue
+
+
+def part(verdict: str, selected: list[str], answers: list[tuple[list[str], float]]) -> dict[str, Any]:
+    ranking = [
+        {
+            "effect": name,
+            "parameters": {"r_x": {"value": 8e-4, "unit": "m", "standard_uncertainty": 2e-5}},
+            "explained_share": 1.0,
+            "delta_bic": 900.0,
+            "plausible": True,
+            "look_alikes": [{"effect": "inner_lever_arms", "share": 1.0}],
+            "held_out_error_before": None,
+            "held_out_error_after": None,
+        }
+        for name in selected
+    ]
+    sets = [{"effects": names, "probability": p} for names, p in answers]
+    return {
+        "verdict": verdict, "residual_over_noise": 1.5, "selected": selected, "ranking": ranking, "answer_set": sets,
+        "unexplained": [], "not_observable": [], "next_experiment": "",
+    }  # fmt: skip
+
+
+def test_the_fit_without_the_effects_is_named() -> None:
+    one = in_words(part("missing_effect", ["lever_arm"], [(["lever_arm"], 0.97)]), "accelerometer")
+    assert "The residual of the fit, which does not contain this effect, is 1.5 times the noise." in one[0]
+    two = in_words(part("missing_effect", ["lever_arm", "hysteresis"], []), "accelerometer")
+    assert "which does not contain these effects" in two[0]
+    none = in_words(part("nothing_missing", [], [([], 0.97)]), "accelerometer")
+    assert none[0].endswith("The residual is 1.5 times the noise.")
+    assert one.count(PLUS_MINUS) == 1
+    assert PLUS_MINUS not in none
+
+
+@pytest.mark.parametrize(("answer", "disagree"), [([], False), (["quadratic_nonlinearity"], True)])
+def test_probabilities_against_the_verdict_are_said(answer: list[str], *, disagree: bool) -> None:
+    said = " ".join(in_words(part("nothing_missing", [], [(answer, 0.91)]), "gyroscope"))
+    assert ("probabilities and selection disagree" in said) is disagree
+
+
+def test_an_effect_that_contains_another_needs_no_distinction() -> None:
+    class Found:
+        selected = ("lever_arm",)
+        on_table = True
+
+    entries = part("missing_effect", ["lever_arm"], [])["ranking"]
+    said = next_experiment("missing_effect", entries, Found())  # type: ignore[arg-type]
+    assert said == f"to confirm lever arm: {catalogue()['lever_arm'].experiment}"
+    assert "moved by a known distance" in said
