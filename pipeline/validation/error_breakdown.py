@@ -20,8 +20,7 @@ from pipeline.errors import ConfigurationError
 from pipeline.estimation.stages import apply_correction
 from pipeline.model.effects import effect_of
 from pipeline.model.effects.base import truth
-from pipeline.model.effects.mounting import Mounting
-from pipeline.model.effects.sessions import SEPARATOR
+from pipeline.model.effects.mounting import SEPARATOR, Mounting
 from pipeline.model.log_motion import LogEnd, fields_used, log_motion
 from pipeline.model.measurement import Part, linear_truth, solve
 from pipeline.records import Motion
