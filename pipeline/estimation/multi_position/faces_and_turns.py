@@ -229,10 +229,10 @@ def _padded(
     time, temperature, weight = np.zeros(shape), np.full(shape, np.nan), np.zeros(shape)
     for k, (recording, span) in enumerate(chosen):
         at = np.minimum(np.arange(shape[1]) + span.start, span.stop - 1)
-        force = np.asarray(recording.accelerometer)[at] - accelerometer.bias
+        centred = np.asarray(recording.accelerometer)[at] - accelerometer.bias
         reading[k], force[k], time[k] = (
             np.asarray(recording.gyroscope)[at],
-            force @ accelerometer.matrix.T,
+            centred @ accelerometer.matrix.T,
             recording.time[at],
         )
         if recording.temperature is not None:
